@@ -1,0 +1,163 @@
+"""The nouns that flow from pixels to command. Frozen; arrays are never changed by whoever receives them.
+
+Frames: camera optical (RDF), body (FRD), world (NED). ``R_a_b`` takes coordinates from b to a: ``p_a = R_a_b @ p_b``.
+Pixels are (u, v) with pixel centres at +0.5. Times are seconds on a monotonic clock, never wall time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+UInt8Array = NDArray[np.uint8]
+UInt16Array = NDArray[np.uint16]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image of one camera."""
+
+    camera: str
+    image: UInt8Array
+    """(height, width, 3) RGB."""
+    time_s: float
+    sequence: int
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSet:
+    """The images of all cameras of one drone at one time; a camera that has failed is absent."""
+
+    time_s: float
+    frames: Mapping[str, Frame]
+
+
+@dataclass(frozen=True, eq=False)
+class VehicleState:
+    """What the drone's own autopilot says of itself. Nothing in here comes from another drone."""
+
+    time_s: float
+    R_ned_body: FloatArray
+    """(3, 3) attitude."""
+    height_m: float
+    """Height above ground from the barometer, metres, up positive."""
+    velocity_ned: FloatArray | None = None
+    """(3,) m/s, the autopilot's own estimate, where it has one."""
+
+
+@dataclass(frozen=True, eq=False)
+class EgoMotion:
+    """The drone's own motion over one interval: ``P_C = rotation @ P_F + translation`` (Eq. 7).
+
+    C is the body frame at the interval's start, F at its end.
+    """
+
+    rotation: FloatArray
+    """(3, 3)"""
+    translation: FloatArray
+    """(3,) metres, in C."""
+    interval_s: float
+    pairs: int
+    inliers: int
+    threshold_m: float
+    """The rejection threshold at which Algorithm 1 found its inliers."""
+
+    @property
+    def velocity(self) -> FloatArray:
+        """(3,) m/s in C, the mean over the interval (Eq. 21)."""
+        return self.translation / self.interval_s
+
+
+@dataclass(frozen=True, eq=False)
+class NeighbourMotion:
+    """A neighbour's own motion over one interval, in C, free of the drone's own (Eq. 31-36)."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    """(3,) metres in C (Eq. 35)."""
+    velocity: FloatArray
+    """(3,) m/s in C (Eq. 36)."""
+    centre: FloatArray
+    """(3,) metres in F: centre of the inliers' bounding box (Eq. 37)."""
+    pairs: int
+    inliers: int
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """One drone seen in one frame set, before any tracking."""
+
+    position: FloatArray
+    """(3,) metres, body FRD of the frame set."""
+    range_sigma_m: float
+    """Standard deviation along the line of sight."""
+    bearing_sigma_rad: float
+    """Standard deviation across it, each way."""
+    size_m: float
+    """Range times angular size: about the drone's own size, constant over time."""
+    cameras: tuple[str, ...]
+    """More than one where the drone straddles an image border."""
+    label: int
+    """Its value in the instance maps of this frame set, from 1 up."""
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbour:
+    """A tracked drone, in level axes that point north, east and down, relative to the own drone."""
+
+    track: int
+    position: FloatArray
+    """(3,) metres, NED, own drone at the origin, at the output's time."""
+    velocity: FloatArray
+    """(3,) m/s, NED, over ground."""
+    position_sigma_m: float
+    velocity_sigma_m_s: float
+    age_s: float
+    """Since first seen."""
+    unseen_s: float
+    """Since last seen; 0 when seen in the newest frame set."""
+    hits: int
+    confirmed: bool
+
+
+@dataclass(frozen=True, eq=False)
+class VelocityCommand:
+    """What the flock law asks of the autopilot; altitude is held elsewhere."""
+
+    velocity: FloatArray
+    """(2,) m/s, north and east, after limits."""
+    acceleration: FloatArray
+    """(2,) m/s^2, north and east: u of Eq. 38 after limits."""
+    yaw_rad: float
+    """Heading, clockwise from north."""
+
+
+@dataclass(frozen=True, eq=False)
+class PilotOutput:
+    """Everything one step of the pilot found and decided."""
+
+    time_s: float
+    ego_motion: EgoMotion | None
+    velocity: FloatArray | None
+    """(3,) m/s NED: the own velocity that the law used; None before there is one."""
+    sightings: tuple[Sighting, ...]
+    neighbours: tuple[Neighbour, ...]
+    command: VelocityCommand
+    reasons: tuple[str, ...] = ()
+    """Why something is missing: each is one short sentence."""
+    counts: Mapping[str, int] = field(default_factory=dict)
+    """Estimates refused in this step, by reason."""
+    stages_ms: Mapping[str, float] = field(default_factory=dict)
+    """Time each stage took, as measured by the caller's clock; empty without one."""
+
+
+ScaleSource = Literal["network", "height"]
+OwnVelocitySource = Literal["vision", "autopilot"]
