@@ -1,0 +1,20 @@
+"""The flocking law (Eq. 38-42), the flock's desired velocity (Eq. 43) and, in `metrics`, figures of a flock.
+
+Everything here is horizontal: north and east.
+"""
+
+from __future__ import annotations
+
+from flockd.config.parameters import DesiredVelocityParameters, FlockingParameters, WeightParameters
+from flockd.flocking.desired import course, desired_velocity
+from flockd.flocking.law import FlockingLaw, limit_norm
+
+__all__ = [
+    "DesiredVelocityParameters",
+    "FlockingLaw",
+    "FlockingParameters",
+    "WeightParameters",
+    "course",
+    "desired_velocity",
+    "limit_norm",
+]
