@@ -1,0 +1,117 @@
+"""Loads a drone's or a scenario's YAML into its typed configuration, or says everything that is wrong with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from flockd.config.complaints import path_in_file, problems_of
+from flockd.config.document import Document, Place, Value, read_document
+from flockd.config.parameters import DroneConfig
+from flockd.config.scenario import ScenarioConfig
+from flockd.errors import ConfigError
+
+Model = TypeVar("Model", bound=BaseModel)
+Overrides = Mapping[str, Value]
+
+
+def load_drone(path: Path | str, overrides: Overrides | None = None) -> DroneConfig:
+    """The configuration of one drone.
+
+    `overrides` sets single values over the file's, by dotted key: `{"perception.flow": "dis"}`.
+    Raises ConfigError with every problem found.
+    """
+    document = read_document(Path(path))
+    _override(document, overrides or {})
+    return _validated(DroneConfig, document)
+
+
+def load_scenario(path: Path | str, overrides: Overrides | None = None) -> ScenarioConfig:
+    """The configuration of one simulated flight, with the drone's file that its key `drone` names merged into it.
+
+    `overrides` sets single values over the files', by dotted key: `{"seed": 3, "drone.perception.flow": "dis"}`.
+    Raises ConfigError with every problem found in both files.
+    """
+    document = read_document(Path(path))
+    _merge_drone(document, Path(path).parent)
+    _override(document, overrides or {})
+    return _validated(ScenarioConfig, document)
+
+
+def schema_of(kind: Literal["drone", "scenario"]) -> dict[str, Any]:
+    """The JSON schema of a configuration file, for editors and other tools."""
+    if kind == "drone":
+        return DroneConfig.model_json_schema()
+    schema = ScenarioConfig.model_json_schema()
+    description = schema["properties"]["drone"]["description"]
+    schema["properties"]["drone"] = {"type": "string", "title": "Drone", "description": description}
+    used = ("StartConfig", "VehicleConfig", "SensorConfig", "WorldConfig")
+    schema["$defs"] = {name: schema["$defs"][name] for name in used}
+    return schema
+
+
+def _merge_drone(document: Document, folder: Path) -> None:
+    """Puts the drone's values and places where the scenario's file names the drone's file."""
+    key = ("drone",)
+    if key in document.spoiled:
+        return
+    place = document.places.get(key, replace(document.places[()], key="drone"))
+    name = document.values.get("drone")
+    if not isinstance(name, str) or not name:
+        fault = "must be the path of the drone's own YAML file" if "drone" in document.values else "is missing"
+        document.problems.append(place.problem(f"{fault}; write it as in `drone: simulator.yaml`"))
+        document.spoiled.add(key)
+        return
+    try:
+        drone = read_document(folder / name)
+    except ConfigError as error:
+        document.problems.append(place.problem(f"names {name}, which cannot be used; mend that file or name another"))
+        document.problems.extend(error.problems)
+        document.spoiled.add(key)
+        return
+    document.values["drone"] = drone.values
+    document.places.update({(*key, *path): place for path, place in drone.places.items()})
+    document.problems.extend(drone.problems)
+    document.spoiled.update((*key, *path) for path in drone.spoiled)
+
+
+def _override(document: Document, overrides: Overrides) -> None:
+    """Sets single values; a problem with one is told of the override, not of the file."""
+    for key, value in overrides.items():
+        path = tuple(key.split("."))
+        if _is_under(path[:-1], document.spoiled):
+            continue
+        values = document.values
+        for length in range(1, len(path)):
+            document.places.setdefault(path[:length], replace(document.places[path[: length - 1]], key=key))
+            inner = values.setdefault(path[length - 1], {})
+            if not isinstance(inner, dict):
+                break  # not a section: validation tells of it
+            values = inner
+        else:
+            values[path[-1]] = value
+            document.places[path] = Place("override", 0, key, "")
+            document.spoiled.discard(path)
+
+
+def _validated(model: type[Model], document: Document) -> Model:
+    try:
+        config = model.model_validate(document.values)
+    except ValidationError as error:
+        told = [
+            detail
+            for detail in error.errors()
+            if not _is_under(path_in_file(detail, document.places), document.spoiled)
+        ]
+        raise ConfigError([*document.problems, *problems_of(told, model, document.places)]) from error
+    if document.problems:
+        raise ConfigError(document.problems)
+    return config
+
+
+def _is_under(path: tuple[str | int, ...], spoiled: set[tuple[str | int, ...]]) -> bool:
+    return any(path[:length] in spoiled for length in range(len(path) + 1))

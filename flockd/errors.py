@@ -1,0 +1,67 @@
+"""Errors that end a command with one sentence and an exit code instead of a traceback."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+
+class ExitCode(IntEnum):
+    """What a command's exit status means; 69 and 78 are the numbers of sysexits.h."""
+
+    DONE = 0
+    CHECK_FAILED = 1
+    USAGE = 2
+    UNAVAILABLE = 69
+    BAD_CONFIGURATION = 78
+
+
+class FlockdError(Exception):
+    """Something a person can mend; the text is the whole story, one sentence a line."""
+
+    exit_code = ExitCode.CHECK_FAILED
+
+
+class UsageError(FlockdError):
+    """The command line asks for something that cannot be."""
+
+    exit_code = ExitCode.USAGE
+
+
+class UnavailableError(FlockdError):
+    """Something outside is not there: an extra that is not installed, a device, a service."""
+
+    exit_code = ExitCode.UNAVAILABLE
+
+
+class ModelError(FlockdError):
+    """A model file or its manifest is missing, damaged or does not fit its role."""
+
+    exit_code = ExitCode.BAD_CONFIGURATION
+
+
+@dataclass(frozen=True, order=True)
+class ConfigProblem:
+    """One thing wrong with a configuration: where, what, and how to mend it."""
+
+    file: str
+    line: int
+    """Counted from 1; 0 where no line is to blame (a missing file, an override)."""
+    key: str
+    """Path inside the file, as in `rig.cameras[0].size_px`; empty for the file as a whole."""
+    message: str
+
+    def __str__(self) -> str:
+        place = f"{self.file}:{self.line}" if self.line else self.file
+        return f"{place}: {self.key}: {self.message}" if self.key else f"{place}: {self.message}"
+
+
+class ConfigError(FlockdError):
+    """Everything wrong with a configuration at once; its text has one line for each problem."""
+
+    exit_code = ExitCode.BAD_CONFIGURATION
+
+    def __init__(self, problems: Sequence[ConfigProblem]) -> None:
+        self.problems = tuple(sorted(problems))
+        super().__init__("\n".join(str(problem) for problem in self.problems))
