@@ -100,7 +100,8 @@ def _sentence(error: ErrorDetails, written: str, path: KeyPath, root: Schema) ->
     if choices:
         close = difflib.get_close_matches(str(value).lower(), choices, n=1)
         return f"{shown} is not known; " + (f"did you mean `{close[0]}`?" if close else f"write {wanted}")
-    return f"{shown} is not {wanted.split(',')[0]}; {_mend(value, schema, wanted)}"
+    short = "a section" if schema.get("type") == "object" else wanted.split(",")[0]
+    return f"{shown} is not {short}; {_mend(value, schema, wanted)}"
 
 
 def _unknown_key(key: str, known: Sequence[str]) -> str:
