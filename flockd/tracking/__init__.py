@@ -1,0 +1,9 @@
+"""Neighbours over time: which sighting is which drone, where it is now and how it moves."""
+
+from __future__ import annotations
+
+from flockd.config.parameters import TrackingParameters
+from flockd.tracking.measurement import Measurement, sighting_covariance
+from flockd.tracking.tracker import Tracker
+
+__all__ = ["Measurement", "Tracker", "TrackingParameters", "sighting_covariance"]

@@ -1,0 +1,295 @@
+"""The tracker in stories: noise, dropouts, crossings, outliers, false sightings, and its own opinion of its errors."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from flockd.messages import Neighbour
+from flockd.tracking import Measurement, Tracker, TrackingParameters, sighting_covariance
+
+Array = NDArray[np.float64]
+STEP_S = 0.5
+AHEAD = np.array([4.0, 0.0, 0.0])
+CRUISE = np.array([1.0, 0.0, 0.0])
+
+
+def _seen(position: Array, sigma_m: float = 0.05, size_m: float = 0.6) -> Measurement:
+    return Measurement(np.asarray(position, dtype=float), sigma_m**2 * np.eye(3), size_m)
+
+
+def _step(tracker: Tracker, time_s: float, *positions: Array, sigma_m: float = 0.05) -> tuple[int, ...]:
+    """One step of an own drone that cruises north at 1 m/s."""
+    if time_s > 0:
+        tracker.predict(STEP_S, CRUISE * STEP_S)
+    return tracker.update(time_s, [_seen(position, sigma_m) for position in positions], CRUISE)
+
+
+def _confirmed(tracker: Tracker) -> list[Neighbour]:
+    return [neighbour for neighbour in tracker.neighbours() if neighbour.confirmed]
+
+
+def _settled(position: Array = AHEAD, *, steps: int = 10, sigma_m: float = 0.05) -> tuple[Tracker, float]:
+    """A tracker that has followed one flock mate at `position`, and the time now."""
+    tracker = Tracker(TrackingParameters())
+    for step in range(steps):
+        _step(tracker, step * STEP_S, position, sigma_m=sigma_m)
+    return tracker, (steps - 1) * STEP_S
+
+
+def test_five_noisy_frames_and_then_a_dropout() -> None:
+    rng = np.random.default_rng(1)
+    tracker = Tracker(TrackingParameters(max_unseen_s=2.0))
+    numbers = {_step(tracker, k * STEP_S, AHEAD + rng.normal(0, 0.05, 3)) for k in range(5)}
+    assert len(numbers) == 1
+    (neighbour,) = tracker.neighbours()
+    assert neighbour.confirmed
+    assert (neighbour.hits, neighbour.age_s, neighbour.unseen_s) == (5, 2.0, 0.0)
+    np.testing.assert_allclose(neighbour.position, AHEAD, atol=0.15)
+    seen_sigma_m = neighbour.position_sigma_m
+
+    for k in range(5, 9):  # unseen for 0.5 ... 2.0 s: it flies on as it flew
+        _step(tracker, k * STEP_S)
+    (neighbour,) = tracker.neighbours()
+    assert neighbour.unseen_s == pytest.approx(2.0)
+    assert (neighbour.hits, neighbour.age_s) == (5, 4.0)
+    np.testing.assert_allclose(neighbour.position, AHEAD, atol=0.5)
+    assert neighbour.position_sigma_m > 4 * seen_sigma_m
+
+    _step(tracker, 9 * STEP_S)
+    assert tracker.neighbours() == ()
+
+
+def test_confirmation_takes_the_number_of_hits_asked_for() -> None:
+    tracker = Tracker(TrackingParameters(confirm_hits=3))
+    found = []
+    for k in range(4):
+        _step(tracker, k * STEP_S, AHEAD)
+        found.append(len(_confirmed(tracker)))
+    assert found == [0, 0, 1, 1]
+
+
+def test_a_track_not_confirmed_dies_at_its_first_miss() -> None:
+    tracker = Tracker(TrackingParameters(confirm_hits=2))
+    (first,) = _step(tracker, 0.0, AHEAD)
+    _step(tracker, 0.5)
+    assert tracker.neighbours() == ()
+    (second,) = _step(tracker, 1.0, AHEAD)
+    assert second != first  # a number is never given twice
+
+
+def test_false_sightings_of_one_frame_are_never_confirmed() -> None:
+    tracker, now_s = _settled()
+    spots = [np.array([x, y, -1.0]) for x in (-9.0, 9.0) for y in (-6.0, 0.0, 6.0)]
+    for k in range(60):
+        now_s += STEP_S
+        _step(tracker, now_s, AHEAD, spots[k % len(spots)])
+        assert len(_confirmed(tracker)) == 1
+    assert len(tracker.neighbours()) == 2
+
+
+def test_two_drones_that_cross_at_one_metre_keep_their_numbers() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        tracker = Tracker(TrackingParameters())
+        given = []
+        for k in range(25):
+            along = -6.0 + 0.5 * k  # each at 1 m/s relative to the own drone, opposite ways, 1 m apart when level
+            truth = [np.array([along, 4.5, 0.0]), np.array([-along, 5.5, 0.0])]
+            shuffled = rng.permutation(2)
+            numbers = _step(tracker, k * STEP_S, *(truth[i] + rng.normal(0, 0.05, 3) for i in shuffled))
+            given.append([numbers[int(np.flatnonzero(shuffled == i)[0])] for i in range(2)])
+        assert np.all(np.array(given) == given[0])
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("sigma_m", [0.05, 0.3])
+def test_one_frame_three_metres_off_moves_a_confirmed_track_little(axis: int, sigma_m: float) -> None:
+    position = np.array([10.0, 0.0, 0.0])
+    tracker, now_s = _settled(position, sigma_m=sigma_m)
+    _step(tracker, now_s + STEP_S, position + 3.0 * np.eye(3)[axis], sigma_m=sigma_m)
+    assert np.linalg.norm(_confirmed(tracker)[0].position - position) < 0.3
+    _step(tracker, now_s + 2 * STEP_S, position, sigma_m=sigma_m)
+    (neighbour,) = tracker.neighbours()
+    assert np.linalg.norm(neighbour.position - position) < 0.3
+
+
+def test_inside_the_gate_an_outlier_moves_a_track_the_less_the_farther_off_it_is() -> None:
+    moved_m = []
+    for off_m in (1.0, 2.5, 3.0):
+        tracker, now_s = _settled(sigma_m=0.7)
+        numbers = _step(tracker, now_s + STEP_S, AHEAD + np.array([0.0, off_m, 0.0]), sigma_m=0.7)
+        assert numbers == (1,)
+        moved_m.append(float(tracker.neighbours()[0].position[1]))
+    gain = moved_m[0] / 1.0  # 1 m is honest here: the plain Kalman gain
+    assert moved_m[2] < 0.75 * gain * 3.0
+    assert moved_m[1] * 2.5 == pytest.approx(moved_m[2] * 3.0)  # beyond 2.5 sigma it falls as 1 / distance
+
+
+def test_a_track_follows_a_jump_that_stays() -> None:
+    """One bad frame moves nothing, but a lasting 0.45 m, many sigmas off, is believed within 3 s."""
+    tracker, now_s = _settled()
+    jumped = AHEAD + np.array([0.0, 0.45, 0.0])
+    errors_m = []
+    for k in range(1, 9):
+        _step(tracker, now_s + k * STEP_S, jumped)
+        (neighbour,) = tracker.neighbours()
+        errors_m.append(np.linalg.norm(neighbour.position - jumped))
+    assert errors_m[0] > 0.2
+    assert max(errors_m[6:]) < 0.1
+
+
+def test_the_first_update_is_the_textbook_kalman_filter() -> None:
+    """By hand: 0.1 m at first sight, velocity +-0.7 m/s, 1 s on: 0.01 + 0.49 + 0.4^2 * 0.5 / 3 = 0.526667 m^2."""
+    tracker = Tracker(TrackingParameters(acceleration_sigma_m_s2=0.4))
+    tracker.update(0.0, [_seen(AHEAD, 0.1)], CRUISE)
+    tracker.predict(1.0, np.array([0.6, 0.0, 0.0]))
+    (before,) = tracker.neighbours()
+    np.testing.assert_allclose(before.position, [4.4, 0.0, 0.0])  # 4 + 1 - 0.6
+    assert before.position_sigma_m == pytest.approx(math.sqrt(0.526667), rel=1e-5)
+    tracker.update(1.0, [_seen(np.array([4.9, 0.0, 0.0]), 0.1)], CRUISE)
+    (after,) = tracker.neighbours()
+    gain = 0.526667 / 0.536667
+    velocity_gain = (0.49 + 0.08 / 2) / 0.536667  # cross covariance: 0.7^2 * 1 s + q / 2
+    np.testing.assert_allclose(after.position, [4.4 + 0.5 * gain, 0.0, 0.0], rtol=1e-5)
+    np.testing.assert_allclose(after.velocity, [1.0 + 0.5 * velocity_gain, 0.0, 0.0], rtol=1e-5)
+    assert after.position_sigma_m == pytest.approx(math.sqrt((1 - gain) * 0.526667), rel=1e-4)
+
+
+def test_prediction_in_two_halves_is_prediction_in_one() -> None:
+    whole, halves = _settled()[0], _settled()[0]
+    whole.predict(0.5, np.array([0.4, 0.2, 0.0]))
+    halves.predict(0.2, np.array([0.1, 0.2, 0.0]))
+    halves.predict(0.3, np.array([0.3, 0.0, 0.0]))
+    (a,), (b,) = whole.neighbours(), halves.neighbours()
+    np.testing.assert_allclose(a.position, b.position, atol=1e-12)
+    assert a.position_sigma_m == pytest.approx(b.position_sigma_m)
+    assert a.velocity_sigma_m_s == pytest.approx(b.velocity_sigma_m_s)
+
+
+def test_without_the_own_displacement_tracks_stay_put_and_grow_uncertain() -> None:
+    tracker, _ = _settled()
+    (before,) = tracker.neighbours()
+    tracker.predict(STEP_S, None)
+    (after,) = tracker.neighbours()
+    np.testing.assert_array_equal(after.position, before.position)
+    np.testing.assert_array_equal(after.velocity, before.velocity)
+    assert after.position_sigma_m**2 > before.position_sigma_m**2 + (0.7 * STEP_S) ** 2
+
+
+def test_a_new_track_flies_as_the_own_drone_does_or_stands_where_that_is_unknown() -> None:
+    for own, velocity, sigma in ((CRUISE, CRUISE, 0.7), (None, np.zeros(3), 1.5)):
+        tracker = Tracker(TrackingParameters())
+        tracker.update(0.0, [_seen(AHEAD)], own)
+        (neighbour,) = tracker.neighbours()
+        np.testing.assert_array_equal(neighbour.velocity, velocity)
+        assert neighbour.velocity_sigma_m_s == pytest.approx(sigma)
+
+
+def test_a_measured_velocity_counts_by_its_variance() -> None:
+    tracker = Tracker(TrackingParameters())
+    measured = Measurement(
+        AHEAD, 0.01 * np.eye(3), 0.6, velocity=np.array([1.0, 0.7, 0.0]), velocity_sigma_m_s=math.sqrt(0.49 / 3)
+    )
+    tracker.update(0.0, [measured], CRUISE)
+    (neighbour,) = tracker.neighbours()
+    np.testing.assert_allclose(neighbour.velocity, [1.0, 0.7 * 3 / 4, 0.0])  # prior variance 0.49, thrice as large
+
+
+def test_the_filtered_velocity_beats_differences_on_a_circle() -> None:
+    """A flock mate on the paper's circle (10 m, 1 m/s), seen with 3 cm of noise."""
+    rng = np.random.default_rng(3)
+    times = np.arange(0.0, 60.0, STEP_S)
+    course = 0.1 * times
+    own = np.column_stack([10 * np.sin(course), 10 - 10 * np.cos(course), np.zeros_like(times)])
+    velocity = np.column_stack([np.cos(course), np.sin(course), np.zeros_like(times)])
+    tracker = Tracker(TrackingParameters())
+    errors: list[list[Array]] = []
+    offset = np.array([2.0, 1.5, 0.5])  # both fly the same way: the offset stays
+    seen = offset + rng.normal(0, 0.03, (len(times), 3))
+    for k, time_s in enumerate(times):
+        if k:
+            tracker.predict(STEP_S, own[k] - own[k - 1])
+        tracker.update(float(time_s), [_seen(seen[k], 0.03)], velocity[k])
+        if k >= 10:
+            (neighbour,) = tracker.neighbours()
+            raw = (own[k] + seen[k] - own[k - 1] - seen[k - 1]) / STEP_S
+            errors.append([neighbour.velocity - velocity[k], raw - velocity[k]])
+    filtered_m_s, raw_m_s = np.sqrt((np.array(errors) ** 2).sum(axis=2).mean(axis=0))
+    assert raw_m_s == pytest.approx(0.03 * math.sqrt(2 * 3) / STEP_S, rel=0.3)
+    assert filtered_m_s < 0.9 * raw_m_s
+
+
+def test_the_filter_knows_its_own_error() -> None:
+    """Truth drawn from the filter's own model: the squared error over its variance averages to 1."""
+    rng = np.random.default_rng(5)
+    parameters = TrackingParameters()
+    density = parameters.acceleration_sigma_m_s2**2 * 0.5
+    noise = np.linalg.cholesky(density * np.array([[STEP_S**3 / 3, STEP_S**2 / 2], [STEP_S**2 / 2, STEP_S]]))
+    position_errors, velocity_errors = [], []
+    for _ in range(60):
+        tracker = Tracker(parameters)
+        position = np.array([8.0, 0.0, 0.0])
+        velocity = CRUISE + rng.normal(0, 0.7, 3)
+        for k in range(12):
+            if k:
+                kick = noise @ rng.normal(size=(2, 3))
+                position = position + velocity * STEP_S + kick[0] - CRUISE * STEP_S
+                velocity = velocity + kick[1]
+                tracker.predict(STEP_S, CRUISE * STEP_S + rng.normal(0, 0.02, 3), 0.02)
+            tracker.update(k * STEP_S, [_seen(position + rng.normal(0, 0.1, 3), 0.1)], CRUISE)
+        neighbour = _confirmed(tracker)[0]
+        position_errors.append((neighbour.position - position) / neighbour.position_sigma_m)
+        velocity_errors.append((neighbour.velocity - velocity) / neighbour.velocity_sigma_m_s)
+    # Mean of 180 squares of a standard normal: 1 +- 0.105; the robust update costs some per cent.
+    assert np.mean(np.square(position_errors)) == pytest.approx(1.0, abs=0.3)
+    assert np.mean(np.square(velocity_errors)) == pytest.approx(1.0, abs=0.3)
+
+
+def test_the_constancy_of_size_steadies_the_range() -> None:
+    """Depth errs by 3 % in each frame, angular size by 1 %: averaging the size leaves about half the error."""
+    rms_m = {}
+    for memory in (0, 15):
+        rng = np.random.default_rng(6)
+        tracker = Tracker(TrackingParameters(size_memory=memory))
+        errors_m = []
+        for k in range(200):
+            truth = np.array([5 + math.sin(0.2 * k * STEP_S), 1.0, 0.5])
+            distance = float(np.linalg.norm(truth))
+            estimated = distance * (1 + rng.normal(0, 0.03))
+            angular_size = 0.6 / distance * (1 + rng.normal(0, 0.01))
+            position = truth / distance * estimated
+            if k:
+                tracker.predict(STEP_S, CRUISE * STEP_S)
+            covariance = sighting_covariance(position, 0.03 * estimated, 0.003)
+            tracker.update(k * STEP_S, [Measurement(position, covariance, estimated * angular_size)], CRUISE)
+            if k >= 20:
+                errors_m.append(tracker.neighbours()[0].position - truth)
+        rms_m[memory] = math.sqrt(np.mean(np.square(errors_m)) * 3)
+    assert rms_m[15] < 0.6 * rms_m[0]
+    assert rms_m[0] < 0.03 * 5.2
+
+
+def test_a_sightings_covariance_is_long_along_the_line_of_sight() -> None:
+    position = np.array([6.0, 8.0, 0.0])
+    covariance = sighting_covariance(position, 0.3, 0.01)
+    along, across, down = np.array([0.6, 0.8, 0.0]), np.array([-0.8, 0.6, 0.0]), np.array([0.0, 0.0, 1.0])
+    axes = np.stack([along, across, down])
+    np.testing.assert_allclose(axes @ covariance @ axes.T, np.diag([0.09, 0.01, 0.01]), atol=1e-15)
+
+
+def test_a_measurement_that_is_no_number_is_refused() -> None:
+    good = {"position": AHEAD, "covariance": np.eye(3), "size_m": 0.6}
+    for bad, reason in (
+        ({"position": np.array([np.nan, 0, 0])}, "position"),
+        ({"position": np.zeros(3)}, "position"),
+        ({"covariance": np.full((3, 3), np.inf)}, "covariance"),
+        ({"size_m": 0.0}, "size"),
+        ({"velocity": np.array([np.nan, 0, 0])}, "velocity"),
+        ({"velocity_sigma_m_s": 0.0}, "sigma"),
+    ):
+        with pytest.raises(ValueError, match=reason):
+            Measurement(**{**good, **bad})  # type: ignore[arg-type]
