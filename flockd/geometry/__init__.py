@@ -1,0 +1,36 @@
+"""Camera models, rigid fits, Algorithm 1, ego- and neighbour motion. Pure: no clock, no files, the same every time."""
+
+from flockd.geometry.cameras import Camera, PinholeCamera, WideAngleCamera
+from flockd.geometry.ego_motion import estimate_ego_motion
+from flockd.geometry.neighbour_motion import estimate_neighbour_motion
+from flockd.geometry.pairs import BACKGROUND_LABEL, PointPairs, grid_pixels, label_pixels, lift_matches
+from flockd.geometry.ransac import RansacResult, ransac_rigid
+from flockd.geometry.refinement import refine_ego_motion
+from flockd.geometry.rig import Rig, RigCamera, build_rig
+from flockd.geometry.rigid_fit import fit_rigid
+from flockd.geometry.rotations import euler_from_rotation, rotation_angle_deg, rotation_from_euler
+from flockd.geometry.transform import RigidTransform
+
+__all__ = [
+    "BACKGROUND_LABEL",
+    "Camera",
+    "PinholeCamera",
+    "PointPairs",
+    "RansacResult",
+    "Rig",
+    "RigCamera",
+    "RigidTransform",
+    "WideAngleCamera",
+    "build_rig",
+    "estimate_ego_motion",
+    "estimate_neighbour_motion",
+    "euler_from_rotation",
+    "fit_rigid",
+    "grid_pixels",
+    "label_pixels",
+    "lift_matches",
+    "ransac_rigid",
+    "refine_ego_motion",
+    "rotation_angle_deg",
+    "rotation_from_euler",
+]
