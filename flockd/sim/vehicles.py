@@ -1,0 +1,151 @@
+"""Simulated multirotors that follow velocity setpoints, and what their autopilots say of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from flockd.config.scenario import SensorConfig, StartConfig, VehicleConfig
+from flockd.messages import FloatArray, VehicleState
+
+GRAVITY_M_S2 = 9.81
+_MAX_SUBSTEP_S = 0.02
+_DRAG_PER_S = 0.3
+"""Deceleration by the air for each m/s against it: what a multirotor leans against to hold its speed."""
+_GUST_TIME_S = 2.0
+_ATTITUDE_ERROR_TIME_S = 30.0
+_VELOCITY_ERROR_TIME_S = 10.0
+
+
+class Vehicles:
+    """All vehicles of a flight.
+
+    Horizontal velocity answers a setpoint as a first-order lag of limited acceleration; altitude is held; the attitude
+    is the one whose thrust gives that acceleration. The arrays are replaced by `step`, never changed in place:
+    `position` (n, 3) m and `velocity` (n, 3) m/s in NED, `R_ned_body` (n, 3, 3).
+    """
+
+    def __init__(self, starts: Sequence[StartConfig], config: VehicleConfig, *, yaw_rad: float = 0.0, seed: int = 0):
+        """Start in level flight at the configured velocities, all heading `yaw_rad`; `seed` rules the gusts."""
+        n = len(starts)
+        self._config = config
+        self._random = np.random.default_rng(seed)
+        self._wind = np.array(config.wind_m_s)
+        self._yaw = np.full(n, yaw_rad)
+        self._gust = self._gust_sigma * self._random.normal(size=(n, 2))
+        self.position = np.array([start.position_m for start in starts])
+        self.velocity = np.array([[*start.velocity_m_s, 0.0] for start in starts])
+        self._thrust = self._drag(self.velocity[:, :2])
+        self.R_ned_body = attitude(self._thrust, self._yaw)
+
+    def step(self, setpoints: FloatArray, yaw_setpoints: FloatArray, interval_s: float) -> None:
+        """Fly on for `interval_s` towards velocities (n, 2) m/s north and east and headings (n,) rad."""
+        substeps = math.ceil(interval_s / _MAX_SUBSTEP_S - 1e-9)
+        for _ in range(substeps):
+            self._substep(setpoints, yaw_setpoints, interval_s / substeps)
+        self.R_ned_body = attitude(self._thrust, self._yaw)
+
+    def _substep(self, setpoints: FloatArray, yaw_setpoints: FloatArray, dt: float) -> None:
+        config = self._config
+        velocity = self.velocity[:, :2]
+        # The exact mean acceleration of a first-order lag over dt, then its limit.
+        wanted = (setpoints - velocity) * (-math.expm1(-dt / config.velocity_time_constant_s) / dt)
+        norms = np.linalg.norm(wanted, axis=1, keepdims=True)
+        steered = wanted * np.minimum(1.0, config.max_acceleration_m_s2 / np.maximum(norms, 1e-12))
+        acceleration = steered + self._gust
+        self.position = self.position.copy()
+        self.position[:, :2] += velocity * dt + acceleration * (dt**2 / 2)
+        self.velocity = np.column_stack([velocity + acceleration * dt, self.velocity[:, 2]])
+
+        keep = math.exp(-dt / _GUST_TIME_S)
+        kick = self._random.normal(size=self._gust.shape)
+        self._gust = keep * self._gust + math.sqrt(1 - keep**2) * self._gust_sigma * kick
+
+        lean = 1.0 if config.tilt_time_constant_s == 0 else -math.expm1(-dt / config.tilt_time_constant_s)
+        self._thrust = self._thrust + lean * (steered + self._drag(self.velocity[:, :2]) - self._thrust)
+        error = (yaw_setpoints - self._yaw + math.pi) % (2 * math.pi) - math.pi
+        limit = math.radians(config.max_yaw_rate_deg_s) * dt
+        self._yaw = self._yaw + np.clip(-math.expm1(-dt / config.yaw_time_constant_s) * error, -limit, limit)
+
+    @property
+    def _gust_sigma(self) -> float:
+        """The gusts' acceleration, m/s^2, an Ornstein-Uhlenbeck process: such that velocity's deviation is `gust_m_s`.
+
+        The lag, of time constant tau, passes tau^2 T / (T + tau) of the variance of a process of time constant T.
+        """
+        tau = self._config.velocity_time_constant_s
+        return self._config.gust_m_s / tau * math.sqrt((_GUST_TIME_S + tau) / _GUST_TIME_S)
+
+    def _drag(self, velocity: FloatArray) -> FloatArray:
+        """(n, 2) m/s^2 of thrust that the air takes up, with wind."""
+        return np.asarray(_DRAG_PER_S * (velocity - self._wind), dtype=float)
+
+
+class SimulatedAutopilot:
+    """One drone's autopilot: the truth with seeded errors that change slowly, and noise on the barometer."""
+
+    def __init__(self, config: SensorConfig, *, seed: int, drone: int) -> None:
+        self._config = config
+        self._random = np.random.default_rng([seed, drone])
+        self._time_s: float | None = None
+        self._height_error = np.zeros(1)  # the barometer is set to zero at take-off
+        self._tilt_error = math.radians(config.attitude_error_deg) * self._random.normal(size=3)
+        self._velocity_error = config.velocity_error_m_s * self._random.normal(size=3)
+
+    def read(self, time_s: float, position: FloatArray, velocity: FloatArray, R_ned_body: FloatArray) -> VehicleState:
+        """What it says at `time_s`, not before the last, of a drone at `position` (3,) m NED, ground at z = 0.
+
+        Yaw errs as roll and pitch do.
+        """
+        config = self._config
+        elapsed_s = 0.0 if self._time_s is None else time_s - self._time_s
+        self._time_s = time_s
+        self._height_error = self._drift(
+            self._height_error, config.barometer_drift_m, config.barometer_drift_time_s, elapsed_s
+        )
+        self._tilt_error = self._drift(
+            self._tilt_error, math.radians(config.attitude_error_deg), _ATTITUDE_ERROR_TIME_S, elapsed_s
+        )
+        self._velocity_error = self._drift(
+            self._velocity_error, config.velocity_error_m_s, _VELOCITY_ERROR_TIME_S, elapsed_s
+        )
+        noise = config.barometer_noise_m * self._random.normal()
+        return VehicleState(
+            time_s=time_s,
+            R_ned_body=euler_rotation(*self._tilt_error) @ R_ned_body,
+            height_m=float(-position[2] + self._height_error[0] + noise),
+            velocity_ned=velocity + self._velocity_error,
+        )
+
+    def _drift(self, error: FloatArray, sigma: float, time_constant_s: float, elapsed_s: float) -> FloatArray:
+        """A Gauss-Markov process after `elapsed_s`."""
+        keep = math.exp(-elapsed_s / time_constant_s)
+        return keep * error + math.sqrt(1 - keep**2) * sigma * self._random.normal(size=error.shape)
+
+
+def attitude(thrust: FloatArray, yaw: FloatArray) -> FloatArray:
+    """R_ned_body (n, 3, 3) of vehicles whose thrust gives (n, 2) m/s^2 north and east beside holding altitude.
+
+    `yaw` (n,) rad. To the north at yaw 0 the nose goes down (negative pitch), to the east the right side (positive
+    roll).
+    """
+    down = np.column_stack([-thrust, np.full(len(yaw), GRAVITY_M_S2)])
+    down /= np.linalg.norm(down, axis=1, keepdims=True)
+    forward = np.cos(yaw) * down[:, 0] + np.sin(yaw) * down[:, 1]
+    right = np.cos(yaw) * down[:, 1] - np.sin(yaw) * down[:, 0]
+    roll, pitch = -np.arcsin(right), np.arctan2(forward, down[:, 2])
+    return np.stack([euler_rotation(*angles) for angles in zip(roll, pitch, yaw, strict=True)])
+
+
+def euler_rotation(roll: float, pitch: float, yaw: float) -> FloatArray:
+    """R_ned_body (3, 3) from aerospace angles in rad: Rz(yaw) Ry(pitch) Rx(roll)."""
+    cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
