@@ -149,6 +149,8 @@ class PilotOutput:
     velocity: FloatArray | None
     """(3,) m/s NED: the own velocity that the law used; None before there is one."""
     sightings: tuple[Sighting, ...]
+    sighting_tracks: tuple[int, ...]
+    """The track that each sighting went to."""
     neighbours: tuple[Neighbour, ...]
     command: VelocityCommand
     reasons: tuple[str, ...] = ()

@@ -1,0 +1,23 @@
+"""Perception: images in, flow, depth and separate drones out; each role an ONNX model behind a manifest."""
+
+from flockd.perception.flow import DisFlow, Flow, OnnxFlow
+from flockd.perception.instances import Instance, group_instances
+from flockd.perception.manifest import Manifest, find_manifests, load_manifest
+from flockd.perception.roles import Perception, Picture, RangeEstimate, SceneMaps
+from flockd.perception.session import OnnxModel
+
+__all__ = [
+    "DisFlow",
+    "Flow",
+    "Instance",
+    "Manifest",
+    "OnnxFlow",
+    "OnnxModel",
+    "Perception",
+    "Picture",
+    "RangeEstimate",
+    "SceneMaps",
+    "find_manifests",
+    "group_instances",
+    "load_manifest",
+]

@@ -1,0 +1,70 @@
+"""Optical flow: a network or OpenCV's DIS."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from flockd.messages import Float32Array, UInt8Array
+from flockd.perception.session import OnnxModel
+
+
+class Flow(Protocol):
+    """Where every pixel of the first image has gone in the second."""
+
+    name: str
+
+    def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
+        """(h, w, 3) RGB twice -> (h, w, 2) pixels right and down."""
+        ...
+
+
+class OnnxFlow:
+    """A flow network; enters images of the size that its manifest asks for."""
+
+    def __init__(self, model: OnnxModel) -> None:
+        self.name = model.manifest.name
+        self._model = model
+        self._scale = model.manifest.image_scale
+        self._multiple = model.manifest.size_multiple
+
+    def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
+        """See ``Flow``."""
+        height, width = first.shape[:2]
+        size = (round(width * self._scale), round(height * self._scale))
+        small = [_padded(_resized(image, size), self._multiple)[None] for image in (first, second)]
+        (flow,) = self._model.run({"first": small[0], "second": small[1]}).values()
+        inner = np.moveaxis(flow[0, :, : size[1], : size[0]], 0, 2)
+        full = cv2.resize(inner, (width, height), interpolation=cv2.INTER_LINEAR)
+        full *= np.array([width / size[0], height / size[1]], np.float32)
+        return np.asarray(full, dtype=np.float32)
+
+
+class DisFlow:
+    """OpenCV's dense inverse search, for small computers."""
+
+    name = "dis"
+
+    def __init__(self) -> None:
+        self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+
+    def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
+        """See ``Flow``."""
+        grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (first, second)]
+        start = np.zeros((*first.shape[:2], 2), np.float32)
+        return np.asarray(self._dis.calc(grey[0], grey[1], start), dtype=np.float32)
+
+
+def _resized(image: UInt8Array, size: tuple[int, int]) -> UInt8Array:
+    if (image.shape[1], image.shape[0]) == size:
+        return image
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _padded(image: UInt8Array, multiple: int) -> UInt8Array:
+    down, right = -image.shape[0] % multiple, -image.shape[1] % multiple
+    if not down and not right:
+        return image
+    return np.asarray(cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_REPLICATE), dtype=np.uint8)

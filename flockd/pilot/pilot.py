@@ -1,0 +1,201 @@
+"""``FlockPilot.step``: camera frames and the own autopilot's state in, velocity command out. No clock, no I/O."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from flockd.config.parameters import DroneConfig
+from flockd.data import data_path
+from flockd.flocking import FlockingLaw, course, desired_velocity
+from flockd.geometry import build_rig
+from flockd.messages import (
+    EgoMotion,
+    Float32Array,
+    FloatArray,
+    FrameSet,
+    Neighbour,
+    NeighbourMotion,
+    PilotOutput,
+    Sighting,
+    VehicleState,
+    VelocityCommand,
+)
+from flockd.perception import Perception
+from flockd.pilot.motions import ego_motion, neighbour_motions
+from flockd.pilot.views import Observer, Perceiver, RigView
+from flockd.tracking import Measurement, Tracker, sighting_covariance
+
+_OWN_DISPLACEMENT_SIGMA_M = 0.02
+
+
+class FlockPilot:
+    """One drone's pilot. Remembers the last frame set and its tracks; everything else comes in with each step."""
+
+    def __init__(
+        self,
+        config: DroneConfig,
+        perceiver: Perceiver | None = None,
+        stopwatch: Callable[[], float] | None = None,
+    ) -> None:
+        """``perceiver`` may be shared by several pilots. ``stopwatch`` (seconds) only fills ``stages_ms``."""
+        self._config = config
+        self._rig = build_rig(config.rig)
+        self._perceiver = perceiver or load_perception(config)
+        self._observer = Observer(self._rig, self._perceiver, height_fixes_scale=config.perception.scale == "height")
+        self._tracker = Tracker(config.tracking)
+        self._law = FlockingLaw(config.flocking)
+        self._stopwatch = stopwatch
+        self._first_time_s: float | None = None
+        self._previous: RigView | None = None
+        self._velocity: FloatArray | None = None
+        self._flows_seen: Mapping[str, Float32Array] = {}
+
+    @property
+    def last_view(self) -> RigView | None:
+        """What the last step saw, for reports."""
+        return self._previous
+
+    @property
+    def last_flows(self) -> Mapping[str, Float32Array]:
+        """By camera, the flow into the last step's images, for reports."""
+        return self._flows_seen
+
+    def step(self, frames: FrameSet, vehicle: VehicleState) -> PilotOutput:
+        """One step of the pure line.
+
+        Args:
+            frames: the newest image of every camera that has one.
+            vehicle: what the own autopilot says, at the frames' time.
+        """
+        laps = _Laps(self._stopwatch)
+        if self._first_time_s is None:
+            self._first_time_s = frames.time_s
+        maps, reasons = self._observer.scenes(frames, vehicle)
+        laps.end("scene")
+        view = self._observer.view(frames, vehicle, maps, reasons)
+        laps.end("distance")
+        previous, reasons = self._pair_with(view, reasons)
+        flows = self._flows(previous, view)
+        laps.end("flow")
+        ego, displacement = self._ego_motion(previous, view, flows, reasons)
+        laps.end("ego_motion")
+        motions: dict[int, NeighbourMotion] = {}
+        if ego is not None and previous is not None:
+            motions, why = neighbour_motions(self._rig, previous, view, flows, ego, self._config.geometry)
+            reasons += why
+        laps.end("neighbour_motion")
+        velocity = self._own_velocity(ego, displacement, vehicle)
+        tracks = self._track(previous, view, displacement, motions, velocity)
+        laps.end("tracking")
+        neighbours = self._tracker.neighbours()
+        command = self._command(view, neighbours, velocity)
+        laps.end("flocking")
+        self._previous, self._flows_seen = view, flows
+        return PilotOutput(
+            time_s=view.time_s,
+            ego_motion=ego,
+            velocity=velocity,
+            sightings=view.sightings,
+            sighting_tracks=tracks,
+            neighbours=neighbours,
+            command=command,
+            reasons=tuple(reasons),
+            counts=Counter(reasons),
+            stages_ms=laps.stages_ms,
+        )
+
+    def _pair_with(self, view: RigView, reasons: list[str]) -> tuple[RigView | None, list[str]]:
+        if self._previous is not None and view.time_s <= self._previous.time_s:
+            return None, [*reasons, "time stamps do not increase: the pair starts anew"]
+        return self._previous, reasons
+
+    def _flows(self, previous: RigView | None, view: RigView) -> dict[str, Float32Array]:
+        if previous is None:
+            return {}
+        both = [name for name in view.cameras if name in previous.cameras]
+        return {n: self._perceiver.flow(n, previous.cameras[n].image, view.cameras[n].image) for n in both}
+
+    def _ego_motion(
+        self, previous: RigView | None, view: RigView, flows: Mapping[str, Float32Array], reasons: list[str]
+    ) -> tuple[EgoMotion | None, FloatArray | None]:
+        """The motion in C and the displacement in NED."""
+        if previous is None:
+            return None, None
+        try:
+            ego = ego_motion(self._rig, previous, view, flows, self._config.geometry)
+        except ValueError as error:
+            reasons.append(f"ego-motion: {error}")
+            return None, None
+        return ego, previous.vehicle.R_ned_body @ ego.translation
+
+    def _own_velocity(
+        self, ego: EgoMotion | None, displacement: FloatArray | None, vehicle: VehicleState
+    ) -> FloatArray | None:
+        """(3,) NED m/s. Where vision fails, the last one that it gave."""
+        if self._config.own_velocity == "autopilot":
+            return vehicle.velocity_ned
+        if ego is not None and displacement is not None:
+            self._velocity = displacement / ego.interval_s  # Eq. 21
+        return self._velocity
+
+    def _track(
+        self,
+        previous: RigView | None,
+        view: RigView,
+        displacement: FloatArray | None,
+        motions: Mapping[int, NeighbourMotion],
+        velocity: FloatArray | None,
+    ) -> tuple[int, ...]:
+        if previous is not None:
+            self._tracker.predict(view.time_s - previous.time_s, displacement, _OWN_DISPLACEMENT_SIGMA_M)
+        measurements = [
+            _measurement(s, view.vehicle.R_ned_body, previous, motions.get(s.label)) for s in view.sightings
+        ]
+        return self._tracker.update(view.time_s, measurements, velocity)
+
+    def _command(self, view: RigView, neighbours: Sequence[Neighbour], velocity: FloatArray | None) -> VelocityCommand:
+        elapsed_s = view.time_s - (self._first_time_s or 0.0)
+        desired = desired_velocity(self._config.desired, elapsed_s)
+        seen = [n for n in neighbours if n.confirmed]
+        positions = np.array([n.position[:2] for n in seen]).reshape(-1, 2)
+        velocities = np.array([n.velocity[:2] for n in seen]).reshape(-1, 2)
+        own = desired if velocity is None else velocity[:2]  # before the first pair: as asked for
+        command, acceleration = self._law.command(own, positions, velocities, desired, self._config.step_s)
+        R = view.vehicle.R_ned_body
+        heading = math.atan2(R[1, 0], R[0, 0])
+        yaw = course(self._config.desired, elapsed_s) if self._config.yaw == "course" else heading
+        return VelocityCommand(command, acceleration, yaw)
+
+
+def load_perception(config: DroneConfig) -> Perception:
+    """The networks that a configuration names."""
+    models = config.perception.models_dir
+    return Perception(config.perception, Path(models) if models else data_path("models"))
+
+
+def _measurement(
+    sighting: Sighting, R_ned_body: FloatArray, previous: RigView | None, motion: NeighbourMotion | None
+) -> Measurement:
+    position = R_ned_body @ sighting.position
+    covariance = sighting_covariance(position, sighting.range_sigma_m, sighting.bearing_sigma_rad)
+    return Measurement(position=position, covariance=covariance, size_m=sighting.size_m)
+
+
+class _Laps:
+    """Milliseconds between calls, if there is a watch."""
+
+    def __init__(self, stopwatch: Callable[[], float] | None) -> None:
+        self._watch = stopwatch
+        self._last = stopwatch() if stopwatch else 0.0
+        self.stages_ms: dict[str, float] = {}
+
+    def end(self, stage: str) -> None:
+        if self._watch:
+            now = self._watch()
+            self.stages_ms[stage] = 1e3 * (now - self._last)
+            self._last = now

@@ -1,0 +1,124 @@
+"""The truth in the place of chosen networks: to measure how much of an error each of them causes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockd.geometry import Rig
+from flockd.messages import Float32Array, FloatArray, UInt8Array
+from flockd.perception import Instance, Perception, Picture, RangeEstimate, SceneMaps
+from flockd.sim.renderer import View, true_flow
+
+ROLES = ("flow", "depth", "segmentation", "distance")
+"""What can be swapped."""
+_SKY_M = 1000.0
+_MIN_PIXELS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """What one drone's cameras truly saw, and where everything was."""
+
+    views: Mapping[str, View]
+    R_ned_cameras: Mapping[str, FloatArray]
+    positions: Mapping[str, FloatArray]
+    """Of the optical centres, NED."""
+    R_ned_body: FloatArray
+    position: FloatArray
+    drone_rotations: FloatArray
+    drone_positions: FloatArray
+    shown: Sequence[int]
+
+
+class TruthPerception:
+    """Stands before the learned perception and answers the swapped roles itself. One for each drone.
+
+    It is told with `show` what the cameras are about to see; the pilot knows nothing of it.
+    """
+
+    def __init__(self, learned: Perception, swap: frozenset[str], rig: Rig) -> None:
+        self.picture_size = learned.picture_size
+        self.map_scale = learned.map_scale
+        self._learned, self._swap, self._rig = learned, swap, rig
+        self._now: Shot | None = None
+        self._before: Shot | None = None
+
+    @property
+    def has_distance(self) -> bool:
+        """There is a second stage, learned or true."""
+        return "distance" in self._swap or self._learned.has_distance
+
+    def show(self, shot: Shot) -> None:
+        """What the next step's frames truly hold."""
+        self._before, self._now = self._now, shot
+
+    def flow(self, camera: str, first: UInt8Array, second: UInt8Array) -> Float32Array:
+        """The true or the learned flow."""
+        if "flow" not in self._swap:
+            return self._learned.flow(camera, first, second)
+        before, now = _known(self._before), _known(self._now)
+        flow, _ = true_flow(
+            before.views[camera], now.views[camera], _matrix(self._rig, camera),
+            R_ned_camera=(before.R_ned_cameras[camera], now.R_ned_cameras[camera]),
+            positions_ned=(before.positions[camera], now.positions[camera]),
+            drone_rotations=(before.drone_rotations, now.drone_rotations),
+            drone_positions=(before.drone_positions, now.drone_positions),
+        )  # fmt: skip
+        return flow
+
+    def scene(self, camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:
+        """Depth and drones, each true or learned."""
+        maps = self._learned.scene(camera, image, geometry)
+        now = _known(self._now)
+        view = now.views[camera]
+        depth, labels, instances = maps.depth, maps.labels, maps.instances
+        if "depth" in self._swap:
+            depth = np.where(np.isfinite(view.depth), view.depth, np.float32(_SKY_M))
+        if "segmentation" in self._swap:
+            labels = view.ids
+            instances = tuple(self._instances(camera, now))
+        return SceneMaps(depth, labels, instances)
+
+    def ranges(self, pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
+        """The true range of the drone nearest to each picture's middle, or the learned one."""
+        if "distance" not in self._swap:
+            return self._learned.ranges(pictures)
+        return tuple(self._range(picture, _known(self._now)) for picture in pictures)
+
+    def _instances(self, camera: str, now: Shot) -> list[Instance]:
+        ids = now.views[camera].ids
+        found = []
+        for drone in now.shown:
+            rows, columns = np.nonzero(ids == drone + 1)
+            if rows.size < _MIN_PIXELS:
+                continue
+            point = now.R_ned_cameras[camera].T @ (now.drone_positions[drone] - now.positions[camera])
+            centre = self._rig.cameras[camera].camera.project(point[None])[0]
+            if not np.isfinite(centre).all():
+                centre = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
+            box = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], np.float64)
+            found.append(Instance(drone + 1, centre, box, float(rows.size)))
+        return sorted(found, key=lambda one: -one.area_px)
+
+    def _range(self, picture: Picture, now: Shot) -> RangeEstimate:
+        in_body = (now.drone_positions[list(now.shown)] - now.position) @ now.R_ned_body
+        in_picture = (in_body - picture.position) @ picture.R_body_camera
+        ranges = np.linalg.norm(in_picture, axis=1)
+        point = in_picture[np.argmax(in_picture[:, 2] / ranges)]
+        range_m = float(np.linalg.norm(point))
+        middle = self.picture_size / 2
+        centre = middle + picture.focal_px * point[:2] / max(point[2], 1e-3)
+        return RangeEstimate(range_m, 0.001, np.clip(centre, -self.picture_size, 2 * self.picture_size))
+
+
+def _known(shot: Shot | None) -> Shot:
+    if shot is None:
+        raise RuntimeError("the truth was asked before it was shown")
+    return shot
+
+
+def _matrix(rig: Rig, camera: str) -> FloatArray:
+    return rig.cameras[camera].camera.matrix

@@ -1,0 +1,159 @@
+"""Export a trained network to ONNX, check it against torch, and write its manifest.
+
+python tools/export.py neighbours --checkpoint RUNS/neighbours/checkpoint.pt --out models
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime as ort
+import torch
+import yaml
+from numpy.typing import NDArray
+from torch import nn
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from flockd.perception.manifest import Manifest  # noqa: E402
+from flockd.perception.session import OnnxModel, golden_feeds  # noqa: E402
+from tools.training.networks import DistanceNet, FlowNet, NeighboursNet  # noqa: E402
+
+ALLOWED_DIFFERENCE = 2e-3
+"""Between ONNX Runtime and torch, as a share of the output's largest value."""
+DATA = "Rendered by tools/render_training_data.py from seeded worlds; no foreign data."
+
+IMAGE = {"shape": ["n", "h", "w", 3], "dtype": "uint8", "meaning": "RGB image", "unit": "grey levels 0-255"}
+NETWORKS: dict[str, dict[str, Any]] = {
+    "neighbours": {
+        "net": NeighboursNet,
+        "roles": ["depth", "segmentation"],
+        "description": "U-Net: metric depth, drone mask and centre offsets of one image",
+        "size_multiple": 32,
+        "golden_size": [480, 640],
+        "inputs": {
+            "image": IMAGE,
+            "geometry": {
+                "shape": ["n", 3, "h/2", "w/2"],
+                "dtype": "float32",
+                "meaning": "ray tangents right and down; inverse depth of flat ground, 0 where unknown",
+                "unit": "1, 1, 1/m",
+            },
+        },
+        "outputs": {
+            "depth": (["n", 1, "h/2", "w/2"], "depth along the optical axis; 80 is sky", "m"),
+            "drone": (["n", 1, "h/2", "w/2"], "logit of being on a drone", "1"),
+            "offset": (["n", 2, "h/2", "w/2"], "from the pixel to its drone's centre, right and down", "output px"),
+        },
+    },
+    "distance": {
+        "net": DistanceNet,
+        "roles": ["distance"],
+        "description": "Range of the drone in the middle of a picture, its centre and the uncertainty",
+        "size_multiple": 1,
+        "golden_size": [96, 96],
+        "inputs": {"picture": {**IMAGE, "shape": ["n", 96, 96, 3]}},
+        "outputs": {
+            "range": (
+                ["n", 4],
+                "log(range / focal length), centre right and down of the middle, log of the first's deviation",
+                "log(m/px), px, px, 1",
+            )
+        },
+    },
+    "flow": {
+        "net": FlowNet,
+        "roles": ["flow"],
+        "description": "Recurrent all-pairs optical flow on half-size images, four iterations",
+        "image_scale": 0.5,
+        "size_multiple": 8,
+        "golden_size": [240, 320],
+        "inputs": {
+            "first": {**IMAGE, "meaning": "earlier RGB image, half size"},
+            "second": {**IMAGE, "meaning": "later RGB image, half size"},
+        },
+        "outputs": {"flow": (["n", 2, "h", "w"], "from first to second, right and down", "input px")},
+    },
+}
+
+
+def main() -> None:
+    """Export one network."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("network", choices=NETWORKS)
+    parser.add_argument("--checkpoint", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--accuracy", action="append", default=[], metavar="WHAT=FIGURE", help="measured accuracy")
+    arguments = parser.parse_args()
+    spec = NETWORKS[arguments.network]
+    net: nn.Module = spec["net"]()
+    state = torch.load(arguments.checkpoint, map_location="cpu")
+    net.load_state_dict(state["net"])
+    net.eval()
+    file = arguments.out / f"{arguments.network}.onnx"
+    manifest = _manifest(arguments.network, spec, dict(a.split("=", 1) for a in arguments.accuracy), state)
+    feeds = golden_feeds(manifest)
+    _write_onnx(net, feeds, list(spec["outputs"]), file)
+    outputs = _compare(net, feeds, file)
+    document = manifest.model_dump(mode="json")
+    document["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
+    for name, value in outputs.items():
+        document["outputs"][name]["golden_mean"] = float(value.mean())
+        document["outputs"][name]["golden_deviation"] = float(value.std())
+    path = arguments.out / f"{arguments.network}.yaml"
+    path.write_text(yaml.safe_dump(document, sort_keys=False, width=110))
+    OnnxModel(path, threads=1)
+    print(f"{path}: {file.stat().st_size / 1e6:.1f} MB, {state['step']} steps, checked")
+
+
+def _manifest(name: str, spec: dict[str, Any], accuracy: dict[str, str], state: dict[str, Any]) -> Manifest:
+    outputs = {
+        key: {"shape": s, "dtype": "float32", "meaning": m, "unit": u, "golden_mean": 0.0, "golden_deviation": 0.0}
+        for key, (s, m, u) in spec["outputs"].items()
+    }
+    kept = {k: v for k, v in spec.items() if k not in ("net", "outputs")}
+    document = {
+        "name": name,
+        "file": f"{name}.onnx",
+        "sha256": "0" * 64,
+        "licence": "Apache-2.0",
+        "data": DATA,
+        "accuracy": accuracy,
+        "command": f"tools/train.py {name} ({state['spent'] / 60:.0f} minutes, {state['step']} steps), tools/export.py",
+        **kept,
+        "outputs": outputs,
+    }
+    return Manifest.model_validate(document, strict=False)
+
+
+def _write_onnx(net: nn.Module, feeds: dict[str, NDArray[Any]], outputs: list[str], file: Path) -> None:
+    free = {0: "n"} if "picture" in feeds else None
+    axes = {n: free or ({1: "h", 2: "w"} if v.dtype == np.uint8 else {2: "h2", 3: "w2"}) for n, v in feeds.items()}
+    axes |= {name: free or {2: "ho", 3: "wo"} for name in outputs}
+    torch.onnx.export(
+        net, tuple(torch.from_numpy(v) for v in feeds.values()), str(file), input_names=list(feeds),
+        output_names=outputs, opset_version=17, dynamo=False, dynamic_axes=axes,
+    )  # fmt: skip
+
+
+def _compare(net: nn.Module, feeds: dict[str, NDArray[Any]], file: Path) -> dict[str, NDArray[Any]]:
+    """ONNX Runtime's outputs, after checking them against torch's."""
+    session = ort.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    names = [output.name for output in session.get_outputs()]
+    ours = dict(zip(names, session.run(names, feeds), strict=True))
+    with torch.no_grad():
+        theirs = net(*(torch.from_numpy(v) for v in feeds.values()))
+    for name, their in zip(names, theirs if isinstance(theirs, tuple) else (theirs,), strict=True):
+        difference = float(np.abs(ours[name] - their.numpy()).max()) / (float(np.abs(ours[name]).max()) + 1e-9)
+        if difference > ALLOWED_DIFFERENCE:
+            raise SystemExit(f"{file}: output {name} differs from torch by {difference:.1e} of its largest value")
+    return ours
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,166 @@
+"""Render training pairs: two camera images a fraction of a second apart, with depth, drones and flow as truth.
+
+python tools/render_training_data.py OUT --worlds 120 --pairs 30 --split training
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from tools.training import worlds  # noqa: E402
+from tools.training.dataset import FOCAL_PX, HEIGHT, MAX_DRONES, WIDTH, create_part, note  # noqa: E402
+
+Array = NDArray[Any]
+
+
+def main() -> None:
+    """Render every world of the split in parallel, one part folder a world."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--split", choices=["training", "validation", "test"], default="training")
+    parser.add_argument("--worlds", type=int, default=120)
+    parser.add_argument("--pairs", type=int, default=30, help="pairs a world")
+    parser.add_argument("--processes", type=int, default=os.cpu_count())
+    arguments = parser.parse_args()
+    seeds = {"training": worlds.TRAINING, "validation": worlds.VALIDATION, "test": worlds.TEST}[arguments.split]
+    os.environ["NUMBA_NUM_THREADS"] = "1"
+    jobs = [(arguments.out / f"part-{i:04d}", seeds[i], arguments.pairs) for i in range(arguments.worlds)]
+    jobs = [job for job in jobs if not (job[0] / "made.json").is_file()]
+    begin = time.monotonic()
+    with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
+        for done, _ in enumerate(pool.imap_unordered(_render_world, jobs), start=1):
+            print(f"{done}/{len(jobs)} worlds, {time.monotonic() - begin:.0f} s", flush=True)
+
+
+def _render_world(job: tuple[Path, int, int]) -> None:
+    from flockd.sim.drone_models import FAMILIES, drone_model  # noqa: PLC0415 - numba starts in the worker
+    from flockd.sim.renderer import Renderer  # noqa: PLC0415
+    from flockd.sim.world import World  # noqa: PLC0415
+
+    folder, seed, count = job
+    rng = np.random.Generator(np.random.PCG64(seed))
+    world = World.generate(seed, ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])), keep_out=None)
+    part = create_part(folder, count)
+    places = world.free_points(count, rng, 2.0)
+    for index in range(count):
+        families = rng.integers(0, FAMILIES, MAX_DRONES)
+        drones = [drone_model(int(f), int(rng.integers(1 << 31))) for f in families]
+        renderer = Renderer(world, drones)
+        _render_pair(renderer, world, places[index], families, part, index, rng)
+    for array in part.values():
+        array.flush()  # type: ignore[attr-defined]
+    note(folder, seed=seed, pairs=count)
+
+
+def _render_pair(
+    renderer: Any,
+    world: Any,
+    place: Array,
+    families: Array,
+    part: dict[str, Array],
+    index: int,
+    rng: np.random.Generator,
+) -> None:
+    from flockd.sim.renderer import true_flow  # noqa: PLC0415
+
+    focal = FOCAL_PX * float(np.exp(rng.normal(0, 0.08)))
+    matrix = np.array([[focal, 0.0, WIDTH / 2], [0.0, focal, HEIGHT / 2], [0.0, 0.0, 1.0]])
+    height = float(rng.uniform(1.5, 8.0))
+    ground = float(world.height_at(place[:1], place[1:2])[0])
+    position = np.array([place[0], place[1], -(ground + height)])
+    attitude = _attitude(rng.uniform(-np.pi, np.pi), rng.normal(0, np.radians(7), 2))
+    interval = float(rng.uniform(0.1, 0.5))
+    velocity = np.append(_direction(rng) * rng.uniform(0, 2.0), rng.normal(0, 0.2))
+    turn = _attitude(rng.normal(0, np.radians(10)) * interval, rng.normal(0, np.radians(4), 2) * interval)
+    positions = [position, position + velocity * interval]
+    attitudes = [attitude, attitude @ turn]
+    shown = np.arange(MAX_DRONES) < rng.choice([0, 1, 2, 3, 4, 5, 6], p=[0.05, 0.15, 0.2, 0.2, 0.15, 0.15, 0.1])
+    places = _drone_places(position, attitude, focal, rng)
+    places[:, 2] = np.minimum(places[:, 2], -(ground + 0.5))
+    moves = (velocity + rng.normal(0, 0.4, (MAX_DRONES, 3))) * interval
+    turns = [_attitude(rng.uniform(-np.pi, np.pi), rng.normal(0, np.radians(7), 2)) for _ in range(MAX_DRONES)]
+    wobble = [_attitude(rng.normal(0, 0.1) * interval, rng.normal(0, 0.07, 2)) for _ in range(MAX_DRONES)]
+    drone_positions = [places, places + moves]
+    drone_rotations = [np.array(turns), np.array([r @ w for r, w in zip(turns, wobble, strict=True)])]
+    views = []
+    for k in range(2):
+        R_ned_camera = attitudes[k] @ R_BODY_CAMERA
+        view = renderer.render(
+            matrix, (WIDTH, HEIGHT), R_ned_camera, positions[k],
+            drone_rotations=drone_rotations[k], drone_positions=drone_positions[k], shown=shown,
+        )  # fmt: skip
+        views.append(view)
+        part["image"][index, k] = view.rgb
+        part["depth"][index, k] = np.minimum(view.depth[1::2, 1::2], 1000.0)
+        part["ids"][index, k] = view.ids[1::2, 1::2]
+        part["R_ned_camera"][index, k] = R_ned_camera
+        part["height"][index, k] = -positions[k][2] - world.height_at(positions[k][:1], positions[k][1:2])[0]
+        _note_drones(part, index, k, view, R_ned_camera, positions[k], drone_positions[k], shown)
+    flow, valid = true_flow(
+        views[0], views[1], matrix,
+        R_ned_camera=(attitudes[0] @ R_BODY_CAMERA, attitudes[1] @ R_BODY_CAMERA), positions_ned=tuple(positions),
+        drone_rotations=tuple(drone_rotations), drone_positions=tuple(drone_positions),
+    )  # fmt: skip
+    part["flow"][index] = np.moveaxis(flow[1::2, 1::2], 2, 0)
+    part["flow_valid"][index] = valid[1::2, 1::2]
+    part["focal"][index] = focal
+    part["drone_family"][index] = families
+
+
+R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+def _note_drones(
+    part: dict[str, Array], index: int, k: int, view: Any, R_ned_camera: Array, position: Array, places: Array,
+    shown: Array,
+) -> None:  # fmt: skip
+    part["drone_centre"][index, k] = np.nan
+    for d in np.nonzero(shown)[0]:
+        part["drone_centre"][index, k, d] = R_ned_camera.T @ (places[d] - position)
+        rows, columns = np.nonzero(view.ids == d + 1)
+        part["drone_pixels"][index, k, d] = rows.size
+        if rows.size:
+            part["drone_box"][index, k, d] = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+
+
+def _drone_places(position: Array, attitude: Array, focal: float, rng: np.random.Generator) -> Array:
+    """Drones all over the picture, most of them near, a few across its borders."""
+    u = rng.uniform(-20, WIDTH + 20, MAX_DRONES) - WIDTH / 2
+    v = np.clip(rng.normal(HEIGHT / 2, HEIGHT / 5, MAX_DRONES), 0, HEIGHT) - HEIGHT / 2
+    rays = np.stack([u / focal, v / focal, np.ones(MAX_DRONES)], 1)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    ranges = np.where(
+        rng.random(MAX_DRONES) < 0.75,
+        np.exp(rng.uniform(np.log(1.2), np.log(7.0), MAX_DRONES)),
+        rng.uniform(7.0, 20.0, MAX_DRONES),
+    )
+    return np.asarray(position + (rays * ranges[:, None]) @ (attitude @ R_BODY_CAMERA).T)
+
+
+def _attitude(yaw: float, tilt: Array) -> Array:
+    roll, pitch = tilt
+    cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
+    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    return np.asarray(about_z @ about_y @ about_x)
+
+
+def _direction(rng: np.random.Generator) -> Array:
+    angle = rng.uniform(-np.pi, np.pi)
+    return np.array([np.cos(angle), np.sin(angle)])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,222 @@
+"""Train one network on rendered pairs; resumes from its last checkpoint.
+
+    python tools/train.py neighbours --data DATA --out RUNS/neighbours --minutes 40
+    python tools/train.py distance   --data DATA --out RUNS/distance --minutes 25
+    python tools/train.py flow       --data DATA --out RUNS/flow --minutes 40
+
+Writes OUT/checkpoint.pt and OUT/curve.csv every few minutes. Uses a GPU where there is one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from tools.training.dataset import PairSet, open_pairs  # noqa: E402
+from tools.training.networks import MAX_DEPTH_M, DistanceNet, FlowNet, NeighboursNet  # noqa: E402
+from tools.training.samples import Sample, distance_sample, drone_list, flow_sample, neighbours_sample  # noqa: E402
+
+Batch = dict[str, Tensor]
+
+
+class Task:
+    """What is trained, on what, against what."""
+
+    def __init__(self, net: nn.Module, batch: int, rate: float) -> None:
+        self.net, self.batch, self.rate = net, batch, rate
+
+    def sample(self, rng: np.random.Generator) -> Sample:
+        """One training sample."""
+        raise NotImplementedError
+
+    def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
+        """The loss and figures worth watching."""
+        raise NotImplementedError
+
+
+class NeighboursTask(Task):
+    """Depth, mask and centre offsets of one image."""
+
+    def __init__(self, pairs: PairSet) -> None:
+        super().__init__(NeighboursNet(), 4, 1.2e-3)
+        self.pairs = pairs
+
+    def sample(self, rng: np.random.Generator) -> Sample:
+        return neighbours_sample(self.pairs, int(rng.integers(self.pairs.count)), rng)
+
+    def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
+        depth, logit, offset = self.net(batch["image"], batch["geometry"])
+        mask = batch["drone"]
+        error = (depth.log() - batch["depth"].log()).abs()
+        sky = batch["depth"] >= MAX_DEPTH_M
+        weight = torch.where(sky, 0.3, 1.0) * (1 + 3 * mask)
+        depth_loss = (error * weight).sum() / weight.sum()
+        bce = F.binary_cross_entropy_with_logits(logit, mask, reduction="none")
+        focal = (1 - torch.exp(-bce)) ** 1.5 * bce * (1 + 3 * mask)
+        probability = torch.sigmoid(logit)
+        dice = 1 - (2 * (probability * mask).sum((1, 2, 3)) + 20) / (
+            probability.sum((1, 2, 3)) + mask.sum((1, 2, 3)) + 20
+        )
+        mask_loss = focal.mean() * 40 + 0.5 * dice.mean()
+        distance = (offset - batch["offset"]).abs().sum(1, keepdim=True)
+        offset_loss = (distance * mask).sum() / (mask.sum() + 1)
+        near = (~sky) & (mask < 0.5)
+        guess = logit > 0
+        figures = {
+            "depth": float(error[near].median().detach()),
+            "iou": float((guess & (mask > 0.5)).sum() / ((guess | (mask > 0.5)).sum() + 1)),
+            "offset": float(offset_loss.detach()),
+        }
+        return depth_loss + mask_loss + 0.05 * offset_loss, figures
+
+
+class DistanceTask(Task):
+    """Range of the drone in the middle of a picture."""
+
+    def __init__(self, pairs: PairSet) -> None:
+        super().__init__(DistanceNet(), 48, 1.5e-3)
+        self.pairs, self.drones = pairs, drone_list(pairs)
+
+    def sample(self, rng: np.random.Generator) -> Sample:
+        return distance_sample(self.pairs, self.drones[int(rng.integers(len(self.drones)))], rng)
+
+    def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
+        out = self.net(batch["picture"])
+        error = (out[:, 0] - batch["target"][:, 0]).abs()
+        centre = (out[:, 1:3] - batch["target"][:, 1:3]).abs().clamp(max=30).sum(1)
+        nll = error / torch.exp(out[:, 3]) * 1.414 + out[:, 3]
+        figures = {
+            "median": float(error.median().detach()),
+            "p95": float(error.quantile(0.95).detach()),
+            "centre": float(centre.median().detach()),
+        }
+        return (0.3 * nll + 2.0 * error + 0.05 * centre).mean(), figures
+
+
+class FlowTask(Task):
+    """Where each pixel went."""
+
+    def __init__(self, pairs: PairSet) -> None:
+        super().__init__(FlowNet(), 6, 6e-4)
+        self.pairs = pairs
+
+    def sample(self, rng: np.random.Generator) -> Sample:
+        return flow_sample(self.pairs, int(rng.integers(self.pairs.count)), rng, (256, 240))
+
+    def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
+        flows = self.net(batch["first"], batch["second"])
+        valid = batch["valid"][:, None] & (batch["flow"].abs().amax(1, keepdim=True) < 120)
+        weight = valid.float() * (1 + 2 * batch["drone"][:, None].float())
+        total = torch.zeros(())
+        for i, flow in enumerate(flows):
+            error = (flow - batch["flow"]).abs().sum(1, keepdim=True)
+            total = total + 0.8 ** (len(flows) - 1 - i) * (error * weight).sum() / (weight.sum() + 1)
+        end_point = (flows[-1] - batch["flow"]).norm(dim=1, keepdim=True).detach()
+        drone = valid & batch["drone"][:, None]
+        figures = {
+            "median": float(end_point[valid].median()),
+            "mean": float(end_point[valid].mean()),
+            "drone": float(end_point[drone].median()) if drone.any() else float("nan"),
+        }
+        return total, figures
+
+
+TASKS: dict[str, Callable[[PairSet], Task]] = {
+    "neighbours": NeighboursTask,
+    "distance": DistanceTask,
+    "flow": FlowTask,
+}
+
+
+def main() -> None:
+    """Train until the minutes are over."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("network", choices=TASKS)
+    parser.add_argument("--data", type=Path, required=True, help="folder of render_training_data.py")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--minutes", type=float, default=60.0, help="of training in all, over every resumption")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    torch.manual_seed(arguments.seed)
+    torch.set_num_threads(arguments.threads)
+    cv2.setNumThreads(1)
+    task = TASKS[arguments.network](open_pairs(arguments.data))
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed)
+
+
+def train(task: Task, out: Path, budget_s: float, seed: int) -> None:
+    """One cosine-shaped run of ``budget_s`` seconds of training."""
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    net = task.net.to(device, memory_format=torch.channels_last)
+    optimiser = torch.optim.AdamW(net.parameters(), lr=task.rate, weight_decay=1e-4)
+    spent, step = 0.0, 0
+    checkpoint = out / "checkpoint.pt"
+    if checkpoint.is_file():
+        state = torch.load(checkpoint, map_location=device)
+        net.load_state_dict(state["net"])
+        optimiser.load_state_dict(state["optimiser"])
+        spent, step = state["spent"], state["step"]
+    rng = np.random.Generator(np.random.PCG64([seed, step]))
+    net.train()
+    last_save = last_print = spent
+    recent: list[dict[str, float]] = []
+    while spent < budget_s:
+        begin = time.monotonic()
+        share = spent / budget_s
+        rate = task.rate * min(1.0, (step + 1) / 300) * (0.5 + 0.5 * np.cos(np.pi * share)) + 1e-6
+        for group in optimiser.param_groups:
+            group["lr"] = rate
+        batch = _stack([task.sample(rng) for _ in range(task.batch)], device)
+        loss, figures = task.loss(batch)
+        if torch.isfinite(loss):
+            optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+            optimiser.step()
+        recent.append({"loss": float(loss.detach()), **figures})
+        step += 1
+        spent += time.monotonic() - begin
+        if spent - last_print > 30 or spent >= budget_s:
+            _note(out, step, spent, recent)
+            recent, last_print = [], spent
+        if spent - last_save > 150 or spent >= budget_s:
+            state = {"net": net.state_dict(), "optimiser": optimiser.state_dict(), "spent": spent, "step": step}
+            torch.save(state, checkpoint.with_suffix(".new"))
+            checkpoint.with_suffix(".new").replace(checkpoint)
+            last_save = spent
+
+
+def _stack(samples: list[Sample], device: torch.device) -> Batch:
+    def joined(name: str) -> NDArray[Any]:
+        return np.stack([sample[name] for sample in samples])
+
+    return {name: torch.from_numpy(joined(name)).to(device) for name in samples[0]}
+
+
+def _note(out: Path, step: int, spent: float, recent: list[dict[str, float]]) -> None:
+    means = {name: float(np.nanmean([figures[name] for figures in recent])) for name in recent[0]}
+    print(f"step {step:6d} {spent:6.0f} s  " + "  ".join(f"{n} {v:.4f}" for n, v in means.items()), flush=True)
+    curve = out / "curve.csv"
+    if not curve.is_file():
+        curve.write_text("step,seconds," + ",".join(means) + "\n")
+    with curve.open("a") as file:
+        file.write(f"{step},{spent:.0f}," + ",".join(f"{v:.6f}" for v in means.values()) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,39 @@
+"""What cameras do to a picture: colour, exposure, blur, noise, compression."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+
+
+def photometric(images: list[Image], rng: np.random.Generator) -> list[Image]:
+    """The same lens and light for all ``images`` (h, w, 3), fresh noise for each."""
+    gain = np.exp(rng.normal(0, 0.18)) * np.exp(rng.normal(0, 0.07, 3))
+    offset = rng.normal(0, 8)
+    gamma = np.exp(rng.normal(0, 0.15))
+    ramp = np.arange(256) / 255.0
+    tables = np.clip(255 * ramp[:, None] ** gamma * gain + offset, 0, 255).astype(np.uint8)
+    blur = rng.random() < 0.3
+    blur_px = rng.uniform(0.4, 1.0)
+    noise = abs(rng.normal(0, 4.0))
+    quality = int(rng.integers(50, 95)) if rng.random() < 0.3 else None
+    out = []
+    for image in images:
+        changed: NDArray[Any] = cv2.LUT(image, tables[None])
+        if blur:
+            changed = cv2.GaussianBlur(changed, (0, 0), blur_px)
+        if noise > 0.3:
+            grain = rng.standard_normal(size=(256, 257), dtype=np.float32) * noise
+            grain = np.tile(grain, (1 + changed.shape[0] // 256, 1 + changed.shape[1] // 257))
+            grain = np.roll(grain, int(rng.integers(1 << 16)))[: changed.shape[0], : changed.shape[1]]
+            changed = cv2.add(changed, cv2.merge([grain] * 3), dtype=cv2.CV_8U)
+        if quality is not None:
+            _, packed = cv2.imencode(".jpg", changed, [cv2.IMWRITE_JPEG_QUALITY, quality])
+            changed = cv2.imdecode(packed, cv2.IMREAD_COLOR)
+        out.append(np.asarray(changed, dtype=np.uint8))
+    return out

@@ -1,0 +1,108 @@
+"""Rendered pairs of images with their truth, on disk as plain arrays that open without being read."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib.format import open_memmap
+from numpy.typing import NDArray
+
+from flockd.geometry import PinholeCamera, RigCamera, RigidTransform
+
+HEIGHT, WIDTH = 640, 480
+MAX_DRONES = 6
+FOCAL_PX = 222.0
+
+ARRAYS: dict[str, tuple[tuple[int, ...], Any]] = {
+    "image": ((2, HEIGHT, WIDTH, 3), np.uint8),
+    "depth": ((2, HEIGHT // 2, WIDTH // 2), np.float16),
+    "ids": ((2, HEIGHT // 2, WIDTH // 2), np.uint8),
+    "flow": ((2, HEIGHT // 2, WIDTH // 2), np.float16),
+    "flow_valid": ((HEIGHT // 2, WIDTH // 2), np.bool_),
+    "focal": ((), np.float32),
+    "R_ned_camera": ((2, 3, 3), np.float32),
+    "height": ((2,), np.float32),
+    "drone_centre": ((2, MAX_DRONES, 3), np.float32),  # camera axes, metres; NaN where there is none
+    "drone_pixels": ((2, MAX_DRONES), np.int32),  # visible, full-size pixels
+    "drone_box": ((2, MAX_DRONES, 4), np.float32),  # full-size pixels
+    "drone_family": ((MAX_DRONES,), np.int16),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class PairSet:
+    """All pairs of one folder; every attribute is (n, ...) as in ``ARRAYS``."""
+
+    arrays: dict[str, NDArray[Any]]
+    count: int
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return self.arrays[name]
+
+
+def open_pairs(folder: Path) -> PairSet:
+    """The pairs of every part in ``folder``, opened read-only."""
+    parts = sorted(folder.glob("part-*"))
+    if not parts:
+        raise FileNotFoundError(f"{folder}: no rendered pairs here; make them with tools/render_training_data.py")
+    opened = {name: [np.load(part / f"{name}.npy", mmap_mode="r") for part in parts] for name in ARRAYS}
+    big = {"image", "depth", "ids", "flow", "flow_valid"}
+    arrays = {n: (_Chained(a) if n in big else np.concatenate([np.asarray(x) for x in a])) for n, a in opened.items()}
+    return PairSet(arrays, sum(len(a) for a in opened["focal"]))  # type: ignore[arg-type]
+
+
+class _Chained:
+    """Several memory-mapped arrays behind one index."""
+
+    def __init__(self, parts: list[NDArray[Any]]) -> None:
+        self._parts = parts
+        self._starts = np.cumsum([0] + [len(p) for p in parts])
+
+    def __getitem__(self, index: int) -> NDArray[Any]:
+        part = int(np.searchsorted(self._starts, index, side="right")) - 1
+        return np.asarray(self._parts[part][index - self._starts[part]])
+
+
+def create_part(folder: Path, count: int) -> dict[str, NDArray[Any]]:
+    """Writable arrays for ``count`` pairs in a new part folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return {
+        name: open_memmap(folder / f"{name}.npy", mode="w+", dtype=dtype, shape=(count, *shape))
+        for name, (shape, dtype) in ARRAYS.items()
+    }
+
+
+def rig_camera(focal: float) -> RigCamera:
+    """The camera that took a picture, alone and at the body's origin, body axes = camera axes."""
+    matrix = np.array([[focal, 0.0, WIDTH / 2], [0.0, focal, HEIGHT / 2], [0.0, 0.0, 1.0]])
+    return RigCamera("camera", PinholeCamera(matrix, (WIDTH, HEIGHT)), RigidTransform.identity())
+
+
+def ground_plane(focal: float, R_ned_camera: NDArray[Any], height_m: float) -> NDArray[np.float32]:
+    """(h/2, w/2) inverse depth of flat ground, 1/m; 0 above the horizon."""
+    right, down = ray_tangents(focal)
+    towards_ground = R_ned_camera[2, 0] * right + R_ned_camera[2, 1] * down + R_ned_camera[2, 2]
+    return np.maximum(towards_ground / height_m, 0.0).astype(np.float32)
+
+
+def ray_tangents(focal: float) -> NDArray[np.float32]:
+    """(2, h/2, w/2) tangents right and down of the optical axis."""
+    u = (np.arange(WIDTH // 2) * 2 + 1 - WIDTH / 2) / focal
+    v = (np.arange(HEIGHT // 2) * 2 + 1 - HEIGHT / 2) / focal
+    return np.stack(np.broadcast_arrays(u[None, :], v[:, None])).astype(np.float32)
+
+
+def drones_seen(pairs: PairSet, min_pixels: int) -> Iterator[tuple[int, int, int]]:
+    """(pair, image, drone) of every drone with at least so many visible pixels."""
+    for pair, image, drone in zip(*np.nonzero(pairs["drone_pixels"] >= min_pixels), strict=True):
+        yield int(pair), int(image), int(drone)
+
+
+def note(folder: Path, **facts: object) -> None:
+    """Leave a record of how the folder was made."""
+    (folder / "made.json").write_text(json.dumps(facts, indent=1))

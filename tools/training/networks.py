@@ -1,0 +1,224 @@
+"""The architectures of the shipped networks, in torch. Every one takes 8-bit RGB and normalises inside.
+
+- ``NeighboursNet``: one image -> metric depth, drone mask, and each drone pixel's offset to its drone's centre.
+- ``DistanceNet``: a small picture centred on one drone -> its range, centre and uncertainty.
+- ``FlowNet``: two images -> optical flow, by recurrent lookups in an all-pairs correlation (RAFT, Teed & Deng 2020).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+MAX_DEPTH_M = 80.0
+"""What the depth output says of the sky."""
+OFFSET_SCALE_PX = 16.0
+"""Centre offsets leave the network in units of this many pixels of the half-size map."""
+
+
+def _conv(inputs: int, outputs: int, stride: int = 1, kernel: int = 3) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(True)
+    )
+
+
+class _Residual(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = _conv(channels, channels)
+        self.second = nn.Sequential(nn.Conv2d(channels, channels, 3, 1, 1, bias=False), nn.BatchNorm2d(channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(x + self.second(self.first(x)))
+
+
+class NeighboursNet(nn.Module):
+    """U-Net at half the image's size.
+
+    Inputs: image (n, h, w, 3) uint8; geometry (n, 3, h/2, w/2): tangents of the pixel's ray right and down of the
+    optical axis, and the inverse depth in 1/m of flat ground as attitude and height say (0: unknown or sky).
+    Outputs, at half size: depth (n, 1, ., .) metres; drone (n, 1, ., .) probability logit; offset (n, 2, ., .) from
+    the pixel to its drone's centre, half-size pixels.
+    """
+
+    widths = (32, 56, 96, 128)
+
+    def __init__(self) -> None:
+        super().__init__()
+        w = self.widths
+        self.stem = _conv(48 + 12, w[0])
+        self.down = nn.ModuleList([_conv(a, b, stride=2) for a, b in zip(w[:-1], w[1:], strict=True)])
+        self.body = nn.ModuleList([_Residual(b) for b in w[1:]])
+        self.deep = nn.Sequential(_Residual(w[-1]), _Residual(w[-1]))
+        self.context = nn.Sequential(nn.Linear(w[-1], w[-1]), nn.ReLU(True), nn.Linear(w[-1], w[-1]))
+        self.lateral = nn.ModuleList([nn.Conv2d(a, a, 1) for a in w[:-1]])
+        self.up = nn.ModuleList([_conv(b, a, kernel=1) for a, b in zip(w[:-1], w[1:], strict=True)])
+        self.merge = nn.ModuleList([_conv(a, a) for a in w[:-1]])
+        self.head = nn.Sequential(_conv(w[0], w[0]), nn.Conv2d(w[0], 4 * 4, 1), nn.PixelShuffle(2))
+
+    def forward(self, image: Tensor, geometry: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        x = image.permute(0, 3, 1, 2).to(geometry.dtype) / 127.5 - 1.0
+        x = torch.cat([F.pixel_unshuffle(x, 4), F.pixel_unshuffle(geometry, 2)], 1)
+        x = self.stem(x)
+        levels = [x]
+        for down, body in zip(self.down, self.body, strict=True):
+            x = body(down(x))
+            levels.append(x)
+        x = self.deep(x)
+        x = x + self.context(x.mean((2, 3)))[:, :, None, None]
+        for i in reversed(range(len(self.merge))):
+            x = F.interpolate(self.up[i](x), scale_factor=2.0, mode="nearest")
+            x = self.merge[i](x + self.lateral[i](levels[i]))
+        out = self.head(x)
+        depth = torch.exp(out[:, :1].clamp(-6.0, 4.0) + 2.0).clamp(0.05, MAX_DEPTH_M)
+        return depth, out[:, 1:2], out[:, 2:4] * OFFSET_SCALE_PX
+
+
+class DistanceNet(nn.Module):
+    """Range of the drone in the middle of a picture.
+
+    Input: picture (n, 96, 96, 3) uint8 of a virtual camera that faces the drone. Outputs (n, 4):
+    log of (range in m / focal length in px), the drone's centre right and down of the picture's centre in px,
+    log of the standard deviation of the first.
+    """
+
+    size = 96
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.features = nn.Sequential(
+            _conv(12, 24),  # 48
+            _conv(24, 40, stride=2),  # 24
+            _Residual(40),
+            _conv(40, 64, stride=2),  # 12
+            _Residual(64),
+            _conv(64, 96, stride=2),  # 6
+            _Residual(96),
+            _conv(96, 128, stride=2),  # 3
+            _Residual(128),
+        )
+        self.head = nn.Sequential(nn.Linear(128 * 9, 128), nn.ReLU(True), nn.Linear(128, 4))
+
+    def forward(self, picture: Tensor) -> Tensor:
+        x = picture.permute(0, 3, 1, 2).float() / 127.5 - 1.0
+        x = self.features(F.pixel_unshuffle(x, 2))
+        out = self.head(x.flatten(1))
+        return torch.cat([out[:, :1] - 5.0, out[:, 1:3] * 10.0, (out[:, 3:] - 3.0).clamp(-7.0, 1.0)], 1)
+
+
+class _Encoder(nn.Module):
+    """Features at an eighth of its input's size."""
+
+    def __init__(self, outputs: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            _conv(12, 24),
+            _Residual(24),
+            _conv(24, 48, stride=2),
+            _Residual(48),
+            _conv(48, 80, stride=2),
+            _Residual(80),
+            nn.Conv2d(80, outputs, 1),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.layers(F.pixel_unshuffle(x, 2))
+
+
+class _Gru(nn.Module):
+    def __init__(self, hidden: int, inputs: int) -> None:
+        super().__init__()
+        self.gates = nn.Conv2d(hidden + inputs, 2 * hidden, 3, 1, 1)
+        self.candidate = nn.Conv2d(hidden + inputs, hidden, 3, 1, 1)
+
+    def forward(self, h: Tensor, x: Tensor) -> Tensor:
+        z, r = torch.sigmoid(self.gates(torch.cat([h, x], 1))).chunk(2, 1)
+        return (1 - z) * h + z * torch.tanh(self.candidate(torch.cat([r * h, x], 1)))
+
+
+class FlowNet(nn.Module):
+    """Recurrent all-pairs flow.
+
+    Inputs: first, second (n, h, w, 3) uint8, h and w multiples of 8. Output: flow (n, 2, h, w) in pixels of its input,
+    from first to second. In training a list, one flow an iteration.
+    """
+
+    hidden, context, feature, radius, levels = 48, 40, 96, 3, 2
+
+    def __init__(self, iterations: int = 4) -> None:
+        super().__init__()
+        self.iterations = iterations
+        self.encoder = _Encoder(self.feature)
+        self.initial = nn.Sequential(_conv(self.feature, 96), nn.Conv2d(96, self.hidden + self.context, 1))
+        lookups = self.levels * (2 * self.radius + 1) ** 2
+        self.correlation = nn.Sequential(nn.Conv2d(lookups, 64, 1), nn.ReLU(True))
+        self.motion = nn.Sequential(nn.Conv2d(2, 16, 3, 1, 1), nn.ReLU(True))
+        self.fuse = nn.Sequential(nn.Conv2d(80, 62, 3, 1, 1), nn.ReLU(True))
+        self.gru = _Gru(self.hidden, self.context + 64)
+        self.delta = nn.Sequential(nn.Conv2d(self.hidden, 64, 3, 1, 1), nn.ReLU(True), nn.Conv2d(64, 2, 3, 1, 1))
+        self.mask = nn.Sequential(nn.Conv2d(self.hidden, 96, 3, 1, 1), nn.ReLU(True), nn.Conv2d(96, 9 * 64, 1))
+
+    def forward(self, first: Tensor, second: Tensor, iterations: int | None = None) -> Tensor | list[Tensor]:
+        both = torch.cat([first, second], 0).permute(0, 3, 1, 2).float() / 127.5 - 1.0
+        features = self.encoder(both)
+        n = first.shape[0]
+        f1, f2 = features[:n], features[n:]
+        h, w = f1.shape[2], f1.shape[3]
+        pyramid = self._pyramid(f1, f2, n, h, w)
+        start = self.initial(f1)
+        hidden, context = torch.tanh(start[:, : self.hidden]), F.relu(start[:, self.hidden :])
+        grid = self._grid(n, h, w, f1)
+        flow = torch.zeros_like(grid)
+        flows: list[Tensor] = []
+        steps = iterations or self.iterations
+        for step in range(steps):
+            flow = flow.detach()
+            found = self.correlation(self._lookup(pyramid, grid + flow, n, h, w))
+            motion = self.fuse(torch.cat([found, self.motion(flow)], 1))
+            hidden = self.gru(hidden, torch.cat([context, motion, flow], 1))
+            flow = flow + self.delta(hidden)
+            if self.training or step == steps - 1:
+                flows.append(self._upsample(flow, hidden, n, h, w))
+        return flows if self.training else flows[-1]
+
+    def _pyramid(self, f1: Tensor, f2: Tensor, n: int, h: int, w: int) -> list[Tensor]:
+        volumes = []
+        flat = f1.flatten(2).transpose(1, 2) / self.feature**0.5
+        for level in range(self.levels):
+            target = f2 if level == 0 else F.avg_pool2d(f2, 2**level, ceil_mode=True)
+            volume = torch.matmul(flat, target.flatten(2))
+            volumes.append(volume.reshape(n * h * w, 1, target.shape[2], target.shape[3]))
+        return volumes
+
+    @staticmethod
+    def _grid(n: int, h: int, w: int, like: Tensor) -> Tensor:
+        v, u = torch.meshgrid(
+            torch.arange(h, dtype=like.dtype, device=like.device),
+            torch.arange(w, dtype=like.dtype, device=like.device),
+            indexing="ij",
+        )
+        return torch.stack([u, v])[None].expand(n, 2, h, w)
+
+    def _lookup(self, pyramid: list[Tensor], at: Tensor, n: int, h: int, w: int) -> Tensor:
+        r = self.radius
+        d = torch.arange(-r, r + 1, dtype=at.dtype, device=at.device)
+        dv, du = torch.meshgrid(d, d, indexing="ij")
+        window = torch.stack([du, dv], -1)[None]
+        centre = at.permute(0, 2, 3, 1).reshape(n * h * w, 1, 1, 2)
+        found = []
+        for level, volume in enumerate(pyramid):
+            place = (centre + 0.5) / 2**level + window  # from here on pixel edges, so that levels line up
+            u = place[..., :1] * (2.0 / volume.shape[3]) - 1.0
+            v = place[..., 1:] * (2.0 / volume.shape[2]) - 1.0
+            sampled = F.grid_sample(volume, torch.cat([u, v], -1), align_corners=False)
+            found.append(sampled.reshape(n, h, w, -1))
+        return torch.cat(found, -1).permute(0, 3, 1, 2)
+
+    def _upsample(self, flow: Tensor, hidden: Tensor, n: int, h: int, w: int) -> Tensor:
+        weights = torch.exp(self.mask(hidden).clamp(-8.0, 8.0)).reshape(n, 9, 64, h, w)
+        edged = F.pad(flow * 8.0, (1, 1, 1, 1))
+        near = torch.stack([edged[:, :, i : i + h, j : j + w] for i in range(3) for j in range(3)], 2)
+        total = weights.sum(1)
+        fine = torch.cat([(weights * near[:, i, :, None]).sum(1) / total for i in (0, 1)], 1)
+        return F.pixel_shuffle(fine, 8)

@@ -1,0 +1,141 @@
+"""Training samples, drawn endlessly from rendered pairs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flockd.geometry import Rig, virtual_crop
+from tools.training.augment import photometric
+from tools.training.dataset import HEIGHT, WIDTH, PairSet, drones_seen, ground_plane, ray_tangents, rig_camera
+from tools.training.networks import MAX_DEPTH_M
+
+Sample = dict[str, NDArray[Any]]
+CROP_HALF_WIDTH_M = 0.5
+"""Half of what the second crop of a drone covers at the drone's range."""
+
+
+def neighbours_sample(pairs: PairSet, index: int, rng: np.random.Generator, *, augment: bool = True) -> Sample:
+    """Image, geometry planes and targets for ``NeighboursNet``."""
+    k = int(rng.integers(2))
+    image, depth, ids = pairs["image"][index][k], pairs["depth"][index][k], pairs["ids"][index][k]
+    focal = float(pairs["focal"][index])
+    prior = np.zeros((HEIGHT // 2, WIDTH // 2), np.float32)
+    with_height = rng.random() < 0.7 if augment else True
+    if with_height:
+        wobble = rng.normal(0, 0.005, 3)
+        tilt = np.array([[1, -wobble[2], wobble[1]], [wobble[2], 1, -wobble[0]], [-wobble[1], wobble[0], 1]])
+        height = float(pairs["height"][index, k]) * (1 + rng.normal(0, 0.02))
+        prior = ground_plane(focal, tilt @ pairs["R_ned_camera"][index, k], height)
+    offset = _centre_offsets(pairs, index, k, ids, focal)
+    geometry = np.concatenate([ray_tangents(focal), prior[None]])
+    if augment:
+        (image,) = photometric([image], rng)
+        if rng.random() < 0.5:
+            image, depth, ids = image[:, ::-1], depth[:, ::-1], ids[:, ::-1]
+            geometry, offset = geometry[:, :, ::-1].copy(), offset[:, :, ::-1].copy()
+            geometry[0] *= -1
+            offset[0] *= -1
+    return {
+        "image": np.ascontiguousarray(image),
+        "geometry": np.ascontiguousarray(geometry),
+        "depth": np.minimum(depth.astype(np.float32), MAX_DEPTH_M)[None],
+        "drone": (ids > 0).astype(np.float32)[None],
+        "offset": np.ascontiguousarray(offset),
+    }
+
+
+def distance_sample(
+    pairs: PairSet, drone: tuple[int, int, int], rng: np.random.Generator, *, augment: bool = True
+) -> Sample:
+    """A picture of one drone and its range, for ``DistanceNet``."""
+    pair, k, d = drone
+    image = np.asarray(pairs["image"][pair][k])
+    focal = float(pairs["focal"][pair])
+    centre = np.asarray(pairs["drone_centre"][pair, k, d], np.float64)
+    range_m = float(np.linalg.norm(centre))
+    first_stage = rng.random() < 0.4
+    half_width = CROP_HALF_WIDTH_M * np.exp(rng.normal(0, 0.08))
+    shift_m = rng.normal(0, 0.03, 2)
+    if first_stage:
+        half_width = float(np.exp(rng.uniform(np.log(0.18), np.log(0.8))))
+        shift_m = rng.normal(0, 0.15, 2) * half_width
+    right, down = _across(centre)
+    aim = _in_view(centre + shift_m[0] * right + shift_m[1] * down, focal)
+    rig = Rig({"camera": rig_camera(focal)})
+    crop = virtual_crop(rig, aim / np.linalg.norm(aim), float(np.arctan(half_width / range_m)), 96)
+    picture, _ = crop.sample({"camera": image})
+    place = crop.camera.project(crop.T_body_virtual.inverse().apply(centre[None]))[0] - 48.0
+    if augment:
+        (picture,) = photometric([picture], rng)
+        if rng.random() < 0.5:
+            picture, place = np.ascontiguousarray(picture[:, ::-1]), place * [-1, 1]
+    target = np.array([np.log(range_m / crop.camera.matrix[0, 0]), *place], np.float32)
+    return {"picture": picture, "target": target}
+
+
+def flow_sample(
+    pairs: PairSet, index: int, rng: np.random.Generator, size: tuple[int, int], *, augment: bool = True
+) -> Sample:
+    """Two half-size images and the flow between them, cropped to ``size`` (height, width)."""
+    first, second = pairs["image"][index]
+    flow, valid = pairs["flow"][index].astype(np.float32), pairs["flow_valid"][index]
+    ids = pairs["ids"][index][0]
+    first, second = (_half(image) for image in (first, second))
+    flow = flow / 2.0
+    if augment:
+        first, second = photometric([first, second], rng)
+        if rng.random() < 0.5:
+            first, second, valid, ids = first[:, ::-1], second[:, ::-1], valid[:, ::-1], ids[:, ::-1]
+            flow = flow[:, :, ::-1] * np.array([-1, 1], np.float32)[:, None, None]
+    top = int(rng.integers(first.shape[0] - size[0] + 1)) if augment else 0
+    left = int(rng.integers(first.shape[1] - size[1] + 1)) if augment else 0
+    window = np.s_[top : top + size[0], left : left + size[1]]
+    return {
+        "first": np.ascontiguousarray(first[window]),
+        "second": np.ascontiguousarray(second[window]),
+        "flow": np.ascontiguousarray(flow[(slice(None), *window)]),
+        "valid": np.ascontiguousarray(valid[window]),
+        "drone": np.ascontiguousarray(ids[window] > 0),
+    }
+
+
+def drone_list(pairs: PairSet, min_pixels: int = 24) -> list[tuple[int, int, int]]:
+    """Every drone worth a picture."""
+    return list(drones_seen(pairs, min_pixels))
+
+
+def _half(image: NDArray[Any]) -> NDArray[Any]:
+
+    return np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _centre_offsets(pairs: PairSet, index: int, k: int, ids: NDArray[Any], focal: float) -> NDArray[np.float32]:
+    """(2, h/2, w/2) half-size pixels from each drone pixel to where its drone's centre projects."""
+    offset = np.zeros((2, *ids.shape), np.float32)
+    rows, columns = np.nonzero(ids)
+    if rows.size:
+        centres = np.asarray(pairs["drone_centre"][index, k], np.float64)
+        with np.errstate(invalid="ignore"):
+            u = (centres[:, 0] / centres[:, 2] * focal + WIDTH / 2) / 2
+            v = (centres[:, 1] / centres[:, 2] * focal + HEIGHT / 2) / 2
+        mine = ids[rows, columns].astype(np.int64) - 1
+        offset[0, rows, columns] = np.nan_to_num(u[mine] - (columns + 0.5))
+        offset[1, rows, columns] = np.nan_to_num(v[mine] - (rows + 0.5))
+    return np.clip(offset, -120, 120)
+
+
+def _across(centre: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    forward = centre / np.linalg.norm(centre)
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    return right, np.cross(forward, right)
+
+
+def _in_view(point: NDArray[Any], focal: float) -> NDArray[Any]:
+    """The point itself, or the nearest at its depth that is inside the picture."""
+    reach = np.array([WIDTH / 2 - 1, HEIGHT / 2 - 1]) / focal * point[2]
+    return np.append(np.clip(point[:2], -reach, reach), point[2])

@@ -1,0 +1,6 @@
+"""Which worlds are for what. Training, validation and test worlds never meet; flights use seeds below all of them."""
+
+FLIGHTS = range(0, 1_000_000)
+TRAINING = range(1_000_000, 2_000_000)
+VALIDATION = range(2_000_000, 3_000_000)
+TEST = range(3_000_000, 4_000_000)
