@@ -1,0 +1,762 @@
+"""The renderer's inner loops, compiled: set up triangles, fill a depth buffer, shade what is seen.
+
+No fastmath: a shared edge must give the same crossing from both of its triangles (no holes), and the bytes must not depend
+on the number of threads. Each image row is written by one thread only.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+
+BANDS = 16
+# Bit-reversed, so that a thread's contiguous share of the loop is spread over the whole image.
+BAND_ORDER = np.array([0, 8, 4, 12, 2, 10, 6, 14, 1, 9, 5, 13, 3, 11, 7, 15], dtype=np.int64)
+SUBSAMPLES = 3
+"""Drone colours are sampled 3x3 per pixel; the middle sample is the pixel's centre."""
+
+
+@njit(parallel=True, cache=True)
+def project_vertices(vertices: Any, P: Any, origin: Any) -> Any:
+    """Homogeneous pixel coordinates (n, 3): ``P @ (vertex - origin)``."""
+    count = vertices.shape[0]
+    q = np.empty((count, 3))
+    for i in prange(count):
+        x = vertices[i, 0] - origin[0]
+        y = vertices[i, 1] - origin[1]
+        z = vertices[i, 2] - origin[2]
+        for k in range(3):
+            q[i, k] = P[k, 0] * x + P[k, 1] * y + P[k, 2] * z
+    return q
+
+
+@njit(parallel=True, cache=True)
+def set_up_triangles(q: Any, triangles: Any, width: int, height: int, rows: Any, planes: Any) -> None:
+    """Row range and plane coefficients of each triangle that can be seen; rows (0, -1) for the others.
+
+    ``planes[t]`` holds three edge functions (a, b, c), positive inside, and 1/z, each linear in (u, v, 1). They are
+    homogeneous (cross products of the corners), so a triangle that reaches behind the camera needs no clipping.
+    """
+    for t in prange(triangles.shape[0]):
+        rows[t, 0] = 0
+        rows[t, 1] = -1
+        a = triangles[t, 0]
+        b = triangles[t, 1]
+        c = triangles[t, 2]
+        ax, ay, az = q[a, 0], q[a, 1], q[a, 2]
+        bx, by, bz = q[b, 0], q[b, 1], q[b, 2]
+        cx, cy, cz = q[c, 0], q[c, 1], q[c, 2]
+        if az <= 0.0 and bz <= 0.0 and cz <= 0.0:
+            continue
+        if (ax < 0.0 and bx < 0.0 and cx < 0.0) or (ay < 0.0 and by < 0.0 and cy < 0.0):
+            continue
+        if ax > width * az and bx > width * bz and cx > width * cz:
+            continue
+        if ay > height * az and by > height * bz and cy > height * cz:
+            continue
+        e0x = by * cz - bz * cy
+        e0y = bz * cx - bx * cz
+        e0z = bx * cy - by * cx
+        determinant = ax * e0x + ay * e0y + az * e0z
+        if determinant > -1e-9:  # seen from behind, or edge on
+            continue
+        top = 0
+        bottom = height - 1
+        if az > 1e-6 and bz > 1e-6 and cz > 1e-6:
+            va = ay / az
+            vb = by / bz
+            vc = cy / cz
+            top = max(top, int(math.ceil(max(-1.0, min(va, vb, vc)) - 0.5)))
+            bottom = min(bottom, int(math.floor(min(height + 1.0, max(va, vb, vc)) - 0.5)))
+            ua = ax / az
+            ub = bx / bz
+            uc = cx / cz
+            if math.ceil(min(ua, ub, uc) - 0.5) > math.floor(max(ua, ub, uc) - 0.5):  # between pixel centres
+                continue
+        if top > bottom:
+            continue
+        e1x = cy * az - cz * ay
+        e1y = cz * ax - cx * az
+        e1z = cx * ay - cy * ax
+        e2x = ay * bz - az * by
+        e2y = az * bx - ax * bz
+        e2z = ax * by - ay * bx
+        rows[t, 0] = top
+        rows[t, 1] = bottom
+        p = planes[t]
+        p[0], p[1], p[2] = -e0x, -e0y, -e0z
+        p[3], p[4], p[5] = -e1x, -e1y, -e1z
+        p[6], p[7], p[8] = -e2x, -e2y, -e2z
+        p[9] = (e0x + e1x + e2x) / determinant
+        p[10] = (e0y + e1y + e2y) / determinant
+        p[11] = (e0z + e1z + e2z) / determinant
+
+
+@njit(cache=True)
+def list_visible(rows: Any) -> Any:
+    """Indices of the triangles with a row range, in order."""
+    count = 0
+    for t in range(rows.shape[0]):
+        if rows[t, 1] >= rows[t, 0]:
+            count += 1
+    visible = np.empty(count, dtype=np.int32)
+    k = 0
+    for t in range(rows.shape[0]):
+        if rows[t, 1] >= rows[t, 0]:
+            visible[k] = t
+            k += 1
+    return visible
+
+
+@njit(parallel=True, cache=True)
+def fill(visible: Any, rows: Any, planes: Any, inverse_depth: Any, hit: Any, band_order: Any) -> None:
+    """Nearest triangle of each pixel: 1/z and its index (-1 for none), row spans from the edges' crossings."""
+    height, width = hit.shape
+    bands = band_order.shape[0]
+    for i in prange(bands):
+        band = band_order[i]
+        first = height * band // bands
+        last = height * (band + 1) // bands - 1
+        for y in range(first, last + 1):
+            for x in range(width):
+                inverse_depth[y, x] = 0.0
+                hit[y, x] = -1
+        for k in range(visible.shape[0]):
+            t = visible[k]
+            if rows[t, 1] < first or rows[t, 0] > last:
+                continue
+            p = planes[t]
+            top = max(first, rows[t, 0])
+            bottom = min(last, rows[t, 1])
+            for y in range(top, bottom + 1):
+                v = y + 0.5
+                low = 0.0
+                high = width - 1.0
+                for e in range(0, 9, 3):
+                    slope = p[e]
+                    rest = p[e + 1] * v + p[e + 2]
+                    if slope > 0.0:
+                        low = max(low, -rest / slope - 0.5)
+                    elif slope < 0.0:
+                        high = min(high, -rest / slope - 0.5)
+                    elif rest < 0.0:
+                        high = -1.0
+                if low > high:
+                    continue
+                x0 = int(math.ceil(low))
+                x1 = int(math.floor(high))
+                step = np.float32(p[9])
+                start = np.float32(p[9] * (x0 + 0.5) + p[10] * v + p[11])
+                for x in range(x0, x1 + 1):
+                    value = start + step * np.float32(x - x0)
+                    if value > inverse_depth[y, x]:
+                        inverse_depth[y, x] = value
+                        hit[y, x] = t
+
+
+@njit(cache=True)
+def _blend(a: Any, b: Any, weight: Any) -> Any:
+    """Four packed bytes of a and b mixed, weight of b in 1/256."""
+    keep = np.uint64(256) - weight
+    low = np.uint64(0x00FF00FF)
+    even = (((a & low) * keep + (b & low) * weight) >> np.uint64(8)) & low
+    odd = (((a >> np.uint64(8)) & low) * keep + ((b >> np.uint64(8)) & low) * weight) & np.uint64(0xFF00FF00)
+    return even | odd
+
+
+@njit(cache=True)
+def _bilinear(texels: Any, base: int, bits: int, u: float, v: float) -> Any:
+    """Packed colour of one level at (u, v) in tiles, repeating."""
+    size = 1 << bits
+    mask = size - 1
+    fu = u * (size * 256.0) - 128.0
+    fv = v * (size * 256.0) - 128.0
+    iu = int(math.floor(fu))
+    iv = int(math.floor(fv))
+    wu = np.uint64(iu & 255)
+    wv = np.uint64(iv & 255)
+    x0 = (iu >> 8) & mask
+    y0 = (iv >> 8) & mask
+    x1 = (x0 + 1) & mask
+    row0 = base + (y0 << bits)
+    row1 = base + (((y0 + 1) & mask) << bits)
+    a = _blend(np.uint64(texels[row0 + x0]), np.uint64(texels[row0 + x1]), wu)
+    b = _blend(np.uint64(texels[row1 + x0]), np.uint64(texels[row1 + x1]), wu)
+    return _blend(a, b, wv)
+
+
+@njit(cache=True)
+def sample(texels: Any, base: int, bits: int, u: float, v: float, level: float) -> Any:
+    """Trilinear packed colour; ``level`` 0 is the finest of ``bits`` + 1 levels stored one after another from ``base``."""
+    if level <= 0.0:
+        return _bilinear(texels, base, bits, u, v)
+    whole = int(level)
+    if whole >= bits:
+        return np.uint64(texels[base + ((4 << (2 * bits)) - 1) // 3 - 1])
+    # Levels before this one hold 4^bits + 4^(bits-1) + ... texels.
+    start = base + ((4 << (2 * bits)) - (4 << (2 * (bits - whole)))) // 3
+    fine = _bilinear(texels, start, bits - whole, u, v)
+    weight = np.uint64((level - whole) * 256.0)
+    coarse = _bilinear(texels, start + (1 << (2 * (bits - whole))), bits - whole - 1, u, v)
+    return _blend(fine, coarse, weight)
+
+
+@njit(cache=True)
+def _byte(packed: Any, shift: int) -> float:
+    """One channel of a packed colour, linear light: textures are stored as square roots."""
+    value = float((packed >> np.uint64(shift)) & np.uint64(255)) * (1.0 / 255.0)
+    return value * value
+
+
+@njit(cache=True)
+def sun_reaches(shadow: Any, frame: Any, n: float, e: float, d: float) -> float:
+    """Share of sunlight at a point, 0 to 1: four neighbours of the shadow map, weighted.
+
+    ``frame`` (3, 4) takes a point to map column, map row and height towards the sun; the map holds the highest
+    thing's height.
+    """
+    size = shadow.shape[0]
+    s = frame[0, 0] * n + frame[0, 1] * e + frame[0, 2] * d + frame[0, 3] - 0.5
+    t = frame[1, 0] * n + frame[1, 1] * e + frame[1, 2] * d + frame[1, 3] - 0.5
+    if s < 0.0 or t < 0.0 or s >= size - 1.0 or t >= size - 1.0:
+        return 1.0
+    here = frame[2, 0] * n + frame[2, 1] * e + frame[2, 2] * d + frame[2, 3]
+    i = int(s)
+    j = int(t)
+    ws = s - i
+    wt = t - j
+    lit = 0.0
+    if here >= shadow[j, i]:
+        lit += (1.0 - ws) * (1.0 - wt)
+    if here >= shadow[j, i + 1]:
+        lit += ws * (1.0 - wt)
+    if here >= shadow[j + 1, i]:
+        lit += (1.0 - ws) * wt
+    if here >= shadow[j + 1, i + 1]:
+        lit += ws * wt
+    return lit
+
+
+@njit(cache=True)
+def _blob_shadow(blobs: Any, sun: Any, n: float, e: float, d: float) -> float:
+    """Share of sunlight left by the drones above a point. ``blobs`` (k, 5): centre, radius, darkness."""
+    left = 1.0
+    for k in range(blobs.shape[0]):
+        x = blobs[k, 0] - n
+        y = blobs[k, 1] - e
+        z = blobs[k, 2] - d
+        along = x * sun[0] + y * sun[1] + z * sun[2]
+        if along <= 0.0:
+            continue
+        off = math.sqrt(max(0.0, x * x + y * y + z * z - along * along))
+        # The sun is half a degree wide: the edge softens with distance.
+        soft = 0.35 * blobs[k, 3] + 0.01 * along
+        edge = (blobs[k, 3] + 0.5 * soft - off) / soft
+        if edge > 0.0:
+            left *= 1.0 - blobs[k, 4] * min(1.0, edge)
+    return left
+
+
+@njit(cache=True)
+def _light(light: Any, normal_d: float, cosine: float) -> Any:
+    """Irradiance (r, g, b) of a surface: sun times ``cosine`` (shadow included) plus sky above and ground below."""
+    up = 0.5 - 0.5 * normal_d
+    return (
+        light[1, 0] * cosine + light[2, 0] * up + light[3, 0] * (1.0 - up),
+        light[1, 1] * cosine + light[2, 1] * up + light[3, 1] * (1.0 - up),
+        light[1, 2] * cosine + light[2, 2] * up + light[3, 2] * (1.0 - up),
+    )
+
+
+@njit(cache=True)
+def _encode(tone: Any, value: float) -> Any:
+    """Linear light to a display byte through the tone curve, which is tabulated over the square root."""
+    index = int(math.sqrt(max(0.0, value)) * 1024.0)
+    return tone[min(index, tone.shape[0] - 1)]
+
+
+@njit(cache=True)
+def _sky(sky: Any, bits: int, x: float, y: float, z: float) -> Any:
+    """Packed sky colour of a direction, NED: an octahedral map of the upper half."""
+    z = max(0.0, -z)
+    scale = 0.5 / max(1e-9, abs(x) + abs(y) + z)
+    size = 1 << bits
+    limit = 0.5 - 0.51 / size  # keep the filter off the opposite border
+    a = max(-limit, min(limit, (x + y) * scale))
+    b = max(-limit, min(limit, (x - y) * scale))
+    return _bilinear(sky, 0, bits, a + 0.5, b + 0.5)
+
+
+@njit(parallel=True, cache=True)
+def shade_scene(
+    hit: Any,
+    planes: Any,
+    inverse_K: Any,
+    R: Any,
+    origin: Any,
+    focal: float,
+    normals: Any,
+    texture: Any,
+    uv: Any,
+    tint: Any,
+    texels: Any,
+    texture_bits: int,
+    ground: Any,
+    ground_bits: int,
+    ground_kind: Any,
+    ground_detail: Any,
+    extent: float,
+    shadow: Any,
+    shadow_frame: Any,
+    light: Any,
+    fog: float,
+    sky: Any,
+    sky_bits: int,
+    tone: Any,
+    blobs: Any,
+    blob_rows: Any,
+    rgb: Any,
+    depth: Any,
+) -> None:
+    """Colour and metric depth of every pixel from its triangle index: the world without drones."""
+    height, width = hit.shape
+    sun = light[0]
+    texture_area = ((4 << (2 * texture_bits)) - 1) // 3
+    texture_size = float(1 << texture_bits)
+    ground_size = 1 << ground_bits
+    lanes = 32
+    for lane in prange(lanes):
+        for y in range(lane, height, lanes):
+            v = y + 0.5
+            for x in range(width):
+                u = x + 0.5
+                cx = inverse_K[0, 0] * u + inverse_K[0, 1] * v + inverse_K[0, 2]
+                cy = inverse_K[1, 1] * v + inverse_K[1, 2]
+                rn = R[0, 0] * cx + R[0, 1] * cy + R[0, 2]
+                re = R[1, 0] * cx + R[1, 1] * cy + R[1, 2]
+                rd = R[2, 0] * cx + R[2, 1] * cy + R[2, 2]
+                length = math.sqrt(cx * cx + cy * cy + 1.0)
+                t = hit[y, x]
+                if t < 0:
+                    depth[y, x] = np.inf
+                    packed = _sky(sky, sky_bits, rn, re, rd)
+                    rgb[y, x, 0] = _encode(tone, 4.0 * _byte(packed, 0))
+                    rgb[y, x, 1] = _encode(tone, 4.0 * _byte(packed, 8))
+                    rgb[y, x, 2] = _encode(tone, 4.0 * _byte(packed, 16))
+                    continue
+                z = 1.0 / (planes[t, 9] * u + planes[t, 10] * v + planes[t, 11])
+                depth[y, x] = z
+                n = origin[0] + rn * z
+                e = origin[1] + re * z
+                d = origin[2] + rd * z
+                nn, ne, nd = normals[t, 0], normals[t, 1], normals[t, 2]
+                facing = max(0.02, -(rn * nn + re * ne + rd * nd) / length)
+                # A pixel's footprint, between its short side and its long one (which grazing views stretch).
+                footprint = z / focal / facing**0.7
+                free = 1.0
+                if x >= blob_rows[y, 0] and x < blob_rows[y, 1]:
+                    free = _blob_shadow(blobs, sun, n, e, d)
+                kind = texture[t]
+                if kind < 0:
+                    gu = (n / extent + 1.0) * 0.5
+                    gv = (e / extent + 1.0) * 0.5
+                    gu -= 2.0 * math.floor(gu * 0.5)
+                    gv -= 2.0 * math.floor(gv * 0.5)
+                    if gu > 1.0:  # mirrored beyond the border
+                        gu = 2.0 - gu
+                    if gv > 1.0:
+                        gv = 2.0 - gv
+                    packed = sample(
+                        ground, 0, ground_bits, gv, gu, math.log2(footprint * ground_size / (2.0 * extent))
+                    )
+                    gi = ground_kind[min(ground_size - 1, int(gu * ground_size)), min(ground_size - 1, int(gv * ground_size))]
+                    tile = ground_detail[gi, 1]
+                    fine = sample(
+                        texels,
+                        int(ground_detail[gi, 0]) * texture_area,
+                        texture_bits,
+                        e * tile,
+                        n * tile,
+                        math.log2(footprint * texture_size * tile),
+                    )
+                    cosine = _byte(packed, 24) if abs(n) < extent and abs(e) < extent else -sun[2]
+                    red, green, blue = _light(light, -1.0, cosine * free)
+                    red *= 2.0 * _byte(packed, 0) * _byte(fine, 0)
+                    green *= 2.0 * _byte(packed, 8) * _byte(fine, 8)
+                    blue *= 2.0 * _byte(packed, 16) * _byte(fine, 16)
+                else:
+                    tu = uv[t, 0, 0] * n + uv[t, 0, 1] * e + uv[t, 0, 2] * d + uv[t, 0, 3]
+                    tv = uv[t, 1, 0] * n + uv[t, 1, 1] * e + uv[t, 1, 2] * d + uv[t, 1, 3]
+                    tile = max(
+                        math.sqrt(uv[t, 0, 0] ** 2 + uv[t, 0, 1] ** 2 + uv[t, 0, 2] ** 2),
+                        math.sqrt(uv[t, 1, 0] ** 2 + uv[t, 1, 1] ** 2 + uv[t, 1, 2] ** 2),
+                    )
+                    fine = sample(
+                        texels, kind * texture_area, texture_bits, tu, tv, math.log2(footprint * texture_size * tile)
+                    )
+                    cosine = nn * sun[0] + ne * sun[1] + nd * sun[2]
+                    if cosine > 0.0:
+                        cosine *= free * sun_reaches(
+                            shadow, shadow_frame, n + 0.08 * nn, e + 0.08 * ne, d + 0.08 * nd
+                        )
+                    red, green, blue = _light(light, nd, max(0.0, cosine))
+                    red *= 2.0 * tint[t, 0] * _byte(fine, 0)
+                    green *= 2.0 * tint[t, 1] * _byte(fine, 8)
+                    blue *= 2.0 * tint[t, 2] * _byte(fine, 16)
+                clear = math.exp(-fog * z * length)
+                rgb[y, x, 0] = _encode(tone, red * clear + light[4, 0] * (1.0 - clear))
+                rgb[y, x, 1] = _encode(tone, green * clear + light[4, 1] * (1.0 - clear))
+                rgb[y, x, 2] = _encode(tone, blue * clear + light[4, 2] * (1.0 - clear))
+
+
+@njit(parallel=True, cache=True)
+def shade_drone(
+    hit: Any,
+    inverse_depth: Any,
+    planes: Any,
+    left: int,
+    top: int,
+    inverse_K: Any,
+    R: Any,
+    origin: Any,
+    focal: float,
+    R_ned_body: Any,
+    position: Any,
+    normals: Any,
+    texture: Any,
+    uv: Any,
+    colours: Any,
+    texels: Any,
+    texture_bits: int,
+    shadow: Any,
+    shadow_frame: Any,
+    light: Any,
+    fog: float,
+    tone: Any,
+    linear: Any,
+    identity: int,
+    rgb: Any,
+    depth: Any,
+    ids: Any,
+) -> None:
+    """Lay one drone over the image by coverage, from its 3x3 supersampled triangle indices within a rectangle.
+
+    Depth and identity come from the middle sample, the pixel's centre. ``normals`` are NED, ``uv`` is in body axes.
+    """
+    s = SUBSAMPLES
+    count = hit.shape[0] // s
+    sun = light[0]
+    texture_area = ((4 << (2 * texture_bits)) - 1) // 3
+    texture_size = float(1 << texture_bits)
+    lanes = 16
+    for lane in prange(lanes):
+        for row in range(lane, count, lanes):
+            y = top + row
+            for column in range(hit.shape[1] // s):
+                x = left + column
+                limit = 0.0
+                if depth[y, x] < np.inf:
+                    limit = 1.0 / depth[y, x]
+                covered = 0
+                sum_red = 0.0
+                sum_green = 0.0
+                sum_blue = 0.0
+                last = -1
+                red = 0.0
+                green = 0.0
+                blue = 0.0
+                for j in range(s):
+                    for i in range(s):
+                        t = hit[row * s + j, column * s + i]
+                        if t < 0 or inverse_depth[row * s + j, column * s + i] <= limit:
+                            continue
+                        covered += 1
+                        if t != last:
+                            last = t
+                            a = column * s + i + 0.5
+                            b = row * s + j + 0.5
+                            z = 1.0 / (planes[t, 9] * a + planes[t, 10] * b + planes[t, 11])
+                            u = left + a / s
+                            v = top + b / s
+                            cx = inverse_K[0, 0] * u + inverse_K[0, 1] * v + inverse_K[0, 2]
+                            cy = inverse_K[1, 1] * v + inverse_K[1, 2]
+                            rn = (R[0, 0] * cx + R[0, 1] * cy + R[0, 2]) * z
+                            re = (R[1, 0] * cx + R[1, 1] * cy + R[1, 2]) * z
+                            rd = (R[2, 0] * cx + R[2, 1] * cy + R[2, 2]) * z
+                            away = math.sqrt(rn * rn + re * re + rd * rd)
+                            nn, ne, nd = normals[t, 0], normals[t, 1], normals[t, 2]
+                            n = origin[0] + rn - position[0]
+                            e = origin[1] + re - position[1]
+                            d = origin[2] + rd - position[2]
+                            bx = R_ned_body[0, 0] * n + R_ned_body[1, 0] * e + R_ned_body[2, 0] * d
+                            by = R_ned_body[0, 1] * n + R_ned_body[1, 1] * e + R_ned_body[2, 1] * d
+                            bz = R_ned_body[0, 2] * n + R_ned_body[1, 2] * e + R_ned_body[2, 2] * d
+                            tu = uv[t, 0, 0] * bx + uv[t, 0, 1] * by + uv[t, 0, 2] * bz + uv[t, 0, 3]
+                            tv = uv[t, 1, 0] * bx + uv[t, 1, 1] * by + uv[t, 1, 2] * bz + uv[t, 1, 3]
+                            facing = max(0.05, -(rn * nn + re * ne + rd * nd) / away)
+                            # Tiles per metre are the same both ways on a drone.
+                            tile = abs(uv[t, 0, 0]) + abs(uv[t, 0, 1]) + abs(uv[t, 0, 2])
+                            fine = sample(
+                                texels,
+                                texture[t] * texture_area,
+                                texture_bits,
+                                tu,
+                                tv,
+                                math.log2(z / focal / facing**0.7 * texture_size * tile),
+                            )
+                            cosine = nn * sun[0] + ne * sun[1] + nd * sun[2]
+                            if cosine > 0.0:
+                                cosine *= sun_reaches(
+                                    shadow, shadow_frame, n + position[0], e + position[1], d + position[2]
+                                )
+                            red, green, blue = _light(light, nd, max(0.0, cosine))
+                            clear = math.exp(-fog * away)
+                            red = red * 2.0 * colours[t, 0] * _byte(fine, 0) * clear + light[4, 0] * (1.0 - clear)
+                            green = green * 2.0 * colours[t, 1] * _byte(fine, 8) * clear + light[4, 1] * (1.0 - clear)
+                            blue = blue * 2.0 * colours[t, 2] * _byte(fine, 16) * clear + light[4, 2] * (1.0 - clear)
+                        sum_red += red
+                        sum_green += green
+                        sum_blue += blue
+                if covered == 0:
+                    continue
+                share = 1.0 / (s * s)
+                rest = 1.0 - covered * share
+                rgb[y, x, 0] = _encode(tone, linear[rgb[y, x, 0]] * rest + sum_red * share)
+                rgb[y, x, 1] = _encode(tone, linear[rgb[y, x, 1]] * rest + sum_green * share)
+                rgb[y, x, 2] = _encode(tone, linear[rgb[y, x, 2]] * rest + sum_blue * share)
+                middle_y = row * s + s // 2
+                middle_x = column * s + s // 2
+                t = hit[middle_y, middle_x]
+                if t >= 0 and inverse_depth[middle_y, middle_x] > limit:
+                    depth[y, x] = 1.0 / (
+                        planes[t, 9] * (middle_x + 0.5) + planes[t, 10] * (middle_y + 0.5) + planes[t, 11]
+                    )
+                    ids[y, x] = identity
+
+
+@njit(cache=True)
+def fill_shadow(vertices: Any, triangles: Any, frame: Any, shadow: Any) -> None:
+    """Greatest height towards the sun in each cell of the shadow map (parallel projection)."""
+    size = shadow.shape[0]
+    for t in range(triangles.shape[0]):
+        s = np.empty(3)
+        r = np.empty(3)
+        h = np.empty(3)
+        for k in range(3):
+            p = vertices[triangles[t, k]]
+            s[k] = frame[0, 0] * p[0] + frame[0, 1] * p[1] + frame[0, 2] * p[2] + frame[0, 3]
+            r[k] = frame[1, 0] * p[0] + frame[1, 1] * p[1] + frame[1, 2] * p[2] + frame[1, 3]
+            h[k] = frame[2, 0] * p[0] + frame[2, 1] * p[1] + frame[2, 2] * p[2] + frame[2, 3]
+        area = (s[1] - s[0]) * (r[2] - r[0]) - (s[2] - s[0]) * (r[1] - r[0])
+        if abs(area) < 1e-9:
+            continue
+        x0 = max(0, int(math.ceil(s.min() - 0.5)))
+        x1 = min(size - 1, int(math.floor(s.max() - 0.5)))
+        y0 = max(0, int(math.ceil(r.min() - 0.5)))
+        y1 = min(size - 1, int(math.floor(r.max() - 0.5)))
+        for y in range(y0, y1 + 1):
+            for x in range(x0, x1 + 1):
+                ds = x + 0.5 - s[0]
+                dr = y + 0.5 - r[0]
+                b1 = (ds * (r[2] - r[0]) - (s[2] - s[0]) * dr) / area
+                b2 = ((s[1] - s[0]) * dr - ds * (r[1] - r[0])) / area
+                if b1 >= 0.0 and b2 >= 0.0 and b1 + b2 <= 1.0:
+                    here = h[0] + b1 * (h[1] - h[0]) + b2 * (h[2] - h[0])
+                    if here > shadow[y, x]:
+                        shadow[y, x] = here
+
+
+@njit(cache=True)
+def _noise(maps: Any, k: int, u: float, v: float) -> float:
+    """Bilinear value of the k-th tileable noise map at (u, v) in tiles."""
+    size = maps.shape[1]
+    mask = size - 1
+    fu = u * size
+    fv = v * size
+    x = int(math.floor(fu))
+    y = int(math.floor(fv))
+    wx = fu - x
+    wy = fv - y
+    x0 = x & mask
+    x1 = (x + 1) & mask
+    y0 = y & mask
+    y1 = (y + 1) & mask
+    above = maps[k, y0, x0] * (1.0 - wx) + maps[k, y0, x1] * wx
+    below = maps[k, y1, x0] * (1.0 - wx) + maps[k, y1, x1] * wx
+    return float(above * (1.0 - wy) + below * wy)
+
+
+@njit(parallel=True, cache=True)
+def compose_ground(
+    noise: Any,
+    extent: float,
+    zone_scale: float,
+    zone_limits: Any,
+    zone_colours: Any,
+    zone_kinds: Any,
+    variation: Any,
+    roads: Any,
+    road_colours: Any,
+    patches: Any,
+    patch_colours: Any,
+    openness: Any,
+    slopes: Any,
+    sun: Any,
+    shadow: Any,
+    shadow_frame: Any,
+    heights: Any,
+    colour: Any,
+    kinds: Any,
+) -> None:
+    """The ground's map: colour and baked sunlight per texel (rows run north, columns east), and which detail covers it.
+
+    Zones from noise, then roads (straight with a sway), then rectangles. Each row of ``roads`` is a point (n, e), a direction, half width,
+    sway, sway length, phase, detail, stripes; of ``patches`` a centre, a direction, half sizes, detail.
+    """
+    size = kinds.shape[0]
+    cells = heights.shape[0] - 1
+    coarse = openness.shape[0]
+    for row in prange(size):
+        n = ((row + 0.5) / size * 2.0 - 1.0) * extent
+        for column in range(size):
+            e = ((column + 0.5) / size * 2.0 - 1.0) * extent
+            gu = (n / extent + 1.0) * 0.5
+            gv = (e / extent + 1.0) * 0.5
+            broad = _noise(noise, 0, gv * zone_scale, gu * zone_scale)
+            tone = _noise(noise, 1, gv, gu)
+            fine = _noise(noise, 2, e / 19.0, n / 19.0)
+            value = broad + 0.12 * fine
+            zone = 0
+            while zone < zone_limits.shape[0] and value > zone_limits[zone]:
+                zone += 1
+            kind = zone_kinds[zone]
+            red = zone_colours[zone, 0]
+            green = zone_colours[zone, 1]
+            blue = zone_colours[zone, 2]
+            worn = 1.0
+            for k in range(roads.shape[0]):
+                dn = n - roads[k, 0]
+                de = e - roads[k, 1]
+                along = dn * roads[k, 2] + de * roads[k, 3]
+                across = -dn * roads[k, 3] + de * roads[k, 2]
+                across += roads[k, 5] * math.sin(along * roads[k, 6] + roads[k, 7])
+                off = abs(across) - roads[k, 4]
+                ragged = 0.12 * fine if roads[k, 9] < 0.5 else 0.02 * fine
+                if off + ragged < 0.0:
+                    kind = int(roads[k, 8])
+                    red = road_colours[k, 0]
+                    green = road_colours[k, 1]
+                    blue = road_colours[k, 2]
+                    worn = 1.0
+                    if roads[k, 9] > 1.5:
+                        stripe = abs(across) < 0.07 and (along * 0.2 - math.floor(along * 0.2)) < 0.5
+                        if stripe or abs(off + 0.25) < 0.06:
+                            red = green = blue = 0.55
+                            worn = 0.9
+                    elif roads[k, 9] < 0.5:  # two wheel tracks
+                        worn = 1.0 - 0.25 * math.exp(-(((abs(across) - 0.5 * roads[k, 4]) / 0.25) ** 2))
+                elif off + ragged < 0.22 and roads[k, 9] > 0.5:
+                    red = green = blue = 0.3
+                    worn = 1.0
+            for k in range(patches.shape[0]):
+                dn = n - patches[k, 0]
+                de = e - patches[k, 1]
+                a = abs(dn * patches[k, 2] + de * patches[k, 3])
+                b = abs(-dn * patches[k, 3] + de * patches[k, 2])
+                if a + 0.03 * fine < patches[k, 4] and b + 0.03 * fine < patches[k, 5]:
+                    kind = int(patches[k, 6])
+                    red = patch_colours[k, 0]
+                    green = patch_colours[k, 1]
+                    blue = patch_colours[k, 2]
+                    worn = 1.0
+                    if patches[k, 4] - a < 0.15 or patches[k, 5] - b < 0.15:
+                        worn = 0.7
+            shade = worn * math.exp(variation[0] * tone + variation[1] * fine)
+            hue = variation[2] * _noise(noise, 3, gv, gu)
+            i = min(coarse - 1, row * coarse // size)
+            j = min(coarse - 1, column * coarse // size)
+            shade *= openness[i, j]
+            # Sunlight: the grid's slopes, smoothed, with what stands in the way.
+            fn = gu * cells
+            fe = gv * cells
+            ci = min(cells - 1, int(fn))
+            cj = min(cells - 1, int(fe))
+            a = fn - ci
+            b = fe - cj
+            height = (heights[ci, cj] * (1.0 - a) + heights[ci + 1, cj] * a) * (1.0 - b) + (
+                heights[ci, cj + 1] * (1.0 - a) + heights[ci + 1, cj + 1] * a
+            ) * b
+            slope_n = (slopes[0, ci, cj] * (1.0 - a) + slopes[0, ci + 1, cj] * a) * (1.0 - b) + (
+                slopes[0, ci, cj + 1] * (1.0 - a) + slopes[0, ci + 1, cj + 1] * a
+            ) * b
+            slope_e = (slopes[1, ci, cj] * (1.0 - a) + slopes[1, ci + 1, cj] * a) * (1.0 - b) + (
+                slopes[1, ci, cj + 1] * (1.0 - a) + slopes[1, ci + 1, cj + 1] * a
+            ) * b
+            lit = 0.0
+            for k in range(5):
+                dx = 0.06 * ((k & 1) * 2 - 1) if k < 4 else 0.0
+                dy = 0.06 * ((k & 2) - 1) if k < 4 else 0.0
+                lit += 0.2 * sun_reaches(shadow, shadow_frame, n + dx, e + dy, -height)
+            cosine = max(0.0, (-slope_n * sun[0] - slope_e * sun[1] - sun[2]) / math.sqrt(1.0 + slope_n**2 + slope_e**2))
+            colour[row, column, 0] = red * shade * (1.0 + hue)
+            colour[row, column, 1] = green * shade
+            colour[row, column, 2] = blue * shade * (1.0 - hue)
+            colour[row, column, 3] = lit * cosine
+            kinds[row, column] = kind
+
+
+@njit(parallel=True, cache=True)
+def flow(depth: Any, ids: Any, depth_2: Any, ids_2: Any, H: Any, t: Any, out: Any, valid: Any) -> None:
+    """Pixel motion: ``z2 (u2, v2, 1) = z H[id] (u, v, 1) + t[id]``, and whether the second image shows the same point."""
+    height, width = ids.shape
+    for y in prange(height):
+        for x in range(width):
+            u = x + 0.5
+            v = y + 0.5
+            k = ids[y, x]
+            m = H[k]
+            z = depth[y, x]
+            sky = not z < np.inf
+            a = m[0, 0] * u + m[0, 1] * v + m[0, 2]
+            b = m[1, 0] * u + m[1, 1] * v + m[1, 2]
+            c = m[2, 0] * u + m[2, 1] * v + m[2, 2]
+            if not sky:
+                a = z * a + t[k, 0]
+                b = z * b + t[k, 1]
+                c = z * c + t[k, 2]
+            if c <= 1e-6:
+                out[y, x, 0] = 0.0
+                out[y, x, 1] = 0.0
+                valid[y, x] = False
+                continue
+            u2 = a / c
+            v2 = b / c
+            out[y, x, 0] = u2 - u
+            out[y, x, 1] = v2 - v
+            valid[y, x] = False
+            if u2 < 0.0 or v2 < 0.0 or u2 >= width or v2 >= height:
+                continue
+            i = int(u2)
+            j = int(v2)
+            if ids_2[j, i] != k:
+                continue
+            if sky:
+                valid[y, x] = not depth_2[j, i] < np.inf
+                continue
+            if abs(depth_2[j, i] - c) < 0.01 * c:
+                valid[y, x] = True
+                continue
+            # Steep planes change by more than that within a pixel; 1/z is linear in the image.
+            fx = u2 - 0.5
+            fy = v2 - 0.5
+            i = max(0, min(width - 2, int(math.floor(fx))))
+            j = max(0, min(height - 2, int(math.floor(fy))))
+            fx -= i
+            fy -= j
+            inverse = (1.0 - fy) * ((1.0 - fx) / depth_2[j, i] + fx / depth_2[j, i + 1]) + fy * (
+                (1.0 - fx) / depth_2[j + 1, i] + fx / depth_2[j + 1, i + 1]
+            )
+            valid[y, x] = abs(inverse * c - 1.0) < 0.01

@@ -1,0 +1,313 @@
+"""Quadrotor meshes: families of one shape and one size each, painted from a seed.
+
+A family's size is its own, so a picture tells the family and with it the size: the only scale that one image has.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from flockd.messages import Float32Array, FloatArray
+from flockd.sim import textures
+from flockd.sim.mesh import Mesh
+from flockd.sim.textures import PackedArray
+
+
+@dataclass(frozen=True, eq=False)
+class DroneModel:
+    """One drone's mesh, body FRD, metres, origin at the centre of its bounding box."""
+
+    family: int
+    seed: int
+    vertices: Float32Array
+    """(n, 3)"""
+    triangles: NDArray[np.int32]
+    """(m, 3)"""
+    colours: Float32Array
+    """(m, 3) linear albedo."""
+    texture: NDArray[np.int32]
+    """(m,) number of the machine texture."""
+    uv: FloatArray
+    """(m, 2, 4) texture coordinates in tiles from body (x, y, z, 1)."""
+    hubs: FloatArray
+    """(4, 3) tops of the motors: front right, rear right, rear left, front left (plus frames: front, right, rear, left)."""
+    extent: FloatArray
+    """(2, 3) least and greatest corner, propellers at any angle; a family's own."""
+    size_m: float
+    """Widest horizontal distance, propeller tip to tip."""
+
+
+@functools.cache
+def machine_texels() -> PackedArray:
+    """The packed pyramids of the machine textures, one after another; the same for all worlds."""
+    rng = np.random.default_rng(7)
+    return np.concatenate([textures.pack_pyramid(textures.speckle(rng)) for _ in range(MACHINE_TEXTURES)])
+
+
+MACHINE_TEXTURES = 3
+
+
+def drone_model(family: int, seed: int) -> DroneModel:
+    """The mesh of a family (0 to ``FAMILIES`` - 1), colours and propeller angles from ``seed``."""
+    if not 0 <= family < FAMILIES:
+        raise ValueError(f"family must be from 0 to {FAMILIES - 1}, not {family}")
+    craft = _Craft(np.random.default_rng([family, seed]))
+    _BUILDERS[family](craft)
+    return craft.model(family, seed)
+
+
+class _Craft:
+    """A drone as it is put together, nose along +x, z down, in its builder's own origin."""
+
+    def __init__(self, rng: Generator) -> None:
+        self.rng = rng
+        self.mesh = Mesh()
+        self.hubs: list[FloatArray] = []
+        self.radii: list[float] = []
+        base = float(rng.choice([rng.uniform(0.02, 0.06), rng.uniform(0.12, 0.3), rng.uniform(0.5, 0.75)]))
+        self.body = np.clip(base * rng.uniform(0.85, 1.15, 3), 0.01, 0.8)
+        if rng.random() < 0.3:
+            self.body = _vivid(rng) * 0.8
+        self.frame = np.full(3, rng.uniform(0.015, 0.07)) if rng.random() < 0.7 else np.full(3, rng.uniform(0.3, 0.7))
+        self.front, self.rear = _vivid(rng), _vivid(rng)
+        self.metal = np.full(3, rng.uniform(0.05, 0.5))
+        # Slow or fast: two blades, or the disc they blur into.
+        self.disc = bool(rng.random() < 0.5)
+        self.prop = np.full(3, rng.uniform(0.03, 0.5)) if rng.random() < 0.7 else _vivid(rng) * 0.7
+        self.skin = rng.integers(0, MACHINE_TEXTURES, 2)
+
+    def box(self, centre: tuple[float, float, float], half: tuple[float, float, float], colour: FloatArray, heading: float = 0.0) -> None:
+        self.mesh.box(np.array(centre), half, heading, int(self.skin[0]), colour, (0.3, 0.3))
+
+    def rod(self, a: tuple[float, float, float], b: tuple[float, float, float], radius: float, colours: list[FloatArray], sides: int = 6) -> None:
+        """A tube in equal lengths of the given colours."""
+        start, end = np.array(a), np.array(b)
+        for k, colour in enumerate(colours):
+            near = start + (end - start) * k / len(colours)
+            far = start + (end - start) * (k + 1) / len(colours)
+            self.mesh.frustum(near, far, (radius, radius), sides, int(self.skin[1]), colour, (0.2, 0.2))
+
+    def beam(self, a: tuple[float, float, float], b: tuple[float, float, float], half: tuple[float, float], colours: list[FloatArray]) -> None:
+        """A level box beam in equal lengths of the given colours; half width and half height."""
+        start, end = np.array(a), np.array(b)
+        step = (end - start) / len(colours)
+        heading = math.atan2(step[1], step[0])
+        for k, colour in enumerate(colours):
+            middle = start + step * (k + 0.5)
+            self.box((middle[0], middle[1], middle[2]), (float(np.hypot(step[0], step[1])) / 2, half[0], half[1]), colour, heading)
+
+    def rotor(self, x: float, y: float, z: float, radius: float, motor: tuple[float, float], *, accent: bool) -> None:
+        """A motor standing on (x, y, z), with its propeller. ``motor``: radius and height."""
+        top = z - motor[1]
+        self.rod((x, y, z), (x, y, top), motor[0], [self.metal, (self.front if x > 0 else self.rear) if accent else self.metal], 8)
+        hub = np.array([x, y, top])
+        self.hubs.append(hub)
+        self.radii.append(radius)
+        angle = self.rng.uniform(0, math.pi)
+        lift = np.array([0, 0, 0.004 + 0.01 * radius])
+        if self.disc:
+            self.mesh.frustum(hub - lift, hub - lift - [0, 0, 0.004], (radius, radius), 18, int(self.skin[1]), self.prop, (0.25, 0.25))
+        else:
+            width = 0.075 * radius + 0.004
+            half = math.sqrt(radius**2 - width**2)
+            self.mesh.box(hub - lift, (half, width, 0.002), angle, int(self.skin[1]), self.prop, (0.25, 0.25))
+
+    def model(self, family: int, seed: int) -> DroneModel:
+        vertices = np.vstack(self.mesh.vertices)
+        hubs = np.array(self.hubs)
+        reach = np.array(self.radii)[:, None] * np.array([1.0, 1.0, 0.0])
+        low = np.minimum(vertices.min(0), (hubs - reach).min(0))
+        high = np.maximum(vertices.max(0), (hubs + reach).max(0))
+        # The rotor disc's own thickness is there whichever way the propeller is drawn.
+        low[2] = min(low[2], float((hubs[:, 2] - 0.008 - 0.01 * np.array(self.radii)).min()))
+        centre = (low + high) / 2
+        apart = np.linalg.norm(hubs[:, None, :2] - hubs[None, :, :2], axis=-1)
+        uv = np.concatenate(self.mesh.uv)
+        uv[:, :, 3] += uv[:, :, :3] @ centre + self.rng.uniform(0, 1, 2)
+        return DroneModel(
+            family=family,
+            seed=seed,
+            vertices=(vertices - centre).astype(np.float32),
+            triangles=np.vstack(self.mesh.triangles).astype(np.int32),
+            colours=np.concatenate(self.mesh.tint).astype(np.float32),
+            texture=np.concatenate(self.mesh.texture).astype(np.int32),
+            uv=uv,
+            hubs=hubs - centre,
+            extent=np.stack([low, high]) - centre,
+            size_m=float((apart + np.add.outer(self.radii, self.radii)).max()),
+        )
+
+
+def _vivid(rng: Generator) -> FloatArray:
+    """A strong colour of any hue."""
+    hue = rng.uniform(0, 2 * math.pi)
+    rgb = 0.5 + 0.5 * np.cos(hue + np.array([0.0, -2.1, 2.1]))
+    return np.asarray(np.clip(rgb * rng.uniform(0.3, 0.8) + rng.uniform(0.0, 0.1), 0.02, 0.85))
+
+
+def _corners(x: float, y: float) -> list[tuple[float, float]]:
+    return [(x, y), (-x, y), (-x, -y), (x, -y)]
+
+
+def _thin_x(c: _Craft) -> None:
+    """The common X on thin tubes: 450 mm between opposite motors."""
+    for x, y in _corners(0.16, 0.16):
+        accent = c.front if x > 0 else c.rear
+        c.rod((0.03 * np.sign(x), 0.03 * np.sign(y), 0), (x, y, 0), 0.009, [c.frame, accent, c.frame])
+        c.rotor(x, y, -0.005, 0.12, (0.016, 0.03), accent=True)
+    c.box((0, 0, 0), (0.06, 0.05, 0.006), c.frame)
+    c.box((0, 0, -0.03), (0.055, 0.04, 0.02), c.body)
+    c.box((0.045, 0, -0.03), (0.014, 0.042, 0.012), c.front)
+    c.box((-0.01, 0, 0.03), (0.06, 0.022, 0.02), c.rear)
+    c.rod((-0.02, 0, -0.05), (-0.02, 0, -0.11), 0.004, [c.frame])
+    c.rod((-0.02, 0, -0.11), (-0.02, 0, -0.122), 0.022, [c.body], 8)
+    for y in (-0.06, 0.06):
+        c.beam((-0.07, y, 0.1), (0.07, y, 0.1), (0.005, 0.005), [c.frame])
+        for x in (-0.04, 0.04):
+            c.rod((x, y * 0.6, 0.005), (x, y, 0.1), 0.004, [c.frame])
+
+
+def _thick_pod(c: _Craft) -> None:
+    """A stout body on short arms, a camera pod under the nose."""
+    c.box((0, 0, 0), (0.1, 0.06, 0.04), c.body)
+    c.box((0, 0, -0.05), (0.075, 0.045, 0.014), c.body * 0.8)
+    c.box((-0.085, 0, -0.005), (0.03, 0.045, 0.03), c.rear)
+    c.box((0.085, 0, -0.015), (0.025, 0.05, 0.02), c.front)
+    c.box((0.0, 0, -0.066), (0.03, 0.025, 0.004), c.front)
+    c.rod((0.07, 0, 0.04), (0.07, 0, 0.06), 0.015, [c.metal], 8)
+    c.box((0.075, 0, 0.085), (0.03, 0.028, 0.026), c.frame)
+    c.rod((0.1, 0, 0.085), (0.125, 0, 0.085), 0.02, [c.metal, np.full(3, 0.02)], 10)
+    for x, y in _corners(0.115, 0.125):
+        accent = c.front if x > 0 else c.rear
+        c.beam((0.5 * x, 0.4 * y, -0.01), (x, y, -0.01), (0.018, 0.014), [c.body, accent])
+        c.rotor(x, y, -0.02, 0.1, (0.019, 0.026), accent=False)
+        c.rod((x, y, 0.0), (x, y, 0.085), 0.009, [c.body, accent])
+
+
+def _folding(c: _Craft) -> None:
+    """A sleek camera drone: front arms swept forward and high, rear arms low."""
+    c.box((0.0, 0, 0), (0.11, 0.038, 0.026), c.body)
+    c.box((-0.015, 0, -0.032), (0.08, 0.032, 0.01), c.body * 1.1)
+    c.box((-0.1, 0, -0.003), (0.02, 0.034, 0.02), c.rear)
+    c.box((0.112, 0, -0.004), (0.012, 0.03, 0.016), np.full(3, 0.03))
+    c.box((0.03, 0, -0.0435), (0.03, 0.012, 0.002), c.front)
+    c.box((0.105, 0, 0.036), (0.022, 0.02, 0.016), c.frame)
+    c.rod((0.125, 0, 0.036), (0.142, 0, 0.036), 0.011, [np.full(3, 0.02)], 8)
+    for y in (1.0, -1.0):
+        c.beam((0.08, 0.035 * y, -0.012), (0.13, 0.15 * y, -0.012), (0.012, 0.009), [c.body, c.body, c.front])
+        c.rotor(0.13, 0.15 * y, -0.02, 0.105, (0.015, 0.022), accent=True)
+        c.rod((0.125, 0.145 * y, -0.005), (0.125, 0.145 * y, 0.055), 0.007, [c.body, c.front])
+        c.beam((-0.08, 0.035 * y, 0.012), (-0.11, 0.135 * y, 0.012), (0.012, 0.009), [c.body, c.body, c.rear])
+        c.rotor(-0.11, 0.135 * y, 0.004, 0.105, (0.015, 0.022), accent=True)
+
+
+def _racer(c: _Craft) -> None:
+    """A small racing frame: flat plates, a canopy, a tilted camera."""
+    c.box((0, 0, 0), (0.055, 0.02, 0.0025), c.frame)
+    c.box((0, 0, -0.024), (0.05, 0.018, 0.0015), c.frame)
+    for x, y in _corners(0.04, 0.014):
+        c.rod((x, y, 0), (x, y, -0.024), 0.003, [c.front if x > 0 else c.rear])
+    c.box((-0.005, 0, -0.037), (0.036, 0.017, 0.012), c.body)
+    c.box((0.05, 0, -0.014), (0.01, 0.01, 0.011), c.front)
+    c.rod((0.06, 0, -0.015), (0.07, 0, -0.018), 0.008, [np.full(3, 0.02)], 8)
+    c.box((-0.005, 0, -0.0505), (0.012, 0.0175, 0.002), c.rear)
+    c.rod((-0.05, 0, -0.02), (-0.08, 0, -0.055), 0.0035, [c.frame, c.rear])
+    for x, y in _corners(0.066, 0.062):
+        c.beam((0.2 * x, 0.2 * y, 0), (x, y, 0), (0.007, 0.003), [c.frame, c.frame, c.front if x > 0 else c.rear])
+        c.rotor(x, y, -0.002, 0.0635, (0.0125, 0.018), accent=True)
+
+
+def _h_frame(c: _Craft) -> None:
+    """Two long booms joined by crossbars, payload slung between."""
+    for y in (-0.2, 0.2):
+        c.beam((-0.22, y, 0), (0.22, y, 0), (0.013, 0.013), [c.rear, c.frame, c.body, c.frame, c.front])
+    for x in (-0.09, 0.09):
+        c.beam((x, -0.2, 0.006), (x, 0.2, 0.006), (0.011, 0.008), [c.frame, c.body, c.frame])
+    c.box((0, 0, -0.012), (0.12, 0.07, 0.008), c.frame)
+    c.box((-0.02, 0, -0.045), (0.07, 0.045, 0.026), c.body)
+    c.box((0.06, 0, -0.038), (0.016, 0.05, 0.018), c.front)
+    c.box((-0.11, 0, -0.028), (0.02, 0.04, 0.012), c.rear)
+    c.box((0.0, 0, 0.04), (0.085, 0.035, 0.03), c.body * 0.7)
+    for x, y in _corners(0.21, 0.2):
+        c.rotor(x, y, -0.012, 0.14, (0.02, 0.034), accent=True)
+        c.rod((x * 0.6, y, 0), (x * 0.7, y, 0.13), 0.007, [c.frame, c.front if x > 0 else c.rear])
+
+
+def _plus(c: _Craft) -> None:
+    """Arms ahead, astern and abeam."""
+    c.rod((0, 0, -0.035), (0, 0, 0.02), 0.075, [c.body], 12)
+    c.rod((0, 0, -0.06), (0, 0, -0.035), 0.05, [c.body * 0.75], 12)
+    c.box((0.06, 0, -0.02), (0.03, 0.022, 0.014), c.front)
+    c.box((-0.07, 0, -0.01), (0.025, 0.03, 0.016), c.rear)
+    c.box((0, 0, 0.042), (0.05, 0.03, 0.024), c.frame)
+    for x, y, accent in ((0.26, 0.0, c.front), (0.0, 0.26, c.body), (-0.26, 0.0, c.rear), (0.0, -0.26, c.body)):
+        c.beam((0.2 * x, 0.2 * y, 0), (x, y, 0), (0.011, 0.011), [c.frame, accent, c.frame, accent])
+        c.rotor(x, y, -0.01, 0.13, (0.018, 0.03), accent=bool(x))
+        c.rod((0.45 * x, 0.45 * y, 0.01), (0.55 * x, 0.55 * y, 0.12), 0.006, [c.frame])
+
+
+def _ducted(c: _Craft) -> None:
+    """Four ducts around a small body."""
+    c.box((0, 0, -0.004), (0.075, 0.03, 0.018), c.body)
+    c.box((0.0, 0, -0.03), (0.045, 0.024, 0.01), c.body * 0.8)
+    c.box((0.075, 0, -0.004), (0.014, 0.018, 0.014), c.front)
+    c.rod((0.085, 0, -0.004), (0.098, 0, -0.004), 0.009, [np.full(3, 0.02)], 8)
+    c.box((-0.075, 0, -0.004), (0.014, 0.024, 0.014), c.rear)
+    for x, y in _corners(0.082, 0.085):
+        accent = c.front if x > 0 else c.rear
+        _ring(c, x, y, 0.074, 0.08, 0.02, accent, c.body)
+        c.rotor(x, y, 0.012, 0.068, (0.011, 0.02), accent=False)
+        c.beam((x - 0.077, y, 0.014), (x + 0.077, y, 0.014), (0.004, 0.003), [c.frame])
+
+
+def _ring(c: _Craft, x: float, y: float, inner: float, outer: float, half_height: float, first: FloatArray, second: FloatArray) -> None:
+    """A short tube with a wall, every third segment in the first colour."""
+    sides = 12
+    angle = np.arange(sides) * 2 * math.pi / sides
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    rows = [np.column_stack([ring * r + (x, y), np.full(sides, z)])
+            for r, z in ((outer, half_height), (outer, -half_height), (inner, -half_height), (inner, half_height))]  # fmt: skip
+    vertices = np.vstack(rows)
+    faces, tint = [], []
+    for k in range(sides):
+        j = (k + 1) % sides
+        for side in range(4):
+            a, b = side * sides, (side + 1) % 4 * sides
+            faces += [(a + k, a + j, b + j), (a + k, b + j, b + k)]
+            tint += [first if k % 3 == 0 else second] * 2
+    c.mesh.add(vertices, np.array(faces), int(c.skin[0]), np.array(tint), (0.3, 0.3))
+
+
+def _long_legs(c: _Craft) -> None:
+    """A big carbon plate frame on tall skids, with a gimballed camera."""
+    c.box((0, 0, 0.012), (0.1, 0.09, 0.003), c.frame)
+    c.box((0, 0, -0.02), (0.09, 0.08, 0.003), c.frame)
+    for x, y in _corners(0.07, 0.06):
+        c.rod((x, y, 0.012), (x, y, -0.02), 0.006, [c.metal])
+    c.box((-0.01, 0, -0.05), (0.07, 0.045, 0.028), c.body)
+    c.box((0.065, 0, -0.036), (0.014, 0.04, 0.012), c.front)
+    c.box((-0.085, 0, -0.034), (0.014, 0.035, 0.012), c.rear)
+    c.rod((-0.03, 0.0, -0.078), (-0.03, 0.0, -0.14), 0.005, [c.frame])
+    c.rod((-0.03, 0.0, -0.14), (-0.03, 0.0, -0.155), 0.03, [c.front], 8)
+    c.rod((0.06, 0, 0.012), (0.06, 0, 0.06), 0.012, [c.metal], 8)
+    c.box((0.06, 0, 0.09), (0.035, 0.03, 0.032), c.body * 0.6)
+    c.rod((0.09, 0, 0.09), (0.12, 0, 0.09), 0.022, [np.full(3, 0.02)], 10)
+    for x, y in _corners(0.235, 0.235):
+        accent = c.front if x > 0 else c.rear
+        c.rod((0.25 * x, 0.25 * y, -0.004), (x, y, -0.004), 0.013, [c.frame, c.frame, accent, c.frame], 8)
+        c.rotor(x, y, -0.015, 0.165, (0.024, 0.034), accent=True)
+    for y in (-1.0, 1.0):
+        c.rod((-0.16, 0.17 * y, 0.26), (0.16, 0.17 * y, 0.26), 0.009, [c.rear, c.frame, c.front])
+        for x in (-0.05, 0.05):
+            c.rod((x, 0.06 * y, 0.01), (1.4 * x, 0.17 * y, 0.26), 0.008, [c.frame, c.body])
+
+
+_BUILDERS = (_thin_x, _thick_pod, _folding, _racer, _h_frame, _plus, _ducted, _long_legs)
+FAMILIES: int = len(_BUILDERS)
+"""How many shapes there are."""

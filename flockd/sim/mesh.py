@@ -1,0 +1,147 @@
+"""Solids as triangles: boxes, cylinders, cones and lumps, with their materials.
+
+Axes are right-handed with z down (NED, or a body's FRD). Outer faces wind counter-clockwise seen from outside.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.random import Generator
+
+from flockd.messages import FloatArray, IntArray
+
+
+def unit(v: FloatArray) -> FloatArray:
+    """Vectors (..., 3) at length 1."""
+    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
+
+
+def _icosphere() -> tuple[FloatArray, IntArray]:
+    """A sphere of 80 triangles."""
+    g = (1 + 5**0.5) / 2
+    v = [(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g), (0, -1, -g), (0, 1, -g),
+         (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1)]  # fmt: skip
+    faces = [(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6),
+             (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10),
+             (8, 6, 7), (9, 8, 1)]  # fmt: skip
+    points = [tuple(p) for p in unit(np.array(v, float))]
+    index = {p: i for i, p in enumerate(points)}
+
+    def middle(a: int, b: int) -> int:
+        p = tuple(unit(np.array(points[min(a, b)]) + np.array(points[max(a, b)])))
+        if p not in index:
+            index[p] = len(points)
+            points.append(p)
+        return index[p]
+
+    split = []
+    for a, b, c in faces:
+        ab, bc, ca = middle(a, b), middle(b, c), middle(c, a)
+        split += [(a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca)]
+    return np.array(points), np.array(split)
+
+
+_SPHERE = _icosphere()
+
+
+class Mesh:
+    """Triangles as they are collected."""
+
+    def __init__(self) -> None:
+        self.vertices: list[FloatArray] = []
+        self.triangles: list[IntArray] = []
+        self.texture: list[IntArray] = []
+        self.uv: list[FloatArray] = []
+        self.tint: list[FloatArray] = []
+        self.count = 0
+
+    def add(
+        self,
+        vertices: FloatArray,
+        triangles: IntArray,
+        texture: int,
+        tint: FloatArray,
+        tile: tuple[float, float],
+        origin: FloatArray | None = None,
+    ) -> None:
+        """Triangles of one texture; ``tile`` is its width and height in metres, columns level, rows downhill from ``origin``."""
+        corner = vertices[triangles]
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        normal = normal / np.maximum(1e-12, np.linalg.norm(normal, axis=1, keepdims=True))
+        level = np.abs(normal[:, 2]) > 0.98
+        across = np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)
+        across[level] = (0.0, 1.0, 0.0)
+        across = unit(across)
+        downhill = np.cross(normal, across)
+        downhill *= np.where(downhill[:, 2:] < 0, -1.0, 1.0)
+        base = vertices[0] if origin is None else origin
+        uv = np.empty((len(triangles), 2, 4))
+        uv[:, 0, :3] = across / tile[0]
+        uv[:, 1, :3] = downhill / tile[1]
+        uv[:, :, 3] = -uv[:, :, :3] @ base
+        self.vertices.append(vertices)
+        self.triangles.append(triangles + self.count)
+        self.count += len(vertices)
+        self.texture.append(np.full(len(triangles), texture))
+        self.uv.append(uv)
+        self.tint.append(np.broadcast_to(tint, (len(triangles), 3)))
+
+    def box(
+        self,
+        centre: FloatArray,
+        half: tuple[float, float, float],
+        heading: float,
+        texture: int,
+        tint: FloatArray,
+        tile: tuple[float, float] = (2.0, 2.0),
+    ) -> None:
+        """A closed box; ``half`` along the heading, across it, and vertically."""
+        signs = np.array([(x, y, z) for z in (1, -1) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))], float)
+        self.add(turn(signs * half, heading) + centre, _BOX, texture, tint, tile)
+
+    def frustum(
+        self,
+        base: FloatArray,
+        tip: FloatArray,
+        radius: tuple[float, float],
+        sides: int,
+        texture: int,
+        tint: FloatArray,
+        tile: tuple[float, float] = (1.0, 2.0),
+    ) -> None:
+        """A closed cylinder or cone between two points."""
+        axis = unit(tip - base)
+        side = unit(np.cross(axis, np.array([0.3, 0.9, 0.1])))
+        other = np.cross(axis, side)
+        angle = np.arange(sides) * 2 * math.pi / sides
+        ring = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * other
+        vertices = np.vstack([base + radius[0] * ring, tip + radius[1] * ring, base[None], tip[None]])
+        k = np.arange(sides)
+        following = (k + 1) % sides
+        walls = np.vstack([np.stack([k, following, k + sides], 1), np.stack([following, following + sides, k + sides], 1)])
+        caps = np.vstack([np.stack([following, k, np.full(sides, 2 * sides)], 1)]
+                         + ([np.stack([k + sides, following + sides, np.full(sides, 2 * sides + 1)], 1)] if radius[1] > 0 else []))  # fmt: skip
+        if radius[1] == 0:
+            walls = walls[:sides]
+        self.add(vertices, np.vstack([walls, caps]), texture, tint, tile)
+
+    def blob(self, centre: FloatArray, radii: FloatArray, rough: float, rng: Generator, texture: int, tint: FloatArray, tile: float) -> None:
+        """A lumpy ellipsoid; each facet a slightly different shade."""
+        sphere, faces = _SPHERE
+        lumpy = sphere * (1.0 + rough * rng.uniform(-1, 1, (len(sphere), 1)))
+        shades = tint * rng.uniform(0.85, 1.15, (len(faces), 1))
+        self.add(turn(lumpy, rng.uniform(0, 6.28)) * radii + centre, faces, texture, shades, (tile, tile))
+
+
+_BOX = np.array(
+    [(0, 1, 2), (0, 2, 3), (4, 6, 5), (4, 7, 6), (0, 5, 1), (0, 4, 5), (1, 6, 2), (1, 5, 6), (2, 7, 3), (2, 6, 7),
+     (3, 4, 0), (3, 7, 4)]  # fmt: skip
+)
+
+
+def turn(points: FloatArray, heading: float) -> FloatArray:
+    """Points (n, 3) turned clockwise from north by ``heading``."""
+    c, s = math.cos(heading), math.sin(heading)
+    return points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])

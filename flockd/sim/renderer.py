@@ -1,0 +1,217 @@
+"""Camera images of a world with drones in it: colour, exact metric depth and instance ids, on the CPU.
+
+Triangles become homogeneous edge functions (no clipping), the nearest one of each pixel is found in horizontal bands in
+parallel, and only what is seen is shaded. The result does not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockd.messages import BoolArray, Float32Array, FloatArray, IntArray, UInt8Array
+from flockd.sim import _raster, textures
+from flockd.sim.drone_models import DroneModel, machine_texels
+from flockd.sim.world import GROUND_MAP_BITS, SKY_BITS, World
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What one camera sees."""
+
+    rgb: UInt8Array
+    """(h, w, 3)"""
+    depth: Float32Array
+    """(h, w) metres along the optical axis at the pixel's centre; inf for sky."""
+    ids: UInt8Array
+    """(h, w) 0 for the world and sky, k for drone k - 1."""
+
+
+class Renderer:
+    """Draws one world and one flock from any camera. Holds no state that changes between images."""
+
+    def __init__(self, world: World, drones: Sequence[DroneModel]) -> None:
+        if len(drones) > 255:
+            raise ValueError(f"ids are bytes: at most 255 drones, not {len(drones)}")
+        self._world = world
+        self._drones = tuple(drones)
+        self._machine = machine_texels()
+        self._normals = [_normals(d) for d in self._drones]
+        codes = world.tone.astype(np.float64)
+        # The middle of the linear values that show as each byte.
+        self._linear = np.interp(np.arange(256), codes[: 1 + int(codes.argmax())], (np.arange(1 + int(codes.argmax())) / 1024.0) ** 2)
+
+    def render(
+        self,
+        matrix: FloatArray,
+        size: tuple[int, int],
+        R_ned_camera: FloatArray,
+        position_ned: FloatArray,
+        *,
+        drone_rotations: FloatArray,
+        drone_positions: FloatArray,
+        shown: BoolArray | Sequence[int] | IntArray,
+    ) -> View:
+        """One image.
+
+        ``matrix`` (3, 3) is the pinhole K for pixel centres at +0.5, ``size`` (width, height), ``R_ned_camera`` (3, 3) takes
+        optical RDF axes to NED, ``position_ned`` (3,) m. ``drone_rotations`` (n, 3, 3) are R_ned_body and ``drone_positions``
+        (n, 3) NED m, one of each drone of the constructor. ``shown``: a mask (n,) or indices; the others are not seen, but
+        every drone with a finite position casts its shadow.
+        """
+        world = self._world
+        width, height = size
+        count = len(self._drones)
+        rotations = np.asarray(drone_rotations, dtype=np.float64).reshape(-1, 3, 3)
+        positions = np.asarray(drone_positions, dtype=np.float64).reshape(-1, 3)
+        if len(rotations) != count or len(positions) != count:
+            raise ValueError(f"{count} drones need {count} poses, not {len(rotations)} rotations and {len(positions)} positions")
+        K = np.ascontiguousarray(matrix, dtype=np.float64)
+        R = np.ascontiguousarray(R_ned_camera, dtype=np.float64)
+        origin = np.ascontiguousarray(position_ned, dtype=np.float64)
+        inverse_K = np.linalg.inv(K)
+        focal = float(np.sqrt(K[0, 0] * K[1, 1]))
+        P = np.ascontiguousarray(K @ R.T)
+
+        q = _raster.project_vertices(world.vertices, P, origin)
+        rows, planes = _set_up(q, world.triangles, width, height)
+        inverse_depth = np.empty((height, width), dtype=np.float32)
+        hit = np.empty((height, width), dtype=np.int32)
+        _raster.fill(_raster.list_visible(rows), rows, planes, inverse_depth, hit, _raster.BAND_ORDER)
+
+        view = View(
+            rgb=np.empty((height, width, 3), dtype=np.uint8),
+            depth=np.empty((height, width), dtype=np.float32),
+            ids=np.zeros((height, width), dtype=np.uint8),
+        )
+        blobs, blob_rows = self._shadows(positions, P, origin, width, height)
+        _raster.shade_scene(
+            hit, planes, inverse_K, R, origin, focal, world.normals, world.texture, world.uv, world.tint, world.texels,
+            textures.TEXTURE_BITS, world.ground_map, GROUND_MAP_BITS, world.ground_kind, world.ground_detail, world.extent_m,
+            world.shadow_map, world.shadow_frame, world.light, world.fog_per_m, world.sky, SKY_BITS, world.tone, blobs,
+            blob_rows, view.rgb, view.depth,
+        )  # fmt: skip
+        chosen = np.arange(count)[np.asarray(shown)] if len(np.asarray(shown)) else np.arange(0)
+        distance = np.linalg.norm(positions[chosen] - origin, axis=1)
+        for k in chosen[np.argsort(-distance, kind="stable")]:
+            self._draw(int(k), rotations[k], positions[k], K, inverse_K, R, origin, focal, view)
+        return view
+
+    def _draw(
+        self,
+        k: int,
+        rotation: FloatArray,
+        position: FloatArray,
+        K: FloatArray,
+        inverse_K: FloatArray,
+        R: FloatArray,
+        origin: FloatArray,
+        focal: float,
+        view: View,
+    ) -> None:
+        """Lay drone k over the view, supersampled within its bounding rectangle."""
+        world, model = self._world, self._drones[k]
+        height, width = view.ids.shape
+        vertices = np.ascontiguousarray(model.vertices.astype(np.float64) @ rotation.T + (position - origin))
+        P = K @ R.T
+        left, top, right, bottom = _bounds(vertices @ P.T, width, height)
+        if left >= right or top >= bottom:
+            return
+        s = _raster.SUBSAMPLES
+        zoom = np.array([[s, 0.0, -s * left], [0.0, s, -s * top], [0.0, 0.0, 1.0]])
+        wide, high = s * (right - left), s * (bottom - top)
+        q = _raster.project_vertices(vertices, np.ascontiguousarray(zoom @ P), np.zeros(3))
+        rows, planes = _set_up(q, model.triangles, wide, high)
+        inverse_depth = np.empty((high, wide), dtype=np.float32)
+        hit = np.empty((high, wide), dtype=np.int32)
+        _raster.fill(_raster.list_visible(rows), rows, planes, inverse_depth, hit, _raster.BAND_ORDER)
+        _raster.shade_drone(
+            hit, inverse_depth, planes, left, top, inverse_K, R, origin, focal, np.ascontiguousarray(rotation), position,
+            self._normals[k] @ rotation.T, model.texture, model.uv, model.colours, self._machine, textures.TEXTURE_BITS,
+            world.shadow_map, world.shadow_frame, world.light, world.fog_per_m, world.tone, self._linear, k + 1,
+            view.rgb, view.depth, view.ids,
+        )  # fmt: skip
+
+    def _shadows(self, positions: FloatArray, P: FloatArray, origin: FloatArray, width: int, height: int) -> tuple[FloatArray, IntArray]:
+        """Discs that stand for the drones in the sun, and per image row the columns that their ground shadows may touch."""
+        world = self._world
+        sun = world.light[0]
+        rows = np.zeros((height, 2), dtype=np.int64)
+        blobs = []
+        for model, position in zip(self._drones, positions, strict=True):
+            if not np.isfinite(position).all():
+                continue
+            # A quadrotor fills roughly half of the disc around it.
+            radius = 0.36 * model.size_m
+            blobs.append((*position, radius, 0.6))
+            ground = -world.height_at(position[:1], position[1:2])[0]
+            foot = position - sun * (max(0.0, ground - position[2]) / -sun[2])
+            reach = 2.0 * radius + 0.02 * (ground - position[2])
+            spread = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-0.4, 0.4)]) * reach / -sun[2]
+            left, top, right, bottom = _bounds((foot + spread - origin) @ P.T, width, height)
+            if left < right and top < bottom:
+                empty = rows[top:bottom, 1] == 0
+                rows[top:bottom, 0] = np.where(empty, left, np.minimum(rows[top:bottom, 0], left))
+                rows[top:bottom, 1] = np.maximum(rows[top:bottom, 1], right)
+        return np.array(blobs, dtype=np.float64).reshape(-1, 5), rows
+
+
+def _normals(model: DroneModel) -> FloatArray:
+    corner = model.vertices.astype(np.float64)[model.triangles]
+    normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    return np.asarray(normals / np.maximum(1e-15, np.linalg.norm(normals, axis=1, keepdims=True)))
+
+
+def _set_up(q: FloatArray, triangles: IntArray, width: int, height: int) -> tuple[IntArray, FloatArray]:
+    rows = np.empty((len(triangles), 2), dtype=np.int32)
+    planes = np.empty((len(triangles), 12))
+    _raster.set_up_triangles(q, triangles, width, height, rows, planes)
+    return rows, planes
+
+
+def _bounds(q: FloatArray, width: int, height: int) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom (exclusive) of homogeneous points, within the image; all of it when one is behind."""
+    if (q[:, 2] <= 0).all():
+        return 0, 0, 0, 0
+    if (q[:, 2] <= 1e-3).any():
+        return 0, 0, width, height
+    pixels = q[:, :2] / q[:, 2:]
+    low = np.clip(np.floor(pixels.min(0)), 0, (width, height)).astype(int)
+    high = np.clip(np.ceil(pixels.max(0)) + 1, 0, (width, height)).astype(int)
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
+def true_flow(
+    first: View,
+    second: View,
+    matrix: FloatArray,
+    *,
+    R_ned_camera: tuple[FloatArray, FloatArray],
+    position_ned: tuple[FloatArray, FloatArray],
+    drone_rotations: tuple[FloatArray, FloatArray],
+    drone_positions: tuple[FloatArray, FloatArray],
+) -> tuple[Float32Array, BoolArray]:
+    """Where every pixel of the first image went in the second: flow (h, w, 2) in pixels, valid (h, w).
+
+    Poses come in pairs (first, second), shaped as for ``Renderer.render``. Sky moves as a point at infinity. Valid: in front of
+    the second camera, within its image, and seen there (same id, and a depth that agrees).
+    """
+    h, w = first.ids.shape
+    K = np.asarray(matrix, dtype=np.float64)
+    flow = np.empty((h, w, 2), dtype=np.float32)
+    valid = np.empty((h, w), dtype=np.bool_)
+    # From the first camera's axes to the second's, for the world (0) and for each drone (k + 1): p2 = A p1 + b.
+    count = len(drone_positions[0])
+    A = np.empty((count + 1, 3, 3))
+    b = np.empty((count + 1, 3))
+    (R1, R2), (p1, p2) = R_ned_camera, position_ned
+    A[0], b[0] = R2.T @ R1, R2.T @ (p1 - p2)
+    for k in range(count):
+        turn = drone_rotations[1][k] @ drone_rotations[0][k].T
+        A[k + 1] = R2.T @ turn @ R1
+        b[k + 1] = R2.T @ (turn @ (p1 - drone_positions[0][k]) + drone_positions[1][k] - p2)
+    inverse_K = np.linalg.inv(K)
+    _raster.flow(first.depth, first.ids, second.depth, second.ids, K @ A @ inverse_K, b @ K.T, flow, valid)
+    return flow, valid
