@@ -42,6 +42,13 @@ def load_scenario(path: Path | str, overrides: Overrides | None = None) -> Scena
     return _validated(ScenarioConfig, document)
 
 
+def load(path: Path | str) -> DroneConfig | ScenarioConfig:
+    """A drone's or a scenario's configuration, whichever the file's keys speak for. Raises ConfigError."""
+    keys = read_document(Path(path)).values.keys()
+    is_drone = len(keys & DroneConfig.model_fields.keys()) > len(keys & ScenarioConfig.model_fields.keys())
+    return load_drone(path) if is_drone else load_scenario(path)
+
+
 def schema_of(kind: Literal["drone", "scenario"]) -> dict[str, Any]:
     """The JSON schema of a configuration file, for editors and other tools."""
     if kind == "drone":

@@ -1,0 +1,56 @@
+"""The command line: `flockd COMMAND ...`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+
+from flockd import __version__
+from flockd.cli import config, models, report, sim
+from flockd.cli.parser import Parser, add_commands
+from flockd.errors import ExitCode, FlockdError, UnavailableError
+
+# Packages of an extra: without them a command is unavailable, not broken.
+EXTRAS = {"numba": "sim", "llvmlite": "sim", "matplotlib": "sim", "jinja2": "sim"}
+INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command and returns its exit code; an expected error is one sentence on stderr."""
+    args = _parser().parse_args(arguments)
+    try:
+        code: int = args.run(args)
+        sys.stdout.flush()
+    except FlockdError as error:
+        return _failed(str(error), error.exit_code)
+    except ModuleNotFoundError as error:
+        extra = EXTRAS.get((error.name or "").partition(".")[0])
+        if extra is None:
+            raise
+        missing = UnavailableError(f"{error.name} is not installed; run: pip install 'flockd[{extra}]'")
+        return _failed(str(missing), missing.exit_code)
+    except BrokenPipeError:  # the reader of our output has gone; Python would complain once more at its end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return ExitCode.DONE
+    except OSError as error:
+        return _failed(f"{error.filename or 'the system'}: {error.strerror or error}", ExitCode.UNAVAILABLE)
+    except KeyboardInterrupt:
+        return _failed("interrupted", INTERRUPTED)
+    return code
+
+
+def _failed(sentence: str, code: int) -> int:
+    sys.stderr.write(f"{sentence}\n")
+    return code
+
+
+def _parser() -> Parser:
+    parser = Parser(
+        prog="flockd",
+        description="Drones that flock by sight alone.",
+        examples=("flockd sim", "flockd config check config/paper_flight.yaml"),
+    )
+    parser.add_argument("--version", action="version", version=f"flockd {__version__}")
+    add_commands(parser, (sim.add, report.add, config.add, models.add))
+    return parser

@@ -1,0 +1,85 @@
+"""`flockd config`: checks, shows and describes configuration files."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+
+from flockd.cli.output import say, say_json
+from flockd.cli.parser import Commands, add_commands
+from flockd.errors import ConfigError, ExitCode
+
+
+def add(commands: Commands) -> None:
+    """Adds the command."""
+    examples = ("flockd config check config/paper_flight.yaml", "flockd config show config/simulator.yaml")
+    parser = commands("config", "Check, show and describe configuration files.", examples)
+    add_commands(parser, (_add_check, _add_show, _add_schema))
+
+
+def _add_check(commands: Commands) -> None:
+    examples = ("flockd config check my_flight.yaml", "flockd config check --json config/*.yaml")
+    parser = commands("check", "Tell everything that is wrong with drone and scenario files.", examples)
+    parser.add_argument("files", nargs="+", metavar="FILE", type=Path)
+    parser.add_argument("--json", action="store_true", help="print the problems as JSON")
+    parser.set_defaults(run=_check)
+
+
+def _add_show(commands: Commands) -> None:
+    examples = ("flockd config show config/paper_flight.yaml", "flockd config show --json config/simulator.yaml")
+    parser = commands("show", "Show a file with every default filled in, a scenario with its drone.", examples)
+    parser.add_argument("file", metavar="FILE", type=Path)
+    parser.add_argument("--json", action="store_true", help="print JSON instead of YAML")
+    parser.set_defaults(run=_show)
+
+
+def _add_schema(commands: Commands) -> None:
+    examples = ("flockd config schema drone", "flockd config schema scenario > scenario.schema.json")
+    parser = commands("schema", "Print the JSON schema of a kind of file, for editors and other tools.", examples)
+    parser.add_argument("kind", choices=("drone", "scenario"))
+    parser.set_defaults(run=_schema)
+
+
+def _check(args: argparse.Namespace) -> int:
+    from flockd.config import load
+
+    results: dict[str, ConfigError | None] = {}
+    for file in args.files:
+        try:
+            load(file)
+        except ConfigError as error:
+            results[str(file)] = error
+        else:
+            results[str(file)] = None
+    failed = [error for error in results.values() if error is not None]
+    problems = sorted({problem for error in failed for problem in error.problems})
+    if args.json:
+        say_json({"ok": not failed, "problems": [asdict(problem) for problem in problems]})
+        return ExitCode.BAD_CONFIGURATION if failed else ExitCode.DONE
+    for file, fault in results.items():
+        if fault is None:
+            say(f"{file}: fine")
+    if failed:
+        raise ConfigError(problems)
+    return ExitCode.DONE
+
+
+def _show(args: argparse.Namespace) -> int:
+    import yaml
+
+    from flockd.config import load
+
+    values = load(args.file).model_dump(mode="json")
+    if args.json:
+        say_json(values)
+    else:
+        say(yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100).rstrip())
+    return ExitCode.DONE
+
+
+def _schema(args: argparse.Namespace) -> int:
+    from flockd.config import schema_of
+
+    say_json(schema_of(args.kind))
+    return ExitCode.DONE

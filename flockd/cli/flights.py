@@ -1,0 +1,86 @@
+"""The folder of a flight: its log, its summary, its report, and what a person is told of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from flockd.cli.output import say, say_json
+from flockd.errors import ExitCode, UsageError
+
+if TYPE_CHECKING:
+    from flockd.sim.log import FlightLog
+    from flockd.sim.swarm import Flight
+
+LOG_NAME = "flight.npz"
+FILMSTRIP_NAME = "filmstrip.npz"
+SUMMARY_NAME = "summary.json"
+REPORT_NAME = "report.html"
+
+
+def prepare(directory: Path) -> None:
+    """Makes the folder; raises UsageError when it holds something else than an earlier flight."""
+    if directory.exists() and not directory.is_dir():
+        raise UsageError(f"{directory}: is a file; name a folder with --out")
+    if directory.is_dir() and any(directory.iterdir()) and not (directory / LOG_NAME).is_file():
+        raise UsageError(f"{directory}: holds other files than a flight's; name a new or empty folder with --out")
+    directory.mkdir(parents=True, exist_ok=True)
+
+
+def save(directory: Path, flight: Flight) -> None:
+    """Writes the flight's log, and its pictures if there are any, over those of an earlier flight."""
+    from flockd.report.filmstrip import save_filmstrip
+
+    flight.log.save(directory / LOG_NAME)
+    (directory / FILMSTRIP_NAME).unlink(missing_ok=True)
+    if flight.filmstrip:
+        save_filmstrip(directory / FILMSTRIP_NAME, flight.filmstrip)
+
+
+def write_findings(directory: Path, log: FlightLog) -> dict[str, Any]:
+    """Writes the summary and the report beside the flight's log, and returns the summary."""
+    from flockd.report.page import write_report
+    from flockd.report.summary import summarise, write_summary
+
+    summary = summarise(log)
+    write_summary(summary, directory / SUMMARY_NAME)
+    write_report(directory)
+    return summary
+
+
+def tell(directory: Path, summary: Mapping[str, Any], *, as_json: bool) -> int:
+    """Prints the summary as JSON, or its key figures and where the report is."""
+    if as_json:
+        say_json(summary)
+        return ExitCode.DONE
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(justify="left")
+    table.add_column(justify="right")
+    for name, value in _key_figures(summary).items():
+        table.add_row(name, value)
+    Console(markup=False, highlight=False).print(table)
+    say(f"report: {directory / REPORT_NAME}")
+    return ExitCode.DONE
+
+
+def _key_figures(summary: Mapping[str, Any]) -> dict[str, str]:
+    flock, neighbours = summary["flock"], summary["neighbours"]
+    figures = {
+        "drones": f"{summary['drones']}",
+        "flown": f"{summary['duration_s']:g} s",
+        "speed": _number(summary["realtime_factor"], "x real time", 2),
+        "closest two drones": _number(flock["min_distance_m"], "m", 2),
+        "order at the end": _number(flock["order_tail"], "of 1", 3),
+        "union at the end": _number(flock["union_tail"], "of 1", 2),
+        "neighbours known within 10 m": _number(neighbours["recall_within_10m"], "of 1", 3),
+        "false neighbours": _number(neighbours["false_per_drone_minute"], "a drone and minute", 2),
+    }
+    return {name: value for name, value in figures.items() if value}
+
+
+def _number(value: float | None, unit: str, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f} {unit}"

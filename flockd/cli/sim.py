@@ -1,0 +1,120 @@
+"""`flockd sim`: flies a simulated flock and reports on it."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flockd.cli.flights import prepare, save, tell, write_findings
+from flockd.cli.output import progress
+from flockd.cli.parser import Commands, positive_count, positive_number, seed
+from flockd.errors import UsageError
+
+if TYPE_CHECKING:
+    from flockd.config import Overrides, ScenarioConfig
+
+SCENARIO = "paper_flight.yaml"
+ROLES = ("flow", "depth", "segmentation", "distance")
+OPTIONS = {
+    "duration": "duration_s",
+    "seed": "seed",
+    "flow": "drone.perception.flow",
+    "scale": "drone.perception.scale",
+}
+"""Which key of the configuration an option sets."""
+
+
+def add(commands: Commands) -> None:
+    """Adds the command."""
+    examples = (
+        "flockd sim",
+        "flockd sim --duration 20 --drones 3 --out out/short",
+        "flockd sim --perception truth --json > truth.json",
+        "flockd sim my_flight.yaml --flow dis --seed 7",
+    )
+    parser = commands("sim", "Fly a simulated flock by sight, and report how it went.", examples)
+    parser.add_argument("scenario", nargs="?", metavar="SCENARIO", type=Path, help="by default the paper's flight")
+    parser.add_argument(
+        "--perception",
+        choices=("learned", "truth"),
+        default="learned",
+        help="fly by sight, or on everybody's exact state without looking (default: learned)",
+    )
+    parser.add_argument("--flow", metavar="NAME", help="the model for optical flow, or `dis`")
+    parser.add_argument("--scale", choices=("network", "height"), help="where the background's scale comes from")
+    parser.add_argument("--drones", metavar="N", type=positive_count, help="size of the flock")
+    parser.add_argument("--duration", metavar="S", type=positive_number, help="seconds to fly")
+    parser.add_argument("--seed", metavar="N", type=seed, help="of the world and of all noise")
+    parser.add_argument(
+        "--swap",
+        metavar="ROLE,...",
+        type=_roles,
+        default=frozenset(),
+        help=f"answer these roles exactly instead of by network: {', '.join(ROLES)}",
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, help="default: out/SCENARIO-PERCEPTION-seedN")
+    parser.add_argument("--telemetry", action="store_true", help="publish over zenoh while flying")
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    parser.set_defaults(run=_run)
+
+
+def _roles(text: str) -> frozenset[str]:
+    roles = frozenset(text.split(","))
+    unknown = sorted(roles - set(ROLES))
+    if unknown:
+        raise argparse.ArgumentTypeError(f"{unknown[0]!r} is not a role; the roles are {', '.join(ROLES)}")
+    return roles
+
+
+def _run(args: argparse.Namespace) -> int:
+    _check_options(args)
+    scenario = _scenario(args)
+    directory = args.out or Path("out") / _folder_name(scenario, args)
+    prepare(directory)
+    from flockd.sim.swarm import fly
+
+    with ExitStack() as stack:
+        telemetry = None
+        if args.telemetry:
+            from flockd.telemetry.publisher import ZenohTelemetry
+
+            telemetry = stack.enter_context(ZenohTelemetry(_plain(scenario.scenario)))
+        tell_progress = stack.enter_context(progress("flying", "steps"))
+        flight = fly(scenario, perception=args.perception, swap=args.swap, telemetry=telemetry, progress=tell_progress)
+    save(directory, flight)
+    return tell(directory, write_findings(directory, flight.log), as_json=args.json)
+
+
+def _check_options(args: argparse.Namespace) -> None:
+    if args.perception == "truth":
+        idle = [option for option in ("flow", "scale", "swap", "telemetry") if getattr(args, option)]
+        if idle:
+            raise UsageError(f"--{idle[0]} has no meaning when nobody looks; drop it or --perception truth")
+
+
+def _scenario(args: argparse.Namespace) -> ScenarioConfig:
+    """The scenario with the options over it."""
+    from flockd.config import load_scenario
+    from flockd.data import data_path
+    from flockd.sim.start import with_drones
+
+    overrides: Overrides = {
+        key: getattr(args, option) for option, key in OPTIONS.items() if getattr(args, option) is not None
+    }
+    scenario = load_scenario(args.scenario or data_path("config") / SCENARIO, overrides)
+    if round(scenario.duration_s / scenario.drone.step_s) < 1:
+        raise UsageError(f"{scenario.duration_s:g} s is shorter than a step of {scenario.drone.step_s:g} s; fly longer")
+    return scenario if args.drones is None else with_drones(scenario, args.drones)
+
+
+def _folder_name(scenario: ScenarioConfig, args: argparse.Namespace) -> str:
+    swapped = "".join(f"-true-{role}" for role in sorted(args.swap))
+    return f"{_plain(scenario.scenario)}-{args.perception}{swapped}-seed{scenario.seed}"
+
+
+def _plain(name: str) -> str:
+    """A scenario's name as part of a path and of a telemetry key."""
+    return re.sub(r"[^A-Za-z0-9_]+", "-", name).strip("-") or "flight"

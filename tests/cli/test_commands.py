@@ -1,0 +1,261 @@
+"""What a person at a terminal gets: help with examples, one sentence for a slip, and exit codes for scripts."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from flockd.cli import main
+from flockd.cli.sim import ROLES
+from flockd.errors import ModelError
+from flockd.sim import truth_perception
+
+ROOT = Path(__file__).parents[2]
+PAPER_FLIGHT = (ROOT / "config" / "paper_flight.yaml").read_text(encoding="utf-8")
+SIMULATOR = (ROOT / "config" / "simulator.yaml").read_text(encoding="utf-8")
+
+COMMANDS = [
+    [],
+    ["sim"],
+    ["report"],
+    ["config"],
+    ["config", "check"],
+    ["config", "show"],
+    ["config", "schema"],
+    ["models"],
+    ["models", "list"],
+    ["models", "verify"],
+]
+
+
+@pytest.fixture
+def scenario(tmp_path: Path) -> Path:
+    """The paper's flight in a folder of its own, to be spoilt."""
+    (tmp_path / "simulator.yaml").write_text(SIMULATOR, encoding="utf-8")
+    path = tmp_path / "flight.yaml"
+    path.write_text(PAPER_FLIGHT, encoding="utf-8")
+    return path
+
+
+def _usage_error(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    with pytest.raises(SystemExit) as exit_:
+        main(arguments)
+    assert exit_.value.code == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    return captured.err
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_help_shows_examples_of_the_command(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main([*command, "--help"])
+    assert exit_.value.code == 0
+    examples = capsys.readouterr().out.split("examples:\n")[1].splitlines()
+    assert examples
+    assert all(example.startswith("  " + " ".join(["flockd", *command])) for example in examples)
+
+
+def test_help_needs_nothing_but_python() -> None:
+    """Of what is installed, nothing but rich is loaded before a command runs."""
+    heavy = {"numpy", "pydantic", "yaml", "cv2", "onnxruntime", "zenoh", "numba", "matplotlib", "jinja2"}
+    code = f"import sys, flockd.cli; print(*{heavy!r} & set(sys.modules))"
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == ""
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(["--version"])
+    assert exit_.value.code == 0
+    assert capsys.readouterr().out == "flockd 0.1.0\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ([], "flockd: the following arguments are required: COMMAND; see flockd --help"),
+        (["sim", "--duration", "-3"], "flockd sim: argument --duration: '-3' is not a positive number"),
+        (["sim", "--duration", "nan"], "flockd sim: argument --duration: 'nan' is not a positive number"),
+        (["sim", "--drones", "0"], "flockd sim: argument --drones: '0' is not a positive whole number"),
+        (["sim", "--drones", "2.5"], "flockd sim: argument --drones: '2.5' is not a positive whole number"),
+        (["sim", "--seed", "-1"], "flockd sim: argument --seed: '-1' is not a whole number, 0 or more"),
+        (["sim", "--seed", "9" * 5000], f"flockd sim: argument --seed: '{'9' * 5000}' is not a whole number"),
+        (
+            ["sim", "--swap", "flow,eyes"],
+            "flockd sim: argument --swap: 'eyes' is not a role; the roles are flow, depth, segmentation, distance",
+        ),
+    ],
+)
+def test_a_slip_on_the_command_line_is_a_usage_error(
+    arguments: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = _usage_error(capsys, *arguments)
+    assert error.startswith(told)
+    assert error.count("\n") == 1
+
+
+def test_the_roles_to_swap_are_those_that_can_be() -> None:
+    assert truth_perception.ROLES == ROLES
+
+
+@pytest.mark.parametrize("option", [["--flow", "dis"], ["--scale", "height"], ["--swap", "flow"], ["--telemetry"]])
+def test_options_of_sight_are_refused_without_sight(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sim", "--perception", "truth", *option]) == 2
+    told = f"{option[0]} has no meaning when nobody looks; drop it or --perception truth\n"
+    assert capsys.readouterr().err == told
+
+
+CAMERAS = SIMULATOR.split("cameras:")[1].split("perception:")[0]
+SPOILT = {
+    "negative duration": (
+        ("flight.yaml", "duration_s: 110.0", "duration_s: -110.0"),
+        "flight.yaml:3: duration_s: -110.0 is not greater than 0; write a positive number of seconds",
+    ),
+    "unknown key": (
+        ("flight.yaml", "duration_s:", "duration:"),
+        "flight.yaml:3: duration: is not a known key; did you mean `duration_s`?",
+    ),
+    "rig without cameras": (
+        ("simulator.yaml", CAMERAS, " []\n"),
+        "simulator.yaml:5: rig.cameras: has 0 entries; write a list of at least 1 entry",
+    ),
+}
+
+
+@pytest.mark.parametrize("slip", SPOILT)
+@pytest.mark.parametrize("command", [["config", "check"], ["config", "show"], ["sim"]], ids=" ".join)
+def test_a_wrong_scenario_is_told_in_one_sentence(
+    scenario: Path, command: list[str], slip: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (name, old, new), told = SPOILT[slip]
+    spoilt = scenario.with_name(name)
+    spoilt.write_text(spoilt.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
+    assert main([*command, str(scenario)]) == 78
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err == f"{scenario.parent}/{told}\n"
+
+
+def test_a_scenario_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sim", str(tmp_path / "none.yaml")]) == 78
+    assert capsys.readouterr().err == f"{tmp_path / 'none.yaml'}: does not exist; check the path\n"
+
+
+def test_a_flight_shorter_than_a_step_is_refused(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sim", str(scenario), "--duration", "0.1"]) == 2
+    assert capsys.readouterr().err == "0.1 s is shorter than a step of 0.5 s; fly longer\n"
+
+
+def test_config_check_reports_for_people_and_machines(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    drone = scenario.with_name("simulator.yaml")
+    assert main(["config", "check", str(scenario), str(drone)]) == 0
+    assert capsys.readouterr().out == f"{scenario}: fine\n{drone}: fine\n"
+    assert main(["config", "check", "--json", str(scenario)]) == 0
+    assert json.loads(capsys.readouterr().out) == {"ok": True, "problems": []}
+
+    drone.write_text(SIMULATOR.replace("yaw: course", "yaw: corse"), encoding="utf-8")
+    assert main(["config", "check", "--json", str(scenario), str(drone)]) == 78
+    assert json.loads(capsys.readouterr().out) == {
+        "ok": False,
+        "problems": [
+            {"file": str(drone), "line": 30, "key": "yaw", "message": "corse is not known; did you mean `course`?"}
+        ],
+    }, "a problem of a file named twice is told once"
+
+
+def test_every_shipped_configuration_is_fine() -> None:
+    files = [str(path) for path in (ROOT / "config").glob("*.yaml")]
+    assert main(["config", "check", *files]) == 0
+
+
+def test_config_show_fills_in_the_defaults_and_can_be_loaded_again(
+    scenario: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drone = scenario.with_name("simulator.yaml")
+    assert main(["config", "show", "--json", str(drone)]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert values["flocking"]["desired_distance_m"] == 3.5, "the paper's D_d, which the file leaves out"
+    assert main(["config", "show", str(drone)]) == 0
+    drone.write_text(capsys.readouterr().out, encoding="utf-8")
+    assert main(["config", "check", str(drone)]) == 0
+    capsys.readouterr()
+    assert main(["config", "show", "--json", str(drone)]) == 0
+    assert json.loads(capsys.readouterr().out) == values
+
+
+@pytest.mark.parametrize("kind", ["drone", "scenario"])
+def test_config_schema_is_json(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["config", "schema", kind]) == 0
+    schema = json.loads(capsys.readouterr().out)
+    assert schema["type"] == "object"
+    assert schema["additionalProperties"] is False
+
+
+def test_a_folder_with_other_files_is_not_flown_into(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "thesis.txt").write_text("the only copy", encoding="utf-8")
+    assert main(["sim", "--duration", "1", "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err == (
+        f"{tmp_path}: holds other files than a flight's; name a new or empty folder with --out\n"
+    )
+    assert main(["sim", "--duration", "1", "--out", str(tmp_path / "thesis.txt")]) == 2
+    assert capsys.readouterr().err == f"{tmp_path / 'thesis.txt'}: is a file; name a folder with --out\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_a_report_of_no_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["report", str(tmp_path)]) == 2
+    assert capsys.readouterr().err == (
+        f"{tmp_path / 'flight.npz'}: does not exist; name a folder that `flockd sim` wrote\n"
+    )
+
+
+def test_a_report_of_a_damaged_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = tmp_path / "flight.npz"
+    for content in (b"", b"PK\x03\x04 cut off", b"something else"):
+        log.write_bytes(content)
+        assert main(["report", str(tmp_path)]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith(f"{log}: is not a whole flight log (")
+        assert error.count("\n") == 1
+
+
+def test_a_missing_extra_is_unavailable(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def without_numba(_: object) -> int:
+        raise ModuleNotFoundError("No module named 'numba'", name="numba")
+
+    monkeypatch.setattr("flockd.cli.sim._scenario", without_numba)
+    assert main(["sim"]) == 69
+    assert capsys.readouterr().err == "numba is not installed; run: pip install 'flockd[sim]'\n"
+
+
+def test_a_damaged_model_is_bad_configuration(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def damaged(_: object) -> int:
+        raise ModelError("models/flow.yaml: sha256: differs; restore it")
+
+    monkeypatch.setattr("flockd.cli.sim._scenario", damaged)
+    assert main(["sim"]) == 78
+    assert capsys.readouterr().err == "models/flow.yaml: sha256: differs; restore it\n"
+
+
+def test_models_in_an_empty_folder_are_unavailable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for command in ("list", "verify"):
+        assert main(["models", command, "--dir", str(tmp_path)]) == 69
+        assert capsys.readouterr().err == (
+            f"{tmp_path} holds no model manifests; name the folder that does with --dir\n"
+        )
+
+
+def test_verifying_a_damaged_model_fails_the_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "flow.yaml").write_text("name: flow\n", encoding="utf-8")
+    assert main(["models", "verify", "--json", "--dir", str(tmp_path)]) == 1
+    (told,) = json.loads(capsys.readouterr().out)
+    assert (told["model"], told["ok"]) == ("flow", False)
+    assert told["fault"].startswith(f"{tmp_path / 'flow.yaml'}: ")
+    assert main(["models", "list", "--dir", str(tmp_path)]) == 78
