@@ -1,0 +1,125 @@
+"""The folders of flockd keep to their places: who may import whom, and what stays pure."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "flockd"
+
+BASE = {"messages", "config", "errors", "data"}
+"""Under everything: the nouns, the typed configuration, the error types, and where the shipped files are."""
+
+MAY_IMPORT = {
+    "messages": set(),
+    "errors": set(),
+    "data": {"errors"},
+    "config": {"messages", "errors"},
+    "geometry": BASE,
+    "perception": BASE,
+    "tracking": BASE,
+    "flocking": BASE,
+    "safety": BASE,
+    "pilot": BASE | {"geometry", "perception", "tracking", "flocking", "safety"},
+    "sources": BASE,
+    "autopilot": BASE,
+    "telemetry": BASE,
+    "recording": BASE,
+    "sim": BASE | {"geometry", "perception", "tracking", "flocking", "safety", "pilot", "telemetry", "report"},
+    "report": BASE | {"geometry", "flocking", "sim"},
+    "cli": BASE | {"perception", "pilot", "telemetry", "sim", "report"},
+}
+"""What each folder may import of the others."""
+
+PURE = ("messages", "geometry", "perception", "tracking", "flocking", "safety", "pilot")
+"""No clock, no socket, no thread, no environment: what is tested is what flies."""
+IMPURE_MODULES = {
+    "asyncio",
+    "threading",
+    "multiprocessing",
+    "concurrent",
+    "time",
+    "datetime",
+    "socket",
+    "zenoh",
+    "random",
+}
+
+NETWORK_LIBRARIES = {"onnxruntime"}
+"""Only perception runs networks."""
+SIMULATOR_LIBRARIES = {"numba", "matplotlib", "jinja2", "markupsafe"}
+"""Of the extra `sim`: only the simulator and its reports may need them."""
+TOOL_LIBRARIES = {"torch", "onnx", "scipy", "trimesh", "embreex", "pytest"}
+"""For training and tests: nothing in the package may need them."""
+
+
+def _imports(path: Path) -> set[str]:
+    """All modules that a file imports, anywhere in it; `from a.b import c` counts as `a.b` and `a.b.c`."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import; write it in full"
+            assert node.module is not None
+            found.add(node.module)
+            found.update(f"{node.module}.{alias.name}" for alias in node.names)
+    return found
+
+
+def _folder(path: Path) -> str:
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def _imported_folders(path: Path) -> set[str]:
+    parts = [name.split(".") for name in _imports(path) if name.startswith("flockd.")]
+    return {names[1] for names in parts if names[1] != "__version__"}
+
+
+def _libraries(path: Path) -> set[str]:
+    return {name.partition(".")[0] for name in _imports(path)}
+
+
+MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
+
+
+def test_every_folder_has_its_place_in_the_table() -> None:
+    assert {_folder(path) for path in MODULES} <= MAY_IMPORT.keys()
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_a_module_imports_only_what_its_folder_may(path: Path) -> None:
+    folder = _folder(path)
+    assert _imported_folders(path) <= MAY_IMPORT[folder] | {folder}
+
+
+@pytest.mark.parametrize("folder", PURE)
+def test_the_pure_line_knows_no_clock_no_thread_and_no_network(folder: str) -> None:
+    for path in (path for path in MODULES if _folder(path) == folder):
+        assert not _libraries(path) & IMPURE_MODULES, path
+        assert "environ" not in path.read_text(encoding="utf-8"), path
+        assert "getenv" not in path.read_text(encoding="utf-8"), path
+
+
+def test_only_perception_runs_networks() -> None:
+    for path in MODULES:
+        if _folder(path) != "perception":
+            assert not _libraries(path) & NETWORK_LIBRARIES, path
+
+
+def test_what_flies_needs_none_of_the_simulators_libraries() -> None:
+    for path in MODULES:
+        if _folder(path) not in {"sim", "report"}:
+            assert not _libraries(path) & SIMULATOR_LIBRARIES, path
+        assert not _libraries(path) & TOOL_LIBRARIES, path
+
+
+def test_no_drone_reads_telemetry_to_fly() -> None:
+    """Telemetry can be published, and nothing in the package can subscribe to it."""
+    for path in MODULES:
+        if _folder(path) != "telemetry":
+            assert "zenoh" not in _libraries(path), path
+        text = path.read_text(encoding="utf-8")
+        assert not any(word in text for word in ("declare_subscriber", "declare_querier", "declare_queryable")), path
