@@ -1,0 +1,131 @@
+"""The record of a simulated flight: what was true, what was estimated and what was commanded, step by step."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flockd.messages import FloatArray, IntArray
+
+_STAGE_PREFIX = "stage "
+
+
+@dataclass(frozen=True, eq=False)
+class FlightLog:
+    """S steps of N drones; NaN where there was no estimate. Raises ValueError for shapes that do not fit together."""
+
+    time_s: FloatArray
+    """(S,) since the flight's start, when each step began."""
+    position: FloatArray
+    """(S, N, 3) m NED, true."""
+    velocity: FloatArray
+    """(S, N, 3) m/s NED, true."""
+    attitude: FloatArray
+    """(S, N, 3, 3) R_ned_body, true."""
+    desired: FloatArray
+    """(S, 2) m/s, the flock's desired velocity."""
+    command_velocity: FloatArray
+    """(S, N, 2) m/s, the setpoint of each step."""
+    command_acceleration: FloatArray
+    """(S, N, 2) m/s^2, u of Eq. 38 after its limit."""
+    ego_rotation: FloatArray
+    """(S, N, 3, 3) R_FC as estimated over the interval that ended with the step (Eq. 7)."""
+    ego_translation: FloatArray
+    """(S, N, 3) m, T_FC likewise, in body axes of the interval's start."""
+    ego_inlier_ratio: FloatArray
+    """(S, N) share of the background pairs that Algorithm 1 kept."""
+    own_velocity_estimate: FloatArray
+    """(S, N, 3) m/s NED, what the flocking law took for the own velocity."""
+    neighbour_position: FloatArray
+    """(S, N, N, 3) m NED: [s, i, j] is drone j relative to drone i by i's confirmed track of it."""
+    neighbour_velocity: FloatArray
+    """(S, N, N, 3) m/s NED over ground, likewise."""
+    sighting_position: FloatArray
+    """(S, N, N, 3) m NED: as `neighbour_position`, of the single frame set before tracking."""
+    false_tracks: IntArray
+    """(S, N) confirmed tracks that match no true drone and did not count before."""
+    truth_position: FloatArray
+    """(S2, N, 3) m NED of the same scenario flown with exact states, same time base; S2 is S, or 0
+    without one."""
+    truth_velocity: FloatArray
+    """(S2, N, 3) m/s NED, likewise."""
+    stages_ms: Mapping[str, FloatArray]
+    """(K,) duration of each run of each stage."""
+    meta: Mapping[str, Any]
+    """What was flown, in values that go into JSON: scenario, perception ("truth": with exact states), flow, scale,
+    drones, duration_s, step_s, seed, wall_s, circle_until_s, desired_distance_m, observation_distance_m, and more."""
+
+    def __post_init__(self) -> None:
+        steps, drones = self.position.shape[:2]
+        companion = steps if len(self.truth_position) else 0
+        state, seen = (steps, drones, 3), (steps, drones, drones, 3)
+        expected: dict[str, tuple[int, ...]] = {
+            "time_s": (steps,),
+            "position": state,
+            "velocity": state,
+            "attitude": (*state, 3),
+            "desired": (steps, 2),
+            "command_velocity": (steps, drones, 2),
+            "command_acceleration": (steps, drones, 2),
+            "ego_rotation": (*state, 3),
+            "ego_translation": state,
+            "ego_inlier_ratio": (steps, drones),
+            "own_velocity_estimate": state,
+            "neighbour_position": seen,
+            "neighbour_velocity": seen,
+            "sighting_position": seen,
+            "false_tracks": (steps, drones),
+            "truth_position": (companion, drones, 3),
+            "truth_velocity": (companion, drones, 3),
+        }
+        for name, shape in expected.items():
+            have = getattr(self, name).shape
+            if have != shape:
+                raise ValueError(f"{name} of a flight of {steps} steps and {drones} drones is {have}, not {shape}")
+
+    def save(self, path: Path) -> None:
+        """Write one compressed `.npz`."""
+        arrays: dict[str, Any] = {
+            field.name: getattr(self, field.name) for field in fields(self) if field.name not in ("stages_ms", "meta")
+        }
+        arrays |= {_STAGE_PREFIX + stage: samples for stage, samples in self.stages_ms.items()}
+        with path.open("wb") as file:
+            np.savez_compressed(file, **arrays, meta=json.dumps(dict(self.meta)))
+
+    @classmethod
+    def load(cls, path: Path) -> FlightLog:
+        """Read what `save` wrote. Raises OSError, or ValueError where the file is no flight log."""
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        stages = {
+            name.removeprefix(_STAGE_PREFIX): arrays.pop(name)
+            for name in list(arrays)
+            if name.startswith(_STAGE_PREFIX)
+        }
+        missing = {field.name for field in fields(cls)} - {"stages_ms"} - arrays.keys()
+        if missing:
+            raise ValueError(f"{path} is no flight log: it has no {', '.join(sorted(missing))}")
+        meta = json.loads(str(arrays.pop("meta")))
+        return cls(**arrays, stages_ms=stages, meta=meta)
+
+
+def match_neighbours(estimated: FloatArray, true: FloatArray) -> list[tuple[int, int]]:
+    """Which estimate is which drone: (estimate, drone) index pairs, one to one, the nearest pair first.
+
+    `estimated` (m, 3) and `true` (n, 3) are metres relative to one observer, which is not among them. No pair is
+    farther apart than 1 m or a quarter of the true range, whichever is more.
+    """
+    distances = np.linalg.norm(estimated[:, None] - true[None], axis=2)
+    allowed = np.maximum(1.0, 0.25 * np.linalg.norm(true, axis=1))
+    pairs: list[tuple[int, int]] = []
+    for flat in np.argsort(distances, axis=None, kind="stable"):
+        estimate, drone = divmod(int(flat), len(true))
+        taken = any(estimate == e or drone == d for e, d in pairs)
+        if not taken and distances[estimate, drone] <= allowed[drone]:
+            pairs.append((estimate, drone))
+    return sorted(pairs)
