@@ -2,6 +2,7 @@
 
 from flockd.geometry.cameras import Camera, PinholeCamera, WideAngleCamera
 from flockd.geometry.ego_motion import estimate_ego_motion
+from flockd.geometry.ground import ground_inverse_depth
 from flockd.geometry.neighbour_motion import estimate_neighbour_motion
 from flockd.geometry.pairs import BACKGROUND_LABEL, PointPairs, grid_pixels, label_pixels, lift_matches
 from flockd.geometry.ransac import RansacResult, ransac_rigid
@@ -10,6 +11,7 @@ from flockd.geometry.rig import Rig, RigCamera, build_rig
 from flockd.geometry.rigid_fit import fit_rigid
 from flockd.geometry.rotations import euler_from_rotation, rotation_angle_deg, rotation_from_euler
 from flockd.geometry.transform import RigidTransform
+from flockd.geometry.virtual_camera import VirtualCrop, virtual_crop
 
 __all__ = [
     "BACKGROUND_LABEL",
@@ -20,6 +22,7 @@ __all__ = [
     "Rig",
     "RigCamera",
     "RigidTransform",
+    "VirtualCrop",
     "WideAngleCamera",
     "build_rig",
     "estimate_ego_motion",
@@ -27,10 +30,12 @@ __all__ = [
     "euler_from_rotation",
     "fit_rigid",
     "grid_pixels",
+    "ground_inverse_depth",
     "label_pixels",
     "lift_matches",
     "ransac_rigid",
     "refine_ego_motion",
     "rotation_angle_deg",
     "rotation_from_euler",
+    "virtual_crop",
 ]

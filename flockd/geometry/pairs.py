@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,26 +55,26 @@ def grid_pixels(size: tuple[int, int], stride: int) -> FloatArray:
     """(n, 2) pixel centres, ``stride`` apart both ways, of an image of ``size`` (width, height); row by row."""
     width, height = size
     u, v = np.meshgrid(np.arange(stride // 2, width, stride), np.arange(stride // 2, height, stride))
-    return np.stack([u.ravel(), v.ravel()], axis=1) + 0.5
+    return np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64) + 0.5
 
 
-def label_pixels(labels: IntArray, label: int, limit: int) -> FloatArray:
+def label_pixels(labels: NDArray[np.integer], label: int, limit: int) -> FloatArray:
     """(n, 2) centres of the pixels of ``labels`` (h, w) that carry ``label``, at most ``limit``, evenly drawn."""
     rows, columns = np.nonzero(labels == label)
     if len(rows) > limit:
         chosen = np.linspace(0, len(rows) - 1, limit).astype(np.int64)
         rows, columns = rows[chosen], columns[chosen]
-    return np.stack([columns, rows], axis=1) + 0.5
+    return np.stack([columns, rows], axis=1).astype(np.float64) + 0.5
 
 
-def lift_matches(
+def lift_matches(  # noqa: PLR0917  two ends of three maps each
     camera: RigCamera,
     pixels: FloatArray,
     flow: Float32Array,
     depth_previous: Float32Array,
     depth_current: Float32Array,
-    labels_previous: IntArray,
-    labels_current: IntArray,
+    labels_previous: NDArray[np.integer],
+    labels_current: NDArray[np.integer],
     *,
     max_depth_m: float,
 ) -> PointPairs:
@@ -102,7 +103,9 @@ def lift_matches(
     pixels_previous, pixels_current = pixels_previous[kept], pixels_current[kept]
     previous = camera.camera.unproject(pixels_previous, z_previous[kept])
     current = camera.camera.unproject(pixels_current, z_current[kept])
-    imaged = np.isfinite(previous[:, 0]) & np.isfinite(current[:, 0])  # outside a fisheye's image circle there is no ray
+    imaged = np.isfinite(previous[:, 0]) & np.isfinite(
+        current[:, 0]
+    )  # outside a fisheye's image circle there is no ray
     return PointPairs(
         previous=camera.T_body_camera.apply(previous[imaged]),
         current=camera.T_body_camera.apply(current[imaged]),
@@ -113,10 +116,14 @@ def lift_matches(
     )
 
 
-def _nearest(values: NDArray[np.generic], pixels: FloatArray) -> NDArray[np.generic]:
+_Value = TypeVar("_Value", bound=np.generic)
+
+
+def _nearest(values: NDArray[_Value], pixels: FloatArray) -> NDArray[_Value]:
     """The value of the pixel that each of ``pixels`` (n, 2), inside the image, falls in."""
     column, row = pixels.astype(np.int64).T
-    return values[row, column]
+    found: NDArray[_Value] = values[row, column]
+    return found
 
 
 def _sample_depth(depth: Float32Array, pixels: FloatArray) -> FloatArray:
@@ -126,9 +133,9 @@ def _sample_depth(depth: Float32Array, pixels: FloatArray) -> FloatArray:
     x, y = np.clip(pixels[:, 0] - 0.5, 0, width - 1), np.clip(pixels[:, 1] - 0.5, 0, height - 1)
     left, top = np.minimum(x.astype(np.int64), width - 2), np.minimum(y.astype(np.int64), height - 2)
     fx, fy = x - left, y - top
-    corners = np.stack(
-        [depth[top, left], depth[top, left + 1], depth[top + 1, left], depth[top + 1, left + 1]]
-    ).astype(np.float64)
+    corners = np.stack([depth[top, left], depth[top, left + 1], depth[top + 1, left], depth[top + 1, left + 1]]).astype(
+        np.float64
+    )
     shares = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
     nearest = depth[pixels[:, 1].astype(np.int64), pixels[:, 0].astype(np.int64)].astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):

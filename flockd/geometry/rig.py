@@ -36,7 +36,8 @@ class RigCamera:
 
     def _seen(self, points_camera: FloatArray) -> FloatArray:
         pixels = self.camera.project(points_camera)
-        return np.where(self.camera.in_image(pixels)[:, None], pixels, np.nan)
+        pixels[~self.camera.in_image(pixels)] = np.nan
+        return pixels
 
 
 @dataclass(frozen=True, eq=False)

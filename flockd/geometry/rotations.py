@@ -53,6 +53,6 @@ def rotation_from_vector(vector: FloatArray) -> FloatArray:
     angle = float(np.linalg.norm(vector))
     x, y, z = (float(component) for component in vector)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    if angle < 1e-8:
-        return np.eye(3) + cross + 0.5 * cross @ cross
-    return np.eye(3) + math.sin(angle) / angle * cross + (1.0 - math.cos(angle)) / angle**2 * cross @ cross
+    sine, one_minus_cosine = (1.0, 0.5) if angle < 1e-8 else (math.sin(angle) / angle, (1 - math.cos(angle)) / angle**2)
+    rotation: FloatArray = np.eye(3) + sine * cross + one_minus_cosine * (cross @ cross)
+    return rotation
