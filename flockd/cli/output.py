@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from time import monotonic
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -33,12 +33,13 @@ def progress(label: str, unit: str) -> Iterator[Callable[[int, int], None]]:
             task = bar.add_task(label, total=None)
             yield lambda done, total: bar.update(task, completed=done, total=total)
         return
-    told_s = time.monotonic()
+    told_s = monotonic()
 
     def tell(done: int, total: int) -> None:
         nonlocal told_s
-        if time.monotonic() - told_s >= PLAIN_LINE_EVERY_S:
-            told_s = time.monotonic()
+        now_s = monotonic()
+        if now_s - told_s >= PLAIN_LINE_EVERY_S:
+            told_s = now_s
             sys.stderr.write(f"{label}: {done} of {total} {unit}\n")
 
     yield tell

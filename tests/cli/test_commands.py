@@ -259,3 +259,26 @@ def test_verifying_a_damaged_model_fails_the_check(tmp_path: Path, capsys: pytes
     assert (told["model"], told["ok"]) == ("flow", False)
     assert told["fault"].startswith(f"{tmp_path / 'flow.yaml'}: ")
     assert main(["models", "list", "--dir", str(tmp_path)]) == 78
+
+
+def test_a_flight_leaves_its_log_summary_and_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "flight"
+    short = ["sim", "--perception", "truth", "--duration", "5", "--drones", "6", "--seed", "3", "--out", str(folder)]
+    assert main([*short, "--json"]) == 0
+    captured = capsys.readouterr()
+    summary = json.loads(captured.out)
+    assert (summary["drones"], summary["duration_s"], summary["seed"]) == (6, 5.0, 3)
+    assert captured.err == ""
+    assert {"flight.npz", "summary.json", "report.html"} <= {path.name for path in folder.iterdir()}
+    assert json.loads((folder / "summary.json").read_text(encoding="utf-8")) == summary
+
+    (folder / "summary.json").unlink()
+    (folder / "report.html").unlink()
+    assert main(["report", str(folder)]) == 0
+    told = capsys.readouterr().out
+    assert f"{summary['flock']['min_distance_m']:.2f} m" in told
+    assert told.splitlines()[-1] == f"report: {folder / 'report.html'}"
+    assert json.loads((folder / "summary.json").read_text(encoding="utf-8")) == summary
+    assert (folder / "report.html").is_file()
+
+    assert main(short) == 0, "an earlier flight may be flown over"

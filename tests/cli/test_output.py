@@ -1,0 +1,44 @@
+"""Whoever waits is told how far it is, and stdout stays free for the result."""
+
+from __future__ import annotations
+
+import io
+import sys
+
+import pytest
+
+from flockd.cli import output
+
+
+class _Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def _count_to_three() -> None:
+    with output.progress("flying", "steps") as tell:
+        for done in (1, 2, 3):
+            tell(done, 3)
+
+
+def test_without_a_terminal_there_is_a_plain_line_now_and_then(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _count_to_three()
+    assert capsys.readouterr() == ("", ""), "quick work is not worth a line"
+    seconds = iter((0.0, 4.0, 11.0, 12.0))  # as it begins, then at each count
+    monkeypatch.setattr(output, "monotonic", lambda: next(seconds))
+    _count_to_three()
+    assert capsys.readouterr() == ("", "flying: 2 of 3 steps\n")
+
+
+def test_on_a_terminal_there_is_a_bar_that_leaves_no_trace(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys, "stderr", terminal := _Terminal())
+    _count_to_three()
+    assert "flying" in terminal.getvalue()
+    assert "3/3" in terminal.getvalue()
+    assert terminal.getvalue().endswith("\x1b[2K"), "the line is wiped"
+    assert capsys.readouterr().out == ""
