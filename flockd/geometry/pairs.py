@@ -67,7 +67,7 @@ def label_pixels(labels: NDArray[np.integer], label: int, limit: int) -> FloatAr
     return np.stack([columns, rows], axis=1).astype(np.float64) + 0.5
 
 
-def lift_matches(  # noqa: PLR0917  two ends of three maps each
+def lift_matches(
     camera: RigCamera,
     pixels: FloatArray,
     flow: Float32Array,

@@ -43,7 +43,9 @@ class VirtualCrop:
         crop = np.full((size[1], size[0], 3), _GREY, dtype=np.uint8)
         valid = np.zeros((size[1], size[0]), dtype=np.bool_)
         for name, where in self._maps(images, range_m).items():
-            seen = np.isfinite(where[:, :, 0])
+            seen = np.isfinite(where[0])
+            if not seen.any():
+                continue
             drawn = _draw(images[name], where, self._minification(self.rig.cameras[name]))
             if seen.all():
                 return drawn, seen
@@ -52,7 +54,7 @@ class VirtualCrop:
         return crop, valid
 
     def _maps(self, images: Mapping[str, UInt8Array], range_m: float | None) -> dict[str, Float32Array]:
-        """For each camera that is needed, the pixels (size, size, 2) it fills the crop from; NaN where it does not."""
+        """For each camera that is needed, u and v (2, size, size) of what it fills the crop with; NaN elsewhere."""
         pixel_centres = _pixel_centres(self.camera.size)
         directions = self.camera.unproject(pixel_centres, np.ones(len(pixel_centres))) @ self.T_body_virtual.rotation.T
         maps: dict[str, FloatArray] = {}
@@ -65,8 +67,9 @@ class VirtualCrop:
             if range_m is None:
                 pixels = [camera.pixels_of_directions(directions[missing]) for camera in others]
             else:
-                lengths = np.linalg.norm(directions[missing], axis=1, keepdims=True)
-                points = self.T_body_virtual.translation + directions[missing] * (range_m / lengths)
+                towards = directions[missing]
+                lengths = np.sqrt(np.einsum("ij,ij->i", towards, towards))
+                points = self.T_body_virtual.translation + towards * (range_m / lengths)[:, None]
                 pixels = [camera.pixels_of_points(points) for camera in others]
             margins = np.stack([_margin(camera, seen) for camera, seen in zip(others, pixels, strict=True)])
             best = margins.argmax(axis=0)
@@ -76,8 +79,8 @@ class VirtualCrop:
                     full = np.full((len(directions), 2), np.nan)
                     full[np.flatnonzero(missing)[chosen]] = pixels[index][chosen]
                     maps[camera.name] = full
-        shape = (self.camera.size[1], self.camera.size[0], 2)
-        return {name: where.reshape(shape).astype(np.float32) for name, where in maps.items()}
+        shape = (2, self.camera.size[1], self.camera.size[0])
+        return {name: where.T.astype(np.float32, order="C").reshape(shape) for name, where in maps.items()}
 
     def _minification(self, camera: RigCamera) -> int:
         """How many pixels of a camera's image, each way, fall into one of the crop's at its middle."""
@@ -136,12 +139,12 @@ def _pixel_centres(size: tuple[int, int]) -> FloatArray:
 
 
 def _draw(image: UInt8Array, where: Float32Array, minification: int) -> UInt8Array:
-    """The image's colours at pixels (h, w, 2), each an average over ``minification`` pixels both ways; at NaN any."""
+    """The image's colours at u and v (2, h, w), averaged over ``minification`` pixels both ways; any at NaN."""
     origin = np.zeros(2, dtype=np.float32)
     if minification > 1:
         # Only the part that is looked at, a block wider, cut along whole blocks.
-        low = np.maximum(np.nanmin(where, axis=(0, 1)) // minification - 1, 0).astype(np.int64) * minification
-        blocks = np.nanmax(where, axis=(0, 1)).astype(np.int64) // minification + 2 - low // minification
+        low = np.maximum(np.nanmin(where, axis=(1, 2)) // minification - 1, 0).astype(np.int64) * minification
+        blocks = np.nanmax(where, axis=(1, 2)).astype(np.int64) // minification + 2 - low // minification
         blocks = np.minimum(blocks, (np.array(image.shape[1::-1]) - low) // minification)
         high = low + blocks * minification
         part = cv2.resize(
@@ -151,7 +154,7 @@ def _draw(image: UInt8Array, where: Float32Array, minification: int) -> UInt8Arr
         )
         image, origin = part.astype(np.uint8, copy=False), low.astype(np.float32)
     # Centres are at integers here, and beyond the outermost ones the border repeats.
-    x, y = ((where[:, :, axis] - origin[axis]) / np.float32(minification) - np.float32(0.5) for axis in range(2))
+    x, y = (where - origin[:, None, None]) / np.float32(minification) - np.float32(0.5)
     drawn = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return drawn.astype(np.uint8, copy=False)
 

@@ -105,7 +105,7 @@ def _depth_at(
     return world.cast(np.broadcast_to(T_ned_camera.translation, directions.shape), directions)
 
 
-def _lifted(  # noqa: PLR0917
+def _lifted(
     camera: RigCamera,
     pixels: FloatArray,
     depth: FloatArray,
