@@ -13,6 +13,7 @@ from flockd.geometry import (
     estimate_ego_motion,
     refine_ego_motion,
     rotation_angle_deg,
+    refinement,
     rotation_from_euler,
 )
 from flockd.messages import EgoMotion
@@ -95,6 +96,14 @@ def test_a_hopeless_start_is_refused_and_not_walked_away_from() -> None:
     pairs, truth = flight(2, Flaws())
     backwards = RigidTransform(rotation_from_euler(0.0, 0.0, np.pi) @ truth.rotation, truth.translation)
     assert refine_ego_motion(pairs, RIG, backwards) is None
+
+
+@pytest.mark.parametrize("rises", [True, False])
+def test_a_polish_that_costs_more_than_its_start_is_refused(monkeypatch: pytest.MonkeyPatch, rises: bool) -> None:
+    pairs, truth = flight(2, Flaws())
+    costs = iter([1.0, 2.0] if rises else [2.0, 1.0])  # of the start, then of the polished motion
+    monkeypatch.setattr(refinement, "_cost", lambda *_: next(costs))
+    assert (refine_ego_motion(pairs, RIG, truth) is None) == rises
 
 
 def test_a_refused_polish_leaves_algorithm_1s_answer() -> None:
