@@ -12,8 +12,8 @@ from flockd.geometry import (
     RigidTransform,
     estimate_ego_motion,
     refine_ego_motion,
-    rotation_angle_deg,
     refinement,
+    rotation_angle_deg,
     rotation_from_euler,
 )
 from flockd.messages import EgoMotion
