@@ -91,6 +91,7 @@ def _render_pair(
     moves = (velocity + rng.normal(0, 0.4, (MAX_DRONES, 3))) * interval
     turns = [_attitude(rng.uniform(-np.pi, np.pi), rng.normal(0, np.radians(7), 2)) for _ in range(MAX_DRONES)]
     wobble = [_attitude(rng.normal(0, 0.1) * interval, rng.normal(0, 0.07, 2)) for _ in range(MAX_DRONES)]
+    places[~shown] = np.nan
     drone_positions = [places, places + moves]
     drone_rotations = [np.array(turns), np.array([r @ w for r, w in zip(turns, wobble, strict=True)])]
     views = []
@@ -109,7 +110,7 @@ def _render_pair(
         _note_drones(part, index, k, view, R_ned_camera, positions[k], drone_positions[k], shown)
     flow, valid = true_flow(
         views[0], views[1], matrix,
-        R_ned_camera=(attitudes[0] @ R_BODY_CAMERA, attitudes[1] @ R_BODY_CAMERA), positions_ned=tuple(positions),
+        R_ned_camera=(attitudes[0] @ R_BODY_CAMERA, attitudes[1] @ R_BODY_CAMERA), position_ned=tuple(positions),
         drone_rotations=tuple(drone_rotations), drone_positions=tuple(drone_positions),
     )  # fmt: skip
     part["flow"][index] = np.moveaxis(flow[1::2, 1::2], 2, 0)

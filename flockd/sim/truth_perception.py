@@ -63,7 +63,7 @@ class TruthPerception:
         flow, _ = true_flow(
             before.views[camera], now.views[camera], _matrix(self._rig, camera),
             R_ned_camera=(before.R_ned_cameras[camera], now.R_ned_cameras[camera]),
-            positions_ned=(before.positions[camera], now.positions[camera]),
+            position_ned=(before.positions[camera], now.positions[camera]),
             drone_rotations=(before.drone_rotations, now.drone_rotations),
             drone_positions=(before.drone_positions, now.drone_positions),
         )  # fmt: skip
