@@ -183,8 +183,9 @@ def _bilinear(texels: Any, base: int, bits: int, u: float, v: float) -> Any:
     x1 = (x0 + 1) & mask
     row0 = base + (y0 << bits)
     row1 = base + (((y0 + 1) & mask) << bits)
-    a = _blend(np.uint64(texels[row0 + x0]), np.uint64(texels[row0 + x1]), wu)
-    b = _blend(np.uint64(texels[row1 + x0]), np.uint64(texels[row1 + x1]), wu)
+    # Unsigned indices spare the check for negative ones.
+    a = _blend(np.uint64(texels[np.uint64(row0 + x0)]), np.uint64(texels[np.uint64(row0 + x1)]), wu)
+    b = _blend(np.uint64(texels[np.uint64(row1 + x0)]), np.uint64(texels[np.uint64(row1 + x1)]), wu)
     return _blend(a, b, wv)
 
 
@@ -301,6 +302,7 @@ def shade_scene(
     normals: Any,
     texture: Any,
     uv: Any,
+    level: Any,
     tint: Any,
     texels: Any,
     texture_bits: int,
@@ -325,8 +327,9 @@ def shade_scene(
     height, width = hit.shape
     sun = light[0]
     texture_area = ((4 << (2 * texture_bits)) - 1) // 3
-    texture_size = float(1 << texture_bits)
     ground_size = 1 << ground_bits
+    ground_level = ground_bits - math.log2(2.0 * extent)
+    focal_level = math.log2(focal)
     lanes = 32
     for lane in prange(lanes):
         for y in range(lane, height, lanes):
@@ -353,9 +356,9 @@ def shade_scene(
                 e = origin[1] + re * z
                 d = origin[2] + rd * z
                 nn, ne, nd = normals[t, 0], normals[t, 1], normals[t, 2]
-                facing = max(0.02, -(rn * nn + re * ne + rd * nd) / length)
-                # A pixel's footprint, between its short side and its long one (which grazing views stretch).
-                footprint = z / focal / facing**0.7
+                # A pixel's footprint, log2 of metres: halfway between its short side and its long one, which grazing views stretch.
+                facing = max(0.02 * length, -(rn * nn + re * ne + rd * nd))
+                footprint = 0.5 * math.log2(z * z * length / facing) - focal_level
                 free = 1.0
                 if x >= blob_rows[y, 0] and x < blob_rows[y, 1]:
                     free = _blob_shadow(blobs, sun, n, e, d)
@@ -369,10 +372,10 @@ def shade_scene(
                         gu = 2.0 - gu
                     if gv > 1.0:
                         gv = 2.0 - gv
-                    packed = sample(
-                        ground, 0, ground_bits, gv, gu, math.log2(footprint * ground_size / (2.0 * extent))
-                    )
-                    gi = ground_kind[min(ground_size - 1, int(gu * ground_size)), min(ground_size - 1, int(gv * ground_size))]
+                    packed = sample(ground, 0, ground_bits, gv, gu, footprint + ground_level)
+                    gi = ground_kind[
+                        min(ground_size - 1, int(gu * ground_size)), min(ground_size - 1, int(gv * ground_size))
+                    ]
                     tile = ground_detail[gi, 1]
                     fine = sample(
                         texels,
@@ -380,7 +383,7 @@ def shade_scene(
                         texture_bits,
                         e * tile,
                         n * tile,
-                        math.log2(footprint * texture_size * tile),
+                        footprint + ground_detail[gi, 2],
                     )
                     cosine = _byte(packed, 24) if abs(n) < extent and abs(e) < extent else -sun[2]
                     red, green, blue = _light(light, -1.0, cosine * free)
@@ -390,18 +393,10 @@ def shade_scene(
                 else:
                     tu = uv[t, 0, 0] * n + uv[t, 0, 1] * e + uv[t, 0, 2] * d + uv[t, 0, 3]
                     tv = uv[t, 1, 0] * n + uv[t, 1, 1] * e + uv[t, 1, 2] * d + uv[t, 1, 3]
-                    tile = max(
-                        math.sqrt(uv[t, 0, 0] ** 2 + uv[t, 0, 1] ** 2 + uv[t, 0, 2] ** 2),
-                        math.sqrt(uv[t, 1, 0] ** 2 + uv[t, 1, 1] ** 2 + uv[t, 1, 2] ** 2),
-                    )
-                    fine = sample(
-                        texels, kind * texture_area, texture_bits, tu, tv, math.log2(footprint * texture_size * tile)
-                    )
+                    fine = sample(texels, kind * texture_area, texture_bits, tu, tv, footprint + level[t])
                     cosine = nn * sun[0] + ne * sun[1] + nd * sun[2]
                     if cosine > 0.0:
-                        cosine *= free * sun_reaches(
-                            shadow, shadow_frame, n + 0.08 * nn, e + 0.08 * ne, d + 0.08 * nd
-                        )
+                        cosine *= free * sun_reaches(shadow, shadow_frame, n + 0.08 * nn, e + 0.08 * ne, d + 0.08 * nd)
                     red, green, blue = _light(light, nd, max(0.0, cosine))
                     red *= 2.0 * tint[t, 0] * _byte(fine, 0)
                     green *= 2.0 * tint[t, 1] * _byte(fine, 8)
@@ -505,7 +500,7 @@ def shade_drone(
                                 texture_bits,
                                 tu,
                                 tv,
-                                math.log2(z / focal / facing**0.7 * texture_size * tile),
+                                math.log2(z / focal / math.sqrt(facing) * texture_size * tile),
                             )
                             cosine = nn * sun[0] + ne * sun[1] + nd * sun[2]
                             if cosine > 0.0:
@@ -565,8 +560,7 @@ def fill_shadow(vertices: Any, triangles: Any, frame: Any, shadow: Any) -> None:
                 b2 = ((s[1] - s[0]) * dr - ds * (r[1] - r[0])) / area
                 if b1 >= 0.0 and b2 >= 0.0 and b1 + b2 <= 1.0:
                     here = h[0] + b1 * (h[1] - h[0]) + b2 * (h[2] - h[0])
-                    if here > shadow[y, x]:
-                        shadow[y, x] = here
+                    shadow[y, x] = max(shadow[y, x], here)
 
 
 @njit(cache=True)
@@ -628,7 +622,7 @@ def compose_ground(
             broad = _noise(noise, 0, gv * zone_scale, gu * zone_scale)
             tone = _noise(noise, 1, gv, gu)
             fine = _noise(noise, 2, e / 19.0, n / 19.0)
-            value = broad + 0.12 * fine
+            value = broad + 0.03 * fine
             zone = 0
             while zone < zone_limits.shape[0] and value > zone_limits[zone]:
                 zone += 1
@@ -700,7 +694,9 @@ def compose_ground(
                 dx = 0.06 * ((k & 1) * 2 - 1) if k < 4 else 0.0
                 dy = 0.06 * ((k & 2) - 1) if k < 4 else 0.0
                 lit += 0.2 * sun_reaches(shadow, shadow_frame, n + dx, e + dy, -height)
-            cosine = max(0.0, (-slope_n * sun[0] - slope_e * sun[1] - sun[2]) / math.sqrt(1.0 + slope_n**2 + slope_e**2))
+            cosine = max(
+                0.0, (-slope_n * sun[0] - slope_e * sun[1] - sun[2]) / math.sqrt(1.0 + slope_n**2 + slope_e**2)
+            )
             colour[row, column, 0] = red * shade * (1.0 + hue)
             colour[row, column, 1] = green * shade
             colour[row, column, 2] = blue * shade * (1.0 - hue)

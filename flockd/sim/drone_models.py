@@ -82,37 +82,67 @@ class _Craft:
         self.prop = np.full(3, rng.uniform(0.03, 0.5)) if rng.random() < 0.7 else _vivid(rng) * 0.7
         self.skin = rng.integers(0, MACHINE_TEXTURES, 2)
 
-    def box(self, centre: tuple[float, float, float], half: tuple[float, float, float], colour: FloatArray, heading: float = 0.0) -> None:
+    def box(
+        self,
+        centre: tuple[float, float, float],
+        half: tuple[float, float, float],
+        colour: FloatArray,
+        heading: float = 0.0,
+    ) -> None:
         self.mesh.box(np.array(centre), half, heading, int(self.skin[0]), colour, (0.3, 0.3))
 
-    def rod(self, a: tuple[float, float, float], b: tuple[float, float, float], radius: float, colours: list[FloatArray], sides: int = 6) -> None:
+    def rod(
+        self,
+        a: tuple[float, float, float],
+        b: tuple[float, float, float],
+        radius: float,
+        colours: list[FloatArray],
+        sides: int = 6,
+    ) -> None:
         """A tube in equal lengths of the given colours."""
-        start, end = np.array(a), np.array(b)
-        for k, colour in enumerate(colours):
-            near = start + (end - start) * k / len(colours)
-            far = start + (end - start) * (k + 1) / len(colours)
-            self.mesh.frustum(near, far, (radius, radius), sides, int(self.skin[1]), colour, (0.2, 0.2))
+        self.mesh.frustum(
+            np.array(a), np.array(b), (radius, radius), sides, int(self.skin[1]), np.array(colours), (0.2, 0.2)
+        )
 
-    def beam(self, a: tuple[float, float, float], b: tuple[float, float, float], half: tuple[float, float], colours: list[FloatArray]) -> None:
+    def beam(
+        self,
+        a: tuple[float, float, float],
+        b: tuple[float, float, float],
+        half: tuple[float, float],
+        colours: list[FloatArray],
+    ) -> None:
         """A level box beam in equal lengths of the given colours; half width and half height."""
         start, end = np.array(a), np.array(b)
         step = (end - start) / len(colours)
         heading = math.atan2(step[1], step[0])
         for k, colour in enumerate(colours):
             middle = start + step * (k + 0.5)
-            self.box((middle[0], middle[1], middle[2]), (float(np.hypot(step[0], step[1])) / 2, half[0], half[1]), colour, heading)
+            self.box(
+                (middle[0], middle[1], middle[2]),
+                (float(np.hypot(step[0], step[1])) / 2, half[0], half[1]),
+                colour,
+                heading,
+            )
 
     def rotor(self, x: float, y: float, z: float, radius: float, motor: tuple[float, float], *, accent: bool) -> None:
         """A motor standing on (x, y, z), with its propeller. ``motor``: radius and height."""
         top = z - motor[1]
-        self.rod((x, y, z), (x, y, top), motor[0], [self.metal, (self.front if x > 0 else self.rear) if accent else self.metal], 8)
+        self.rod(
+            (x, y, z),
+            (x, y, top),
+            motor[0],
+            [self.metal, (self.front if x > 0 else self.rear) if accent else self.metal],
+            8,
+        )
         hub = np.array([x, y, top])
         self.hubs.append(hub)
         self.radii.append(radius)
         angle = self.rng.uniform(0, math.pi)
         lift = np.array([0, 0, 0.004 + 0.01 * radius])
         if self.disc:
-            self.mesh.frustum(hub - lift, hub - lift - [0, 0, 0.004], (radius, radius), 18, int(self.skin[1]), self.prop, (0.25, 0.25))
+            self.mesh.frustum(
+                hub - lift, hub - lift - [0, 0, 0.004], (radius, radius), 16, int(self.skin[1]), self.prop, (0.25, 0.25)
+            )
         else:
             width = 0.075 * radius + 0.004
             half = math.sqrt(radius**2 - width**2)
@@ -199,12 +229,18 @@ def _folding(c: _Craft) -> None:
     c.box((0.03, 0, -0.0435), (0.03, 0.012, 0.002), c.front)
     c.box((0.105, 0, 0.036), (0.022, 0.02, 0.016), c.frame)
     c.rod((0.125, 0, 0.036), (0.142, 0, 0.036), 0.011, [np.full(3, 0.02)], 8)
-    for y in (1.0, -1.0):
-        c.beam((0.08, 0.035 * y, -0.012), (0.13, 0.15 * y, -0.012), (0.012, 0.009), [c.body, c.body, c.front])
-        c.rotor(0.13, 0.15 * y, -0.02, 0.105, (0.015, 0.022), accent=True)
-        c.rod((0.125, 0.145 * y, -0.005), (0.125, 0.145 * y, 0.055), 0.007, [c.body, c.front])
-        c.beam((-0.08, 0.035 * y, 0.012), (-0.11, 0.135 * y, 0.012), (0.012, 0.009), [c.body, c.body, c.rear])
-        c.rotor(-0.11, 0.135 * y, 0.004, 0.105, (0.015, 0.022), accent=True)
+    for x, y in _corners(1.0, 1.0):
+        accent = c.front if x > 0 else c.rear
+        hub = (0.13, 0.15 * y, -0.02) if x > 0 else (-0.11, 0.135 * y, 0.004)
+        c.beam(
+            (0.08 * x, 0.035 * y, hub[2] + 0.008),
+            (hub[0], hub[1], hub[2] + 0.008),
+            (0.012, 0.009),
+            [c.body, c.body, accent],
+        )
+        c.rotor(*hub, 0.105, (0.015, 0.022), accent=True)
+        if x > 0:
+            c.rod((0.125, 0.145 * y, -0.005), (0.125, 0.145 * y, 0.055), 0.007, [c.body, accent])
 
 
 def _racer(c: _Craft) -> None:
@@ -266,7 +302,9 @@ def _ducted(c: _Craft) -> None:
         c.beam((x - 0.077, y, 0.014), (x + 0.077, y, 0.014), (0.004, 0.003), [c.frame])
 
 
-def _ring(c: _Craft, x: float, y: float, inner: float, outer: float, half_height: float, first: FloatArray, second: FloatArray) -> None:
+def _ring(
+    c: _Craft, x: float, y: float, inner: float, outer: float, half_height: float, first: FloatArray, second: FloatArray
+) -> None:
     """A short tube with a wall, every third segment in the first colour."""
     sides = 12
     angle = np.arange(sides) * 2 * math.pi / sides
@@ -298,10 +336,10 @@ def _long_legs(c: _Craft) -> None:
     c.rod((0.06, 0, 0.012), (0.06, 0, 0.06), 0.012, [c.metal], 8)
     c.box((0.06, 0, 0.09), (0.035, 0.03, 0.032), c.body * 0.6)
     c.rod((0.09, 0, 0.09), (0.12, 0, 0.09), 0.022, [np.full(3, 0.02)], 10)
-    for x, y in _corners(0.235, 0.235):
+    for x, y in _corners(0.21, 0.21):
         accent = c.front if x > 0 else c.rear
         c.rod((0.25 * x, 0.25 * y, -0.004), (x, y, -0.004), 0.013, [c.frame, c.frame, accent, c.frame], 8)
-        c.rotor(x, y, -0.015, 0.165, (0.024, 0.034), accent=True)
+        c.rotor(x, y, -0.015, 0.15, (0.024, 0.034), accent=True)
     for y in (-1.0, 1.0):
         c.rod((-0.16, 0.17 * y, 0.26), (0.16, 0.17 * y, 0.26), 0.009, [c.rear, c.frame, c.front])
         for x in (-0.05, 0.05):

@@ -111,23 +111,50 @@ class Mesh:
         tint: FloatArray,
         tile: tuple[float, float] = (1.0, 2.0),
     ) -> None:
-        """A closed cylinder or cone between two points."""
+        """A closed cylinder or cone (tip radius 0) between two points; ``tint`` (3,), or (n, 3) in n equal bands."""
         axis = unit(tip - base)
         side = unit(np.cross(axis, np.array([0.3, 0.9, 0.1])))
-        other = np.cross(axis, side)
         angle = np.arange(sides) * 2 * math.pi / sides
-        ring = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * other
-        vertices = np.vstack([base + radius[0] * ring, tip + radius[1] * ring, base[None], tip[None]])
+        ring = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(axis, side)
+        bands = np.atleast_2d(tint)
+        share = np.linspace(0.0, 1.0, len(bands) + 1)[:, None, None]
+        rings = base + share * (tip - base) + (radius[0] + share * (radius[1] - radius[0])) * ring
+        vertices = np.vstack([rings.reshape(-1, 3), base[None], tip[None]])
         k = np.arange(sides)
         following = (k + 1) % sides
-        walls = np.vstack([np.stack([k, following, k + sides], 1), np.stack([following, following + sides, k + sides], 1)])
-        caps = np.vstack([np.stack([following, k, np.full(sides, 2 * sides)], 1)]
-                         + ([np.stack([k + sides, following + sides, np.full(sides, 2 * sides + 1)], 1)] if radius[1] > 0 else []))  # fmt: skip
-        if radius[1] == 0:
-            walls = walls[:sides]
-        self.add(vertices, np.vstack([walls, caps]), texture, tint, tile)
+        faces, shades = [], []
+        for band, colour in enumerate(bands):
+            low, high = band * sides, (band + 1) * sides
+            faces.append(np.stack([k + low, following + low, k + high], 1))
+            faces.append(np.stack([following + low, following + high, k + high], 1))
+            shades.append(np.tile(colour, (2 * sides, 1)))
+        end = len(bands) * sides
+        faces += [
+            np.stack([following, k, np.full(sides, end + sides)], 1),
+            np.stack([k + end, following + end, np.full(sides, end + sides + 1)], 1),
+        ]
+        shades += [np.tile(bands[0], (sides, 1)), np.tile(bands[-1], (sides, 1))]
+        triangles, colours = np.vstack(faces), np.vstack(shades)
+        if radius[1] == 0:  # a point has no cap
+            keep = (
+                np.linalg.norm(
+                    np.cross(*(vertices[triangles[:, i]] - vertices[triangles[:, 0]] for i in (1, 2))), axis=1
+                )
+                > 1e-12
+            )
+            triangles, colours = triangles[keep], colours[keep]
+        self.add(vertices, triangles, texture, colours, tile)
 
-    def blob(self, centre: FloatArray, radii: FloatArray, rough: float, rng: Generator, texture: int, tint: FloatArray, tile: float) -> None:
+    def blob(
+        self,
+        centre: FloatArray,
+        radii: FloatArray,
+        rough: float,
+        rng: Generator,
+        texture: int,
+        tint: FloatArray,
+        tile: float,
+    ) -> None:
         """A lumpy ellipsoid; each facet a slightly different shade."""
         sphere, faces = _SPHERE
         lumpy = sphere * (1.0 + rough * rng.uniform(-1, 1, (len(sphere), 1)))
@@ -136,8 +163,20 @@ class Mesh:
 
 
 _BOX = np.array(
-    [(0, 1, 2), (0, 2, 3), (4, 6, 5), (4, 7, 6), (0, 5, 1), (0, 4, 5), (1, 6, 2), (1, 5, 6), (2, 7, 3), (2, 6, 7),
-     (3, 4, 0), (3, 7, 4)]  # fmt: skip
+    [
+        (0, 1, 2),
+        (0, 2, 3),
+        (4, 6, 5),
+        (4, 7, 6),
+        (0, 5, 1),
+        (0, 4, 5),
+        (1, 6, 2),
+        (1, 5, 6),
+        (2, 7, 3),
+        (2, 6, 7),
+        (3, 4, 0),
+        (3, 7, 4),
+    ]  # fmt: skip
 )
 
 

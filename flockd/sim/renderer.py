@@ -41,7 +41,9 @@ class Renderer:
         self._normals = [_normals(d) for d in self._drones]
         codes = world.tone.astype(np.float64)
         # The middle of the linear values that show as each byte.
-        self._linear = np.interp(np.arange(256), codes[: 1 + int(codes.argmax())], (np.arange(1 + int(codes.argmax())) / 1024.0) ** 2)
+        self._linear = np.interp(
+            np.arange(256), codes[: 1 + int(codes.argmax())], (np.arange(1 + int(codes.argmax())) / 1024.0) ** 2
+        )
 
     def render(
         self,
@@ -67,7 +69,9 @@ class Renderer:
         rotations = np.asarray(drone_rotations, dtype=np.float64).reshape(-1, 3, 3)
         positions = np.asarray(drone_positions, dtype=np.float64).reshape(-1, 3)
         if len(rotations) != count or len(positions) != count:
-            raise ValueError(f"{count} drones need {count} poses, not {len(rotations)} rotations and {len(positions)} positions")
+            raise ValueError(
+                f"{count} drones need {count} poses, not {len(rotations)} rotations and {len(positions)} positions"
+            )
         K = np.ascontiguousarray(matrix, dtype=np.float64)
         R = np.ascontiguousarray(R_ned_camera, dtype=np.float64)
         origin = np.ascontiguousarray(position_ned, dtype=np.float64)
@@ -88,7 +92,7 @@ class Renderer:
         )
         blobs, blob_rows = self._shadows(positions, P, origin, width, height)
         _raster.shade_scene(
-            hit, planes, inverse_K, R, origin, focal, world.normals, world.texture, world.uv, world.tint, world.texels,
+            hit, planes, inverse_K, R, origin, focal, world.normals, world.texture, world.uv, world.level, world.tint, world.texels,
             textures.TEXTURE_BITS, world.ground_map, GROUND_MAP_BITS, world.ground_kind, world.ground_detail, world.extent_m,
             world.shadow_map, world.shadow_frame, world.light, world.fog_per_m, world.sky, SKY_BITS, world.tone, blobs,
             blob_rows, view.rgb, view.depth,
@@ -134,7 +138,9 @@ class Renderer:
             view.rgb, view.depth, view.ids,
         )  # fmt: skip
 
-    def _shadows(self, positions: FloatArray, P: FloatArray, origin: FloatArray, width: int, height: int) -> tuple[FloatArray, IntArray]:
+    def _shadows(
+        self, positions: FloatArray, P: FloatArray, origin: FloatArray, width: int, height: int
+    ) -> tuple[FloatArray, IntArray]:
         """Discs that stand for the drones in the sun, and per image row the columns that their ground shadows may touch."""
         world = self._world
         sun = world.light[0]

@@ -38,8 +38,15 @@ def pack_pyramid(texture: Float32Array) -> PackedArray:
         level = (rows[:, 0::2] + rows[:, 1::2]) * np.float32(0.25)
 
 
-def fractal_noise(rng: Generator, size: int = SIZE, *, slope: float = 1.0, finest: float = 2.0, coarsest: float = 0.5,
-                  stretch: float = 1.0) -> Float32Array:
+def fractal_noise(
+    rng: Generator,
+    size: int = SIZE,
+    *,
+    slope: float = 1.0,
+    finest: float = 2.0,
+    coarsest: float = 0.5,
+    stretch: float = 1.0,
+) -> Float32Array:
     """Tileable noise (size, size), mean 0, standard deviation 1.
 
     ``slope``: amplitude falls as frequency^-slope (0 white, 1 natural, 2 smooth). Wavelengths from ``finest`` pixels to
@@ -99,14 +106,14 @@ def grass(rng: Generator) -> Float32Array:
     """Blades and tufts."""
     fine = fractal_noise(rng, slope=0.4, stretch=float(rng.uniform(1.0, 1.6)))
     tufts = fractal_noise(rng, slope=1.2)
-    return _coloured(np.exp(0.35 * fine + 0.3 * tufts), fractal_noise(rng, slope=1.0), 0.15)
+    return _coloured(np.exp(0.45 * fine + 0.4 * tufts), fractal_noise(rng, slope=1.0), 0.15)
 
 
 def soil(rng: Generator) -> Float32Array:
     """Earth with clods."""
     clods = fractal_noise(rng, slope=float(rng.uniform(0.8, 1.3)))
     stones = np.maximum(0.0, fractal_noise(rng, slope=0.5, finest=6.0) - 1.6)
-    return _coloured(np.exp(0.28 * clods) + 0.35 * stones, fractal_noise(rng, slope=1.5), 0.08)
+    return _coloured(np.exp(0.42 * clods) + 0.35 * stones, fractal_noise(rng, slope=1.5), 0.08)
 
 
 def gravel(rng: Generator) -> Float32Array:
@@ -121,7 +128,7 @@ def asphalt(rng: Generator) -> Float32Array:
     """Fine grain with cracks and repairs."""
     grain = fractal_noise(rng, slope=0.15)
     wear = fractal_noise(rng, slope=1.5)
-    value = np.exp(0.16 * grain + 0.12 * wear)
+    value = np.exp(0.26 * grain + 0.22 * wear)
     cracks = np.abs(fractal_noise(rng, slope=1.3, finest=3.0))
     value *= np.where(cracks < rng.uniform(0.005, 0.04), 0.55, 1.0)
     return _coloured(value.astype(np.float32))
@@ -130,8 +137,8 @@ def asphalt(rng: Generator) -> Float32Array:
 def stone_cells(rng: Generator) -> Float32Array:
     """Irregular flagstones or dried mud."""
     edge, cell = _cells(rng, int(rng.integers(4, 9)))
-    shade = rng.uniform(0.65, 1.0, cell.max() + 1).astype(np.float32)
-    value = shade[cell] * np.where(edge < 0.06, 0.45, 1.0) * np.exp(0.12 * fractal_noise(rng, slope=0.8))
+    shade = rng.uniform(0.5, 1.0, cell.max() + 1).astype(np.float32)
+    value = shade[cell] * np.where(edge < 0.06, 0.45, 1.0) * np.exp(0.2 * fractal_noise(rng, slope=0.8))
     return _coloured(value.astype(np.float32), fractal_noise(rng, slope=1.4), 0.1)
 
 
@@ -141,7 +148,7 @@ def _courses(rng: Generator, rows: int, columns: int, *, offset: float, joint: f
     row = np.floor(r * rows).astype(np.int64)
     shifted = (c * columns + offset * (row % 2)) % columns
     column = np.floor(shifted).astype(np.int64)
-    shade = rng.uniform(0.7, 1.0, (rows, columns)).astype(np.float32)[row, column % columns]
+    shade = rng.uniform(0.55, 1.0, (rows, columns)).astype(np.float32)[row, column % columns]
     across = np.minimum((r * rows) % 1.0, 1.0 - (r * rows) % 1.0) / rows
     along = np.minimum(shifted % 1.0, 1.0 - shifted % 1.0) / columns
     border = np.minimum(across, along) < joint
@@ -152,14 +159,14 @@ def bricks(rng: Generator) -> Float32Array:
     """A running bond."""
     columns = int(rng.integers(4, 9))
     value = _courses(rng, 2 * int(round(columns * rng.uniform(0.9, 1.5))), columns, offset=0.5, joint=0.006)
-    return _coloured(value * np.exp(0.1 * fractal_noise(rng, slope=0.5)), fractal_noise(rng, slope=1.0), 0.08)
+    return _coloured(value * np.exp(0.18 * fractal_noise(rng, slope=0.7)), fractal_noise(rng, slope=1.0), 0.08)
 
 
 def paving(rng: Generator) -> Float32Array:
     """Slabs."""
     count = int(rng.integers(3, 9))
     value = _courses(rng, count, count, offset=float(rng.choice([0.0, 0.5])), joint=0.005)
-    return _coloured(value * np.exp(0.09 * fractal_noise(rng, slope=0.6)), fractal_noise(rng, slope=1.5), 0.05)
+    return _coloured(value * np.exp(0.18 * fractal_noise(rng, slope=0.8)), fractal_noise(rng, slope=1.5), 0.05)
 
 
 def planks(rng: Generator) -> Float32Array:
@@ -204,9 +211,7 @@ def leaves(rng: Generator) -> Float32Array:
 
 def bark(rng: Generator) -> Float32Array:
     """Vertical ridges."""
-    return _coloured(
-        np.exp(0.35 * fractal_noise(rng, slope=0.8, stretch=0.35)), fractal_noise(rng, slope=1.5), 0.06
-    )
+    return _coloured(np.exp(0.35 * fractal_noise(rng, slope=0.8, stretch=0.35)), fractal_noise(rng, slope=1.5), 0.06)
 
 
 def speckle(rng: Generator) -> Float32Array:
@@ -219,7 +224,9 @@ def speckle(rng: Generator) -> Float32Array:
         inside = (np.abs((r - y + 0.5) % 1.0 - 0.5) < high) & (np.abs((c - x + 0.5) % 1.0 - 0.5) < wide)
         value = np.where(inside, value * np.float32(rng.choice([0.5, 0.75, 1.3, 1.6])), value)
     for count in rng.integers(2, 5, 2):
-        line = np.abs((r * count) % 1.0 - 0.5) < 0.012 if rng.random() < 0.5 else np.abs((c * count) % 1.0 - 0.5) < 0.012
+        line = (
+            np.abs((r * count) % 1.0 - 0.5) < 0.012 if rng.random() < 0.5 else np.abs((c * count) % 1.0 - 0.5) < 0.012
+        )
         value = np.where(line, value * np.float32(0.6), value)
     return _coloured(value)
 
@@ -252,7 +259,9 @@ def facade(rng: Generator, wall: Float32Array, colour: Float32Array) -> Float32A
                 window[y : y + edge] = frame_colour
             if sill:
                 below = row * bay + y1
-                image[below : below + 2 * edge, column * bay + x0 - edge : column * bay + x1 + edge] = frame_colour * 0.7
+                image[below : below + 2 * edge, column * bay + x0 - edge : column * bay + x1 + edge] = (
+                    frame_colour * 0.7
+                )
     if rng.random() < 0.5:  # a band between floors
         image[bay - 2 * edge : bay] *= rng.uniform(0.5, 1.5)
         image[-2 * edge :] *= rng.uniform(0.5, 1.5)

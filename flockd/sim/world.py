@@ -43,6 +43,8 @@ class World:
     """(m,) texture number, or GROUND."""
     uv: FloatArray
     """(m, 2, 4): texture coordinates in tiles from (n, e, d, 1)."""
+    level: FloatArray
+    """(m,) log2 of texels per metre."""
     tint: FloatArray
     """(m, 3) linear."""
     texels: PackedArray
@@ -50,7 +52,7 @@ class World:
     """Pyramid of colour and, in the fourth byte, baked sunlight; rows run north, columns east."""
     ground_kind: UInt8Array
     ground_detail: FloatArray
-    """(kinds, 2): texture number and tiles per metre."""
+    """(kinds, 3): texture number, tiles per metre, log2 of texels per metre."""
     ground_heights: FloatArray
     """(cells + 1, cells + 1) metres, up positive, rows north, columns east, from -extent to +extent."""
     obstacles: FloatArray
@@ -93,7 +95,9 @@ class World:
         """(n,) horizontal metres from points (n, 2) to the nearest obstacle's footprint; 0 inside one."""
         return _footprint_distance(self.obstacles, points)
 
-    def free_points(self, count: int, rng: Generator, min_distance_m: float, *, within_m: float | None = None) -> FloatArray:
+    def free_points(
+        self, count: int, rng: Generator, min_distance_m: float, *, within_m: float | None = None
+    ) -> FloatArray:
         """(count, 2) north, east: uniform over the square of half side ``within_m``, clear of all obstacles.
 
         Raises ``ValueError`` when the world is too crowded for that.
@@ -176,6 +180,8 @@ class _Generator:
         corner = vertices[triangles]
         normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         normals /= np.maximum(1e-12, np.linalg.norm(normals, axis=1, keepdims=True))
+        uv = np.concatenate([np.zeros((ground_count, 2, 4)), *mesh.uv])
+        tiles_per_m = 1.0 / rng.uniform(2.2, 4.5, self.ground_kinds)
         sun = light[0]
         frame = self._shadow_frame(sun)
         shadow = np.full((SHADOW_MAP_SIZE, SHADOW_MAP_SIZE), -1e9, dtype=np.float32)
@@ -190,12 +196,15 @@ class _Generator:
             triangles=triangles,
             normals=normals,
             texture=np.concatenate([np.full(ground_count, GROUND), *mesh.texture]).astype(np.int32),
-            uv=np.concatenate([np.zeros((ground_count, 2, 4)), *mesh.uv]),
+            uv=uv,
+            level=np.log2(textures.SIZE * np.maximum(1e-6, np.linalg.norm(uv[:, :, :3], axis=2).max(axis=1))),
             tint=np.concatenate([np.ones((ground_count, 3)), *mesh.tint]),
             texels=np.concatenate([textures.pack_pyramid(t) for t in self.textures]),
             ground_map=textures.pack_pyramid(ground_map),
             ground_kind=kinds,
-            ground_detail=np.array([(i, 1.0 / rng.uniform(2.2, 4.5)) for i in range(self.ground_kinds)]),
+            ground_detail=np.column_stack(
+                [np.arange(self.ground_kinds), tiles_per_m, np.log2(textures.SIZE * tiles_per_m)]
+            ),
             ground_heights=self.heights,
             obstacles=np.array(self.obstacles).reshape(-1, 6),
             shadow_map=shadow,
@@ -274,7 +283,9 @@ class _Generator:
             a, b = np.exp(rng.uniform(math.log(0.6), math.log(12.0), 2))
             patches.append((n, e, math.cos(heading), math.sin(heading), a, b, rng.integers(0, self.ground_kinds)))
         self.patches = np.array(patches, dtype=float).reshape(-1, 7)
-        self.patch_colours = np.array([_ground_colour(rng, self.ground_names[int(p[6])]) for p in patches]).reshape(-1, 3)
+        self.patch_colours = np.array([_ground_colour(rng, self.ground_names[int(p[6])]) for p in patches]).reshape(
+            -1, 3
+        )
 
     def _ground_map(self, sun: FloatArray, shadow: Float32Array, frame: FloatArray) -> tuple[Float32Array, UInt8Array]:
         rng = self.rng
@@ -282,16 +293,16 @@ class _Generator:
         colour = np.empty((size, size, 4), dtype=np.float32)
         kinds = np.empty((size, size), dtype=np.uint8)
         noise = np.stack([
-            textures.fractal_noise(rng, slope=1.9, coarsest=0.5),
+            textures.fractal_noise(rng, slope=rng.uniform(2.0, 2.6), coarsest=0.5),
             textures.fractal_noise(rng, slope=rng.uniform(0.8, 1.3), coarsest=0.4),
-            textures.fractal_noise(rng, slope=rng.uniform(0.7, 1.2), coarsest=0.4),
+            textures.fractal_noise(rng, slope=rng.uniform(0.4, 1.0), coarsest=0.4),
             textures.fractal_noise(rng, slope=1.5, coarsest=0.4),
         ])  # fmt: skip
         cell = 2 * self.extent / (self.heights.shape[0] - 1)
         slopes = np.stack(np.gradient(self.heights, cell))
         _raster.compose_ground(
             noise, self.extent, rng.uniform(0.7, 2.5), self.zone_limits, self.zone_colours, self.zone_kinds,
-            np.array([rng.uniform(0.1, 0.35), rng.uniform(0.06, 0.25), rng.uniform(0.0, 0.12)]),
+            np.array([rng.uniform(0.12, 0.38), rng.uniform(0.1, 0.35), rng.uniform(0.0, 0.1)]),
             self.roads, self.road_colours, self.patches, self.patch_colours, self._openness(), slopes, sun, shadow,
             frame, self.heights, colour, kinds,
         )  # fmt: skip
@@ -315,7 +326,10 @@ class _Generator:
             covered[rows, columns] = np.maximum(covered[rows, columns], inside * min(1.0, 0.3 * top))
         for _ in range(3):
             for axis_number in (0, 1):
-                total = np.cumsum(np.pad(covered, [(3, 2) if k == axis_number else (0, 0) for k in (0, 1)], mode="edge"), axis=axis_number)
+                total = np.cumsum(
+                    np.pad(covered, [(3, 2) if k == axis_number else (0, 0) for k in (0, 1)], mode="edge"),
+                    axis=axis_number,
+                )
                 upper = np.take(total, np.arange(5, total.shape[axis_number]), axis=axis_number)
                 lower = np.take(total, np.arange(0, total.shape[axis_number] - 5), axis=axis_number)
                 covered = (upper - lower) / 5
@@ -327,21 +341,30 @@ class _Generator:
         """Sun, skylight, haze and the sky's map. Scaled so that level ground receives about 1."""
         rng = self.rng
         elevation, azimuth = math.radians(rng.uniform(25, 70)), rng.uniform(0, 2 * math.pi)
-        sun = np.array([math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), -math.sin(elevation)])
+        sun = np.array(
+            [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), -math.sin(elevation)]
+        )
         overcast = float(rng.choice([0.0, 0.0, rng.uniform(0, 0.6), rng.uniform(0.7, 1.0)]))
         warm = (math.radians(70) - elevation) / math.radians(45) * rng.uniform(0.3, 1.0)
         sun_colour = np.array([1.0, 1.0 - 0.14 * warm, 1.0 - 0.38 * warm]) * (1.0 - 0.92 * overcast)
-        blue = np.array([0.62, 0.8, 1.1]) * rng.uniform(0.9, 1.1, 3)
-        skylight = (blue * (1 - overcast) + np.array([0.95, 1.0, 1.05]) * overcast) * rng.uniform(0.22, 0.42)
+        blue = np.array([0.62, 0.8, 1.1]) * rng.uniform(0.93, 1.07, 3)
+        skylight = (blue * (1 - overcast) + np.array([0.95, 1.0, 1.05]) * overcast) * rng.uniform(0.16, 0.36)
         skylight = skylight * (1.0 + 1.5 * overcast)
         irradiance = float((sun_colour * math.sin(elevation) + skylight).mean())
-        exposure = 2.0 ** rng.uniform(-0.4, 0.35) / irradiance
+        exposure = 2.0 ** rng.uniform(-0.55, 0.35) / irradiance
         sun_colour, skylight = sun_colour * exposure, skylight * exposure
         bounce = rng.uniform(0.15, 0.3) * (sun_colour * math.sin(elevation) + skylight) * rng.uniform(0.8, 1.0, 3)
-        zenith = (np.array([0.1, 0.24, 0.62]) * (1 - overcast) + 0.5 * overcast) * rng.uniform(0.8, 1.25, 3)
-        horizon = (np.array([0.55, 0.68, 0.85]) * (1 - overcast) + 0.72 * overcast) * rng.uniform(0.85, 1.1, 3)
-        zenith, horizon = zenith * 1.3, horizon * 1.3
-        fog = math.exp(rng.uniform(math.log(0.0012), math.log(0.012)))
+        zenith = (
+            (np.array([0.1, 0.24, 0.62]) * (1 - overcast) + 0.42 * overcast)
+            * rng.uniform(0.75, 1.2)
+            * rng.uniform(0.93, 1.07, 3)
+        )
+        horizon = (
+            (np.array([0.55, 0.68, 0.85]) * (1 - overcast) + 0.62 * overcast)
+            * rng.uniform(0.7, 1.15)
+            * rng.uniform(0.95, 1.05, 3)
+        )
+        fog = math.exp(rng.uniform(math.log(0.0006), math.log(0.007)))
 
         size = 1 << SKY_BITS
         t = (np.arange(size) + 0.5) / size - 0.5
@@ -361,7 +384,7 @@ class _Generator:
         density = clouds[row, column]
         cover = rng.uniform(-1.3, 0.6) + 1.5 * overcast
         amount = np.clip((density + cover) * rng.uniform(0.5, 1.5), 0, 1)[..., None] * np.clip(up * 5, 0, 1)[..., None]
-        white = (0.95 * (1 - overcast) + 0.8 * overcast) * (1.15 - 0.25 * np.clip(density, 0, 2)[..., None]) * 1.25
+        white = (0.95 * (1 - overcast) + 0.8 * overcast) * (1.15 - 0.25 * np.clip(density, 0, 2)[..., None])
         sky = sky * (1 - amount) + white * amount
         light = np.stack([sun, sun_colour, skylight, bounce, horizon])
         return light, fog, textures.pack_pyramid((sky / 4.0).astype(np.float32))[: size * size]
@@ -411,29 +434,31 @@ class _Generator:
         rng = self.rng
 
         def some(most: int, chance: float) -> int:
-            return int(most * rng.random() ** 2) + 1 if rng.random() < chance else 0
+            return int(most * rng.random() ** 1.5) + 1 if rng.random() < chance else 0
 
         self.tree_styles = [_TreeStyle.draw(rng, self.leaves) for _ in range(int(rng.integers(1, 4)))]
-        for _ in range(some(22, 0.75)):
+        for _ in range(some(30, 0.75)):
             self._building()
-        for _ in range(some(8, 0.35)):
+        for _ in range(some(14, 0.45)):
             self._container()
-        for _ in range(some(10, 0.5)):
+        for _ in range(some(16, 0.6)):
             self._fence()
-        for _ in range(some(14, 0.35)):
+        for _ in range(some(24, 0.4)):
             self._car()
-        for _ in range(some(14, 0.5)):
+        for _ in range(some(24, 0.55)):
             self._pole()
-        for _ in range(some(110, 0.85)):
+        for _ in range(some(130, 0.85)):
             self._tree()
-        for _ in range(some(60, 0.6)):
+        for _ in range(some(90, 0.65)):
             self._bush()
-        for _ in range(some(40, 0.5)):
+        for _ in range(some(50, 0.5)):
             self._rock()
         for _ in range(some(120, 0.5)):
             self._pebble()
 
-    def _place(self, half_length: float, half_width: float, top: float, *, off_road: bool = False, gap: float = 0.5) -> _Place | None:
+    def _place(
+        self, half_length: float, half_width: float, top: float, *, off_road: bool = False, gap: float = 0.5
+    ) -> _Place | None:
         """A spot for a footprint that keeps clear of the path and of what stands already; None if none was found."""
         rng = self.rng
         reach = math.hypot(half_length, half_width)
@@ -441,10 +466,14 @@ class _Generator:
             n, e = rng.uniform(-1, 1, 2) * (self.extent - 4.0 - reach)
             heading = rng.uniform(0, math.pi)
             footprint = np.array([[n, e, half_length, half_width, heading, top]])
-            if self.keep_out is not None and _footprint_distance(footprint, self.keep_out).min() < self.clearance + 0.05:
+            if (
+                self.keep_out is not None
+                and _footprint_distance(footprint, self.keep_out).min() < self.clearance + 0.05
+            ):
                 continue
             if off_road and any(
-                abs(-(n - r[0]) * r[3] + (e - r[1]) * r[2]) < r[4] + r[5] + min(half_length, half_width) for r in self.roads
+                abs(-(n - r[0]) * r[3] + (e - r[1]) * r[2]) < r[4] + r[5] + min(half_length, half_width)
+                for r in self.roads
             ):
                 continue
             if self.obstacles:
@@ -452,7 +481,9 @@ class _Generator:
                 if (_footprint_distance(standing, np.array([[n, e]])) < min(half_length, half_width) + gap).any():
                     continue
                 distance = np.hypot(standing[:, 0] - n, standing[:, 1] - e)
-                bound = np.minimum(np.hypot(standing[:, 2], standing[:, 3]), 1.3 * np.minimum(standing[:, 2], standing[:, 3]) + 0.5)
+                bound = np.minimum(
+                    np.hypot(standing[:, 2], standing[:, 3]), 1.3 * np.minimum(standing[:, 2], standing[:, 3]) + 0.5
+                )
                 if (distance < bound + reach).any():
                     continue
             self.obstacles.append((n, e, half_length, half_width, heading, top))
@@ -480,13 +511,22 @@ class _Generator:
         tint = np.full(3, 0.5) * rng.uniform(0.75, 1.2) if windows else paint
         bay_m = rng.uniform(2.2, 4.0)
         foundation = 0.6
-        for side, (length, turn, out) in enumerate(((a, 0.0, b), (b, math.pi / 2, a), (a, math.pi, b), (b, -math.pi / 2, a))):
+        for side, (length, turn, out) in enumerate(
+            ((a, 0.0, b), (b, math.pi / 2, a), (a, math.pi, b), (b, -math.pi / 2, a))
+        ):
             wall = _Place(place.north, place.east, place.heading + turn)
-            corners = np.array([wall.at(x, out, z + d) for x, d in ((-length, foundation), (length, foundation), (length, -wall_m), (-length, -wall_m))])
+            corners = np.array(
+                [
+                    wall.at(x, out, z + d)
+                    for x, d in ((-length, foundation), (length, foundation), (length, -wall_m), (-length, -wall_m))
+                ]
+            )
             bays = max(1, round(2 * length / bay_m))
             tile = (4 * length / bays, 2 * floor_m) if windows else (3.0, 3.0)
             # Seen from outside the wall's columns run the other way: winding decides.
-            self.mesh.add(corners, np.array([(0, 1, 2), (0, 2, 3)]), facade, tint, tile, wall.at(length, out, z - wall_m))
+            self.mesh.add(
+                corners, np.array([(0, 1, 2), (0, 2, 3)]), facade, tint, tile, wall.at(length, out, z - wall_m)
+            )
             if side == 0 and rng.random() < 0.7:
                 door = wall.at(rng.uniform(-0.6, 0.6) * length, out, z - 1.0)
                 self.mesh.box(door, (0.5, 0.04, 1.05), wall.heading, self.planks, _paint(rng), (1.0, 2.0))
@@ -494,11 +534,24 @@ class _Generator:
         roof = int(rng.choice(self.roofs))
         top = z - wall_m
         if rng.random() < 0.35:
-            self.mesh.box(place.at(0, 0, top - 0.12), (a + 0.5 * overhang, b + 0.5 * overhang, 0.13), place.heading, self.walls[0], roof_tint, (3.0, 3.0))
+            self.mesh.box(
+                place.at(0, 0, top - 0.12),
+                (a + 0.5 * overhang, b + 0.5 * overhang, 0.13),
+                place.heading,
+                self.walls[0],
+                roof_tint,
+                (3.0, 3.0),
+            )
             for _ in range(int(rng.integers(0, 4))):
                 x, y = rng.uniform(-0.7, 0.7) * a, rng.uniform(-0.6, 0.6) * b
                 size = rng.uniform(0.3, 0.9, 3)
-                self.mesh.box(place.at(x, y, top - 0.2 - size[2]), (size[0], size[1], size[2]), place.heading, self.roofs[1], _paint(rng))
+                self.mesh.box(
+                    place.at(x, y, top - 0.2 - size[2]),
+                    (size[0], size[1], size[2]),
+                    place.heading,
+                    self.roofs[1],
+                    _paint(rng),
+                )
             return
         la, lb = a + overhang, b + overhang
         ridge = la if rng.random() < 0.6 else la * rng.uniform(0.0, 0.6)
@@ -507,12 +560,21 @@ class _Generator:
                       place.at(-ridge, 0, top - roof_m), place.at(ridge, 0, top - roof_m)])  # fmt: skip
         tile = (rng.uniform(1.5, 3.0),) * 2
         self.mesh.add(v, np.array([(0, 5, 1), (0, 4, 5), (2, 4, 3), (2, 5, 4)]), roof, roof_tint, tile, v[4])
-        self.mesh.add(v, np.array([(1, 5, 2), (3, 4, 0)]), roof if ridge < la else self.walls[1], roof_tint if ridge < la else paint, tile, v[4])
+        self.mesh.add(
+            v,
+            np.array([(1, 5, 2), (3, 4, 0)]),
+            roof if ridge < la else self.walls[1],
+            roof_tint if ridge < la else paint,
+            tile,
+            v[4],
+        )
         self.mesh.add(v, np.array([(0, 1, 2), (0, 2, 3)]), self.planks, paint * 0.6, (2.0, 2.0))
         if rng.random() < 0.6:
             size = rng.uniform(0.2, 0.45)
             spot = place.at(rng.uniform(-0.5, 0.5) * ridge, rng.uniform(-0.4, 0.4) * b, top - roof_m)
-            self.mesh.box(spot, (size, size, rng.uniform(0.7, 1.3)), place.heading, self.walls[0], _paint(rng), (1.5, 1.5))
+            self.mesh.box(
+                spot, (size, size, rng.uniform(0.7, 1.3)), place.heading, self.walls[0], _paint(rng), (1.5, 1.5)
+            )
 
     def _container(self) -> None:
         rng = self.rng
@@ -520,7 +582,14 @@ class _Generator:
         place = self._place(a, b, 2 * h)
         if place is not None:
             texture = int(rng.choice([*self.walls, *self.roofs]))
-            self.mesh.box(place.at(0, 0, self._ground_z(place) - h + 0.1), (a, b, h + 0.1), place.heading, texture, _paint(rng), (2.4, 2.4))
+            self.mesh.box(
+                place.at(0, 0, self._ground_z(place) - h + 0.1),
+                (a, b, h + 0.1),
+                place.heading,
+                texture,
+                _paint(rng),
+                (2.4, 2.4),
+            )
 
     def _fence(self) -> None:
         rng = self.rng
@@ -536,15 +605,33 @@ class _Generator:
             z = self._ground_z(piece)
             half = a / sections
             if style < 0.35:  # wall
-                self.mesh.box(piece.at(0, 0, z - h + 0.2), (half, 0.12, h + 0.2), place.heading, self.walls[1], tint, (2.0, 2.0))
+                self.mesh.box(
+                    piece.at(0, 0, z - h + 0.2), (half, 0.12, h + 0.2), place.heading, self.walls[1], tint, (2.0, 2.0)
+                )
             elif style < 0.55:  # hedge
-                self.mesh.box(piece.at(0, 0, z - h + 0.2), (half, 0.24, h + 0.2), place.heading, self.leaves[0], _leaf_colour(rng), (1.2, 1.2))
+                self.mesh.box(
+                    piece.at(0, 0, z - h + 0.2),
+                    (half, 0.24, h + 0.2),
+                    place.heading,
+                    self.leaves[0],
+                    _leaf_colour(rng),
+                    (1.2, 1.2),
+                )
             else:
-                self.mesh.box(piece.at(half, 0, z - h + 0.2), (0.06, 0.06, h + 0.25), place.heading, self.planks, tint, (1.0, 1.0))
+                self.mesh.box(
+                    piece.at(half, 0, z - h + 0.2), (0.06, 0.06, h + 0.25), place.heading, self.planks, tint, (1.0, 1.0)
+                )
                 rails = (0.35, 1.0, 1.65) if style < 0.8 else (0.95,)
                 thick = 0.08 if style < 0.8 else 0.75 * h
                 for level in rails:
-                    self.mesh.box(piece.at(0, 0, z - level * h - 0.05), (half, 0.025, thick), place.heading, self.planks, tint, (1.0, 1.0))
+                    self.mesh.box(
+                        piece.at(0, 0, z - level * h - 0.05),
+                        (half, 0.025, thick),
+                        place.heading,
+                        self.planks,
+                        tint,
+                        (1.0, 1.0),
+                    )
 
     def _car(self) -> None:
         rng = self.rng
@@ -556,8 +643,22 @@ class _Generator:
         paint = _paint(rng)
         smooth = self.facades[0]
         self.mesh.box(place.at(0, 0, z - 0.58), (length, width, 0.3), place.heading, self.rock, paint, (4.0, 4.0))
-        self.mesh.box(place.at(-0.15 * length, 0, z - 1.14), (0.55 * length, 0.88 * width, 0.26), place.heading, smooth, np.full(3, 0.12), (9.0, 9.0))
-        self.mesh.box(place.at(-0.15 * length, 0, z - 1.43), (0.5 * length, 0.85 * width, 0.04), place.heading, self.rock, paint, (4.0, 4.0))
+        self.mesh.box(
+            place.at(-0.15 * length, 0, z - 1.14),
+            (0.55 * length, 0.88 * width, 0.26),
+            place.heading,
+            smooth,
+            np.full(3, 0.12),
+            (9.0, 9.0),
+        )
+        self.mesh.box(
+            place.at(-0.15 * length, 0, z - 1.43),
+            (0.5 * length, 0.85 * width, 0.04),
+            place.heading,
+            self.rock,
+            paint,
+            (4.0, 4.0),
+        )
         for x in (-0.62, 0.62):
             for y in (-1.0, 1.0):
                 hub = place.at(x * length, y * (width - 0.12), z - 0.31)
@@ -577,7 +678,9 @@ class _Generator:
         if style < 0.4:
             self.mesh.box(place.at(0.25, 0, z - h), (0.35, 0.1, 0.06), place.heading, self.rock, tint)
         elif style < 0.75:
-            self.mesh.box(place.at(r, 0, z - h + 0.4), (0.02, 0.35, 0.35), place.heading, self.facades[1], _paint(rng), (0.9, 0.9))
+            self.mesh.box(
+                place.at(r, 0, z - h + 0.4), (0.02, 0.35, 0.35), place.heading, self.facades[1], _paint(rng), (0.9, 0.9)
+            )
         else:
             self.mesh.blob(place.at(0, 0, z - h), np.full(3, 0.2), 0.0, rng, self.rock, np.full(3, 0.5), 2.0)
 
@@ -595,23 +698,62 @@ class _Generator:
         trunk_tint = np.array([0.22, 0.15, 0.1]) * rng.uniform(0.6, 1.8)
         r = 0.02 * height + 0.06
         bare = style.bare * height
-        mesh.frustum(place.at(0, 0, z + 0.3), place.at(0, 0, z - max(bare + 0.3, 0.75 * height)), (r, 0.5 * r), 7, self.bark, trunk_tint)
+        mesh.frustum(
+            place.at(0, 0, z + 0.3),
+            place.at(0, 0, z - max(bare + 0.3, 0.75 * height)),
+            (r, 0.5 * r),
+            7,
+            self.bark,
+            trunk_tint,
+        )
         if style.shape == "cone":
             layers = style.layers
             for k in range(layers):
                 low = bare + (height - bare) * k / layers * 0.85
                 high = low + (height - low) * (0.75 if k < layers - 1 else 1.0)
-                mesh.frustum(place.at(0, 0, z - low), place.at(0, 0, z - high), (crown * (1 - 0.75 * k / layers), 0.0), 9, style.texture, tint * (1 + 0.1 * k), (1.5, 1.5))
+                mesh.frustum(
+                    place.at(0, 0, z - low),
+                    place.at(0, 0, z - high),
+                    (crown * (1 - 0.75 * k / layers), 0.0),
+                    9,
+                    style.texture,
+                    tint * (1 + 0.1 * k),
+                    (1.5, 1.5),
+                )
         elif style.shape == "column":
-            mesh.blob(place.at(0, 0, z - (bare + height) / 2), np.array([0.45 * crown, 0.45 * crown, (height - bare) / 2]), 0.12, rng, style.texture, tint, 1.6)
+            mesh.blob(
+                place.at(0, 0, z - (bare + height) / 2),
+                np.array([0.45 * crown, 0.45 * crown, (height - bare) / 2]),
+                0.12,
+                rng,
+                style.texture,
+                tint,
+                1.6,
+            )
         elif style.shape == "round":
-            mesh.blob(place.at(0, 0, z - (bare + height) / 2), np.array([0.9 * crown, 0.9 * crown, (height - bare) / 2]), 0.14, rng, style.texture, tint, 2.0)
+            mesh.blob(
+                place.at(0, 0, z - (bare + height) / 2),
+                np.array([0.9 * crown, 0.9 * crown, (height - bare) / 2]),
+                0.14,
+                rng,
+                style.texture,
+                tint,
+                2.0,
+            )
         elif style.shape == "cloud":
             for _ in range(style.layers + 2):
                 x, y = rng.uniform(-0.55, 0.55, 2) * crown
                 size = rng.uniform(0.35, 0.55) * crown
                 up = rng.uniform(bare + 0.5 * size, max(bare + 0.6 * size, height - size))
-                mesh.blob(place.at(x, y, z - up), np.array([size, size, 0.8 * size]), 0.16, rng, style.texture, tint * rng.uniform(0.85, 1.15), 1.6)
+                mesh.blob(
+                    place.at(x, y, z - up),
+                    np.array([size, size, 0.8 * size]),
+                    0.16,
+                    rng,
+                    style.texture,
+                    tint * rng.uniform(0.85, 1.15),
+                    1.6,
+                )
         else:  # bare branches
             for _ in range(9):
                 foot = place.at(0, 0, z - rng.uniform(0.35, 0.72) * height)
@@ -625,7 +767,15 @@ class _Generator:
         place = self._place(r, r, 1.3 * r, gap=-0.3)
         if place is not None:
             z = self._ground_z(place)
-            self.mesh.blob(place.at(0, 0, z - 0.5 * r), np.array([0.8 * r, 0.8 * r, 0.7 * r]), 0.2, rng, int(rng.choice(self.leaves)), _leaf_colour(rng), 1.2)
+            self.mesh.blob(
+                place.at(0, 0, z - 0.5 * r),
+                np.array([0.8 * r, 0.8 * r, 0.7 * r]),
+                0.2,
+                rng,
+                int(rng.choice(self.leaves)),
+                _leaf_colour(rng),
+                1.2,
+            )
 
     def _rock(self) -> None:
         rng = self.rng
@@ -634,7 +784,15 @@ class _Generator:
         if place is not None:
             z = self._ground_z(place)
             radii = r * rng.uniform(0.55, 0.8, 3)
-            self.mesh.blob(place.at(0, 0, z - 0.2 * r), radii, 0.2, rng, self.rock, np.full(3, rng.uniform(0.15, 0.5)) * rng.uniform(0.85, 1.1, 3), 1.5)
+            self.mesh.blob(
+                place.at(0, 0, z - 0.2 * r),
+                radii,
+                0.2,
+                rng,
+                self.rock,
+                np.full(3, rng.uniform(0.15, 0.5)) * rng.uniform(0.85, 1.1, 3),
+                1.5,
+            )
 
     def _pebble(self) -> None:
         """Low things may lie under the path too."""
@@ -643,9 +801,19 @@ class _Generator:
         size = rng.uniform(0.05, 0.2)
         z = self._ground_z(place)
         if rng.random() < 0.6:
-            self.mesh.blob(place.at(0, 0, z), np.array([size, size, 0.7 * size]), 0.2, rng, self.rock, np.full(3, rng.uniform(0.1, 0.6)), 0.8)
+            self.mesh.blob(
+                place.at(0, 0, z),
+                np.array([size, size, 0.7 * size]),
+                0.2,
+                rng,
+                self.rock,
+                np.full(3, rng.uniform(0.1, 0.6)),
+                0.8,
+            )
         else:
-            self.mesh.blob(place.at(0, 0, z), np.array([size, size, 0.8 * size]), 0.25, rng, self.leaves[1], _leaf_colour(rng), 0.8)
+            self.mesh.blob(
+                place.at(0, 0, z), np.array([size, size, 0.8 * size]), 0.25, rng, self.leaves[1], _leaf_colour(rng), 0.8
+            )
 
     def _horizon(self) -> None:
         """Far woods and hills beyond the extent: a ring of lumps, none nearer than 1.3 extents."""
@@ -654,7 +822,9 @@ class _Generator:
             bearing, away = rng.uniform(0, 2 * math.pi), self.extent * rng.uniform(1.9, 4.5)
             wide, high = rng.uniform(8, 35), rng.uniform(4, 16)
             centre = np.array([away * math.cos(bearing), away * math.sin(bearing), 0.2 * high])
-            self.mesh.blob(centre, np.array([wide, wide, high]), 0.12, rng, self.leaves[0], _leaf_colour(rng) * 0.8, 6.0)
+            self.mesh.blob(
+                centre, np.array([wide, wide, high]), 0.12, rng, self.leaves[0], _leaf_colour(rng) * 0.8, 6.0
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -695,7 +865,9 @@ def _paint(rng: Generator) -> FloatArray:
 
 
 def _roof_colour(rng: Generator) -> FloatArray:
-    base = np.array([(0.4, 0.14, 0.08), (0.2, 0.2, 0.22), (0.3, 0.22, 0.15), (0.15, 0.22, 0.2)])[int(rng.integers(0, 4))]
+    base = np.array([(0.4, 0.14, 0.08), (0.2, 0.2, 0.22), (0.3, 0.22, 0.15), (0.15, 0.22, 0.2)])[
+        int(rng.integers(0, 4))
+    ]
     return np.asarray(np.clip(base * rng.uniform(0.6, 1.6) * rng.uniform(0.85, 1.15, 3), 0.03, 0.7))
 
 
@@ -709,14 +881,14 @@ def _ground_colour(rng: Generator, kind: str) -> FloatArray:
         "bricks": (0.3, 0.18, 0.14),
         "stone_cells": (0.33, 0.3, 0.25),
     }[kind]
-    return np.asarray(np.clip(np.array(base) * rng.uniform(0.65, 1.5) * rng.uniform(0.8, 1.2, 3), 0.03, 0.7))
+    return np.asarray(np.clip(np.array(base) * rng.uniform(0.55, 1.4) * rng.uniform(0.85, 1.15, 3), 0.02, 0.7))
 
 
 def _tone_curve(rng: Generator) -> UInt8Array:
     """Soft shoulder, then the sRGB encoding."""
     linear = (np.arange(2049) / 1024.0) ** 2
-    strength = rng.uniform(1.2, 1.9)
+    strength = rng.uniform(0.9, 1.4)
     y = (1 - np.exp(-strength * linear)) / (1 - math.exp(-strength * 3.0))
-    y = np.minimum(y, 1.0)
+    y = np.minimum(y, 1.0) ** rng.uniform(1.0, 1.2)
     srgb = np.where(y <= 0.0031308, 12.92 * y, 1.055 * y ** (1 / 2.4) - 0.055)
     return np.asarray(np.round(255 * srgb), dtype=np.uint8)
