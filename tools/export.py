@@ -20,9 +20,9 @@ from torch import nn
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from flockd.perception.manifest import Manifest  # noqa: E402
-from flockd.perception.session import OnnxModel, golden_feeds  # noqa: E402
-from tools.training.networks import DistanceNet, FlowNet, NeighboursNet  # noqa: E402
+from flockd.perception.manifest import Manifest
+from flockd.perception.session import OnnxModel, golden_feeds
+from tools.training.networks import DistanceNet, FlowNet, NeighboursNet
 
 ALLOWED_DIFFERENCE = 2e-3
 """Between ONNX Runtime and torch, as a share of the output's largest value."""

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from tools.training import worlds  # noqa: E402
-from tools.training.dataset import FOCAL_PX, HEIGHT, MAX_DRONES, WIDTH, create_part, note  # noqa: E402
+from tools.training import worlds
+from tools.training.dataset import FOCAL_PX, HEIGHT, MAX_DRONES, WIDTH, create_part, note
 
 Array = NDArray[Any]
 
@@ -110,8 +110,9 @@ def _render_pair(
         _note_drones(part, index, k, view, R_ned_camera, positions[k], drone_positions[k], shown)
     flow, valid = true_flow(
         views[0], views[1], matrix,
-        R_ned_camera=(attitudes[0] @ R_BODY_CAMERA, attitudes[1] @ R_BODY_CAMERA), position_ned=tuple(positions),
-        drone_rotations=tuple(drone_rotations), drone_positions=tuple(drone_positions),
+        R_ned_camera=(attitudes[0] @ R_BODY_CAMERA, attitudes[1] @ R_BODY_CAMERA), position_ned=(positions[0], positions[1]),
+        drone_rotations=(drone_rotations[0], drone_rotations[1]),
+        drone_positions=(drone_positions[0], drone_positions[1]),
     )  # fmt: skip
     part["flow"][index] = np.moveaxis(flow[1::2, 1::2], 2, 0)
     part["flow_valid"][index] = valid[1::2, 1::2]

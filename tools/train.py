@@ -25,9 +25,9 @@ from torch.nn import functional as F
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from tools.training.dataset import PairSet, open_pairs  # noqa: E402
-from tools.training.networks import MAX_DEPTH_M, DistanceNet, FlowNet, NeighboursNet  # noqa: E402
-from tools.training.samples import Sample, distance_sample, drone_list, flow_sample, neighbours_sample  # noqa: E402
+from tools.training.dataset import PairSet, open_pairs
+from tools.training.networks import MAX_DEPTH_M, DistanceNet, FlowNet, NeighboursNet
+from tools.training.samples import Sample, distance_sample, drone_list, flow_sample, neighbours_sample
 
 Batch = dict[str, Tensor]
 
@@ -55,9 +55,11 @@ class NeighboursTask(Task):
         self.pairs = pairs
 
     def sample(self, rng: np.random.Generator) -> Sample:
+        """See ``Task``."""
         return neighbours_sample(self.pairs, int(rng.integers(self.pairs.count)), rng)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
+        """See ``Task``."""
         depth, logit, offset = self.net(batch["image"], batch["geometry"])
         mask = batch["drone"]
         error = (depth.log() - batch["depth"].log()).abs()
@@ -91,9 +93,11 @@ class DistanceTask(Task):
         self.pairs, self.drones = pairs, drone_list(pairs)
 
     def sample(self, rng: np.random.Generator) -> Sample:
+        """See ``Task``."""
         return distance_sample(self.pairs, self.drones[int(rng.integers(len(self.drones)))], rng)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
+        """See ``Task``."""
         out = self.net(batch["picture"])
         error = (out[:, 0] - batch["target"][:, 0]).abs()
         centre = (out[:, 1:3] - batch["target"][:, 1:3]).abs().clamp(max=30).sum(1)
@@ -114,9 +118,11 @@ class FlowTask(Task):
         self.pairs = pairs
 
     def sample(self, rng: np.random.Generator) -> Sample:
+        """See ``Task``."""
         return flow_sample(self.pairs, int(rng.integers(self.pairs.count)), rng, (256, 240))
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
+        """See ``Task``."""
         flows = self.net(batch["first"], batch["second"])
         valid = batch["valid"][:, None] & (batch["flow"].abs().amax(1, keepdim=True) < 120)
         weight = valid.float() * (1 + 2 * batch["drone"][:, None].float())

@@ -112,7 +112,7 @@ class TrackingParameters(Section):
     gate_sigma: Positive = 4.0
     """Association gate in standard deviations."""
     min_gate_m: Positive = 0.5
-    acceleration_sigma_m_s2: Positive = 0.4
+    acceleration_sigma_m_s2: Positive = 0.2
     """How hard a neighbour may manoeuvre between two frame sets."""
     size_memory: Annotated[int, Field(ge=0)] = 0
     """Number of sightings over which a neighbour's physical size is averaged; 0: off."""

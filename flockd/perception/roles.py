@@ -130,7 +130,8 @@ class Perception:
         model = self._models[key]
         if role not in model.manifest.roles:
             raise ModelError(
-                f"perception.{role}: model {name!r} fills {', '.join(model.manifest.roles)} and not {role}; choose another"
+                f"perception.{role}: model {name!r} fills {', '.join(model.manifest.roles)} and not {role}; "
+                "choose another"
             )
         return model
 

@@ -95,7 +95,7 @@ class Observer:
                 continue
             try:
                 maps[name] = self._perceiver.scene(name, frame.image, self._geometry(camera, vehicle))
-            except FloatingPointError as error:
+            except (FloatingPointError, ValueError) as error:  # a network gone astray; a height below the ground
                 reasons.append(f"camera {name}: {error}")
         return maps, reasons
 
@@ -104,7 +104,7 @@ class Observer:
     ) -> RigView:
         """Sightings of the whole rig, and the maps relabelled by them."""
         images = {name: frames.frames[name].image for name in maps}
-        found = self._locate(images, maps)
+        found = self._locate(images, maps) if maps else []
         sightings, label_of = _merge(found)
         views = {}
         for name, scene in maps.items():
@@ -126,6 +126,7 @@ class Observer:
         return np.concatenate([tangents, ground[None]])
 
     def _locate(self, images: Mapping[str, UInt8Array], maps: Mapping[str, SceneMaps]) -> list[_Located]:
+        live = Rig({name: self._rig.cameras[name] for name in maps})
         candidates = [
             _Candidate(name, instance, *_aim(self._rig.cameras[name], instance))
             for name, scene in maps.items()
@@ -134,12 +135,12 @@ class Observer:
         if not self._perceiver.has_distance:
             located = [self._locate_by_depth(c, maps[c.camera]) for c in candidates]
             return [one for one in located if one is not None]
-        first = self._ranges(images, [(c.direction, c.half_angle, None) for c in candidates])
+        first = self._ranges(live, images, [(c.direction, c.half_angle, None) for c in candidates])
         again = [
-            (self._in_view(position, c), float(np.arctan(_SECOND_HALF_WIDTH_M / max(range_m, 0.5))), range_m)
+            (_in_view(live, position, c), float(np.arctan(_SECOND_HALF_WIDTH_M / max(range_m, 0.5))), range_m)
             for c, (position, range_m, _) in zip(candidates, first, strict=True)
         ]
-        second = self._ranges(images, again)
+        second = self._ranges(live, images, again)
         return [
             _Located(c, position, max(sigma, _MIN_RELATIVE_SIGMA) * range_m, _size(c, range_m))
             for c, (position, range_m, sigma) in zip(candidates, second, strict=True)
@@ -147,12 +148,10 @@ class Observer:
         ]
 
     def _ranges(
-        self, images: Mapping[str, UInt8Array], aims: Sequence[tuple[FloatArray, float, float | None]]
+        self, live: Rig, images: Mapping[str, UInt8Array], aims: Sequence[tuple[FloatArray, float, float | None]]
     ) -> list[tuple[FloatArray, float, float]]:
         """For each (direction, half angle, range if known): position in the body, distance from it, relative sigma."""
-        crops = [
-            virtual_crop(self._rig, direction, angle, self._perceiver.picture_size) for direction, angle, _ in aims
-        ]
+        crops = [virtual_crop(live, direction, angle, self._perceiver.picture_size) for direction, angle, _ in aims]
         pictures = [
             Picture(
                 image=crop.sample(images, range_m=range_m)[0],
@@ -168,11 +167,6 @@ class Observer:
             position = crop.T_body_virtual.apply(estimate.range_m * ray[None])[0]
             out.append((position, float(np.linalg.norm(position)), estimate.relative_sigma))
         return out
-
-    def _in_view(self, position: FloatArray, candidate: _Candidate) -> FloatArray:
-        """The direction to a position, or the candidate's own where no camera looks that way."""
-        direction = position / np.linalg.norm(position)
-        return direction if self._rig.covers(direction[None])[0] else candidate.direction
 
     def _locate_by_depth(self, candidate: _Candidate, scene: SceneMaps) -> _Located | None:
         """Eq. 37 on the depth map alone: the centre of the bounding box of the drone's points."""
@@ -244,6 +238,12 @@ def _aim(camera: RigCamera, instance: Instance) -> tuple[FloatArray, float, floa
     wide = float(np.arccos(np.clip(rays[0] @ rays[1], -1, 1)))
     half_angle = float(np.clip(_FIRST_MARGIN * reach, np.radians(1.0), np.radians(35.0)))
     return camera.T_body_camera.rotation @ centre, half_angle, max(wide, 1e-3)
+
+
+def _in_view(live: Rig, position: FloatArray, candidate: _Candidate) -> FloatArray:
+    """The direction to a position, or the candidate's own where no camera looks that way."""
+    direction = position / np.linalg.norm(position)
+    return direction if live.covers(direction[None])[0] else candidate.direction
 
 
 def _size(candidate: _Candidate, range_m: float) -> float:

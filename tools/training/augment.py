@@ -34,6 +34,6 @@ def photometric(images: list[Image], rng: np.random.Generator) -> list[Image]:
             changed = cv2.add(changed, cv2.merge([grain] * 3), dtype=cv2.CV_8U)
         if quality is not None:
             _, packed = cv2.imencode(".jpg", changed, [cv2.IMWRITE_JPEG_QUALITY, quality])
-            changed = cv2.imdecode(packed, cv2.IMREAD_COLOR)
+            changed = np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR))
         out.append(np.asarray(changed, dtype=np.uint8))
     return out

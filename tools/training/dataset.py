@@ -87,7 +87,7 @@ def ground_plane(focal: float, R_ned_camera: NDArray[Any], height_m: float) -> N
     """(h/2, w/2) inverse depth of flat ground, 1/m; 0 above the horizon."""
     right, down = ray_tangents(focal)
     towards_ground = R_ned_camera[2, 0] * right + R_ned_camera[2, 1] * down + R_ned_camera[2, 2]
-    return np.maximum(towards_ground / height_m, 0.0).astype(np.float32)
+    return np.asarray(np.maximum(towards_ground / height_m, 0.0), dtype=np.float32)
 
 
 def ray_tangents(focal: float) -> NDArray[np.float32]:

@@ -7,6 +7,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -48,16 +50,17 @@ class NeighboursNet(nn.Module):
         super().__init__()
         w = self.widths
         self.stem = _conv(48 + 12, w[0])
-        self.down = nn.ModuleList([_conv(a, b, stride=2) for a, b in zip(w[:-1], w[1:], strict=True)])
+        self.down = nn.ModuleList([_conv(a, b, stride=2) for a, b in pairwise(w)])
         self.body = nn.ModuleList([_Residual(b) for b in w[1:]])
         self.deep = nn.Sequential(_Residual(w[-1]), _Residual(w[-1]))
         self.context = nn.Sequential(nn.Linear(w[-1], w[-1]), nn.ReLU(True), nn.Linear(w[-1], w[-1]))
         self.lateral = nn.ModuleList([nn.Conv2d(a, a, 1) for a in w[:-1]])
-        self.up = nn.ModuleList([_conv(b, a, kernel=1) for a, b in zip(w[:-1], w[1:], strict=True)])
+        self.up = nn.ModuleList([_conv(b, a, kernel=1) for a, b in pairwise(w)])
         self.merge = nn.ModuleList([_conv(a, a) for a in w[:-1]])
         self.head = nn.Sequential(_conv(w[0], w[0]), nn.Conv2d(w[0], 4 * 4, 1), nn.PixelShuffle(2))
 
     def forward(self, image: Tensor, geometry: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Depth, logit and offsets."""
         x = image.permute(0, 3, 1, 2).to(geometry.dtype) / 127.5 - 1.0
         x = torch.cat([F.pixel_unshuffle(x, 4), F.pixel_unshuffle(geometry, 2)], 1)
         x = self.stem(x)
@@ -101,6 +104,7 @@ class DistanceNet(nn.Module):
         self.head = nn.Sequential(nn.Linear(128 * 9, 128), nn.ReLU(True), nn.Linear(128, 4))
 
     def forward(self, picture: Tensor) -> Tensor:
+        """One row a picture."""
         x = picture.permute(0, 3, 1, 2).float() / 127.5 - 1.0
         x = self.features(F.pixel_unshuffle(x, 2))
         out = self.head(x.flatten(1))
@@ -160,6 +164,7 @@ class FlowNet(nn.Module):
         self.mask = nn.Sequential(nn.Conv2d(self.hidden, 96, 3, 1, 1), nn.ReLU(True), nn.Conv2d(96, 9 * 64, 1))
 
     def forward(self, first: Tensor, second: Tensor, iterations: int | None = None) -> Tensor | list[Tensor]:
+        """The last flow, or in training all of them."""
         both = torch.cat([first, second], 0).permute(0, 3, 1, 2).float() / 127.5 - 1.0
         features = self.encoder(both)
         n = first.shape[0]
