@@ -1,8 +1,10 @@
 """The renderer's inner loops, compiled: set up triangles, fill a depth buffer, shade what is seen.
 
-No fastmath: a shared edge must give the same crossing from both of its triangles (no holes), and the bytes must not depend
-on the number of threads. Each image row is written by one thread only.
+No fastmath: a shared edge must give the same crossing from both of its triangles (no holes), and the bytes must not
+depend on the number of threads. Each image row is written by one thread only.
 """
+# Compiled loops are long: a call for each few lines would cost more than it explains.
+# ruff: noqa: PLR0912, PLR0915
 
 from __future__ import annotations
 
@@ -69,8 +71,8 @@ def set_up_triangles(q: Any, triangles: Any, width: int, height: int, rows: Any,
             va = ay / az
             vb = by / bz
             vc = cy / cz
-            top = max(top, int(math.ceil(max(-1.0, min(va, vb, vc)) - 0.5)))
-            bottom = min(bottom, int(math.floor(min(height + 1.0, max(va, vb, vc)) - 0.5)))
+            top = max(top, math.ceil(max(-1.0, min(va, vb, vc)) - 0.5))
+            bottom = min(bottom, math.floor(min(height + 1.0, max(va, vb, vc)) - 0.5))
             ua = ax / az
             ub = bx / bz
             uc = cx / cz
@@ -146,8 +148,8 @@ def fill(visible: Any, rows: Any, planes: Any, inverse_depth: Any, hit: Any, ban
                         high = -1.0
                 if low > high:
                     continue
-                x0 = int(math.ceil(low))
-                x1 = int(math.floor(high))
+                x0 = math.ceil(low)
+                x1 = math.floor(high)
                 step = np.float32(p[9])
                 start = np.float32(p[9] * (x0 + 0.5) + p[10] * v + p[11])
                 for x in range(x0, x1 + 1):
@@ -174,8 +176,8 @@ def _bilinear(texels: Any, base: int, bits: int, u: float, v: float) -> Any:
     mask = size - 1
     fu = u * (size * 256.0) - 128.0
     fv = v * (size * 256.0) - 128.0
-    iu = int(math.floor(fu))
-    iv = int(math.floor(fv))
+    iu = math.floor(fu)
+    iv = math.floor(fv)
     wu = np.uint64(iu & 255)
     wv = np.uint64(iv & 255)
     x0 = (iu >> 8) & mask
@@ -191,7 +193,7 @@ def _bilinear(texels: Any, base: int, bits: int, u: float, v: float) -> Any:
 
 @njit(cache=True)
 def sample(texels: Any, base: int, bits: int, u: float, v: float, level: float) -> Any:
-    """Trilinear packed colour; ``level`` 0 is the finest of ``bits`` + 1 levels stored one after another from ``base``."""
+    """Trilinear packed colour; ``level`` 0 is the finest of ``bits`` + 1 levels, stored in turn from ``base``."""
     if level <= 0.0:
         return _bilinear(texels, base, bits, u, v)
     whole = int(level)
@@ -356,7 +358,8 @@ def shade_scene(
                 e = origin[1] + re * z
                 d = origin[2] + rd * z
                 nn, ne, nd = normals[t, 0], normals[t, 1], normals[t, 2]
-                # A pixel's footprint, log2 of metres: halfway between its short side and its long one, which grazing views stretch.
+                # A pixel's footprint, log2 of metres: midway between its short side and its long one, which
+                # grazing views stretch.
                 facing = max(0.02 * length, -(rn * nn + re * ne + rd * nd))
                 footprint = 0.5 * math.log2(z * z * length / facing) - focal_level
                 free = 1.0
@@ -548,10 +551,10 @@ def fill_shadow(vertices: Any, triangles: Any, frame: Any, shadow: Any) -> None:
         area = (s[1] - s[0]) * (r[2] - r[0]) - (s[2] - s[0]) * (r[1] - r[0])
         if abs(area) < 1e-9:
             continue
-        x0 = max(0, int(math.ceil(s.min() - 0.5)))
-        x1 = min(size - 1, int(math.floor(s.max() - 0.5)))
-        y0 = max(0, int(math.ceil(r.min() - 0.5)))
-        y1 = min(size - 1, int(math.floor(r.max() - 0.5)))
+        x0 = max(0, math.ceil(s.min() - 0.5))
+        x1 = min(size - 1, math.floor(s.max() - 0.5))
+        y0 = max(0, math.ceil(r.min() - 0.5))
+        y1 = min(size - 1, math.floor(r.max() - 0.5))
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
                 ds = x + 0.5 - s[0]
@@ -570,8 +573,8 @@ def _noise(maps: Any, k: int, u: float, v: float) -> float:
     mask = size - 1
     fu = u * size
     fv = v * size
-    x = int(math.floor(fu))
-    y = int(math.floor(fv))
+    x = math.floor(fu)
+    y = math.floor(fv)
     wx = fu - x
     wy = fv - y
     x0 = x & mask
@@ -607,8 +610,7 @@ def compose_ground(
 ) -> None:
     """The ground's map: colour and baked sunlight per texel (rows run north, columns east), and which detail covers it.
 
-    Zones from noise, then roads (straight with a sway), then rectangles. Each row of ``roads`` is a point (n, e), a direction, half width,
-    sway, sway length, phase, detail, stripes; of ``patches`` a centre, a direction, half sizes, detail.
+    Zones from noise, then roads (straight with a sway), then rectangles: their rows are ``Scenery``'s.
     """
     size = kinds.shape[0]
     cells = heights.shape[0] - 1
@@ -706,7 +708,7 @@ def compose_ground(
 
 @njit(parallel=True, cache=True)
 def flow(depth: Any, ids: Any, depth_2: Any, ids_2: Any, H: Any, t: Any, out: Any, valid: Any) -> None:
-    """Pixel motion: ``z2 (u2, v2, 1) = z H[id] (u, v, 1) + t[id]``, and whether the second image shows the same point."""
+    """Pixel motion: ``z2 (u2, v2, 1) = z H[id] (u, v, 1) + t[id]``, and whether the second image shows that point."""
     height, width = ids.shape
     for y in prange(height):
         for x in range(width):
@@ -748,8 +750,8 @@ def flow(depth: Any, ids: Any, depth_2: Any, ids_2: Any, H: Any, t: Any, out: An
             # Steep planes change by more than that within a pixel; 1/z is linear in the image.
             fx = u2 - 0.5
             fy = v2 - 0.5
-            i = max(0, min(width - 2, int(math.floor(fx))))
-            j = max(0, min(height - 2, int(math.floor(fy))))
+            i = max(0, min(width - 2, math.floor(fx)))
+            j = max(0, min(height - 2, math.floor(fy)))
             fx -= i
             fy -= j
             inverse = (1.0 - fy) * ((1.0 - fx) / depth_2[j, i] + fx / depth_2[j, i + 1]) + fy * (

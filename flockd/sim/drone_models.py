@@ -36,7 +36,8 @@ class DroneModel:
     uv: FloatArray
     """(m, 2, 4) texture coordinates in tiles from body (x, y, z, 1)."""
     hubs: FloatArray
-    """(4, 3) tops of the motors: front right, rear right, rear left, front left (plus frames: front, right, rear, left)."""
+    """(4, 3) tops of the motors: front right, rear right, rear left, front left (plus frame: front, right, rear, left).
+    """
     extent: FloatArray
     """(2, 3) least and greatest corner, propellers at any angle; a family's own."""
     size_m: float
@@ -309,15 +310,14 @@ def _ring(
     sides = 12
     angle = np.arange(sides) * 2 * math.pi / sides
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    rows = [np.column_stack([ring * r + (x, y), np.full(sides, z)])
-            for r, z in ((outer, half_height), (outer, -half_height), (inner, -half_height), (inner, half_height))]  # fmt: skip
-    vertices = np.vstack(rows)
+    profile = ((outer, half_height), (outer, -half_height), (inner, -half_height), (inner, half_height))
+    vertices = np.vstack([np.column_stack([ring * r + (x, y), np.full(sides, z)]) for r, z in profile])
     faces, tint = [], []
     for k in range(sides):
         j = (k + 1) % sides
         for side in range(4):
             a, b = side * sides, (side + 1) % 4 * sides
-            faces += [(a + k, a + j, b + j), (a + k, b + j, b + k)]
+            faces += [(a + k, b + j, a + j), (a + k, b + k, b + j)]
             tint += [first if k % 3 == 0 else second] * 2
     c.mesh.add(vertices, np.array(faces), int(c.skin[0]), np.array(tint), (0.3, 0.3))
 

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 from numpy.random import Generator
+from numpy.typing import NDArray
 
 from flockd.messages import FloatArray, IntArray
 
@@ -46,16 +47,23 @@ def _icosphere() -> tuple[FloatArray, IntArray]:
 _SPHERE = _icosphere()
 
 
-class Mesh:
-    """Triangles as they are collected."""
+def face_normals(vertices: FloatArray, triangles: IntArray | NDArray[np.int32]) -> FloatArray:
+    """Outward unit normals (m, 3); zero for a triangle without area."""
+    corner = vertices[triangles]
+    normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    return np.asarray(normals / np.maximum(1e-15, np.linalg.norm(normals, axis=1, keepdims=True)))
 
-    def __init__(self) -> None:
+
+class Mesh:
+    """Triangles as they are collected, numbered from ``first_vertex``."""
+
+    def __init__(self, first_vertex: int = 0) -> None:
         self.vertices: list[FloatArray] = []
         self.triangles: list[IntArray] = []
         self.texture: list[IntArray] = []
         self.uv: list[FloatArray] = []
         self.tint: list[FloatArray] = []
-        self.count = 0
+        self.count = first_vertex
 
     def add(
         self,
@@ -66,10 +74,8 @@ class Mesh:
         tile: tuple[float, float],
         origin: FloatArray | None = None,
     ) -> None:
-        """Triangles of one texture; ``tile`` is its width and height in metres, columns level, rows downhill from ``origin``."""
-        corner = vertices[triangles]
-        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        normal = normal / np.maximum(1e-12, np.linalg.norm(normal, axis=1, keepdims=True))
+        """Triangles of one texture, ``tile`` metres wide and high; columns level, rows downhill from ``origin``."""
+        normal = face_normals(vertices, triangles)
         level = np.abs(normal[:, 2]) > 0.98
         across = np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)
         across[level] = (0.0, 1.0, 0.0)
@@ -136,12 +142,7 @@ class Mesh:
         shades += [np.tile(bands[0], (sides, 1)), np.tile(bands[-1], (sides, 1))]
         triangles, colours = np.vstack(faces), np.vstack(shades)
         if radius[1] == 0:  # a point has no cap
-            keep = (
-                np.linalg.norm(
-                    np.cross(*(vertices[triangles[:, i]] - vertices[triangles[:, 0]] for i in (1, 2))), axis=1
-                )
-                > 1e-12
-            )
+            keep = np.linalg.norm(face_normals(vertices, triangles), axis=1) > 0.5
             triangles, colours = triangles[keep], colours[keep]
         self.add(vertices, triangles, texture, colours, tile)
 
@@ -162,25 +163,15 @@ class Mesh:
         self.add(turn(lumpy, rng.uniform(0, 6.28)) * radii + centre, faces, texture, shades, (tile, tile))
 
 
-_BOX = np.array(
-    [
-        (0, 1, 2),
-        (0, 2, 3),
-        (4, 6, 5),
-        (4, 7, 6),
-        (0, 5, 1),
-        (0, 4, 5),
-        (1, 6, 2),
-        (1, 5, 6),
-        (2, 7, 3),
-        (2, 6, 7),
-        (3, 4, 0),
-        (3, 7, 4),
-    ]  # fmt: skip
-)
+# fmt: off
+_BOX = np.array([
+    (0, 1, 2), (0, 2, 3), (4, 6, 5), (4, 7, 6), (0, 5, 1), (0, 4, 5),
+    (1, 6, 2), (1, 5, 6), (2, 7, 3), (2, 6, 7), (3, 4, 0), (3, 7, 4),
+])
+# fmt: on
 
 
 def turn(points: FloatArray, heading: float) -> FloatArray:
     """Points (n, 3) turned clockwise from north by ``heading``."""
     c, s = math.cos(heading), math.sin(heading)
-    return points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+    return np.asarray(points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]]))

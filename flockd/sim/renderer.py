@@ -10,11 +10,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flockd.messages import BoolArray, Float32Array, FloatArray, IntArray, UInt8Array
 from flockd.sim import _raster, textures
 from flockd.sim.drone_models import DroneModel, machine_texels
-from flockd.sim.world import GROUND_MAP_BITS, SKY_BITS, World
+from flockd.sim.mesh import face_normals
+from flockd.sim.sky import SKY_BITS
+from flockd.sim.world import GROUND_MAP_BITS, World
+
+Indices = NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +43,7 @@ class Renderer:
         self._world = world
         self._drones = tuple(drones)
         self._machine = machine_texels()
-        self._normals = [_normals(d) for d in self._drones]
+        self._normals = [face_normals(d.vertices.astype(np.float64), d.triangles) for d in self._drones]
         codes = world.tone.astype(np.float64)
         # The middle of the linear values that show as each byte.
         self._linear = np.interp(
@@ -58,10 +63,11 @@ class Renderer:
     ) -> View:
         """One image.
 
-        ``matrix`` (3, 3) is the pinhole K for pixel centres at +0.5, ``size`` (width, height), ``R_ned_camera`` (3, 3) takes
-        optical RDF axes to NED, ``position_ned`` (3,) m. ``drone_rotations`` (n, 3, 3) are R_ned_body and ``drone_positions``
-        (n, 3) NED m, one of each drone of the constructor. ``shown``: a mask (n,) or indices; the others are not seen, but
-        every drone with a finite position casts its shadow.
+        ``matrix`` (3, 3) is the pinhole K for pixel centres at +0.5, ``size`` (width, height), ``R_ned_camera`` (3, 3)
+        takes optical RDF axes to NED, ``position_ned`` (3,) m. ``drone_rotations`` (n, 3, 3) are R_ned_body and
+        ``drone_positions`` (n, 3) NED m, one of each drone of the constructor. ``shown``: a mask (n,) or indices; the
+        others are not seen, but every drone with a finite position casts its shadow. Poses of another number than the
+        drones raise ``ValueError``.
         """
         world = self._world
         width, height = size
@@ -72,10 +78,10 @@ class Renderer:
             raise ValueError(
                 f"{count} drones need {count} poses, not {len(rotations)} rotations and {len(positions)} positions"
             )
-        K = np.ascontiguousarray(matrix, dtype=np.float64)
+        K: FloatArray = np.ascontiguousarray(matrix, dtype=np.float64)
         R = np.ascontiguousarray(R_ned_camera, dtype=np.float64)
-        origin = np.ascontiguousarray(position_ned, dtype=np.float64)
-        inverse_K = np.linalg.inv(K)
+        origin: FloatArray = np.ascontiguousarray(position_ned, dtype=np.float64)
+        inverse_K: FloatArray = np.asarray(np.linalg.inv(K), dtype=np.float64)
         focal = float(np.sqrt(K[0, 0] * K[1, 1]))
         P = np.ascontiguousarray(K @ R.T)
 
@@ -92,10 +98,10 @@ class Renderer:
         )
         blobs, blob_rows = self._shadows(positions, P, origin, width, height)
         _raster.shade_scene(
-            hit, planes, inverse_K, R, origin, focal, world.normals, world.texture, world.uv, world.level, world.tint, world.texels,
-            textures.TEXTURE_BITS, world.ground_map, GROUND_MAP_BITS, world.ground_kind, world.ground_detail, world.extent_m,
-            world.shadow_map, world.shadow_frame, world.light, world.fog_per_m, world.sky, SKY_BITS, world.tone, blobs,
-            blob_rows, view.rgb, view.depth,
+            hit, planes, inverse_K, R, origin, focal, world.normals, world.texture, world.uv, world.level, world.tint,
+            world.texels, textures.TEXTURE_BITS, world.ground_map, GROUND_MAP_BITS, world.ground_kind,
+            world.ground_detail, world.extent_m, world.shadow_map, world.shadow_frame, world.light, world.fog_per_m,
+            world.sky, SKY_BITS, world.tone, blobs, blob_rows, view.rgb, view.depth,
         )  # fmt: skip
         chosen = np.arange(count)[np.asarray(shown)] if len(np.asarray(shown)) else np.arange(0)
         distance = np.linalg.norm(positions[chosen] - origin, axis=1)
@@ -132,16 +138,16 @@ class Renderer:
         hit = np.empty((high, wide), dtype=np.int32)
         _raster.fill(_raster.list_visible(rows), rows, planes, inverse_depth, hit, _raster.BAND_ORDER)
         _raster.shade_drone(
-            hit, inverse_depth, planes, left, top, inverse_K, R, origin, focal, np.ascontiguousarray(rotation), position,
-            self._normals[k] @ rotation.T, model.texture, model.uv, model.colours, self._machine, textures.TEXTURE_BITS,
-            world.shadow_map, world.shadow_frame, world.light, world.fog_per_m, world.tone, self._linear, k + 1,
-            view.rgb, view.depth, view.ids,
+            hit, inverse_depth, planes, left, top, inverse_K, R, origin, focal, np.ascontiguousarray(rotation),
+            position, self._normals[k] @ rotation.T, model.texture, model.uv, model.colours, self._machine,
+            textures.TEXTURE_BITS, world.shadow_map, world.shadow_frame, world.light, world.fog_per_m, world.tone,
+            self._linear, k + 1, view.rgb, view.depth, view.ids,
         )  # fmt: skip
 
     def _shadows(
         self, positions: FloatArray, P: FloatArray, origin: FloatArray, width: int, height: int
     ) -> tuple[FloatArray, IntArray]:
-        """Discs that stand for the drones in the sun, and per image row the columns that their ground shadows may touch."""
+        """Discs that stand for the drones in the sun, and per image row the columns that their shadows may touch."""
         world = self._world
         sun = world.light[0]
         rows = np.zeros((height, 2), dtype=np.int64)
@@ -164,13 +170,7 @@ class Renderer:
         return np.array(blobs, dtype=np.float64).reshape(-1, 5), rows
 
 
-def _normals(model: DroneModel) -> FloatArray:
-    corner = model.vertices.astype(np.float64)[model.triangles]
-    normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    return np.asarray(normals / np.maximum(1e-15, np.linalg.norm(normals, axis=1, keepdims=True)))
-
-
-def _set_up(q: FloatArray, triangles: IntArray, width: int, height: int) -> tuple[IntArray, FloatArray]:
+def _set_up(q: FloatArray, triangles: Indices, width: int, height: int) -> tuple[Indices, FloatArray]:
     rows = np.empty((len(triangles), 2), dtype=np.int32)
     planes = np.empty((len(triangles), 12))
     _raster.set_up_triangles(q, triangles, width, height, rows, planes)
@@ -201,8 +201,8 @@ def true_flow(
 ) -> tuple[Float32Array, BoolArray]:
     """Where every pixel of the first image went in the second: flow (h, w, 2) in pixels, valid (h, w).
 
-    Poses come in pairs (first, second), shaped as for ``Renderer.render``. Sky moves as a point at infinity. Valid: in front of
-    the second camera, within its image, and seen there (same id, and a depth that agrees).
+    Poses come in pairs (first, second), shaped as for ``Renderer.render``. Sky moves as a point at infinity. Valid: in
+    front of the second camera, within its image, and seen there (same id, and a depth that agrees).
     """
     h, w = first.ids.shape
     K = np.asarray(matrix, dtype=np.float64)

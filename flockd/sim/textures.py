@@ -12,7 +12,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from flockd.messages import Float32Array
+from flockd.messages import Float32Array, FloatArray
 
 TEXTURE_BITS = 9
 SIZE = 1 << TEXTURE_BITS
@@ -57,7 +57,7 @@ def fractal_noise(
     fx = np.fft.rfftfreq(size)[None, :].astype(np.float32)
     frequency = np.hypot(fx * np.float32(stretch), fy / np.float32(stretch))
     frequency[0, 0] = 1.0
-    gain = frequency ** np.float32(-slope)
+    gain = np.power(frequency, np.float32(-slope))
     gain *= np.exp(-((frequency * np.float32(finest) / 2) ** 4)) * (frequency * size * coarsest >= 0.5)
     gain[0, 0] = 0.0
     noise = np.fft.irfft2(spectrum * gain, s=(size, size)).astype(np.float32)
@@ -75,11 +75,11 @@ def _coloured(value: Float32Array, tint: Float32Array | None = None, amount: flo
     rgb = np.repeat(value[..., None], 3, axis=2)
     if tint is not None:
         rgb *= 1.0 + amount * tint[..., None] * np.array([1.0, 0.1, -1.0], dtype=np.float32)
-    return np.clip(rgb * (0.5 / max(1e-3, float(value.mean()))), 0.02, 1.0).astype(np.float32)
+    return np.asarray(np.clip(rgb * (0.5 / max(1e-3, float(value.mean()))), 0.02, 1.0), dtype=np.float32)
 
 
 def _cells(rng: Generator, count: int) -> tuple[Float32Array, NDArray[np.int64]]:
-    """Tileable Worley cells on a jittered ``count`` x ``count`` grid: border closeness (0 at borders) and cell number."""
+    """Tileable Worley cells on a jittered ``count`` x ``count`` grid: 0 at their borders, and cell numbers."""
     jitter = rng.random((count, count, 2), dtype=np.float32)
     rows, columns = _grid()
     nearest = np.full((SIZE, SIZE), 9.0, dtype=np.float32)
@@ -158,7 +158,7 @@ def _courses(rng: Generator, rows: int, columns: int, *, offset: float, joint: f
 def bricks(rng: Generator) -> Float32Array:
     """A running bond."""
     columns = int(rng.integers(4, 9))
-    value = _courses(rng, 2 * int(round(columns * rng.uniform(0.9, 1.5))), columns, offset=0.5, joint=0.006)
+    value = _courses(rng, 2 * round(columns * rng.uniform(0.9, 1.5)), columns, offset=0.5, joint=0.006)
     return _coloured(value * np.exp(0.18 * fractal_noise(rng, slope=0.7)), fractal_noise(rng, slope=1.0), 0.08)
 
 
@@ -231,7 +231,7 @@ def speckle(rng: Generator) -> Float32Array:
     return _coloured(value)
 
 
-def facade(rng: Generator, wall: Float32Array, colour: Float32Array) -> Float32Array:
+def facade(rng: Generator, wall: Float32Array, colour: FloatArray) -> Float32Array:
     """Two by two window bays in a coloured wall; a tile is two bays wide and two floors high, rows run downwards."""
     bay = SIZE // 2
     image = wall * colour.astype(np.float32)
