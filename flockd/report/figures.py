@@ -205,7 +205,7 @@ def _length(axes: Axes, one: FloatArray, other: FloatArray) -> None:
     north, east = (one + other) / 2
     short = metres < 0.15 * np.ptp(axes.get_ylim())
     if short:
-        away = np.array([one[1] - other[1], other[0] - one[0]]) / metres
+        away = np.array([one[1] - other[1], other[0] - one[0]]) / max(metres, 1e-9)
         away *= 1 if away @ (north, east) > 0 else -1  # outwards from the flock's middle
         north, east = (north, east) + 0.09 * np.ptp(axes.get_ylim()) * away
     axes.text(

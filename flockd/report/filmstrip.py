@@ -85,7 +85,7 @@ _FLOW_ZERO = 32768
 
 
 def save_filmstrip(path: Path, frames: Sequence[FilmstripFrame]) -> None:
-    """Write the frames at half size; about 0.25 MB for each frame of four 480x640 cameras."""
+    """Write the frames at half size; some 0.4 MB for each frame of four 480x640 cameras."""
     arrays: dict[str, NDArray[np.generic]] = {}
     index = []
     for number, frame in enumerate(frames):
@@ -271,9 +271,10 @@ def _draw_seen(axes: Axes, frame: FilmstripFrame, camera: str) -> None:
         colour = 255 * np.array(to_rgb(_track_colour(frame, label)))
         tinted[labels == label] = 0.55 * tinted[labels == label] + 0.45 * colour
     _show(axes, tinted.astype(np.uint8), interpolation="bilinear")
+    taken: list[_Box] = []
     for label in found:
         _outline(axes, labels == label, _track_colour(frame, label))
-        _name(axes, labels == label, _caption(frame, label), _track_colour(frame, label))
+        taken.append(_name(axes, labels == label, _caption(frame, label), taken))
 
 
 def _track_colour(frame: FilmstripFrame, label: int) -> str:
@@ -290,22 +291,34 @@ def _outline(axes: Axes, mask: BoolArray, colour: str) -> None:
     # A border of nothing closes the outline of a drone that the image's edge cuts.
     padded = np.pad(mask, 1).astype(float)
     axes.contour(
-        np.arange(-0.5, width + 1), np.arange(-0.5, height + 1), padded, levels=[0.5], colors=[colour], linewidths=1.1
+        np.arange(-0.5, width + 1), np.arange(-0.5, height + 1), padded, levels=[0.5], colors=[colour], linewidths=0.8
     )
 
 
-def _name(axes: Axes, mask: BoolArray, caption: str, colour: str) -> None:
-    """Written above the drone, or below one near the top; kept inside the picture."""
+_Box = tuple[float, float, float, float]
+"""Left, top, right, bottom in pixels."""
+
+
+def _name(axes: Axes, mask: BoolArray, caption: str, taken: Sequence[_Box]) -> _Box:
+    """Written as near to the drone as there is room, within the picture and clear of the names already there."""
     height, width = mask.shape
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    above = rows[0] > 0.09 * height
-    half = 0.036 * width * len(caption) / 2
+    half, line = 0.018 * width * len(caption), 0.034 * height
+    x = float(np.clip((columns[0] + columns[-1] + 1) / 2, half, width - half))
+    tops = [rows[0] - 1.3 * line, rows[-1] + 0.3 * line]
+    tops += [rows[0] - lines * line for lines in (2.3, 3.3)] + [rows[-1] + lines * line for lines in (1.3, 2.3)]
+    boxes = [(x - half, float(top), x + half, float(top) + line) for top in tops if 0 <= top <= height - line]
+    free = (box for box in boxes if not any(_overlap(box, other) for other in taken))
+    box = next(free, boxes[0])
     axes.text(
-        float(np.clip((columns[0] + columns[-1] + 1) / 2, half, width - half)),
-        rows[0] - 0.012 * height if above else rows[-1] + 1 + 0.012 * height,
-        caption, ha="center", va="bottom" if above else "top",
+        x, box[1] + line / 2, caption, ha="center", va="center",
         color="#ffffff", fontsize=7, fontweight="bold", path_effects=_HALO,
     )  # fmt: skip
+    return box
+
+
+def _overlap(one: _Box, other: _Box) -> bool:
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
 
 
 def _draw_depth(axes: Axes, depth: NDArray[np.float32]) -> None:

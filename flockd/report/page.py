@@ -314,19 +314,19 @@ def _stages(stages: Mapping[str, Mapping[str, float]]) -> list[dict[str, Any]]:
 _DEFINITIONS = (
     (
         "x, y, yaw, pitch, roll",
-        "Error of a drone's own motion over one step, R_FC and T_FC with P_C = R_FC P_F + T_FC, in the body axes at "
+        "Error of a drone’s own motion over one step, R_FC and T_FC with P_C = R_FC P_F + T_FC, in the body axes at "
         "the start of the step.",
     ),
     ("distance", "Error of the horizontal distance to a tracked neighbour."),
     (
         "obj1",
-        "Eq. 44: before the circle ends -V·e / (2 |e|²), which is -0.5 at the desired velocity e; then the L1 distance "
+        "Eq. 44: before the circle ends −V·e / (2 |e|²), which is −0.5 at the desired velocity e; then the L1 distance "
         "from it.",
     ),
     (
         "obj2",
-        "Eq. 45: over all others within 20 m, how far the distance is from 3.5 m plus the L1 difference in velocity. "
-        "Five drones cannot all be 3.5 m apart: their sum rests at 15.27, not 0.",
+        "Eq. 45: over all others within the observation distance, how far the distance is from the desired one plus "
+        "the L1 difference in velocity. Five drones cannot all be 3.5 m apart: their sum rests at 15.27, not 0.",
     ),
     (
         "convergence",
@@ -334,12 +334,12 @@ _DEFINITIONS = (
         "tail mean. Error: the mean absolute deviation from the tail mean over the tail. Bias: the tail mean less that "
         "of the flight with exact states.",
     ),
-    ("closest", "Distances are between the drones' middles, in three dimensions."),
+    ("closest", "Distances are between the drones’ middles, in three dimensions."),
     ("order", "Mean cosine between the velocities of all pairs over the last 10 s: 1 is all flying one way."),
-    ("union", "(N - groups) / (N - 1) over the last 10 s, linked within the observation distance: 1 is one flock."),
+    ("union", "(N − groups) / (N − 1) over the last 10 s, linked within the observation distance: 1 is one flock."),
     (
         "connectivity",
-        "Second eigenvalue of the same graph's Laplacian over N: 1 where everybody is linked to everybody.",
+        "Second eigenvalue of the same graph’s Laplacian over N: 1 where everybody is linked to everybody.",
     ),
     ("safety", "1 less the share of pairs closer than 1 m, twice a collision radius of 0.5 m, over all steps."),
     ("separation", "Below D_II two drones push each other away (Eq. 41)."),

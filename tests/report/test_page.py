@@ -414,3 +414,17 @@ def test_maps_of_another_size_are_refused() -> None:
     moment = _moment()
     with pytest.raises(ValueError, match=r"camera 'left': the depth is \(48, 32\), the image \(96, 64\)"):
         FilmstripFrame(**{**vars(moment), "depth": {"left": moment.depth["left"][::2, ::2]}})
+
+
+def test_names_of_close_drones_do_not_cover_each_other() -> None:
+    moment = _moment()
+    labels = np.zeros((96, 64), np.uint8)
+    labels[50:56, 20:28], labels[50:56, 32:40] = 1, 2
+    figure = filmstrip_figure(
+        FilmstripFrame(**{**vars(moment), "labels": {"left": labels}, "ranges": {1: 3.0, 2: 3.1}, "track_ids": {2: 4}})
+    )
+    figure.canvas.draw()
+    names = [text for axes in figure.axes for text in axes.texts if text.get_text().endswith(" m")]
+    assert sorted(name.get_text() for name in names) == ["#4  3.10 m", "new  3.00 m"]
+    one, other = (name.get_window_extent() for name in names)
+    assert not one.overlaps(other)
