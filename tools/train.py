@@ -168,7 +168,7 @@ def main() -> None:
 def train(task: Task, out: Path, budget_s: float, seed: int) -> None:
     """One cosine-shaped run of ``budget_s`` seconds of training."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    net = task.net.to(device, memory_format=torch.channels_last)
+    net = task.net.to(device).to(memory_format=torch.channels_last)
     optimiser = torch.optim.AdamW(net.parameters(), lr=task.rate, weight_decay=1e-4)
     spent, step = 0.0, 0
     checkpoint = out / "checkpoint.pt"
@@ -188,7 +188,8 @@ def train(task: Task, out: Path, budget_s: float, seed: int) -> None:
         for group in optimiser.param_groups:
             group["lr"] = rate
         batch = _stack([task.sample(rng) for _ in range(task.batch)], device)
-        loss, figures = task.loss(batch)
+        with torch.autocast(device.type, dtype=torch.bfloat16):
+            loss, figures = task.loss(batch)
         if torch.isfinite(loss):
             optimiser.zero_grad(set_to_none=True)
             loss.backward()

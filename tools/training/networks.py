@@ -25,6 +25,13 @@ def _conv(inputs: int, outputs: int, stride: int = 1, kernel: int = 3) -> nn.Seq
     )
 
 
+def _in_full_precision(layer: nn.Module, x: Tensor) -> Tensor:
+    """The layer on 32-bit numbers, also where training runs on 16-bit ones: metres need more than three digits."""
+    with torch.autocast(x.device.type, enabled=False):
+        y: Tensor = layer(x.float())
+        return y
+
+
 class _Residual(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -57,7 +64,8 @@ class NeighboursNet(nn.Module):
         self.lateral = nn.ModuleList([nn.Conv2d(a, a, 1) for a in w[:-1]])
         self.up = nn.ModuleList([_conv(b, a, kernel=1) for a, b in pairwise(w)])
         self.merge = nn.ModuleList([_conv(a, a) for a in w[:-1]])
-        self.head = nn.Sequential(_conv(w[0], w[0]), nn.Conv2d(w[0], 4 * 4, 1), nn.PixelShuffle(2))
+        self.last = _conv(w[0], w[0])
+        self.head = nn.Sequential(nn.Conv2d(w[0], 4 * 4, 1), nn.PixelShuffle(2))
 
     def forward(self, image: Tensor, geometry: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Depth, logit and offsets."""
@@ -73,7 +81,7 @@ class NeighboursNet(nn.Module):
         for i in reversed(range(len(self.merge))):
             x = F.interpolate(self.up[i](x), scale_factor=2.0, mode="nearest")
             x = self.merge[i](x + self.lateral[i](levels[i]))
-        out = self.head(x)
+        out = _in_full_precision(self.head, self.last(x))
         depth = torch.exp(out[:, :1].clamp(-6.0, 4.0) + 2.0).clamp(0.05, MAX_DEPTH_M)
         return depth, out[:, 1:2], out[:, 2:4] * OFFSET_SCALE_PX
 
@@ -107,7 +115,7 @@ class DistanceNet(nn.Module):
         """One row a picture."""
         x = picture.permute(0, 3, 1, 2).float() / 127.5 - 1.0
         x = self.features(F.pixel_unshuffle(x, 2))
-        out = self.head(x.flatten(1))
+        out = _in_full_precision(self.head, x.flatten(1))
         return torch.cat([out[:, :1] - 5.0, out[:, 1:3] * 10.0, (out[:, 3:] - 3.0).clamp(-7.0, 1.0)], 1)
 
 
@@ -173,7 +181,7 @@ class FlowNet(nn.Module):
         pyramid = self._pyramid(f1, f2, n, h, w)
         start = self.initial(f1)
         hidden, context = torch.tanh(start[:, : self.hidden]), F.relu(start[:, self.hidden :])
-        grid = self._grid(n, h, w, f1)
+        grid = self._grid(n, h, w, start.float())
         flow = torch.zeros_like(grid)
         flows: list[Tensor] = []
         steps = iterations or self.iterations
@@ -216,7 +224,7 @@ class FlowNet(nn.Module):
             place = (centre + 0.5) / 2**level + window  # from here on pixel edges, so that levels line up
             u = place[..., :1] * (2.0 / volume.shape[3]) - 1.0
             v = place[..., 1:] * (2.0 / volume.shape[2]) - 1.0
-            sampled = F.grid_sample(volume, torch.cat([u, v], -1), align_corners=False)
+            sampled = F.grid_sample(volume.float(), torch.cat([u, v], -1), align_corners=False)
             found.append(sampled.reshape(n, h, w, -1))
         return torch.cat(found, -1).permute(0, 3, 1, 2)
 
