@@ -411,6 +411,88 @@ def shade_scene(
 
 
 @njit(parallel=True, cache=True)
+def smooth_edges(hit: Any, planes: Any, linear: Any, tone: Any, sharp: Any, rgb: Any) -> None:
+    """Blend colours along edges by coverage: four samples in a pixel ask which of the 3x3 pixels' triangles covers it.
+
+    A sample takes the colour of the pixel where its triangle was seen, so nothing is shaded twice. ``rgb`` comes as a
+    copy of ``sharp``.
+    """
+    height, width = hit.shape
+    lanes = 32
+    for lane in prange(lanes):
+        seen = np.empty(9, dtype=np.int64)
+        at = np.empty((9, 2), dtype=np.int64)
+        for y in range(lane, height, lanes):
+            for x in range(width):
+                t = hit[y, x]
+                if (
+                    (x == 0 or hit[y, x - 1] == t)
+                    and (x + 1 == width or hit[y, x + 1] == t)
+                    and (y == 0 or hit[y - 1, x] == t)
+                    and (y + 1 == height or hit[y + 1, x] == t)
+                ):
+                    continue
+                edge = False
+                for k in range(4):
+                    i = x + (k == 0) - (k == 1)
+                    j = y + (k == 2) - (k == 3)
+                    if i < 0 or j < 0 or i >= width or j >= height or hit[j, i] == t:
+                        continue
+                    change = 0.0
+                    for channel in range(3):
+                        change += abs(float(sharp[j, i, channel]) - float(sharp[y, x, channel]))
+                    edge = edge or change > 24.0
+                if not edge:
+                    continue
+                count = 1
+                seen[0] = t
+                at[0, 0] = y
+                at[0, 1] = x
+                for j in range(max(0, y - 1), min(height, y + 2)):
+                    for i in range(max(0, x - 1), min(width, x + 2)):
+                        known = False
+                        for k in range(count):
+                            known = known or seen[k] == hit[j, i]
+                        if not known:
+                            seen[count] = hit[j, i]
+                            at[count, 0] = j
+                            at[count, 1] = i
+                            count += 1
+                red = 0.0
+                green = 0.0
+                blue = 0.0
+                for sample_number in range(4):
+                    u = x + 0.125 + 0.25 * sample_number
+                    v = y + 0.125 + 0.25 * ((2 * sample_number + 1) % 5)
+                    best = -1
+                    nearest = 0.0
+                    for k in range(count):
+                        if seen[k] < 0:
+                            if best < 0:
+                                best = k
+                            continue
+                        p = planes[seen[k]]
+                        if (
+                            p[0] * u + p[1] * v + p[2] >= 0.0
+                            and p[3] * u + p[4] * v + p[5] >= 0.0
+                            and p[6] * u + p[7] * v + p[8] >= 0.0
+                        ):
+                            inverse = p[9] * u + p[10] * v + p[11]
+                            if inverse > nearest:
+                                nearest = inverse
+                                best = k
+                    best = max(0, best)  # covered by something that no pixel shows: as the pixel itself
+                    j = at[best, 0]
+                    i = at[best, 1]
+                    red += 0.25 * linear[sharp[j, i, 0]]
+                    green += 0.25 * linear[sharp[j, i, 1]]
+                    blue += 0.25 * linear[sharp[j, i, 2]]
+                rgb[y, x, 0] = _encode(tone, red)
+                rgb[y, x, 1] = _encode(tone, green)
+                rgb[y, x, 2] = _encode(tone, blue)
+
+
+@njit(parallel=True, cache=True)
 def shade_drone(
     hit: Any,
     inverse_depth: Any,
