@@ -21,7 +21,7 @@ SUBSAMPLES = 3
 """Drone colours are sampled 3x3 per pixel; the middle sample is the pixel's centre."""
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=True, error_model="numpy")
 def project_vertices(vertices: Any, P: Any, origin: Any) -> Any:
     """Homogeneous pixel coordinates (n, 3): ``P @ (vertex - origin)``."""
     count = vertices.shape[0]
@@ -35,7 +35,7 @@ def project_vertices(vertices: Any, P: Any, origin: Any) -> Any:
     return q
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=True, error_model="numpy")
 def set_up_triangles(q: Any, triangles: Any, width: int, height: int, rows: Any, planes: Any) -> None:
     """Row range and plane coefficients of each triangle that can be seen; rows (0, -1) for the others.
 
@@ -97,7 +97,7 @@ def set_up_triangles(q: Any, triangles: Any, width: int, height: int, rows: Any,
         p[11] = (e0z + e1z + e2z) / determinant
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def list_visible(rows: Any) -> Any:
     """Indices of the triangles with a row range, in order."""
     count = 0
@@ -113,7 +113,7 @@ def list_visible(rows: Any) -> Any:
     return visible
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=True, error_model="numpy")
 def fill(visible: Any, rows: Any, planes: Any, inverse_depth: Any, hit: Any, band_order: Any) -> None:
     """Nearest triangle of each pixel: 1/z and its index (-1 for none), row spans from the edges' crossings."""
     height, width = hit.shape
@@ -159,7 +159,7 @@ def fill(visible: Any, rows: Any, planes: Any, inverse_depth: Any, hit: Any, ban
                         hit[y, x] = t
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _blend(a: Any, b: Any, weight: Any) -> Any:
     """Four packed bytes of a and b mixed, weight of b in 1/256."""
     keep = np.uint64(256) - weight
@@ -169,7 +169,7 @@ def _blend(a: Any, b: Any, weight: Any) -> Any:
     return even | odd
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _bilinear(texels: Any, base: int, bits: int, u: float, v: float) -> Any:
     """Packed colour of one level at (u, v) in tiles, repeating."""
     size = 1 << bits
@@ -191,7 +191,7 @@ def _bilinear(texels: Any, base: int, bits: int, u: float, v: float) -> Any:
     return _blend(a, b, wv)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def sample(texels: Any, base: int, bits: int, u: float, v: float, level: float) -> Any:
     """Trilinear packed colour; ``level`` 0 is the finest of ``bits`` + 1 levels, stored in turn from ``base``."""
     if level <= 0.0:
@@ -207,14 +207,14 @@ def sample(texels: Any, base: int, bits: int, u: float, v: float, level: float) 
     return _blend(fine, coarse, weight)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _byte(packed: Any, shift: int) -> float:
     """One channel of a packed colour, linear light: textures are stored as square roots."""
     value = float((packed >> np.uint64(shift)) & np.uint64(255)) * (1.0 / 255.0)
     return value * value
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def sun_reaches(shadow: Any, frame: Any, n: float, e: float, d: float) -> float:
     """Share of sunlight at a point, 0 to 1: four neighbours of the shadow map, weighted.
 
@@ -243,7 +243,7 @@ def sun_reaches(shadow: Any, frame: Any, n: float, e: float, d: float) -> float:
     return lit
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _blob_shadow(blobs: Any, sun: Any, n: float, e: float, d: float) -> float:
     """Share of sunlight left by the drones above a point. ``blobs`` (k, 5): centre, radius, darkness."""
     left = 1.0
@@ -263,7 +263,7 @@ def _blob_shadow(blobs: Any, sun: Any, n: float, e: float, d: float) -> float:
     return left
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _light(light: Any, normal_d: float, cosine: float) -> Any:
     """Irradiance (r, g, b) of a surface: sun times ``cosine`` (shadow included) plus sky above and ground below."""
     up = 0.5 - 0.5 * normal_d
@@ -274,14 +274,14 @@ def _light(light: Any, normal_d: float, cosine: float) -> Any:
     )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _encode(tone: Any, value: float) -> Any:
     """Linear light to a display byte through the tone curve, which is tabulated over the square root."""
     index = int(math.sqrt(max(0.0, value)) * 1024.0)
     return tone[min(index, tone.shape[0] - 1)]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _sky(sky: Any, bits: int, x: float, y: float, z: float) -> Any:
     """Packed sky colour of a direction, NED: an octahedral map of the upper half."""
     z = max(0.0, -z)
@@ -293,7 +293,7 @@ def _sky(sky: Any, bits: int, x: float, y: float, z: float) -> Any:
     return _bilinear(sky, 0, bits, a + 0.5, b + 0.5)
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=True, error_model="numpy")
 def shade_scene(
     hit: Any,
     planes: Any,
@@ -369,12 +369,10 @@ def shade_scene(
                 if kind < 0:
                     gu = (n / extent + 1.0) * 0.5
                     gv = (e / extent + 1.0) * 0.5
-                    gu -= 2.0 * math.floor(gu * 0.5)
-                    gv -= 2.0 * math.floor(gv * 0.5)
-                    if gu > 1.0:  # mirrored beyond the border
-                        gu = 2.0 - gu
-                    if gv > 1.0:
-                        gv = 2.0 - gv
+                    beyond = not (0.0 <= gu <= 1.0 and 0.0 <= gv <= 1.0)
+                    if beyond:  # mirrored
+                        gu = 1.0 - abs(1.0 - (gu - 2.0 * math.floor(gu * 0.5)))
+                        gv = 1.0 - abs(1.0 - (gv - 2.0 * math.floor(gv * 0.5)))
                     packed = sample(ground, 0, ground_bits, gv, gu, footprint + ground_level)
                     gi = ground_kind[
                         min(ground_size - 1, int(gu * ground_size)), min(ground_size - 1, int(gv * ground_size))
@@ -388,7 +386,7 @@ def shade_scene(
                         n * tile,
                         footprint + ground_detail[gi, 2],
                     )
-                    cosine = _byte(packed, 24) if abs(n) < extent and abs(e) < extent else -sun[2]
+                    cosine = -sun[2] if beyond else _byte(packed, 24)
                     red, green, blue = _light(light, -1.0, cosine * free)
                     red *= 2.0 * _byte(packed, 0) * _byte(fine, 0)
                     green *= 2.0 * _byte(packed, 8) * _byte(fine, 8)
@@ -410,8 +408,8 @@ def shade_scene(
                 rgb[y, x, 2] = _encode(tone, blue * clear + light[4, 2] * (1.0 - clear))
 
 
-@njit(parallel=True, cache=True)
-def smooth_edges(hit: Any, planes: Any, linear: Any, tone: Any, sharp: Any, rgb: Any) -> None:
+@njit(parallel=True, cache=True, error_model="numpy")
+def smooth_edges(hit: Any, texture: Any, planes: Any, linear: Any, tone: Any, sharp: Any, rgb: Any) -> None:
     """Blend colours along edges by coverage: four samples in a pixel ask which of the 3x3 pixels' triangles covers it.
 
     A sample takes the colour of the pixel where its triangle was seen, so nothing is shaded twice. ``rgb`` comes as a
@@ -438,6 +436,8 @@ def smooth_edges(hit: Any, planes: Any, linear: Any, tone: Any, sharp: Any, rgb:
                     j = y + (k == 2) - (k == 3)
                     if i < 0 or j < 0 or i >= width or j >= height or hit[j, i] == t:
                         continue
+                    if t >= 0 and hit[j, i] >= 0 and texture[t] < 0 and texture[hit[j, i]] < 0:
+                        continue  # the ground runs on
                     change = 0.0
                     for channel in range(3):
                         change += abs(float(sharp[j, i, channel]) - float(sharp[y, x, channel]))
@@ -492,7 +492,7 @@ def smooth_edges(hit: Any, planes: Any, linear: Any, tone: Any, sharp: Any, rgb:
                 rgb[y, x, 2] = _encode(tone, blue)
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=True, error_model="numpy")
 def shade_drone(
     hit: Any,
     inverse_depth: Any,
@@ -617,7 +617,7 @@ def shade_drone(
                     ids[y, x] = identity
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def fill_shadow(vertices: Any, triangles: Any, frame: Any, shadow: Any) -> None:
     """Greatest height towards the sun in each cell of the shadow map (parallel projection)."""
     size = shadow.shape[0]
@@ -648,7 +648,7 @@ def fill_shadow(vertices: Any, triangles: Any, frame: Any, shadow: Any) -> None:
                     shadow[y, x] = max(shadow[y, x], here)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _noise(maps: Any, k: int, u: float, v: float) -> float:
     """Bilinear value of the k-th tileable noise map at (u, v) in tiles."""
     size = maps.shape[1]
@@ -668,7 +668,7 @@ def _noise(maps: Any, k: int, u: float, v: float) -> float:
     return float(above * (1.0 - wy) + below * wy)
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=True, error_model="numpy")
 def compose_ground(
     noise: Any,
     extent: float,
@@ -788,7 +788,7 @@ def compose_ground(
             kinds[row, column] = kind
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=True, error_model="numpy")
 def flow(depth: Any, ids: Any, depth_2: Any, ids_2: Any, H: Any, t: Any, out: Any, valid: Any) -> None:
     """Pixel motion: ``z2 (u2, v2, 1) = z H[id] (u, v, 1) + t[id]``, and whether the second image shows that point."""
     height, width = ids.shape

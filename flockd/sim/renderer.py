@@ -101,7 +101,7 @@ class Renderer:
                 world.fog_per_m, world.sky, SKY_BITS, world.tone, blobs, blob_rows, sharp, depth,
             )  # fmt: skip
             view = View(rgb=sharp.copy(), depth=depth, ids=np.zeros((height, width), dtype=np.uint8))
-            _raster.smooth_edges(hit, planes, self._linear, world.tone, sharp, view.rgb)
+            _raster.smooth_edges(hit, world.texture, planes, self._linear, world.tone, sharp, view.rgb)
         chosen = np.arange(count)[np.asarray(shown)] if len(np.asarray(shown)) else np.arange(0)
         distance = np.linalg.norm(positions[chosen] - origin, axis=1)
         for k in chosen[np.argsort(-distance, kind="stable")]:
