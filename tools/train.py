@@ -10,6 +10,7 @@ Writes OUT/checkpoint.pt and OUT/curve.csv every few minutes. Uses a GPU where t
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -86,28 +87,49 @@ class NeighboursTask(Task):
 
 
 class DistanceTask(Task):
-    """Range of the drone in the middle of a picture."""
+    """Range of the drone in the middle of a picture.
+
+    Pictures come from a pool that is renewed a little with every batch: cutting one costs more than learning from it.
+    """
+
+    pool_size = 50_000
+    renewed_in_a_batch = 6
 
     def __init__(self, pairs: PairSet) -> None:
-        super().__init__(DistanceNet(), 48, 1.5e-3)
+        super().__init__(DistanceNet(), 64, 2e-3)
         self.pairs, self.drones = pairs, drone_list(pairs)
+        self.pool: list[Sample] = []
+        self.drawn = 0
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """See ``Task``."""
+        self.drawn += 1
+        if len(self.pool) < self.pool_size:
+            while len(self.pool) < self.pool_size:
+                self.pool.append(self._fresh(rng))
+        elif self.drawn % self.batch < self.renewed_in_a_batch:
+            self.pool[int(rng.integers(self.pool_size))] = self._fresh(rng)
+        return self.pool[int(rng.integers(self.pool_size))]
+
+    def _fresh(self, rng: np.random.Generator) -> Sample:
         return distance_sample(self.pairs, self.drones[int(rng.integers(len(self.drones)))], rng)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         """See ``Task``."""
-        out = self.net(batch["picture"])
+        out, hints = self.net(batch["picture"])
         error = (out[:, 0] - batch["target"][:, 0]).abs()
         centre = (out[:, 1:3] - batch["target"][:, 1:3]).abs().clamp(max=30).sum(1)
         nll = error / torch.exp(out[:, 3]) * 1.414 + out[:, 3]
+        family = F.cross_entropy(hints[:, :-1], batch["family"])
+        apparent = (hints[:, -1] - batch["apparent"]).abs().mean()
         figures = {
             "median": float(error.median().detach()),
             "p95": float(error.quantile(0.95).detach()),
             "centre": float(centre.median().detach()),
+            "family": float((hints[:, :-1].argmax(1) == batch["family"]).float().mean()),
+            "apparent": float(apparent.detach()),
         }
-        return (0.3 * nll + 2.0 * error + 0.05 * centre).mean(), figures
+        return (0.3 * nll + 2.0 * error + 0.05 * centre).mean() + 0.3 * family + apparent, figures
 
 
 class FlowTask(Task):
@@ -154,6 +176,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of render_training_data.py")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--minutes", type=float, default=60.0, help="of training in all, over every resumption")
+    parser.add_argument("--start", type=Path, help="weights to begin with: another run's checkpoint.pt")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
@@ -161,6 +184,8 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(1)
     task = TASKS[arguments.network](open_pairs(arguments.data))
+    if arguments.start:
+        task.net.load_state_dict(torch.load(arguments.start, map_location="cpu")["net"])
     arguments.out.mkdir(parents=True, exist_ok=True)
     train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed)
 
@@ -184,7 +209,7 @@ def train(task: Task, out: Path, budget_s: float, seed: int) -> None:
     while spent < budget_s:
         begin = time.monotonic()
         share = spent / budget_s
-        rate = task.rate * min(1.0, (step + 1) / 300) * (0.5 + 0.5 * np.cos(np.pi * share)) + 1e-6
+        rate = task.rate * min(1.0, (step + 1) / 300) * (0.5 + 0.5 * math.cos(math.pi * share)) + 1e-6
         for group in optimiser.param_groups:
             group["lr"] = rate
         batch = _stack([task.sample(rng) for _ in range(task.batch)], device)

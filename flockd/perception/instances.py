@@ -10,7 +10,8 @@ import numpy as np
 from flockd.messages import Float32Array, FloatArray, UInt8Array
 
 _CELL = 2  # votes are gathered in cells of this many map pixels
-_MAX_INSTANCES = 254
+_MAX_INSTANCES = 48
+"""More than this in one image is a network gone astray; the weakest are joined to the others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +59,7 @@ def group_instances(
         found.append((area, scale * np.median(votes[mine], axis=0), box, mine))
     found.sort(key=lambda item: -item[0])
     instances = []
-    for label, (area, centre, box, mine) in enumerate(found[:_MAX_INSTANCES], start=1):
+    for label, (area, centre, box, mine) in enumerate(found, start=1):
         labels[rows[mine], columns[mine]] = label
         instances.append(Instance(label, centre, box, area))
     return labels, tuple(instances)
@@ -85,6 +86,8 @@ def _vote_peaks(votes: FloatArray, shape: tuple[int, int]) -> FloatArray:
             np.hypot(*(place - other)) < 3.0 + 0.35 * np.sqrt(w) for other, w in zip(kept, strongest, strict=True)
         )
         if not near:
+            if len(kept) == _MAX_INSTANCES:
+                break
             kept.append(place)
             strongest.append(float(((np.abs(votes - place).max(1)) < 6).sum()))
     if not kept:

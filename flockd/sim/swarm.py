@@ -7,25 +7,21 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-import cv2
 import numpy as np
 
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import UsageError
 from flockd.flocking import FlockingLaw, course, desired_velocity
-from flockd.geometry import PinholeCamera, Rig, build_rig
-from flockd.messages import FloatArray, Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
+from flockd.messages import FloatArray, FrameSet, PilotOutput, VehicleState
 from flockd.perception import Perception
 from flockd.pilot import FlockPilot
 from flockd.pilot.pilot import load_perception
 from flockd.report.filmstrip import FilmstripFrame
-from flockd.sim.drone_models import FAMILIES, drone_model
 from flockd.sim.log import FlightLog, match_neighbours
-from flockd.sim.renderer import Renderer
+from flockd.sim.photographer import Photographer
 from flockd.sim.truth import fly_truth, step_times
-from flockd.sim.truth_perception import ROLES, Shot, TruthPerception
+from flockd.sim.truth_perception import ROLES, TruthPerception
 from flockd.sim.vehicles import SimulatedAutopilot, Vehicles
-from flockd.sim.world import World
 from flockd.telemetry import TelemetrySink, publish_step
 
 FILMSTRIP_FRAMES = 6
@@ -119,29 +115,16 @@ class _SeeingCrew:
     def __init__(self, scenario: ScenarioConfig, swap: frozenset[str], telemetry: TelemetrySink | None) -> None:
         self._scenario = scenario
         self._telemetry = telemetry
-        self._rig = build_rig(scenario.drone.rig)
-        self._world = World.generate(
-            scenario.seed,
-            ground_relief_m=scenario.world.ground_relief_m,
-            keep_out=planned_path(scenario),
-            clearance_m=scenario.world.clearance_m + _spread(scenario),
-        )
+        self._photographer = Photographer(scenario)
         count = len(scenario.vehicles)
-        family = scenario.world.drone_family
-        rng = np.random.default_rng([scenario.seed, 1])
-        drawn = int(rng.integers(FAMILIES))
-        shape = drawn if family == "any" else family
-        self._renderer = Renderer(self._world, [drone_model(shape, int(rng.integers(1 << 31))) for _ in range(count)])
         learned: Perception = load_perception(scenario.drone)
-        self._truths = [TruthPerception(learned, swap, self._rig) for _ in range(count)] if swap else []
+        self._truths = [TruthPerception(learned, swap, self._photographer.rig) for _ in range(count)] if swap else []
         self._pilots = [
             FlockPilot(scenario.drone, self._truths[i] if swap else learned, stopwatch=time.perf_counter)
             for i in range(count)
         ]
         self._autopilots = [SimulatedAutopilot(scenario.sensors, seed=scenario.seed, drone=i) for i in range(count)]
-        self._noise = _ImageNoise(scenario.sensors.image_noise, scenario.seed)
         self._outputs: list[PilotOutput] = []
-        self._images: dict[str, UInt8Array] = {}
 
     def decide(
         self, step: int, time_s: float, vehicles: Vehicles, recorder: _Recorder
@@ -151,7 +134,7 @@ class _SeeingCrew:
         self._outputs = []
         for i, pilot in enumerate(self._pilots):
             begin = time.perf_counter()
-            frames, shot = self._photograph(i, step, time_s, vehicles)
+            frames, shot = self._photographer.photograph(i, step, time_s, vehicles)
             if self._truths:
                 self._truths[i].show(shot)
             render_ms = 1e3 * (time.perf_counter() - begin)
@@ -188,44 +171,6 @@ class _SeeingCrew:
         if self._telemetry is not None:
             publish_step(self._telemetry, f"drone{index + 1}", state, output)
         return output
-
-    def _photograph(self, index: int, step: int, time_s: float, vehicles: Vehicles) -> tuple[FrameSet, Shot]:
-        others = [i for i in range(len(self._pilots)) if i != index]
-        views, turns, places, frames = {}, {}, {}, {}
-        for name, mounted in self._rig.cameras.items():
-            camera = mounted.camera
-            if not isinstance(camera, PinholeCamera):
-                raise UsageError(f"camera {name}: the renderer knows only pinhole cameras; change its model")
-            R_ned_body = vehicles.R_ned_body[index]
-            turns[name] = R_ned_body @ mounted.T_body_camera.rotation
-            places[name] = vehicles.position[index] + R_ned_body @ mounted.T_body_camera.translation
-            views[name] = self._renderer.render(
-                camera.matrix, camera.size, turns[name], places[name],
-                drone_rotations=vehicles.R_ned_body, drone_positions=vehicles.position, shown=others,
-            )  # fmt: skip
-            frames[name] = Frame(name, self._noise.add(views[name].rgb), time_s, step)
-        shot = Shot(
-            views, turns, places, vehicles.R_ned_body[index], vehicles.position[index],
-            vehicles.R_ned_body, vehicles.position, others,
-        )  # fmt: skip
-        return FrameSet(time_s, frames), shot
-
-
-class _ImageNoise:
-    """Grain that never repeats at the same place: one large tile, rolled by a seeded amount for each image."""
-
-    def __init__(self, sigma: float, seed: int) -> None:
-        self._rng = np.random.default_rng([seed, 2])
-        self._tile = sigma * self._rng.standard_normal((1031, 1033, 3), dtype=np.float32) if sigma > 0 else None
-
-    def add(self, image: UInt8Array) -> UInt8Array:
-        if self._tile is None:
-            return image
-        height, width = image.shape[:2]
-        top = int(self._rng.integers(self._tile.shape[0] - height))
-        left = int(self._rng.integers(self._tile.shape[1] - width))
-        grain = self._tile[top : top + height, left : left + width]
-        return np.asarray(cv2.add(image, grain, dtype=cv2.CV_8U), dtype=np.uint8)
 
 
 class _Recorder:
@@ -316,17 +261,3 @@ class _Recorder:
             false_tracks=self.false_tracks, truth_position=truth_position, truth_velocity=truth_velocity,
             stages_ms={stage: np.array(ms) for stage, ms in self.stages.items()}, meta=meta,
         )  # fmt: skip
-
-
-def planned_path(scenario: ScenarioConfig) -> FloatArray:
-    """(n, 2) north and east of the flock's middle if it flies exactly as desired, and on for a few metres."""
-    times = np.arange(0.0, scenario.duration_s + 5.0, 0.5)
-    steps = np.array([desired_velocity(scenario.drone.desired, float(t)) * 0.5 for t in times])
-    start = np.mean([vehicle.position_m[:2] for vehicle in scenario.vehicles], axis=0)
-    return np.asarray(start + np.cumsum(steps, axis=0))
-
-
-def _spread(scenario: ScenarioConfig) -> float:
-    """How far from their middle the outermost vehicles start, beyond the four metres of a flock of five."""
-    starts = np.array([vehicle.position_m[:2] for vehicle in scenario.vehicles])
-    return max(0.0, float(np.linalg.norm(starts - starts.mean(0), axis=1).max()) - 4.0)

@@ -9,7 +9,8 @@ import numpy as np
 
 from flockd.geometry import Rig
 from flockd.messages import Float32Array, FloatArray, UInt8Array
-from flockd.perception import Instance, Perception, Picture, RangeEstimate, SceneMaps
+from flockd.perception import Instance, Picture, RangeEstimate, SceneMaps
+from flockd.pilot import Perceiver
 from flockd.sim.renderer import View, true_flow
 
 ROLES = ("flow", "depth", "segmentation", "distance")
@@ -39,7 +40,7 @@ class TruthPerception:
     It is told with `show` what the cameras are about to see; the pilot knows nothing of it.
     """
 
-    def __init__(self, learned: Perception, swap: frozenset[str], rig: Rig) -> None:
+    def __init__(self, learned: Perceiver, swap: frozenset[str], rig: Rig) -> None:
         self.picture_size = learned.picture_size
         self.map_scale = learned.map_scale
         self._learned, self._swap, self._rig = learned, swap, rig
@@ -71,16 +72,19 @@ class TruthPerception:
 
     def scene(self, camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:
         """Depth and drones, each true or learned."""
-        maps = self._learned.scene(camera, image, geometry)
         now = _known(self._now)
         view = now.views[camera]
-        depth, labels, instances = maps.depth, maps.labels, maps.instances
-        if "depth" in self._swap:
-            depth = np.where(np.isfinite(view.depth), view.depth, np.float32(_SKY_M))
-        if "segmentation" in self._swap:
-            labels = view.ids
-            instances = tuple(self._instances(camera, now))
-        return SceneMaps(depth, labels, instances)
+        true = SceneMaps(
+            depth=np.where(np.isfinite(view.depth), view.depth, np.float32(_SKY_M)),
+            labels=view.ids,
+            instances=tuple(self._instances(camera, now)),
+        )
+        if {"depth", "segmentation"} <= self._swap:
+            return true
+        learned = self._learned.scene(camera, image, geometry)
+        depth = true.depth if "depth" in self._swap else learned.depth
+        drones = true if "segmentation" in self._swap else learned
+        return SceneMaps(depth, drones.labels, drones.instances)
 
     def ranges(self, pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
         """The true range of the drone nearest to each picture's middle, or the learned one."""

@@ -18,6 +18,9 @@ MAX_DEPTH_M = 80.0
 OFFSET_SCALE_PX = 16.0
 """Centre offsets leave the network in units of this many pixels of the half-size map."""
 
+MAX_FAMILIES = 16
+"""Room for this many drone shapes in the distance network's training hints."""
+
 
 def _conv(inputs: int, outputs: int, stride: int = 1, kernel: int = 3) -> nn.Sequential:
     return nn.Sequential(
@@ -70,7 +73,11 @@ class NeighboursNet(nn.Module):
     def forward(self, image: Tensor, geometry: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Depth, logit and offsets."""
         x = image.permute(0, 3, 1, 2).to(geometry.dtype) / 127.5 - 1.0
-        x = torch.cat([F.pixel_unshuffle(x, 4), F.pixel_unshuffle(geometry, 2)], 1)
+        ground = geometry[:, 2:]
+        known = ground > 0
+        log_ground = torch.log(ground.clamp(min=1.0 / MAX_DEPTH_M))
+        planes = torch.cat([geometry[:, :2], torch.where(known, log_ground + 3.0, torch.zeros_like(ground))], 1)
+        x = torch.cat([F.pixel_unshuffle(x, 4), F.pixel_unshuffle(planes, 2)], 1)
         x = self.stem(x)
         levels = [x]
         for down, body in zip(self.down, self.body, strict=True):
@@ -82,7 +89,8 @@ class NeighboursNet(nn.Module):
             x = F.interpolate(self.up[i](x), scale_factor=2.0, mode="nearest")
             x = self.merge[i](x + self.lateral[i](levels[i]))
         out = _in_full_precision(self.head, self.last(x))
-        depth = torch.exp(out[:, :1].clamp(-6.0, 4.0) + 2.0).clamp(0.05, MAX_DEPTH_M)
+        start = torch.where(known, -log_ground, torch.full_like(ground, 2.0))  # the network corrects flat ground
+        depth = torch.exp((start + out[:, :1]).clamp(-3.0, 5.0)).clamp(max=MAX_DEPTH_M)
         return depth, out[:, 1:2], out[:, 2:4] * OFFSET_SCALE_PX
 
 
@@ -109,14 +117,17 @@ class DistanceNet(nn.Module):
             _conv(96, 128, stride=2),  # 3
             _Residual(128),
         )
-        self.head = nn.Sequential(nn.Linear(128 * 9, 128), nn.ReLU(True), nn.Linear(128, 4))
+        self.summary = nn.Sequential(nn.Linear(128 * 9, 160), nn.ReLU(True))
+        self.head = nn.Linear(160, 4)
+        self.hints = nn.Linear(160, MAX_FAMILIES + 1)
 
-    def forward(self, picture: Tensor) -> Tensor:
-        """One row a picture."""
+    def forward(self, picture: Tensor) -> Tensor | tuple[Tensor, Tensor]:
+        """One row a picture; in training also hints: a logit for each family, and the log of the apparent size."""
         x = picture.permute(0, 3, 1, 2).float() / 127.5 - 1.0
-        x = self.features(F.pixel_unshuffle(x, 2))
-        out = _in_full_precision(self.head, x.flatten(1))
-        return torch.cat([out[:, :1] - 5.0, out[:, 1:3] * 10.0, (out[:, 3:] - 3.0).clamp(-7.0, 1.0)], 1)
+        x = _in_full_precision(self.summary, self.features(F.pixel_unshuffle(x, 2)).flatten(1))
+        out = _in_full_precision(self.head, x)
+        out = torch.cat([out[:, :1] - 4.0, out[:, 1:3] * 10.0, (out[:, 3:] - 3.0).clamp(-7.0, 1.0)], 1)
+        return (out, _in_full_precision(self.hints, x)) if self.training else out
 
 
 class _Encoder(nn.Module):

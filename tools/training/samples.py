@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.geometry import Rig, virtual_crop
+from flockd.sim.drone_models import FAMILIES, drone_model
 from tools.training.augment import photometric
 from tools.training.dataset import HEIGHT, WIDTH, PairSet, drones_seen, ground_plane, ray_tangents, rig_camera
 from tools.training.networks import MAX_DEPTH_M
 
 Sample = dict[str, NDArray[Any]]
+SIZES_M = [drone_model(family, 0).size_m for family in range(FAMILIES)]
 CROP_HALF_WIDTH_M = 0.5
 """Half of what the second crop of a drone covers at the drone's range."""
 
@@ -74,7 +76,14 @@ def distance_sample(
         if rng.random() < 0.5:
             picture, place = np.ascontiguousarray(picture[:, ::-1]), place * [-1, 1]
     target = np.array([np.log(range_m / crop.camera.matrix[0, 0]), *place], np.float32)
-    return {"picture": picture, "target": target}
+    family = int(pairs["drone_family"][pair, d])
+    apparent = np.log(SIZES_M[family]) - target[0]
+    return {
+        "picture": picture,
+        "target": target,
+        "family": np.array(family),
+        "apparent": np.array(apparent, np.float32),
+    }
 
 
 def flow_sample(
@@ -103,7 +112,7 @@ def flow_sample(
     }
 
 
-def drone_list(pairs: PairSet, min_pixels: int = 24) -> list[tuple[int, int, int]]:
+def drone_list(pairs: PairSet, min_pixels: int = 40) -> list[tuple[int, int, int]]:
     """Every drone worth a picture."""
     return list(drones_seen(pairs, min_pixels))
 
