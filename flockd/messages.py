@@ -151,6 +151,8 @@ class PilotOutput:
     sightings: tuple[Sighting, ...]
     sighting_tracks: tuple[int, ...]
     """The track that each sighting went to."""
+    neighbour_motions: Mapping[int, NeighbourMotion]
+    """By the label of the sighting."""
     neighbours: tuple[Neighbour, ...]
     command: VelocityCommand
     reasons: tuple[str, ...] = ()

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from tools.training import worlds
-from tools.training.dataset import FOCAL_PX, HEIGHT, MAX_DRONES, WIDTH, create_part, note
+from tools.training.dataset import FOCAL_PX, HEIGHT, MAX_DRONES, R_BODY_CAMERA, WIDTH, create_part, note
 
 Array = NDArray[Any]
 
@@ -118,9 +118,6 @@ def _render_pair(
     part["flow_valid"][index] = valid[1::2, 1::2]
     part["focal"][index] = focal
     part["drone_family"][index] = families
-
-
-R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 def _note_drones(

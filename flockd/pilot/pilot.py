@@ -102,6 +102,7 @@ class FlockPilot:
             velocity=velocity,
             sightings=view.sightings,
             sighting_tracks=tracks,
+            neighbour_motions=motions,
             neighbours=neighbours,
             command=command,
             reasons=tuple(reasons),

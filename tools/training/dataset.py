@@ -17,6 +17,8 @@ from flockd.geometry import PinholeCamera, RigCamera, RigidTransform
 HEIGHT, WIDTH = 640, 480
 MAX_DRONES = 6
 FOCAL_PX = 222.0
+R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""Of a camera that looks forward: optical RDF to body FRD."""
 
 ARRAYS: dict[str, tuple[tuple[int, ...], Any]] = {
     "image": ((2, HEIGHT, WIDTH, 3), np.uint8),
@@ -78,9 +80,9 @@ def create_part(folder: Path, count: int) -> dict[str, NDArray[Any]]:
 
 
 def rig_camera(focal: float) -> RigCamera:
-    """The camera that took a picture, alone and at the body's origin, body axes = camera axes."""
+    """The camera that took a picture, alone, at the body's origin and looking forward."""
     matrix = np.array([[focal, 0.0, WIDTH / 2], [0.0, focal, HEIGHT / 2], [0.0, 0.0, 1.0]])
-    return RigCamera("camera", PinholeCamera(matrix, (WIDTH, HEIGHT)), RigidTransform.identity())
+    return RigCamera("camera", PinholeCamera(matrix, (WIDTH, HEIGHT)), RigidTransform(R_BODY_CAMERA, np.zeros(3)))
 
 
 def ground_plane(focal: float, R_ned_camera: NDArray[Any], height_m: float) -> NDArray[np.float32]:

@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 from flockd.geometry import Rig, virtual_crop
 from flockd.sim.drone_models import FAMILIES, drone_model
 from tools.training.augment import photometric
-from tools.training.dataset import HEIGHT, WIDTH, PairSet, drones_seen, ground_plane, ray_tangents, rig_camera
+from tools.training.dataset import (
+    HEIGHT,
+    R_BODY_CAMERA,
+    WIDTH,
+    PairSet,
+    drones_seen,
+    ground_plane,
+    ray_tangents,
+    rig_camera,
+)
 from tools.training.networks import MAX_DEPTH_M
 
 Sample = dict[str, NDArray[Any]]
@@ -66,11 +75,11 @@ def distance_sample(
         half_width = float(np.exp(rng.uniform(np.log(0.18), np.log(0.8))))
         shift_m = rng.normal(0, 0.15, 2) * half_width
     right, down = _across(centre)
-    aim = _in_view(centre + shift_m[0] * right + shift_m[1] * down, focal)
+    aim = R_BODY_CAMERA @ _in_view(centre + shift_m[0] * right + shift_m[1] * down, focal)
     rig = Rig({"camera": rig_camera(focal)})
     crop = virtual_crop(rig, aim / np.linalg.norm(aim), float(np.arctan(half_width / range_m)), 96)
     picture, _ = crop.sample({"camera": image})
-    place = crop.camera.project(crop.T_body_virtual.inverse().apply(centre[None]))[0] - 48.0
+    place = crop.camera.project(crop.T_body_virtual.inverse().apply((R_BODY_CAMERA @ centre)[None]))[0] - 48.0
     if augment:
         (picture,) = photometric([picture], rng)
         if rng.random() < 0.5:

@@ -1,0 +1,150 @@
+"""The pure line on rendered frames, with perception answered by the truth: what is left is the pilot's own doing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from flockd.config import ScenarioConfig, load_scenario
+from flockd.data import data_path
+from flockd.geometry import rotation_angle_deg
+from flockd.messages import Float32Array, FrameSet, PilotOutput, UInt8Array, VehicleState
+from flockd.perception import Picture, RangeEstimate, SceneMaps
+from flockd.pilot import FlockPilot
+from flockd.sim.photographer import Photographer
+from flockd.sim.truth_perception import ROLES, TruthPerception
+from flockd.sim.vehicles import Vehicles
+
+STEP_S = 0.5
+CRUISE = np.array([[1.0, 0.0], [0.8, 0.2]])
+TURNED = np.array([0.2, 0.0])
+
+
+class NoNetworks:
+    """Stands where the networks would; every role is answered by the truth before it comes here."""
+
+    picture_size = 96
+    map_scale = 2
+    has_distance = True
+
+    def flow(self, camera: str, first: UInt8Array, second: UInt8Array) -> Float32Array:
+        raise AssertionError("asked for a learned flow")
+
+    def scene(self, camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:
+        raise AssertionError("asked for a learned scene")
+
+    def ranges(self, pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
+        raise AssertionError("asked for a learned range")
+
+
+def scenario_with(*places: tuple[float, float, float]) -> ScenarioConfig:
+    scenario = load_scenario(data_path("config") / "paper_flight.yaml", {"seed": 4})
+    start = scenario.vehicles[0]
+    drones = tuple(start.model_copy(update={"position_m": place, "velocity_m_s": (1.0, 0.0)}) for place in places)
+    return scenario.model_copy(update={"vehicles": drones})
+
+
+class Flyer:
+    """Drone 0 of a scenario, flying with true maps while the others fly as told."""
+
+    def __init__(self, scenario: ScenarioConfig) -> None:
+        self.scenario = scenario
+        self.photographer = Photographer(scenario)
+        self.truth = TruthPerception(NoNetworks(), frozenset(ROLES), self.photographer.rig)
+        self.pilot = FlockPilot(scenario.drone, self.truth)
+        self.vehicles = Vehicles(scenario.vehicles, scenario.vehicle)
+        self.time_s = 100.0
+        self.steps = 0
+
+    def look(self) -> tuple[FrameSet, VehicleState]:
+        frames, shot = self.photographer.photograph(0, self.steps, self.time_s, self.vehicles)
+        self.truth.show(shot)
+        v = self.vehicles
+        return frames, VehicleState(self.time_s, v.R_ned_body[0], -float(v.position[0, 2]), v.velocity[0])
+
+    def step(self) -> PilotOutput:
+        return self.pilot.step(*self.look())
+
+    def move(self) -> None:
+        count = len(self.scenario.vehicles)
+        self.vehicles.step(CRUISE[:count], TURNED[:count], STEP_S)
+        self.time_s += STEP_S
+        self.steps += 1
+
+
+@pytest.fixture(scope="module")
+def flyer() -> Flyer:
+    """A neighbour 3 m ahead to the right: after the turn on the border between the front and the right camera."""
+    return Flyer(scenario_with((0.0, 0.0, -4.0), (1.8, 2.4, -3.6)))
+
+
+def test_true_maps_give_true_motions(flyer: Flyer) -> None:
+    first = flyer.step()
+    assert first.ego_motion is None
+    before = flyer.vehicles
+    R_before, p_before = before.R_ned_body[0], before.position[0]
+    q_before = before.position[1]
+    flyer.move()
+    second = flyer.step()
+    after = flyer.vehicles
+    assert second.ego_motion is not None
+    true_translation = R_before.T @ (after.position[0] - p_before)
+    assert np.allclose(second.ego_motion.translation, true_translation, atol=0.002)
+    assert rotation_angle_deg(second.ego_motion.rotation.T @ R_before.T @ after.R_ned_body[0]) < 0.02
+    assert second.velocity is not None
+    assert np.allclose(second.velocity, (after.position[0] - p_before) / STEP_S, atol=0.005)
+    confirmed = [n for n in second.neighbours if n.confirmed]
+    assert len(confirmed) == 1, "a neighbour that straddles two cameras is one neighbour"
+    assert np.allclose(confirmed[0].position, after.position[1] - after.position[0], atol=0.02)
+    (motion,) = second.neighbour_motions.values()
+    assert np.allclose(R_before @ motion.velocity, (after.position[1] - q_before) / STEP_S, atol=0.1)
+    (sighting,) = second.sightings
+    assert set(sighting.cameras) == {"front", "right"}
+
+
+def test_a_repeated_time_stamp_restarts_the_pair_and_says_so(flyer: Flyer) -> None:
+    output = flyer.step()
+    assert output.ego_motion is None
+    assert any("time stamps" in reason for reason in output.reasons)
+
+
+def test_the_rest_of_the_rig_flies_on_without_one_camera() -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+    flyer.step()
+    flyer.move()
+    frames, state = flyer.look()
+    without_left = FrameSet(frames.time_s, {n: f for n, f in frames.frames.items() if n != "left"})
+    output = flyer.pilot.step(without_left, state)
+    assert output.counts["camera left: no frame"] == 1
+    assert output.ego_motion is not None
+    assert len(output.sightings) == 1
+
+
+def test_a_network_gone_astray_costs_its_frame_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+    sound = flyer.truth.scene
+
+    def astray(camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:
+        if camera == "back":
+            raise FloatingPointError("model x: output depth is not finite")
+        return sound(camera, image, geometry)
+
+    monkeypatch.setattr(flyer.truth, "scene", astray)
+    flyer.step()
+    flyer.move()
+    output = flyer.step()
+    assert output.counts["camera back: model x: output depth is not finite"] == 1
+    assert output.ego_motion is not None
+
+
+def test_blind_cameras_still_give_a_finite_command() -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0)))
+    _, state = flyer.look()
+    output = flyer.pilot.step(FrameSet(flyer.time_s, {}), state)
+    assert output.ego_motion is None
+    assert len(output.reasons) == 4
+    assert np.isfinite(output.command.velocity).all()
+    assert math.isfinite(output.command.yaw_rad)
