@@ -110,7 +110,8 @@ def _render_pair(
         _note_drones(part, index, k, view, R_ned_camera, positions[k], drone_positions[k], shown)
     flow, valid = true_flow(
         views[0], views[1], matrix,
-        R_ned_camera=(attitudes[0] @ R_BODY_CAMERA, attitudes[1] @ R_BODY_CAMERA), position_ned=(positions[0], positions[1]),
+        R_ned_camera=(attitudes[0] @ R_BODY_CAMERA, attitudes[1] @ R_BODY_CAMERA),
+        position_ned=(positions[0], positions[1]),
         drone_rotations=(drone_rotations[0], drone_rotations[1]),
         drone_positions=(drone_positions[0], drone_positions[1]),
     )  # fmt: skip

@@ -43,6 +43,10 @@ class Task:
         """One training sample."""
         raise NotImplementedError
 
+    def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
+        """One batch of them."""
+        return [self.sample(rng) for _ in range(self.batch)]
+
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         """The loss and figures worth watching."""
         raise NotImplementedError
@@ -52,12 +56,19 @@ class NeighboursTask(Task):
     """Depth, mask and centre offsets of one image."""
 
     def __init__(self, pairs: PairSet) -> None:
-        super().__init__(NeighboursNet(), 4, 1.2e-3)
+        super().__init__(NeighboursNet(), 12, 1.2e-3)
         self.pairs = pairs
+        self.drawn = 0
 
     def sample(self, rng: np.random.Generator) -> Sample:
+        """See ``Task``. Every fourth batch holds whole images, the others three times as many windows around drones."""
+        crop_px = 320 if self.drawn % 4 else None
+        return neighbours_sample(self.pairs, int(rng.integers(self.pairs.count)), rng, crop_px=crop_px)
+
+    def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
         """See ``Task``."""
-        return neighbours_sample(self.pairs, int(rng.integers(self.pairs.count)), rng)
+        self.drawn += 1
+        return [self.sample(rng) for _ in range(self.batch if self.drawn % 4 else self.batch // 3)]
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         """See ``Task``."""
@@ -212,7 +223,7 @@ def train(task: Task, out: Path, budget_s: float, seed: int) -> None:
         rate = task.rate * min(1.0, (step + 1) / 300) * (0.5 + 0.5 * math.cos(math.pi * share)) + 1e-6
         for group in optimiser.param_groups:
             group["lr"] = rate
-        batch = _stack([task.sample(rng) for _ in range(task.batch)], device)
+        batch = _stack(task.batch_samples(rng), device)
         with torch.autocast(device.type, dtype=torch.bfloat16):
             loss, figures = task.loss(batch)
         if torch.isfinite(loss):

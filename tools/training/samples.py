@@ -29,8 +29,10 @@ CROP_HALF_WIDTH_M = 0.5
 """Half of what the second crop of a drone covers at the drone's range."""
 
 
-def neighbours_sample(pairs: PairSet, index: int, rng: np.random.Generator, *, augment: bool = True) -> Sample:
-    """Image, geometry planes and targets for ``NeighboursNet``."""
+def neighbours_sample(
+    pairs: PairSet, index: int, rng: np.random.Generator, *, crop_px: int | None = None, augment: bool = True
+) -> Sample:
+    """Image, geometry planes and targets for ``NeighboursNet``; ``crop_px``: of a square, mostly around a drone."""
     k = int(rng.integers(2))
     image, depth, ids = pairs["image"][index][k], pairs["depth"][index][k], pairs["ids"][index][k]
     focal = float(pairs["focal"][index])
@@ -43,6 +45,11 @@ def neighbours_sample(pairs: PairSet, index: int, rng: np.random.Generator, *, a
         prior = ground_plane(focal, tilt @ pairs["R_ned_camera"][index, k], height)
     offset = _centre_offsets(pairs, index, k, ids, focal)
     geometry = np.concatenate([ray_tangents(focal), prior[None]])
+    if crop_px:
+        top, left = _window(pairs, index, k, crop_px, rng)
+        image = image[top : top + crop_px, left : left + crop_px]
+        half = np.s_[..., top // 2 : (top + crop_px) // 2, left // 2 : (left + crop_px) // 2]
+        depth, ids, offset, geometry = depth[half], ids[half], offset[half], geometry[half]
     if augment:
         (image,) = photometric([image], rng)
         if rng.random() < 0.5:
@@ -57,6 +64,17 @@ def neighbours_sample(pairs: PairSet, index: int, rng: np.random.Generator, *, a
         "drone": (ids > 0).astype(np.float32)[None],
         "offset": np.ascontiguousarray(offset),
     }
+
+
+def _window(pairs: PairSet, index: int, k: int, size: int, rng: np.random.Generator) -> tuple[int, int]:
+    """Even top and left of a square window, four times out of five around some drone."""
+    seen = np.flatnonzero(pairs["drone_pixels"][index, k] > 8)
+    middle = rng.uniform((0, 0), (WIDTH, HEIGHT))
+    if len(seen) and rng.random() < 0.8:
+        left, top, right, bottom = pairs["drone_box"][index, k, int(rng.choice(seen))]
+        middle = np.array([left + right, top + bottom]) / 2 + rng.uniform(-0.4, 0.4, 2) * size
+    corner = np.clip(middle - size / 2, 0, (WIDTH - size, HEIGHT - size))
+    return int(corner[1]) // 2 * 2, int(corner[0]) // 2 * 2
 
 
 def distance_sample(

@@ -1,0 +1,144 @@
+"""The shipped models: whole, as their manifests say, and refused in one sentence when they are not."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import onnxruntime as ort
+import pytest
+
+from flockd.cli import main
+from flockd.config.parameters import PerceptionConfig
+from flockd.data import data_path
+from flockd.errors import ModelError
+from flockd.perception import DisFlow, OnnxFlow, OnnxModel, Perception, find_manifests, load_manifest
+
+MODELS = data_path("models")
+NAMES = ["distance", "flow", "neighbours"]
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def copies(tmp_path: Path) -> Path:
+    """The shipped models, to be spoilt."""
+    folder = tmp_path / "models"
+    shutil.copytree(MODELS, folder)
+    return folder
+
+
+def test_three_models_fill_the_four_roles() -> None:
+    manifests = [load_manifest(path)[0] for path in find_manifests(MODELS)]
+    assert [m.name for m in manifests] == NAMES
+    assert sorted(role for m in manifests for role in m.roles) == ["depth", "distance", "flow", "segmentation"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_model_opens_and_gives_its_golden_answer(name: str) -> None:
+    OnnxModel(MODELS / f"{name}.yaml", threads=1)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_manifest_names_what_the_model_file_has(name: str) -> None:
+    manifest, file = load_manifest(MODELS / f"{name}.yaml")
+    session = ort.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    assert {i.name: i.type for i in session.get_inputs()} == {
+        key: f"tensor({'float' if spec.dtype == 'float32' else spec.dtype})" for key, spec in manifest.inputs.items()
+    }
+    assert {o.name for o in session.get_outputs()} == set(manifest.outputs)
+
+
+def test_a_flipped_bit_is_refused(copies: Path) -> None:
+    file = copies / "flow.onnx"
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(ModelError, match=r"flow\.yaml: sha256: .*flow\.onnx .* was changed or damaged; restore it"):
+        OnnxModel(copies / "flow.yaml", threads=1)
+
+
+def test_a_truncated_file_whose_hash_was_updated_is_still_refused(copies: Path) -> None:
+    file = copies / "flow.onnx"
+    content = file.read_bytes()
+    old = load_manifest(copies / "flow.yaml")[0].sha256
+    file.write_bytes(content[: len(content) // 2])
+    import hashlib
+
+    manifest = copies / "flow.yaml"
+    manifest.write_text(manifest.read_text().replace(old, hashlib.sha256(file.read_bytes()).hexdigest()))
+    with pytest.raises(ModelError, match=r"flow\.yaml: file: .*flow\.onnx cannot be loaded"):
+        OnnxModel(manifest, threads=1)
+
+
+def test_another_models_weights_do_not_give_the_golden_answer(copies: Path) -> None:
+    manifest = copies / "distance.yaml"
+    text = manifest.read_text()
+    golden = next(line for line in text.splitlines() if "golden_mean" in line)
+    manifest.write_text(text.replace(golden, golden.split(":")[0] + ": 123.0"))
+    with pytest.raises(ModelError, match=r"distance\.yaml: outputs\.range: the golden input gives mean"):
+        OnnxModel(manifest, threads=1)
+
+
+def test_an_input_that_does_not_fit_the_manifest_is_refused(copies: Path) -> None:
+    manifest = copies / "distance.yaml"
+    manifest.write_text(manifest.read_text().replace("  picture:", "  photograph:"))
+    with pytest.raises(ModelError, match=r"inputs: the manifest names \['photograph'\] but the model file has"):
+        OnnxModel(manifest, threads=1)
+
+
+def test_the_simulator_refuses_a_flipped_bit_in_one_sentence(
+    copies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = bytearray((copies / "neighbours.onnx").read_bytes())
+    content[-100] ^= 8
+    (copies / "neighbours.onnx").write_bytes(content)
+    drone = (ROOT / "config" / "simulator.yaml").read_text()
+    drone = drone.replace("perception:\n", f"perception:\n  models_dir: {copies}\n")
+    (tmp_path / "simulator.yaml").write_text(drone)
+    flight = tmp_path / "flight.yaml"
+    flight.write_text((ROOT / "config" / "paper_flight.yaml").read_text())
+    assert main(["sim", str(flight), "--duration", "1", "--out", str(tmp_path / "out")]) == 78
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert f"{copies / 'neighbours.yaml'}: sha256: {copies / 'neighbours.onnx'}" in error
+    assert "restore it" in error
+
+
+def test_a_model_in_the_wrong_role_is_refused() -> None:
+    with pytest.raises(ModelError, match=r"perception\.flow: model 'distance' fills distance and not flow"):
+        Perception(PerceptionConfig(flow="distance"), MODELS)
+
+
+def test_a_model_that_is_not_there_is_refused_with_those_that_are() -> None:
+    with pytest.raises(ModelError, match=r"perception\.flow: there is no model 'raft'.*distance, flow, neighbours"):
+        Perception(PerceptionConfig(flow="raft"), MODELS)
+
+
+def shifted_pictures(shift: tuple[float, float], size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Two pictures of one smooth texture, the second moved by ``shift`` pixels right and down."""
+    width, height = size
+    v, u = np.mgrid[:height, :width].astype(float)
+
+    def picture(du: float, dv: float) -> np.ndarray:
+        rng = np.random.default_rng(3)
+        total = np.zeros((height, width, 3))
+        for period in (90, 60, 40, 27, 18, 12, 8):
+            for _ in range(3):
+                angle, phase = rng.uniform(0, 2 * np.pi, 2)
+                wave = np.cos(2 * np.pi / period * ((u - du) * np.cos(angle) + (v - dv) * np.sin(angle)) + phase)
+                total += wave[..., None] * rng.uniform(-1, 1, 3)
+        return np.clip(127 + 22 * total, 0, 255).astype(np.uint8)
+
+    return picture(0, 0), picture(*shift)
+
+
+@pytest.mark.parametrize("size", [(480, 640), (640, 480), (330, 250)])
+def test_flow_finds_a_known_shift_at_any_image_size(size: tuple[int, int]) -> None:
+    first, second = shifted_pictures((9.0, -5.0), size)
+    inner = np.s_[32:-32, 32:-32]
+    dis = DisFlow().flow(first, second)[inner]
+    assert np.abs(np.median(dis, axis=(0, 1)) - [9.0, -5.0]).max() < 0.2
+    network = OnnxFlow(OnnxModel(MODELS / "flow.yaml", threads=1)).flow(first, second)
+    assert network.shape == (size[1], size[0], 2)
+    assert np.abs(np.median(network[inner], axis=(0, 1)) - [9.0, -5.0]).max() < 1.0
