@@ -47,14 +47,12 @@ class DisFlow:
 
     name = "dis"
 
-    def __init__(self) -> None:
-        self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-
     def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
         """See ``Flow``."""
         grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (first, second)]
         start = np.zeros((*first.shape[:2], 2), np.float32)
-        return np.asarray(self._dis.calc(grey[0], grey[1], start), dtype=np.float32)
+        dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)  # one a call: it is not for two threads
+        return np.asarray(dis.calc(grey[0], grey[1], start), dtype=np.float32)
 
 
 def _resized(image: UInt8Array, size: tuple[int, int]) -> UInt8Array:

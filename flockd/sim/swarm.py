@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,7 +14,7 @@ import numpy as np
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import UsageError
 from flockd.flocking import FlockingLaw, course, desired_velocity
-from flockd.messages import FloatArray, FrameSet, PilotOutput, VehicleState
+from flockd.messages import FloatArray, PilotOutput, VehicleState
 from flockd.perception import Perception
 from flockd.pilot import FlockPilot
 from flockd.pilot.pilot import load_perception
@@ -124,6 +126,9 @@ class _SeeingCrew:
             for i in range(count)
         ]
         self._autopilots = [SimulatedAutopilot(scenario.sensors, seed=scenario.seed, drone=i) for i in range(count)]
+        # Pilots share nothing but the networks, so their order does not matter: they fly as many at a time as there
+        # are cores. Rendering uses all cores by itself.
+        self._side_by_side = ThreadPoolExecutor(os.cpu_count())
         self._outputs: list[PilotOutput] = []
 
     def decide(
@@ -131,17 +136,21 @@ class _SeeingCrew:
     ) -> tuple[FloatArray, FloatArray]:
         """Velocity setpoints (n, 2) and headings (n,)."""
         recorder.truth(step, vehicles, desired_velocity(self._scenario.drone.desired, time_s))
-        self._outputs = []
+        steps = []
+        render_ms = []
         for i, pilot in enumerate(self._pilots):
             begin = time.perf_counter()
             frames, shot = self._photographer.photograph(i, step, time_s, vehicles)
             if self._truths:
                 self._truths[i].show(shot)
-            render_ms = 1e3 * (time.perf_counter() - begin)
+            render_ms.append(1e3 * (time.perf_counter() - begin))
             state = self._autopilots[i].read(time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i])
-            output = self._fly(i, pilot, frames, state)
-            recorder.seen(step, i, output, state, vehicles, {"render": render_ms, **output.stages_ms})
-            self._outputs.append(output)
+            steps.append((pilot, frames, state))
+        self._outputs = list(self._side_by_side.map(lambda one: one[0].step(one[1], one[2]), steps))
+        for i, (output, (_, _, state)) in enumerate(zip(self._outputs, steps, strict=True)):
+            if self._telemetry is not None:
+                publish_step(self._telemetry, f"drone{i + 1}", state, output)
+            recorder.seen(step, i, output, state, vehicles, {"render": render_ms[i], **output.stages_ms})
         commands = [output.command for output in self._outputs]
         return np.array([c.velocity for c in commands]), np.array([c.yaw_rad for c in commands])
 
@@ -165,12 +174,6 @@ class _SeeingCrew:
                 ranges={s.label: float(np.linalg.norm(s.position)) for s in output.sightings},
             )
         ]
-
-    def _fly(self, index: int, pilot: FlockPilot, frames: FrameSet, state: VehicleState) -> PilotOutput:
-        output = pilot.step(frames, state)
-        if self._telemetry is not None:
-            publish_step(self._telemetry, f"drone{index + 1}", state, output)
-        return output
 
 
 class _Recorder:
