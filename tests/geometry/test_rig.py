@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from flockd.config import load_drone
 from flockd.config.parameters import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
+from flockd.data import data_path
 from flockd.geometry import PinholeCamera, Rig, RigCamera, RigidTransform, WideAngleCamera, build_rig
 
 from .synthetic_world import four_camera_rig
@@ -93,3 +95,13 @@ def test_a_rig_without_cameras_or_with_a_misfiled_one_is_refused() -> None:
     with pytest.raises(ValueError, match="'front' is filed under the name 'back'"):
         Rig({"back": camera})
     assert RigCamera("x", camera.camera, RigidTransform.identity()).name == "x"
+
+
+def test_the_simulators_rig_has_no_blind_sector_for_neighbours() -> None:
+    """Every direction from 45 degrees below to 45 degrees above the horizon is in some camera's view."""
+    rig = build_rig(load_drone(data_path("config") / "simulator.yaml").rig)
+    azimuth, elevation = np.meshgrid(np.radians(np.arange(0.0, 360.0, 0.5)), np.radians(np.arange(-45.0, 45.1, 0.5)))
+    directions = np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), -np.sin(elevation)], axis=-1
+    )
+    assert rig.covers(directions.reshape(-1, 3)).all()
