@@ -85,6 +85,7 @@ class NeighbourMotion:
     """(3,) metres in C (Eq. 35)."""
     velocity: FloatArray
     """(3,) m/s in C (Eq. 36)."""
+    interval_s: float
     centre: FloatArray
     """(3,) metres in F: centre of the inliers' bounding box (Eq. 37)."""
     pairs: int

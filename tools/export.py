@@ -69,7 +69,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "flow": {
         "net": FlowNet,
         "roles": ["flow"],
-        "description": "Recurrent all-pairs optical flow on half-size images, four iterations",
+        "description": "Optical flow on half-size images: best match of the whole image, then three recurrent refinements",
         "image_scale": 0.5,
         "size_multiple": 8,
         "golden_size": [240, 320],

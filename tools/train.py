@@ -196,7 +196,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     task = TASKS[arguments.network](open_pairs(arguments.data))
     if arguments.start:
-        task.net.load_state_dict(torch.load(arguments.start, map_location="cpu")["net"])
+        task.net.load_state_dict(torch.load(arguments.start, map_location="cpu")["net"], strict=False)
     arguments.out.mkdir(parents=True, exist_ok=True)
     train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed)
 

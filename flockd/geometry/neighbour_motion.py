@@ -32,6 +32,7 @@ def estimate_neighbour_motion(
         rotation=found.transform.rotation,
         translation=translation,
         velocity=translation / ego.interval_s,  # Eq. 36
+        interval_s=ego.interval_s,
         centre=(seen.min(axis=0) + seen.max(axis=0)) / 2.0,  # Eq. 37
         pairs=len(pairs),
         inliers=int(found.inliers.sum()),

@@ -31,6 +31,8 @@ from flockd.pilot.views import Observer, Perceiver, RigView
 from flockd.tracking import Measurement, Tracker, sighting_covariance
 
 _OWN_DISPLACEMENT_SIGMA_M = 0.02
+_MOTION_CAUTION = 2.0
+"""Eq. 36 rests on the same ranges as the positions do: it counts for less than its own spread says."""
 
 
 class FlockPilot:
@@ -182,9 +184,18 @@ def load_perception(config: DroneConfig) -> Perception:
 def _measurement(
     sighting: Sighting, R_ned_body: FloatArray, previous: RigView | None, motion: NeighbourMotion | None
 ) -> Measurement:
+    """A sighting in level axes, with the velocity of Eq. 36 where there is one."""
     position = R_ned_body @ sighting.position
     covariance = sighting_covariance(position, sighting.range_sigma_m, sighting.bearing_sigma_rad)
-    return Measurement(position=position, covariance=covariance, size_m=sighting.size_m)
+    if motion is None or previous is None:
+        return Measurement(position=position, covariance=covariance, size_m=sighting.size_m)
+    return Measurement(
+        position=position,
+        covariance=covariance,
+        size_m=sighting.size_m,
+        velocity=previous.vehicle.R_ned_body @ motion.velocity,
+        velocity_sigma_m_s=_MOTION_CAUTION * math.sqrt(2) * sighting.range_sigma_m / motion.interval_s,
+    )
 
 
 class _Laps:

@@ -161,7 +161,7 @@ class _Gru(nn.Module):
 
 
 class FlowNet(nn.Module):
-    """Recurrent all-pairs flow.
+    """Recurrent all-pairs flow that begins at the best match of the whole image.
 
     Inputs: first, second (n, h, w, 3) uint8, h and w multiples of 8. Output: flow (n, 2, h, w) in pixels of its input,
     from first to second. In training a list, one flow an iteration.
@@ -169,10 +169,11 @@ class FlowNet(nn.Module):
 
     hidden, context, feature, radius, levels = 48, 40, 96, 3, 2
 
-    def __init__(self, iterations: int = 4) -> None:
+    def __init__(self, iterations: int = 3) -> None:
         super().__init__()
         self.iterations = iterations
         self.encoder = _Encoder(self.feature)
+        self.sharpness = nn.Parameter(torch.tensor(1.0))
         self.initial = nn.Sequential(_conv(self.feature, 96), nn.Conv2d(96, self.hidden + self.context, 1))
         lookups = self.levels * (2 * self.radius + 1) ** 2
         self.correlation = nn.Sequential(nn.Conv2d(lookups, 64, 1), nn.ReLU(True))
@@ -193,8 +194,11 @@ class FlowNet(nn.Module):
         start = self.initial(f1)
         hidden, context = torch.tanh(start[:, : self.hidden]), F.relu(start[:, self.hidden :])
         grid = self._grid(n, h, w, start.float())
-        flow = torch.zeros_like(grid)
+        match = (pyramid[0].float() * torch.exp(self.sharpness)).reshape(n, h * w, h * w).softmax(2)
+        flow = torch.matmul(match, grid.flatten(2).transpose(1, 2)).transpose(1, 2).reshape(n, 2, h, w) - grid
         flows: list[Tensor] = []
+        if self.training:
+            flows.append(F.interpolate(flow * 8.0, scale_factor=8.0, mode="bilinear", align_corners=False))
         steps = iterations or self.iterations
         for step in range(steps):
             flow = flow.detach()
