@@ -60,16 +60,17 @@ NETWORKS: dict[str, dict[str, Any]] = {
         "inputs": {"picture": {**IMAGE, "shape": ["n", 96, 96, 3]}},
         "outputs": {
             "range": (
-                ["n", 4],
-                "log(range / focal length), centre right and down of the middle, log of the first's deviation",
-                "log(m/px), px, px, 1",
+                ["n", 5],
+                "log(range / focal length), centre right and down of the middle, log of the first's deviation, "
+                "logit of a drone being there",
+                "log(m/px), px, px, 1, 1",
             )
         },
     },
     "flow": {
         "net": FlowNet,
         "roles": ["flow"],
-        "description": "Optical flow on half-size images: best match of the whole image, then three recurrent refinements",
+        "description": "Optical flow on half-size images: best match anywhere, then three recurrent refinements",
         "image_scale": 0.5,
         "size_multiple": 8,
         "golden_size": [240, 320],

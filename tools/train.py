@@ -13,7 +13,6 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from tools.training.dataset import PairSet, open_pairs
 from tools.training.networks import MAX_DEPTH_M, DistanceNet, FlowNet, NeighboursNet
-from tools.training.samples import Sample, distance_sample, drone_list, flow_sample, neighbours_sample
+from tools.training.samples import Sample, distance_sample, drone_list, flow_sample, neighbours_sample, no_drone_sample
 
 Batch = dict[str, Tensor]
 
@@ -106,9 +105,10 @@ class DistanceTask(Task):
     pool_size = 50_000
     renewed_in_a_batch = 6
 
-    def __init__(self, pairs: PairSet) -> None:
+    def __init__(self, pairs: PairSet, negatives: Path | None) -> None:
         super().__init__(DistanceNet(), 64, 2e-3)
         self.pairs, self.drones = pairs, drone_list(pairs)
+        self.negatives = np.load(negatives) if negatives else None
         self.pool: list[Sample] = []
         self.drawn = 0
 
@@ -123,24 +123,33 @@ class DistanceTask(Task):
         return self.pool[int(rng.integers(self.pool_size))]
 
     def _fresh(self, rng: np.random.Generator) -> Sample:
+        if self.negatives is not None and rng.random() < 0.25:
+            hard = self.negatives[int(rng.integers(len(self.negatives)))] if rng.random() < 0.7 else None
+            return no_drone_sample(self.pairs, hard, rng)
         return distance_sample(self.pairs, self.drones[int(rng.integers(len(self.drones)))], rng)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         """See ``Task``."""
         out, hints = self.net(batch["picture"])
+        there = batch["drone"]
         error = (out[:, 0] - batch["target"][:, 0]).abs()
         centre = (out[:, 1:3] - batch["target"][:, 1:3]).abs().clamp(max=30).sum(1)
         nll = error / torch.exp(out[:, 3]) * 1.414 + out[:, 3]
-        family = F.cross_entropy(hints[:, :-1], batch["family"])
-        apparent = (hints[:, -1] - batch["apparent"]).abs().mean()
+        family = F.cross_entropy(hints[:, :-1], batch["family"], reduction="none")
+        apparent = (hints[:, -1] - batch["apparent"]).abs()
+        each = 0.3 * nll + 2.0 * error + 0.05 * centre + 0.3 * family + apparent
+        seen = there > 0.5
+        right = (out[:, 4] > 0) == seen
         figures = {
-            "median": float(error.median().detach()),
-            "p95": float(error.quantile(0.95).detach()),
-            "centre": float(centre.median().detach()),
-            "family": float((hints[:, :-1].argmax(1) == batch["family"]).float().mean()),
-            "apparent": float(apparent.detach()),
+            "median": float(error[seen].median().detach()),
+            "p95": float(error[seen].quantile(0.95).detach()),
+            "centre": float(centre[seen].median().detach()),
+            "family": float((hints[seen, :-1].argmax(1) == batch["family"][seen]).float().mean()),
+            "drone": float(right[seen].float().mean()),
+            "other": float(right[~seen].float().mean()) if (~seen).any() else float("nan"),
         }
-        return (0.3 * nll + 2.0 * error + 0.05 * centre).mean() + 0.3 * family + apparent, figures
+        exists = F.binary_cross_entropy_with_logits(out[:, 4], there)
+        return (each * there).sum() / there.sum().clamp(min=1) + 0.5 * exists, figures
 
 
 class FlowTask(Task):
@@ -173,20 +182,24 @@ class FlowTask(Task):
         return total, figures
 
 
-TASKS: dict[str, Callable[[PairSet], Task]] = {
-    "neighbours": NeighboursTask,
-    "distance": DistanceTask,
-    "flow": FlowTask,
-}
+NETWORKS = ("neighbours", "distance", "flow")
+
+
+def _task(network: str, pairs: PairSet, negatives: Path | None) -> Task:
+    if network == "neighbours":
+        return NeighboursTask(pairs)
+    return DistanceTask(pairs, negatives) if network == "distance" else FlowTask(pairs)
 
 
 def main() -> None:
     """Train until the minutes are over."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("network", choices=TASKS)
+    parser.add_argument("network", choices=NETWORKS)
     parser.add_argument("--data", type=Path, required=True, help="folder of render_training_data.py")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--minutes", type=float, default=60.0, help="of training in all, over every resumption")
+    parser.add_argument("--negatives", type=Path, help="what is no drone, for `distance`: file of mine_negatives.py")
+    parser.add_argument("--rate", type=float, help="learning rate to begin with")
     parser.add_argument("--start", type=Path, help="weights to begin with: another run's checkpoint.pt")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
@@ -194,11 +207,22 @@ def main() -> None:
     torch.manual_seed(arguments.seed)
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(1)
-    task = TASKS[arguments.network](open_pairs(arguments.data))
+    task = _task(arguments.network, open_pairs(arguments.data), arguments.negatives)
+    task.rate = arguments.rate or task.rate
     if arguments.start:
-        task.net.load_state_dict(torch.load(arguments.start, map_location="cpu")["net"], strict=False)
+        begin_with(task.net, torch.load(arguments.start, map_location="cpu")["net"])
     arguments.out.mkdir(parents=True, exist_ok=True)
     train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed)
+
+
+def begin_with(net: nn.Module, weights: dict[str, Tensor]) -> None:
+    """Take over what fits; of a layer that has grown, the part that was there."""
+    own = net.state_dict()
+    for name, value in weights.items():
+        if name in own and own[name].dim() == value.dim():
+            part = tuple(slice(0, min(a, b)) for a, b in zip(own[name].shape, value.shape, strict=True))
+            own[name][part] = value[part]
+    net.load_state_dict(own)
 
 
 def train(task: Task, out: Path, budget_s: float, seed: int) -> None:

@@ -50,6 +50,8 @@ class RangeEstimate:
     """Standard deviation of the range, as a share of it."""
     centre: FloatArray
     """(2,) u, v of the drone's centre in the picture."""
+    is_drone: float = 1.0
+    """Probability that there is a drone at all."""
 
 
 class Perception:
@@ -113,6 +115,7 @@ class Perception:
                 range_m=float(np.exp(row[0]) * picture.focal_px),
                 relative_sigma=float(np.exp(row[3])),
                 centre=np.array([middle + row[1], middle + row[2]], np.float64),
+                is_drone=float(1.0 / (1.0 + np.exp(-row[4]))),
             )
             for row, picture in zip(out, pictures, strict=True)
         )

@@ -20,6 +20,8 @@ _FIRST_MARGIN = 1.3
 """The first picture of a drone is this much wider than its box."""
 _SECOND_HALF_WIDTH_M = 0.5
 """Half of what the second picture covers at the drone's range."""
+_SURE = 0.5
+"""What the second look says is a drone with less than this probability is none."""
 _SAME_DRONE = 0.6
 """Two sightings closer than this share of their size are one drone seen by two cameras."""
 _BEARING_SIGMA_RAD = 0.004
@@ -142,15 +144,15 @@ class Observer:
         ]
         second = self._ranges(live, images, again)
         return [
-            _Located(c, position, max(sigma, _MIN_RELATIVE_SIGMA) * range_m, _size(c, range_m))
-            for c, (position, range_m, sigma) in zip(candidates, second, strict=True)
-            if 0.2 < range_m < 60.0
+            _Located(c, position, max(estimate.relative_sigma, _MIN_RELATIVE_SIGMA) * range_m, _size(c, range_m))
+            for c, (position, range_m, estimate) in zip(candidates, second, strict=True)
+            if estimate.is_drone > _SURE and 0.2 < range_m < 60.0
         ]
 
     def _ranges(
         self, live: Rig, images: Mapping[str, UInt8Array], aims: Sequence[tuple[FloatArray, float, float | None]]
-    ) -> list[tuple[FloatArray, float, float]]:
-        """For each (direction, half angle, range if known): position in the body, distance from it, relative sigma."""
+    ) -> list[tuple[FloatArray, float, RangeEstimate]]:
+        """For each (direction, half angle, range if known): position in the body, distance from it, all estimated."""
         crops = [virtual_crop(live, direction, angle, self._perceiver.picture_size) for direction, angle, _ in aims]
         pictures = [
             Picture(
@@ -165,7 +167,7 @@ class Observer:
         for crop, estimate in zip(crops, self._perceiver.ranges(pictures), strict=True):
             ray = crop.camera.rays(estimate.centre[None])[0]
             position = crop.T_body_virtual.apply(estimate.range_m * ray[None])[0]
-            out.append((position, float(np.linalg.norm(position)), estimate.relative_sigma))
+            out.append((position, float(np.linalg.norm(position)), estimate))
         return out
 
     def _locate_by_depth(self, candidate: _Candidate, scene: SceneMaps) -> _Located | None:

@@ -97,9 +97,9 @@ class NeighboursNet(nn.Module):
 class DistanceNet(nn.Module):
     """Range of the drone in the middle of a picture.
 
-    Input: picture (n, 96, 96, 3) uint8 of a virtual camera that faces the drone. Outputs (n, 4):
+    Input: picture (n, 96, 96, 3) uint8 of a virtual camera that faces the drone. Outputs (n, 5):
     log of (range in m / focal length in px), the drone's centre right and down of the picture's centre in px,
-    log of the standard deviation of the first.
+    log of the standard deviation of the first, logit of there being a drone at all.
     """
 
     size = 96
@@ -118,7 +118,7 @@ class DistanceNet(nn.Module):
             _Residual(128),
         )
         self.summary = nn.Sequential(nn.Linear(128 * 9, 160), nn.ReLU(True))
-        self.head = nn.Linear(160, 4)
+        self.head = nn.Linear(160, 5)
         self.hints = nn.Linear(160, MAX_FAMILIES + 1)
 
     def forward(self, picture: Tensor) -> Tensor | tuple[Tensor, Tensor]:
@@ -126,7 +126,8 @@ class DistanceNet(nn.Module):
         x = picture.permute(0, 3, 1, 2).float() / 127.5 - 1.0
         x = _in_full_precision(self.summary, self.features(F.pixel_unshuffle(x, 2)).flatten(1))
         out = _in_full_precision(self.head, x)
-        out = torch.cat([out[:, :1] - 4.0, out[:, 1:3] * 10.0, (out[:, 3:] - 3.0).clamp(-7.0, 1.0)], 1)
+        sigma = (out[:, 3:4] - 3.0).clamp(-7.0, 1.0)
+        out = torch.cat([out[:, :1] - 4.0, out[:, 1:3] * 10.0, sigma, out[:, 4:]], 1)
         return (out, _in_full_precision(self.hints, x)) if self.training else out
 
 

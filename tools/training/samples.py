@@ -110,6 +110,35 @@ def distance_sample(
         "target": target,
         "family": np.array(family),
         "apparent": np.array(apparent, np.float32),
+        "drone": np.array(1.0, np.float32),
+    }
+
+
+def no_drone_sample(pairs: PairSet, negative: NDArray[Any] | None, rng: np.random.Generator) -> Sample:
+    """A picture of something else: a row of mine_negatives.py, or anywhere in any image."""
+    if negative is not None:
+        pair, k = int(negative[0]), int(negative[1])
+        middle, half_px = negative[2:4] + rng.normal(0, 0.15, 2) * negative[4], negative[4]
+        half_px = half_px * np.exp(rng.uniform(0.0, 1.0))
+    else:
+        pair, k = int(rng.integers(pairs.count)), int(rng.integers(2))
+        middle, half_px = rng.uniform((0, 0), (WIDTH, HEIGHT)), np.exp(rng.uniform(np.log(6), np.log(90)))
+        boxes = pairs["drone_box"][pair, k][pairs["drone_pixels"][pair, k] > 0]
+        if len(boxes) and (np.abs((boxes[:, :2] + boxes[:, 2:]) / 2 - middle).max(1) < 1.5 * half_px).any():
+            return no_drone_sample(pairs, None, rng)
+    focal = float(pairs["focal"][pair])
+    middle = np.clip(middle, 1, (WIDTH - 1, HEIGHT - 1))
+    aim = R_BODY_CAMERA @ np.array([*((middle - (WIDTH / 2, HEIGHT / 2)) / focal), 1.0])
+    half_angle = float(np.arctan(max(half_px, 4.0) / focal))
+    crop = virtual_crop(Rig({"camera": rig_camera(focal)}), aim / np.linalg.norm(aim), half_angle, 96)
+    picture, _ = crop.sample({"camera": np.asarray(pairs["image"][pair][k])})
+    (picture,) = photometric([picture], rng)
+    return {
+        "picture": picture,
+        "target": np.zeros(3, np.float32),
+        "family": np.array(0),
+        "apparent": np.array(0.0, np.float32),
+        "drone": np.array(0.0, np.float32),
     }
 
 

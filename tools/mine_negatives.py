@@ -1,0 +1,51 @@
+"""Find what the segmentation network wrongly takes for drones: the distance network learns to say no to it.
+
+python tools/mine_negatives.py --data DATA/training --model RUNS/models/neighbours.yaml --out DATA/negatives.npy
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from flockd.perception import OnnxModel, group_instances
+from tools.training.dataset import ground_plane, open_pairs, ray_tangents
+
+EAGER_LOGIT = -0.4
+"""Pixels above this count, so that near misses are found too."""
+
+
+def main() -> None:
+    """Write (n, 5): pair, image, centre right and down in px, half of the box's longer side in px."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--model", type=Path, required=True, help="manifest of a neighbours network")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--threads", type=int, default=1)
+    arguments = parser.parse_args()
+    pairs = open_pairs(arguments.data)
+    model = OnnxModel(arguments.model, threads=arguments.threads)
+    found = []
+    for pair in range(pairs.count):
+        focal = float(pairs["focal"][pair])
+        ground = ground_plane(focal, pairs["R_ned_camera"][pair, 0], float(pairs["height"][pair, 0]))
+        planes = np.concatenate([ray_tangents(focal), ground[None]])
+        out = model.run({"image": np.asarray(pairs["image"][pair][0])[None], "geometry": planes[None]})
+        ids = np.asarray(pairs["ids"][pair][0])
+        labels, instances = group_instances(out["drone"][0, 0] - EAGER_LOGIT, out["offset"][0], scale=2)
+        for instance in instances:
+            if (ids[labels == instance.label] > 0).mean() < 0.05:
+                left, top, right, bottom = instance.box
+                half = max(right - left, bottom - top) / 2
+                found.append((pair, 0, (left + right) / 2, (top + bottom) / 2, half))
+    np.save(arguments.out, np.array(found, np.float32))
+    print(f"{arguments.out}: {len(found)} in {pairs.count} images")
+
+
+if __name__ == "__main__":
+    main()
