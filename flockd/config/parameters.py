@@ -100,6 +100,8 @@ class GeometryParameters(Section):
     background_stride_px: Annotated[int, Field(ge=1, le=256)] = 12
     max_depth_m: Positive = 40.0
     """Background farther away says little of the translation and is left out."""
+    max_acceleration_m_s2: Positive = 6.0
+    """An ego-motion that would need more than this since the last one is refused, twice in a row at most."""
     refine: bool = True
     """Polish the ego-motion by its reprojection error after Algorithm 1."""
 

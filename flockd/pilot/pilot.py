@@ -31,6 +31,7 @@ from flockd.pilot.views import Observer, Perceiver, RigView
 from flockd.tracking import Measurement, Tracker, sighting_covariance
 
 _OWN_DISPLACEMENT_SIGMA_M = 0.02
+_MAX_REFUSALS = 2
 _MOTION_CAUTION = 2.0
 """Eq. 36 rests on the same ranges as the positions do: it counts for less than its own spread says."""
 
@@ -55,6 +56,7 @@ class FlockPilot:
         self._first_time_s: float | None = None
         self._previous: RigView | None = None
         self._velocity: FloatArray | None = None
+        self._refused_in_a_row = 0
         self._flows_seen: Mapping[str, Float32Array] = {}
 
     @property
@@ -134,17 +136,31 @@ class FlockPilot:
         except ValueError as error:
             reasons.append(f"ego-motion: {error}")
             return None, None
-        return ego, previous.vehicle.R_ned_body @ ego.translation
+        displacement = previous.vehicle.R_ned_body @ ego.translation
+        if not self._is_plausible(displacement, ego.interval_s):
+            reasons.append("ego-motion: no vehicle changes its velocity that fast")
+            return None, None
+        return ego, displacement
+
+    def _is_plausible(self, displacement: FloatArray, interval_s: float) -> bool:
+        """Whether the last velocity can have become this one; a third refusal in a row would rather doubt the last."""
+        if self._velocity is None:
+            return True
+        change = float(np.linalg.norm(displacement / interval_s - self._velocity))
+        allowed = self._config.geometry.max_acceleration_m_s2 * interval_s * (1 + self._refused_in_a_row)
+        if change <= allowed or self._refused_in_a_row == _MAX_REFUSALS:
+            self._refused_in_a_row = 0
+            return True
+        self._refused_in_a_row += 1
+        return False
 
     def _own_velocity(
         self, ego: EgoMotion | None, displacement: FloatArray | None, vehicle: VehicleState
     ) -> FloatArray | None:
         """(3,) NED m/s. Where vision fails, the last one that it gave."""
-        if self._config.own_velocity == "autopilot":
-            return vehicle.velocity_ned
         if ego is not None and displacement is not None:
             self._velocity = displacement / ego.interval_s  # Eq. 21
-        return self._velocity
+        return vehicle.velocity_ned if self._config.own_velocity == "autopilot" else self._velocity
 
     def _track(
         self,

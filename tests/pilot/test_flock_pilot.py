@@ -148,3 +148,19 @@ def test_blind_cameras_still_give_a_finite_command() -> None:
     assert len(output.reasons) == 4
     assert np.isfinite(output.command.velocity).all()
     assert math.isfinite(output.command.yaw_rad)
+
+
+def test_an_impossible_ego_motion_is_refused_but_not_for_ever() -> None:
+    """No vehicle jumps 4 m in a step. If it goes on, it was the past that was wrong."""
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0)))
+    flyer.step()
+    flyer.move()
+    assert flyer.step().ego_motion is not None
+    known = []
+    for _ in range(4):
+        flyer.move()
+        flyer.vehicles.position = flyer.vehicles.position + np.array([4.0, 0.0, 0.0])
+        output = flyer.step()
+        known.append(output.ego_motion is not None)
+        assert (output.ego_motion is not None) != any("that fast" in reason for reason in output.reasons)
+    assert known == [False, False, True, True]
