@@ -17,9 +17,7 @@ UNCLASSED = 255
 """Label of pixels too near a drone's outline to be sure of, and of drones that are not sighted."""
 _OUTLINE_PX = 5
 _FIRST_MARGIN = 1.3
-"""The first picture of a drone is this much wider than its box."""
-_SECOND_HALF_WIDTH_M = 0.5
-"""Half of what the second picture covers at the drone's range."""
+"""A picture of a drone is this much wider than its box."""
 _SURE = 0.5
 """What the second look says is a drone with less than this probability is none."""
 _SAME_DRONE = 0.6
@@ -139,10 +137,10 @@ class Observer:
             return [one for one in located if one is not None]
         first = self._ranges(live, images, [(c.direction, c.half_angle, None) for c in candidates])
         again = [
-            (_in_view(live, position, c), float(np.arctan(_SECOND_HALF_WIDTH_M / max(range_m, 0.5))), range_m)
+            (_in_view(live, position, c), c.half_angle, range_m)
             for c, (position, range_m, _) in zip(candidates, first, strict=True)
         ]
-        second = self._ranges(live, images, again)
+        second = self._ranges(live, images, again)  # now in the middle, and whole where two cameras share it
         return [
             _Located(c, position, max(estimate.relative_sigma, _MIN_RELATIVE_SIGMA) * range_m, _size(c, range_m))
             for c, (position, range_m, estimate) in zip(candidates, second, strict=True)

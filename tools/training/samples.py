@@ -25,8 +25,6 @@ from tools.training.networks import MAX_DEPTH_M
 
 Sample = dict[str, NDArray[Any]]
 SIZES_M = [drone_model(family, 0).size_m for family in range(FAMILIES)]
-CROP_HALF_WIDTH_M = 0.5
-"""Half of what the second crop of a drone covers at the drone's range."""
 
 
 def neighbours_sample(
@@ -86,12 +84,9 @@ def distance_sample(
     focal = float(pairs["focal"][pair])
     centre = np.asarray(pairs["drone_centre"][pair, k, d], np.float64)
     range_m = float(np.linalg.norm(centre))
-    first_stage = rng.random() < 0.4
-    half_width = CROP_HALF_WIDTH_M * np.exp(rng.normal(0, 0.08))
-    shift_m = rng.normal(0, 0.03, 2)
-    if first_stage:
-        half_width = float(np.exp(rng.uniform(np.log(0.18), np.log(0.8))))
-        shift_m = rng.normal(0, 0.15, 2) * half_width
+    # How much of the picture the drone fills must say nothing about metres: it is drawn apart from family and range.
+    half_width = SIZES_M[int(pairs["drone_family"][pair, d])] / 2 * float(np.exp(rng.uniform(np.log(0.6), np.log(2.4))))
+    shift_m = rng.normal(0, 0.15 if rng.random() < 0.5 else 0.03, 2) * half_width
     right, down = _across(centre)
     aim = R_BODY_CAMERA @ _in_view(centre + shift_m[0] * right + shift_m[1] * down, focal)
     rig = Rig({"camera": rig_camera(focal)})
