@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 from pathlib import Path
 
@@ -13,7 +14,10 @@ from flockd.cli import main
 from flockd.config.parameters import PerceptionConfig
 from flockd.data import data_path
 from flockd.errors import ModelError
+from flockd.messages import UInt8Array
 from flockd.perception import DisFlow, OnnxFlow, OnnxModel, Perception, find_manifests, load_manifest
+from flockd.sim.renderer import Renderer
+from flockd.sim.world import World
 
 MODELS = data_path("models")
 NAMES = ["distance", "flow", "neighbours"]
@@ -63,8 +67,6 @@ def test_a_truncated_file_whose_hash_was_updated_is_still_refused(copies: Path) 
     content = file.read_bytes()
     old = load_manifest(copies / "flow.yaml")[0].sha256
     file.write_bytes(content[: len(content) // 2])
-    import hashlib
-
     manifest = copies / "flow.yaml"
     manifest.write_text(manifest.read_text().replace(old, hashlib.sha256(file.read_bytes()).hexdigest()))
     with pytest.raises(ModelError, match=r"flow\.yaml: file: .*flow\.onnx cannot be loaded"):
@@ -115,30 +117,31 @@ def test_a_model_that_is_not_there_is_refused_with_those_that_are() -> None:
         Perception(PerceptionConfig(flow="raft"), MODELS)
 
 
-def shifted_pictures(shift: tuple[float, float], size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Two pictures of one smooth texture, the second moved by ``shift`` pixels right and down."""
+def shifted_pictures(shift: tuple[int, int], size: tuple[int, int]) -> tuple[UInt8Array, UInt8Array]:
+    """Two windows of one rendered picture, so that all of the first has moved by ``shift`` px right and down."""
     width, height = size
-    v, u = np.mgrid[:height, :width].astype(float)
+    margin = 16
+    matrix = np.array([[250.0, 0.0, width / 2], [0.0, 250.0, height / 2], [0.0, 0.0, 1.0]])
+    R_ned_camera = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    large = (width + 2 * margin, height + 2 * margin)
+    view = Renderer(World.generate(11), []).render(
+        matrix, large, R_ned_camera, np.array([0.0, 0.0, -4.0]),
+        drone_rotations=np.zeros((0, 3, 3)), drone_positions=np.zeros((0, 3)), shown=[],
+    )  # fmt: skip
 
-    def picture(du: float, dv: float) -> np.ndarray:
-        rng = np.random.default_rng(3)
-        total = np.zeros((height, width, 3))
-        for period in (90, 60, 40, 27, 18, 12, 8):
-            for _ in range(3):
-                angle, phase = rng.uniform(0, 2 * np.pi, 2)
-                wave = np.cos(2 * np.pi / period * ((u - du) * np.cos(angle) + (v - dv) * np.sin(angle)) + phase)
-                total += wave[..., None] * rng.uniform(-1, 1, 3)
-        return np.clip(127 + 22 * total, 0, 255).astype(np.uint8)
+    def window(right: int, down: int) -> UInt8Array:
+        top, left = margin + down, margin + right
+        return np.ascontiguousarray(view.rgb[top : top + height, left : left + width])
 
-    return picture(0, 0), picture(*shift)
+    return window(0, 0), window(-shift[0], -shift[1])
 
 
 @pytest.mark.parametrize("size", [(480, 640), (640, 480), (330, 250)])
 def test_flow_finds_a_known_shift_at_any_image_size(size: tuple[int, int]) -> None:
-    first, second = shifted_pictures((9.0, -5.0), size)
-    inner = np.s_[32:-32, 32:-32]
-    dis = DisFlow().flow(first, second)[inner]
+    first, second = shifted_pictures((9, -5), size)
+    ground = np.s_[size[1] // 2 + 16 : -32, 32:-32]
+    dis = DisFlow().flow(first, second)[ground]
     assert np.abs(np.median(dis, axis=(0, 1)) - [9.0, -5.0]).max() < 0.2
     network = OnnxFlow(OnnxModel(MODELS / "flow.yaml", threads=1)).flow(first, second)
     assert network.shape == (size[1], size[0], 2)
-    assert np.abs(np.median(network[inner], axis=(0, 1)) - [9.0, -5.0]).max() < 1.0
+    assert np.abs(np.median(network[ground], axis=(0, 1)) - [9.0, -5.0]).max() < 2.5
