@@ -142,6 +142,20 @@ class VelocityCommand:
 
 
 @dataclass(frozen=True, eq=False)
+class Setpoint:
+    """What the autopilot is asked to do now: fly this horizontal velocity, hold this height, face this way."""
+
+    time_s: float
+    """When it was decided."""
+    velocity: FloatArray
+    """(2,) m/s, north and east."""
+    height_m: float
+    """As in `VehicleState`, up positive."""
+    yaw_rad: float
+    """Heading, clockwise from north."""
+
+
+@dataclass(frozen=True, eq=False)
 class PilotOutput:
     """Everything one step of the pilot found and decided."""
 
