@@ -198,3 +198,5 @@ class DroneConfig(Section):
     own_velocity: OwnVelocitySource = "vision"
     yaw: Literal["hold", "course"] = "course"
     """Heading: kept as it is, or along the desired velocity."""
+    autopilot: AutopilotParameters | None = None
+    """None: this drone's commands go nowhere but to the simulator."""
