@@ -26,10 +26,11 @@ MAY_IMPORT = {
     "sources": BASE,
     "autopilot": BASE,
     "telemetry": BASE,
-    "recording": BASE,
-    "sim": BASE | {"geometry", "perception", "tracking", "flocking", "safety", "pilot", "telemetry", "report"},
+    "recording": BASE | {"telemetry"},  # for the table of topics, which says what is recorded
+    "sim": BASE
+    | {"geometry", "perception", "tracking", "flocking", "safety", "pilot", "telemetry", "recording", "report"},
     "report": BASE | {"geometry", "flocking", "sim"},
-    "cli": BASE | {"perception", "pilot", "telemetry", "sim", "report"},
+    "cli": BASE | {"perception", "pilot", "telemetry", "recording", "sim", "report"},
 }
 """What each folder may import of the others."""
 

@@ -185,6 +185,26 @@ class AutopilotParameters(Section):
     """Height above home to fly at; by default the height at which the flight begins."""
 
 
+class RecordingConfig(Section):
+    """How a flight is written down, where it is."""
+
+    images: Literal["png", "jpeg"] = "png"
+    """`png` loses nothing: only then does a replay equal the flight."""
+    jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 90
+    queue_mb: Positive = 64.0
+    """What waits for the disk; beyond it steps are dropped."""
+    file_mb: Positive = 2000.0
+    """Then the recording goes on in a new file."""
+    quota_mb: Positive = 20000.0
+    """Of the drone's recordings in one folder together: the oldest are deleted to make room."""
+
+    @model_validator(mode="after")
+    def _a_file_fits(self) -> Self:
+        if self.file_mb > self.quota_mb:
+            raise ValueError(f"a file of {self.file_mb:g} MB does not fit into {self.quota_mb:g} MB; raise quota_mb")
+        return self
+
+
 class DroneConfig(Section):
     """Everything one drone's pilot needs."""
 
@@ -198,5 +218,19 @@ class DroneConfig(Section):
     own_velocity: OwnVelocitySource = "vision"
     yaw: Literal["hold", "course"] = "course"
     """Heading: kept as it is, or along the desired velocity."""
+    recording: RecordingConfig = RecordingConfig()
     autopilot: AutopilotParameters | None = None
     """None: this drone's commands go nowhere but to the simulator."""
+
+    @model_validator(mode="after")
+    def _every_camera_has_its_device(self) -> Self:
+        if self.source is None or self.source.kind != "v4l2":
+            return self
+        rig = [camera.name for camera in self.rig.cameras]
+        devices = [camera.name for camera in self.source.cameras]
+        if sorted(rig) != sorted(devices):
+            raise ValueError(
+                f"source.cameras names {', '.join(devices) or 'none'}, but the rig has {', '.join(rig)}; "
+                "give each camera of the rig one entry of the same name"
+            )
+        return self

@@ -106,6 +106,6 @@ TOPICS = {
         Topic("command", CommandMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
         Topic("health", HealthMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
         Topic("events", EventMessage, rate_hz=None, stale_after_s=None, recorded=True),
-        Topic("timings", TimingsMessage, rate_hz=2.0, stale_after_s=1.5, recorded=False),
+        Topic("timings", TimingsMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
     )
 }

@@ -1,0 +1,6 @@
+"""Recording: what a drone saw, knew and decided, in files that replay and viewers read."""
+
+from flockd.recording.mcap_file import RecordingError
+from flockd.recording.recorder import Recorder
+
+__all__ = ["Recorder", "RecordingError"]

@@ -1,0 +1,243 @@
+"""The one place that knows the MCAP format: writes it in small chunks, and reads whatever of a file is whole."""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO, Literal, Self
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
+from mcap.stream_reader import CRCValidationError, breakup_chunk
+from mcap.writer import CompressionType, Writer
+
+from flockd.errors import FlockdError
+
+CHUNK_BYTES = 100_000
+"""What a killed writer loses at most, besides what it has not yet been given time to flush."""
+SYNC_EVERY_S = 1.0
+"""How much a loss of power takes, where the disk keeps its word."""
+_MAGIC = b"\x89MCAP0\r\n"
+_HEAD = struct.Struct("<BQ")
+_BROKEN = (McapError, CRCValidationError, zstandard.ZstdError, struct.error, UnicodeDecodeError, MemoryError)
+
+
+class RecordingError(FlockdError):
+    """A file is no recording, or not one that can do what was asked of it."""
+
+
+Encoding = Literal["json", "protobuf"]
+
+
+@dataclass(frozen=True)
+class Stream:
+    """One topic of a file and what its messages are."""
+
+    topic: str
+    encoding: Encoding
+    schema_name: str
+    schema: bytes
+    """A JSON schema, or a serialised protobuf FileDescriptorSet."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One message of a file."""
+
+    stream: Stream
+    time_ns: int
+    sequence: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Note:
+    """Named facts about the whole file."""
+
+    name: str
+    facts: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Inclosure:
+    """A whole file within the file."""
+
+    name: str
+    media_type: str
+    data: bytes
+
+
+Record = Entry | Note | Inclosure
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Where and why a file cannot be read any further, or one chunk of it not at all."""
+
+    offset: int
+    reason: str
+    at_end: bool
+    """The file just stops: its writer was killed. Otherwise something within it is spoilt."""
+
+
+class McapFile:
+    """Writes one file. Every method may raise OSError; then only `abandon` is left to call."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = path.open("wb")
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._channels: dict[str, int] = {}
+        self._synced_s = time.monotonic()
+        try:
+            self._writer.start(library="flockd")
+        except OSError:
+            self.abandon()
+            raise
+
+    @property
+    def size(self) -> int:
+        """Bytes so far, without the chunk in progress."""
+        return self._file.tell()
+
+    def write(self, record: Record) -> None:
+        """Adds a record; notes and inclosures go straight to the file, entries into a chunk."""
+        match record:
+            case Entry(stream, time_ns, sequence, data):
+                self._writer.add_message(self._channel(stream), time_ns, data, time_ns, sequence)
+            case Note(name, facts):
+                self._writer.add_metadata(name, dict(facts))
+            case Inclosure(name, media_type, data):
+                self._writer.add_attachment(0, 0, name, media_type, data)
+
+    def flush(self) -> None:
+        """Ends the chunk and hands it to the system; about once a second also to the disk."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        now_s = time.monotonic()
+        if now_s - self._synced_s >= SYNC_EVERY_S:
+            self._synced_s = now_s
+            os.fsync(self._file.fileno())
+
+    def finish(self) -> None:
+        """Writes the index and closes the file."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._file.close()
+
+    def abandon(self) -> None:
+        """Closes the file as it stands, without another byte: what is in it can be recovered."""
+        self._file.raw.close()  # closing the buffered file would try to write once more
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.finish()
+        else:
+            self.abandon()
+
+    def _channel(self, stream: Stream) -> int:
+        if stream.topic not in self._channels:
+            encoding = "jsonschema" if stream.encoding == "json" else stream.encoding
+            schema = self._writer.register_schema(stream.schema_name, encoding, stream.schema)
+            self._channels[stream.topic] = self._writer.register_channel(stream.topic, stream.encoding, schema)
+        return self._channels[stream.topic]
+
+
+def read_records(path: Path) -> Iterator[Record | Damage]:
+    """All records in the order in which they were written, and what could not be read.
+
+    A damaged chunk is told and left out; where the file stops before its end, that is told last. Raises RecordingError
+    for what is no MCAP file, and OSError.
+    """
+    with path.open("rb") as file:
+        if file.read(len(_MAGIC)) != _MAGIC:
+            raise RecordingError(f"{path}: is not a recording (it does not begin as MCAP files do); name another file")
+        yield from _Reader(file).records()
+
+
+class _Reader:
+    """Walks from record to record by their lengths, so that one broken record does not hide the next."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._size = os.fstat(file.fileno()).st_size
+        self._schemas: dict[int, Schema] = {}
+        self._streams: dict[int, Stream] = {}
+
+    def records(self) -> Iterator[Record | Damage]:
+        while True:
+            offset = self._file.tell()
+            head = self._file.read(_HEAD.size)
+            if len(head) < _HEAD.size:
+                yield Damage(offset, "it stops without an end", at_end=True)
+                return
+            opcode, length = _HEAD.unpack(head)
+            if offset + _HEAD.size + length > self._size:
+                yield Damage(offset, "it stops within a record", at_end=True)
+                return
+            if opcode == Opcode.DATA_END:
+                if self._file.seek(-len(_MAGIC), io.SEEK_END) and self._file.read() != _MAGIC:
+                    yield Damage(offset, "it stops within its index", at_end=True)
+                return
+            if opcode == 0:
+                yield Damage(offset, "zeros stand where a record should begin", at_end=True)
+                return
+            content = self._file.read(length)
+            try:
+                found = list(self._parsed(opcode, content))
+            except _BROKEN as error:
+                yield Damage(offset, f"a {_name(opcode)} cannot be read ({error})", at_end=False)
+            else:
+                yield from found
+
+    def _parsed(self, opcode: int, content: bytes) -> Iterator[Record]:
+        stream = ReadDataStream(io.BytesIO(content))
+        match opcode:
+            case Opcode.CHUNK:
+                for record in breakup_chunk(Chunk.read(stream), validate_crc=True):
+                    yield from self._unpacked(record)
+            case Opcode.SCHEMA:
+                yield from self._unpacked(Schema.read(stream))
+            case Opcode.CHANNEL:
+                yield from self._unpacked(Channel.read(stream))
+            case Opcode.MESSAGE:
+                yield from self._unpacked(Message.read(stream, len(content)))
+            case Opcode.METADATA:
+                metadata = Metadata.read(stream)
+                yield Note(metadata.name, metadata.metadata)
+            case Opcode.ATTACHMENT:
+                attachment = Attachment.read(stream)
+                yield Inclosure(attachment.name, attachment.media_type, attachment.data)
+
+    def _unpacked(self, record: object) -> Iterator[Entry]:
+        match record:
+            case Schema():
+                self._schemas[record.id] = record
+            case Channel():
+                schema = self._schemas.get(record.schema_id)
+                name, data = (schema.name, schema.data) if schema else ("", b"")
+                encoding: Encoding = "protobuf" if record.message_encoding == "protobuf" else "json"
+                self._streams[record.id] = Stream(record.topic, encoding, name, data)
+            case Message() if record.channel_id in self._streams:  # its channel was in a damaged chunk
+                yield Entry(self._streams[record.channel_id], record.log_time, record.sequence, record.data)
+
+
+def _name(opcode: int) -> str:
+    try:
+        return Opcode(opcode).name.lower()
+    except ValueError:
+        return f"record of the unknown kind {opcode}"

@@ -1,0 +1,55 @@
+"""What a recording consists of: the streams that replay needs, those of the table of topics, and those for viewers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from flockd.messages import PilotOutput, VehicleState
+from flockd.recording.codec import json_schema
+from flockd.recording.mcap_file import Stream
+from flockd.telemetry import TOPICS
+
+FORMAT = "1"
+"""Of this layout; a reader refuses others."""
+FLIGHT_NOTE = "flockd"
+MODELS_NOTE = "models"
+END_NOTE = "end"
+CONFIGURATION = "configuration.json"
+
+
+@dataclass(frozen=True)
+class FrameEntry:
+    """One image of a frame set; the image itself is the camera's message with the step's number."""
+
+    camera: str
+    time_s: float
+    sequence: int
+
+
+@dataclass(frozen=True)
+class StepFrames:
+    """Which images went into a step."""
+
+    step: int
+    """Counted from 0 over the whole recording; a missing number is a step that was dropped."""
+    time_s: float
+    frames: tuple[FrameEntry, ...]
+
+
+def _json_stream(topic: str, kind: Any) -> Stream:
+    name = f"flockd.{kind.__name__.removesuffix('Message')}"
+    return Stream(topic, "json", name, json.dumps(json_schema(kind)).encode())
+
+
+FRAMES = _json_stream("/frames", StepFrames)
+VEHICLE = _json_stream("/vehicle", VehicleState)
+OUTPUT = _json_stream("/output", PilotOutput)
+TABLE = {key: _json_stream(f"/{key}", topic.type) for key, topic in TOPICS.items() if topic.recorded}
+"""The telemetry that the table of topics wants recorded."""
+
+
+def nanoseconds(time_s: float) -> int:
+    """A time as MCAP has it; the exact one stands in the messages themselves."""
+    return max(0, round(time_s * 1e9))
