@@ -221,16 +221,3 @@ class DroneConfig(Section):
     recording: RecordingConfig = RecordingConfig()
     autopilot: AutopilotParameters | None = None
     """None: this drone's commands go nowhere but to the simulator."""
-
-    @model_validator(mode="after")
-    def _every_camera_has_its_device(self) -> Self:
-        if self.source is None or self.source.kind != "v4l2":
-            return self
-        rig = [camera.name for camera in self.rig.cameras]
-        devices = [camera.name for camera in self.source.cameras]
-        if sorted(rig) != sorted(devices):
-            raise ValueError(
-                f"source.cameras names {', '.join(devices) or 'none'}, but the rig has {', '.join(rig)}; "
-                "give each camera of the rig one entry of the same name"
-            )
-        return self
