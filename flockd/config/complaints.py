@@ -80,7 +80,8 @@ def _sentence(error: ErrorDetails, written: str, path: KeyPath, root: Schema) ->
     wanted = _wanted(root, schema, _unit(path))
     shown = written or ("a list" if isinstance(value, tuple) else _shown(value))
     if kind == "extra_forbidden":
-        return _unknown_key(str(path[-1]), sorted(_schema_at(root, path[:-1]).get("properties", {})))
+        section = _with_parts(root, _schema_at(root, path[:-1]))
+        return _unknown_key(str(path[-1]), sorted(section.get("properties", {})))
     if kind == "missing" and isinstance(value, tuple):
         return f"{_shown(value)}; write {wanted}"
     if kind == "missing":
@@ -204,10 +205,17 @@ def _resolved(root: Schema, schema: Schema) -> Schema:
     return schema
 
 
+def _with_parts(root: Schema, schema: Schema) -> Schema:
+    """Of an optional section or list, the branch that is not null."""
+    branches = [_resolved(root, branch) for branch in schema.get("anyOf", ())]
+    return next((branch for branch in branches if branch.get("type") in {"object", "array"}), schema)
+
+
 def _schema_at(root: Schema, path: KeyPath) -> Schema:
     """The part of the schema that describes a path; empty where there is none (an unknown key)."""
     schema = _resolved(root, root)
     for part in path:
+        schema = _with_parts(root, schema)
         if isinstance(part, str):
             schema = schema.get("properties", {}).get(part, {})
         else:
