@@ -1,0 +1,195 @@
+"""Frames from another program on this computer through zenoh's shared memory, and the side that publishes them.
+
+A frame is one message under `flockd-frames/v1/<drone>/<camera>`: its payload is the image, row by row, 3 bytes RGB a
+pixel; its attachment says what it is in 24 bytes, little-endian: `rgb8`, width and height (uint16), sequence (uint64),
+time in seconds (float64). Where shared memory cannot be had, the same messages go through the socket.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import struct
+import time
+from collections.abc import Callable, Mapping, Sequence
+from types import TracebackType
+from typing import Self
+
+import zenoh
+from zenoh import shm
+
+from flockd.config.parameters import DroneConfig, SourceParameters
+from flockd.errors import UnavailableError
+from flockd.messages import Frame, FrameSet
+from flockd.sources.frames import CameraStatus, RawFrame
+from flockd.sources.images import RgbFormat
+from flockd.sources.intake import Intake
+
+PREFIX = "flockd-frames/v1"
+"""Apart from telemetry, which no drone reads."""
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7448"
+_HEADER = struct.Struct("<4sHHQd")
+_MAGIC = b"rgb8"
+_POOL_BYTES = 64 << 20
+"""Three sets of five drones with four 640x480 cameras each."""
+
+
+class FramePublisher:
+    """Publishes the frames of any number of drones; what a simulator calls. Raises UnavailableError without endpoint.
+
+    Nothing waits for a reader: a frame that nobody can take in time is dropped on the way.
+    """
+
+    def __init__(self, *, listen: Sequence[str] = (DEFAULT_ENDPOINT,)) -> None:
+        self._session, note = _open(listen=listen, connect=())
+        self._notes = [note] if note else []
+        self._pool = None if note else self._shared_pool()
+        self._publishers: dict[tuple[str, str], zenoh.Publisher] = {}
+
+    def publish(self, drone: str, frame: Frame) -> None:
+        """Sends one frame; its image is copied."""
+        height, width, _ = frame.image.shape
+        header = _HEADER.pack(_MAGIC, width, height, frame.sequence, frame.time_s)
+        self._publisher(drone, frame.camera).put(self._payload(frame.image.tobytes()), attachment=header)
+
+    def notes(self) -> tuple[str, ...]:
+        """What a person should know although nothing is wrong: each is one sentence."""
+        return tuple(self._notes)
+
+    def close(self) -> None:
+        """Ends the session."""
+        self._session.close()  # type: ignore[no-untyped-call]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _shared_pool(self) -> shm.ShmProvider | None:
+        try:
+            return shm.ShmProvider.default_backend(_POOL_BYTES)
+        except zenoh.ZError as error:
+            self._note(_without_shared_memory(error))
+            return None
+
+    def _payload(self, data: bytes) -> bytes | shm.ZShmMut:
+        if self._pool is None:
+            return data
+        try:
+            block = self._pool.alloc(len(data), shm.GarbageCollect())
+        except zenoh.ZError as error:  # full: readers hold what they have not copied yet
+            self._note(_without_shared_memory(error))
+            return data
+        block[:] = data
+        return block
+
+    def _note(self, sentence: str) -> None:
+        if sentence not in self._notes:
+            self._notes.append(sentence)
+
+    def _publisher(self, drone: str, camera: str) -> zenoh.Publisher:
+        publisher = self._publishers.get((drone, camera))
+        if publisher is None:
+            publisher = self._session.declare_publisher(
+                f"{PREFIX}/{drone}/{camera}", congestion_control=zenoh.CongestionControl.DROP
+            )
+            self._publishers[drone, camera] = publisher
+        return publisher
+
+
+class SharedMemorySource:
+    """A ``FrameSource`` of what a ``FramePublisher`` publishes for one drone."""
+
+    def __init__(
+        self, config: DroneConfig, parameters: SourceParameters, *, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._formats = {camera.name: RgbFormat(camera.size_px) for camera in config.rig.cameras}
+        self._where = parameters.shared_memory
+        self._intake = Intake(tuple(self._formats), parameters, clock)
+        self._session: zenoh.Session | None = None
+        self._subscribers: list[zenoh.Subscriber[None]] = []
+        self._notes: list[str] = []
+
+    def start(self) -> None:
+        """See ``FrameSource``; raises UnavailableError for an endpoint that cannot be one."""
+        self._session, note = _open(listen=(), connect=self._where.connect)
+        self._notes += [note] if note else []
+        self._subscribers = [
+            self._session.declare_subscriber(
+                f"{PREFIX}/{self._where.drone}/{camera}", functools.partial(self._receive, camera)
+            )
+            for camera in self._formats
+        ]
+
+    def newest(self, timeout_s: float = 0.0) -> FrameSet | None:
+        """See ``FrameSource``."""
+        return self._intake.newest(timeout_s)
+
+    def status(self) -> Mapping[str, CameraStatus]:
+        """See ``FrameSource``."""
+        return self._intake.status()
+
+    def notes(self) -> tuple[str, ...]:
+        """See ``FrameSource``."""
+        return tuple(self._notes)
+
+    def stop(self) -> None:
+        """See ``FrameSource``."""
+        self._intake.stop()
+        if self._session is not None:
+            self._session.close()  # type: ignore[no-untyped-call]
+
+    def _receive(self, camera: str, sample: zenoh.Sample) -> None:
+        """On a thread of zenoh's."""
+        if sample.payload.as_shm() is None and not self._notes:
+            self._notes.append("frames come through a socket instead of shared memory: slower, and otherwise the same")
+        image_format = self._formats[camera]
+        try:
+            header = b"" if sample.attachment is None else sample.attachment.to_bytes()
+            magic, width, height, sequence, time_s = _HEADER.unpack(header)
+        except struct.error:
+            magic = b""
+        if magic != _MAGIC:
+            self._intake.count(camera, "received", "malformed")
+            return
+        if (width, height) != image_format.size:
+            self._intake.count(camera, "received", "corrupt")
+            asked = "x".join(map(str, image_format.size))
+            self._intake.fault(camera, f"{camera}: frames of {width}x{height} come, but the rig says {asked}; mend one")
+            return
+        self._intake.offer(RawFrame(camera, sample.payload.to_bytes(), image_format.decode, time_s, sequence))
+
+
+def _open(*, listen: Sequence[str], connect: Sequence[str]) -> tuple[zenoh.Session, str | None]:
+    """A peer that knows nobody but these endpoints, and a note if it has to do without shared memory."""
+    try:
+        return zenoh.open(_peer_config(listen, connect, shared_memory=True)), None
+    except zenoh.ZError as error:
+        try:
+            session = zenoh.open(_peer_config(listen, connect, shared_memory=False))
+        except zenoh.ZError as still:
+            reason = str(still).split(" at ")[0].split(": [")[0]
+            endpoints = ", ".join([*listen, *connect])
+            raise UnavailableError(f"frames cannot use {endpoints} ({reason}); name another endpoint") from still
+        return session, _without_shared_memory(error)
+
+
+def _peer_config(listen: Sequence[str], connect: Sequence[str], *, shared_memory: bool) -> zenoh.Config:
+    """A peer opens without a router, unlike a client; it tries for ever to reach who is not there yet."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"peer"')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("scouting/gossip/enabled", "false")
+    config.insert_json5("listen/endpoints", json.dumps(list(listen)))
+    config.insert_json5("connect/endpoints", json.dumps(list(connect)))
+    config.insert_json5("connect/retry", json.dumps({"period_init_ms": 100, "period_max_ms": 1000}))
+    config.insert_json5("transport/shared_memory/enabled", json.dumps(shared_memory))
+    return config
+
+
+def _without_shared_memory(error: zenoh.ZError) -> str:
+    reason = str(error).split(" at ")[0]
+    return f"frames go through a socket instead of shared memory ({reason}): slower, and otherwise the same"
