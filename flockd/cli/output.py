@@ -19,6 +19,11 @@ def say(text: str) -> None:
     sys.stdout.write(f"{text}\n")
 
 
+def complain(text: str) -> None:
+    """Writes lines on stderr."""
+    sys.stderr.write(f"{text}\n")
+
+
 def say_json(value: object) -> None:
     """Writes one JSON document on stdout."""
     say(json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False))

@@ -9,14 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli.flights import prepare, save, tell, write_findings
-from flockd.cli.output import progress
+from flockd.cli.output import complain, progress
 from flockd.cli.parser import Commands, positive_count, positive_number, seed
 from flockd.errors import UsageError
 
 if TYPE_CHECKING:
     from flockd.config import Overrides, ScenarioConfig
+    from flockd.recording import Recorder
 
 SCENARIO = "paper_flight.yaml"
+RECORDINGS = "recordings"
 ROLES = ("flow", "depth", "segmentation", "distance")
 OPTIONS = {
     "duration": "duration_s",
@@ -34,6 +36,7 @@ def add(commands: Commands) -> None:
         "flockd sim --duration 20 --drones 3 --out out/short",
         "flockd sim --perception truth --json > truth.json",
         "flockd sim my_flight.yaml --flow dis --seed 7",
+        "flockd sim --record --duration 20",
     )
     parser = commands("sim", "Fly a simulated flock by sight, and report how it went.", examples)
     parser.add_argument("scenario", nargs="?", metavar="SCENARIO", type=Path, help="by default the paper's flight")
@@ -57,6 +60,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument("--out", metavar="DIR", type=Path, help="default: out/SCENARIO-PERCEPTION-seedN")
     parser.add_argument("--telemetry", action="store_true", help="publish over zenoh while flying")
+    parser.add_argument("--record", action="store_true", help="write a recording of each drone to DIR/recordings")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     parser.set_defaults(run=_run)
 
@@ -83,14 +87,47 @@ def _run(args: argparse.Namespace) -> int:
 
             telemetry = stack.enter_context(ZenohTelemetry(_plain(scenario.scenario)))
         tell_progress = stack.enter_context(progress("flying", "steps"))
-        flight = fly(scenario, perception=args.perception, swap=args.swap, telemetry=telemetry, progress=tell_progress)
+        flight = fly(
+            scenario,
+            perception=args.perception,
+            swap=args.swap,
+            telemetry=telemetry,
+            recorders=_recorders(scenario, args.swap, directory / RECORDINGS, stack) if args.record else (),
+            progress=tell_progress,
+        )
     save(directory, flight)
     return tell(directory, write_findings(directory, flight.log), as_json=args.json)
 
 
+def _recorders(
+    scenario: ScenarioConfig, swap: frozenset[str], directory: Path, stack: ExitStack
+) -> tuple[Recorder, ...]:
+    """A recorder for each drone, over an earlier flight's recordings."""
+    from flockd.cli.record import models_of
+    from flockd.recording import Recorder
+
+    directory.mkdir(exist_ok=True)
+    for earlier in directory.glob("drone*.mcap"):
+        earlier.unlink()
+    facts = {"scenario": scenario.scenario, "seed": str(scenario.seed), "true_roles": ", ".join(sorted(swap))}
+    return tuple(
+        stack.enter_context(
+            Recorder(
+                directory / f"drone{i + 1}.mcap",
+                drone=f"drone{i + 1}",
+                config=scenario.drone,
+                models=models_of(scenario.drone),
+                facts=facts,
+                on_event=complain,
+            )
+        )
+        for i in range(len(scenario.vehicles))
+    )
+
+
 def _check_options(args: argparse.Namespace) -> None:
     if args.perception == "truth":
-        idle = [option for option in ("flow", "scale", "swap", "telemetry") if getattr(args, option)]
+        idle = [option for option in ("flow", "scale", "swap", "telemetry", "record") if getattr(args, option)]
         if idle:
             raise UsageError(f"--{idle[0]} has no meaning when nobody looks; drop it or --perception truth")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
@@ -18,6 +18,7 @@ from flockd.messages import FloatArray, PilotOutput, VehicleState
 from flockd.perception import Perception
 from flockd.pilot import FlockPilot
 from flockd.pilot.pilot import load_perception
+from flockd.recording import Recorder
 from flockd.report.filmstrip import FilmstripFrame
 from flockd.sim.log import FlightLog, match_neighbours
 from flockd.sim.photographer import Photographer
@@ -44,6 +45,7 @@ def fly(
     perception: Literal["learned", "truth"] = "learned",
     swap: frozenset[str] = frozenset(),
     telemetry: TelemetrySink | None = None,
+    recorders: Sequence[Recorder] = (),
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Flight:
     """Fly a scenario. The same scenario gives the same flight, bit for bit, except for the times it took.
@@ -53,6 +55,7 @@ def fly(
         perception: `learned` flies from rendered images; `truth` from exact relative states.
         swap: roles of perception that are answered by the truth instead of a network.
         telemetry: where every drone's output is published; nothing comes back from there.
+        recorders: one a drone, or none; nothing comes back from there either.
         progress: told (steps done, steps in all).
     """
     unknown = swap - set(ROLES)
@@ -61,7 +64,7 @@ def fly(
     begin = time.perf_counter()
     times = step_times(scenario)
     recorder = _Recorder(scenario, times)
-    crew = _ExactCrew(scenario) if perception == "truth" else _SeeingCrew(scenario, swap, telemetry)
+    crew = _ExactCrew(scenario) if perception == "truth" else _SeeingCrew(scenario, swap, telemetry, recorders)
     yaw = course(scenario.drone.desired, 0.0)
     vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=yaw, seed=scenario.seed)
     pictured = set(np.linspace(1, len(times) - 1, FILMSTRIP_FRAMES).astype(int).tolist())
@@ -114,9 +117,15 @@ class _ExactCrew:
 class _SeeingCrew:
     """One pilot a drone, each given only its own images and its own autopilot's readings."""
 
-    def __init__(self, scenario: ScenarioConfig, swap: frozenset[str], telemetry: TelemetrySink | None) -> None:
+    def __init__(
+        self,
+        scenario: ScenarioConfig,
+        swap: frozenset[str],
+        telemetry: TelemetrySink | None,
+        recorders: Sequence[Recorder],
+    ) -> None:
         self._scenario = scenario
-        self._telemetry = telemetry
+        self._telemetry, self._recorders = telemetry, recorders
         self._photographer = Photographer(scenario)
         count = len(scenario.vehicles)
         learned: Perception = load_perception(scenario.drone)
@@ -147,9 +156,12 @@ class _SeeingCrew:
             state = self._autopilots[i].read(time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i])
             steps.append((pilot, frames, state))
         self._outputs = list(self._side_by_side.map(lambda one: one[0].step(one[1], one[2]), steps))
-        for i, (output, (_, _, state)) in enumerate(zip(self._outputs, steps, strict=True)):
+        for i, (output, (_, frames, state)) in enumerate(zip(self._outputs, steps, strict=True)):
             if self._telemetry is not None:
                 publish_step(self._telemetry, f"drone{i + 1}", state, output)
+            if self._recorders:
+                self._recorders[i].drain()  # simulated time stands still, so nothing need ever be dropped
+                self._recorders[i].step(frames, state, output)
             recorder.seen(step, i, output, state, vehicles, {"render": render_ms[i], **output.stages_ms})
         commands = [output.command for output in self._outputs]
         return np.array([c.velocity for c in commands]), np.array([c.yaw_rad for c in commands])

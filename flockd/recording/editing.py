@@ -1,0 +1,92 @@
+"""Makes a new recording of the whole steps of another: after a kill or damage, or of a stretch of time."""
+
+from __future__ import annotations
+
+import json
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from flockd.recording import foxglove
+from flockd.recording.codec import from_json
+from flockd.recording.mcap_file import Entry, McapFile, Note, RecordingError, read_records
+from flockd.recording.reader import Contents, Recording, head_of, is_calibration, makes_steps
+from flockd.recording.streams import END_NOTE, FLIGHT_NOTE, FRAMES, VEHICLE, StepFrames
+
+
+def recover(recording: Recording, target: Path) -> int:
+    """Writes what is whole of a recording, all its files as one; gives the number of steps.
+
+    Raises RecordingError when no step is whole, and OSError; then there is no target.
+    """
+    return _copy(recording.contents, target, -np.inf, np.inf, {"recovered": recording.path.name})
+
+
+def cut(recording: Recording, target: Path, start_s: float, end_s: float) -> int:
+    """Writes the stretch from `start_s` to `end_s` of the recording's clock; gives the number of steps.
+
+    Raises RecordingError when no whole step is in it, and OSError; then there is no target.
+    """
+    return _copy(recording.contents, target, start_s, end_s, {"cut_from": recording.path.name})
+
+
+@contextmanager
+def written_whole(target: Path) -> Iterator[Path]:
+    """A place to write to, which becomes the target when all is written and vanishes otherwise."""
+    draft = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
+    try:
+        yield draft
+        draft.replace(target)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def _copy(contents: Contents, target: Path, start_s: float, end_s: float, origin: dict[str, str]) -> int:
+    whole = _whole_steps(contents, start_s, end_s)
+    if not whole:
+        raise RecordingError(f"{contents.paths[0]}: holds no whole step there; nothing was written")
+    flight, models, configuration = head_of(contents.paths[0])
+    facts = {**flight.facts, "recording": uuid.uuid4().hex, "part": "0", **origin}
+    with written_whole(target) as draft, McapFile(draft) as file:
+        for record in (Note(FLIGHT_NOTE, facts), models, configuration):
+            file.write(record)
+        for entry in _kept(contents, whole, lambda time_ns: start_s * 1e9 <= time_ns <= end_s * 1e9):
+            file.write(entry)
+        file.write(Note(END_NOTE, {"steps": str(len(whole)), "lost": str(contents.lost)}))
+    return len(whole)
+
+
+def _kept(contents: Contents, whole: set[int], in_time: Callable[[int], bool]) -> Iterator[Entry]:
+    calibrated: set[str] = set()
+    for entry in _entries(contents):
+        topic = entry.stream.topic
+        if is_calibration(topic):
+            if topic not in calibrated:
+                yield entry
+            calibrated.add(topic)
+        elif entry.sequence in whole if makes_steps(topic) else in_time(entry.time_ns):
+            yield entry
+
+
+def _whole_steps(contents: Contents, start_s: float, end_s: float) -> set[int]:
+    """Steps with their vehicle's state and all the images that they list."""
+    seen: dict[int, set[str]] = {}
+    listed: dict[int, StepFrames] = {}
+    for entry in _entries(contents):
+        if makes_steps(entry.stream.topic):
+            seen.setdefault(entry.sequence, set()).add(entry.stream.topic)
+        if entry.stream.topic == FRAMES.topic:
+            listed[entry.sequence] = from_json(StepFrames, json.loads(entry.data))
+    return {
+        number
+        for number, step in listed.items()
+        if start_s <= step.time_s <= end_s
+        and {VEHICLE.topic, *(foxglove.image_stream(f.camera).topic for f in step.frames)} <= seen[number]
+    }
+
+
+def _entries(contents: Contents) -> Iterator[Entry]:
+    return (record for path in contents.paths for record in read_records(path) if isinstance(record, Entry))

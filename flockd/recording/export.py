@@ -1,0 +1,99 @@
+"""Takes a recording apart: its messages as tables, its images as files."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from flockd.recording import foxglove
+from flockd.recording.codec import Json
+from flockd.recording.mcap_file import Entry, read_records
+from flockd.recording.reader import Recording, is_image
+
+Row = dict[str, Any]
+Tables = dict[str, list[Row]]
+Format = Literal["csv", "parquet"]
+WORDS = ("NaN", "Infinity", "-Infinity")
+"""Numbers that JSON has only as text."""
+
+
+def export_tables(recording: Recording, folder: Path, form: Format) -> tuple[Path, ...]:
+    """Writes a table for each stream of JSON messages, and one for each list within them: a row each message or entry.
+
+    Nested names are joined by dots. Raises OSError, and ModuleNotFoundError for Parquet without pyarrow.
+    """
+    tables: Tables = {}
+    for entry in _entries(recording):
+        if entry.stream.encoding == "json":
+            _add(tables, entry.stream.topic.strip("/"), {"log_time_s": entry.time_ns * 1e-9}, json.loads(entry.data))
+    write = _write_csv if form == "csv" else _write_parquet
+    return tuple(write(folder / f"{name}.{form}", rows) for name, rows in tables.items())
+
+
+def export_images(recording: Recording, folder: Path) -> int:
+    """Writes each image as it is in the recording to `CAMERA/STEP_TIME.png` or `.jpeg`; gives their number."""
+    count = 0
+    for entry in _entries(recording):
+        if is_image(entry.stream.topic):
+            data, kind = foxglove.image_data(entry.data)
+            camera = folder / entry.stream.topic.split("/")[-2]
+            camera.mkdir(parents=True, exist_ok=True)
+            (camera / f"{entry.sequence:06d}_{entry.time_ns * 1e-9:.6f}.{kind}").write_bytes(data)
+            count += 1
+    return count
+
+
+def _entries(recording: Recording) -> Iterator[Entry]:
+    paths = recording.contents.paths
+    return (record for path in paths for record in read_records(path) if isinstance(record, Entry))
+
+
+def _add(tables: Tables, table: str, fixed: Mapping[str, Any], message: Json) -> None:
+    """One message as a row, its lists of mappings as rows of tables of their own that begin with the message's time."""
+    row = dict(fixed)
+    tables.setdefault(table, []).append(row)
+    time = {name: message[name] for name in ("step", "time_s") if name in message} or dict(fixed)
+    _fill(tables, table, row, time, "", message)
+
+
+def _fill(tables: Tables, table: str, row: Row, time: Row, prefix: str, message: Mapping[str, Json]) -> None:
+    for key, value in message.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            _fill(tables, table, row, time, f"{name}.", value)
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            for inner in value:
+                _add(tables, f"{table}.{name}", time, inner)
+        elif isinstance(value, list) and any(isinstance(one, str) and one not in WORDS for one in value):
+            row[name] = "; ".join(value)
+        elif isinstance(value, list):
+            row.update({f"{name}.{index}": _number(one) for index, one in enumerate(value)})
+        else:
+            row[name] = _number(value)
+
+
+def _number(value: Json) -> Json:
+    return float(value) if value in WORDS else value
+
+
+def _columns(rows: list[Row]) -> list[str]:
+    return list(dict.fromkeys(name for row in rows for name in row))
+
+
+def _write_csv(path: Path, rows: list[Row]) -> Path:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, _columns(rows))
+        writer.writeheader()
+        writer.writerows(rows)
+    return path
+
+
+def _write_parquet(path: Path, rows: list[Row]) -> Path:
+    import pyarrow as pa  # noqa: PLC0415 - an optional extra
+    import pyarrow.parquet as pq  # noqa: PLC0415
+
+    pq.write_table(pa.table({name: [row.get(name) for row in rows] for name in _columns(rows)}), path)
+    return path

@@ -1,0 +1,282 @@
+"""Reads a recording: finished, or cut off by a kill, but never one that is not ours or not enough to be played."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from pydantic import ValidationError
+
+from flockd.config import DroneConfig
+from flockd.messages import Frame, FrameSet, UInt8Array, VehicleState
+from flockd.recording import foxglove
+from flockd.recording.codec import from_json
+from flockd.recording.mcap_file import Damage, Entry, Inclosure, Note, Record, RecordingError, read_records
+from flockd.recording.recorder import part_path
+from flockd.recording.streams import (
+    CONFIGURATION,
+    END_NOTE,
+    FLIGHT_NOTE,
+    FORMAT,
+    FRAMES,
+    MODELS_NOTE,
+    OUTPUT,
+    VEHICLE,
+    StepFrames,
+)
+
+_MEND = "`flockd record recover` makes a recording without it"
+_IMAGE_SUFFIX, _CALIBRATION_SUFFIX = "/image", "/calibration"
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedStep:
+    """What went into one step of the pilot, and what came out."""
+
+    number: int
+    """Counted from 0 at the flight's first step."""
+    frames: FrameSet
+    vehicle: VehicleState
+    output: Mapping[str, Any] | None
+    """A `PilotOutput` as JSON, every number exact; None where the recording ends before it."""
+
+
+@dataclass
+class StreamFacts:
+    """One topic of a recording."""
+
+    topic: str
+    schema: str
+    messages: int = 0
+    bytes: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Messages a second from the first to the last."""
+        span_s = (self.last_ns - self.first_ns) * 1e-9
+        return (self.messages - 1) / span_s if span_s > 0 else None
+
+
+@dataclass
+class Contents:
+    """What one pass over all of a recording's files found."""
+
+    flight: Mapping[str, str]
+    models: Mapping[str, str]
+    configuration: bytes
+    paths: tuple[Path, ...] = ()
+    streams: dict[str, StreamFacts] = field(default_factory=dict)
+    steps: list[tuple[int, float]] = field(default_factory=list)
+    """Number and time of each step."""
+    lost: int = 0
+    """Steps and messages that the recorder dropped, by its own count."""
+    damages: list[tuple[Path, Damage]] = field(default_factory=list)
+    finished: bool = False
+
+    @property
+    def gaps(self) -> tuple[tuple[int, int], ...]:
+        """Each run of steps that is missing, as its first and last number."""
+        numbers = [number for number, _ in self.steps]
+        return tuple((a + 1, b - 1) for a, b in pairwise(numbers) if b > a + 1)
+
+
+class Recording:
+    """One drone's recording with all its files, checked as a whole when it is opened."""
+
+    def __init__(self, path: Path, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
+        """Opens the file and those that go on where it ends.
+
+        Raises RecordingError for what is no recording of ours, or not whole enough to be played, and OSError.
+        `progress` is told how many of how many bytes are checked.
+        """
+        self.path = path
+        self.contents = _survey(path, progress)
+        self.config = _config(path, self.contents.configuration)
+
+    @property
+    def drone(self) -> str:
+        """Whose flight it is."""
+        return self.contents.flight["drone"]
+
+    @property
+    def start_s(self) -> float:
+        """The first step's time."""
+        return self.contents.steps[0][1]
+
+    @property
+    def duration_s(self) -> float:
+        """From the first step to the last."""
+        return self.contents.steps[-1][1] - self.start_s
+
+    def steps(self, start_s: float = -np.inf, end_s: float = np.inf) -> Iterator[RecordedStep]:
+        """The steps at these times (of the recording's clock) in the order in which they were flown.
+
+        Raises RecordingError where an image or a message is spoilt.
+        """
+        gathered: dict[int, dict[str, bytes]] = {}
+        for path in self.contents.paths:
+            for record in read_records(path):
+                if isinstance(record, Entry) and makes_steps(record.stream.topic):
+                    waiting = gathered.setdefault(record.sequence, {})
+                    waiting[record.stream.topic] = record.data
+                    if record.stream.topic == OUTPUT.topic:
+                        yield from self._built(record.sequence, gathered.pop(record.sequence), start_s, end_s)
+        for number, messages in gathered.items():  # killed between a step's images and its output
+            yield from self._built(number, messages, start_s, end_s)
+
+    def _built(
+        self, number: int, messages: Mapping[str, bytes], start_s: float, end_s: float
+    ) -> Iterator[RecordedStep]:
+        if FRAMES.topic not in messages or VEHICLE.topic not in messages:
+            return
+        try:
+            listed: StepFrames = from_json(StepFrames, json.loads(messages[FRAMES.topic]))
+            if not start_s <= listed.time_s <= end_s:
+                return
+            vehicle: VehicleState = from_json(VehicleState, json.loads(messages[VEHICLE.topic]))
+            output = json.loads(messages[OUTPUT.topic]) if OUTPUT.topic in messages else None
+            frames = {}
+            for entry in listed.frames:
+                image = _picture(messages[foxglove.image_stream(entry.camera).topic])
+                frames[entry.camera] = Frame(entry.camera, image, entry.time_s, entry.sequence)
+        except KeyError as error:
+            raise RecordingError(f"{self.path}: step {number} lost its image {error}; {_MEND}") from error
+        except (ValueError, RecordingError) as error:
+            raise RecordingError(f"{self.path}: step {number} cannot be read ({error}); {_MEND}") from error
+        yield RecordedStep(number, FrameSet(listed.time_s, frames), vehicle, output)
+
+
+def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
+    """What every file begins with: the flight, its models and its configuration.
+
+    Raises RecordingError where the file is not ours or ends before all three, and OSError.
+    """
+    flight, models, configuration = None, None, None
+    for record in read_records(path):
+        match record:
+            case Note(name) if name == FLIGHT_NOTE:
+                flight = record
+            case Note(name) if name == MODELS_NOTE:
+                models = record
+            case Inclosure(name) if name == CONFIGURATION:
+                configuration = record
+            case Damage():
+                if flight is None:
+                    raise RecordingError(f"{path}: nothing in it can be read ({record.reason}); use another copy")
+                raise RecordingError(f"{path}: is cut off before the configuration of the flight; use another copy")
+            case Entry() if flight is None:
+                break
+        if flight and models and configuration:
+            if flight.facts.get("format") != FORMAT:
+                known = f"format {flight.facts.get('format')!r}, and this flockd reads {FORMAT!r}"
+                raise RecordingError(f"{path}: is of {known}; use the flockd that wrote it")
+            return flight, models, configuration
+    raise RecordingError(f"{path}: is an MCAP file, but no recording of flockd; name one that flockd wrote")
+
+
+def check(path: Path) -> None:
+    """Raises RecordingError when there is no file to read at all."""
+    if not path.is_file():
+        fault = "is a folder; name a recording in it" if path.is_dir() else "does not exist; check the path"
+        raise RecordingError(f"{path}: {fault}")
+
+
+def _survey(first: Path, progress: Callable[[int, int], None]) -> Contents:
+    check(first)
+    flight, models, configuration = head_of(first)
+    found = Contents(flight.facts, models.facts, configuration.data)
+    found.paths = tuple(_all_parts(first, flight))
+    total, done = sum(path.stat().st_size for path in found.paths), 0
+    for path in found.paths:
+        found.finished = True
+        for record in read_records(path):
+            if isinstance(record, Entry):
+                done += len(record.data)
+                progress(done, total)
+            _note(found, path, record)
+        found.finished = found.finished and not any(where == path for where, _ in found.damages)
+    if not found.steps:
+        raise RecordingError(f"{first}: holds no step of a flight; record one that flies")
+    return found
+
+
+def _all_parts(first: Path, flight: Note) -> Iterator[Path]:
+    """The file, and those after it that say they are of the same recording."""
+    yield first
+    number = int(flight.facts.get("part", "0"))
+    start = first if number == 0 else first.with_name(first.name.replace(f".{number}.mcap", ".mcap"))
+    while (path := part_path(start, number + 1)).is_file() and path != first:
+        number += 1
+        try:
+            head = head_of(path)[0]
+        except RecordingError:  # killed in the moment in which it was begun, or another flight's remains
+            return
+        if head.facts.get("recording") != flight.facts.get("recording"):
+            return
+        yield path
+
+
+def _note(found: Contents, path: Path, record: Record | Damage) -> None:
+    match record:
+        case Entry(stream, time_ns, sequence, data):
+            facts = found.streams.setdefault(stream.topic, StreamFacts(stream.topic, stream.schema_name))
+            facts.first_ns = time_ns if facts.messages == 0 else min(facts.first_ns, time_ns)
+            facts.last_ns = max(facts.last_ns, time_ns)
+            facts.messages += 1
+            facts.bytes += len(data)
+            if stream.topic == FRAMES.topic:
+                found.steps.append((sequence, _time_of(path, data)))
+        case Note(name, facts_of_end) if name == END_NOTE:
+            found.lost = int(facts_of_end.get("lost", "0"))
+        case Damage():
+            found.damages.append((path, record))
+
+
+def _time_of(path: Path, data: bytes) -> float:
+    try:
+        return float(json.loads(data)["time_s"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise RecordingError(f"{path}: holds a frame set without a time; use another copy") from error
+
+
+def _config(path: Path, text: bytes) -> DroneConfig:
+    try:
+        return DroneConfig.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"]) or "the whole"
+        raise RecordingError(
+            f"{path}: the configuration in it is not one of this flockd ({key}: {first['msg']}); "
+            "use the flockd that wrote it"
+        ) from error
+
+
+def is_image(topic: str) -> bool:
+    """Whether this stream holds a camera's pictures."""
+    return topic.endswith(_IMAGE_SUFFIX)
+
+
+def is_calibration(topic: str) -> bool:
+    """Whether this stream says once what a camera is."""
+    return topic.endswith(_CALIBRATION_SUFFIX)
+
+
+def makes_steps(topic: str) -> bool:
+    """Whether this stream's messages are parts of steps, numbered by their sequence."""
+    return topic in {FRAMES.topic, VEHICLE.topic, OUTPUT.topic} or is_image(topic)
+
+
+def _picture(message: bytes) -> UInt8Array:
+    data, kind = foxglove.image_data(message)
+    bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    if bgr is None:
+        raise ValueError(f"a {kind} image does not decode")
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
