@@ -33,7 +33,6 @@ Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "RTL", "OFFBOARD"]
 TICK_S = 0.02
 MAX_STEP_S = 0.2
 """After a longer pause of this computer the vehicle has stood still."""
-HEARTBEAT_S = 1.0
 DEFAULT_STREAMS_S = {31: 0.1, 32: 0.1, 245: 1.0, 1: 1.0, 24: 1.0, 230: 1.0, 242: 1.0, 436: 2.0}
 """Message number and seconds between two, until somebody asks for another rate."""
 TYPE_MASK = 2531
@@ -81,7 +80,7 @@ class PointMass:
 
     TIME_CONSTANT_S = 0.25
     MAX_ACCELERATION_M_S2 = 4.0
-    MAX_CLIMB_M_S = 1.5
+    MAX_CLIMB_M_S = 3.0
 
     def __init__(self, position: FloatArray, yaw_rad: float = 0.0) -> None:
         """At rest at `position`, (3,) metres NED."""
@@ -120,8 +119,10 @@ class AutopilotStandIn:
         height_m: float = 0.0,
         yaw_rad: float = 0.0,
         motion: Motion | None = None,
+        heartbeat_s: float = 1.0,
     ) -> None:
-        """Bind a socket; nothing is sent before `start`."""
+        """Bind a socket; nothing is sent before `start`. A second between heartbeats is PX4's."""
+        self._heartbeat_s = heartbeat_s
         self.battery_share = 1.0
         self.estimate_ok = True
         self.silent = False
@@ -363,7 +364,7 @@ class AutopilotStandIn:
         self._mav.statustext_send(mavlink.MAV_SEVERITY_CRITICAL, text[:50].encode())
 
     def _send_streams(self, now: float) -> None:
-        self._send_if_due(now, 0, HEARTBEAT_S, self._send_heartbeat)
+        self._send_if_due(now, 0, self._heartbeat_s, self._send_heartbeat)
         senders: dict[int, Callable[[], None]] = {
             31: self._send_attitude,
             32: self._send_position,
@@ -380,7 +381,7 @@ class AutopilotStandIn:
 
     def _send_if_due(self, now: float, number: int, interval_s: float, sender: Callable[[], None]) -> None:
         if now >= self._due_s.get(number, 0.0):
-            self._due_s[number] = max(self._due_s.get(number, 0.0) + interval_s, now)
+            self._due_s[number] = max(self._due_s.get(number, now) + interval_s, now)
             sender()
 
     def _boot_ms(self) -> int:

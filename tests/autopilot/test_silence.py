@@ -1,0 +1,165 @@
+"""Whatever stops in flockd, the setpoints stop within half a second, and the autopilot's own failsafe takes over."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from flockd.autopilot.stand_in import AutopilotStandIn
+from tests.autopilot.conftest import HEARTBEAT_S
+
+try:
+    from tests.autopilot.flight import Flight, flying, until
+except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
+    pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
+
+STOPS_WITHIN_S = 0.5
+FAILSAFE_WITHIN_S = 2.5
+"""COM_OF_LOSS_T is 1 s; the rest is the silence before it, and a busy computer."""
+
+
+@contextmanager
+def _child_in_offboard(port: int) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-m", "tests.autopilot.flight", str(port)]
+    root = Path(__file__).parents[2]
+    with subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "offboard\n"
+        try:
+            yield child
+        finally:
+            child.kill()
+
+
+def _becomes_silent_and_fails_safe(
+    stand_in: AutopilotStandIn, child: subprocess.Popen[str], how: signal.Signals
+) -> None:
+    time.sleep(0.3)
+    assert stand_in.mode == "OFFBOARD"
+    stopped_s = time.monotonic()
+    os.kill(child.pid, how)
+    asyncio.run(until(lambda: stand_in.mode == "LOITER", FAILSAFE_WITHIN_S))
+    assert stand_in.failsafe
+    assert stand_in.setpoints[-1][0] - stopped_s < STOPS_WITHIN_S
+
+
+def test_a_killed_process_is_silence_and_failsafe(port: int, stand_in: AutopilotStandIn) -> None:
+    with _child_in_offboard(port) as child:
+        _becomes_silent_and_fails_safe(stand_in, child, signal.SIGKILL)
+
+
+def test_a_stopped_process_is_so_too_and_does_not_take_the_drone_back_when_it_goes_on(
+    port: int, stand_in: AutopilotStandIn
+) -> None:
+    """PX4 and the stand-in return to offboard with the first setpoint that comes: so none may come."""
+    with _child_in_offboard(port) as child:
+        _becomes_silent_and_fails_safe(stand_in, child, signal.SIGSTOP)
+        before = len(stand_in.setpoints)
+        os.kill(child.pid, signal.SIGCONT)
+        time.sleep(1.0)
+        assert child.poll() is None
+        assert len(stand_in.setpoints) == before
+        assert stand_in.mode == "LOITER"
+
+
+def test_the_stand_in_itself_would_return_to_offboard(port: int, stand_in: AutopilotStandIn) -> None:
+    """Or the story above would tell nothing."""
+
+    async def story() -> None:
+        async with flying(port) as flight:
+            await flight.enter_offboard()
+            flight.streamer.end("for the test")
+            await until(lambda: stand_in.failsafe)
+            flight.link.send_setpoint((stand_in.setpoints[-1])[1])
+            await until(lambda: stand_in.mode == "OFFBOARD", 1.0)
+
+    asyncio.run(story())
+
+
+def _busy(duration_s: float) -> None:
+    """Keeps the interpreter busy, unlike a sleep."""
+    until_s = time.monotonic() + duration_s
+    while time.monotonic() < until_s:
+        sum(range(1000))
+
+
+@pytest.mark.parametrize("block", [time.sleep, _busy])
+def test_a_blocked_event_loop_is_silence_and_failsafe(
+    port: int, stand_in: AutopilotStandIn, block: Callable[[float], None]
+) -> None:
+    async def story() -> None:
+        async with flying(port) as flight:
+            await flight.enter_offboard()
+            blocked_s = time.monotonic()
+            block(1.8)
+            assert stand_in.setpoints[-1][0] - blocked_s < STOPS_WITHIN_S
+            assert stand_in.mode == "LOITER"
+            assert stand_in.failsafe
+            await asyncio.sleep(0.3)
+            assert stand_in.setpoints[-1][0] - blocked_s < STOPS_WITHIN_S
+            assert not flight.streamer.report().streaming
+
+    asyncio.run(story())
+
+
+def test_a_dead_control_task_is_silence_and_failsafe(port: int, stand_in: AutopilotStandIn) -> None:
+    stand_in.parameters["COM_OBL_RC_ACT"] = 4
+
+    async def story() -> None:
+        async with flying(port) as flight:
+            await flight.enter_offboard()
+            died_s = time.monotonic()
+            flight.control.cancel()
+            await until(lambda: stand_in.mode == "LAND", FAILSAFE_WITHIN_S)
+            assert stand_in.setpoints[-1][0] - died_s < STOPS_WITHIN_S
+            assert flight.link.status().flight_mode in {"offboard", "land"}
+
+    asyncio.run(story())
+
+
+def test_when_the_pilot_switches_it_is_silent_at_once_and_stays_so(port: int, stand_in: AutopilotStandIn) -> None:
+    async def story() -> None:
+        async with flying(port) as flight:
+            await flight.enter_offboard()
+            await asyncio.sleep(0.3)
+            stand_in.pilot_selects("POSCTL")
+            seen_s = time.monotonic() + await until(lambda: flight.link.status().flight_mode == "position")
+            await asyncio.sleep(0.6)
+            assert stand_in.setpoints[-1][0] - seen_s < 0.2
+            assert flight.streamer.report().silence == "the autopilot left offboard for position"
+            assert stand_in.mode == "POSCTL"
+            await _begins_anew(flight, stand_in)
+
+    asyncio.run(story())
+
+
+async def _begins_anew(flight: Flight, stand_in: AutopilotStandIn) -> None:
+    before = len(stand_in.setpoints)
+    flight.streamer.begin()
+    await until(lambda: len(stand_in.setpoints) > before + 5)
+    stand_in.pilot_selects("OFFBOARD")
+    await until(lambda: flight.streamer.report().offboard)
+
+
+def test_a_lost_link_is_silence_though_the_autopilot_comes_back(port: int, stand_in: AutopilotStandIn) -> None:
+    async def story() -> None:
+        async with flying(port) as flight:
+            await flight.enter_offboard()
+            stand_in.silent = True
+            await until(lambda: not flight.streamer.report().streaming, 4.0)
+            stand_in.silent = False
+            before = len(stand_in.setpoints)
+            await asyncio.sleep(2 * HEARTBEAT_S)
+            assert len(stand_in.setpoints) == before
+            assert flight.streamer.report().silence == "the autopilot's heartbeat is lost"
+
+    asyncio.run(story())
