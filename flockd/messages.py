@@ -102,8 +102,10 @@ class Sighting:
     """Standard deviation along the line of sight."""
     bearing_sigma_rad: float
     """Standard deviation across it, each way."""
+    drone_probability: float
+    """Of being a drone at all."""
     size_m: float
-    """Range times angular size: about the drone's own size, constant over time."""
+    """About the drone's own size, constant over time: its range times its angular size."""
     cameras: tuple[str, ...]
     """More than one where the drone straddles an image border."""
     label: int

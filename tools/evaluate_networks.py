@@ -22,7 +22,7 @@ from flockd.config.parameters import PerceptionConfig
 from flockd.data import data_path
 from flockd.geometry import Rig
 from flockd.messages import Frame, FrameSet, Sighting, VehicleState
-from flockd.perception import DisFlow, Perception
+from flockd.perception import UNSURE, DisFlow, Perception
 from flockd.pilot.views import Observer
 from tools.training.dataset import HEIGHT, R_BODY_CAMERA, WIDTH, PairSet, open_pairs, rig_camera
 
@@ -71,7 +71,8 @@ def evaluate(pairs: PairSet, perception: Perception, indices: Iterable[int]) -> 
             maps, _ = observer.scenes(frames, vehicle)
             found.depth[name].append(_depth_error(maps["camera"].depth[1::2, 1::2], depth, ids))
             if with_height:
-                _mask(maps["camera"].labels[1::2, 1::2] > 0, ids, pairs, index, found)
+                labels = maps["camera"].labels[1::2, 1::2]
+                _mask((labels > 0) & (labels != UNSURE), ids, pairs, index, found)
                 sightings = observer.view(frames, vehicle, maps, ()).sightings
                 _distances(sightings, pairs, index, found)
         flow = np.asarray(pairs["flow"][index], np.float32)

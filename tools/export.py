@@ -60,23 +60,23 @@ NETWORKS: dict[str, dict[str, Any]] = {
         "inputs": {"picture": {**IMAGE, "shape": ["n", 96, 96, 3]}},
         "outputs": {
             "range": (
-                ["n", 5],
+                ["n", 6],
                 "log(range / focal length), centre right and down of the middle, log of the first's deviation, "
-                "logit of a drone being there",
-                "log(m/px), px, px, 1, 1",
+                "logit of a drone being there, log(size * focal length / range)",
+                "log(m/px), px, px, 1, 1, log(px)",
             )
         },
     },
     "flow": {
         "net": FlowNet,
         "roles": ["flow"],
-        "description": "Optical flow on half-size images: best match anywhere, then three recurrent refinements",
-        "image_scale": 0.5,
+        "description": "Optical flow on quarter-size images: best match anywhere, then three recurrent refinements",
+        "image_scale": 0.25,
         "size_multiple": 8,
-        "golden_size": [240, 320],
+        "golden_size": [120, 160],
         "inputs": {
-            "first": {**IMAGE, "meaning": "earlier RGB image, half size"},
-            "second": {**IMAGE, "meaning": "later RGB image, half size"},
+            "first": {**IMAGE, "meaning": "earlier RGB image, quarter size"},
+            "second": {**IMAGE, "meaning": "later RGB image, quarter size"},
         },
         "outputs": {"flow": (["n", 2, "h", "w"], "from first to second, right and down", "input px")},
     },

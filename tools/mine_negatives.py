@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from flockd.perception import OnnxModel, group_instances
 from tools.training.dataset import ground_plane, open_pairs, ray_tangents
 
-EAGER_LOGIT = -0.4
+EAGER_LOGIT = -1.5
 """Pixels above this count, so that near misses are found too."""
 
 

@@ -61,7 +61,7 @@ class NeighboursTask(Task):
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """See ``Task``. Every fourth batch holds whole images, the others three times as many windows around drones."""
-        crop_px = 320 if self.drawn % 4 else None
+        crop_px = 256 if self.drawn % 4 else None
         return neighbours_sample(self.pairs, int(rng.integers(self.pairs.count)), rng, crop_px=crop_px)
 
     def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
@@ -130,21 +130,22 @@ class DistanceTask(Task):
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         """See ``Task``."""
-        out, hints = self.net(batch["picture"])
+        out, families = self.net(batch["picture"])
         there = batch["drone"]
         error = (out[:, 0] - batch["target"][:, 0]).abs()
         centre = (out[:, 1:3] - batch["target"][:, 1:3]).abs().clamp(max=30).sum(1)
         nll = error / torch.exp(out[:, 3]) * 1.414 + out[:, 3]
-        family = F.cross_entropy(hints[:, :-1], batch["family"], reduction="none")
-        apparent = (hints[:, -1] - batch["apparent"]).abs()
+        family = F.cross_entropy(families, batch["family"], reduction="none")
+        apparent = (out[:, 5] - batch["apparent"]).abs()
         each = 0.3 * nll + 2.0 * error + 0.05 * centre + 0.3 * family + apparent
         seen = there > 0.5
         right = (out[:, 4] > 0) == seen
         figures = {
             "median": float(error[seen].median().detach()),
             "p95": float(error[seen].quantile(0.95).detach()),
+            "apparent": float(apparent[seen].median().detach()),
             "centre": float(centre[seen].median().detach()),
-            "family": float((hints[seen, :-1].argmax(1) == batch["family"][seen]).float().mean()),
+            "family": float((families[seen].argmax(1) == batch["family"][seen]).float().mean()),
             "drone": float(right[seen].float().mean()),
             "other": float(right[~seen].float().mean()) if (~seen).any() else float("nan"),
         }
@@ -156,12 +157,12 @@ class FlowTask(Task):
     """Where each pixel went."""
 
     def __init__(self, pairs: PairSet) -> None:
-        super().__init__(FlowNet(), 6, 6e-4)
+        super().__init__(FlowNet(), 16, 6e-4)
         self.pairs = pairs
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """See ``Task``."""
-        return flow_sample(self.pairs, int(rng.integers(self.pairs.count)), rng, (256, 240))
+        return flow_sample(self.pairs, int(rng.integers(self.pairs.count)), rng, (144, 112))
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         """See ``Task``."""

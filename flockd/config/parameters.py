@@ -76,6 +76,8 @@ class PerceptionConfig(Section):
 
     flow: str = "flow"
     """`dis` is OpenCV's DIS flow instead of a network."""
+    flow_refinement: Literal["dis", "none"] = "dis"
+    """A network's flow finds what moved far; DIS then makes it exact."""
     depth: str = "neighbours"
     segmentation: str = "neighbours"
     distance: str = "distance"

@@ -1,4 +1,4 @@
-"""Optical flow: a network or OpenCV's DIS."""
+"""Optical flow: a network, OpenCV's DIS, or the one after the other."""
 
 from __future__ import annotations
 
@@ -43,14 +43,20 @@ class OnnxFlow:
 
 
 class DisFlow:
-    """OpenCV's dense inverse search, for small computers."""
+    """OpenCV's dense inverse search (Kroeger et al. 2016): alone for small computers, or after another flow.
 
-    name = "dis"
+    It is exact to a fraction of a pixel where it converges, but loses what moves far; a network is the other way round.
+    """
+
+    def __init__(self, start: Flow | None = None) -> None:
+        """``start``: the flow to begin with at the coarsest scale; None: no motion."""
+        self.name = f"{start.name}+dis" if start else "dis"
+        self._start = start
 
     def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
         """See ``Flow``."""
+        start = self._start.flow(first, second) if self._start else np.zeros((*first.shape[:2], 2), np.float32)
         grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (first, second)]
-        start = np.zeros((*first.shape[:2], 2), np.float32)
         dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)  # one a call: it is not for two threads
         return np.asarray(dis.calc(grey[0], grey[1], start), dtype=np.float32)
 

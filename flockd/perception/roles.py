@@ -13,9 +13,12 @@ from flockd.config.parameters import PerceptionConfig
 from flockd.errors import ModelError
 from flockd.messages import Float32Array, FloatArray, UInt8Array
 from flockd.perception.flow import DisFlow, Flow, OnnxFlow
-from flockd.perception.instances import Instance, group_instances
+from flockd.perception.instances import UNSURE, Instance, group_instances
 from flockd.perception.manifest import Role
 from flockd.perception.session import OnnxModel
+
+_EAGER_LOGIT = -1.5
+"""Where a second stage weeds out what is none, the first proposes drones from this logit up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +28,7 @@ class SceneMaps:
     depth: Float32Array
     """(h, w) metres along the optical axis; the sky is very far."""
     labels: UInt8Array
-    """(h, w) 0 for background, then one value a drone."""
+    """(h, w) 0 for background, then one value a drone; ``UNSURE`` for the part of a drone that may be background."""
     instances: tuple[Instance, ...]
 
 
@@ -50,6 +53,8 @@ class RangeEstimate:
     """Standard deviation of the range, as a share of it."""
     centre: FloatArray
     """(2,) u, v of the drone's centre in the picture."""
+    size_m: float
+    """The drone's size from tip to tip; errs like the range does, but is the same in every picture of one drone."""
     is_drone: float = 1.0
     """Probability that there is a drone at all."""
 
@@ -66,7 +71,7 @@ class Perception:
         self._dir = models_dir
         self._threads = config.threads
         cv2.setNumThreads(config.threads)
-        self._flow: Flow = DisFlow() if config.flow == "dis" else OnnxFlow(self._model(config.flow, "flow"))
+        self._flow = self._build_flow(config)
         self._depth = self._model(config.depth, "depth")
         self._segmentation = self._model(config.segmentation, "segmentation")
         self._distance = None if config.distance == "none" else self._model(config.distance, "distance")
@@ -94,7 +99,9 @@ class Perception:
             outputs = self._segmentation.run({"image": padded[None], "geometry": planes[None]})
         logit = outputs["drone"][0, 0, : height // 2, : width // 2]
         offset = outputs["offset"][0, :, : height // 2, : width // 2]
-        labels, instances = group_instances(logit, offset, scale=self.map_scale)
+        threshold = _EAGER_LOGIT if self.has_distance else 0.0
+        labels, instances = group_instances(logit - np.float32(threshold), offset, scale=self.map_scale)
+        labels[(labels > 0) & (logit < 0)] = UNSURE
         size = (width, height)
         return SceneMaps(
             np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), dtype=np.float32),
@@ -115,10 +122,17 @@ class Perception:
                 range_m=float(np.exp(row[0]) * picture.focal_px),
                 relative_sigma=float(np.exp(row[3])),
                 centre=np.array([middle + row[1], middle + row[2]], np.float64),
+                size_m=float(np.exp(row[0] + row[5])),
                 is_drone=float(1.0 / (1.0 + np.exp(-row[4]))),
             )
             for row, picture in zip(out, pictures, strict=True)
         )
+
+    def _build_flow(self, config: PerceptionConfig) -> Flow:
+        if config.flow == "dis":
+            return DisFlow()
+        network = OnnxFlow(self._model(config.flow, "flow"))
+        return DisFlow(network) if config.flow_refinement == "dis" else network
 
     def _model(self, name: str, role: Role) -> OnnxModel:
         path = Path(name) if name.endswith(".yaml") else self._dir / f"{name}.yaml"

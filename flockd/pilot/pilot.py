@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,7 @@ from flockd.messages import (
 from flockd.perception import Perception
 from flockd.pilot.motions import ego_motion, neighbour_motions
 from flockd.pilot.views import Observer, Perceiver, RigView
-from flockd.tracking import Measurement, Tracker, sighting_covariance
+from flockd.tracking import ExpectedNeighbour, Measurement, Tracker, sighting_covariance
 
 _OWN_DISPLACEMENT_SIGMA_M = 0.02
 _MAX_REFUSALS = 2
@@ -81,7 +82,7 @@ class FlockPilot:
             self._first_time_s = frames.time_s
         maps, reasons = self._observer.scenes(frames, vehicle)
         laps.end("scene")
-        view = self._observer.view(frames, vehicle, maps, reasons)
+        view = self._observer.view(frames, vehicle, maps, reasons, self._expected(frames.time_s))
         laps.end("distance")
         previous, reasons = self._pair_with(view, reasons)
         flows = self._flows(previous, view)
@@ -113,6 +114,11 @@ class FlockPilot:
             counts=Counter(reasons),
             stages_ms=laps.stages_ms,
         )
+
+    def _expected(self, time_s: float) -> tuple[ExpectedNeighbour, ...]:
+        if self._previous is None or time_s <= self._previous.time_s:
+            return ()
+        return self._tracker.expect(time_s - self._previous.time_s, self._velocity)
 
     def _pair_with(self, view: RigView, reasons: list[str]) -> tuple[RigView | None, list[str]]:
         if self._previous is not None and view.time_s <= self._previous.time_s:
@@ -203,12 +209,16 @@ def _measurement(
     """A sighting in level axes, with the velocity of Eq. 36 where there is one."""
     position = R_ned_body @ sighting.position
     covariance = sighting_covariance(position, sighting.range_sigma_m, sighting.bearing_sigma_rad)
-    if motion is None or previous is None:
-        return Measurement(position=position, covariance=covariance, size_m=sighting.size_m)
-    return Measurement(
+    measurement = Measurement(
         position=position,
         covariance=covariance,
         size_m=sighting.size_m,
+        drone_probability=sighting.drone_probability,
+    )
+    if motion is None or previous is None:
+        return measurement
+    return replace(
+        measurement,
         velocity=previous.vehicle.R_ned_body @ motion.velocity,
         velocity_sigma_m_s=_MOTION_CAUTION * math.sqrt(2) * sighting.range_sigma_m / motion.interval_s,
     )

@@ -11,15 +11,21 @@ import numpy as np
 
 from flockd.geometry import Rig, RigCamera, ground_inverse_depth, virtual_crop
 from flockd.messages import Float32Array, FloatArray, Frame, FrameSet, Sighting, UInt8Array, VehicleState
-from flockd.perception import Instance, Picture, RangeEstimate, SceneMaps
+from flockd.perception import UNSURE, Instance, Picture, RangeEstimate, SceneMaps
+from flockd.tracking import ExpectedNeighbour
 
-UNCLASSED = 255
+UNCLASSED = UNSURE
 """Label of pixels too near a drone's outline to be sure of, and of drones that are not sighted."""
 _OUTLINE_PX = 5
 _FIRST_MARGIN = 1.3
 """A picture of a drone is this much wider than its box."""
 _SURE = 0.5
 """What the second look says is a drone with less than this probability is none."""
+_EXPECTED_MARGIN = 0.75
+"""Half of a picture of a drone that is expected somewhere is this many times its size wide."""
+_SURE_OF_EXPECTED = 0.7
+_EXPECTED_GATE = 0.2
+"""What is found where a drone was expected must be as near to that place as this share of its range, or 0.5 m."""
 _SAME_DRONE = 0.6
 """Two sightings closer than this share of their size are one drone seen by two cameras."""
 _BEARING_SIGMA_RAD = 0.004
@@ -27,6 +33,9 @@ _MIN_RELATIVE_SIGMA = 0.005
 _DEPTH_MAP_RELATIVE_SIGMA = 0.08
 """Of a drone's range where the depth map alone gives it."""
 _MAX_DRONE_RADIUS_M = 0.6
+_NEAREST_M, _FARTHEST_M = 0.2, 60.0
+_HALF_ANGLES = (np.radians(1.0), np.radians(35.0))
+"""Of the second stage's pictures."""
 
 
 class Perceiver(Protocol):
@@ -100,11 +109,21 @@ class Observer:
         return maps, reasons
 
     def view(
-        self, frames: FrameSet, vehicle: VehicleState, maps: Mapping[str, SceneMaps], reasons: Sequence[str]
+        self,
+        frames: FrameSet,
+        vehicle: VehicleState,
+        maps: Mapping[str, SceneMaps],
+        reasons: Sequence[str],
+        expected: Sequence[ExpectedNeighbour] = (),
     ) -> RigView:
-        """Sightings of the whole rig, and the maps relabelled by them."""
+        """Sightings of the whole rig, and the maps relabelled by them.
+
+        Where a drone is ``expected`` but not segmented, the second stage looks once more.
+        """
         images = {name: frames.frames[name].image for name in maps}
         found = self._locate(images, maps) if maps else []
+        if maps and self._perceiver.has_distance:
+            found += self._look_again(images, vehicle, found, expected)
         sightings, label_of = _merge(found)
         views = {}
         for name, scene in maps.items():
@@ -128,23 +147,59 @@ class Observer:
     def _locate(self, images: Mapping[str, UInt8Array], maps: Mapping[str, SceneMaps]) -> list[_Located]:
         live = Rig({name: self._rig.cameras[name] for name in maps})
         candidates = [
-            _Candidate(name, instance, *_aim(self._rig.cameras[name], instance))
+            _Candidate((name,), *_aim(self._rig.cameras[name], instance), instance)
             for name, scene in maps.items()
             for instance in scene.instances
         ]
         if not self._perceiver.has_distance:
-            located = [self._locate_by_depth(c, maps[c.camera]) for c in candidates]
+            located = [self._locate_by_depth(c, maps[c.cameras[0]]) for c in candidates]
             return [one for one in located if one is not None]
+        return [one for one in self._look(live, images, candidates) if one.is_drone > _SURE]
+
+    def _look_again(
+        self,
+        images: Mapping[str, UInt8Array],
+        vehicle: VehicleState,
+        found: Sequence[_Located],
+        expected: Sequence[ExpectedNeighbour],
+    ) -> list[_Located]:
+        """What the second stage finds where a drone is expected and none was segmented."""
+        live = Rig({name: self._rig.cameras[name] for name in images})
+        candidates, places = [], []
+        for one in expected:
+            place = vehicle.R_ned_body.T @ one.position
+            range_m = float(np.linalg.norm(place))
+            direction = place / range_m
+            half_angle = float(np.clip(np.arctan(_EXPECTED_MARGIN * one.size_m / range_m), *_HALF_ANGLES))
+            cameras = tuple(name for name, pixel in live.pixels_of(place[None]).items() if np.isfinite(pixel).all())
+            if not cameras or any(_angle(direction, f.position) < half_angle for f in found):
+                continue
+            candidates.append(_Candidate(cameras, direction, half_angle))
+            places.append(place)
+        return [
+            one
+            for one, place in zip(self._look(live, images, candidates), places, strict=True)
+            if one.is_drone > _SURE_OF_EXPECTED
+            and np.linalg.norm(one.position - place) < max(_EXPECTED_GATE * float(np.linalg.norm(place)), 0.5)
+        ]
+
+    def _look(self, live: Rig, images: Mapping[str, UInt8Array], candidates: Sequence[_Candidate]) -> list[_Located]:
+        """The second stage, twice: the second picture has the drone in the middle, and whole where cameras share it."""
         first = self._ranges(live, images, [(c.direction, c.half_angle, None) for c in candidates])
         again = [
             (_in_view(live, position, c), c.half_angle, range_m)
             for c, (position, range_m, _) in zip(candidates, first, strict=True)
         ]
-        second = self._ranges(live, images, again)  # now in the middle, and whole where two cameras share it
+        second = self._ranges(live, images, again)
         return [
-            _Located(c, position, max(estimate.relative_sigma, _MIN_RELATIVE_SIGMA) * range_m, _size(c, range_m))
+            _Located(
+                candidate=c,
+                position=position,
+                range_sigma_m=max(estimate.relative_sigma, _MIN_RELATIVE_SIGMA) * range_m,
+                size_m=estimate.size_m,
+                is_drone=estimate.is_drone if _NEAREST_M < range_m < _FARTHEST_M else 0.0,
+            )
             for c, (position, range_m, estimate) in zip(candidates, second, strict=True)
-            if estimate.is_drone > _SURE and 0.2 < range_m < 60.0
         ]
 
     def _ranges(
@@ -170,7 +225,9 @@ class Observer:
 
     def _locate_by_depth(self, candidate: _Candidate, scene: SceneMaps) -> _Located | None:
         """Eq. 37 on the depth map alone: the centre of the bounding box of the drone's points."""
-        rig_camera = self._rig.cameras[candidate.camera]
+        if candidate.instance is None:
+            return None
+        rig_camera = self._rig.cameras[candidate.cameras[0]]
         rows, columns = np.nonzero(scene.labels == candidate.instance.label)
         pixels = np.asarray(np.stack([columns, rows], 1) + 0.5, np.float64)
         points = rig_camera.camera.unproject(pixels, np.asarray(scene.depth[rows, columns], np.float64))
@@ -181,7 +238,8 @@ class Observer:
         centre = (points[kept].min(0) + points[kept].max(0)) / 2
         position = rig_camera.T_body_camera.apply(centre[None])[0]
         range_m = float(np.linalg.norm(position))
-        return _Located(candidate, position, _DEPTH_MAP_RELATIVE_SIGMA * range_m, _size(candidate, range_m))
+        size_m = range_m * _angular_width(rig_camera, candidate.instance)
+        return _Located(candidate, position, _DEPTH_MAP_RELATIVE_SIGMA * range_m, size_m)
 
     @staticmethod
     def _drone_depth(
@@ -203,11 +261,16 @@ class Observer:
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    camera: str
-    instance: Instance
+    cameras: tuple[str, ...]
     direction: FloatArray
     half_angle: float
-    angular_size: float
+    instance: Instance | None = None
+    """None where no drone was segmented, but one is expected."""
+
+    @property
+    def area_px(self) -> float:
+        """Of its pixels."""
+        return self.instance.area_px if self.instance else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,6 +279,7 @@ class _Located:
     position: FloatArray
     range_sigma_m: float
     size_m: float
+    is_drone: float = 1.0
 
 
 def _fault(frame: Frame | None, camera: RigCamera) -> str | None:
@@ -227,17 +291,26 @@ def _fault(frame: Frame | None, camera: RigCamera) -> str | None:
     return None
 
 
-def _aim(camera: RigCamera, instance: Instance) -> tuple[FloatArray, float, float]:
-    """Direction of a drone in the body, half the angle of its first picture, and its angular size."""
+def _aim(camera: RigCamera, instance: Instance) -> tuple[FloatArray, float]:
+    """Direction of a drone in the body and half the angle of its first picture."""
     left, top, right, bottom = instance.box
     corners = np.array([[left, top], [right, top], [left, bottom], [right, bottom], instance.centre])
     rays = camera.camera.rays(corners)
     inside = camera.camera.in_image(instance.centre[None])[0] and np.isfinite(rays[4]).all()
     centre = rays[4] if inside else rays[:4].mean(0) / np.linalg.norm(rays[:4].mean(0))
     reach = float(np.arccos(np.clip(rays[:4] @ centre, -1, 1)).max())
-    wide = float(np.arccos(np.clip(rays[0] @ rays[1], -1, 1)))
-    half_angle = float(np.clip(_FIRST_MARGIN * reach, np.radians(1.0), np.radians(35.0)))
-    return camera.T_body_camera.rotation @ centre, half_angle, max(wide, 1e-3)
+    half_angle = float(np.clip(_FIRST_MARGIN * reach, *_HALF_ANGLES))
+    return camera.T_body_camera.rotation @ centre, half_angle
+
+
+def _angular_width(camera: RigCamera, instance: Instance) -> float:
+    left, top, right, _ = instance.box
+    rays = camera.camera.rays(np.array([[left, top], [right, top]]))
+    return max(_angle(rays[0], rays[1]), 1e-3)
+
+
+def _angle(a: FloatArray, b: FloatArray) -> float:
+    return float(np.arccos(np.clip(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)), -1, 1)))
 
 
 def _in_view(live: Rig, position: FloatArray, candidate: _Candidate) -> FloatArray:
@@ -246,14 +319,10 @@ def _in_view(live: Rig, position: FloatArray, candidate: _Candidate) -> FloatArr
     return direction if live.covers(direction[None])[0] else candidate.direction
 
 
-def _size(candidate: _Candidate, range_m: float) -> float:
-    return range_m * candidate.angular_size
-
-
 def _merge(found: Sequence[_Located]) -> tuple[tuple[Sighting, ...], dict[tuple[str, int], int]]:
     """One sighting a drone: what two cameras place at the same spot is one. Also (camera, instance) -> label."""
     groups: list[list[_Located]] = []
-    for one in sorted(found, key=lambda item: -item.candidate.instance.area_px):
+    for one in sorted(found, key=lambda item: -item.candidate.area_px):
         for group in groups:
             size = max(group[0].size_m, one.size_m)
             if np.linalg.norm(group[0].position - one.position) < max(_SAME_DRONE * size, 0.25):
@@ -265,19 +334,21 @@ def _merge(found: Sequence[_Located]) -> tuple[tuple[Sighting, ...], dict[tuple[
     for label, group in enumerate(groups[: UNCLASSED - 1], start=1):
         weights = np.array([one.range_sigma_m**-2 for one in group])
         position = (weights[:, None] * np.array([one.position for one in group])).sum(0) / weights.sum()
-        cameras = tuple(dict.fromkeys(one.candidate.camera for one in group))
+        cameras = tuple(dict.fromkeys(name for one in group for name in one.candidate.cameras))
         sightings.append(
             Sighting(
                 position=position,
                 range_sigma_m=min(one.range_sigma_m for one in group),  # errors of two pictures of one drone are alike
                 bearing_sigma_rad=_BEARING_SIGMA_RAD,
-                size_m=max(one.size_m for one in group),
+                drone_probability=max(one.is_drone for one in group),
+                size_m=float((weights * [one.size_m for one in group]).sum() / weights.sum()),
                 cameras=cameras,
                 label=label,
             )
         )
         for one in group:
-            label_of[(one.candidate.camera, one.candidate.instance.label)] = label
+            if one.candidate.instance:
+                label_of[(one.candidate.cameras[0], one.candidate.instance.label)] = label
     return tuple(sightings), label_of
 
 

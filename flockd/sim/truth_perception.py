@@ -17,6 +17,8 @@ ROLES = ("flow", "depth", "segmentation", "distance")
 """What can be swapped."""
 _SKY_M = 1000.0
 _MIN_PIXELS = 10
+_SIZE_M = 0.6
+"""What the true distances say of every drone's size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,14 +110,18 @@ class TruthPerception:
         return sorted(found, key=lambda one: -one.area_px)
 
     def _range(self, picture: Picture, now: Shot) -> RangeEstimate:
-        in_body = (now.drone_positions[list(now.shown)] - now.position) @ now.R_ned_body
+        size = self.picture_size
+        visible = [d for d in now.shown if any((view.ids == d + 1).sum() >= _MIN_PIXELS for view in now.views.values())]
+        if not visible:
+            return RangeEstimate(1.0, 1.0, np.full(2, size / 2), _SIZE_M, is_drone=0.0)
+        in_body = (now.drone_positions[visible] - now.position) @ now.R_ned_body
         in_picture = (in_body - picture.position) @ picture.R_body_camera
         ranges = np.linalg.norm(in_picture, axis=1)
         point = in_picture[np.argmax(in_picture[:, 2] / ranges)]
         range_m = float(np.linalg.norm(point))
-        middle = self.picture_size / 2
-        centre = middle + picture.focal_px * point[:2] / max(point[2], 1e-3)
-        return RangeEstimate(range_m, 0.001, np.clip(centre, -self.picture_size, 2 * self.picture_size))
+        centre = size / 2 + picture.focal_px * point[:2] / max(point[2], 1e-3)
+        inside = bool(((centre > 0) & (centre < size)).all())
+        return RangeEstimate(range_m, 0.001, np.clip(centre, -size, 2 * size), _SIZE_M, is_drone=float(inside))
 
 
 def _known(shot: Shot | None) -> Shot:

@@ -18,7 +18,9 @@ class Measurement:
     covariance: FloatArray
     """(3, 3) m^2 of `position`."""
     size_m: float
-    """Range times angular size, as of `Sighting.size_m`."""
+    """As of `Sighting.size_m`."""
+    drone_probability: float = 1.0
+    """Of being a drone at all, 0 to 1."""
     velocity: FloatArray | None = None
     """(3,) m/s over ground, where one was estimated (Eq. 36)."""
     velocity_sigma_m_s: float = 1.0
@@ -31,6 +33,8 @@ class Measurement:
             raise ValueError("a measured position's covariance must be finite")
         if not (np.isfinite(self.size_m) and self.size_m > 0):
             raise ValueError(f"a measured size must be finite and positive, not {self.size_m} m")
+        if not 0 <= self.drone_probability <= 1:
+            raise ValueError(f"a probability lies between 0 and 1, not at {self.drone_probability}")
         if self.velocity is not None and not np.isfinite(self.velocity).all():
             raise ValueError("a measured velocity must be finite")
         if not (np.isfinite(self.velocity_sigma_m_s) and self.velocity_sigma_m_s > 0):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -27,6 +27,16 @@ _POSITION = np.hstack([np.eye(3), np.zeros((3, 3))])
 _VELOCITY = np.hstack([np.zeros((3, 3)), np.eye(3)])
 
 
+@dataclass(frozen=True, eq=False)
+class ExpectedNeighbour:
+    """Where a drone should be seen next."""
+
+    position: FloatArray
+    """(3,) metres, NED, own drone at the origin."""
+    size_m: float
+    """As of `Sighting.size_m`."""
+
+
 @dataclass
 class _Track:
     """State (6,): position relative to the own drone and velocity over ground, NED."""
@@ -37,7 +47,10 @@ class _Track:
     first_seen_s: float
     last_seen_s: float
     sizes: deque[float]
-    hits: int = field(default=1)
+    size_m: float
+    probability_sum: float
+    hits: int = 1
+    confirmed: bool = False
 
 
 class Tracker:
@@ -95,6 +108,21 @@ class Tracker:
         self._tracks = [track for track in self._tracks if self._is_kept(track)]
         return tuple(numbers)
 
+    def expect(self, interval_s: float, own_velocity: FloatArray | None) -> tuple[ExpectedNeighbour, ...]:
+        """Where the confirmed tracks should be after `interval_s`, if everybody flies on; changes nothing.
+
+        `own_velocity` (3,) NED m/s; None: all stay where they are relative to the own drone.
+        """
+        return tuple(
+            ExpectedNeighbour(
+                position=track.state[:3]
+                + interval_s * (0.0 if own_velocity is None else track.state[3:] - own_velocity),
+                size_m=track.size_m,
+            )
+            for track in self._tracks
+            if track.confirmed
+        )
+
     def neighbours(self) -> tuple[Neighbour, ...]:
         """All tracks as of the last `predict` and `update`, confirmed or not, by track number."""
         return tuple(
@@ -107,17 +135,19 @@ class Tracker:
                 age_s=self._time_s - track.first_seen_s,
                 unseen_s=self._time_s - track.last_seen_s,
                 hits=track.hits,
-                confirmed=self._is_confirmed(track),
+                confirmed=track.confirmed,
             )
             for track in self._tracks
         )
 
-    def _is_confirmed(self, track: _Track) -> bool:
-        return track.hits >= self.parameters.confirm_hits
+    def _confirm(self, track: _Track) -> None:
+        """Once confirmed, a track stays so."""
+        sure = track.probability_sum / track.hits > self.parameters.confirm_probability
+        track.confirmed = track.confirmed or (sure and track.hits >= self.parameters.confirm_hits)
 
     def _is_kept(self, track: _Track) -> bool:
         unseen_s = self._time_s - track.last_seen_s
-        return unseen_s <= (self.parameters.max_unseen_s if self._is_confirmed(track) else 0.0)
+        return unseen_s <= (self.parameters.max_unseen_s if track.confirmed else 0.0)
 
     def _associate(self, measurements: Sequence[Measurement]) -> dict[int, _Track]:
         """Measurement index -> track, one to one: the likeliest pair first, then the next of those left.
@@ -162,14 +192,20 @@ class Tracker:
             first_seen_s=self._time_s,
             last_seen_s=self._time_s,
             sizes=deque([measurement.size_m], maxlen=self.parameters.size_memory),
+            size_m=measurement.size_m,
+            probability_sum=measurement.drone_probability,
         )
+        self._confirm(track)
         _absorb_velocity(track, measurement)
         return track
 
     def _see(self, track: _Track, measurement: Measurement) -> None:
         track.last_seen_s = self._time_s
         track.hits += 1
+        track.probability_sum += measurement.drone_probability
+        self._confirm(track)
         track.sizes.append(measurement.size_m)
+        track.size_m = float(np.median(track.sizes)) if track.sizes else measurement.size_m
         position, covariance = measurement.position, measurement.covariance
         if track.sizes:  # size_memory > 0
             position, covariance = range_from_size(measurement, track.sizes)

@@ -140,6 +140,30 @@ def test_a_network_gone_astray_costs_its_frame_only(monkeypatch: pytest.MonkeyPa
     assert output.ego_motion is not None
 
 
+@pytest.mark.parametrize("still_there", [True, False])
+def test_a_drone_that_segmentation_misses_is_seen_where_it_is_expected(
+    monkeypatch: pytest.MonkeyPatch, still_there: bool
+) -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+    for _ in range(3):
+        flyer.step()
+        flyer.move()
+    sound = flyer.truth.scene
+
+    def blind(camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:
+        scene = sound(camera, image, geometry)
+        return SceneMaps(scene.depth, np.zeros_like(scene.labels), ())
+
+    monkeypatch.setattr(flyer.truth, "scene", blind)
+    if not still_there:
+        flyer.vehicles.position[1] += [0.0, 40.0, 0.0]
+    output = flyer.step()
+    assert len(output.sightings) == (1 if still_there else 0)
+    if still_there:
+        place = flyer.vehicles.R_ned_body[0] @ output.sightings[0].position
+        assert np.allclose(place, flyer.vehicles.position[1] - flyer.vehicles.position[0], atol=0.02)
+
+
 def test_blind_cameras_still_give_a_finite_command() -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0)))
     _, state = flyer.look()

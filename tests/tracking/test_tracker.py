@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import math
 
 import numpy as np
@@ -38,6 +40,32 @@ def _settled(position: Array = AHEAD, *, steps: int = 10, sigma_m: float = 0.05)
     for step in range(steps):
         _step(tracker, step * STEP_S, position, sigma_m=sigma_m)
     return tracker, (steps - 1) * STEP_S
+
+
+def test_what_hardly_looks_like_a_drone_is_not_confirmed_however_often_it_is_seen() -> None:
+    tracker = Tracker(TrackingParameters(confirm_hits=2, confirm_probability=0.9))
+    for k in range(8):
+        tracker.predict(STEP_S, np.zeros(3))
+        tracker.update(k * STEP_S, [replace(_seen(AHEAD), drone_probability=0.8)])
+        assert not tracker.neighbours()[0].confirmed
+    for k in range(8, 18):  # 8 of 0.8 and n of 1.0 are 0.9 on average when n is 8
+        tracker.predict(STEP_S, np.zeros(3))
+        tracker.update(k * STEP_S, [_seen(AHEAD)])
+        assert tracker.neighbours()[0].confirmed == (k >= 8 + 8)
+
+
+def test_a_flock_mate_is_expected_where_it_flies_to() -> None:
+    tracker = Tracker(TrackingParameters())
+    _step(tracker, 0.0, AHEAD)
+    assert tracker.expect(STEP_S, CRUISE) == ()  # not confirmed yet
+    for k in range(1, 20):  # it gains 0.2 m/s on the own drone
+        _step(tracker, k * STEP_S, AHEAD + np.array((0.1 * k, 0.0, 0.0)), sigma_m=0.01)
+    now = AHEAD + np.array((1.9, 0.0, 0.0))
+    (expected,) = tracker.expect(1.0, CRUISE)
+    np.testing.assert_allclose(expected.position, now + np.array((0.2, 0.0, 0.0)), atol=0.03)
+    assert expected.size_m == 0.6
+    (blind,) = tracker.expect(1.0, None)
+    np.testing.assert_allclose(blind.position, now, atol=0.03)
 
 
 def test_five_noisy_frames_and_then_a_dropout() -> None:
@@ -288,6 +316,7 @@ def test_a_measurement_that_is_no_number_is_refused() -> None:
         ({"position": np.zeros(3)}, "position"),
         ({"covariance": np.full((3, 3), np.inf)}, "covariance"),
         ({"size_m": 0.0}, "size"),
+        ({"drone_probability": 1.2}, "probability"),
         ({"velocity": np.array([np.nan, 0, 0])}, "velocity"),
         ({"velocity_sigma_m_s": 0.0}, "sigma"),
     ):

@@ -35,6 +35,13 @@ def _in_full_precision(layer: nn.Module, x: Tensor) -> Tensor:
         return y
 
 
+def _blocks(image: Tensor, size: int) -> Tensor:
+    """(n, h, w, 3) uint8 -> (n, 3 size^2, h / size, w / size) in -1..1, each block of pixels in one place."""
+    n, h, w, _ = image.shape
+    x = image.reshape(n, h // size, size, w // size, size, 3).permute(0, 5, 2, 4, 1, 3)
+    return x.reshape(n, 3 * size * size, h // size, w // size).float() / 127.5 - 1.0
+
+
 class _Residual(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -46,7 +53,7 @@ class _Residual(nn.Module):
 
 
 class NeighboursNet(nn.Module):
-    """U-Net at half the image's size.
+    """U-Net at a quarter of the image's size, with a thin branch at half: a far drone's arms are a pixel wide.
 
     Inputs: image (n, h, w, 3) uint8; geometry (n, 3, h/2, w/2): tangents of the pixel's ray right and down of the
     optical axis, and the inverse depth in 1/m of flat ground as attitude and height say (0: unknown or sky).
@@ -55,10 +62,16 @@ class NeighboursNet(nn.Module):
     """
 
     widths = (32, 56, 96, 128)
+    fine_width = 16
 
     def __init__(self) -> None:
         super().__init__()
         w = self.widths
+        self.fine = _conv(12 + 3, self.fine_width)
+        self.fine_down = _conv(self.fine_width, w[0], stride=2)
+        self.fine_up = nn.Sequential(nn.Conv2d(w[0], 4 * self.fine_width, 1), nn.PixelShuffle(2))
+        self.fine_merge = _conv(self.fine_width, self.fine_width)
+        self.fine_head = nn.Conv2d(self.fine_width, 4, 1)
         self.stem = _conv(48 + 12, w[0])
         self.down = nn.ModuleList([_conv(a, b, stride=2) for a, b in pairwise(w)])
         self.body = nn.ModuleList([_Residual(b) for b in w[1:]])
@@ -72,13 +85,13 @@ class NeighboursNet(nn.Module):
 
     def forward(self, image: Tensor, geometry: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Depth, logit and offsets."""
-        x = image.permute(0, 3, 1, 2).to(geometry.dtype) / 127.5 - 1.0
         ground = geometry[:, 2:]
         known = ground > 0
         log_ground = torch.log(ground.clamp(min=1.0 / MAX_DEPTH_M))
         planes = torch.cat([geometry[:, :2], torch.where(known, log_ground + 3.0, torch.zeros_like(ground))], 1)
-        x = torch.cat([F.pixel_unshuffle(x, 4), F.pixel_unshuffle(planes, 2)], 1)
-        x = self.stem(x)
+        fine = self.fine(torch.cat([_blocks(image, 2), planes], 1))
+        x = torch.cat([_blocks(image, 4), F.pixel_unshuffle(planes, 2)], 1)
+        x = self.stem(x) + self.fine_down(fine)
         levels = [x]
         for down, body in zip(self.down, self.body, strict=True):
             x = body(down(x))
@@ -88,7 +101,9 @@ class NeighboursNet(nn.Module):
         for i in reversed(range(len(self.merge))):
             x = F.interpolate(self.up[i](x), scale_factor=2.0, mode="nearest")
             x = self.merge[i](x + self.lateral[i](levels[i]))
-        out = _in_full_precision(self.head, self.last(x))
+        x = self.last(x)
+        fine = self.fine_merge(F.relu(fine + self.fine_up(x)))
+        out = _in_full_precision(self.head, x) + _in_full_precision(self.fine_head, fine)
         start = torch.where(known, -log_ground, torch.full_like(ground, 2.0))  # the network corrects flat ground
         depth = torch.exp((start + out[:, :1]).clamp(-3.0, 5.0)).clamp(max=MAX_DEPTH_M)
         return depth, out[:, 1:2], out[:, 2:4] * OFFSET_SCALE_PX
@@ -97,9 +112,10 @@ class NeighboursNet(nn.Module):
 class DistanceNet(nn.Module):
     """Range of the drone in the middle of a picture.
 
-    Input: picture (n, 96, 96, 3) uint8 of a virtual camera that faces the drone. Outputs (n, 5):
+    Input: picture (n, 96, 96, 3) uint8 of a virtual camera that faces the drone. Outputs (n, 6):
     log of (range in m / focal length in px), the drone's centre right and down of the picture's centre in px,
-    log of the standard deviation of the first, logit of there being a drone at all.
+    log of the standard deviation of the first, logit of there being a drone at all, log of the drone's size in px
+    as it would appear from the side (its size in m times focal length over range).
     """
 
     size = 96
@@ -118,17 +134,16 @@ class DistanceNet(nn.Module):
             _Residual(128),
         )
         self.summary = nn.Sequential(nn.Linear(128 * 9, 160), nn.ReLU(True))
-        self.head = nn.Linear(160, 5)
-        self.hints = nn.Linear(160, MAX_FAMILIES + 1)
+        self.head = nn.Linear(160, 6)
+        self.family = nn.Linear(160, MAX_FAMILIES)
 
     def forward(self, picture: Tensor) -> Tensor | tuple[Tensor, Tensor]:
-        """One row a picture; in training also hints: a logit for each family, and the log of the apparent size."""
-        x = picture.permute(0, 3, 1, 2).float() / 127.5 - 1.0
-        x = _in_full_precision(self.summary, self.features(F.pixel_unshuffle(x, 2)).flatten(1))
+        """One row a picture; in training also a logit for each family."""
+        x = _in_full_precision(self.summary, self.features(_blocks(picture, 2)).flatten(1))
         out = _in_full_precision(self.head, x)
         sigma = (out[:, 3:4] - 3.0).clamp(-7.0, 1.0)
-        out = torch.cat([out[:, :1] - 4.0, out[:, 1:3] * 10.0, sigma, out[:, 4:]], 1)
-        return (out, _in_full_precision(self.hints, x)) if self.training else out
+        out = torch.cat([out[:, :1] - 4.0, out[:, 1:3] * 10.0, sigma, out[:, 4:5], out[:, 5:] + 4.0], 1)
+        return (out, _in_full_precision(self.family, x)) if self.training else out
 
 
 class _Encoder(nn.Module):

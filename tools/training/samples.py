@@ -85,7 +85,8 @@ def distance_sample(
     centre = np.asarray(pairs["drone_centre"][pair, k, d], np.float64)
     range_m = float(np.linalg.norm(centre))
     # How much of the picture the drone fills must say nothing about metres: it is drawn apart from family and range.
-    half_width = SIZES_M[int(pairs["drone_family"][pair, d])] / 2 * float(np.exp(rng.uniform(np.log(0.6), np.log(2.4))))
+    fill = float(np.exp(np.clip(rng.normal(np.log(1.35), 0.27), np.log(0.7), np.log(2.4))))
+    half_width = SIZES_M[int(pairs["drone_family"][pair, d])] / 2 * fill
     shift_m = rng.normal(0, 0.15 if rng.random() < 0.5 else 0.03, 2) * half_width
     right, down = _across(centre)
     aim = R_BODY_CAMERA @ _in_view(centre + shift_m[0] * right + shift_m[1] * down, focal)
@@ -140,12 +141,11 @@ def no_drone_sample(pairs: PairSet, negative: NDArray[Any] | None, rng: np.rando
 def flow_sample(
     pairs: PairSet, index: int, rng: np.random.Generator, size: tuple[int, int], *, augment: bool = True
 ) -> Sample:
-    """Two half-size images and the flow between them, cropped to ``size`` (height, width)."""
-    first, second = pairs["image"][index]
-    flow, valid = pairs["flow"][index].astype(np.float32), pairs["flow_valid"][index]
-    ids = pairs["ids"][index][0]
-    first, second = (_half(image) for image in (first, second))
-    flow = flow / 2.0
+    """Two quarter-size images and the flow between them, cropped to ``size`` (height, width)."""
+    first, second = (_quarter(image) for image in pairs["image"][index])
+    flow = _pairwise(pairs["flow"][index].astype(np.float32)).mean((-3, -1)) / 4.0
+    valid = np.asarray(_pairwise(pairs["flow_valid"][index]).all((-3, -1)))
+    ids = _pairwise(pairs["ids"][index][0]).max((-3, -1))
     if augment:
         first, second = photometric([first, second], rng)
         if rng.random() < 0.5:
@@ -168,9 +168,14 @@ def drone_list(pairs: PairSet, min_pixels: int = 40) -> list[tuple[int, int, int
     return list(drones_seen(pairs, min_pixels))
 
 
-def _half(image: NDArray[Any]) -> NDArray[Any]:
+def _quarter(image: NDArray[Any]) -> NDArray[Any]:
+    return np.asarray(cv2.resize(image, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
-    return np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+def _pairwise(values: NDArray[Any]) -> NDArray[Any]:
+    """(..., h, w) -> (..., h / 2, 2, w / 2, 2)."""
+    h, w = values.shape[-2:]
+    return values.reshape(*values.shape[:-2], h // 2, 2, w // 2, 2)
 
 
 def _centre_offsets(pairs: PairSet, index: int, k: int, ids: NDArray[Any], focal: float) -> NDArray[np.float32]:
