@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import struct
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -98,6 +99,8 @@ class McapFile:
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._channels: dict[str, int] = {}
         self._synced_s = time.monotonic()
+        self._syncing: threading.Thread | None = None
+        self._sync_error: OSError | None = None
         try:
             self._writer.start(library="flockd")
         except OSError:
@@ -122,10 +125,13 @@ class McapFile:
     def flush(self) -> None:
         """Ends the chunk and hands it to the system; about once a second also to the disk."""
         self._writer.flush()  # type: ignore[no-untyped-call]
+        if self._sync_error is not None:
+            raise self._sync_error
         now_s = time.monotonic()
-        if now_s - self._synced_s >= SYNC_EVERY_S:
+        if now_s - self._synced_s >= SYNC_EVERY_S and not (self._syncing and self._syncing.is_alive()):
             self._synced_s = now_s
-            os.fsync(self._file.fileno())
+            self._syncing = threading.Thread(target=self._sync, args=(os.dup(self._file.fileno()),), daemon=True)
+            self._syncing.start()
 
     def finish(self) -> None:
         """Writes the index and closes the file."""
@@ -148,6 +154,15 @@ class McapFile:
             self.finish()
         else:
             self.abandon()
+
+    def _sync(self, descriptor: int) -> None:
+        """In a thread of its own: a slow disk takes long for this, and the next messages must not wait for it."""
+        try:
+            os.fsync(descriptor)
+        except OSError as error:
+            self._sync_error = error
+        finally:
+            os.close(descriptor)
 
     def _channel(self, stream: Stream) -> int:
         if stream.topic not in self._channels:

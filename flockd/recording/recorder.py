@@ -216,8 +216,8 @@ class Recorder:
     def _write_queue(self) -> None:
         self._parts.begin()
         flushed_s = time.monotonic()
-        unflushed = False
-        while True:
+        closing = unflushed = False
+        while not (closing and self._queue.empty()):  # what is told while closing belongs into the file too
             try:
                 item = self._queue.get(timeout=FLUSH_EVERY_S)
             except queue.Empty:
@@ -227,13 +227,14 @@ class Recorder:
                     self._write_step(item)
                 case _Message():
                     self._write_message(item)
+                case _Close():
+                    closing = True
             unflushed = unflushed or item is not None
             if unflushed and (item is None or time.monotonic() - flushed_s >= FLUSH_EVERY_S):
                 self._parts.flush()
                 flushed_s, unflushed = time.monotonic(), False
-            if isinstance(item, _Close):
-                return
-            if item is not None:
+            if isinstance(item, _Step | _Message):
+                self._parts.turn_page()
                 self._release(item)
 
     def _release(self, item: _Step | _Message) -> None:
@@ -341,9 +342,13 @@ class _Parts:
         self._file.write(entry)
 
     def flush(self) -> None:
-        """Makes safe what was written, and turns the page where the file is full."""
+        """Makes safe what was written."""
         assert self._file is not None
         self._file.flush()
+
+    def turn_page(self) -> None:
+        """Goes on in the next file where this one is full."""
+        assert self._file is not None
         if self._file.size >= self._settings.file_mb * _MB:
             self._file.finish()
             self._number += 1

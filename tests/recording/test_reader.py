@@ -1,0 +1,206 @@
+"""What a kill leaves can be played, what is not ours is refused, and what is edited is whole."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from flockd.recording import RecordingError
+from flockd.recording.codec import to_json
+from flockd.recording.editing import cut, recover
+from flockd.recording.export import export_images, export_tables
+from flockd.recording.reader import Recording
+from tests.recording.made_up import record
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("flight") / "drone1.mcap"
+    record(path)
+    return path
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(RecordingError) as caught:
+        Recording(path)
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(f"{path}: ")
+    return str(caught.value).removeprefix(f"{path}: ")
+
+
+def test_what_is_no_recording_is_refused_in_one_sentence(tmp_path: Path, whole: Path) -> None:
+    path = tmp_path / "x.mcap"
+    assert refusal(path) == "does not exist; check the path"
+    assert refusal(tmp_path) == "is a folder; name a recording in it"
+    for content in (b"", b"hello", b"\x89MCAP"):
+        path.write_bytes(content)
+        assert refusal(path) == "is not a recording (it does not begin as MCAP files do); name another file"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/speed", "json", writer.register_schema("x", "jsonschema", b"{}"))
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    assert refusal(path) == "is an MCAP file, but no recording of flockd; name one that flockd wrote"
+    content = whole.read_bytes()
+    path.write_bytes(content.replace(b"\x01\x00\x00\x001", b"\x01\x00\x00\x002", 1))
+    assert refusal(path) == "is of format '2', and this flockd reads '1'; use the flockd that wrote it"
+
+
+def test_a_file_cut_off_anywhere_is_refused_or_played_as_far_as_it_goes(tmp_path: Path, whole: Path) -> None:
+    content = whole.read_bytes()
+    path = tmp_path / "drone1.mcap"
+    outcomes = []
+    for length in np.linspace(8, len(content) - 1, 120).astype(int):
+        path.write_bytes(content[:length])
+        try:
+            recording = Recording(path)
+        except RecordingError as error:
+            assert "\n" not in str(error)
+            outcomes.append(0)
+        else:
+            assert not recording.contents.finished
+            steps = list(recording.steps())
+            assert [step.number for step in steps] == list(range(len(steps)))
+            outcomes.append(len(steps))
+    assert outcomes == sorted(outcomes)
+    assert (outcomes[0], outcomes[-1]) == (0, 10)
+
+
+def test_damage_within_is_told_and_recovered_from(tmp_path: Path, whole: Path) -> None:
+    content = bytearray(whole.read_bytes())
+    at = len(content) // 2
+    content[at : at + 2000] = bytes(2000)
+    path = tmp_path / "drone1.mcap"
+    path.write_bytes(content)
+    damaged = Recording(path)
+    ((where, damage),) = damaged.contents.damages
+    assert where == path
+    assert at - 200_000 < damage.offset <= at
+    assert not damage.at_end
+    with pytest.raises(RecordingError, match=r"step \d lost its image .*; `flockd record recover` makes"):
+        list(damaged.steps())
+    steps = recover(damaged, tmp_path / "mended.mcap")
+    mended = Recording(tmp_path / "mended.mcap")
+    assert mended.contents.finished
+    assert not mended.contents.damages
+    assert len(list(mended.steps())) == steps
+    assert 7 <= steps <= 9
+    ((first, last),) = mended.contents.gaps
+    assert last - first + 1 == 10 - steps
+
+
+KILLS = 8
+FLYING = f"""
+import os, random, signal, sys, time
+from pathlib import Path
+from tests.recording.made_up import MadeUpPilot, drone_config, inputs
+from flockd.recording import Recorder
+
+def fly(path, pipe):
+    config = drone_config()
+    pilot = MadeUpPilot(config)
+    recorder = Recorder(path, drone="drone1", config=config)
+    for frames, vehicle in inputs(1000, period_s=0.1):
+        recorder.step(frames, vehicle, pilot.step(frames, vehicle))
+        os.write(pipe, f"{{frames.time_s!r}}\\n".encode())
+        time.sleep(0.1)
+
+children = []
+for number in range({KILLS}):
+    pipe = os.pipe()
+    path = Path(sys.argv[1]) / f"flight{{number}}.mcap"
+    child = os.fork()
+    if child == 0:
+        fly(path, pipe[1])
+    children.append((random.Random(number).uniform(0.5, 2.5), child, pipe))
+began = time.monotonic()
+for moment, child, (reading, writing) in sorted(children):
+    time.sleep(max(0.0, began + moment - time.monotonic()))
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+for _, _, (reading, writing) in children:
+    os.close(writing)
+    print(os.read(reading, 1 << 20).split()[-1].decode())
+"""
+
+
+def test_a_kill_at_any_moment_loses_half_a_second_at_most(tmp_path: Path) -> None:
+    flown = subprocess.run(
+        [sys.executable, "-c", FLYING, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    last_flown = [float(line) for line in flown.stdout.split()]
+    for number in range(KILLS):
+        recording = Recording(tmp_path / f"flight{number}.mcap")
+        assert not recording.contents.finished
+        mended = tmp_path / f"mended{number}.mcap"
+        steps = recover(recording, mended)
+        back = Recording(mended)
+        assert back.contents.finished
+        assert not back.contents.gaps
+        assert len(list(back.steps())) == steps
+        assert back.start_s + back.duration_s >= last_flown[number] - 0.5
+
+
+def test_a_cut_holds_its_stretch_and_what_is_needed_to_play_it(tmp_path: Path, whole: Path) -> None:
+    recording = Recording(whole)
+    target = tmp_path / "cut.mcap"
+    assert cut(recording, target, recording.start_s + 0.25, recording.start_s + 0.65) == 4
+    piece = Recording(target)
+    assert piece.contents.finished
+    assert piece.config == recording.config
+    assert piece.contents.flight["cut_from"] == "drone1.mcap"
+    originals = {step.number: step for step in recording.steps()}
+    for step in piece.steps():
+        original = originals[step.number]
+        assert step.output == original.output
+        assert np.array_equal(step.frames.frames["front"].image, original.frames.frames["front"].image)
+    assert [step.number for step in piece.steps()] == [3, 4, 5, 6]
+    assert piece.contents.streams["/camera/front/calibration"].messages == 1
+    assert piece.contents.streams["/health"].messages == 4
+    with pytest.raises(RecordingError, match="holds no whole step there; nothing was written"):
+        cut(recording, tmp_path / "none.mcap", 0.0, 1.0)
+    assert [path.name for path in tmp_path.iterdir()] == ["cut.mcap"]
+
+
+def test_tables_and_pictures_hold_what_was_flown(tmp_path: Path) -> None:
+    outputs = record(tmp_path / "drone1.mcap", steps=3)
+    recording = Recording(tmp_path / "drone1.mcap")
+    folder = tmp_path / "tables"
+    folder.mkdir()
+    export_tables(recording, folder, "csv")
+    with (folder / "output.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["command.yaw_rad"]) for row in rows] == [output.command.yaw_rad for output in outputs]
+    assert [row["velocity.2"] for row in rows] == ["nan"] * 3
+    assert rows[0]["reasons"] == "front"
+    with (folder / "output.neighbours.csv").open(encoding="utf-8") as file:
+        neighbours = list(csv.DictReader(file))
+    assert [float(row["time_s"]) for row in neighbours] == [output.time_s for output in outputs]
+    assert [float(row["position.0"]) for row in neighbours] == [o.neighbours[0].position[0] for o in outputs]
+
+    assert export_images(recording, tmp_path / "images") == 6
+    first = sorted((tmp_path / "images" / "left").iterdir())[0]
+    assert first.name == "000000_999.999857.png"
+    step = next(recording.steps())
+    written = cv2.cvtColor(cv2.imread(str(first)), cv2.COLOR_BGR2RGB)
+    assert np.array_equal(written, step.frames.frames["left"].image)
+    assert json.dumps(step.output) == json.dumps(to_json(outputs[0]))
+
+
+def test_tables_as_parquet(tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
+    outputs = record(tmp_path / "drone1.mcap", steps=3)
+    export_tables(Recording(tmp_path / "drone1.mcap"), tmp_path, "parquet")
+    table = parquet.read_table(tmp_path / "output.parquet").to_pydict()
+    assert table["command.yaw_rad"] == [output.command.yaw_rad for output in outputs]
