@@ -96,8 +96,8 @@ class Assembler:
         self._lines[camera].counts.update({"corrupt": 1, "missing": 1, "used": -1})
 
     def counts(self, camera: str) -> dict[Count, int]:
-        """What happened to a camera's frames so far."""
-        return dict(self._lines[camera].counts)
+        """What happened to a camera's frames so far; what never happened is absent."""
+        return {what: count for what, count in self._lines[camera].counts.items() if count}
 
     def age_s(self, camera: str, now_s: float) -> float:
         """Since the camera's last usable frame arrived; infinite before the first."""
@@ -108,11 +108,10 @@ class Assembler:
         if not math.isfinite(frame.time_s) or (last is not None and frame.time_s <= last.time_s):
             return "time_stamp"
         line.last = frame
-        if last is None:
-            return None
-        same = frame.sequence == last.sequence or frame.data == last.data
-        line.repeats = line.repeats + 1 if same else 0
-        line.counts["lost"] += max(frame.sequence - last.sequence - 1, 0)  # a reopened camera counts from zero again
+        if last is not None:
+            same = frame.sequence == last.sequence or frame.data == last.data
+            line.repeats = line.repeats + 1 if same else 0
+            line.counts["lost"] += max(frame.sequence - last.sequence - 1, 0)  # a reopened camera begins at zero
         if line.repeats >= self._frozen_after:
             return "frozen"
         return "late" if frame.time_s + self._tolerance_s <= self._last_set_s else None

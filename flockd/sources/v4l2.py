@@ -114,8 +114,9 @@ class _Camera:
                     self._capture(device)
             except CameraError as error:
                 self._intake.fault(self._name, str(error))
-            pause_s = _FIRST_PAUSE_S if self._delivered else min(2.0 * pause_s, _LONGEST_PAUSE_S)
+            pause_s = _FIRST_PAUSE_S if self._delivered else pause_s
             self._stopping.wait(pause_s)
+            pause_s = min(2.0 * pause_s, _LONGEST_PAUSE_S)
 
     def _open(self) -> V4l2Device:
         return V4l2Device(

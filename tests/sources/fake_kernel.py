@@ -1,0 +1,284 @@
+"""A stand-in for the kernel's side of V4L2: plays cameras to the capture code by the bytes of linux/videodev2.h.
+
+The request numbers and offsets are those that a C compiler gives for the header on 64-bit machines, written down here
+independently of the code under test.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import math
+import mmap
+import os
+import struct
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+
+class Request(IntEnum):
+    """The numbers of the ioctl requests."""
+
+    QUERYCAP = 0x80685600
+    S_FMT = 0xC0D05605
+    REQBUFS = 0xC0145608
+    QUERYBUF = 0xC0585609
+    QBUF = 0xC058560F
+    DQBUF = 0xC0585611
+    STREAMON = 0x40045612
+    STREAMOFF = 0x40045613
+    S_PARM = 0xC0CC5616
+    G_CTRL = 0xC008561B
+    S_CTRL = 0xC008561C
+    QUERYCTRL = 0xC0445624
+
+
+FLAG_ERROR, FLAG_MONOTONIC, FLAG_CLOCK_UNKNOWN = 0x40, 0x2000, 0x0000
+VIDEO_CAPTURE, STREAMING, METADATA_CAPTURE = 0x1, 0x04000000, 0x00800000
+BUFFER_LENGTH = 1 << 20
+EXPOSURE_AUTO, EXPOSURE, GAIN = 0x009A0901, 0x009A0902, 0x00980913
+
+
+@dataclass
+class FakeControl:
+    """A control as QUERYCTRL tells of it."""
+
+    name: bytes
+    low: int
+    high: int
+    value: int
+    step: int = 1
+
+
+@dataclass
+class FakeCamera:
+    """One camera and its driver; the test says what it sends."""
+
+    formats: tuple[tuple[int, int, bytes], ...] = ((640, 480, b"MJPG"), (640, 480, b"YUYV"))
+    rates: tuple[int, ...] = (30, 15)
+    padding: int = 0
+    """Bytes at the end of each row of an image that is not compressed."""
+    capabilities: int = VIDEO_CAPTURE | STREAMING
+    controls: dict[int, FakeControl] = field(
+        default_factory=lambda: {
+            GAIN: FakeControl(b"Gain", 0, 255, 64),
+            EXPOSURE_AUTO: FakeControl(b"Auto Exposure", 0, 3, 3),
+            EXPOSURE: FakeControl(b"Exposure Time, Absolute", 1, 5000, 157),
+        }
+    )
+    plugged: bool = True
+    owner: int | None = None
+    """The descriptor that streams."""
+    streaming: bool = False
+    settings: list[tuple[str, object]] = field(default_factory=list)
+    """What was asked of the driver, in order."""
+    memory: list[mmap.mmap] = field(default_factory=list)
+    empty: deque[int] = field(default_factory=deque)
+    full: deque[tuple[int, int, float, int, int]] = field(default_factory=deque)
+    sequence: int = 0
+    failing: int = 0
+    """The error number of every DQBUF; 0: none."""
+
+
+class FakeKernel:
+    """Cameras by the path of their device."""
+
+    def __init__(self, **cameras: FakeCamera) -> None:
+        self.cameras = {f"/dev/{name}": camera for name, camera in cameras.items()}
+        self.open_files: dict[int, FakeCamera] = {}
+        self._changed = threading.Condition()
+        self._next = 100
+
+    # What the test does
+
+    def send(
+        self,
+        name: str,
+        data: bytes,
+        *,
+        time_s: float | None = None,
+        flags: int = FLAG_MONOTONIC,
+        lost_before: int = 0,
+        wait_s: float = 5.0,
+    ) -> float:
+        """The camera takes a picture as soon as it streams; gives its time stamp."""
+        camera = self.cameras[f"/dev/{name}"]
+        until_s = time.monotonic() + wait_s
+        with self._changed:
+            while not (camera.streaming and camera.empty):
+                assert self._changed.wait(max(until_s - time.monotonic(), 0.0)), f"{name} is not streaming"
+            stamp = time.monotonic() if time_s is None else time_s
+            index = camera.empty.popleft()
+            camera.memory[index][: len(data)] = data
+            camera.sequence += lost_before
+            camera.full.append((index, len(data), stamp, camera.sequence, flags))
+            camera.sequence += 1
+            self._changed.notify_all()
+        return stamp
+
+    def unplug(self, name: str) -> None:
+        with self._changed:
+            self.cameras[f"/dev/{name}"].plugged = False
+            self._changed.notify_all()
+
+    def plug(self, name: str) -> None:
+        with self._changed:
+            self.cameras[f"/dev/{name}"].plugged = True
+
+    def fail(self, name: str, number: int) -> None:
+        with self._changed:
+            self.cameras[f"/dev/{name}"].failing = number
+            self._changed.notify_all()
+
+    # What the capture code calls
+
+    def open(self, path: str) -> int:
+        with self._changed:
+            camera = self.cameras.get(path)
+            if camera is None or not camera.plugged:
+                raise OSError(errno.ENOENT, os.strerror(errno.ENOENT))
+            self._next += 1
+            self.open_files[self._next] = camera
+            return self._next
+
+    def close(self, descriptor: int) -> None:
+        with self._changed:
+            camera = self.open_files.pop(descriptor)
+            if camera.owner == descriptor:
+                assert all(memory.closed for memory in camera.memory), "a mapping keeps the device open"
+                _release(camera)
+
+    def map(self, descriptor: int, length: int, offset: int) -> mmap.mmap:
+        assert length == BUFFER_LENGTH
+        memory = mmap.mmap(-1, length)
+        assert offset == len(self.open_files[descriptor].memory) * BUFFER_LENGTH
+        self.open_files[descriptor].memory.append(memory)
+        return memory
+
+    def wait(self, descriptor: int, timeout_s: float) -> bool:
+        camera = self.open_files[descriptor]
+        with self._changed:
+            return self._changed.wait_for(
+                lambda: bool(camera.full) or not camera.plugged or bool(camera.failing), timeout_s
+            )
+
+    def ioctl(self, descriptor: int, request: int, argument: ctypes.Structure | ctypes.c_int) -> None:
+        play = {
+            Request.QUERYCAP: _query_capabilities,
+            Request.S_FMT: _set_format,
+            Request.S_PARM: _set_rate,
+            Request.QUERYCTRL: _query_control,
+            Request.S_CTRL: _set_control,
+            Request.G_CTRL: _get_control,
+            Request.REQBUFS: _request_buffers,
+            Request.QUERYBUF: _query_buffer,
+            Request.QBUF: _queue,
+            Request.DQBUF: _dequeue,
+            Request.STREAMON: _start,
+            Request.STREAMOFF: _stop,
+        }[Request(request)]
+        with self._changed:
+            camera = self.open_files[descriptor]
+            if not camera.plugged:
+                raise _error(errno.ENODEV)
+            if play in {_set_format, _request_buffers} and camera.owner not in {None, descriptor}:
+                raise _error(errno.EBUSY)
+            if play is _request_buffers:
+                camera.owner = descriptor
+            play(camera, memoryview(argument).cast("B"))
+            self._changed.notify_all()
+
+
+def _query_capabilities(camera: FakeCamera, memory: memoryview) -> None:
+    of_all_devices = 0x80000000 | VIDEO_CAPTURE | METADATA_CAPTURE | STREAMING
+    struct.pack_into("<III", memory, 80, 6 << 16, of_all_devices, camera.capabilities)
+
+
+def _set_format(camera: FakeCamera, memory: memoryview) -> None:
+    width, height, code = struct.unpack_from("<II4s", memory, 8)
+    camera.settings.append(("format", (width, height, code)))
+    if (width, height, code) not in camera.formats:
+        width, height, code = camera.formats[0]
+    row = 0 if code == b"MJPG" else 2 * width + camera.padding
+    struct.pack_into("<II4sIII", memory, 8, width, height, code, 1, row, BUFFER_LENGTH)
+
+
+def _set_rate(camera: FakeCamera, memory: memoryview) -> None:
+    numerator, denominator = struct.unpack_from("<II", memory, 12)
+    camera.settings.append(("rate", denominator / numerator))
+    rate = min(camera.rates, key=lambda rate: abs(rate - denominator / numerator))
+    struct.pack_into("<II", memory, 12, 1, rate)
+
+
+def _query_control(camera: FakeCamera, memory: memoryview) -> None:
+    asked = struct.unpack_from("<I", memory)[0]
+    later = sorted(number for number in camera.controls if number > (asked & 0x7FFFFFFF))
+    if not later:
+        raise _error(errno.EINVAL)
+    control = camera.controls[later[0]]
+    struct.pack_into("<II32s", memory, 0, later[0], 1, control.name)
+    struct.pack_into("<iii", memory, 40, control.low, control.high, control.step)
+
+
+def _set_control(camera: FakeCamera, memory: memoryview) -> None:
+    number, value = struct.unpack_from("<Ii", memory)
+    if number == EXPOSURE and camera.controls[EXPOSURE_AUTO].value == 3:
+        raise _error(errno.EACCES)  # as long as the automatic has it
+    control = camera.controls[number]
+    control.value = value // control.step * control.step
+    camera.settings.append((control.name.decode(), value))
+
+
+def _get_control(camera: FakeCamera, memory: memoryview) -> None:
+    struct.pack_into("<i", memory, 4, camera.controls[struct.unpack_from("<I", memory)[0]].value)
+
+
+def _request_buffers(camera: FakeCamera, memory: memoryview) -> None:
+    count, kind, how = struct.unpack_from("<III", memory)
+    assert (count, kind, how) == (4, 1, 1), "buffers for capture that are mapped"
+
+
+def _query_buffer(camera: FakeCamera, memory: memoryview) -> None:
+    struct.pack_into("<I", memory, 64, struct.unpack_from("<I", memory)[0] * BUFFER_LENGTH)
+    struct.pack_into("<I", memory, 72, BUFFER_LENGTH)
+
+
+def _queue(camera: FakeCamera, memory: memoryview) -> None:
+    camera.empty.append(struct.unpack_from("<I", memory)[0])
+
+
+def _dequeue(camera: FakeCamera, memory: memoryview) -> None:
+    if camera.failing:
+        raise _error(camera.failing)
+    if not camera.full:
+        raise _error(errno.EAGAIN)
+    index, length, stamp, sequence, flags = camera.full.popleft()
+    struct.pack_into("<IIII", memory, 0, index, 1, length, flags)
+    seconds = math.floor(stamp)
+    struct.pack_into("<qq", memory, 24, seconds, min(round((stamp - seconds) * 1e6), 999_999))
+    struct.pack_into("<II", memory, 56, sequence, 1)
+
+
+def _start(camera: FakeCamera, memory: memoryview) -> None:
+    camera.streaming = True
+
+
+def _stop(camera: FakeCamera, memory: memoryview) -> None:
+    camera.streaming = False
+
+
+def _release(camera: FakeCamera) -> None:
+    """Its last user has gone."""
+    camera.owner = None
+    camera.streaming = False
+    camera.sequence = 0
+    camera.memory.clear()
+    camera.empty.clear()
+    camera.full.clear()
+
+
+def _error(number: int) -> OSError:
+    return OSError(number, os.strerror(number))
