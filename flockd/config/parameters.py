@@ -189,6 +189,8 @@ class GateParameters(Section):
             raise ValueError("degraded_separation_m is below min_separation_m; write a larger one")
         if 0 < len(self.fence_corners_m) < 3:
             raise ValueError("fence_corners_m has fewer than 3 corners; add the others, or delete it")
+        if len(set(self.fence_corners_m)) < len(self.fence_corners_m):
+            raise ValueError("fence_corners_m names a corner twice; delete one, the fence closes by itself")
         return self
 
 

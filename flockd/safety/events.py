@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -135,7 +136,7 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         (
             Event.ESTIMATE_STALE,
             not inputs.estimate_age_s <= p.estimate_timeout_s,
-            f"the newest estimate is {inputs.estimate_age_s:.1f} s old",
+            f"no estimate {_since(inputs.estimate_age_s)}",
         ),
         (
             Event.EGO_MOTION_POOR,
@@ -174,7 +175,7 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         (
             Event.NEIGHBOURS_LOST,
             not inputs.neighbours_age_s <= p.neighbours_timeout_s,
-            f"no neighbour seen for {inputs.neighbours_age_s:.1f} s",
+            f"no neighbour seen {_since(inputs.neighbours_age_s)}",
         ),
         (
             Event.NEIGHBOUR_CLOSE,
@@ -187,7 +188,7 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         (
             Event.LINK_LOST,
             not inputs.heartbeat_age_s <= p.heartbeat_timeout_s,
-            f"no heartbeat from the autopilot for {inputs.heartbeat_age_s:.1f} s",
+            f"no heartbeat from the autopilot {_since(inputs.heartbeat_age_s)}",
         ),
         (Event.NOT_OFFBOARD, inputs.flight_mode != OFFBOARD, f"the flight mode is {inputs.flight_mode or 'not known'}"),
         (Event.NOT_ARMED, not inputs.armed, "not armed"),
@@ -200,6 +201,10 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         (Event.LAND_ASKED, inputs.land_asked, "an operator asked for Land"),
     )
     return {event: sentence for event, holds, sentence in table if holds}
+
+
+def _since(age_s: float) -> str:
+    return "yet" if age_s == math.inf else f"for {age_s:.1f} s"
 
 
 def _fault(camera: CameraHealth, p: SafetyParameters) -> str:

@@ -156,7 +156,8 @@ class Supervisor:
     def _hand_over(self, state: State, noticed: dict[Event, str]) -> None:
         """Leaves the flight for good, and remembers why."""
         self._state = state
-        self._latched |= {event: noticed[event] for event in noticed if self._reaction(event) >= Reaction.HOVER}
+        grave = [event for event in noticed if self._reaction(event) >= Reaction.HOVER]
+        self._latched |= {event: noticed[event] for event in sorted(grave, key=self._reaction, reverse=True)}
 
     def _reaction(self, event: Event) -> Reaction:
         return self._rules[event].reaction_at(self._now_s - self._since_s[event])

@@ -1,0 +1,496 @@
+"""The last gate: what passes, what is made smaller, what is refused; by hand and with random numbers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from flockd.messages import FloatArray, Setpoint, VelocityCommand
+from flockd.safety import Action, Gate, GateParameters, Objection, Permission, Surroundings, Verdict, Wanted
+
+STILL = np.zeros(2)
+NOBODY = np.empty((0, 3))
+DRAG_FREE = GateParameters(max_acceleration_m_s2=1e6)
+"""So that a step shows the limit it is about at once."""
+HOME = Surroundings(position=STILL, velocity=STILL, yaw_rad=0.5, neighbours=NOBODY)
+
+
+def wanted(velocity: ArrayLike, *, time_s: float = 0.0, height_m: float = 5.0, yaw_rad: float = 1.0) -> Wanted:
+    command = VelocityCommand(np.asarray(velocity, dtype=float), np.zeros(2), yaw_rad)
+    return Wanted(command, time_s, height_m)
+
+
+NO_COMMAND = Wanted(None, 0.0, height_m=5.0)
+
+
+class Stream:
+    """A gate that is stepped at 20 Hz with fresh permissions."""
+
+    def __init__(self, parameters: GateParameters | None = None) -> None:
+        self.gate = Gate(parameters or DRAG_FREE)
+        self.now_s = 0.0
+
+    def step(
+        self, velocity: ArrayLike, action: Action = Action.FLY, around: Surroundings = HOME, height_m: float = 5.0
+    ) -> Verdict:
+        self.now_s += 0.05
+        permission = Permission(action, self.now_s)
+        return self.gate.step(self.now_s, permission, wanted(velocity, time_s=self.now_s, height_m=height_m), around)
+
+    def second(self, velocity: ArrayLike, action: Action = Action.FLY, around: Surroundings = HOME) -> Verdict:
+        """The second of two steps: the first one begins at the drone's own velocity."""
+        self.step(velocity, action, around)
+        return self.step(velocity, action, around)
+
+
+def sent(verdict: Verdict) -> Setpoint:
+    assert verdict.setpoint is not None
+    return verdict.setpoint
+
+
+def near(*neighbours: ArrayLike) -> Surroundings:
+    return replace(HOME, neighbours=np.array(neighbours, dtype=float))
+
+
+# Silence.
+
+
+def test_a_command_within_all_limits_passes_as_it_is() -> None:
+    verdict = Stream().second([0.6, -0.8])
+    setpoint = sent(verdict)
+    np.testing.assert_allclose(setpoint.velocity, [0.6, -0.8])
+    assert (setpoint.time_s, setpoint.height_m, setpoint.yaw_rad) == (0.1, 5.0, 1.0)
+    assert verdict.objections == ()
+
+
+def test_it_is_silent_until_allowed() -> None:
+    verdict = Gate(DRAG_FREE).step(0.0, Permission(Action.SILENCE, 0.0), wanted([1.0, 0.0]), HOME)
+    assert verdict == Verdict(None, (Objection.NOT_ALLOWED,))
+
+
+@pytest.mark.parametrize("action", set(Action) - {Action.SILENCE, Action.FLY, Action.FLY_DEGRADED})
+def test_all_other_actions_send_standstill_whatever_the_command(action: Action) -> None:
+    for want in (
+        wanted([1.0, 1.0]),
+        wanted([math.nan, 99.0], yaw_rad=math.nan),
+        NO_COMMAND,
+        wanted([1, 1], time_s=-99),
+    ):
+        verdict = Gate(DRAG_FREE).step(0.0, Permission(action, 0.0), want, HOME)
+        np.testing.assert_array_equal(sent(verdict).velocity, STILL)
+        assert sent(verdict).yaw_rad == 0.5  # as the drone looks
+        assert verdict.objections == ()
+
+
+@pytest.mark.parametrize("action", [Action.FLY, Action.HOVER])
+@pytest.mark.parametrize(
+    ("age_s", "good"), [(0.25, True), (0.26, False), (-0.25, True), (-0.26, False), (math.nan, False)]
+)
+def test_a_permission_is_good_for_so_long(action: Action, age_s: float, good: bool) -> None:
+    gate = Gate(GateParameters(permission_timeout_s=0.25))
+    verdict = gate.step(8.0, Permission(action, 8.0 - age_s), wanted([1.0, 0.0], time_s=8.0), HOME)
+    assert (verdict.setpoint is not None) == good
+    assert verdict.objections == (() if good else (Objection.PERMISSION_STALE,))
+
+
+@pytest.mark.parametrize("action", [Action.FLY, Action.FLY_DEGRADED])
+@pytest.mark.parametrize(
+    ("age_s", "good"), [(1.5, True), (1.51, False), (-1.5, True), (-1.51, False), (math.nan, False)]
+)
+def test_a_command_is_good_for_so_long(action: Action, age_s: float, good: bool) -> None:
+    verdict = Gate(DRAG_FREE).step(8.0, Permission(action, 8.0), wanted([1.0, 0.0], time_s=8.0 - age_s), HOME)
+    assert (verdict.setpoint is not None) == good
+    assert verdict.objections == (() if good else (Objection.COMMAND_STALE,))
+
+
+def test_before_the_first_command_there_is_none_to_fly() -> None:
+    verdict = Gate(DRAG_FREE).step(0.0, Permission(Action.FLY, 0.0), NO_COMMAND, HOME)
+    assert verdict == Verdict(None, (Objection.COMMAND_STALE,))
+
+
+def test_a_daemon_that_stalls_is_silenced_in_time_for_the_half_second() -> None:
+    stream = Stream(GateParameters())
+    stream.step([1.0, 0.0])
+    last = Permission(Action.FLY, stream.now_s)
+    heard_s = [
+        now_s
+        for now_s in np.arange(0.05, 2.0, 0.05)
+        if stream.gate.step(now_s, last, wanted([1.0, 0.0], time_s=0.05), HOME).setpoint is not None
+    ]
+    assert max(heard_s) - last.time_s < 0.5
+
+
+# Numbers that cannot be.
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_command_that_is_not_finite_is_refused_and_brings_standstill(bad: float, axis: int) -> None:
+    velocity = np.array([0.5, 0.5])
+    velocity[axis] = bad
+    verdict = Stream().second(velocity)
+    np.testing.assert_array_equal(sent(verdict).velocity, STILL)
+    assert Objection.COMMAND_NOT_FINITE in verdict.objections
+
+
+def test_a_yaw_that_is_not_finite_is_refused_and_the_last_one_kept() -> None:
+    stream = Stream()
+    stream.second([0.5, 0.0])
+    want = wanted([0.5, 0.0], time_s=0.1, yaw_rad=math.nan)
+    verdict = stream.gate.step(0.15, Permission(Action.FLY, 0.15), want, HOME)
+    np.testing.assert_allclose(sent(verdict).velocity, STILL, atol=1e-12)
+    assert sent(verdict).yaw_rad == 1.0
+    assert verdict.objections == (Objection.COMMAND_NOT_FINITE,)
+
+
+def test_standing_still_it_looks_where_it_looked_last() -> None:
+    stream = Stream()
+    stream.second([0.5, 0.0])
+    assert sent(stream.step([0.5, 0.0], Action.HOVER)).yaw_rad == 1.0
+
+
+def test_a_command_faster_than_any_may_be_is_refused_not_slowed() -> None:
+    stream = Stream(GateParameters(max_speed_m_s=5.0, max_acceleration_m_s2=1e6))
+    verdict = stream.second([3.0, 4.0])
+    np.testing.assert_allclose(sent(verdict).velocity, [3.0, 4.0])
+    assert verdict.objections == ()
+    verdict = stream.step([3.0, 4.01])
+    np.testing.assert_allclose(sent(verdict).velocity, STILL, atol=1e-12)
+    assert verdict.objections == (Objection.COMMAND_TOO_LARGE,)
+
+
+def test_refusals_are_counted() -> None:
+    stream = Stream()
+    for velocity in ([1.0, 0.0], [9.0, 0.0], [math.nan, 0.0], [9.0, 0.0]):
+        stream.step(velocity)
+    stream.step([1.0, 0.0], Action.SILENCE)
+    assert stream.gate.counts == {
+        Objection.COMMAND_TOO_LARGE: 2,
+        Objection.COMMAND_NOT_FINITE: 1,
+        Objection.NOT_ALLOWED: 1,
+    }
+
+
+@pytest.mark.parametrize("height_m", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("action", [Action.FLY, Action.HOVER])
+def test_without_a_height_to_hold_nothing_can_be_sent(height_m: float, action: Action) -> None:
+    verdict = Stream().step([1.0, 0.0], action, height_m=height_m)
+    assert verdict == Verdict(None, (Objection.SETPOINT_NOT_FINITE,))
+
+
+def test_without_any_yaw_nothing_can_be_sent() -> None:
+    lost = replace(HOME, yaw_rad=math.nan)
+    verdict = Stream().step([1.0, 0.0], Action.HOVER, lost)
+    assert verdict == Verdict(None, (Objection.SETPOINT_NOT_FINITE,))
+    assert sent(Stream().step([1.0, 0.0], Action.FLY, lost)).yaw_rad == 1.0
+
+
+@pytest.mark.parametrize(
+    ("around", "objection"),
+    [
+        (replace(HOME, position=np.array([0.0, math.nan])), Objection.POSITION_UNKNOWN),
+        (near([9.0, 0.0, 0.0], [math.nan, 5.0, 0.0]), Objection.NEIGHBOUR_UNKNOWN),
+        (near([9.0, 0.0, math.inf]), Objection.NEIGHBOUR_UNKNOWN),
+    ],
+)
+def test_where_the_drone_or_a_neighbour_is_not_known_it_stands_still(
+    around: Surroundings, objection: Objection
+) -> None:
+    verdict = Stream().second([1.0, 0.0], around=around)
+    np.testing.assert_array_equal(sent(verdict).velocity, STILL)
+    assert verdict.objections == (objection,)
+
+
+def test_without_a_fence_the_position_does_not_matter() -> None:
+    free = DRAG_FREE.model_copy(update={"fence_radius_m": None})
+    verdict = Stream(free).second([1.0, 0.0], around=replace(HOME, position=np.full(2, math.nan)))
+    np.testing.assert_allclose(sent(verdict).velocity, [1.0, 0.0])
+    assert verdict.objections == ()
+
+
+# Speed and acceleration.
+
+
+def test_degraded_it_flies_slower_and_says_so() -> None:
+    stream = Stream(DRAG_FREE.model_copy(update={"degraded_speed_m_s": 1.0}))
+    verdict = stream.second([1.8, 2.4], Action.FLY_DEGRADED)
+    np.testing.assert_allclose(sent(verdict).velocity, [0.6, 0.8])
+    assert verdict.objections == (Objection.SLOWED,)
+    verdict = stream.second([0.6, 0.8], Action.FLY_DEGRADED)
+    np.testing.assert_allclose(sent(verdict).velocity, [0.6, 0.8])
+    assert verdict.objections == ()
+
+
+def test_degraded_a_command_too_large_is_refused_all_the_same() -> None:
+    verdict = Stream().second([30.0, 0.0], Action.FLY_DEGRADED)
+    np.testing.assert_array_equal(sent(verdict).velocity, STILL)
+    assert verdict.objections == (Objection.COMMAND_TOO_LARGE,)
+
+
+def test_from_standstill_it_gathers_speed_at_the_limit() -> None:
+    stream = Stream(GateParameters(max_acceleration_m_s2=2.0))
+    speeds = [sent(stream.step([0.0, 1.0])).velocity[1] for _ in range(13)]
+    # 2 m/s^2 * 0.05 s = 0.1 m/s more each step, from zero, until what was asked for
+    np.testing.assert_allclose(speeds, [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.0, 1.0])
+
+
+def test_it_brakes_at_the_limit_too() -> None:
+    stream = Stream(GateParameters(max_acceleration_m_s2=2.0))
+    for _ in range(20):
+        stream.step([1.0, 0.0])
+    speeds = [sent(stream.step([1.0, 0.0], Action.HOVER)).velocity[0] for _ in range(3)]
+    np.testing.assert_allclose(speeds, [0.9, 0.8, 0.7])
+
+
+def test_it_takes_over_at_the_velocity_that_the_drone_has() -> None:
+    moving = replace(HOME, velocity=np.array([2.0, 0.0]))
+    stream = Stream(GateParameters(max_acceleration_m_s2=2.0))
+    velocities = [sent(stream.step([0.0, 0.0], around=moving)).velocity[0] for _ in range(3)]
+    np.testing.assert_allclose(velocities, [2.0, 1.9, 1.8])
+
+
+def test_a_drone_faster_than_the_limit_is_taken_over_at_the_limit() -> None:
+    moving = replace(HOME, velocity=np.array([0.0, -9.0]))
+    np.testing.assert_allclose(sent(Stream(GateParameters()).step([0.0, 0.0], around=moving)).velocity, [0.0, -4.0])
+
+
+def test_an_unknown_velocity_of_its_own_counts_as_none() -> None:
+    lost = replace(HOME, velocity=np.array([math.nan, 1.0]))
+    np.testing.assert_array_equal(sent(Stream(GateParameters()).step([1.0, 0.0], around=lost)).velocity, STILL)
+
+
+def test_after_silence_it_starts_again_from_the_velocity_that_the_drone_has() -> None:
+    stream = Stream(GateParameters(max_acceleration_m_s2=2.0))
+    for _ in range(20):
+        stream.step([1.0, 0.0])
+    stream.step([1.0, 0.0], Action.SILENCE)
+    np.testing.assert_allclose(sent(stream.step([1.0, 0.0])).velocity, STILL)
+
+
+def test_a_streamer_that_paused_does_not_jump() -> None:
+    parameters = GateParameters(max_acceleration_m_s2=2.0, permission_timeout_s=0.25)
+    stream = Stream(parameters)
+    for _ in range(20):
+        stream.step([1.0, 0.0])
+    stream.now_s = 10.0
+    np.testing.assert_allclose(sent(stream.step([1.0, 0.0])).velocity, STILL)  # from the drone's own
+    stream.now_s += 0.2  # 0.25 s later
+    np.testing.assert_allclose(sent(stream.step([1.0, 0.0])).velocity, [0.5, 0.0])
+
+
+def test_twice_at_one_instant_nothing_changes_nor_when_the_clock_is_read_late() -> None:
+    gate = Gate(GateParameters())
+    for now_s in (0.0, 0.05, 0.05, 0.04):
+        velocity = sent(
+            gate.step(now_s, Permission(Action.FLY, now_s), wanted([1.0, 0.0], time_s=now_s), HOME)
+        ).velocity
+    np.testing.assert_allclose(velocity, [0.25, 0.0])  # 5 m/s^2 for 0.05 s
+
+
+# Fence and heights.
+
+
+def test_outside_the_fence_only_what_leads_inward_or_along_it_is_left() -> None:
+    outside = replace(HOME, position=np.array([101.0, 0.0]))
+    verdict = Stream().second([1.0, 0.5], around=outside)
+    np.testing.assert_allclose(sent(verdict).velocity, [0.0, 0.5])
+    assert verdict.objections == (Objection.FENCE,)
+    verdict = Stream().second([-1.0, 0.5], around=outside)
+    np.testing.assert_allclose(sent(verdict).velocity, [-1.0, 0.5])
+    assert verdict.objections == ()
+    inside = replace(HOME, position=np.array([99.0, 0.0]))
+    np.testing.assert_allclose(sent(Stream().second([1.0, 0.5], around=inside)).velocity, [1.0, 0.5])
+
+
+def test_beyond_the_corner_of_a_fence_only_the_way_back_is_left() -> None:
+    square = ((-10.0, -10.0), (-10.0, 10.0), (10.0, 10.0), (10.0, -10.0))
+    parameters = DRAG_FREE.model_copy(update={"fence_corners_m": square, "fence_radius_m": None})
+    corner = replace(HOME, position=np.array([11.0, 11.0]))
+    verdict = Stream(parameters).second([1.0, 0.0], around=corner)
+    np.testing.assert_allclose(sent(verdict).velocity, [0.5, -0.5])  # what of it is not along (1, 1)
+    assert verdict.objections == (Objection.FENCE,)
+
+
+def test_the_height_is_brought_into_the_band() -> None:
+    heights = GateParameters(min_height_m=2.0, max_height_m=20.0)
+    for asked_m, sent_m in ((1.0, 2.0), (2.0, 2.0), (20.0, 20.0), (25.0, 20.0)):
+        verdict = Stream(heights).step([0.0, 0.0], height_m=asked_m)
+        assert sent(verdict).height_m == sent_m
+        assert verdict.objections == (() if asked_m == sent_m else (Objection.HEIGHT,))
+
+
+# Separation.
+
+
+def test_no_velocity_towards_a_neighbour_that_is_too_near() -> None:
+    verdict = Stream().second([1.0, 0.5], around=near([0.9, 0.0, 0.0]))
+    np.testing.assert_allclose(sent(verdict).velocity, [0.0, 0.5])
+    assert verdict.objections == (Objection.SEPARATION,)
+
+
+def test_away_from_it_and_past_a_farther_one_the_drone_may_fly() -> None:
+    for around in (near([-0.9, 0.0, 0.0]), near([1.0, 0.0, 0.0]), near([0.7, 0.0, 0.8])):
+        verdict = Stream().second([1.0, 0.5], around=around)
+        np.testing.assert_allclose(sent(verdict).velocity, [1.0, 0.5])
+        assert verdict.objections == ()
+
+
+def test_degraded_it_keeps_farther_away() -> None:
+    parameters = DRAG_FREE.model_copy(update={"min_separation_m": 1.0, "degraded_separation_m": 1.5})
+    for action, velocity in ((Action.FLY, [0.5, 0.5]), (Action.FLY_DEGRADED, [0.0, 0.5])):
+        np.testing.assert_allclose(
+            sent(Stream(parameters).second([0.5, 0.5], action, near([1.4, 0.0, 0.0]))).velocity, velocity
+        )
+    moving = replace(near([1.4, 0.0, 0.0]), velocity=np.array([1.0, 0.0]))
+    np.testing.assert_allclose(sent(Stream(parameters).step([0.0, 0.0], Action.HOVER, moving)).velocity, STILL)
+
+
+def test_a_neighbour_straight_above_is_in_no_direction() -> None:
+    verdict = Stream().second([1.0, 0.5], around=near([0.0, 0.0, -0.5]))
+    np.testing.assert_allclose(sent(verdict).velocity, [1.0, 0.5])
+    assert verdict.objections == ()
+
+
+def test_between_two_neighbours_only_the_way_between_or_standstill_is_left() -> None:
+    ahead_and_right = near([0.5, 0.0, 0.0], [0.0, 0.5, 0.0])
+    np.testing.assert_allclose(sent(Stream().second([1.0, 0.5], around=ahead_and_right)).velocity, STILL, atol=1e-12)
+    np.testing.assert_allclose(sent(Stream().second([1.0, -0.5], around=ahead_and_right)).velocity, [0.0, -0.5])
+
+
+def test_separation_and_fence_hold_together() -> None:
+    around = replace(near([0.0, 0.5, 0.0]), position=np.array([101.0, 0.0]))
+    verdict = Stream().second([1.0, 1.0], around=around)
+    np.testing.assert_allclose(sent(verdict).velocity, STILL, atol=1e-12)
+    assert verdict.objections == (Objection.FENCE, Objection.SEPARATION)
+
+
+def test_separation_wins_over_the_acceleration_limit() -> None:
+    stream = Stream(GateParameters(max_acceleration_m_s2=2.0))
+    for _ in range(20):
+        stream.step([1.0, 0.0])
+    np.testing.assert_allclose(sent(stream.step([1.0, 0.0], around=near([0.9, 0.0, 0.0]))).velocity, STILL, atol=1e-12)
+
+
+# Whatever the numbers are.
+
+PARAMETERS = GateParameters(
+    max_speed_m_s=3.0,
+    max_acceleration_m_s2=4.0,
+    degraded_speed_m_s=1.0,
+    min_separation_m=1.0,
+    degraded_separation_m=1.5,
+    fence_radius_m=12.0,
+    fence_corners_m=((-8.0, -10.0), (-8.0, 10.0), (10.0, 10.0), (10.0, 2.0), (2.0, 2.0), (2.0, -10.0)),
+    min_height_m=2.0,
+    max_height_m=20.0,
+)
+OUTLINE = np.concatenate(
+    [
+        np.linspace(a, b, 400, endpoint=False)
+        for a, b in zip(PARAMETERS.fence_corners_m, (*PARAMETERS.fence_corners_m[1:], (-8.0, -10.0)), strict=True)
+    ]
+)
+
+
+def _number(rng: np.random.Generator, scale: float, odd: float) -> float:
+    """Mostly an ordinary number; with the probability `odd` one that nobody reckons with."""
+    if rng.random() < odd:
+        return float(rng.choice([math.nan, math.inf, -math.inf, 1e300, -1e9, 0.0]))
+    return float(rng.normal(0.0, scale))
+
+
+def _vector(rng: np.random.Generator, size: int, scale: float, odd: float) -> FloatArray:
+    return np.array([_number(rng, scale, odd) for _ in range(size)])
+
+
+@pytest.mark.parametrize("odd", [0.0, 0.02, 0.2])
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.filterwarnings("ignore:overflow encountered")
+def test_whatever_is_asked_for_what_is_sent_is_safe(seed: int, odd: float) -> None:
+    rng = np.random.default_rng(seed)
+    gate, last, now_s = Gate(PARAMETERS), None, 0.0
+    total = {"sent": 0, "moving": 0, "near": 0, "outside": 0}
+    for _ in range(1000):
+        now_s += float(rng.choice([0.0, 0.05, 0.05, 0.05, 0.2]))
+        action = Action(rng.choice([Action.FLY, Action.FLY, Action.FLY_DEGRADED, *Action]))
+        permission = Permission(action, now_s - abs(_number(rng, 0.1, odd)))
+        want = wanted(
+            _vector(rng, 2, 1.5, odd),
+            time_s=now_s - abs(_number(rng, 0.6, odd)),
+            height_m=10.0 + _number(rng, 8.0, odd),
+            yaw_rad=_number(rng, 2.0, odd),
+        )
+        around = Surroundings(
+            position=_vector(rng, 2, 6.0, odd),
+            velocity=_vector(rng, 2, 2.0, odd),
+            yaw_rad=_number(rng, 2.0, odd),
+            neighbours=np.array([_vector(rng, 3, 1.0, odd) for _ in range(rng.integers(0, 4))]).reshape(-1, 3),
+        )
+        verdict = gate.step(now_s, permission, want, around)
+        setpoint = verdict.setpoint
+        fresh = now_s - permission.time_s <= 0.3 and action is not Action.SILENCE
+        if action in (Action.FLY, Action.FLY_DEGRADED):
+            fresh &= now_s - want.time_s <= 1.5
+        if setpoint is None:
+            assert odd or not fresh
+        else:
+            assert fresh
+            total["sent"] += 1
+            total["moving"] += bool(np.linalg.norm(setpoint.velocity) > 0.1)
+            assert np.isfinite([*setpoint.velocity, setpoint.height_m, setpoint.yaw_rad, setpoint.time_s]).all()
+            assert np.linalg.norm(setpoint.velocity) <= 3.0 + 1e-9
+            assert 2.0 <= setpoint.height_m <= 20.0
+            if last is not None and not {Objection.FENCE, Objection.SEPARATION} & {*verdict.objections}:
+                change = np.linalg.norm(setpoint.velocity - last.velocity)
+                assert change <= 4.0 * (now_s - last.time_s) + 1e-9
+            total["near"] += _assert_not_towards_a_near_one(setpoint, around, 1.0 if action is Action.FLY else 1.5)
+            total["outside"] += _assert_not_outward(setpoint, around)
+        last = setpoint
+    assert total["moving"] > 20
+    assert total["near"] > 20
+    assert total["outside"] > 20
+
+
+def _assert_not_towards_a_near_one(setpoint: Setpoint, around: Surroundings, separation_m: float) -> bool:
+    near_ones = [n for n in around.neighbours if np.isfinite(n).all() and math.hypot(*n) < separation_m]
+    for neighbour in near_ones:
+        soon = neighbour[:2] - 1e-6 * setpoint.velocity
+        assert math.hypot(*soon) >= math.hypot(*neighbour[:2]) - 1e-14
+    return bool(near_ones)
+
+
+def _assert_not_outward(setpoint: Setpoint, around: Surroundings) -> bool:
+    here = around.position
+    if not (np.abs(here) < 1e6).all():
+        return False
+    soon = here + 1e-4 * setpoint.velocity
+    outside = False
+    if math.hypot(*here) > 12.0:
+        outside = True
+        assert math.hypot(*soon) <= math.hypot(*here) + 1e-8  # along a circle it grows with the square of the way
+    if here[0] < -8.0 or abs(here[1]) > 10.0 or here[0] > 10.0 or (here[0] > 2.0 and here[1] < 2.0):
+        outside = True
+        foot = OUTLINE[np.argmin(np.linalg.norm(OUTLINE - here, axis=1))]  # the fence's nearest point, to 5 cm
+        assert setpoint.velocity @ (here - foot) <= 0.03 * np.linalg.norm(setpoint.velocity) + 1e-9
+    return outside
+
+
+def test_what_is_left_is_the_nearest_to_what_was_asked_for() -> None:
+    """Against all velocities of a fine grid."""
+    rng = np.random.default_rng(5)
+    angles = np.linspace(0.0, math.tau, 360, endpoint=False)
+    speeds = np.linspace(0.0, 1.5, 151)
+    grid = np.concatenate([speed * np.column_stack([np.cos(angles), np.sin(angles)]) for speed in speeds])
+    for _ in range(25):
+        offsets = rng.normal(0.0, 0.3, (int(rng.integers(1, 4)), 2))
+        neighbours = np.hstack([offsets, np.zeros((len(offsets), 1))])
+        velocity = rng.normal(0.0, 0.5, 2)
+        around = replace(HOME, neighbours=neighbours)
+        left = sent(Stream().second(velocity, around=around)).velocity
+        allowed = grid[(grid @ neighbours[:, :2].T <= 1e-9).all(axis=1)]
+        nearest = np.linalg.norm(allowed - velocity, axis=1).min()
+        assert np.linalg.norm(left - velocity) <= nearest + 1e-6

@@ -1,0 +1,65 @@
+"""Limits that contradict each other are refused with a mend."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from flockd.config import load_drone
+from flockd.errors import ConfigError
+from flockd.safety import GateParameters, SafetyParameters
+
+SIMULATOR = Path(__file__).parents[2] / "config" / "simulator.yaml"
+
+
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [
+        ({"min_height_m": 5.0, "max_height_m": 5.0}, "min_height_m 5 is not below max_height_m"),
+        ({"degraded_speed_m_s": 4.5}, "degraded_speed_m_s is above max_speed_m_s"),
+        ({"degraded_separation_m": 0.5}, "degraded_separation_m is below min_separation_m"),
+        ({"fence_corners_m": ((0.0, 0.0), (1.0, 0.0))}, "fewer than 3 corners"),
+        ({"fence_corners_m": ((0.0, 0.0), (9.0, 0.0), (9.0, 9.0), (0.0, 0.0))}, "names a corner twice"),
+        ({"permission_timeout_s": 0.5}, "less than or equal to 0.4"),
+    ],
+)
+def test_limits_of_the_gate(limits: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        GateParameters(**limits)
+
+
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [
+        ({"degraded_ego_motion_failures": 7}, "degraded_ego_motion_failures is above max_ego_motion_failures"),
+        ({"degraded_load": 2.5}, "degraded_load is above max_load"),
+        ({"degraded_temperature_c": 99.0}, "degraded_temperature_c is above max_temperature_c"),
+        ({"hover_s": 10.0}, "less than or equal to 3"),
+    ],
+)
+def test_limits_of_the_supervisor(limits: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        SafetyParameters(**limits)
+
+
+def test_a_law_faster_than_the_gate_is_told_with_both_keys() -> None:
+    with pytest.raises(
+        ConfigError, match=r"flocking.max_speed_m_s 6 is above safety.gate.max_speed_m_s.*write 4 or less"
+    ):
+        load_drone(SIMULATOR, {"flocking.max_speed_m_s": 6.0})
+    both = load_drone(SIMULATOR, {"flocking.max_speed_m_s": 6.0, "safety.gate.max_speed_m_s": 6.0})
+    assert both.safety.gate.max_speed_m_s == 6.0
+
+
+def test_a_file_may_draw_a_fence(tmp_path: Path) -> None:
+    fence = (
+        "safety:\n  gate:\n    fence_radius_m: null\n    fence_corners_m: [[0, -20], [40, -20], [40, 20], [0, 20]]\n"
+    )
+    path = tmp_path / "drone.yaml"
+    path.write_text(SIMULATOR.read_text(encoding="utf-8") + fence, encoding="utf-8")
+    gate = load_drone(path).safety.gate
+    assert gate.fence_radius_m is None
+    assert gate.fence_corners_m == ((0.0, -20.0), (40.0, -20.0), (40.0, 20.0), (0.0, 20.0))
