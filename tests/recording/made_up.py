@@ -54,8 +54,9 @@ class MadeUpPilot:
         felt += 0.0 if vehicle.velocity_ned is None else float(vehicle.velocity_ned.sum())
         self._memory = math.sin(self._memory + seen + felt + self.gain)
         m = self._memory
+        whole: PilotOutput = filled(PilotOutput, m)
         return replace(
-            filled(PilotOutput, m),
+            whole,
             time_s=frames.time_s,
             ego_motion=replace(filled(EgoMotion, m), translation=np.array([m, 1e-310, -0.0])),
             velocity=np.array([m, 1 / 3, math.nan]),
@@ -67,7 +68,7 @@ class MadeUpPilot:
 def filled(kind: Any, number: float, name: str = "") -> Any:
     """A message of this type with something in every field, whatever fields it has."""
     origin, parts = get_origin(kind), get_args(kind)
-    if is_dataclass(kind):
+    if is_dataclass(kind) and isinstance(kind, type):
         return kind(**{field: filled(hint, number, field) for field, hint in get_type_hints(kind).items()})
     if origin is np.ndarray:
         return np.full((3, 3) if name == "rotation" else 3, number)

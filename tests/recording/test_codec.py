@@ -58,6 +58,7 @@ def test_any_double_comes_back() -> None:
 
 def test_what_is_no_message_is_refused() -> None:
     good = to_json(next(inputs(1))[1])
+    spoilt: object
     for spoilt in ({**good, "height_m": "high"}, {**good, "height_m": True}, {**good, "R_ned_body": 3}, [], None):
         with pytest.raises(ValueError, match=r"."):
             from_json(VehicleState, spoilt)

@@ -50,7 +50,7 @@ def test_what_is_no_recording_is_refused_in_one_sentence(tmp_path: Path, whole: 
         writer.start()
         channel = writer.register_channel("/speed", "json", writer.register_schema("x", "jsonschema", b"{}"))
         writer.add_message(channel, 1, b"{}", 1)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
     assert refusal(path) == "is an MCAP file, but no recording of flockd; name one that flockd wrote"
     content = whole.read_bytes()
     path.write_bytes(content.replace(b"\x01\x00\x00\x001", b"\x01\x00\x00\x002", 1))
@@ -193,7 +193,9 @@ def test_tables_and_pictures_hold_what_was_flown(tmp_path: Path) -> None:
     first = sorted((tmp_path / "images" / "left").iterdir())[0]
     assert first.name == "000000_999.999857.png"
     step = next(recording.steps())
-    written = cv2.cvtColor(cv2.imread(str(first)), cv2.COLOR_BGR2RGB)
+    picture = cv2.imread(str(first))
+    assert picture is not None
+    written = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
     assert np.array_equal(written, step.frames.frames["left"].image)
     assert json.dumps(step.output) == json.dumps(to_json(outputs[0]))
 

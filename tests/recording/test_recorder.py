@@ -136,7 +136,8 @@ def test_jpeg_is_smaller_and_near(tmp_path: Path) -> None:
 
 
 def test_a_frame_that_is_no_picture_is_left_out_and_told(tmp_path: Path) -> None:
-    config, told = drone_config(), []
+    config = drone_config()
+    told: list[str] = []
     with Recorder(tmp_path / "drone1.mcap", drone="drone1", config=config, on_event=told.append) as recorder:
         frames, vehicle = next(inputs(1))
         output = MadeUpPilot(config).step(frames, vehicle)
@@ -166,7 +167,8 @@ def test_files_turn_over_and_stay_within_the_quota(tmp_path: Path) -> None:
 
 
 def test_a_disk_that_never_answers_costs_steps_but_no_time(tmp_path: Path) -> None:
-    path, told = tmp_path / "drone1.mcap", []
+    path = tmp_path / "drone1.mcap"
+    told: list[str] = []
     os.mkfifo(path)  # nobody reads: even opening it does not return
     config = drone_config()
     recorder = Recorder(

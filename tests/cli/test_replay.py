@@ -1,0 +1,285 @@
+"""`flockd replay`: the flight again, and a readable word on whatever comes out differently."""
+
+from __future__ import annotations
+
+import json
+import resource
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import pytest
+import yaml
+
+from flockd.cli import main
+from flockd.config import Overrides, ScenarioConfig, load_scenario
+from flockd.data import data_path
+from flockd.errors import ModelError
+from flockd.messages import FrameSet, PilotOutput, VehicleState
+from flockd.recording import Recorder
+from flockd.recording.reader import Recording
+from flockd.sim.log import FlightLog
+from flockd.sim.start import with_drones
+from tests.recording.made_up import MODELS, MadeUpPilot, drone_config, record
+
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture
+def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A recorded flight of the made-up pilot, which will also be the one to fly it again."""
+    monkeypatch.setattr("flockd.pilot.FlockPilot", MadeUpPilot)
+    monkeypatch.setattr("flockd.cli.replay.models_of", lambda config: MODELS)
+    path = tmp_path / "drone1.mcap"
+    record(path)
+    return path
+
+
+class Nudged(MadeUpPilot):
+    """Turns a little more from the fourth step on."""
+
+    nudge = 1e-9
+
+    def step(self, frames: FrameSet, vehicle: VehicleState) -> PilotOutput:
+        output = super().step(frames, vehicle)
+        if frames.time_s > 1000.25:
+            output.command.velocity[1] += self.nudge
+        return output
+
+
+@pytest.fixture
+def nudged(path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr("flockd.pilot.FlockPilot", Nudged)
+    return path
+
+
+def test_a_replay_equals_the_flight(path: Path, capsys: Capture) -> None:
+    assert main(["replay", str(path), "--diff"]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    first, second = captured.out.splitlines()
+    assert first.startswith("drone1: 10 steps, 0.9 s, ")
+    assert second.startswith("equal in all ")
+    assert main(["replay", str(path), "--diff", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert (result["steps"], result["diff"]["equal"], result["warnings"]) == (10, True, [])
+
+
+def test_the_first_difference_is_told_with_time_drone_field_and_both_values(nudged: Path, capsys: Capture) -> None:
+    assert main(["replay", str(nudged), "--diff"]) == 1
+    told = capsys.readouterr().out.splitlines()
+    recorded = next(step.output for step in Recording(nudged).steps() if step.number == 3)
+    assert recorded is not None
+    value = recorded["command"]["velocity"][1]
+    assert told[1] == (
+        f"drone1 differs at 1000.300 s (step 3) in command.velocity[1]: expected {value!r}, found {value + 1e-9!r}"
+    )
+    assert told[2] == "  command.velocity: in 7 of 10 steps, by at most 1e-09"
+    assert main(["replay", str(nudged), "--diff", "--json"]) == 1
+    first = json.loads(capsys.readouterr().out)["diff"]["first"]
+    assert first["field"] == "command.velocity[1]"
+    assert (first["expected"], first["found"]) == (value, value + 1e-9)
+
+
+def test_tolerances_are_for_a_field_and_what_is_in_it(nudged: Path, capsys: Capture) -> None:
+    for tolerance, code in (("command=2e-9", 0), ("command.velocity=2e-9", 0), ("command.yaw_rad=1", 1)):
+        assert main(["replay", str(nudged), "--diff", "--tolerance", tolerance]) == code
+    narrow = ["--tolerance", "command=1", "--tolerance", "command.velocity=1e-12"]
+    assert main(["replay", str(nudged), "--diff", *narrow]) == 1, "the longer name counts"
+    capsys.readouterr()
+
+
+def test_a_reference_is_written_compared_and_updated(
+    path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    reference = path.with_name("drone1.expected")
+    against = ["replay", str(path), "--diff", "--reference", str(reference)]
+    update = ["replay", str(path), "--reference", str(reference), "--update-reference"]
+    assert main(against) == 2
+    assert capsys.readouterr().err == f"{reference}: does not exist; write it first with --update-reference\n"
+    assert main(update) == 0
+    assert main(against) == 0
+    assert main([*against, "--start", "0.4"]) == 1, "a pilot that begins in the middle remembers nothing"
+    monkeypatch.setattr("flockd.pilot.FlockPilot", Nudged)
+    capsys.readouterr()
+    assert main(against) == 1
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last == f"if this is meant: flockd replay {path} --reference {reference} --update-reference"
+    assert main(update) == 0
+    assert main(against) == 0
+
+    reference.write_text(reference.read_text(encoding="utf-8")[:-400], encoding="utf-8")
+    capsys.readouterr()
+    assert main(against) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"{reference}: is ")
+    assert error.count("\n") == 1
+
+
+def test_a_new_recording_is_a_flight_too(nudged: Path, capsys: Capture) -> None:
+    out = nudged.with_name("again.mcap")
+    assert main(["replay", str(nudged), "--out", str(out)]) == 0
+    assert main(["replay", str(out), "--diff"]) == 0
+    assert Recording(out).contents.flight["replayed_from"] == "drone1.mcap"
+    assert main(["replay", str(nudged), "--out", str(out)]) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == f"{out}: exists; name a new file with --out"
+
+
+def test_a_replay_that_breaks_off_leaves_no_recording(
+    path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    class Broken(MadeUpPilot):
+        def step(self, frames: FrameSet, vehicle: VehicleState) -> PilotOutput:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("flockd.pilot.FlockPilot", Broken)
+    assert main(["replay", str(path), "--out", str(path.with_name("again.mcap"))]) == 130
+    assert [file.name for file in path.parent.iterdir()] == ["drone1.mcap"]
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+def test_other_settings_can_be_tried(path: Path, capsys: Capture) -> None:
+    config = drone_config()
+    values = config.model_dump(mode="json")
+    values["flocking"]["cohesion"] = 0.2
+    file = path.with_name("other.yaml")
+    file.write_text(yaml.safe_dump(values), encoding="utf-8")
+    assert main(["replay", str(path), "--config", str(file), "--diff"]) == 1
+    values["rig"]["cameras"][1]["size_px"] = [320, 240]
+    file.write_text(yaml.safe_dump(values), encoding="utf-8")
+    capsys.readouterr()
+    assert main(["replay", str(path), "--config", str(file)]) == 2
+    assert capsys.readouterr().err == (
+        f"{file}: rig.cameras: wants camera 'left' with 320 x 240 pixels, and {path} has it with 160 x 120; "
+        "give it the recording's cameras\n"
+    )
+
+
+def test_speed_1_takes_as_long_as_the_flight_took(path: Path, capsys: Capture) -> None:
+    begin = time.monotonic()
+    assert main(["replay", str(path), "--speed", "1", "--start", "0.3", "--end", "0.8"]) == 0
+    assert time.monotonic() - begin >= 0.5
+    assert capsys.readouterr().out.startswith("drone1: 6 steps, 0.5 s")
+
+
+def test_what_keeps_a_replay_from_being_the_flight_is_told(
+    path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    monkeypatch.setattr("flockd.cli.replay.models_of", lambda config: {"flow": "cd" * 32})
+    killed = path.with_name("killed.mcap")
+    killed.write_bytes(path.read_bytes()[:-200_000])
+    assert main(["replay", str(killed), "--diff"]) == 0
+    cut_off, models = capsys.readouterr().err.splitlines()
+    assert cut_off.startswith(f"{killed}: ends early at byte ")
+    assert models == "model flow is cdcdcdcdcdcd here, and the recording flew with abababababab: outputs will differ"
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--update-reference"], "--update-reference needs the file to write; name it with --reference"),
+        (["--reference", "x"], "--reference alone does nothing; add --diff or --update-reference"),
+        (["--tolerance", "command=1"], "--tolerance has no meaning without --diff; add it"),
+        (
+            ["--reference", "x", "--diff", "--update-reference"],
+            "--diff and --update-reference exclude each other; compare first, then update",
+        ),
+    ],
+)
+def test_options_that_make_no_sense_together(path: Path, options: list[str], told: str, capsys: Capture) -> None:
+    assert main(["replay", str(path), *options]) == 2
+    assert capsys.readouterr().err == f"{told}\n"
+
+
+@pytest.mark.parametrize("option", [["--speed", "-1"], ["--tolerance", "command"], ["--tolerance", "command=-1"]])
+def test_slips_are_usage_errors(option: list[str], capsys: Capture) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main(["replay", "x.mcap", *option])
+    assert exit_.value.code == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+# From pixels: two drones through the simulator, with the shipped networks and small cameras.
+DRONES = ("drone1", "drone2")
+
+
+def scenario(overrides: Overrides) -> ScenarioConfig:
+    flight = with_drones(load_scenario(data_path("config") / "paper_flight.yaml", {"duration_s": 2.5, **overrides}), 2)
+    cameras = tuple(
+        camera.model_copy(
+            update={
+                "size_px": (240, 320),
+                "intrinsics": camera.intrinsics.model_copy(update={"fx": 111.0, "fy": 111.0, "cx": 120.0, "cy": 160.0}),
+            }
+        )
+        for camera in flight.drone.rig.cameras[:2]
+    )
+    drone = flight.drone.model_copy(update={"rig": flight.drone.rig.model_copy(update={"cameras": cameras})})
+    return flight.model_copy(update={"drone": drone})
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    fly: Callable[[Path, list[str]], FlightLog]
+    """Again, recorded in a folder; what the recorders tell goes into the list."""
+    folder: Path
+    log: FlightLog
+
+
+@pytest.fixture(scope="module", params=["dis", "flow"])
+def flight(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    from flockd.cli.record import models_of
+    from flockd.sim.swarm import fly
+
+    flown = scenario({"drone.perception.flow": request.param})
+
+    def fly_recorded(folder: Path, told: list[str]) -> FlightLog:
+        with ExitStack() as stack:
+            recorders = [
+                Recorder(
+                    folder / f"{drone}.mcap",
+                    drone=drone,
+                    config=flown.drone,
+                    models=models_of(flown.drone),
+                    on_event=told.append,
+                )
+                for drone in DRONES
+            ]
+            for recorder in recorders:
+                stack.enter_context(recorder)
+            return fly(flown, recorders=recorders).log
+
+    folder = tmp_path_factory.mktemp("flight")
+    try:
+        return Flight(fly_recorded, folder, fly_recorded(folder, []))
+    except (ModelError, IndexError) as error:
+        pytest.skip(f"the networks in models/ do not fit the code: {error}")
+
+
+def test_a_replay_of_a_simulated_flight_equals_it_bit_for_bit(flight: Flight, capsys: Capture) -> None:
+    for index, drone in enumerate(DRONES):
+        path = flight.folder / f"{drone}.mcap"
+        assert main(["replay", str(path), "--diff", "--json"]) == 0
+        result = json.loads(capsys.readouterr().out)
+        assert (result["steps"], result["diff"]["equal"], result["warnings"]) == (5, True, [])
+        assert result["diff"]["values"] > 5 * 30
+        for step in Recording(path).steps():
+            assert step.output is not None
+            assert step.output["command"]["velocity"] == flight.log.command_velocity[step.number, index].tolist()
+
+
+@pytest.mark.parametrize("flight", ["dis"], indirect=True)
+def test_a_flight_over_a_full_disk_is_the_same_flight(flight: Flight, tmp_path: Path) -> None:
+    told: list[str] = []
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, before[1]))
+    try:
+        again = flight.fly(tmp_path, told)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert sorted(event.split(":")[0] for event in told) == [f"recording {tmp_path / drone}.mcap" for drone in DRONES]
+    for part in fields(FlightLog):
+        if part.name not in ("stages_ms", "meta"):
+            assert getattr(again, part.name).tobytes() == getattr(flight.log, part.name).tobytes(), part.name
