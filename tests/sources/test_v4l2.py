@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import mmap
+import os
 import struct
+import termios
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -24,7 +27,7 @@ from flockd.config.parameters import (
 from flockd.messages import FrameSet
 from flockd.sources import CameraStatus, v4l2_device
 from flockd.sources.v4l2 import V4l2Source
-from flockd.sources.v4l2_device import control_name
+from flockd.sources.v4l2_device import Kernel, LinuxKernel, control_name
 from tests.sources.fake_kernel import (
     FLAG_CLOCK_UNKNOWN,
     FLAG_ERROR,
@@ -52,7 +55,7 @@ def start() -> Iterator[Start]:
     """Starts a source of the given cameras; each camera's device is /dev/ and its name."""
     started: list[V4l2Source] = []
 
-    def begin(kernel: FakeKernel, *cameras: CameraDeviceParameters, silence_s: float = 0.3) -> V4l2Source:
+    def begin(kernel: Kernel, *cameras: CameraDeviceParameters, silence_s: float = 0.3) -> V4l2Source:
         lens = IntrinsicsConfig(fx=300.0, fy=300.0, cx=320.0, cy=240.0)
         rig = RigConfig(cameras=tuple(CameraConfig(name=c.name, size_px=SIZE, intrinsics=lens) for c in cameras))
         parameters = SourceParameters(kind="v4l2", cameras=cameras, silence_s=silence_s, set_tolerance_s=0.2)
@@ -420,3 +423,33 @@ def test_a_buffer_written_by_the_headers_offsets_is_read_field_by_field() -> Non
     assert (buffer.index, buffer.bytesused, buffer.flags, buffer.field) == (3, 4711, 0x2040, 1)
     assert (buffer.seconds, buffer.microseconds, buffer.sequence) == (1_234_567, 654_321, 99)
     assert (buffer.offset, buffer.length) == (0x300000, 614_400)
+
+
+def test_the_real_system_calls_answer_into_the_structures_they_are_given() -> None:
+    """Without a camera: a pipe tells how many bytes wait in it (FIONREAD), and when; a file is mapped."""
+    kernel = LinuxKernel()
+    reading, writing = os.pipe()
+    try:
+        assert not kernel.wait(reading, 0.0)
+        os.write(writing, b"12345")
+        assert kernel.wait(reading, 0.0)
+        waiting = ctypes.c_int(0)
+        kernel.ioctl(reading, termios.FIONREAD, waiting)
+        assert waiting.value == 5
+    finally:
+        kernel.close(reading)
+        kernel.close(writing)
+    file = os.memfd_create("buffer")
+    os.write(file, bytes(mmap.PAGESIZE) + b"the second page")
+    os.ftruncate(file, 2 * mmap.PAGESIZE)
+    memory = kernel.map(file, mmap.PAGESIZE, mmap.PAGESIZE)
+    kernel.close(file)
+    assert memory[slice(0, 15)] == b"the second page"
+    memory.close()
+
+
+def test_what_is_no_camera_is_told_by_the_real_kernel(start: Start) -> None:
+    camera = CameraDeviceParameters(name="front", device="/dev/null")
+    source = start(LinuxKernel(), camera)
+    sentence = "front: /dev/null is not a V4L2 camera (Inappropriate ioctl for device)"
+    assert _until(source, lambda status: status.fault is not None).fault == sentence

@@ -1,0 +1,166 @@
+"""Measure what it takes to get camera frames into the pilot: decoding, putting sets together, shared memory.
+
+python tools/bench_sources.py [--size 640 480] [--cameras 4] [--json]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import sys
+import time
+from collections.abc import Callable
+from multiprocessing.synchronize import Event
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from flockd.config.parameters import (
+    CameraConfig,
+    DroneConfig,
+    IntrinsicsConfig,
+    RigConfig,
+    SharedMemoryParameters,
+    SourceParameters,
+)
+from flockd.messages import Frame, UInt8Array
+from flockd.sources import FramePublisher
+from flockd.sources.assembler import Assembler
+from flockd.sources.frames import RawFrame
+from flockd.sources.images import MjpegFormat, RgbFormat, YuyvFormat
+from flockd.sources.shared_memory import SharedMemorySource
+
+ENDPOINT = "tcp/127.0.0.1:7458"
+ROUNDS = 100
+PERIOD_S = 0.05
+Size = tuple[int, int]
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--size", type=int, nargs=2, default=(640, 480), metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--cameras", type=int, default=4)
+    parser.add_argument("--threads", type=int, default=1, help="that OpenCV may use")
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(arguments.threads)
+    size: Size = (arguments.size[0], arguments.size[1])
+    times_ms = measure_decoding(size) | measure_sets(arguments.cameras) | measure_shared_memory(size, arguments.cameras)
+    if arguments.json:
+        print(json.dumps(times_ms, indent=1))
+        return
+    print(f"{size[0]}x{size[1]}, {arguments.cameras} cameras, {ROUNDS} rounds{'p50 ms':>32s}{'p95 ms':>9s}")
+    for name, (median, high) in times_ms.items():
+        print(f"{name:58s}{median:9.3f}{high:9.3f}")
+
+
+def measure_decoding(size: Size) -> dict[str, tuple[float, float]]:
+    """From a camera's bytes to RGB, one image."""
+    image = _scene(size)
+    ok, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90])
+    assert ok
+    mjpeg, jpeg = MjpegFormat(size), encoded.tobytes()
+    yuyv, pairs = YuyvFormat(size, 2 * size[0]), image[..., :2].tobytes()
+    rgb, plain = RgbFormat(size), image.tobytes()
+    return {
+        f"MJPEG check before decoding ({len(jpeg) // 1000} kB)": _timed(lambda: mjpeg.check(jpeg)),
+        "MJPEG to RGB, with all checks": _timed(lambda: mjpeg.decode(jpeg)),
+        "YUYV to RGB, with all checks": _timed(lambda: yuyv.decode(pairs)),
+        "RGB as it is": _timed(lambda: rgb.decode(plain)),
+    }
+
+
+def measure_sets(cameras: int) -> dict[str, tuple[float, float]]:
+    """One frame of each camera in, one set out, without decoding."""
+    names = [f"camera-{index}" for index in range(cameras)]
+    assembler = Assembler(names, SourceParameters(kind="shared_memory"), 0.0)
+    decode = RgbFormat((1, 1)).decode
+    payloads = [bytes([number % 256]) * 40_000 for number in range(7)]
+
+    def one_set(number: int) -> None:
+        for name in names:
+            assembler.offer(RawFrame(name, payloads[number % 7], decode, 0.1 * number, number), 0.1 * number)
+        assert assembler.take(0.1 * number) is not None
+
+    numbers = iter(range(1, 10 * ROUNDS))
+    return {"one set out of one frame a camera, not decoded": _timed(lambda: one_set(next(numbers)))}
+
+
+def measure_shared_memory(size: Size, cameras: int) -> dict[str, tuple[float, float]]:
+    """A set of frames from another process: to publish it, and until the pilot has it."""
+    names = [f"camera-{index}" for index in range(cameras)]
+    lens = IntrinsicsConfig(fx=300.0, fy=300.0, cx=320.0, cy=240.0)
+    rig = RigConfig(cameras=tuple(CameraConfig(name=name, size_px=size, intrinsics=lens) for name in names))
+    where = SharedMemoryParameters(drone="bench", connect=(ENDPOINT,))
+    parameters = SourceParameters(kind="shared_memory", shared_memory=where)
+    source = SharedMemorySource(DroneConfig(rig=rig, source=parameters), parameters)
+    context = multiprocessing.get_context("spawn")
+    stopping, publishing_ms = context.Event(), context.SimpleQueue()
+    simulator = context.Process(target=_publish, args=(size, names, stopping, publishing_ms), daemon=True)
+    simulator.start()
+    source.start()
+    ages_ms: list[float] = []
+    try:
+        while len(ages_ms) < ROUNDS:
+            frames = source.newest(20.0)
+            if frames is None:
+                sys.exit("no frames came; is the port of the benchmark in use?")
+            if len(frames.frames) == cameras:
+                ages_ms.append((time.monotonic() - frames.time_s) * 1e3)
+    finally:
+        stopping.set()
+        source.stop()
+    for note in source.notes():
+        print(f"note: {note}", file=sys.stderr)
+    return {
+        f"publishing {cameras} frames to another process": publishing_ms.get(),
+        f"from the first of {cameras} frames published to the set received": _percentiles(ages_ms),
+    }
+
+
+def _publish(
+    size: Size, names: list[str], stopping: Event, times_ms: multiprocessing.SimpleQueue[tuple[float, float]]
+) -> None:
+    """In the other process: a set each period, stamped when it is sent."""
+    images = [_scene(size, seed) for seed in range(8)]
+    spent_ms = []
+    with FramePublisher(listen=[ENDPOINT]) as publisher:
+        number = 0
+        while not stopping.wait(PERIOD_S):
+            began_s = time.monotonic()
+            for index, name in enumerate(names):
+                publisher.publish("bench", Frame(name, images[(number + index) % len(images)], began_s, number))
+            spent_ms.append((time.monotonic() - began_s) * 1e3)
+            number += 1
+    times_ms.put(_percentiles(spent_ms))
+
+
+def _scene(size: Size, seed: int = 0) -> UInt8Array:
+    """RGB with about as much detail as a meadow has."""
+    rng = np.random.default_rng(seed)
+    coarse = rng.integers(0, 256, (size[1] // 16, size[0] // 16, 3), np.uint8)
+    grain = rng.integers(0, 12, (size[1], size[0], 3), np.uint8)
+    return np.asarray(cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC) // 2 + grain, np.uint8)
+
+
+def _timed(call: Callable[[], object]) -> tuple[float, float]:
+    call()
+    times_ms = []
+    for _ in range(ROUNDS):
+        began_s = time.perf_counter()
+        call()
+        times_ms.append((time.perf_counter() - began_s) * 1e3)
+    return _percentiles(times_ms)
+
+
+def _percentiles(times_ms: list[float]) -> tuple[float, float]:
+    return float(np.percentile(times_ms, 50)), float(np.percentile(times_ms, 95))
+
+
+if __name__ == "__main__":
+    main()
