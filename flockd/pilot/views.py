@@ -21,8 +21,10 @@ _FIRST_MARGIN = 1.3
 """A picture of a drone is this much wider than its box."""
 _SURE = 0.5
 """What the second look says is a drone with less than this probability is none."""
-_EXPECTED_MARGIN = 0.75
-"""Half of a picture of a drone that is expected somewhere is this many times its size wide."""
+_MARGIN = 0.68
+"""Half of a picture of a drone of known size is this many times its size wide."""
+_MAX_RESIZE = 1.7
+"""The second picture's angle is at most this many times the first's, and at least as much smaller."""
 _SURE_OF_EXPECTED = 0.7
 _EXPECTED_GATE = 0.2
 """What is found where a drone was expected must be as near to that place as this share of its range, or 0.5 m."""
@@ -170,7 +172,7 @@ class Observer:
             place = vehicle.R_ned_body.T @ one.position
             range_m = float(np.linalg.norm(place))
             direction = place / range_m
-            half_angle = float(np.clip(np.arctan(_EXPECTED_MARGIN * one.size_m / range_m), *_HALF_ANGLES))
+            half_angle = _half_angle(one.size_m, range_m)
             cameras = tuple(name for name, pixel in live.pixels_of(place[None]).items() if np.isfinite(pixel).all())
             if not cameras or any(_angle(direction, f.position) < half_angle for f in found):
                 continue
@@ -184,11 +186,14 @@ class Observer:
         ]
 
     def _look(self, live: Rig, images: Mapping[str, UInt8Array], candidates: Sequence[_Candidate]) -> list[_Located]:
-        """The second stage, twice: the second picture has the drone in the middle, and whole where cameras share it."""
+        """The second stage, twice: the second picture is cut to the drone's size, with it in the middle.
+
+        Where two cameras share the drone, the second picture shows it whole.
+        """
         first = self._ranges(live, images, [(c.direction, c.half_angle, None) for c in candidates])
         again = [
-            (_in_view(live, position, c), c.half_angle, range_m)
-            for c, (position, range_m, _) in zip(candidates, first, strict=True)
+            (_in_view(live, position, c), _half_angle(estimate.size_m, range_m, c.half_angle), range_m)
+            for c, (position, range_m, estimate) in zip(candidates, first, strict=True)
         ]
         second = self._ranges(live, images, again)
         return [
@@ -197,9 +202,9 @@ class Observer:
                 position=position,
                 range_sigma_m=max(estimate.relative_sigma, _MIN_RELATIVE_SIGMA) * range_m,
                 size_m=estimate.size_m,
-                is_drone=estimate.is_drone if _NEAREST_M < range_m < _FARTHEST_M else 0.0,
+                is_drone=min(estimate.is_drone, before.is_drone) if _NEAREST_M < range_m < _FARTHEST_M else 0.0,
             )
-            for c, (position, range_m, estimate) in zip(candidates, second, strict=True)
+            for c, (position, range_m, estimate), (_, _, before) in zip(candidates, second, first, strict=True)
         ]
 
     def _ranges(
@@ -311,6 +316,14 @@ def _angular_width(camera: RigCamera, instance: Instance) -> float:
 
 def _angle(a: FloatArray, b: FloatArray) -> float:
     return float(np.arccos(np.clip(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)), -1, 1)))
+
+
+def _half_angle(size_m: float, range_m: float, before: float | None = None) -> float:
+    """Half the angle of a picture that suits a drone of known size, not far from what it was ``before``."""
+    angle = float(np.arctan(_MARGIN * size_m / range_m))
+    if before is not None:
+        angle = float(np.clip(angle, before / _MAX_RESIZE, before * _MAX_RESIZE))
+    return float(np.clip(angle, *_HALF_ANGLES))
 
 
 def _in_view(live: Rig, position: FloatArray, candidate: _Candidate) -> FloatArray:
