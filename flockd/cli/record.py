@@ -121,7 +121,7 @@ def _info(args: argparse.Namespace) -> int:
         say_json(facts)
         return ExitCode.DONE
     from rich.console import Console
-    from rich.table import Column, Table
+    from rich.table import Table
 
     for name in ("drone", "version", "steps", "duration_s", "bytes", "images", "finished", "lost"):
         say(f"{name:12}{facts[name]}")
@@ -131,11 +131,10 @@ def _info(args: argparse.Namespace) -> int:
         say(f"{'gap':12}steps {gap['first_step']} to {gap['last_step']} are missing")
     for damage in facts["damages"]:
         say(f"{'damage':12}{damage['file']} at byte {damage['byte']}: {damage['reason']}")
-    schema = Column("schema", overflow="fold")
-    table = Table("stream", schema, "messages", "rate", "bytes", box=None, pad_edge=False)
+    table = Table("stream", "schema", "messages", "rate", box=None, pad_edge=False)
     for stream in facts["streams"]:
         rate = "" if stream["rate_hz"] is None else f"{stream['rate_hz']:.2f} Hz"
-        table.add_row(stream["topic"], stream["schema"], f"{stream['messages']}", rate, f"{stream['bytes']}")
+        table.add_row(stream["topic"], stream["schema"], f"{stream['messages']}", rate)
     Console(markup=False, highlight=False).print(table)
     return ExitCode.DONE
 

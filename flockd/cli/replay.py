@@ -216,9 +216,10 @@ def _recording_to(out: Path, recording: Recording, config: DroneConfig) -> Itera
     from flockd.config.parameters import RecordingConfig
     from flockd.recording import Recorder, RecordingError
     from flockd.recording.editing import written_whole
+    from flockd.recording.streams import REPLAYED
 
     settings = RecordingConfig(images="png", file_mb=1e9, quota_mb=1e12)
-    facts = {"replayed_from": recording.path.name}
+    facts = {REPLAYED: recording.path.name}
     with written_whole(out) as draft:
         with Recorder(
             draft, drone=recording.drone, config=config, settings=settings, models=models_of(config), facts=facts

@@ -107,8 +107,9 @@ def _recorders(
     from flockd.recording import Recorder
 
     directory.mkdir(exist_ok=True)
-    for earlier in directory.glob("drone*.mcap"):
-        earlier.unlink()
+    for earlier in directory.iterdir():
+        if re.fullmatch(r"drone\d+(\.\d+)?\.mcap", earlier.name):
+            earlier.unlink()
     facts = {"scenario": scenario.scenario, "seed": str(scenario.seed), "true_roles": ", ".join(sorted(swap))}
     return tuple(
         stack.enter_context(

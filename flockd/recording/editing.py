@@ -14,7 +14,7 @@ from flockd.recording import foxglove
 from flockd.recording.codec import from_json
 from flockd.recording.mcap_file import Entry, McapFile, Note, RecordingError, read_records
 from flockd.recording.reader import Contents, Recording, head_of, is_calibration, makes_steps
-from flockd.recording.streams import END_NOTE, FLIGHT_NOTE, FRAMES, VEHICLE, StepFrames
+from flockd.recording.streams import CUT, END_NOTE, FLIGHT_NOTE, FRAMES, RECOVERED, VEHICLE, StepFrames
 
 
 def recover(recording: Recording, target: Path) -> int:
@@ -22,7 +22,7 @@ def recover(recording: Recording, target: Path) -> int:
 
     Raises RecordingError when no step is whole, and OSError; then there is no target.
     """
-    return _copy(recording.contents, target, -np.inf, np.inf, {"recovered": recording.path.name})
+    return _copy(recording.contents, target, -np.inf, np.inf, {RECOVERED: recording.path.name})
 
 
 def cut(recording: Recording, target: Path, start_s: float, end_s: float) -> int:
@@ -30,7 +30,7 @@ def cut(recording: Recording, target: Path, start_s: float, end_s: float) -> int
 
     Raises RecordingError when no whole step is in it, and OSError; then there is no target.
     """
-    return _copy(recording.contents, target, start_s, end_s, {"cut_from": recording.path.name})
+    return _copy(recording.contents, target, start_s, end_s, {CUT: recording.path.name})
 
 
 @contextmanager

@@ -18,7 +18,6 @@ from flockd.messages import Frame, FrameSet, UInt8Array, VehicleState
 from flockd.recording import foxglove
 from flockd.recording.codec import from_json
 from flockd.recording.mcap_file import Damage, Entry, Inclosure, Note, Record, RecordingError, read_records
-from flockd.recording.recorder import part_path
 from flockd.recording.streams import (
     CONFIGURATION,
     END_NOTE,
@@ -29,6 +28,7 @@ from flockd.recording.streams import (
     OUTPUT,
     VEHICLE,
     StepFrames,
+    part_path,
 )
 
 _MEND = "`flockd record recover` makes a recording without it"
@@ -79,7 +79,11 @@ class Contents:
     lost: int = 0
     """Steps and messages that the recorder dropped, by its own count."""
     damages: list[tuple[Path, Damage]] = field(default_factory=list)
-    finished: bool = False
+
+    @property
+    def finished(self) -> bool:
+        """Whether its writer came to the end of it."""
+        return not any(damage.at_end for _, damage in self.damages)
 
     @property
     def gaps(self) -> tuple[tuple[int, int], ...]:
@@ -121,22 +125,23 @@ class Recording:
 
         Raises RecordingError where an image or a message is spoilt.
         """
-        gathered: dict[int, dict[str, bytes]] = {}
+        number, messages = -1, dict[str, bytes]()
         for path in self.contents.paths:
             for record in read_records(path):
                 if isinstance(record, Entry) and makes_steps(record.stream.topic):
-                    waiting = gathered.setdefault(record.sequence, {})
-                    waiting[record.stream.topic] = record.data
-                    if record.stream.topic == OUTPUT.topic:
-                        yield from self._built(record.sequence, gathered.pop(record.sequence), start_s, end_s)
-        for number, messages in gathered.items():  # killed between a step's images and its output
-            yield from self._built(number, messages, start_s, end_s)
+                    if record.sequence != number:
+                        yield from self._built(number, messages, start_s, end_s)
+                        number, messages = record.sequence, {}
+                    messages[record.stream.topic] = record.data
+        yield from self._built(number, messages, start_s, end_s)
 
     def _built(
         self, number: int, messages: Mapping[str, bytes], start_s: float, end_s: float
     ) -> Iterator[RecordedStep]:
-        if FRAMES.topic not in messages or VEHICLE.topic not in messages:
+        if FRAMES.topic not in messages:
             return
+        if VEHICLE.topic not in messages and not self.contents.finished and number == self.contents.steps[-1][0]:
+            return  # killed within this step
         try:
             listed: StepFrames = from_json(StepFrames, json.loads(messages[FRAMES.topic]))
             if not start_s <= listed.time_s <= end_s:
@@ -148,7 +153,7 @@ class Recording:
                 image = _picture(messages[foxglove.image_stream(entry.camera).topic])
                 frames[entry.camera] = Frame(entry.camera, image, entry.time_s, entry.sequence)
         except KeyError as error:
-            raise RecordingError(f"{self.path}: step {number} lost its image {error}; {_MEND}") from error
+            raise RecordingError(f"{self.path}: step {number} lost its message {error}; {_MEND}") from error
         except (ValueError, RecordingError) as error:
             raise RecordingError(f"{self.path}: step {number} cannot be read ({error}); {_MEND}") from error
         yield RecordedStep(number, FrameSet(listed.time_s, frames), vehicle, output)
@@ -196,13 +201,11 @@ def _survey(first: Path, progress: Callable[[int, int], None]) -> Contents:
     found.paths = tuple(_all_parts(first, flight))
     total, done = sum(path.stat().st_size for path in found.paths), 0
     for path in found.paths:
-        found.finished = True
         for record in read_records(path):
             if isinstance(record, Entry):
                 done += len(record.data)
                 progress(done, total)
             _note(found, path, record)
-        found.finished = found.finished and not any(where == path for where, _ in found.damages)
     if not found.steps:
         raise RecordingError(f"{first}: holds no step of a flight; record one that flies")
     return found

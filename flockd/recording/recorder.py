@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import platform
 import queue
-import re
 import threading
 import time
 import uuid
@@ -24,9 +23,11 @@ from flockd.config.parameters import RecordingConfig, RigConfig
 from flockd.messages import Frame, FrameSet, PilotOutput, VehicleState
 from flockd.recording import foxglove
 from flockd.recording.codec import to_json
-from flockd.recording.mcap_file import Entry, Inclosure, McapFile, Note
+from flockd.recording.mcap_file import Entry, Inclosure, McapFile, Note, RecordingError
+from flockd.recording.reader import head_of
 from flockd.recording.streams import (
     CONFIGURATION,
+    EDITED,
     END_NOTE,
     FLIGHT_NOTE,
     FORMAT,
@@ -38,6 +39,7 @@ from flockd.recording.streams import (
     FrameEntry,
     StepFrames,
     nanoseconds,
+    part_path,
 )
 from flockd.telemetry import publish_step
 from flockd.telemetry.topics import EventMessage
@@ -142,7 +144,10 @@ class Recorder:
         self._put(_Step(number, frames, vehicle, output), size + _SMALL_BYTES)
 
     def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
-        """Takes one telemetry message, if the table of topics wants it recorded; a `TelemetrySink`."""
+        """Takes one telemetry message, if the table of topics wants it recorded; a `TelemetrySink`.
+
+        For what does not follow from a step, such as events: all that does is written with the step.
+        """
         if drone == self._drone and topic in TABLE:
             self._put(_Message(topic, message), _SMALL_BYTES)
 
@@ -366,9 +371,11 @@ class _Parts:
             self._file.abandon()
 
     def _make_room(self) -> None:
-        """Deletes this drone's oldest recordings in the folder until a whole file more stays within the quota."""
-        name = re.compile(rf"{re.escape(self._flight['drone'])}([.-].*)?\.mcap")
-        others = [p for p in self._first.parent.iterdir() if name.fullmatch(p.name) and p != self.path]
+        """Deletes this drone's oldest recordings in the folder until a whole file more stays within the quota.
+
+        Only what a recorder wrote: what someone cut or recovered from it stays and does not count.
+        """
+        others = [path for path in self._first.parent.glob("*.mcap") if path != self.path and self._is_ours(path)]
         others.sort(key=lambda path: path.stat().st_mtime)
         room = (self._settings.quota_mb - self._settings.file_mb) * _MB - sum(path.stat().st_size for path in others)
         for path in others:
@@ -378,10 +385,12 @@ class _Parts:
             path.unlink()
             self._tell(f"recording: {path} was deleted, as all recordings may take {self._settings.quota_mb:g} MB")
 
-
-def part_path(first: Path, number: int) -> Path:
-    """Of a recording's files, the one with this number; the first is number 0."""
-    return first.with_name(f"{first.stem}.{number}{first.suffix}") if number else first
+    def _is_ours(self, path: Path) -> bool:
+        try:
+            facts = head_of(path)[0].facts
+        except RecordingError:
+            return False
+        return facts.get("drone") == self._flight["drone"] and not facts.keys() & EDITED
 
 
 def _step_entries(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from flockd.messages import PilotOutput, VehicleState
@@ -16,6 +17,8 @@ FORMAT = "1"
 FLIGHT_NOTE = "flockd"
 MODELS_NOTE = "models"
 END_NOTE = "end"
+RECOVERED, CUT, REPLAYED = EDITED = ("recovered_from", "cut_from", "replayed_from")
+"""Facts of a recording that was made of another."""
 CONFIGURATION = "configuration.json"
 
 
@@ -48,6 +51,11 @@ VEHICLE = _json_stream("/vehicle", VehicleState)
 OUTPUT = _json_stream("/output", PilotOutput)
 TABLE = {key: _json_stream(f"/{key}", topic.type) for key, topic in TOPICS.items() if topic.recorded}
 """The telemetry that the table of topics wants recorded."""
+
+
+def part_path(first: Path, number: int) -> Path:
+    """Of a recording's files, the one with this number; the first is number 0."""
+    return first.with_name(f"{first.stem}.{number}{first.suffix}") if number else first
 
 
 def nanoseconds(time_s: float) -> int:

@@ -88,7 +88,7 @@ def test_damage_within_is_told_and_recovered_from(tmp_path: Path, whole: Path) -
     assert where == path
     assert at - 200_000 < damage.offset <= at
     assert not damage.at_end
-    with pytest.raises(RecordingError, match=r"step \d lost its image .*; `flockd record recover` makes"):
+    with pytest.raises(RecordingError, match=r"step \d lost its message .*; `flockd record recover` makes"):
         list(damaged.steps())
     steps = recover(damaged, tmp_path / "mended.mcap")
     mended = Recording(tmp_path / "mended.mcap")

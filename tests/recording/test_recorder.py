@@ -26,6 +26,7 @@ from flockd.config import DroneConfig
 from flockd.config.parameters import RecordingConfig
 from flockd.geometry import build_rig
 from flockd.recording import Recorder
+from flockd.recording.editing import cut
 from flockd.recording.reader import Recording
 from flockd.telemetry import TOPICS
 from tests.recording.made_up import MODELS, MadeUpPilot, drone_config, inputs, record
@@ -152,13 +153,17 @@ def test_a_frame_that_is_no_picture_is_left_out_and_told(tmp_path: Path) -> None
 def test_files_turn_over_and_stay_within_the_quota(tmp_path: Path) -> None:
     others = tmp_path / "drone10.mcap"
     others.write_bytes(b"another drone's")
+    record(tmp_path / "yesterday.mcap", steps=5)
+    cut(Recording(tmp_path / "yesterday.mcap"), tmp_path / "kept.mcap", 0.0, 2000.0)
     settings = RecordingConfig(file_mb=0.4, quota_mb=1.2)
     record(tmp_path / "drone1.mcap", steps=15, settings=settings)
     files = sorted(tmp_path.glob("drone1.*mcap"))
     assert 2 <= len(files) < 6
     assert sum(file.stat().st_size for file in files) < 1.2e6 + 2.5e5, "within the quota, but for one step too many"
     assert others.exists()
-    assert not (tmp_path / "drone1.mcap").exists(), "the oldest goes first"
+    assert (tmp_path / "kept.mcap").exists(), "what someone cut out is not the recorder's to delete"
+    assert not (tmp_path / "yesterday.mcap").exists(), "the oldest goes first"
+    assert not (tmp_path / "drone1.mcap").exists(), "then its own beginning"
     first = Recording(min(files, key=lambda file: int(file.suffixes[0][1:])))
     assert set(first.contents.paths) == set(files)
     numbers = [step.number for step in first.steps()]
