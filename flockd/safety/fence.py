@@ -36,17 +36,16 @@ def offsets_outside(p: GateParameters, position: FloatArray) -> FloatArray:
         offsets.append(position * (1 - p.fence_radius_m / distance))
     if p.fence_corners_m and not _inside(position, np.array(p.fence_corners_m)):
         offsets.append(position - _nearest_on_outline(position, np.array(p.fence_corners_m)))
-    return np.array(offsets).reshape(-1, 2)
+    return np.reshape(offsets, (len(offsets), 2))
 
 
 def _inside(point: FloatArray, corners: FloatArray) -> bool:
     """Whether a point is in a polygon: a ray from it to the east crosses the outline an odd number of times."""
     north, east = point
-    inside = False
-    for (n1, e1), (n2, e2) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        if (n1 > north) != (n2 > north) and east < e1 + (e2 - e1) * (north - n1) / (n2 - n1):
-            inside = not inside
-    return inside
+    ends = np.roll(corners, -1, axis=0)
+    spans = (corners[:, 0] > north) != (ends[:, 0] > north)
+    (n1, e1), (n2, e2) = corners[spans].T, ends[spans].T
+    return bool(np.sum(east < e1 + (e2 - e1) * (north - n1) / (n2 - n1)) % 2)
 
 
 def _nearest_on_outline(point: FloatArray, corners: FloatArray) -> FloatArray:

@@ -33,8 +33,8 @@ def _outline(corners: tuple[tuple[float, float], ...]) -> FloatArray:
 
 def test_a_circle_around_home() -> None:
     fence = GateParameters(fence_radius_m=50.0)
-    assert not outside_fence(fence, np.array([30.0, 40.0]))
-    assert outside_fence(fence, np.array([30.0, 40.01]))
+    assert outside_fence(fence, np.array([30.0, 40.0])) is False
+    assert outside_fence(fence, np.array([30.0, 40.01])) is True
     assert outside_fence(fence, np.array([-30.0, -40.01]))
     # 6, 8 outward of the point 30, 40 where the ray from home leaves the circle
     np.testing.assert_allclose(offsets_outside(fence, np.array([36.0, 48.0])), [[6.0, 8.0]])
@@ -42,7 +42,7 @@ def test_a_circle_around_home() -> None:
 
 def test_without_a_fence_nothing_is_outside_not_even_the_unknown() -> None:
     nothing = GateParameters(fence_radius_m=None)
-    assert not outside_fence(nothing, np.array([1e6, 1e6]))
+    assert outside_fence(nothing, np.array([1e6, 1e6])) is False
     assert not outside_fence(nothing, NOWHERE)
     assert len(offsets_outside(nothing, np.array([1e6, 1e6]))) == 0
 
