@@ -121,6 +121,13 @@ FRAMES_OVER_ZENOH = PACKAGE / "sources" / "shared_memory.py"
 """A drone's own camera frames may come over zenoh, under keys that no telemetry has."""
 
 
+@pytest.mark.parametrize(
+    ("library", "adapter"), [("mavsdk", "autopilot/mavsdk_link.py"), ("pymavlink", "autopilot/stand_in.py")]
+)
+def test_an_outside_library_sits_behind_one_file(library: str, adapter: str) -> None:
+    assert [path for path in MODULES if library in _libraries(path)] == [PACKAGE / adapter]
+
+
 def test_no_drone_reads_telemetry_to_fly() -> None:
     """Telemetry can be published, and nothing in the package can subscribe to it."""
     from flockd.sources import shared_memory
