@@ -78,7 +78,7 @@ def measure_decoding(size: Size) -> dict[str, tuple[float, float]]:
 def measure_sets(cameras: int) -> dict[str, tuple[float, float]]:
     """One frame of each camera in, one set out, without decoding."""
     names = [f"camera-{index}" for index in range(cameras)]
-    assembler = Assembler(names, SourceParameters(kind="shared_memory"), 0.0)
+    assembler = Assembler(names, SourceParameters(kind="shared_memory"))
     decode = RgbFormat((1, 1)).decode
     payloads = [bytes([number % 256]) * 40_000 for number in range(7)]
 

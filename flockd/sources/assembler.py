@@ -37,25 +37,26 @@ class _Line:
     repeats: int = 0
     usable_s: float = -math.inf
     """When its last usable frame arrived."""
+    awaited: bool = True
     counts: Counter[Count] = field(default_factory=Counter)
 
 
 class Assembler:
     """Frames go in one by one, sets come out; the newest wins.
 
-    A set is complete when every camera that is alive has a frame within ``set_tolerance_s`` of the set's time, which is
-    the stamp of one of its frames. A camera is alive until it has brought nothing usable for ``set_wait_s``. What is
-    not complete after ``set_wait_s`` goes on as it is. Set times increase, and no frame is in two sets.
+    A set is complete when every camera that is awaited has a frame within ``set_tolerance_s`` of the set's time, which
+    is the stamp of one of its frames. What is not complete ``set_wait_s`` after a frame came goes on as it is, and who
+    is absent from it is not awaited again before its next usable frame. Set times increase, and no frame is in two
+    sets.
 
     ``now_s`` is the caller's clock; it is only compared with itself, never with time stamps.
     """
 
-    def __init__(self, cameras: Sequence[str], parameters: SourceParameters, now_s: float) -> None:
+    def __init__(self, cameras: Sequence[str], parameters: SourceParameters) -> None:
         self._lines = {camera: _Line() for camera in cameras}
         self._tolerance_s = parameters.set_tolerance_s
         self._wait_s = parameters.set_wait_s
         self._frozen_after = parameters.frozen_after or math.inf
-        self._started_s = now_s
         self._last_set_s = -math.inf
 
     def offer(self, frame: RawFrame, now_s: float) -> Count | None:
@@ -67,6 +68,7 @@ class Assembler:
             line.counts[refused] += 1
             return refused
         line.usable_s = now_s
+        line.awaited = True
         line.held.append(_Held(frame, now_s))
         while self._is_useless(line):
             line.held.popleft()
@@ -75,11 +77,11 @@ class Assembler:
 
     def take(self, now_s: float) -> RawFrameSet | None:
         """The newest set that is ready; None if there is none newer than the last."""
-        alive = {name for name, line in self._lines.items() if now_s - self._heard_s(line) <= self._wait_s}
+        awaited = {name for name, line in self._lines.items() if line.awaited}
         best: RawFrameSet | None = None
         for time_s in self._times():
             candidate = RawFrameSet(time_s, self._near(time_s))
-            if alive <= candidate.frames.keys():
+            if awaited <= candidate.frames.keys():
                 return self._handed_out(candidate)
             if best is None or len(candidate.frames) > len(best.frames):
                 best = candidate
@@ -121,9 +123,6 @@ class Assembler:
         span_s = line.held[-1].frame.time_s - line.held[0].frame.time_s
         return span_s > self._wait_s + self._tolerance_s or len(line.held) > _MOST_HELD
 
-    def _heard_s(self, line: _Line) -> float:
-        return max(line.usable_s, self._started_s)
-
     def _times(self) -> list[float]:
         """Where a set could be, newest first."""
         stamps = {held.frame.time_s for line in self._lines.values() for held in line.held}
@@ -150,6 +149,7 @@ class Assembler:
         for name, line in self._lines.items():
             used = chosen.frames.get(name)
             line.counts["used" if used else "missing"] += 1
+            line.awaited = used is not None
             until_s = used.time_s if used else chosen.time_s - self._tolerance_s
             while line.held and line.held[0].frame.time_s <= until_s:
                 if line.held.popleft().frame is not used:

@@ -23,7 +23,7 @@ class Intake:
         self, cameras: Sequence[str], parameters: SourceParameters, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._clock = clock
-        self._assembler = Assembler(cameras, parameters, clock())
+        self._assembler = Assembler(cameras, parameters)
         self._faults: dict[str, str | None] = dict.fromkeys(cameras)
         self._changed = threading.Condition()
         self._stopped = False
