@@ -43,9 +43,11 @@ ON_GROUND_M = 0.05
 ARRIVED_M = 0.3
 ALL_ESTIMATED = 1 | 2 | 4 | 8 | 16 | 32
 OFFBOARD_LOSS_MODES: dict[int, Mode] = {0: "RTL", 3: "RTL", 4: "LAND", 5: "LOITER"}
-"""COM_OBL_RC_ACT; 0 would be position mode, which needs a remote control that the stand-in has not got."""
+"""By COM_OBL_RC_ACT, no others; 0 would be position mode, which needs a remote control: the stand-in has none."""
 LATITUDE_DEG, LONGITUDE_DEG = 47.3977, 8.5456
 MAX_SETPOINTS_KEPT = 100_000
+SO_TIMESTAMPNS = 35
+"""Of Linux: the kernel says when each packet came, however long this thread waited for a turn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,12 +137,13 @@ class AutopilotStandIn:
         }
         """An int is an INT32 parameter, a float a REAL32 one."""
         self.setpoints: deque[tuple[float, Setpoint]] = deque(maxlen=MAX_SETPOINTS_KEPT)
-        """When each came, on the monotonic clock, and what it said."""
+        """When each came by the kernel's stamp, on the monotonic clock, and what it said."""
         self.refused_setpoints = 0
 
         self._target = ("127.0.0.1", port)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
+        self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         self._mav = mavlink.MAVLink(self, srcSystem=system_id, srcComponent=1)
         self._mav.robust_parsing = True
         self._motion = motion or PointMass(np.array([0.0, 0.0, -height_m]), yaw_rad)
@@ -223,14 +226,15 @@ class AutopilotStandIn:
         while (left_s := deadline - time.monotonic()) > 0:
             self._socket.settimeout(left_s)
             try:
-                data = self._socket.recv(4096)
+                data, ancillary, _, _ = self._socket.recvmsg(4096, 64)
             except TimeoutError:
                 return
             if self.silent:
                 continue
+            arrived_s = _arrival(ancillary)
             with self._lock:
                 for message in self._mav.parse_buffer(data) or ():
-                    self._handle(message)
+                    self._handle(message, arrived_s)
 
     # Rules
 
@@ -309,12 +313,12 @@ class AutopilotStandIn:
 
     # MAVLink, in
 
-    def _handle(self, message: Any) -> None:
+    def _handle(self, message: Any, arrived_s: float) -> None:
         if getattr(message, "target_system", self._mav.srcSystem) != self._mav.srcSystem:
             return
         match message.get_type():
             case "SET_POSITION_TARGET_LOCAL_NED":
-                self._take_setpoint(message)
+                self._take_setpoint(message, arrived_s)
             case "COMMAND_LONG":
                 result = self._obey(int(message.command), message)
                 self._mav.command_ack_send(
@@ -328,14 +332,13 @@ class AutopilotStandIn:
             case _:
                 pass
 
-    def _take_setpoint(self, message: Any) -> None:
+    def _take_setpoint(self, message: Any, arrived_s: float) -> None:
         numbers = (message.vx, message.vy, message.z, message.yaw)
         if message.type_mask != TYPE_MASK or message.coordinate_frame != 1 or not np.isfinite(numbers).all():
             self.refused_setpoints += 1
             return
-        now = time.monotonic()
         velocity = np.array([message.vx, message.vy])
-        self.setpoints.append((now, Setpoint(now, velocity, height_m=-message.z, yaw_rad=message.yaw)))
+        self.setpoints.append((arrived_s, Setpoint(arrived_s, velocity, height_m=-message.z, yaw_rad=message.yaw)))
 
     def _obey(self, command: int, message: Any) -> int:
         done: bool
@@ -472,6 +475,14 @@ def quaternion_from_rotation(rotation: FloatArray) -> tuple[float, float, float,
         cr * sp * cy + sr * cp * sy,
         cr * cp * sy - sr * sp * cy,
     )
+
+
+def _arrival(ancillary: list[tuple[int, int, bytes]]) -> float:
+    """When a packet came by the kernel's stamp, on the monotonic clock."""
+    (stamp,) = (data for level, kind, data in ancillary if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS))
+    seconds, nanoseconds = struct.unpack("@ll", stamp)
+    ago_s = time.time() - (seconds + nanoseconds * 1e-9)
+    return time.monotonic() - float(ago_s)
 
 
 def _mode_by_number(main: int, sub: int) -> Mode | None:

@@ -21,6 +21,9 @@ Send = Callable[[Setpoint], None]
 Gate = Callable[[Setpoint], Setpoint | None]
 """What may be sent in a setpoint's place; None: nothing."""
 
+CLOSE_TIMEOUT_S = 1.0
+"""A cable that takes no more bytes may hold the thread for ever; it dies with the process."""
+
 
 @dataclass(frozen=True)
 class StreamReport:
@@ -83,7 +86,7 @@ class SetpointStreamer:
         self.end("closed")
         self._closing.set()
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(CLOSE_TIMEOUT_S)
 
     def begin(self) -> None:
         """Streams from now on, with setpoints given from now on."""

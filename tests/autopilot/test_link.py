@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -187,6 +189,23 @@ def test_two_links_on_two_ports_mind_their_own_vehicle(port: int, stand_in: Auto
     second_port = port + 1 if port < 65535 else port - 1
     with AutopilotStandIn(second_port, system_id=9, height_m=4.0, heartbeat_s=HEARTBEAT_S) as second:
         asyncio.run(story())
+
+
+def test_the_stand_in_runs_as_a_program_too(port: int) -> None:
+    async def story() -> None:
+        link = await AutopilotLink.connect(_parameters(port, system_id=4))
+        await until(lambda: link.vehicle_state() is not None)
+        state = link.vehicle_state()
+        assert state is not None
+        assert state.height_m == pytest.approx(6.0)
+        await link.close()
+
+    options = ["--port", str(port), "--system-id", "4", "--height", "6"]
+    with subprocess.Popen([sys.executable, "-m", "flockd.autopilot.stand_in", *options]) as program:
+        try:
+            asyncio.run(story())
+        finally:
+            program.kill()
 
 
 def test_nobody_there_is_told_with_what_to_check(port: int) -> None:

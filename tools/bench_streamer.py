@@ -1,0 +1,120 @@
+"""Measure how regularly setpoints leave while the networks keep every core busy, and print one table.
+
+python tools/bench_streamer.py [--seconds 20] [--json]
+
+A child process streams through MAVSDK to an autopilot stand-in in this one, first idle, then with the shipped networks
+and geometry running without a pause. The times are those at which the kernel handed the packets over.
+Exit code 1: p99 above 60 ms, or a gap of 0.5 s.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from flockd.autopilot.mavsdk_link import AutopilotLink
+from flockd.autopilot.stand_in import AutopilotStandIn
+from flockd.autopilot.streamer import SetpointStreamer
+from flockd.config.parameters import AutopilotParameters
+from flockd.data import data_path
+from flockd.messages import Setpoint
+from flockd.perception.session import OnnxModel, golden_feeds
+
+P99_BAR_MS = 60.0
+WORST_BAR_MS = 500.0
+WARM_UP_S = 1.0
+
+
+def main() -> int:
+    """Measure and print; the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=20.0, help="for each row (20)")
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--child", nargs=2, metavar=("PORT", "LOAD"), help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.child:
+        port, load = arguments.child
+        print(json.dumps(asyncio.run(stream(int(port), arguments.seconds, loaded=load == "busy"))))
+        return 0
+    rows = {load: intervals_ms(load, arguments.seconds) for load in ("idle", "busy")}
+    if arguments.json:
+        print(json.dumps(rows, indent=1))
+    else:
+        print(f"{'this process':14s}{'setpoints':>10s}{'p50 ms':>9s}{'p99 ms':>9s}{'max ms':>9s}")
+        for load, row in rows.items():
+            print(f"{load:14s}{row['count']:10.0f}{row['p50']:9.1f}{row['p99']:9.1f}{row['max']:9.1f}")
+    passed = all(row["p99"] <= P99_BAR_MS and row["max"] < WORST_BAR_MS for row in rows.values())
+    return 0 if passed else 1
+
+
+def intervals_ms(load: str, seconds: float) -> dict[str, float]:
+    """How many setpoints came, and median, 99th percentile and longest of the intervals between them."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = int(probe.getsockname()[1])
+    with AutopilotStandIn(port, height_m=2.5) as stand_in:
+        command = [sys.executable, sys.argv[0], "--seconds", str(seconds), "--child", str(port), load]
+        child = subprocess.run(command, stdout=subprocess.PIPE, check=True)
+        begun_s, ended_s = json.loads(child.stdout)
+        times_s = [time_s for time_s, _ in stand_in.setpoints if begun_s <= time_s <= ended_s]
+    intervals = 1000.0 * np.diff(times_s)
+    p50, p99 = np.percentile(intervals, (50, 99))
+    return {"count": len(times_s), "p50": float(p50), "p99": float(p99), "max": float(intervals.max())}
+
+
+async def stream(port: int, seconds: float, *, loaded: bool) -> tuple[float, float]:
+    """Streams beside a control task, and a load where wanted; from when to when, on the monotonic clock."""
+    parameters = AutopilotParameters(address=f"udpin://127.0.0.1:{port}")
+    link = await AutopilotLink.connect(parameters)
+    streamer = SetpointStreamer(link.send_setpoint, link.status, lambda setpoint: setpoint, parameters)
+    streamer.start()
+    streamer.begin()
+    stop = threading.Event()
+    threads = [threading.Thread(target=work, args=(stop,)) for work in works()] if loaded else []
+    for thread in threads:
+        thread.start()
+    until_s = time.monotonic() + WARM_UP_S + seconds
+    while time.monotonic() < until_s:
+        streamer.offer(Setpoint(time.monotonic(), np.array([1.0, 0.0]), 2.5, 0.0))
+        streamer.beat()
+        await asyncio.sleep(0.05)
+    stop.set()
+    for thread in threads:
+        thread.join()
+    streamer.close()
+    await link.close()
+    return until_s - seconds, until_s
+
+
+def works() -> list[Callable[[threading.Event], None]]:
+    """What a drone computes: all networks in turn, on as many threads as there are cores, and geometry beside them."""
+    models = [OnnxModel(path, threads=os.cpu_count() or 1) for path in sorted(data_path("models").glob("*.yaml"))]
+
+    def networks(stop: threading.Event) -> None:
+        while not stop.is_set():
+            for model in models:
+                model.run(golden_feeds(model.manifest))
+
+    def geometry(stop: threading.Event) -> None:
+        pairs = np.random.default_rng(0).normal(size=(200, 3, 300))
+        while not stop.is_set():
+            np.linalg.svd(pairs @ pairs.transpose(0, 2, 1))
+
+    return [networks, geometry]
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
