@@ -80,13 +80,15 @@ def filled(kind: Any, number: float, name: str = "") -> Any:
     return {float: number, int: 3, bool: True, str: "front"}[kind]
 
 
-def inputs(steps: int, period_s: float = 0.1, seed: int = 0) -> Iterator[tuple[FrameSet, VehicleState]]:
-    """Frame sets and vehicle states at times that no decimal fraction hits."""
+def inputs(
+    steps: int, period_s: float = 0.1, seed: int = 0, levels: int = 256
+) -> Iterator[tuple[FrameSet, VehicleState]]:
+    """Frame sets and vehicle states at times that no decimal fraction hits; pictures of few levels compress well."""
     rng = np.random.default_rng(seed)
     for step in range(steps):
         time_s = 1000.0 + period_s * step + 1 / 3e6
         frames = {
-            name: Frame(name, rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8), time_s - 1e-3 / 7, 10 + step)
+            name: Frame(name, rng.integers(0, levels, (HEIGHT, WIDTH, 3), dtype=np.uint8), time_s - 1e-3 / 7, 10 + step)
             for name in ("front", "left")
         }
         turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]

@@ -17,6 +17,7 @@ from flockd.recording import RecordingError
 from flockd.recording.codec import to_json
 from flockd.recording.editing import cut, recover
 from flockd.recording.export import export_images, export_tables
+from flockd.recording.mcap_file import Damage, Entry, McapFile, read_records
 from flockd.recording.reader import Recording
 from tests.recording.made_up import record
 
@@ -100,6 +101,23 @@ def test_damage_within_is_told_and_recovered_from(tmp_path: Path, whole: Path) -
     assert last - first + 1 == 10 - steps
 
 
+def test_a_step_without_its_vehicle_is_the_last_of_a_killed_one_or_an_error(tmp_path: Path, whole: Path) -> None:
+    records = [record for record in read_records(whole) if not isinstance(record, Damage)]
+    vehicles = [n for n, r in enumerate(records) if isinstance(r, Entry) and r.stream.topic == "/vehicle"]
+    killed = McapFile(tmp_path / "killed.mcap")
+    for written in records[: vehicles[-1]]:
+        killed.write(written)
+    killed.flush()
+    killed.abandon()
+    assert [step.number for step in Recording(killed.path).steps()] == list(range(9))
+    with McapFile(tmp_path / "odd.mcap") as odd:
+        for number, written in enumerate(records):
+            if number != vehicles[4]:
+                odd.write(written)
+    with pytest.raises(RecordingError, match="step 4 lost its message '/vehicle'"):
+        list(Recording(odd.path).steps())
+
+
 KILLS = 8
 FLYING = f"""
 import os, random, signal, sys, time
@@ -111,7 +129,7 @@ def fly(path, pipe):
     config = drone_config()
     pilot = MadeUpPilot(config)
     recorder = Recorder(path, drone="drone1", config=config)
-    for frames, vehicle in inputs(1000, period_s=0.1):
+    for frames, vehicle in inputs(1000, period_s=0.1, levels=1):  # so little that nothing is written for its size
         recorder.step(frames, vehicle, pilot.step(frames, vehicle))
         os.write(pipe, f"{{frames.time_s!r}}\\n".encode())
         time.sleep(0.1)

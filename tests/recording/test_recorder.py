@@ -235,6 +235,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_flight(tmp_path: Path, kind:
         assert told == [f"recording {path}: {reason}; the recording ends here and the flight goes on"]
         assert recorder.failure == told[0]
         assert recorder.lost > 15
+        assert str(path) not in {f"{fd.readlink()}" for fd in Path("/proc/self/fd").iterdir() if fd.is_symlink()}
         recording = Recording(path)
         assert not recording.contents.finished
         kept = list(recording.steps())
