@@ -203,6 +203,26 @@ def test_what_comes_after_its_set_has_gone_is_late() -> None:
     assert stage.assembler.age_s("back", stage.now_s) == math.inf, "what is of no use is no sign of life"
 
 
+def test_of_two_frames_within_the_tolerance_the_nearer_is_taken() -> None:
+    stage = Stage("front", "back")
+    stage.send("back", 0.986)
+    stage.send("back", 1.0)
+    stage.send("front", 1.003)
+    assert stage.stamps() == {"front": 1.003, "back": 1.0}
+
+
+def test_a_frame_just_older_than_the_last_set_begins_none_but_may_join_the_next() -> None:
+    stage = Stage("front", "back")
+    stage.send("front", 1.0)
+    stage.now_s += 0.11
+    assert stage.stamps() == {"front": 1.0}
+    assert stage.send("back", 0.99) is None
+    stage.now_s += 0.11
+    assert stage.take() is None
+    stage.send("front", 1.005)
+    assert stage.stamps() == {"front": 1.005, "back": 0.99}
+
+
 @pytest.mark.parametrize("time_s", [5.0, 4.9, -3.0, math.nan, math.inf])
 def test_a_stamp_that_stands_still_or_goes_back_or_is_no_number_is_dropped(time_s: float) -> None:
     stage = Stage("front")
