@@ -14,11 +14,15 @@ HEARTBEAT_S = 0.25
 """Quicker than PX4's, so that a story does not begin with a second of waiting."""
 
 
-@pytest.fixture
-def port() -> int:
+def free_port() -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+@pytest.fixture
+def port() -> int:
+    return free_port()
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from flockd.autopilot.stand_in import AutopilotStandIn, Demand, MotionState
 from flockd.autopilot.status import AutopilotError, Firmware
 from flockd.config.parameters import AutopilotParameters
 from flockd.messages import Setpoint
-from tests.autopilot.conftest import HEARTBEAT_S
+from tests.autopilot.conftest import HEARTBEAT_S, free_port
 
 try:
     from flockd.autopilot.mavsdk_link import SETPOINT_TYPE_MASK, AutopilotLink
@@ -186,7 +186,7 @@ def test_two_links_on_two_ports_mind_their_own_vehicle(port: int, stand_in: Auto
             assert second.state.velocity[0] == pytest.approx(-0.5, abs=0.15)
             assert (one.link.system_id, two.link.system_id) == (1, 9)
 
-    second_port = port + 1 if port < 65535 else port - 1
+    second_port = free_port()
     with AutopilotStandIn(second_port, system_id=9, height_m=4.0, heartbeat_s=HEARTBEAT_S) as second:
         asyncio.run(story())
 
