@@ -76,14 +76,15 @@ def _seconds(text: str) -> float:
 
 def stretch(recording: Recording, args: argparse.Namespace) -> tuple[float, float]:
     """From when to when, on the recording's clock, --start and --end ask for. Raises UsageError for nothing."""
+    rounding_s = 1e-6
     end_s = recording.duration_s if args.end is None else args.end
-    if args.start > min(end_s, recording.duration_s):
+    begin, end = recording.start_s + args.start - rounding_s, recording.start_s + end_s + rounding_s
+    if not any(begin <= time_s <= end for _, time_s in recording.contents.steps):
         raise UsageError(
             f"{recording.path}: has no step from {args.start:g} s to {end_s:g} s, as it is "
             f"{recording.duration_s:g} s long; choose --start and --end within it"
         )
-    rounding_s = 1e-6
-    return recording.start_s + args.start - rounding_s, recording.start_s + end_s + rounding_s
+    return begin, end
 
 
 def opened(path: Path) -> Recording:
@@ -123,7 +124,7 @@ def _info(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.table import Table
 
-    for name in ("drone", "version", "steps", "duration_s", "bytes", "images", "finished", "lost"):
+    for name in ("drone", "began", "version", "steps", "duration_s", "bytes", "images", "finished", "lost"):
         say(f"{name:12}{facts[name]}")
     for name, sha256 in facts["models"].items():
         say(f"{'model':12}{name} {sha256[:12]}")

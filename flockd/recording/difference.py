@@ -101,6 +101,8 @@ def load_reference(path: Path) -> Outputs:
         lines = path.read_text(encoding="utf-8").splitlines()
         head, *steps = (json.loads(line) for line in lines)
         outputs = {int(line["step"]): dict(line["output"]) for line in steps}
+        if any(not isinstance(output["time_s"], float) for output in outputs.values()):
+            raise ValueError("a step has no time")  # noqa: TRY301 - told below
         if len(outputs) != head["steps"]:
             raise RecordingError(f"{path}: is cut off after {len(outputs)} of {head['steps']} steps; {_MEND}")
     except (ValueError, KeyError, TypeError) as error:

@@ -10,6 +10,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
@@ -42,7 +43,6 @@ from flockd.recording.streams import (
     part_path,
 )
 from flockd.telemetry import publish_step
-from flockd.telemetry.topics import EventMessage
 
 FLUSH_EVERY_S = 0.2
 _VERSIONS = {
@@ -108,7 +108,8 @@ class Recorder:
         self._settings = settings or config.recording
         self._drone = drone
         self._on_event = on_event
-        flight = {"drone": drone, "images": self._settings.images, **_VERSIONS, **(facts or {})}
+        began = datetime.now(UTC).isoformat(timespec="seconds")
+        flight = {"drone": drone, "began": began, "images": self._settings.images, **_VERSIONS, **(facts or {})}
         head = (
             Note(MODELS_NOTE, models or {}),
             Inclosure(CONFIGURATION, "application/json", config.model_dump_json(indent=1).encode()),
@@ -123,7 +124,8 @@ class Recorder:
         self._told_full = False
         self._closed = False
         self._failure: str | None = None
-        self._time_s = 0.0
+        self._time_s: float | None = None
+        self._early: list[_Message] = []
         self._thread = threading.Thread(target=self._write_all, name=f"recorder {drone}", daemon=True)
         self._thread.start()
 
@@ -194,7 +196,7 @@ class Recorder:
         """Into the file and to whoever listens."""
         with self._lock:
             self._held_bytes += _SMALL_BYTES
-            self._queue.put(_Message("events", EventMessage(time_s=self._time_s, event=event)))
+            self._queue.put(_Message("events", {"event": event}))
         self._on_event(event)
 
     def _write_all(self) -> None:
@@ -258,13 +260,19 @@ class Recorder:
         publish_step(_Direct(self._write_message), self._drone, step.vehicle, step.output)
         for reason in step.output.reasons:
             self._parts.write(_log_entry(step.frames.time_s, "WARNING", reason))
+        early, self._early = self._early, []
+        for item in early:  # told before there was a time
+            self._write_message(item)
 
     def _write_message(self, item: _Message) -> None:
         if item.topic not in TABLE:
             return
-        stamp = item.message.get("time_s")
-        time_s = float(stamp) if isinstance(stamp, int | float) else self._time_s
-        self._parts.write(_json_entry(TABLE[item.topic], time_s, 0, item.message))
+        stamp = item.message.get("time_s", self._time_s)  # without one: what this recorder tells of itself
+        if not isinstance(stamp, int | float):
+            self._early.append(item)
+            return
+        time_s = float(stamp)
+        self._parts.write(_json_entry(TABLE[item.topic], time_s, 0, {"time_s": time_s, **item.message}))
         if item.topic == "events":
             self._parts.write(_log_entry(time_s, "INFO", str(item.message.get("event", ""))))
 

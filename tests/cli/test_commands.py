@@ -109,7 +109,9 @@ def test_the_roles_to_swap_are_those_that_can_be() -> None:
     assert truth_perception.ROLES == ROLES
 
 
-@pytest.mark.parametrize("option", [["--flow", "dis"], ["--scale", "height"], ["--swap", "flow"], ["--telemetry"]])
+@pytest.mark.parametrize(
+    "option", [["--flow", "dis"], ["--scale", "height"], ["--swap", "flow"], ["--telemetry"], ["--record"]]
+)
 def test_options_of_sight_are_refused_without_sight(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sim", "--perception", "truth", *option]) == 2
     told = f"{option[0]} has no meaning when nobody looks; drop it or --perception truth\n"

@@ -68,6 +68,8 @@ def test_cut_takes_a_stretch(path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert json.loads(told(capsys, 0, "record", "cut", path, *stretch, "--json"))["steps"] == 4
     late = told(capsys, 2, "record", "cut", path, "--start", "5", "--out", path.with_name("late.mcap"))
     assert late == (f"{path}: has no step from 5 s to 0.9 s, as it is 0.9 s long; choose --start and --end within it\n")
+    between = told(capsys, 2, "record", "cut", path, "--start", "0.32", "--end", "0.38", "--out", "x.mcap")
+    assert "has no step from 0.32 s to 0.38 s" in between
     missing = told(capsys, 2, "record", "cut", path, "--out", path.parent / "nowhere" / "cut.mcap")
     assert missing.startswith(f"{path.parent / 'nowhere'}: is no folder; ")
     assert {file.name for file in path.parent.iterdir()} == {"drone1.mcap", "cut.mcap"}

@@ -166,6 +166,9 @@ def test_files_turn_over_and_stay_within_the_quota(tmp_path: Path) -> None:
     assert not (tmp_path / "drone1.mcap").exists(), "then its own beginning"
     first = Recording(min(files, key=lambda file: int(file.suffixes[0][1:])))
     assert set(first.contents.paths) == set(files)
+    told = [message for file in files for _, message in messages(file, "/events")]
+    assert told
+    assert all(message.log_time >= 1000e9 for message in told), "told before the first step, but not at time 0"
     numbers = [step.number for step in first.steps()]
     assert numbers == list(range(numbers[0], 15))
     assert Recording(files[-1]).config == drone_config(), "each file is complete in itself"
