@@ -158,9 +158,8 @@ def test_without_shared_memory_the_same_bytes_come_through_the_socket_with_a_not
         )
         frames, _ = _first(publisher, source)
         _assert_same(frames, int(frames.time_s / 0.5))
-        assert source.notes() == (
-            "frames come through a socket instead of shared memory: slower, and otherwise the same",
-        )
+        assert len(source.notes()) == 1
+        assert "through a socket instead of shared memory" in source.notes()[0]
 
 
 def test_a_pool_that_is_full_sends_through_the_socket_and_says_so_once(
