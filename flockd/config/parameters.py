@@ -85,6 +85,8 @@ class PerceptionConfig(Section):
     models_dir: str | None = None
     """Folder of the manifests; by default the one that comes with flockd."""
     threads: Annotated[int, Field(ge=1, le=64)] = 2
+    deadline_s: Positive = 1.0
+    """In flight, a network that has not answered one call by then is stuck, and is ended."""
     scale: ScaleSource = "height"
     """The background's metric scale: `network` (pure RGB, as in the paper) or `height` (attitude and height above
     ground from the autopilot)."""
@@ -290,6 +292,8 @@ class SharedMemoryParameters(Section):
     """Whose frames: the name under which they are published."""
     connect: Annotated[tuple[str, ...], Field(min_length=1)] = ("tcp/127.0.0.1:7448",)
     """zenoh endpoints of the program that publishes them."""
+    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
+    """How often each camera's frames come; `safety.camera_timeout_periods` counts in these."""
 
 
 class SourceParameters(Section):
@@ -354,6 +358,8 @@ class AutopilotParameters(Section):
     """By default the pilot arms, brings the drone up and switches to offboard."""
     height_m: Positive | None = None
     """Height above home to fly at; by default the height at which the flight begins."""
+    low_battery_share: Share = 0.2
+    """The battery counts as low when the autopilot says that no more than this is left."""
 
 
 class RecordingConfig(Section):
@@ -376,9 +382,28 @@ class RecordingConfig(Section):
         return self
 
 
+OperatorCommand = Literal["hold", "land", "resume"]
+
+
+class TelemetryParameters(Section):
+    """Who may watch this drone, and what they may ask of it."""
+
+    fleet: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")] = "fleet"
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    """zenoh endpoints at which watchers find this drone, as in `tcp/0.0.0.0:7447`."""
+    connect: tuple[str, ...] = ()
+    """zenoh endpoints, of a router or of `flockd status --listen`, that this drone tries to reach for ever."""
+    zenoh_config: str | None = None
+    """A file of zenoh's own settings to begin with, for TLS and access control; see `config/zenoh_tls.json5`."""
+    commands: tuple[OperatorCommand, ...] = ()
+    """What operators may ask over telemetry; by default nothing."""
+
+
 class DroneConfig(Section):
     """Everything one drone's pilot needs."""
 
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")] = "drone"
+    """By which it is known in telemetry and recordings; different for each drone of a fleet."""
     step_s: Positive = 0.5
     rig: RigConfig
     source: SourceParameters | None = None
@@ -405,6 +430,7 @@ class DroneConfig(Section):
     recording: RecordingConfig = RecordingConfig()
     autopilot: AutopilotParameters | None = None
     """None: this drone's commands go nowhere but to the simulator."""
+    telemetry: TelemetryParameters = TelemetryParameters()
 
     @model_validator(mode="after")
     def _every_camera_has_its_device(self) -> Self:

@@ -81,6 +81,11 @@ class Perception:
         """Whether there is a second stage."""
         return self._distance is not None
 
+    def terminate(self) -> None:
+        """Ends every run of a network that is under way; whoever called it gets an error."""
+        for model in self._models.values():
+            model.terminate()
+
     def flow(self, camera: str, first: UInt8Array, second: UInt8Array) -> Float32Array:
         """(h, w, 2) pixels from the first image to the second."""
         return self._flow.flow(first, second)

@@ -25,17 +25,32 @@ class OnnxModel:
         self.manifest, file = load_manifest(path)
         self._path = path
         self._session = _open(file, path, threads)
+        self._running: set[ort.RunOptions] = set()
         self._check_names()
         self.check_golden()
 
     def run(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         """The outputs by name. ``FloatingPointError`` when one is not finite."""
         names = list(self.manifest.outputs)
-        outputs = dict(zip(names, self._session.run(names, dict(feeds)), strict=True))
+        outputs = dict(zip(names, self._answers(names, feeds), strict=True))
         for name, value in outputs.items():
             if not np.isfinite(value).all():
                 raise FloatingPointError(f"model {self.manifest.name}: output {name} is not finite")
         return outputs
+
+    def terminate(self) -> None:
+        """Ends the runs that are under way, from any thread; ONNX Runtime then raises an error of its own in them."""
+        for options in tuple(self._running):
+            options.terminate = True
+
+    def _answers(self, names: list[str], feeds: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
+        options = ort.RunOptions()
+        self._running.add(options)
+        try:
+            answers: list[NDArray[Any]] = self._session.run(names, dict(feeds), options)
+        finally:
+            self._running.discard(options)
+        return answers
 
     def check_golden(self) -> None:
         """Run the golden input; ``ModelError`` when the answer is not the manifest's."""

@@ -1,42 +1,45 @@
-"""Publishes telemetry over zenoh, as one peer for all drones of a process."""
+"""Publishes telemetry over zenoh, as one peer for all drones of a process, and answers who asks."""
 
 from __future__ import annotations
 
 import json
 import math
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 import numpy as np
 import zenoh
 
-from flockd.errors import UnavailableError
-from flockd.telemetry.topics import PREFIX, TOPICS
+from flockd.telemetry.peer import DEFAULT_ENDPOINT, checked_name, open_peer
+from flockd.telemetry.topics import PREFIX, TOPICS, AboutMessage, AnswerMessage
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-_NAME = re.compile(r"[A-Za-z0-9_.-]+")
+Ask = Callable[[str], AnswerMessage]
+"""Takes an operator's command by name, on a thread of zenoh's; returns at once."""
 
 
 class ZenohTelemetry:
     """A telemetry sink that puts each message under `flockd/v1/<fleet>/<drone>/<topic>`.
 
-    It listens on and connects to the given endpoints only: it neither shouts nor hearkens on the network, as multicast
-    scouting is off. A put never waits: without a subscriber it goes nowhere, and a congested link drops it. Raises
-    UnavailableError when an endpoint cannot be used, and ValueError for a fleet's name that does not fit into a key.
+    It listens on and connects to the given endpoints only: it neither shouts nor hearkens on the network. A put never
+    waits: without a subscriber it goes nowhere, and a congested link drops it. Raises UnavailableError when an endpoint
+    or the file of settings cannot be used, and ValueError for a fleet's name that does not fit into a key.
     """
 
-    def __init__(self, fleet: str, *, listen: Sequence[str] = (DEFAULT_ENDPOINT,), connect: Sequence[str] = ()) -> None:
-        self._prefix = f"{PREFIX}/{_checked(fleet)}"
+    def __init__(
+        self,
+        fleet: str,
+        *,
+        listen: Sequence[str] = (DEFAULT_ENDPOINT,),
+        connect: Sequence[str] = (),
+        settings: Path | None = None,
+    ) -> None:
+        self._prefix = f"{PREFIX}/{checked_name(fleet)}"
         self._publishers: dict[tuple[str, str], zenoh.Publisher] = {}
+        self._kept: list[object] = []
         self._lost = 0
-        try:
-            self._session = zenoh.open(_peer_config(listen, connect))
-        except zenoh.ZError as error:
-            reason = str(error).split(" at ")[0].split(": [")[0]
-            endpoints = ", ".join([*listen, *connect])
-            raise UnavailableError(f"telemetry cannot use {endpoints} ({reason}); name another endpoint") from error
+        self._session = open_peer(listen, connect, settings)
 
     @property
     def lost(self) -> int:
@@ -53,6 +56,17 @@ class ZenohTelemetry:
             self._publisher(drone, topic).put(payload)
         except zenoh.ZError:  # telemetry never ends a flight
             self._lost += 1
+
+    def announce(self, drone: str, about: AboutMessage, ask: Ask) -> None:
+        """Shows that a drone is alive for as long as this session is, says what it flies with, and takes commands."""
+        key = f"{self._prefix}/{checked_name(drone)}"
+        self._kept += [
+            self._session.liveliness().declare_token(f"{key}/alive"),
+            self._session.declare_queryable(f"{key}/about", lambda query: _answer(query, about)),
+            self._session.declare_queryable(
+                f"{key}/ask/*", lambda query: _answer(query, ask(str(query.key_expr).rpartition("/")[2]))
+            ),
+        ]
 
     def close(self) -> None:
         """Ends the session; later messages are lost, and counted."""
@@ -72,7 +86,7 @@ class ZenohTelemetry:
             if topic not in TOPICS:
                 raise ValueError(f"{topic!r} is not a topic; the topics are {', '.join(TOPICS)}")
             publisher = self._session.declare_publisher(
-                f"{self._prefix}/{_checked(drone)}/{topic}",
+                f"{self._prefix}/{checked_name(drone)}/{topic}",
                 encoding=zenoh.Encoding.APPLICATION_JSON,
                 congestion_control=zenoh.CongestionControl.DROP,
             )
@@ -80,20 +94,9 @@ class ZenohTelemetry:
         return publisher
 
 
-def _peer_config(listen: Sequence[str], connect: Sequence[str]) -> zenoh.Config:
-    """A peer opens without a router, unlike a client."""
-    config = zenoh.Config()
-    config.insert_json5("mode", '"peer"')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("listen/endpoints", json.dumps(list(listen)))
-    config.insert_json5("connect/endpoints", json.dumps(list(connect)))
-    return config
-
-
-def _checked(name: str) -> str:
-    if not _NAME.fullmatch(name):
-        raise ValueError(f"{name!r} does not fit into a key; use letters, digits, '_', '.' and '-'")
-    return name
+def _answer(query: zenoh.Query, message: Mapping[str, object]) -> None:
+    """Answers under the key that was asked for; a query for several at once, as with `*`, is answered as one."""
+    query.reply(query.key_expr, json.dumps(_finite(message), allow_nan=False), encoding=zenoh.Encoding.APPLICATION_JSON)
 
 
 def _finite(value: object) -> object:

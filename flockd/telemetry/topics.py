@@ -2,6 +2,10 @@
 
 A key is `flockd/v1/<fleet>/<drone>/<topic>`; a message is a JSON object in UTF-8. Every number is finite or null.
 Vectors are lists: NED is north, east, down. Times are seconds on the drone's monotonic clock.
+
+`state` to `timings` follow from each step of the pilot; `flight` and `computer` come from the daemon, at all times.
+Beside the topics, a drone in flight has a liveliness token `.../alive`, answers a query for `.../about` with an
+`AboutMessage`, and one for `.../ask/hold`, `land` or `resume` with an `AnswerMessage`.
 """
 
 from __future__ import annotations
@@ -84,6 +88,89 @@ class TimingsMessage(TypedDict):
     stages_ms: dict[str, float]
 
 
+class ReasonMessage(TypedDict):
+    """Something that is the matter."""
+
+    event: str
+    """For programs: a value of `flockd.safety.Event`."""
+    sentence: str
+    """For people."""
+
+
+class FlightMessage(TypedDict):
+    """Who flies the drone, and why."""
+
+    time_s: float
+    state: str
+    """`idle`, `ready`, `normal`, `degraded`, `hover`, `asking` (for Hold or worse) or `silent` (handed over)."""
+    reasons: list[ReasonMessage]
+    """What is the matter, the worst first."""
+    flight_mode: str
+    """The autopilot's."""
+    armed: bool | None
+    in_air: bool | None
+    heartbeat_age_s: float | None
+    """Of the autopilot; null before the first."""
+    battery_share: float | None
+    """0 to 1."""
+    height_m: float | None
+    """Above home, up positive."""
+    silence: str | None
+    """Why no setpoint goes to the autopilot; null while they do."""
+    setpoints_sent: int
+    setpoints_missed: int
+    """Deadlines that this computer was too busy to keep."""
+
+
+class CameraMessage(TypedDict):
+    """How one camera is doing."""
+
+    age_s: float | None
+    """Since its newest usable frame; null before the first."""
+    fault: str | None
+    counts: dict[str, int]
+    """Frames since the start, by what became of them."""
+
+
+class ComputerMessage(TypedDict):
+    """How the computer keeps up. Counts are since the start."""
+
+    time_s: float
+    cameras: dict[str, CameraMessage]
+    load: float
+    """How long the steps take (95th percentile) over how long they may."""
+    steps: int
+    steps_failed: int
+    network_faults: int
+    """Answers that cannot be."""
+    networks_stuck: int
+    """Calls that were ended because they did not answer."""
+    loop_lag_s: float
+    """How late the event loop was, at worst, in the last second."""
+    temperature_c: float | None
+    messages_lost: int
+    recording: str | None
+    """The file, or why the recording ended; null where nothing is recorded."""
+
+
+class AboutMessage(TypedDict):
+    """What a drone flies with."""
+
+    version: str
+    configuration: dict[str, object]
+    """Every key of the drone's configuration, defaults filled in."""
+    commands: list[str]
+    """What operators may ask of it."""
+
+
+class AnswerMessage(TypedDict):
+    """What became of an operator's command."""
+
+    accepted: bool
+    """The drone will try; `flight` tells what comes of it."""
+    sentence: str
+
+
 @dataclass(frozen=True)
 class Topic:
     """One published stream of each drone."""
@@ -107,5 +194,7 @@ TOPICS = {
         Topic("health", HealthMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
         Topic("events", EventMessage, rate_hz=None, stale_after_s=None, recorded=True),
         Topic("timings", TimingsMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
+        Topic("flight", FlightMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
+        Topic("computer", ComputerMessage, rate_hz=1.0, stale_after_s=3.0, recorded=True),
     )
 }
