@@ -27,6 +27,7 @@ MAY_IMPORT = {
     "autopilot": BASE,
     "telemetry": BASE,
     "recording": BASE | {"telemetry"},  # for the table of topics, which says what is recorded
+    "datasets": BASE | {"geometry", "perception", "pilot"},
     "sim": BASE
     | {"geometry", "perception", "tracking", "flocking", "safety", "pilot", "telemetry", "recording", "report"},
     "report": BASE | {"geometry", "flocking", "sim"},

@@ -107,12 +107,12 @@ def models_of(config: DroneConfig) -> dict[str, str]:
     return {manifest.name: manifest.sha256 for manifest in manifests}
 
 
-def refuse_existing(path: Path) -> None:
+def refuse_existing(path: Path, option: str = "--out") -> None:
     """Raises UsageError when there is something at `path`, or no folder for it."""
     if path.exists():
-        raise UsageError(f"{path}: exists; name a new file with --out")
+        raise UsageError(f"{path}: exists; name a new file with {option}")
     if not path.parent.is_dir():
-        raise UsageError(f"{path.parent}: is no folder; make it first, or name another file with --out")
+        raise UsageError(f"{path.parent}: is no folder; make it first, or name another file with {option}")
 
 
 def _info(args: argparse.Namespace) -> int:

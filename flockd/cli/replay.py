@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from flockd.cli.datasets import add_dataset_options, refuse_dataset_options, replay_dataset
 from flockd.cli.output import complain, progress, say, say_json
 from flockd.cli.parser import Commands
 from flockd.cli.record import add_stretch, models_of, opened, refuse_existing, stretch
@@ -31,6 +32,8 @@ def add(commands: Commands) -> None:
         "flockd replay drone1.mcap --config my_drone.yaml --out again.mcap",
         "flockd replay drone1.mcap --diff --reference drone1.expected --tolerance command=1e-6",
         "flockd replay drone1.mcap --reference drone1.expected --update-reference",
+        "flockd replay rgbd_folder --depth recorded --stride 3 --trajectory path.txt",
+        "flockd replay clip.mp4 --calibration K.txt --flow dis --json",
     )
     description = "Let the pilot fly a recorded flight again: the same frames and vehicle states, the same code."
     parser = commands("replay", description, examples)
@@ -53,6 +56,7 @@ def add(commands: Commands) -> None:
         help="numbers of this field, such as command.velocity, may differ by X; may be given again",
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    add_dataset_options(parser)
     parser.set_defaults(run=_run)
 
 
@@ -90,6 +94,11 @@ class _Replayed:
 
 
 def _run(args: argparse.Namespace) -> int:
+    from flockd.datasets import is_dataset
+
+    if is_dataset(args.recording):
+        return replay_dataset(args)
+    refuse_dataset_options(args)
     _check_options(args)
     recording = opened(args.recording)
     config = _config(args, recording)

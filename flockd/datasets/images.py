@@ -1,0 +1,80 @@
+"""Image and depth files, whole or not at all: a decoder would fill in what is missing."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from flockd.datasets.errors import DatasetError
+from flockd.messages import Float32Array, UInt8Array
+
+SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff"})
+_PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
+_JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_CHUNK_FRAME = 12
+"""Bytes of a PNG chunk beside its data: length, name and checksum."""
+
+
+def read_image(path: Path, size: tuple[int, int] | None = None) -> UInt8Array:
+    """(h, w, 3) RGB; grey images have three equal channels. Raises DatasetError, also for another ``size``."""
+    image = _decoded(path, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+    if size is not None:
+        _check_size(path, image.shape[1::-1], size)
+    return np.asarray(image, np.uint8)
+
+
+def read_depth(path: Path, size: tuple[int, int], units_per_m: float) -> Float32Array:
+    """(h, w) metres, NaN where the file has 0. Raises DatasetError, also for a file that has 0 everywhere."""
+    raw = _decoded(path, cv2.IMREAD_UNCHANGED)
+    if raw.dtype != np.uint16 or raw.ndim != 2:
+        raise DatasetError(f"{path}: is no depth map; it needs one channel of 16 bits")
+    _check_size(path, raw.shape[1::-1], size)
+    if not raw.any():
+        raise DatasetError(f"{path}: its depth is 0 everywhere; restore it, or replay with --depth network")
+    return np.where(raw > 0, raw.astype(np.float32) / np.float32(units_per_m), np.float32(np.nan))
+
+
+def _decoded(path: Path, flags: int) -> cv2.typing.MatLike:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read ({error.strerror}); restore it, or leave its frame out") from None
+    fault = _fault(data)
+    image = None if fault else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if image is None:
+        raise DatasetError(f"{path}: {fault or 'is no image'}; restore it, or leave its frame out")
+    return image
+
+
+def _fault(data: bytes) -> str | None:
+    """What is wrong with a file before it is decoded."""
+    if data.startswith(_PNG):
+        return _png_fault(data)
+    if data.startswith(_JPEG) and _JPEG_END not in data[-64:]:
+        return "the JPEG ends too early"
+    return None if data else "is empty"
+
+
+def _png_fault(data: bytes) -> str | None:
+    at = len(_PNG)
+    while at + _CHUNK_FRAME <= len(data):
+        end = at + _CHUNK_FRAME + int.from_bytes(data[at : at + 4])
+        if end > len(data):
+            break
+        if zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end]):
+            return f"the PNG is damaged at byte {at}"
+        if data[at + 4 : at + 8] == _PNG_END:
+            return None
+        at = end
+    return "the PNG ends too early"
+
+
+def _check_size(path: Path, found: tuple[int, ...], size: tuple[int, int]) -> None:
+    if found != size:
+        raise DatasetError(
+            f"{path}: is {found[0]} x {found[1]} pixels, and the camera {size[0]} x {size[1]}; "
+            "give it the dataset's size"
+        )
