@@ -32,7 +32,7 @@ MAY_IMPORT = {
     | {"geometry", "perception", "tracking", "flocking", "safety", "pilot", "telemetry", "recording", "report"},
     "report": BASE | {"geometry", "flocking", "sim"},
     "daemon": BASE | {"perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"},
-    "cli": BASE | {"perception", "pilot", "telemetry", "recording", "sim", "report", "daemon"},
+    "cli": BASE | {"perception", "pilot", "telemetry", "recording", "datasets", "sim", "report", "daemon"},
 }
 """What each folder may import of the others."""
 
