@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 _ANY_ACCELERATION_M_S2 = 1e9
 """A camera in somebody's hand keeps to no drone's limits."""
+_STRIDE_PX = 6
+"""One camera has to do for the four of a drone."""
 _OF_RECORDINGS = ("speed", "start", "end", "out", "diff", "reference", "update_reference", "tolerance")
 _OF_DATASETS = ("depth", "stride", "flow", "calibration", "trajectory")
 
@@ -92,7 +94,12 @@ def _config(args: argparse.Namespace, dataset: Dataset) -> tuple[DroneConfig, li
     rig = RigConfig(cameras=(dataset.camera,))
     notes = []
     if args.config is None:
-        geometry = GeometryParameters(max_acceleration_m_s2=_ANY_ACCELERATION_M_S2)
+        geometry = GeometryParameters(
+            max_acceleration_m_s2=_ANY_ACCELERATION_M_S2,
+            background_stride_px=_STRIDE_PX,
+            # The polish trusts depth as little as a network's deserves; a sensor's is better than that.
+            refine=args.depth != "recorded",
+        )
         config = DroneConfig(rig=rig, geometry=geometry, perception=PerceptionConfig(scale="network"))
     else:
         loaded = load(args.config)

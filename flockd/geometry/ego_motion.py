@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from flockd.config.parameters import GeometryParameters
 from flockd.geometry.pairs import BACKGROUND_LABEL, PointPairs
 from flockd.geometry.ransac import ransac_rigid
 from flockd.geometry.refinement import refine_ego_motion
 from flockd.geometry.rig import Rig
+from flockd.geometry.transform import RigidTransform
 from flockd.messages import EgoMotion
+
+_EXPLAINED_PX = 3.0
+_MIN_EXPLAINED = 0.05
+"""Of the matches so near to where a motion moves them; on real images true motions explain 15 % and more, and those
+that Algorithm 1 finds in nothing but false matches, within wide thresholds in metres, under 4 %."""
 
 
 def estimate_ego_motion(
@@ -17,7 +25,7 @@ def estimate_ego_motion(
 
     Algorithm 1 finds it; with ``parameters.refine`` its reprojection error is then made small, and the result of
     Algorithm 1 stays where that fails. ``inliers`` and ``threshold_m`` are Algorithm 1's. Raises ValueError with the
-    reason where there is no estimate.
+    reason where there is no estimate, or one that explains hardly any of the matches that it was made from.
     """
     background = pairs.select(pairs.labels == BACKGROUND_LABEL)
     found = ransac_rigid(
@@ -32,6 +40,11 @@ def estimate_ego_motion(
     motion = found.transform
     if parameters.refine:
         motion = refine_ego_motion(background, rig, motion, seed=seed) or motion
+    explained = _explained(background, rig, motion)
+    if explained < _MIN_EXPLAINED:
+        raise ValueError(
+            f"the best motion explains only {explained:.1%} of {len(background)} matches within {_EXPLAINED_PX:g} px"
+        )
     return EgoMotion(
         rotation=motion.rotation,
         translation=motion.translation,
@@ -40,3 +53,16 @@ def estimate_ego_motion(
         inliers=int(found.inliers.sum()),
         threshold_m=found.threshold,
     )
+
+
+def _explained(pairs: PointPairs, rig: Rig, motion: RigidTransform) -> float:
+    """The share of matches whose point, seen first and moved, falls on its second pixel."""
+    moved = motion.inverse().apply(pairs.previous)
+    near = 0
+    for name, camera in rig.cameras.items():
+        mine = pairs.camera_names == name
+        mount = camera.T_body_camera
+        pixels = camera.camera.project((moved[mine] - mount.translation) @ mount.rotation)
+        distances = np.linalg.norm(pixels - pairs.pixels_current[mine], axis=1)
+        near += int(np.count_nonzero(distances < _EXPLAINED_PX))  # behind a camera it is NaN, and not near
+    return near / len(pairs)

@@ -10,6 +10,7 @@ from flockd.geometry import (
     PointPairs,
     Rig,
     RigidTransform,
+    ego_motion,
     estimate_ego_motion,
     refine_ego_motion,
     refinement,
@@ -106,21 +107,40 @@ def test_a_polish_that_costs_more_than_its_start_is_refused(monkeypatch: pytest.
     assert (refine_ego_motion(pairs, RIG, truth) is None) == rises
 
 
-def test_a_refused_polish_leaves_algorithm_1s_answer() -> None:
+def test_a_refused_polish_leaves_algorithm_1s_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     pairs, _ = flight(3, Flaws())
-    # Filed under cameras that look the other way: no point can be reprojected.
-    opposite = {"front": "back", "back": "front", "left": "right", "right": "left"}
-    astray = PointPairs(
-        previous=pairs.previous,
-        current=pairs.current,
-        labels=pairs.labels,
-        camera_names=np.array([opposite[name] for name in pairs.camera_names]),
-        pixels_previous=pairs.pixels_previous,
-        pixels_current=pairs.pixels_current,
-    )
-    raw, kept = (estimate_ego_motion(astray, RIG, 0.5, parameters) for parameters in (UNPOLISHED, POLISHED))
+    monkeypatch.setattr(ego_motion, "refine_ego_motion", lambda *_, **__: None)
+    raw, kept = (estimate_ego_motion(pairs, RIG, 0.5, parameters) for parameters in (UNPOLISHED, POLISHED))
     assert np.array_equal(raw.rotation, kept.rotation)
     assert np.array_equal(raw.translation, kept.translation)
+
+
+def with_false_matches(pairs: PointPairs, share: float) -> PointPairs:
+    """So many of the matches lead tens of pixels astray, each to its own place, on surfaces of the same depth."""
+    random = np.random.default_rng(8)
+    false = random.permutation(len(pairs)) < share * len(pairs)
+    pixels, points = pairs.pixels_current.copy(), pairs.current.copy()
+    for name, camera in RIG.cameras.items():
+        mine = np.flatnonzero(false & (pairs.camera_names == name))
+        pixels[mine] += random.uniform(20.0, 40.0, (len(mine), 2)) * random.choice([-1.0, 1.0], (len(mine), 2))
+        depth = camera.T_body_camera.inverse().apply(points[mine])[:, 2]
+        points[mine] = camera.T_body_camera.apply(camera.camera.unproject(pixels[mine], depth))
+    return PointPairs(pairs.previous, points, pairs.labels, pairs.camera_names, pairs.pixels_previous, pixels)
+
+
+@pytest.mark.parametrize("parameters", [POLISHED, UNPOLISHED])
+def test_a_motion_that_explains_none_of_its_matches_is_no_estimate(parameters: GeometryParameters) -> None:
+    """Within metres there are always some that agree: false matches on nearby surfaces are not far apart in space."""
+    pairs, _ = flight(6, EXACT)
+    with pytest.raises(ValueError, match=r"explains only \d\.\d% of \d+ matches within 3 px"):
+        estimate_ego_motion(with_false_matches(pairs, 0.99), RIG, 0.5, parameters)
+
+
+def test_one_true_match_in_three_is_enough() -> None:
+    pairs, truth = flight(6, EXACT)
+    degrees, metres = errors(estimate_ego_motion(with_false_matches(pairs, 0.66), RIG, 0.5, UNPOLISHED), truth)
+    assert degrees < 0.1
+    assert metres < 0.01
 
 
 def test_a_start_some_degrees_and_decimetres_off_is_mended() -> None:
