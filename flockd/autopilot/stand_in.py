@@ -201,6 +201,11 @@ class AutopilotStandIn:
         """The truth."""
         return self._state
 
+    def pilot_arms(self) -> None:
+        """The pilot starts the motors."""
+        with self._lock:
+            self._arm()
+
     def pilot_selects(self, mode: Mode) -> None:
         """The pilot turns the switch."""
         with self._lock:

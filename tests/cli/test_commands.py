@@ -20,6 +20,8 @@ SIMULATOR = (ROOT / "config" / "simulator.yaml").read_text(encoding="utf-8")
 
 COMMANDS = [
     [],
+    ["run"],
+    ["status"],
     ["sim"],
     ["report"],
     ["record"],

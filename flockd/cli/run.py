@@ -1,0 +1,75 @@
+"""`flockd run`: flies this drone until it is told to stop."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import logging
+import os
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flockd.cli.parser import Commands
+from flockd.errors import ExitCode, UsageError
+
+if TYPE_CHECKING:
+    from flockd.config import DroneConfig
+    from flockd.daemon import Ending, ServiceManager
+
+
+def add(commands: Commands) -> None:
+    """Adds the command."""
+    examples = (
+        "flockd run --config config/quadrotor.yaml",
+        "flockd run --config /etc/flockd/drone1.yaml --record /var/lib/flockd",
+    )
+    description = "Fly this drone: cameras in, setpoints for its autopilot out, until told to stop."
+    parser = commands("run", description, examples)
+    parser.add_argument("--config", metavar="FILE", type=Path, required=True, help="the drone's configuration")
+    parser.add_argument("--record", metavar="DIR", type=Path, help="write a recording of each flight to this folder")
+    parser.set_defaults(run=_run)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from flockd.config import load_drone
+    from flockd.daemon import ServiceManager, only_instance
+
+    if args.record is not None and not args.record.is_dir():
+        raise UsageError(f"{args.record}: is no folder; make it first, or name another with --record")
+    _log_to_stderr()
+    service = ServiceManager(os.environ)
+    config: DroneConfig | None = load_drone(args.config)
+    while config is not None:
+        with only_instance(config.name, os.environ):
+            config = asyncio.run(_fly(config, args, service)).reload
+    return ExitCode.DONE
+
+
+async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceManager) -> Ending:
+    """With SIGTERM and Ctrl-C for standstill, Hold and the end, and SIGHUP for the configuration."""
+    from flockd.cli.record import models_of
+    from flockd.config import load_drone
+    from flockd.daemon import Daemon
+    from flockd.pilot.pilot import load_perception
+
+    daemon = Daemon(
+        config,
+        str(args.config),
+        load_networks=lambda: load_perception(config),
+        models=models_of(config),
+        recordings=args.record,
+        service=service,
+    )
+    loop = asyncio.get_running_loop()
+    loop.add_signal_handler(signal.SIGTERM, daemon.ask_to_stop)
+    loop.add_signal_handler(signal.SIGINT, daemon.ask_to_stop)
+    loop.add_signal_handler(signal.SIGHUP, lambda: daemon.ask_to_reload(lambda: load_drone(args.config)))
+    return await daemon.run()
+
+
+def _log_to_stderr() -> None:
+    """The journal dates its lines itself."""
+    dated = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
+    logging.basicConfig(level=logging.INFO, format=f"{dated}%(message)s")
+    logging.getLogger("flockd.autopilot").setLevel(logging.WARNING)  # MAVSDK tells a lot of itself

@@ -1,0 +1,143 @@
+"""`flockd status`: a live table of the fleet, the worst first."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from flockd.cli.output import say_json
+from flockd.cli.parser import Commands, positive_number
+from flockd.errors import ExitCode, UnavailableError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from flockd.telemetry.watcher import Watched
+
+ENDPOINT = "tcp/127.0.0.1:7447"
+LISTEN_S = 3.0
+REFRESH_S = 0.5
+GONE, QUIET = "gone", "quiet"
+"""Instead of a state: its process has ended or cannot be reached; it is there, and publishes nothing."""
+WORST_FIRST = (GONE, QUIET, "asking", "hover", "silent", "degraded", "idle", "ready", "normal")
+
+
+def add(commands: Commands) -> None:
+    """Adds the command."""
+    examples = (
+        "flockd status",
+        "flockd status --connect tcp/10.0.0.11:7447 --connect tcp/10.0.0.12:7447",
+        "flockd status --listen tcp/0.0.0.0:7447 --fleet meadow",
+        "flockd status --json --seconds 2",
+    )
+    parser = commands("status", "Show how each drone of a fleet is doing, the worst first.", examples)
+    parser.add_argument("--fleet", metavar="NAME", help="only this one; by default every fleet that is heard")
+    parser.add_argument(
+        "--connect", metavar="ENDPOINT", action="append", help=f"of a drone or a router; by default {ENDPOINT}"
+    )
+    parser.add_argument("--listen", metavar="ENDPOINT", action="append", help="where drones connect to")
+    parser.add_argument("--zenoh-config", metavar="FILE", type=Path, help="zenoh's own settings, as for TLS")
+    parser.add_argument(
+        "--seconds", metavar="S", type=positive_number, help="listen this long and print once, also on a terminal"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON, once")
+    parser.set_defaults(run=_run)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from flockd.telemetry.watcher import FleetWatcher
+
+    connect, listen = args.connect or [], args.listen or []
+    if not connect and not listen:
+        connect = [ENDPOINT]
+    once = args.json or args.seconds is not None or not sys.stdout.isatty()
+    with FleetWatcher(args.fleet, listen=listen, connect=connect, settings=args.zenoh_config) as watcher:
+        if not once:
+            return _show_live(watcher.drones)
+        time.sleep(args.seconds or LISTEN_S)
+        drones = watcher.drones()
+    rows = rows_of(drones, time.monotonic())
+    if args.json:
+        say_json(rows)
+    elif rows:
+        _console().print(_table(rows))
+    if not rows:
+        places = ", ".join([*listen, *connect])
+        raise UnavailableError(
+            f"no drone was heard at {places} within {args.seconds or LISTEN_S:g} s; name where they are "
+            "with --connect, or let them come with --listen"
+        )
+    return ExitCode.DONE
+
+
+def rows_of(drones: Iterable[Watched], now_s: float) -> list[dict[str, Any]]:
+    """What is told of each drone, the worst first; ``now_s`` on the watcher's clock."""
+    rows = [_row(drone, now_s) for drone in drones]
+    return sorted(rows, key=lambda row: (WORST_FIRST.index(row["state"]), row["fleet"], row["drone"]))
+
+
+def _row(drone: Watched, now_s: float) -> dict[str, Any]:
+    flight: Mapping[str, Any] = drone.message("flight", now_s) or {}
+    computer: Mapping[str, Any] = drone.message("computer", now_s) or {}
+    neighbours = drone.message("neighbours", now_s)
+    state = flight.get("state", QUIET) if drone.alive else GONE
+    blind = [camera["fault"] for camera in computer.get("cameras", {}).values() if camera["fault"]]
+    return {
+        "fleet": drone.fleet,
+        "drone": drone.drone,
+        "state": state if state in WORST_FIRST else QUIET,
+        "flight_mode": flight.get("flight_mode"),
+        "height_m": flight.get("height_m"),
+        "battery_share": flight.get("battery_share"),
+        "neighbours": None
+        if neighbours is None
+        else sum(1 for neighbour in neighbours["neighbours"] if neighbour["confirmed"]),
+        "load": computer.get("load"),
+        "matters": [reason["sentence"] for reason in flight.get("reasons", ())] + blind,
+    }
+
+
+def _table(rows: list[dict[str, Any]]) -> Table:
+    from rich.table import Table
+
+    table = Table("drone", "state", "mode", "height", "battery", "sees", "load", "what is the matter", box=None)
+    for row in rows:
+        table.add_row(
+            f"{row['fleet']}/{row['drone']}",
+            row["state"],
+            row["flight_mode"] or "",
+            _number(row["height_m"], ".1f", " m"),
+            _number(row["battery_share"], ".0%", ""),
+            _number(row["neighbours"], "d", ""),
+            _number(row["load"], ".0%", ""),
+            "; ".join(row["matters"]),
+        )
+    return table
+
+
+def _number(value: float | None, form: str, unit: str) -> str:
+    return "" if value is None else f"{value:{form}}{unit}"
+
+
+def _show_live(drones: Any) -> int:
+    """Until Ctrl-C."""
+    from rich.live import Live
+
+    with Live(console=_console(), auto_refresh=False) as live:
+        try:
+            while True:
+                rows = rows_of(drones(), time.monotonic())
+                live.update(_table(rows) if rows else "no drone was heard yet", refresh=True)
+                time.sleep(REFRESH_S)
+        except KeyboardInterrupt:
+            return ExitCode.DONE
+
+
+def _console() -> Any:
+    from rich.console import Console
+
+    return Console(markup=False, highlight=False)

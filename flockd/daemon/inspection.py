@@ -1,0 +1,155 @@
+"""Gathers all that the supervisor goes by."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockd.autopilot.status import AutopilotStatus
+from flockd.config import DroneConfig
+from flockd.daemon.computer import LoopLag, Thermometer
+from flockd.daemon.networks import WatchedNetworks
+from flockd.daemon.sight import Sight
+from flockd.messages import FloatArray, VehicleState
+from flockd.safety import CameraHealth, Gate, Inputs, Objection, outside_fence, outside_heights
+from flockd.sources import CameraStatus, Count, FrameSource
+
+DROPS_WINDOW_S = 5.0
+_BAD: tuple[Count, ...] = ("time_stamp", "flagged", "corrupt", "malformed")
+_REFUSED = (Objection.COMMAND_NOT_FINITE, Objection.COMMAND_TOO_LARGE)
+
+
+@dataclass
+class Asked:
+    """What people want, and what the autopilot refused."""
+
+    shutdown: bool = False
+    hold: bool = False
+    land: bool = False
+    resume: bool = False
+    """Until it was told once, as the next."""
+    offboard_refused: bool = False
+
+
+class Inspector:
+    """Looks at everything, at each tick of the control loop."""
+
+    def __init__(
+        self,
+        config: DroneConfig,
+        source: FrameSource,
+        sight: Sight,
+        networks: WatchedNetworks,
+        gate: Gate,
+        lag: LoopLag,
+        thermometer: Thermometer,
+        dead_tasks: Mapping[str, str],
+        clock: Callable[[], float],
+    ) -> None:
+        """``dead_tasks``: why each task that has ended did, by name; grows elsewhere."""
+        self._config, self._source, self._sight, self._networks = config, source, sight, networks
+        self._gate, self._lag, self._thermometer, self._dead_tasks = gate, lag, thermometer, dead_tasks
+        self._clock = clock
+        self._eyes = _Eyes(config)
+        self._faults_told = 0
+        self._refused_told = 0
+        self._had_satellites = False
+
+    def inspect(self, status: AutopilotStatus, vehicle: VehicleState | None, asked: Asked) -> Inputs:
+        """All as of now; what is asked once is told once."""
+        now = self._clock()
+        sight, look = self._sight, self._sight.newest
+        neighbours = look.output.neighbours if look else ()
+        ranges = [float(np.linalg.norm(n.position)) for n in neighbours if n.confirmed]
+        eyes = self._eyes.look(now, self._source.status())
+        position = position_from_home(status)
+        self._had_satellites = self._had_satellites or status.gps_ok is True
+        inputs = Inputs(
+            cameras=eyes.cameras,
+            dropped_share=eyes.dropped_share,
+            estimate_age_s=math.inf if look is None else now - look.time_s,
+            ego_motion_failures=sight.ego_motion_failures,
+            network_faults=self._networks.faults - self._faults_told,
+            inference_stuck=self._networks.stuck,
+            load=sight.load(),
+            temperature_c=self._thermometer.hottest_c,
+            loop_lag_s=self._lag.worst_s(),
+            dead_tasks=tuple(self._dead_tasks),
+            neighbours_age_s=now - sight.neighbour_seen_s,
+            nearest_neighbour_m=min(ranges, default=math.inf),
+            refused_commands=self._refused() - self._refused_told,
+            outside_fence=outside_fence(self._config.safety.gate, position),
+            outside_heights=vehicle is None or outside_heights(self._config.safety.gate, vehicle.height_m),
+            heartbeat_age_s=status.heartbeat_age_s,
+            flight_mode=None if status.flight_mode == "unknown" else status.flight_mode,
+            armed=None if math.isinf(status.heartbeat_age_s) else status.armed,
+            in_air=None if status.landed_state == "unknown" else status.in_air,
+            offboard_refused=asked.offboard_refused,
+            battery_low=self._battery_low(status),
+            position_lost=status.estimate_ok is False or (self._had_satellites and status.gps_ok is False),
+            shutdown_asked=asked.shutdown,
+            hold_asked=asked.hold,
+            land_asked=asked.land,
+            resume_asked=asked.resume,
+        )
+        self._faults_told += inputs.network_faults
+        self._refused_told += inputs.refused_commands
+        asked.resume = asked.offboard_refused = False
+        return inputs
+
+    def _refused(self) -> int:
+        return sum(self._gate.counts[objection] for objection in _REFUSED)
+
+    def _battery_low(self, status: AutopilotStatus) -> bool:
+        assert self._config.autopilot is not None
+        return status.battery_share is not None and status.battery_share <= self._config.autopilot.low_battery_share
+
+
+def position_from_home(status: AutopilotStatus) -> FloatArray:
+    """(2,) metres north and east; NaN where the autopilot has not said."""
+    if status.position_ned is None or status.home_ned is None:
+        return np.full(2, np.nan)
+    from_home: FloatArray = (status.position_ned - status.home_ned)[:2]
+    return from_home
+
+
+@dataclass(frozen=True)
+class _Seen:
+    cameras: Mapping[str, CameraHealth]
+    dropped_share: float
+
+
+class _Eyes:
+    """How the cameras are doing, and how many of their frames of late were worth nothing."""
+
+    def __init__(self, config: DroneConfig) -> None:
+        source = config.source
+        assert source is not None
+        common_hz = source.shared_memory.rate_hz
+        rates = {camera.name: camera.rate_hz for camera in source.cameras}
+        self._periods_s = {camera.name: 1.0 / rates.get(camera.name, common_hz) for camera in config.rig.cameras}
+        self._frozen_before = dict.fromkeys(self._periods_s, 0)
+        self._window: deque[tuple[float, int, int]] = deque()
+
+    def look(self, now: float, status: Mapping[str, CameraStatus]) -> _Seen:
+        cameras = {name: self._health(name, camera) for name, camera in status.items()}
+        received = sum(camera.counts.get("received", 0) for camera in status.values())
+        bad = sum(camera.counts.get(what, 0) for camera in status.values() for what in _BAD)
+        while self._window and now - self._window[0][0] > DROPS_WINDOW_S:
+            self._window.popleft()
+        self._window.append((now, received, bad))
+        _, received_before, bad_before = self._window[0]
+        return _Seen(cameras, (bad - bad_before) / max(received - received_before, 1))
+
+    def _health(self, name: str, camera: CameraStatus) -> CameraHealth:
+        """A fault after which frozen pictures were counted is that of a frozen camera."""
+        frozen = camera.counts.get("frozen", 0)
+        if camera.fault is None:
+            self._frozen_before[name] = frozen
+        is_frozen = camera.fault is not None and frozen > self._frozen_before[name]
+        unplugged = camera.fault is not None and not is_frozen
+        return CameraHealth(camera.age_s, self._periods_s[name], unplugged=unplugged, frozen=is_frozen)

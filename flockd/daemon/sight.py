@@ -1,0 +1,129 @@
+"""Looks and thinks: takes the newest frames, lets the pilot step, and keeps what it found."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockd.config import DroneConfig
+from flockd.daemon.networks import NetworkStuckError, WatchedNetworks
+from flockd.daemon.worker import Worker
+from flockd.messages import FrameSet, PilotOutput, VehicleState
+from flockd.pilot import FlockPilot
+from flockd.sources import FrameSource
+
+FRAME_WAIT_S = 0.1
+FRAME_DEADLINE_S = 2.0
+"""To decode one set."""
+STEP_DEADLINE_S = 10.0
+"""Of a whole step, whose networks have deadlines of their own; the drone has been handed over long before."""
+STEPS_REMEMBERED = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What one step found, and when on the daemon's clock its frames were taken from the cameras."""
+
+    time_s: float
+    output: PilotOutput
+    of_flight: int
+    """The flight whose pilot found it."""
+
+
+OnStep = Callable[[FrameSet, VehicleState, PilotOutput], None]
+
+
+class Sight:
+    """The pilot's eyes and mind, at the pilot's own rate. Frames that come meanwhile are dropped by the source."""
+
+    def __init__(
+        self,
+        config: DroneConfig,
+        source: FrameSource,
+        networks: WatchedNetworks,
+        vehicle_at: Callable[[float], VehicleState | None],
+        on_step: OnStep,
+        tell: Callable[[str], None],
+        clock: Callable[[], float],
+    ) -> None:
+        """``vehicle_at`` gives the vehicle's state at a frame's time; None before any is known."""
+        self._config, self._source, self._networks = config, source, networks
+        self._vehicle_at, self._on_step, self._tell, self._clock = vehicle_at, on_step, tell, clock
+        self._decoding = Worker("decoding")
+        self._geometry = Worker("geometry")
+        self._pilot: FlockPilot | None = None
+        self._flight = 0
+        self._took_s: deque[float] = deque(maxlen=STEPS_REMEMBERED)
+        self.saw_frames = False
+        self.newest: Look | None = None
+        self.steps = 0
+        self.failed = 0
+        """Steps that came to nothing, because a network answered nonsense or nothing."""
+        self.ego_motion_failures = 0
+        """In a row."""
+        self.neighbour_seen_s = -math.inf
+        """When a confirmed neighbour was last seen."""
+
+    def begin_flight(self, number: int) -> None:
+        """From the next step on with a fresh pilot: its time counts from there, and a recording can be replayed."""
+        self._flight, self._pilot = number, None
+
+    def load(self) -> float:
+        """How long the steps take, 95th percentile of the last ones, over how long they may."""
+        return float(np.percentile(self._took_s, 95)) / self._config.step_s if self._took_s else 0.0
+
+    async def run(self) -> None:
+        """Looks for ever. Raises LateError when decoding or a step hangs."""
+        due_s = self._clock()
+        while True:
+            frames = await self._decoding.do(FRAME_DEADLINE_S, self._source.newest, FRAME_WAIT_S)
+            if frames is None:
+                continue
+            self.saw_frames = True
+            taken_s = self._clock()
+            vehicle = self._vehicle_at(frames.time_s)
+            if vehicle is not None:
+                await self._step(taken_s, frames, vehicle)
+            now = self._clock()
+            due_s = max(due_s + self._config.step_s, now)
+            await asyncio.sleep(due_s - now)
+
+    def leave(self) -> None:
+        """Lets the threads go."""
+        self._decoding.leave()
+        self._geometry.leave()
+
+    async def _step(self, taken_s: float, frames: FrameSet, vehicle: VehicleState) -> None:
+        flight, first = self._flight, self._pilot is None
+        self.steps += 1
+        try:
+            pilot = self._pilot
+            if pilot is None:
+                pilot = await self._geometry.do(STEP_DEADLINE_S, self._fresh_pilot)
+            output = await self._geometry.do(STEP_DEADLINE_S, pilot.step, frames, vehicle)
+        except (FloatingPointError, NetworkStuckError) as error:
+            self.failed += 1
+            self._tell(f"a step came to nothing: {error}")
+            return
+        finally:
+            self._took_s.append(self._clock() - taken_s)
+        if flight != self._flight:
+            return  # a flight began meanwhile; this was the old pilot's last thought
+        self._pilot = pilot
+        self.newest = Look(taken_s, output, flight)
+        self._count(output, first, taken_s)
+        self._on_step(frames, vehicle, output)
+
+    def _fresh_pilot(self) -> FlockPilot:
+        return FlockPilot(self._config, self._networks, stopwatch=self._clock)
+
+    def _count(self, output: PilotOutput, first: bool, taken_s: float) -> None:
+        if not first:  # the first has nothing to compare with
+            self.ego_motion_failures = 0 if output.ego_motion is not None else self.ego_motion_failures + 1
+        seen = [taken_s - neighbour.unseen_s for neighbour in output.neighbours if neighbour.confirmed]
+        self.neighbour_seen_s = max([self.neighbour_seen_s, *seen])

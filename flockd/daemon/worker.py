@@ -1,0 +1,67 @@
+"""A thread for one concern: nothing waits in asyncio's own executor, and a job that hangs costs its thread alone."""
+
+from __future__ import annotations
+
+import asyncio
+import queue
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+class LateError(Exception):
+    """A job was not done by its deadline; it may still be running."""
+
+
+class BusyError(Exception):
+    """A worker's queue is full."""
+
+
+class Worker:
+    """Does one job after the other; ``backlog`` of them may wait. Its thread never keeps the process from ending."""
+
+    def __init__(self, name: str, backlog: int = 1) -> None:
+        self._name = name
+        self._jobs: queue.Queue[tuple[Future[Any], Callable[[], Any]] | None] = queue.Queue(backlog)
+        threading.Thread(target=self._run, name=name, daemon=True).start()
+
+    def submit(self, job: Callable[..., T], *arguments: object) -> Future[T]:
+        """Gives it a job, from any thread. Raises BusyError when too many wait."""
+        future: Future[T] = Future()
+        try:
+            self._jobs.put_nowait((future, lambda: job(*arguments)))
+        except queue.Full as error:
+            raise BusyError(f"{self._name}: too many jobs wait") from error
+        return future
+
+    async def do(self, deadline_s: float, job: Callable[..., T], *arguments: object) -> T:
+        """What the job returns or raises. Raises LateError when it has not by then, and BusyError."""
+        try:
+            async with asyncio.timeout(deadline_s) as deadline:
+                return await asyncio.wrap_future(self.submit(job, *arguments))
+        except TimeoutError as error:
+            if not deadline.expired():
+                raise
+            raise LateError(f"{self._name}: not done within {deadline_s:g} s") from error
+
+    def leave(self) -> None:
+        """Lets the thread end after what it does now; if that never ends, it dies with the process."""
+        with suppress(queue.Full):
+            self._jobs.put_nowait(None)
+
+    def _run(self) -> None:
+        while (entry := self._jobs.get()) is not None:
+            future, job = entry
+            if not future.set_running_or_notify_cancel():
+                continue
+            try:
+                result = job()
+            except BaseException as error:  # noqa: BLE001 - it is the asker's to handle
+                future.set_exception(error)
+            else:
+                future.set_result(result)
+            del entry, future, job  # or the last frames would stay in memory until the next

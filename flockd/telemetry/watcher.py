@@ -1,0 +1,107 @@
+"""Watches a fleet: for the commands of people. Nothing that flies imports this."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import zenoh
+
+from flockd.telemetry.peer import checked_name, open_peer
+from flockd.telemetry.topics import PREFIX, TOPICS
+
+
+@dataclass(frozen=True)
+class Heard:
+    """The newest message of one topic, and when it came on the watcher's clock."""
+
+    time_s: float
+    message: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Watched:
+    """What is known of one drone."""
+
+    fleet: str
+    drone: str
+    alive: bool = False
+    """Its liveliness token is there: its process runs and can be reached."""
+    topics: Mapping[str, Heard] = field(default_factory=dict)
+
+    def message(self, topic: str, now_s: float) -> Mapping[str, Any] | None:
+        """The newest of a topic; None where there is none, or one too old to say anything of now."""
+        heard, stale_s = self.topics.get(topic), TOPICS[topic].stale_after_s
+        if heard is None or (stale_s is not None and now_s - heard.time_s > stale_s):
+            return None
+        return heard.message
+
+
+class FleetWatcher:
+    """Hears all that the drones of a fleet publish. Raises UnavailableError for an endpoint that cannot be used."""
+
+    def __init__(
+        self,
+        fleet: str | None,
+        *,
+        listen: Sequence[str],
+        connect: Sequence[str],
+        settings: Path | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``fleet``: None for every fleet that is heard."""
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._drones: dict[tuple[str, str], Watched] = {}
+        self.malformed = 0
+        """Messages that are none."""
+        self._session = open_peer(listen, connect, settings)
+        drones = f"{PREFIX}/{'*' if fleet is None else checked_name(fleet)}/*"
+        self._subscribers = [
+            self._session.declare_subscriber(f"{drones}/{topic}", self._take_message) for topic in TOPICS
+        ]
+        self._tokens = self._session.liveliness().declare_subscriber(f"{drones}/alive", self._take_token, history=True)
+
+    def drones(self) -> tuple[Watched, ...]:
+        """All that were ever heard of."""
+        with self._lock:
+            return tuple(self._drones.values())
+
+    def close(self) -> None:
+        """Ends the session."""
+        self._session.close()  # type: ignore[no-untyped-call]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _take_message(self, sample: zenoh.Sample) -> None:
+        """On a thread of zenoh's."""
+        fleet, drone, topic = str(sample.key_expr).split("/")[2:5]
+        try:
+            message = json.loads(sample.payload.to_bytes())
+        except ValueError:
+            message = None
+        if not isinstance(message, dict) or not TOPICS[topic].type.__annotations__.keys() <= message.keys():
+            self.malformed += 1
+            return
+        with self._lock:
+            watched = self._drones.get((fleet, drone), Watched(fleet, drone))
+            topics = {**watched.topics, topic: Heard(self._clock(), message)}
+            self._drones[fleet, drone] = replace(watched, topics=topics)
+
+    def _take_token(self, sample: zenoh.Sample) -> None:
+        fleet, drone = str(sample.key_expr).split("/")[2:4]
+        with self._lock:
+            watched = self._drones.get((fleet, drone), Watched(fleet, drone))
+            self._drones[fleet, drone] = replace(watched, alive=sample.kind == zenoh.SampleKind.PUT)

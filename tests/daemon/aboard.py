@@ -1,0 +1,265 @@
+"""A daemon in a test: real MAVSDK to the autopilot stand-in, real frames over zenoh, a tiny perceiver, a watcher."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import threading
+import time
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from flockd.autopilot.stand_in import AutopilotStandIn
+from flockd.config import DroneConfig
+from flockd.config.parameters import (
+    AutopilotParameters,
+    CameraConfig,
+    DesiredVelocityParameters,
+    ExtrinsicsConfig,
+    GeometryParameters,
+    IntrinsicsConfig,
+    PerceptionConfig,
+    RigConfig,
+    SafetyParameters,
+    SharedMemoryParameters,
+    SourceParameters,
+    TelemetryParameters,
+)
+from flockd.daemon import Daemon, Ending, ServiceManager
+from flockd.messages import Float32Array, Frame, UInt8Array
+from flockd.perception import Picture, RangeEstimate, SceneMaps
+from flockd.sources import FramePublisher
+from flockd.telemetry.watcher import FleetWatcher, Heard
+from tests.autopilot.flight import until
+
+WIDTH, HEIGHT = 64, 48
+CAMERAS = ("front", "back")
+FRAMES_HZ = 10.0
+STEP_S = 0.25
+SPEED_M_S = 1.0
+SECONDS_TO_FAIL = 20.0
+PATIENT = SafetyParameters(degraded_load=50.0, max_load=100.0, max_loop_lag_s=2.0, recovery_s=0.5)
+"""These stories are not about how fast the computer is that tells them."""
+
+
+class TinyPerceiver:
+    """Not networks: says that all stands still before a tilted wall, and sees no drone. A test may spoil it."""
+
+    picture_size = 96
+    map_scale = 2
+    has_distance = True
+
+    def __init__(self) -> None:
+        self.astray = 0
+        """As many flows will be told as not finite, as those of a network are that went astray."""
+        self.hangs = threading.Event()
+        """Set: does not answer."""
+        self.ends_when_told = True
+        self.told_to_end = 0
+
+    def terminate(self) -> None:
+        self.told_to_end += 1
+        if self.ends_when_told:
+            self.hangs.clear()
+
+    def flow(self, camera: str, first: UInt8Array, second: UInt8Array) -> Float32Array:
+        if self.astray > 0:
+            self.astray -= 1
+            raise FloatingPointError("model tiny: output flow is not finite")
+        while self.hangs.is_set():
+            time.sleep(0.01)
+        return np.zeros((*first.shape[:2], 2), np.float32)
+
+    def scene(self, camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:
+        rows, columns = np.mgrid[0 : image.shape[0], 0 : image.shape[1]]
+        depth = (5.0 + 0.02 * rows + 0.01 * columns).astype(np.float32)
+        return SceneMaps(depth, np.zeros(image.shape[:2], np.uint8), ())
+
+    def ranges(self, pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
+        return ()
+
+
+class Cameras:
+    """Publishes noise as the pictures of all cameras until told otherwise."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.silent: set[str] = set()
+        self._publisher = FramePublisher(listen=[endpoint])
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._closing.set()
+        self._thread.join()
+        self._publisher.close()
+
+    def _run(self) -> None:
+        rng = np.random.default_rng(0)
+        number = 0
+        while not self._closing.wait(1.0 / FRAMES_HZ):
+            number += 1
+            for camera in CAMERAS:
+                if camera not in self.silent:
+                    image = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+                    self._publisher.publish("tiny", Frame(camera, image, time.monotonic(), number))
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def config_for(port: int, frames: str, telemetry: str, **autopilot: Any) -> DroneConfig:
+    lens = IntrinsicsConfig(fx=32.0, fy=32.0, cx=32.0, cy=24.0)
+    cameras = tuple(
+        CameraConfig(name=name, size_px=(WIDTH, HEIGHT), intrinsics=lens, extrinsics=ExtrinsicsConfig(yaw_deg=yaw))
+        for name, yaw in zip(CAMERAS, (0.0, 180.0), strict=True)
+    )
+    return DroneConfig(
+        name="tiny",
+        step_s=STEP_S,
+        rig=RigConfig(cameras=cameras),
+        perception=PerceptionConfig(deadline_s=0.5),
+        geometry=GeometryParameters(hypotheses=20),
+        safety=PATIENT,
+        source=SourceParameters(
+            kind="shared_memory",
+            shared_memory=SharedMemoryParameters(drone="tiny", connect=(frames,), rate_hz=FRAMES_HZ / 2),
+        ),
+        autopilot=AutopilotParameters(address=f"udpin://127.0.0.1:{port}", **autopilot),
+        telemetry=TelemetryParameters(fleet="test", listen=(telemetry,), commands=("resume", "land")),
+        desired=DesiredVelocityParameters(speed_m_s=SPEED_M_S, circle_until_s=0.0),
+        own_velocity="autopilot",
+        yaw="hold",
+    )
+
+
+@dataclass
+class Aboard:
+    """What a story can touch."""
+
+    config: DroneConfig
+    stand_in: AutopilotStandIn
+    cameras: Cameras
+    perceiver: TinyPerceiver
+    daemon: Daemon
+    ending: asyncio.Task[Ending]
+    watcher: FleetWatcher
+    session: zenoh.Session
+    service: list[str]
+    events: list[str]
+
+    def heard(self) -> dict[str, Heard]:
+        return {topic: heard for drone in self.watcher.drones() for topic, heard in drone.topics.items()}
+
+    def state(self) -> str:
+        flight = self.heard().get("flight")
+        return "" if flight is None else str(flight.message["state"])
+
+    def matters(self) -> set[str]:
+        return {reason["event"] for reason in self.heard()["flight"].message["reasons"]}
+
+    async def until_state(self, *states: str) -> None:
+        await until(lambda: self.state() in states, SECONDS_TO_FAIL)
+
+    async def until_event(self, beginning: str) -> None:
+        await until(lambda: any(event.startswith(beginning) for event in self.events), SECONDS_TO_FAIL)
+
+    async def ask(self, what: str) -> dict[str, Any]:
+        """The answer to a query, with zenoh alone as any other program would put it."""
+        key = f"flockd/v1/test/tiny/{what}"
+        for _ in range(20):  # until the two have found each other
+            replies = await asyncio.to_thread(lambda: list(self.session.get(key, timeout=3.0)))
+            if replies:
+                break
+            await asyncio.sleep(0.1)
+        (sample,) = (reply.ok for reply in replies)
+        assert sample is not None
+        answer: dict[str, Any] = json.loads(sample.payload.to_bytes())
+        return answer
+
+    async def is_ready_in_the_air(self) -> None:
+        """As after a restart in the air, once an operator has said that it may fly again."""
+        await self.until_state("idle")
+        await until(lambda: self.matters() == {"started", "not_offboard", "neighbours_lost"}, SECONDS_TO_FAIL)
+        assert (await self.ask("ask/resume"))["accepted"] is True
+        await self.until_state("ready")
+
+    async def flies(self) -> None:
+        """The pilot selects offboard."""
+        await until(lambda: len(self.stand_in.setpoints) > 5, SECONDS_TO_FAIL)
+        self.stand_in.pilot_selects("OFFBOARD")
+        await until(lambda: self.speed() > 0.8 * SPEED_M_S, SECONDS_TO_FAIL)
+
+    def speed(self) -> float:
+        return float(np.linalg.norm(self.stand_in.state.velocity[:2]))
+
+
+@asynccontextmanager
+async def aboard(
+    stand_in: AutopilotStandIn,
+    port: int,
+    tmp_path: Path,
+    *,
+    recordings: Path | None = None,
+    **autopilot: Any,
+) -> AsyncIterator[Aboard]:
+    """A daemon that runs, watched. The story ends it, or else it is asked to end."""
+    frames, telemetry = free_endpoint(), free_endpoint()
+    perceiver, cameras = TinyPerceiver(), Cameras(frames)
+    manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    manager.bind(str(tmp_path / "notify"))
+    manager.setblocking(False)
+    config = config_for(port, frames, telemetry, **autopilot)
+    environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "1000000"}
+    daemon = Daemon(
+        config,
+        "tiny.yaml",
+        load_networks=lambda: perceiver,
+        models={"tiny": "0" * 64},
+        recordings=recordings,
+        service=ServiceManager(environment),
+    )
+    ending = asyncio.create_task(daemon.run())
+    watcher = FleetWatcher("test", listen=[], connect=[telemetry])
+    session = zenoh.open(_client(telemetry))
+    told: list[str] = []
+    events: list[str] = []
+    session.declare_subscriber(
+        "flockd/v1/test/tiny/events", lambda sample: events.append(json.loads(sample.payload.to_bytes())["event"])
+    )
+    listening = asyncio.create_task(_listen(manager, told))
+    try:
+        yield Aboard(config, stand_in, cameras, perceiver, daemon, ending, watcher, session, told, events)
+    finally:
+        perceiver.hangs.clear()
+        listening.cancel()
+        daemon.ask_to_stop()
+        await asyncio.wait({ending})
+        session.close()  # type: ignore[no-untyped-call]
+        watcher.close()
+        cameras.close()
+        manager.close()
+
+
+async def _listen(manager: socket.socket, told: list[str]) -> None:
+    while True:
+        told += (await asyncio.get_running_loop().sock_recv(manager, 4096)).decode().splitlines()
+
+
+def _client(endpoint: str) -> zenoh.Config:
+    config = zenoh.Config()
+    config.insert_json5("mode", '"peer"')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("listen/endpoints", "[]")
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    return config

@@ -1,0 +1,233 @@
+"""The daemon's stories: it starts, flies, and hands over whatever happens. The autopilot is a stand-in, not PX4."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flockd.autopilot.stand_in import AutopilotStandIn
+from tests.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
+
+try:
+    from flockd.daemon import DaemonError, Ending
+    from flockd.recording.reader import Recording
+    from tests.autopilot.flight import until
+    from tests.daemon.aboard import SECONDS_TO_FAIL, SPEED_M_S, aboard
+except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
+    pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
+
+
+def test_from_the_ground_into_the_air_and_back_into_the_pilots_hands(tmp_path: Path) -> None:
+    port = free_port()
+
+    async def story() -> None:
+        async with aboard(stand_in, port, tmp_path) as ship:
+            await until(lambda: "READY=1" in ship.service, SECONDS_TO_FAIL)
+            await ship.until_state("idle")
+            await until(lambda: "started" not in ship.matters())  # it was seen disarmed on the ground
+            assert not stand_in.setpoints, "nothing is sent before it is ready"
+            stand_in.pilot_arms()
+            stand_in.pilot_selects("TAKEOFF")
+            await ship.until_state("ready")
+            await until(lambda: stand_in.mode == "LOITER", SECONDS_TO_FAIL)
+            height_m = -float(stand_in.state.position[2])
+            await ship.flies()
+            await ship.until_state("normal", "degraded")
+            await until(lambda: ship.speed() > 0.9 * SPEED_M_S)
+            np.testing.assert_allclose(stand_in.state.velocity[:2], [SPEED_M_S, 0.0], atol=0.2)  # north: Eq. 43 at 0 s
+            assert -float(stand_in.state.position[2]) == pytest.approx(height_m, abs=0.2)
+            sent_m = [sent.height_m for _, sent in list(stand_in.setpoints)[-5:]]
+            np.testing.assert_allclose(sent_m, height_m, atol=0.1)
+            _tells_what_it_does(ship.heard())
+            assert ship.service.count("WATCHDOG=1") >= 4
+
+            stand_in.pilot_selects("POSCTL")
+            await ship.until_state("silent")
+            before = len(stand_in.setpoints)
+            await asyncio.sleep(0.5)
+            assert len(stand_in.setpoints) == before
+            assert "not_offboard" in ship.matters()
+            assert stand_in.mode == "POSCTL"
+
+    with AutopilotStandIn(port, heartbeat_s=HEARTBEAT_S) as stand_in:
+        asyncio.run(story())
+
+
+def _tells_what_it_does(heard: object) -> None:
+    assert isinstance(heard, dict)
+    assert {"state", "neighbours", "command", "health", "timings", "flight", "computer", "events"} <= heard.keys()
+    flight, computer = heard["flight"].message, heard["computer"].message
+    assert (flight["flight_mode"], flight["armed"], flight["in_air"]) == ("offboard", True, True)
+    assert flight["silence"] is None
+    assert flight["setpoints_sent"] > 0
+    assert flight["battery_share"] == 1.0
+    assert set(computer["cameras"]) == {"front", "back"}
+    assert computer["cameras"]["front"]["fault"] is None
+    assert computer["cameras"]["front"]["counts"]["used"] > 0
+    assert computer["steps"] > 0
+    assert computer["recording"] is None
+    assert set(heard["timings"].message["stages_ms"]) >= {"scene", "flow", "ego_motion", "flocking"}
+    assert np.linalg.norm(heard["command"].message["velocity_ne"]) == pytest.approx(SPEED_M_S, abs=0.2)
+
+
+def test_a_silent_rig_is_hovered_out_and_then_held(tmp_path: Path, port: int, stand_in: AutopilotStandIn) -> None:
+    async def story() -> None:
+        async with aboard(stand_in, port, tmp_path) as ship:
+            await ship.is_ready_in_the_air()
+            await ship.flies()
+            ship.cameras.silent |= {"front", "back"}
+            silent_s = time.monotonic()
+            await until(lambda: stand_in.mode == "LOITER", SECONDS_TO_FAIL)
+            # Three frame periods of 0.2 s until it is noticed, 1 s of hovering, and some for Hold on a busy computer.
+            assert 1.0 < time.monotonic() - silent_s < 3.0
+            assert not stand_in.failsafe, "it was asked for Hold, not left to its failsafe"
+            last = [sent for at_s, sent in stand_in.setpoints if at_s > silent_s + 1.2]
+            assert last, "the hover is sent"
+            assert all(np.linalg.norm(sent.velocity) < 0.01 for sent in last)
+            await ship.until_state("silent")
+            ship.cameras.silent.clear()
+            await asyncio.sleep(1.0)
+            assert ship.state() == "silent", "no re-entry by itself"
+
+    asyncio.run(story())
+
+
+def test_one_camera_of_two_gone_is_a_slower_flight(tmp_path: Path, port: int, stand_in: AutopilotStandIn) -> None:
+    async def story() -> None:
+        async with aboard(stand_in, port, tmp_path) as ship:
+            await ship.is_ready_in_the_air()
+            await ship.flies()
+            ship.cameras.silent.add("back")
+            await until(lambda: "camera_lost" in ship.matters(), SECONDS_TO_FAIL)
+            assert ship.state() == "degraded"
+            assert stand_in.mode == "OFFBOARD"
+
+    asyncio.run(story())
+
+
+def test_an_astray_network_degrades_and_sigterm_ends_in_hold(
+    tmp_path: Path, port: int, stand_in: AutopilotStandIn
+) -> None:
+    async def story() -> None:
+        async with aboard(stand_in, port, tmp_path, recordings=tmp_path) as ship:
+            await ship.is_ready_in_the_air()
+            await ship.flies()
+            await ship.until_state("normal")
+            ship.perceiver.astray = 1
+            await ship.until_event("a step came to nothing: model tiny: output flow is not finite")
+            await ship.until_event("degraded: a network gave numbers that cannot be")
+            assert ship.heard()["computer"].message["recording"].startswith(str(tmp_path))
+
+            asked_s = time.monotonic()
+            ship.daemon.ask_to_stop()
+            await until(lambda: stand_in.mode == "LOITER", 2.0)
+            assert not stand_in.failsafe
+            assert await ship.ending == Ending(None)
+            assert "STOPPING=1" in ship.service
+            assert stand_in.setpoints[-1][0] - asked_s < 2.0
+
+    asyncio.run(story())
+    (path,) = tmp_path.glob("tiny-*.mcap")
+    recording = Recording(path)
+    assert recording.contents.finished
+    assert len(recording.contents.steps) > 5
+
+
+def test_a_dead_control_task_is_held_by_the_last_resort(
+    tmp_path: Path, port: int, stand_in: AutopilotStandIn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def story() -> None:
+        async with aboard(stand_in, port, tmp_path) as ship:
+            await ship.is_ready_in_the_air()
+            await ship.flies()
+
+            def dies(*_: object) -> None:
+                raise ArithmeticError("for the test")
+
+            monkeypatch.setattr("flockd.daemon.control.Control.tick", dies)
+            await until(lambda: stand_in.mode == "LOITER", 2.0)
+            assert not stand_in.failsafe
+            with pytest.raises(DaemonError, match=r"a task died \(control: ArithmeticError\('for the test'\)\)"):
+                await ship.ending
+
+    asyncio.run(story())
+
+
+def test_any_other_dead_task_is_a_hold_too(
+    tmp_path: Path, port: int, stand_in: AutopilotStandIn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def story() -> None:
+        async with aboard(stand_in, port, tmp_path) as ship:
+            await ship.is_ready_in_the_air()
+            await ship.flies()
+
+            def dies(*_: object) -> None:
+                raise ArithmeticError("for the test")
+
+            monkeypatch.setattr("flockd.pilot.FlockPilot.step", dies)
+            await until(lambda: stand_in.mode == "LOITER", 2.0)
+            assert not stand_in.failsafe
+            with pytest.raises(DaemonError, match="sight: ArithmeticError"):
+                await ship.ending
+
+    asyncio.run(story())
+
+
+def test_a_stuck_network_is_ended_and_the_flight_goes_on(tmp_path: Path, port: int, stand_in: AutopilotStandIn) -> None:
+    async def story() -> None:
+        async with aboard(stand_in, port, tmp_path) as ship:
+            await ship.is_ready_in_the_air()
+            await ship.flies()
+            ship.perceiver.hangs.set()
+            await until(lambda: ship.perceiver.told_to_end == 1, SECONDS_TO_FAIL)
+            await until(lambda: ship.heard()["computer"].message["networks_stuck"] == 1, SECONDS_TO_FAIL)
+            assert stand_in.mode == "OFFBOARD"
+            await ship.until_state("normal")
+
+    asyncio.run(story())
+
+
+def test_arming_and_taking_off_by_itself_where_configured(tmp_path: Path) -> None:
+    port = free_port()
+
+    async def story() -> None:
+        async with aboard(stand_in, port, tmp_path, arm_and_take_off=True, height_m=HOVER_M) as ship:
+            await until(lambda: stand_in.mode == "OFFBOARD", SECONDS_TO_FAIL)
+            await ship.until_state("normal", "degraded")
+            assert (await ship.ask("ask/hold"))["accepted"] is False, "not among telemetry.commands"
+            assert stand_in.mode == "OFFBOARD"
+            assert (await ship.ask("ask/land"))["accepted"] is True
+            await until(lambda: stand_in.mode == "LAND", SECONDS_TO_FAIL)
+
+    with AutopilotStandIn(port, heartbeat_s=HEARTBEAT_S) as stand_in:
+        asyncio.run(story())
+
+
+def test_the_configuration_is_read_again_on_the_ground_only(
+    tmp_path: Path, port: int, stand_in: AutopilotStandIn
+) -> None:
+    async def story() -> None:
+        async with aboard(stand_in, port, tmp_path) as ship:
+            await ship.until_state("idle")
+            about = await ship.ask("about")
+            assert about["configuration"]["name"] == "tiny"
+            ship.daemon.ask_to_reload(lambda: pytest.fail("read in the air"))
+            await ship.until_event("the configuration was not read again, because the drone is armed or in the air")
+            assert not ship.ending.done()
+
+    async def on_the_ground(stand_in: AutopilotStandIn, port: int) -> None:
+        async with aboard(stand_in, port, tmp_path / "ground") as ship:
+            await ship.until_state("idle")
+            other = ship.config.model_copy(update={"step_s": 0.2})
+            ship.daemon.ask_to_reload(lambda: other)
+            assert await ship.ending == Ending(other)
+
+    asyncio.run(story())
+    (tmp_path / "ground").mkdir()
+    second = free_port()
+    with AutopilotStandIn(second, heartbeat_s=HEARTBEAT_S) as on_ground:
+        asyncio.run(on_the_ground(on_ground, second))
