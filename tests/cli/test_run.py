@@ -1,0 +1,157 @@
+"""`flockd run` as a service manager runs it: a process of its own, with the shipped networks on tiny pictures."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+from flockd.autopilot.stand_in import AutopilotStandIn
+from flockd.cli import main
+from flockd.data import data_path
+from tests.autopilot.conftest import HEARTBEAT_S, free_port
+
+try:
+    from tests.daemon.aboard import Cameras, config_for, free_endpoint
+except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
+    pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
+
+RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
+ROOT = Path(__file__).parents[2]
+SECONDS_TO_FAIL = 60.0
+"""To load three networks on a computer that is busy with other things."""
+
+
+class Manager:
+    """Listens as a service manager does."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.told: list[str] = []
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(str(path))
+        self._socket.settimeout(0.1)
+
+    def until(self, condition: Callable[[], bool], process: subprocess.Popen[str]) -> None:
+        begun_s = time.monotonic()
+        while not condition():
+            assert process.poll() is None, process.communicate()
+            assert time.monotonic() - begun_s < SECONDS_TO_FAIL, self.told
+            try:
+                self.told += self._socket.recv(4096).decode().splitlines()
+            except TimeoutError:
+                continue
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@pytest.fixture
+def manager(tmp_path: Path) -> Iterator[Manager]:
+    manager = Manager(tmp_path / "notify")
+    yield manager
+    manager.close()
+
+
+def _written(path: Path, port: int, frames: str, telemetry: str) -> Path:
+    values = config_for(port, frames, telemetry).model_dump(mode="json", exclude_defaults=True)
+    path.write_text(yaml.safe_dump(values), encoding="utf-8")
+    return path
+
+
+def _run(config: Path, folder: Path, *options: str) -> subprocess.Popen[str]:
+    environment = {"NOTIFY_SOCKET": str(folder / "notify"), "XDG_RUNTIME_DIR": str(folder), "PATH": "/usr/bin"}
+    command = [sys.executable, "-c", RUN, "run", "--config", str(config), *options]
+    return subprocess.Popen(
+        command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def test_it_gets_ready_alone_reads_its_file_again_and_ends_when_told(
+    tmp_path: Path, manager: Manager, capsys: pytest.CaptureFixture[str]
+) -> None:
+    port, frames, telemetry = free_port(), free_endpoint(), free_endpoint()
+    config = _written(tmp_path / "tiny.yaml", port, frames, telemetry)
+    cameras = Cameras(frames)
+    with AutopilotStandIn(port, heartbeat_s=HEARTBEAT_S), _run(config, tmp_path) as process:
+        try:
+            manager.until(lambda: "READY=1" in manager.told, process)
+            assert any(line.startswith("STATUS=idle: ") for line in manager.told)
+
+            with _run(config, tmp_path) as second:
+                _, told = second.communicate(timeout=SECONDS_TO_FAIL)
+            assert second.returncode == 69
+            lock = tmp_path / "flockd-tiny.lock"
+            assert told.splitlines()[-1] == (
+                f"{lock}: another flockd (process {process.pid}) flies drone 'tiny'; stop it first, or give this one "
+                "another `name`"
+            )
+
+            assert main(["status", "--connect", telemetry, "--seconds", "2.5", "--json"]) == 0
+            (row,) = json.loads(capsys.readouterr().out)
+            assert (row["fleet"], row["drone"], row["state"], row["flight_mode"]) == ("test", "tiny", "idle", "hold")
+            assert "not armed" in row["matters"]
+
+            process.send_signal(signal.SIGHUP)
+            manager.until(lambda: manager.told.count("READY=1") == 2, process)
+            assert "RELOADING=1" in manager.told
+
+            process.send_signal(signal.SIGTERM)
+            _, told = process.communicate(timeout=SECONDS_TO_FAIL)
+            assert process.returncode == 0, told
+        finally:
+            process.kill()
+            cameras.close()
+
+
+def test_a_changed_model_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    models = tmp_path / "models"
+    shutil.copytree(data_path("models"), models)
+    flow = bytearray((models / "flow.onnx").read_bytes())
+    flow[len(flow) // 2] ^= 1
+    (models / "flow.onnx").write_bytes(flow)
+    config = _written(tmp_path / "tiny.yaml", free_port(), free_endpoint(), free_endpoint())
+    values = yaml.safe_load(config.read_text(encoding="utf-8"))
+    values["perception"]["models_dir"] = str(models)
+    config.write_text(yaml.safe_dump(values), encoding="utf-8")
+    assert main(["run", "--config", str(config)]) == 78
+    assert "flow.yaml: sha256: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("section", "told"), [("autopilot", "autopilot: is missing"), ("source", "source: is missing")]
+)
+def test_a_drone_that_cannot_be_flown_is_bad_configuration(
+    section: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = _written(tmp_path / "tiny.yaml", free_port(), free_endpoint(), free_endpoint())
+    values = yaml.safe_load(config.read_text(encoding="utf-8"))
+    del values[section]
+    config.write_text(yaml.safe_dump(values), encoding="utf-8")
+    assert main(["run", "--config", str(config)]) == 78
+    assert capsys.readouterr().err.splitlines()[-1].startswith(f"{config}: {told}; ")
+
+
+def test_recordings_need_their_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "--config", "none.yaml", "--record", str(tmp_path / "none")]) == 2
+    assert capsys.readouterr().err == (
+        f"{tmp_path / 'none'}: is no folder; make it first, or name another with --record\n"
+    )
+
+
+def test_a_fleet_that_is_not_there_is_unavailable(capsys: pytest.CaptureFixture[str]) -> None:
+    endpoint = free_endpoint()
+    assert main(["status", "--connect", endpoint, "--seconds", "0.2"]) == 69
+    assert capsys.readouterr().err == (
+        f"no drone was heard at {endpoint} within 0.2 s; name where they are with --connect, or let them come with "
+        "--listen\n"
+    )
