@@ -28,6 +28,8 @@ def read_calibration(file: Path, size: tuple[int, int]) -> CameraConfig:
 
     Raises ConfigError, also where it is of another size.
     """
+    if not file.is_file():
+        raise _problem(file, "does not exist; put the calibration there, or name one with --calibration")
     if file.suffix.lower() in {".yaml", ".yml"}:
         return _camera_of_drone(file, size)
     matrix = read_rows(file, columns=3, what="a 3x3 matrix, three numbers a line")

@@ -15,6 +15,9 @@ from flockd.messages import EgoMotion, Float32Array, Frame, FrameSet, PilotOutpu
 from flockd.perception import Picture, RangeEstimate, SceneMaps
 from flockd.pilot import FlockPilot, Perceiver
 
+_FLAT_DEVIATION = 1.0
+"""Grey levels of standard deviation under which an image shows nothing: matched with anything, it would stand still."""
+
 
 @dataclass(frozen=True, eq=False)
 class Pair:
@@ -96,7 +99,8 @@ def fly_pairs(
     for frame in dataset.frames(with_depth=recorded_depth):
         moment = frame.moment
         perceiver.show(frame.depth)
-        output = pilots[moment.index % stride].step(_frame_set(frame, mounted.name), _unknown_vehicle(moment.time_s))
+        frames = _frame_set(frame, mounted.name)
+        output = pilots[moment.index % stride].step(frames, _unknown_vehicle(moment.time_s))
         if len(past) == stride:
             before, output_before = past[0]
             yield _pair(mounted, before, moment, output_before, output)
@@ -104,7 +108,10 @@ def fly_pairs(
 
 
 def _frame_set(frame: DatasetFrame, camera: str) -> FrameSet:
+    """Without a frame where its image is all of one colour, as cameras' images are in flight."""
     moment = frame.moment
+    if float(frame.image.std(axis=(0, 1)).max()) < _FLAT_DEVIATION:
+        return FrameSet(moment.time_s, {})
     return FrameSet(moment.time_s, {camera: Frame(camera, frame.image, moment.time_s, moment.index)})
 
 
@@ -116,9 +123,18 @@ def _unknown_vehicle(time_s: float) -> VehicleState:
 def _pair(camera: RigCamera, before: Moment, after: Moment, first: PilotOutput, second: PilotOutput) -> Pair:
     ego = second.ego_motion
     if ego is None:
-        blind = [reason for reason in first.reasons if reason.startswith("camera ")]
-        return Pair(before, after, None, None, "; ".join(dict.fromkeys([*blind, *second.reasons])))
+        return Pair(
+            before, after, None, None, "; ".join([*_blind(before, first), *_blind(after, second), *_why(second)])
+        )
     return Pair(before, after, _of_camera(ego, camera), ego.inliers / ego.pairs, None)
+
+
+def _blind(moment: Moment, output: PilotOutput) -> list[str]:
+    return [f"frame {moment.index}: {reason}" for reason in output.reasons if reason.startswith("camera ")]
+
+
+def _why(output: PilotOutput) -> list[str]:
+    return [reason for reason in output.reasons if not reason.startswith("camera ")]
 
 
 def _of_camera(ego: EgoMotion, camera: RigCamera) -> RigidTransform:

@@ -12,7 +12,6 @@ from flockd.datasets.errors import DatasetError
 from flockd.datasets.images import read_image
 from flockd.datasets.poses import PoseTrack, track_of_rows
 from flockd.datasets.tables import read_lines, read_rows
-from flockd.errors import ConfigError, ConfigProblem
 from flockd.messages import FloatArray
 
 _UNITS_PER_M = 5000.0
@@ -27,12 +26,8 @@ def open_tum(path: Path, calibration: Path | None) -> FileDataset:
     Raises DatasetError and ConfigError.
     """
     times_s, images = _listed(path / "rgb.txt")
-    file = calibration or path / "K.txt"
-    if calibration is None and not file.is_file():
-        message = "is missing, as the TUM layout brings no calibration; put it there, or name one with --calibration"
-        raise ConfigError([ConfigProblem(str(file), 0, "", message)])
     size = read_image(images[0]).shape[1::-1]
-    camera = read_calibration(file, (size[0], size[1]))
+    camera = read_calibration(calibration or path / "K.txt", (size[0], size[1]))
     depth = _depth_of(path / "depth.txt", times_s)
     track = _track(path / "groundtruth.txt") if (path / "groundtruth.txt").exists() else None
     entries = tuple(

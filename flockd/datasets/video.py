@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -67,8 +68,15 @@ def open_video(path: Path, calibration: Path | None) -> VideoDataset:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
+    """Closed at the end."""
+    # What the decoder thinks of a damaged file would stand on stderr, beside our own sentence.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    logging = cv2.utils.logging
+    before = logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    logging.setLogLevel(before)
     # As it was filmed: a phone's note to turn the picture would turn it away from its calibration.
-    video = cv2.VideoCapture(str(path), cv2.CAP_ANY, [cv2.CAP_PROP_ORIENTATION_AUTO, 0])
+    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     try:
         yield video
     finally:
