@@ -1,9 +1,10 @@
-"""How the computer under the daemon is doing: how late the event loop runs, and how hot it is."""
+"""How the computer under the daemon is doing: how late the event loop runs, how hot it is, what its clock does."""
 
 from __future__ import annotations
 
 import asyncio
 import math
+import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ LOOK_S = 0.05
 MEMORY_S = 1.0
 THERMAL_ZONES = Path("/sys/class/thermal")
 READ_DEADLINE_S = 1.0
+JUMP_S = 0.5
 
 
 class LoopLag:
@@ -59,6 +61,29 @@ class Thermometer:
                 self._worker.leave()
                 self._worker = Worker("thermometer")
             await asyncio.sleep(1.0)
+
+
+class WallClock:
+    """Notes when somebody sets the clock. Nothing in a flight goes by it; who reads the log wants to know."""
+
+    def __init__(
+        self, tell: Callable[[str], None], clock: Callable[[], float], wall: Callable[[], float] = time.time
+    ) -> None:
+        self._tell, self._clock, self._wall = tell, clock, wall
+        self._ahead_s = wall() - clock()
+
+    async def run(self) -> None:
+        """Looks for ever."""
+        while True:
+            self.look()
+            await asyncio.sleep(1.0)
+
+    def look(self) -> None:
+        """Once."""
+        ahead_s = self._wall() - self._clock()
+        if abs(ahead_s - self._ahead_s) > JUMP_S:
+            self._tell(f"the wall clock was set by {ahead_s - self._ahead_s:+.1f} s; nothing in the flight goes by it")
+        self._ahead_s = ahead_s
 
 
 def hottest_zone_c(folder: Path) -> float | None:

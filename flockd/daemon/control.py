@@ -168,9 +168,12 @@ class Control:
         self._streamer.beat()
 
     def _command(self, now: float) -> tuple[FloatArray, float, float]:
-        """Velocity, heading, and when that was decided: standstill until this flight's pilot knows its own motion."""
+        """Velocity, heading, and when that was decided: standstill until this flight's pilot has looked twice.
+
+        It knows neither its own motion nor its neighbours before that.
+        """
         look = self._sight.newest
-        if look is None or look.of_flight != self._flight or look.output.velocity is None:
+        if look is None or look.flight != self._flight or look.number < 2:
             return np.zeros(2), self._yaw_rad, now
         return look.output.command.velocity, look.output.command.yaw_rad, look.time_s
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from flockd.autopilot.mavsdk_link import AutopilotLink
 from flockd.autopilot.streamer import SetpointStreamer
 from flockd.daemon.chronicle import Chronicle
-from flockd.daemon.computer import LoopLag, Thermometer
+from flockd.daemon.computer import LoopLag, Thermometer, WallClock
 from flockd.daemon.control import Control
 from flockd.daemon.networks import WatchedNetworks
 from flockd.daemon.requests import Requests, TakeOff
@@ -33,6 +33,7 @@ class Crew:
     telemetry: ZenohTelemetry
     lag: LoopLag
     thermometer: Thermometer
+    wall_clock: WallClock
     dead_tasks: dict[str, str]
     """Why each task that has ended did, by name."""
     over: asyncio.Event = field(default_factory=asyncio.Event)

@@ -16,7 +16,7 @@ from flockd.autopilot.streamer import SetpointStreamer
 from flockd.config import DroneConfig
 from flockd.config.parameters import AutopilotParameters
 from flockd.daemon.chronicle import Chronicle
-from flockd.daemon.computer import LoopLag, Thermometer
+from flockd.daemon.computer import LoopLag, Thermometer, WallClock
 from flockd.daemon.control import FLYING, Control, Door, VehicleHistory
 from flockd.daemon.crew import Crew
 from flockd.daemon.inspection import Asked, Inspector
@@ -166,7 +166,7 @@ class Daemon:
         crew = Crew(
             link=link, streamer=streamer, source=self._source, sight=sight, networks=networks, control=control,
             requests=requests, take_off=take_off, chronicle=chronicle, telemetry=telemetry, lag=lag,
-            thermometer=thermometer, dead_tasks=dead,
+            thermometer=thermometer, wall_clock=WallClock(chronicle.event, clock), dead_tasks=dead,
         )  # fmt: skip
         telemetry.announce(config.name, self._about(), self._taker(asyncio.get_running_loop(), chronicle))
         return crew
@@ -187,6 +187,7 @@ class Daemon:
             "sight": crew.sight.run,
             "loop lag": crew.lag.run,
             "thermometer": crew.thermometer.run,
+            "wall clock": crew.wall_clock.run,
             "telemetry": lambda: tell_for_ever(crew, self._clock),
             "service": lambda: tell_service(crew, self._service),
         }

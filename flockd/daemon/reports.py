@@ -25,7 +25,11 @@ async def tell_service(crew: Crew, service: ServiceManager) -> None:
         await asyncio.sleep(START_LOOK_S)
     service.ready(_status_line(crew.control.decision))
     crew.chronicle.event("ready: models loaded, autopilot heard, first frames seen")
+    told: set[str] = set()
     while True:
+        for note in set(crew.source.notes()) - told:
+            crew.chronicle.event(note)
+            told.add(note)
         await asyncio.sleep(STATUS_EVERY_S)
         service.status(_status_line(crew.control.decision))
 

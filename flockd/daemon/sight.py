@@ -31,8 +31,10 @@ class Look:
 
     time_s: float
     output: PilotOutput
-    of_flight: int
-    """The flight whose pilot found it."""
+    flight: int
+    """Whose pilot found it."""
+    number: int
+    """Counted from 1 with the first of its pilot."""
 
 
 OnStep = Callable[[FrameSet, VehicleState, PilotOutput], None]
@@ -99,7 +101,7 @@ class Sight:
         self._geometry.leave()
 
     async def _step(self, taken_s: float, frames: FrameSet, vehicle: VehicleState) -> None:
-        flight, first = self._flight, self._pilot is None
+        flight = self._flight
         self.steps += 1
         try:
             pilot = self._pilot
@@ -114,16 +116,17 @@ class Sight:
             self._took_s.append(self._clock() - taken_s)
         if flight != self._flight:
             return  # a flight began meanwhile; this was the old pilot's last thought
+        number = 1 if self._pilot is None or self.newest is None else self.newest.number + 1
         self._pilot = pilot
-        self.newest = Look(taken_s, output, flight)
-        self._count(output, first, taken_s)
+        self.newest = Look(taken_s, output, flight, number)
+        self._count(self.newest)
         self._on_step(frames, vehicle, output)
 
     def _fresh_pilot(self) -> FlockPilot:
         return FlockPilot(self._config, self._networks, stopwatch=self._clock)
 
-    def _count(self, output: PilotOutput, first: bool, taken_s: float) -> None:
-        if not first:  # the first has nothing to compare with
-            self.ego_motion_failures = 0 if output.ego_motion is not None else self.ego_motion_failures + 1
-        seen = [taken_s - neighbour.unseen_s for neighbour in output.neighbours if neighbour.confirmed]
+    def _count(self, look: Look) -> None:
+        if look.number > 1:  # the first has nothing to compare with
+            self.ego_motion_failures = 0 if look.output.ego_motion is not None else self.ego_motion_failures + 1
+        seen = [look.time_s - neighbour.unseen_s for neighbour in look.output.neighbours if neighbour.confirmed]
         self.neighbour_seen_s = max([self.neighbour_seen_s, *seen])

@@ -1,0 +1,79 @@
+"""The fleet's table: who needs to be looked at stands first."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from flockd.cli.status import rows_of
+from flockd.telemetry.topics import ComputerMessage, FlightMessage
+from flockd.telemetry.watcher import Heard, Watched
+
+NOW_S = 1000.0
+
+
+def _drone(name: str, state: str, *, alive: bool = True, age_s: float = 0.3, **more: Any) -> Watched:
+    flight = FlightMessage(
+        time_s=5.0, state=state, reasons=[], flight_mode="offboard", armed=True, in_air=True, heartbeat_age_s=0.1,
+        battery_share=0.5, height_m=4.0, silence=None, setpoints_sent=1, setpoints_missed=0,
+    )  # fmt: skip
+    return Watched("meadow", name, alive, {"flight": Heard(NOW_S - age_s, {**flight, **more})})
+
+
+def test_the_worst_stands_first() -> None:
+    fleet = [
+        _drone("a", "normal"),
+        _drone("b", "degraded"),
+        _drone("c", "idle"),
+        _drone("d", "hover"),
+        _drone("e", "normal", age_s=2.0),
+        _drone("f", "normal", alive=False),
+        _drone("g", "ready"),
+        _drone("h", "asking"),
+        _drone("i", "silent"),
+        _drone("j", "normal"),
+        _drone("k", "of a later version"),
+    ]
+    rows = rows_of(fleet, NOW_S)
+    assert [(row["drone"], row["state"]) for row in rows] == [
+        ("f", "gone"),
+        ("e", "quiet"),
+        ("k", "quiet"),
+        ("h", "asking"),
+        ("d", "hover"),
+        ("i", "silent"),
+        ("b", "degraded"),
+        ("c", "idle"),
+        ("g", "ready"),
+        ("a", "normal"),
+        ("j", "normal"),
+    ]
+
+
+def test_a_row_tells_what_is_the_matter() -> None:
+    drone = _drone("a", "degraded", reasons=[{"event": "hot", "sentence": "the computer is at 90 °C"}])
+    computer = ComputerMessage(
+        time_s=5.0,
+        cameras={
+            "front": {"age_s": 0.1, "fault": None, "counts": {}},
+            "back": {"age_s": None, "fault": "back: no such device", "counts": {}},
+        },
+        load=0.8, steps=3, steps_failed=0, network_faults=0, networks_stuck=0, loop_lag_s=0.0, temperature_c=90.0,
+        messages_lost=0, recording=None,
+    )  # fmt: skip
+    neighbours = {"time_s": 5.0, "neighbours": [{"confirmed": True}, {"confirmed": False}, {"confirmed": True}]}
+    topics = {**drone.topics, "computer": Heard(NOW_S, {**computer}), "neighbours": Heard(NOW_S, neighbours)}
+    (row,) = rows_of([Watched("meadow", "a", alive=True, topics=topics)], NOW_S)
+    assert row["matters"] == ["the computer is at 90 °C", "back: no such device"]
+    assert (row["neighbours"], row["load"], row["battery_share"], row["height_m"]) == (2, 0.8, 0.5, 4.0)
+
+
+def test_a_table_is_printed_for_people(capsys: pytest.CaptureFixture[str]) -> None:
+    from flockd.cli.status import _console, _table
+
+    _console().print(_table(rows_of([_drone("a", "normal"), _drone("b", "x", alive=False)], NOW_S)))
+    heading, first, second = (line.split() for line in capsys.readouterr().out.splitlines())
+    assert heading[:5] == ["drone", "state", "mode", "height", "battery"]
+    assert first[:2] == ["meadow/b", "gone"]
+    assert second == ["meadow/a", "normal", "offboard", "4.0", "m", "50%"]
