@@ -16,6 +16,8 @@ _EXPLAINED_PX = 3.0
 _MIN_EXPLAINED = 0.05
 """Of the matches so near to where a motion moves them; on real images true motions explain 15 % and more, and those
 that Algorithm 1 finds in nothing but false matches, within wide thresholds in metres, under 4 %."""
+_KEPT = 0.9
+"""A polish that loses more of the explained matches than the rest has followed the false ones."""
 
 
 def estimate_ego_motion(
@@ -24,8 +26,9 @@ def estimate_ego_motion(
     """``P_C = R_FC P_F + T_FC`` (Eq. 7) from the pairs labelled background, of all cameras together.
 
     Algorithm 1 finds it; with ``parameters.refine`` its reprojection error is then made small, and the result of
-    Algorithm 1 stays where that fails. ``inliers`` and ``threshold_m`` are Algorithm 1's. Raises ValueError with the
-    reason where there is no estimate, or one that explains hardly any of the matches that it was made from.
+    Algorithm 1 stays where that fails or leaves its matches behind. ``inliers`` and ``threshold_m`` are Algorithm 1's.
+    Raises ValueError with the reason where there is no estimate, or one that explains hardly any of the matches that
+    it was made from.
     """
     background = pairs.select(pairs.labels == BACKGROUND_LABEL)
     found = ransac_rigid(
@@ -38,9 +41,12 @@ def estimate_ego_motion(
         seed=seed,
     )
     motion = found.transform
-    if parameters.refine:
-        motion = refine_ego_motion(background, rig, motion, seed=seed) or motion
     explained = _explained(background, rig, motion)
+    if parameters.refine:
+        polished = refine_ego_motion(background, rig, motion, agreeing=found.inliers, seed=seed)
+        still = _explained(background, rig, polished) if polished else 0.0
+        if polished and still >= _KEPT * explained:
+            motion, explained = polished, still
     if explained < _MIN_EXPLAINED:
         raise ValueError(
             f"the best motion explains only {explained:.1%} of {len(background)} matches within {_EXPLAINED_PX:g} px"

@@ -10,7 +10,7 @@ from flockd.geometry.pairs import PointPairs
 from flockd.geometry.rig import Rig, RigCamera
 from flockd.geometry.rotations import rotation_from_vector
 from flockd.geometry.transform import RigidTransform
-from flockd.messages import FloatArray
+from flockd.messages import BoolArray, FloatArray
 
 _MAX_PAIRS = 2500
 _FLOW_SIGMA_PX = 0.3
@@ -28,13 +28,17 @@ _UNSEEN_PX = 1e3
 """Residual of a point that a motion moves out of the lens's reach."""
 
 
-def refine_ego_motion(pairs: PointPairs, rig: Rig, initial: RigidTransform, *, seed: int = 0) -> RigidTransform | None:
+def refine_ego_motion(
+    pairs: PointPairs, rig: Rig, initial: RigidTransform, *, agreeing: BoolArray | None = None, seed: int = 0
+) -> RigidTransform | None:
     """The motion near ``initial`` (F to C) that best reprojects the pairs, or None where there is no better one.
 
     Both ways over all cameras: the point lifted at t must fall on its pixel at t+1 and the point lifted at t+1 on its
     pixel at t. Gauss-Newton on the six parameters with Cauchy weights. A residual along the point's parallax is
     discounted by what the depth's own error makes of it, across it only the flow's error counts: far points fix the
-    rotation, near ones with sound depth the translation's length, and all of them its direction.
+    rotation, near ones with sound depth the translation's length, and all of them its direction. How large a residual
+    may be is learned from the pairs that ``agreeing`` (n,) marks, those that agree with ``initial`` in space: of all
+    pairs, more than half may be false matches.
 
     None means that the steps did not converge or the robust cost did not fall. Raises ValueError for pairs of a camera
     that is not in the rig.
@@ -42,21 +46,23 @@ def refine_ego_motion(pairs: PointPairs, rig: Rig, initial: RigidTransform, *, s
     strangers = set(pairs.camera_names.tolist()) - set(rig.cameras)
     if strangers:
         raise ValueError(f"pairs of camera {sorted(strangers)[0]!r}, which is not in the rig")
+    agreeing = np.ones(len(pairs), np.bool_) if agreeing is None else agreeing
     if len(pairs) > _MAX_PAIRS:
-        drawn = np.random.default_rng(seed).choice(len(pairs), _MAX_PAIRS, replace=False)
-        pairs = pairs.select(np.sort(drawn))
-    views = [
-        _View(camera, pairs.select(pairs.camera_names == name))
-        for name, camera in rig.cameras.items()
-        if np.any(pairs.camera_names == name)
-    ]
+        drawn = np.sort(np.random.default_rng(seed).choice(len(pairs), _MAX_PAIRS, replace=False))
+        pairs, agreeing = pairs.select(drawn), agreeing[drawn]
+    mine = {name: pairs.camera_names == name for name in rig.cameras}
+    views = [_View(rig.cameras[name], pairs.select(which)) for name, which in mine.items() if which.any()]
+    # As `_linearise` puts them: camera by camera, there and back.
+    typical = np.concatenate([np.tile(agreeing[which], 2) for which in mine.values()])
+    if not typical.any():
+        return None
     motion = initial
     for iteration in range(_MAX_STEPS):
         residuals, jacobians, parallax = _linearise(views, motion)
         if iteration < _SCALED_STEPS:
             # While the motion is still rough, so are the size of the residuals and the direction of the parallax.
             whitening = _whitening(parallax)
-            scale = _CAUCHY * _sigma(_times(whitening, residuals))
+            scale = _CAUCHY * _sigma(_times(whitening[typical], residuals[typical]))
         white = _times(whitening, residuals)
         weights = 1.0 / (1.0 + (white**2).sum(axis=1) / scale**2)
         J = whitening @ jacobians
