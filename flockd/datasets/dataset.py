@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from flockd.config.parameters import CameraConfig
+from flockd.datasets.errors import DatasetError
 from flockd.datasets.images import read_depth, read_image
 from flockd.geometry import RigidTransform
 from flockd.messages import Float32Array, UInt8Array
@@ -86,6 +87,13 @@ class FileDataset:
     entries: tuple[Entry, ...]
     depth_units_per_m: float = 1000.0
     notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raises DatasetError if a file is missing: better now than after an hour."""
+        for entry in self.entries:
+            for file in (entry.image, entry.depth):
+                if file is not None and not file.is_file():
+                    raise DatasetError(f"{file}: is missing; restore it, or leave its frame out")
 
     @property
     def has_depth(self) -> bool:

@@ -288,7 +288,7 @@ def test_a_listed_image_that_is_gone_is_named(
     gone = sorted((tmp_path / "rgb").iterdir())[3]
     gone.unlink()
     assert main(["replay", str(tmp_path), "--depth", "network"]) == 1
-    assert f"{gone}: cannot be read" in capfd.readouterr().err
+    assert f"{gone}: is missing" in capfd.readouterr().err
 
 
 def test_poses_of_another_time_are_named(film: Film, tmp_path: Path, onlooker: None, capsys: Capture) -> None:
