@@ -155,7 +155,7 @@ class Daemon:
         stack.callback(streamer.close)
         history, lag, thermometer = VehicleHistory(), LoopLag(clock), Thermometer()
         sight = Sight(config, self._source, networks, history.at, chronicle.step, chronicle.event, clock)
-        stack.callback(sight.leave)
+        stack.push_async_callback(_patiently, closing, sight.leave)
         dead: dict[str, str] = {}
         inspector = Inspector(config, self._source, sight, networks, gate, lag, thermometer, dead, clock)
         requests = Requests(link, chronicle.event)

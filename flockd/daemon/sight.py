@@ -22,6 +22,7 @@ FRAME_DEADLINE_S = 2.0
 """To decode one set."""
 STEP_DEADLINE_S = 10.0
 """Of a whole step, whose networks have deadlines of their own; the drone has been handed over long before."""
+LEAVE_S = 0.7
 STEPS_REMEMBERED = 20
 
 
@@ -60,6 +61,7 @@ class Sight:
         self._geometry = Worker("geometry")
         self._pilot: FlockPilot | None = None
         self._flight = 0
+        self._failure: str | None = None
         self._took_s: deque[float] = deque(maxlen=STEPS_REMEMBERED)
         self.saw_frames = False
         self.newest: Look | None = None
@@ -96,9 +98,10 @@ class Sight:
             await asyncio.sleep(due_s - now)
 
     def leave(self) -> None:
-        """Lets the threads go."""
-        self._decoding.leave()
-        self._geometry.leave()
+        """Ends what runs; takes up to two seconds, from any thread."""
+        self._networks.leave()
+        self._geometry.leave(LEAVE_S)
+        self._decoding.leave(LEAVE_S)
 
     async def _step(self, taken_s: float, frames: FrameSet, vehicle: VehicleState) -> None:
         flight = self._flight
@@ -109,13 +112,13 @@ class Sight:
                 pilot = await self._geometry.do(STEP_DEADLINE_S, self._fresh_pilot)
             output = await self._geometry.do(STEP_DEADLINE_S, pilot.step, frames, vehicle)
         except (FloatingPointError, NetworkStuckError) as error:
-            self.failed += 1
-            self._tell(f"a step came to nothing: {error}")
+            self._note_failure(str(error))
             return
         finally:
             self._took_s.append(self._clock() - taken_s)
         if flight != self._flight:
             return  # a flight began meanwhile; this was the old pilot's last thought
+        self._failure = None
         number = 1 if self._pilot is None or self.newest is None else self.newest.number + 1
         self._pilot = pilot
         self.newest = Look(taken_s, output, flight, number)
@@ -124,6 +127,13 @@ class Sight:
 
     def _fresh_pilot(self) -> FlockPilot:
         return FlockPilot(self._config, self._networks, stopwatch=self._clock)
+
+    def _note_failure(self, why: str) -> None:
+        """Tells it when it is new, and counts it."""
+        self.failed += 1
+        if why != self._failure:
+            self._tell(f"a step came to nothing: {why}")
+        self._failure = why
 
     def _count(self, look: Look) -> None:
         if look.number > 1:  # the first has nothing to compare with

@@ -27,7 +27,8 @@ class Worker:
     def __init__(self, name: str, backlog: int = 1) -> None:
         self._name = name
         self._jobs: queue.Queue[tuple[Future[Any], Callable[[], Any]] | None] = queue.Queue(backlog)
-        threading.Thread(target=self._run, name=name, daemon=True).start()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
 
     def submit(self, job: Callable[..., T], *arguments: object) -> Future[T]:
         """Gives it a job, from any thread. Raises BusyError when too many wait."""
@@ -48,10 +49,14 @@ class Worker:
                 raise
             raise LateError(f"{self._name}: not done within {deadline_s:g} s") from error
 
-    def leave(self) -> None:
-        """Lets the thread end after what it does now; if that never ends, it dies with the process."""
+    def leave(self, timeout_s: float = 0.0) -> None:
+        """Lets the thread end after what it does now, and waits so long for it; if it hangs, it dies with the process.
+
+        To wait is for threads that run foreign code, which a process had better not end under.
+        """
         with suppress(queue.Full):
             self._jobs.put_nowait(None)
+        self._thread.join(timeout_s)
 
     def _run(self) -> None:
         while (entry := self._jobs.get()) is not None:
