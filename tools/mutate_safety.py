@@ -14,8 +14,8 @@ import ast
 import importlib
 import itertools
 import os
+import resource
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -34,10 +34,35 @@ TESTS = {
 }
 """The files of tests/safety, the likeliest to notice first; else the supervisor's."""
 SUPERVISORS_TESTS = ("test_supervisor.py", "test_gate.py", "test_fence.py")
-TIME_LIMIT_S = 120
+CPU_LIMIT_S = 60
+"""For a mutant that never ends; many times what the tests take."""
 
-EQUIVALENT: dict[str, str] = {}
-"""Changed lines, as they are printed, that mean the same as before; and why."""
+EQUIVALENT: dict[str, str] = {
+    "policy.py Reaction: SILENCE = (7)": "only the order counts, and it is still the worst",
+    "policy.py Barrier: LATCH = (3)": "only the order counts, and it is still the worst",
+    'policy.py Barrier: WAIT = 2 """Not ready while it lasts.""" LATCH = 1': (
+        "the order counts for how reasons are told, and what latches is told first anyway"
+    ),
+    "policy.py Rule: later: Reaction = Reaction.RETURN": "it never comes where no `after_s` is given: that is infinite",
+    "supervisor.py _Flight: asked: Reaction = Reaction.DEGRADE": "whatever may be asked for is worse still",
+    "supervisor.py _Flight: asked_s: float = (0.0)": "written when something is asked for, and read only afterwards",
+    "supervisor.py Supervisor.__init__: self._state = State.READY": "latched, the first step makes it idle",
+    "supervisor.py Supervisor.__init__: pass  # self._flight = _Flight()": "each flight begins with a new one",
+    "supervisor.py Supervisor.__init__: pass  # self._now_s = -math.inf": "each step writes it before it is read",
+    "supervisor.py Supervisor.__init__: self._now_s = (math.inf)": "each step writes it before it is read",
+    "supervisor.py Supervisor.__init__: self._now_s = -(0.0)": "each step writes it before it is read",
+    "fence.py _inside: ends = np.roll(corners, (1), axis=0)": "the same outline, the other way round",
+    "fence.py _inside: return bool(np.sum((east >= e1 + (e2 - e1) * (north - n1) / (n2 - n1))) % 2)": (
+        "the same ray, to the west; a closed outline is crossed an even number of times in all"
+    ),
+    "fence.py _inside: return bool(np.sum((east <= e1 + (e2 - e1) * (north - n1) / (n2 - n1))) % 2)": (
+        "differs on the outline itself, which is neither inside nor outside"
+    ),
+    "fence.py _nearest_on_outline: sides = np.roll(corners, (1), axis=0) - corners": (
+        "the same outline, the other way round"
+    ),
+}
+"""What survives because it means the same as before, by `Mutant.name`; and why."""
 
 Edit = tuple[ast.expr | ast.stmt, str]
 
@@ -48,6 +73,8 @@ class Mutant:
 
     file: str
     line: int
+    place: str
+    """The class and function it is in."""
     changed: str
     """The changed lines, stripped, one after another."""
     source: str
@@ -55,7 +82,7 @@ class Mutant:
     @property
     def name(self) -> str:
         """By which it is known in EQUIVALENT; without the line number, which moves."""
-        return f"{self.file}: {self.changed}"
+        return f"{self.file} {self.place}: {self.changed}"
 
 
 def main() -> int:
@@ -69,7 +96,7 @@ def main() -> int:
         parser.error(f"there is no {arguments.only} in {SAFETY}")
     mutants = [mutant for path in files for mutant in mutants_of(path)]
     if arguments.list:
-        print(*(f"{mutant.file}:{mutant.line}  {mutant.changed}" for mutant in mutants), sep="\n")
+        print(*(f"line {mutant.line} of {mutant.name}" for mutant in mutants), sep="\n")
         return 0
     with tempfile.TemporaryDirectory() as folder:
         prepare(Path(folder))
@@ -82,12 +109,12 @@ def report(mutants: Sequence[Mutant], survivors: Sequence[Mutant]) -> int:
     unexplained = [mutant for mutant in survivors if mutant.name not in EQUIVALENT]
     for mutant in survivors:
         verdict = EQUIVALENT.get(mutant.name, "SURVIVED")
-        print(f"{mutant.file}:{mutant.line}  {mutant.changed}\n    {verdict}")
+        print(f"line {mutant.line} of {mutant.name}\n    {verdict}")
     killed = len(mutants) - len(survivors)
     print(f"{len(mutants)} mutants: {killed} killed, {len(survivors) - len(unexplained)} equivalent, ", end="")
     print(f"{len(unexplained)} survived")
     files = {mutant.file for mutant in mutants}
-    stale = {name for name in EQUIVALENT if name.partition(":")[0] in files} - {mutant.name for mutant in survivors}
+    stale = {name for name in EQUIVALENT if name.partition(" ")[0] in files} - {mutant.name for mutant in survivors}
     for name in sorted(stale):
         print(f"EQUIVALENT has an entry without a survivor; delete it: {name}")
     return 1 if unexplained or stale else 0
@@ -138,7 +165,7 @@ def survives(mutant: Mutant, folder: Path) -> bool:
 
 def _run_tests(files: Sequence[str]) -> None:
     """In a forked process, which it ends: with 0 if all tests pass."""
-    signal.alarm(TIME_LIMIT_S)  # for a mutant that never ends
+    resource.setrlimit(resource.RLIMIT_CPU, (CPU_LIMIT_S, CPU_LIMIT_S))
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)
@@ -167,7 +194,18 @@ def mutants_of(path: Path) -> Iterator[Mutant]:
             first = next(n for n, (a, b) in enumerate(zip(before, after, strict=False)) if a != b)
             kept = next(n for n, (a, b) in enumerate(zip(before[::-1], after[::-1], strict=False)) if a != b)
             changed = " ".join(line.strip() for line in after[first : max(len(after) - kept, first + 1)])
-            yield Mutant(path.name, first + 1, changed, mutated)
+            yield Mutant(path.name, first + 1, _place(tree, first + 1), changed, mutated)
+
+
+def _place(node: ast.AST, line: int) -> str:
+    """The dotted name of the innermost class or function that a line is in."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.stmt) and child.lineno <= line <= (child.end_lineno or child.lineno):
+            inner = _place(child, line)
+            if isinstance(child, ast.ClassDef | ast.FunctionDef):
+                return f"{child.name}.{inner}".rstrip(".")
+            return inner
+    return ""
 
 
 def _edited(source: str, edits: Sequence[Edit]) -> str:
@@ -266,7 +304,7 @@ def _of_statement(node: ast.stmt) -> Iterator[Edit]:
             yield node.test, "True"
             yield node.test, "False"
         case ast.Expr(value=ast.Call()) | ast.AugAssign() | ast.Assign(targets=[ast.Attribute() | ast.Subscript()]):
-            yield node, "pass"
+            yield node, f"pass  # {ast.unparse(node).splitlines()[0]}"
         case ast.Return(value=ast.expr()):
             yield node, "return None"
 

@@ -127,7 +127,7 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
     temperature = inputs.temperature_c
     table = (
         (Event.SIGHT_LOST, sightless, f"too few cameras see: {', '.join(lost) or 'there are none'}"),
-        (Event.CAMERA_LOST, bool(lost) and not sightless, f"a blind sector: {', '.join(lost)}"),
+        (Event.CAMERA_LOST, len(lost) > 0 and not sightless, f"a blind sector: {', '.join(lost)}"),
         (
             Event.FRAMES_DROPPED,
             not inputs.dropped_share <= p.max_dropped_share,
@@ -171,7 +171,7 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
             not inputs.loop_lag_s <= p.max_loop_lag_s,
             f"the event loop is {inputs.loop_lag_s:.2f} s late",
         ),
-        (Event.TASK_DIED, bool(inputs.dead_tasks), f"ended and should not have: {', '.join(inputs.dead_tasks)}"),
+        (Event.TASK_DIED, len(inputs.dead_tasks) > 0, f"ended and should not have: {', '.join(inputs.dead_tasks)}"),
         (
             Event.NEIGHBOURS_LOST,
             not inputs.neighbours_age_s <= p.neighbours_timeout_s,

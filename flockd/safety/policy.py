@@ -29,7 +29,7 @@ class Reaction(IntEnum):
 
 
 class Barrier(IntEnum):
-    """What an event means for a drone that flockd does not fly; of several the worst wins."""
+    """What an event means for a drone that flockd does not fly."""
 
     NONE = 0
     WAIT = 1
@@ -69,13 +69,13 @@ class Rule:
     """Before the flight and after it."""
     reaction: Reaction
     """In flight."""
-    later: Reaction | None = None
-    """In flight, instead, once it has lasted `after_s`."""
     after_s: float = math.inf
+    later: Reaction = Reaction.HOLD
+    """In flight, instead, once it has lasted `after_s`."""
 
     def reaction_at(self, lasted_s: float) -> Reaction:
         """What is done in flight about the event when it has lasted this long."""
-        return self.later if self.later is not None and lasted_s >= self.after_s else self.reaction
+        return self.later if lasted_s >= self.after_s else self.reaction
 
 
 def rules(p: SafetyParameters) -> dict[Event, Rule]:
@@ -98,11 +98,11 @@ def rules(p: SafetyParameters) -> dict[Event, Rule]:
         Event.TOO_HOT: Rule(Barrier.WAIT, Reaction.HOVER),
         Event.LOOP_LATE: Rule(Barrier.NONE, Reaction.DEGRADE),
         Event.TASK_DIED: Rule(Barrier.WAIT, Reaction.HOLD),
-        Event.NEIGHBOURS_LOST: Rule(Barrier.NONE, Reaction.NOTE, later=Reaction.HOLD, after_s=alone_s),
+        Event.NEIGHBOURS_LOST: Rule(Barrier.NONE, Reaction.NOTE, alone_s, Reaction.HOLD),
         Event.NEIGHBOUR_CLOSE: Rule(Barrier.NONE, Reaction.NOTE),
         Event.COMMAND_REFUSED: Rule(Barrier.NONE, Reaction.DEGRADE),
-        Event.FENCE_LEFT: Rule(Barrier.WAIT, Reaction.DEGRADE, later=Reaction.HOLD, after_s=p.outside_s),
-        Event.HEIGHTS_LEFT: Rule(Barrier.WAIT, Reaction.DEGRADE, later=Reaction.HOLD, after_s=p.outside_s),
+        Event.FENCE_LEFT: Rule(Barrier.WAIT, Reaction.DEGRADE, p.outside_s, Reaction.HOLD),
+        Event.HEIGHTS_LEFT: Rule(Barrier.WAIT, Reaction.DEGRADE, p.outside_s, Reaction.HOLD),
         Event.LINK_LOST: Rule(Barrier.LATCH, Reaction.SILENCE),
         Event.NOT_OFFBOARD: Rule(Barrier.NONE, Reaction.SILENCE),
         Event.NOT_ARMED: Rule(Barrier.WAIT, Reaction.SILENCE),

@@ -106,7 +106,7 @@ class Supervisor:
 
     def _wait(self, noticed: dict[Event, str], released: bool) -> None:
         """Idle, ready or silent: may it fly, and does the pilot want it to?"""
-        if released and Event.LINK_LOST not in noticed:
+        if released:
             self._latched = {}
         barriers = {event: self._rules[event].barrier for event in noticed}
         self._latched |= {event: noticed[event] for event, barrier in barriers.items() if barrier is Barrier.LATCH}
@@ -120,7 +120,7 @@ class Supervisor:
             self._begin(noticed)
 
     def _begin(self, noticed: dict[Event, str]) -> None:
-        self._state = State.NORMAL
+        """The pilot has switched to offboard."""
         self._since_s = dict.fromkeys(noticed, self._now_s)
         self._flight = _Flight()
         self._fly(noticed)

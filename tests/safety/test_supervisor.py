@@ -279,6 +279,11 @@ def test_the_pilot_takes_over_and_it_never_comes_back_by_itself() -> None:
     assert flight.events == [Event.NOT_OFFBOARD]
 
 
+def test_what_was_mild_when_the_pilot_took_over_is_not_told_as_a_reason_for_it() -> None:
+    flight = flying().step(cameras=ONE_LOST, flight_mode="position").step(cameras=ALL_SEE)
+    assert flight.events == [Event.NOT_OFFBOARD]
+
+
 def test_after_landing_and_disarming_a_new_flight_may_begin() -> None:
     flight = flying().step(flight_mode="position").step(flight_mode="land").step(in_air=False)
     assert (flight.state, flight.action) == (State.SILENT, Action.SILENCE)
@@ -373,6 +378,19 @@ def test_every_flight_has_its_own_second_of_hovering() -> None:
     flight.step(armed=False, in_air=False).step(armed=True, in_air=True, flight_mode="hold")
     assert flight.step(flight_mode=OFFBOARD).state is State.NORMAL
     assert flight.run(0.875, cameras=NONE_SEE).state is State.HOVER
+
+
+def test_a_flight_that_begins_degraded_has_a_whole_second_of_hovering_too() -> None:
+    flight = ready().step(cameras=ONE_LOST).step(flight_mode=OFFBOARD)
+    assert flight.state is State.DEGRADED
+    flight.step(cameras=NONE_SEE).run(1.0 - STEP_S)
+    assert (flight.state, flight.action) == (State.HOVER, Action.HOVER)
+
+
+def test_it_makes_no_difference_what_the_clock_showed_at_the_start() -> None:
+    for now_s in (0.0, 1e6):
+        flight = Flight(now_s=now_s).step(armed=False, in_air=False, flight_mode="hold").step(armed=True, in_air=True)
+        assert flight.step(flight_mode=OFFBOARD).state is State.NORMAL
 
 
 def test_every_flight_asks_anew() -> None:
