@@ -245,7 +245,8 @@ class Daemon:
             crew.chronicle.begin_recording()
         elif crew.chronicle.recording is not None and not crew.link.status().armed:
             crew.chronicle.end_recording()
-        if (self._asked.shutdown or crew.dead_tasks) and now.state in {State.IDLE, State.SILENT}:
+        handed_over = now.state in {State.IDLE, State.SILENT} and not crew.requests.asking
+        if (self._asked.shutdown or crew.dead_tasks) and handed_over:
             crew.over.set()
 
     def _about(self) -> AboutMessage:

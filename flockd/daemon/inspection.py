@@ -54,7 +54,7 @@ class Inspector:
         self._config, self._source, self._sight, self._networks = config, source, sight, networks
         self._gate, self._lag, self._thermometer, self._dead_tasks = gate, lag, thermometer, dead_tasks
         self._clock = clock
-        self._eyes = _Eyes(config)
+        self._eyes = Eyes(config)
         self._faults_told = 0
         self._refused_told = 0
         self._had_satellites = False
@@ -118,12 +118,14 @@ def position_from_home(status: AutopilotStatus) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class Seen:
+    """What the supervisor is told of the cameras."""
+
     cameras: Mapping[str, CameraHealth]
     dropped_share: float
 
 
-class _Eyes:
+class Eyes:
     """How the cameras are doing, and how many of their frames of late were worth nothing."""
 
     def __init__(self, config: DroneConfig) -> None:
@@ -135,7 +137,8 @@ class _Eyes:
         self._frozen_before = dict.fromkeys(self._periods_s, 0)
         self._window: deque[tuple[float, int, int]] = deque()
 
-    def look(self, now: float, status: Mapping[str, CameraStatus]) -> _Seen:
+    def look(self, now: float, status: Mapping[str, CameraStatus]) -> Seen:
+        """As of now; to be called again and again."""
         cameras = {name: self._health(name, camera) for name, camera in status.items()}
         received = sum(camera.counts.get("received", 0) for camera in status.values())
         bad = sum(camera.counts.get(what, 0) for camera in status.values() for what in _BAD)
@@ -143,7 +146,7 @@ class _Eyes:
             self._window.popleft()
         self._window.append((now, received, bad))
         _, received_before, bad_before = self._window[0]
-        return _Seen(cameras, (bad - bad_before) / max(received - received_before, 1))
+        return Seen(cameras, (bad - bad_before) / max(received - received_before, 1))
 
     def _health(self, name: str, camera: CameraStatus) -> CameraHealth:
         """A fault after which frozen pictures were counted is that of a frozen camera."""

@@ -36,6 +36,8 @@ class Requests:
         self._link, self._tell = link, tell
         self.wish: Wish | None = None
         """Set by the control loop; None: nothing."""
+        self.asking = False
+        """A request is under way; a landing takes two, and the first already ends offboard."""
 
     async def run(self) -> None:
         """Asks for ever, whenever there is something to ask for."""
@@ -53,6 +55,7 @@ class Requests:
             await self._wait_for_another(wish)
 
     async def _ask(self, wish: Wish, ask: Callable[[], Awaitable[None]]) -> None:
+        self.asking = True
         try:
             async with asyncio.timeout(ANSWER_S):
                 await ask()
@@ -62,6 +65,8 @@ class Requests:
             self._tell(f"the autopilot was asked for {wish} and has not answered yet")
         else:
             self._tell(f"the autopilot was asked for {wish}, and agreed")
+        finally:
+            self.asking = False
 
     async def _wait_for_another(self, wish: Wish) -> None:
         loop = asyncio.get_running_loop()

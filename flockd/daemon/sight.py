@@ -18,9 +18,9 @@ from flockd.pilot import FlockPilot
 from flockd.sources import FrameSource
 
 FRAME_WAIT_S = 0.1
-FRAME_DEADLINE_S = 2.0
+FRAME_DEADLINE_S = 5.0
 """To decode one set."""
-STEP_DEADLINE_S = 10.0
+STEP_DEADLINE_S = 30.0
 """Of a whole step, whose networks have deadlines of their own; the drone has been handed over long before."""
 LEAVE_S = 0.7
 STEPS_REMEMBERED = 20

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from flockd.autopilot.stand_in import AutopilotStandIn
+from flockd.config import DroneConfig
+from flockd.errors import ConfigError, ConfigProblem
 from tests.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
 
 try:
@@ -167,6 +169,26 @@ def test_a_dead_control_task_is_held_by_the_last_resort(
     asyncio.run(story())
 
 
+def test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe(
+    tmp_path: Path, port: int, stand_in: AutopilotStandIn
+) -> None:
+    async def story() -> None:
+        async with aboard(stand_in, port, tmp_path) as ship:
+            await ship.is_ready_in_the_air()
+            await ship.flies()
+            ship.service.clear()
+            blocked_s = time.monotonic()
+            time.sleep(2.0)
+            assert stand_in.setpoints[-1][0] - blocked_s < 0.5
+            assert stand_in.mode == "LOITER"
+            assert stand_in.failsafe
+            before = len(stand_in.setpoints)
+            await ship.until_state("silent")
+            assert len(stand_in.setpoints) == before, "one more, and PX4 would be in offboard again"
+
+    asyncio.run(story())
+
+
 def test_any_other_dead_task_is_a_hold_too(
     tmp_path: Path, port: int, stand_in: AutopilotStandIn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -203,6 +225,10 @@ def test_arming_and_taking_off_by_itself_where_configured(tmp_path: Path) -> Non
         asyncio.run(story())
 
 
+def _wrong() -> DroneConfig:
+    raise ConfigError([ConfigProblem("tiny.yaml", 3, "step_s", "is missing")])
+
+
 def test_the_configuration_is_read_again_on_the_ground_only(
     tmp_path: Path, port: int, stand_in: AutopilotStandIn
 ) -> None:
@@ -218,6 +244,8 @@ def test_the_configuration_is_read_again_on_the_ground_only(
     async def on_the_ground(stand_in: AutopilotStandIn, port: int) -> None:
         async with aboard(stand_in, port, tmp_path / "ground") as ship:
             await ship.until_state("idle")
+            ship.daemon.ask_to_reload(_wrong)
+            await ship.until_event("the configuration was not taken, and the old one stays: tiny.yaml:3: ")
             other = ship.config.model_copy(update={"step_s": 0.2})
             ship.daemon.ask_to_reload(lambda: other)
             assert await ship.ending == Ending(other)

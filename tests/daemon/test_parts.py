@@ -17,13 +17,15 @@ import pytest
 
 from flockd.config.parameters import CameraConfig, DroneConfig, IntrinsicsConfig, RigConfig, SourceParameters
 from flockd.daemon.computer import LoopLag, WallClock, hottest_zone_c
-from flockd.daemon.inspection import _Eyes
+from flockd.daemon.inspection import Eyes
 from flockd.daemon.lock import only_instance
 from flockd.daemon.networks import NetworkStuckError, WatchedNetworks
 from flockd.daemon.service import ServiceManager
 from flockd.daemon.worker import BusyError, LateError, Worker
+from flockd.data import data_path
 from flockd.errors import UnavailableError
 from flockd.messages import VehicleState
+from flockd.perception import OnnxModel
 from flockd.sources import CameraStatus, Count
 from tests.daemon.aboard import TinyPerceiver
 
@@ -77,6 +79,24 @@ def test_a_stuck_network_is_ended_then_abandoned_then_hopeless() -> None:
     tiny.hangs.clear()
     networks.flow("front", IMAGE, IMAGE)
     assert not networks.hopeless, "a worker of its own answers"
+
+
+def test_the_shipped_networks_end_when_told() -> None:
+    """A picture of 16 megapixels takes a flow network many seconds on any computer that flies."""
+    model = OnnxModel(data_path("models") / "flow.yaml", threads=1)
+    image = np.zeros((1, 4096, 4096, 3), np.uint8)
+    worker = Worker("test")
+    call = worker.submit(model.run, dict.fromkeys(model.manifest.inputs, image))
+    time.sleep(0.3)
+    assert not call.done()
+    told_s = time.monotonic()
+    while not call.done():
+        model.terminate()
+        time.sleep(0.01)
+    assert time.monotonic() - told_s < 5.0
+    with pytest.raises(Exception, match="terminate"):
+        call.result()
+    worker.leave(5.0)
 
 
 def test_a_network_gone_astray_is_counted() -> None:
@@ -187,7 +207,7 @@ def test_eyes_tell_frozen_from_unplugged_and_count_bad_frames_of_late() -> None:
         name="front", size_px=(64, 48), intrinsics=IntrinsicsConfig(fx=32.0, fy=32.0, cx=32.0, cy=24.0)
     )
     config = DroneConfig(rig=RigConfig(cameras=(camera,)), source=SourceParameters(kind="shared_memory"))
-    eyes = _Eyes(config)
+    eyes = Eyes(config)
     fine = eyes.look(0.0, _status(None, received=100, frozen=3)).cameras["front"]
     assert (fine.unplugged, fine.frozen, fine.period_s) == (False, False, 0.1)
     gone = eyes.look(1.0, _status("front: no such device", received=100, frozen=3)).cameras["front"]
