@@ -194,8 +194,8 @@ def _without(velocity: FloatArray, directions: FloatArray) -> FloatArray:
 
 def _units(vectors: FloatArray) -> FloatArray:
     """The vectors (n, 2) at length 1, without those of no length: straight above or below is in no direction."""
-    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    units: FloatArray = (vectors / np.where(lengths > 0, lengths, 1.0))[lengths[:, 0] > 0]
+    somewhere = vectors[np.any(vectors != 0, axis=1)]
+    units: FloatArray = somewhere / np.linalg.norm(somewhere, axis=1, keepdims=True)
     return units
 
 

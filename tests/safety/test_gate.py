@@ -306,6 +306,13 @@ def test_outside_the_fence_only_what_leads_inward_or_along_it_is_left() -> None:
     np.testing.assert_allclose(sent(Stream().second([1.0, 0.5], around=inside)).velocity, [1.0, 0.5])
 
 
+def test_along_the_fence_and_past_a_neighbour_nothing_is_held_back() -> None:
+    around = replace(near([0.5, 0.0, 0.0]), position=np.array([101.0, 0.0]))
+    verdict = Stream().second([0.0, 1.0], around=around)
+    np.testing.assert_array_equal(sent(verdict).velocity, [0.0, 1.0])
+    assert verdict.objections == ()
+
+
 def test_beyond_the_corner_of_a_fence_only_the_way_back_is_left() -> None:
     square = ((-10.0, -10.0), (-10.0, 10.0), (10.0, 10.0), (10.0, -10.0))
     parameters = DRAG_FREE.model_copy(update={"fence_corners_m": square, "fence_radius_m": None})
