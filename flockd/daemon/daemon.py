@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from contextlib import AsyncExitStack
@@ -21,6 +22,7 @@ from flockd.daemon.control import FLYING, Control, Door, VehicleHistory
 from flockd.daemon.crew import Crew
 from flockd.daemon.inspection import Asked, Inspector
 from flockd.daemon.networks import Networks, WatchedNetworks
+from flockd.daemon.preview import preview
 from flockd.daemon.reports import tell_for_ever, tell_service
 from flockd.daemon.requests import Requests, TakeOff
 from flockd.daemon.service import ServiceManager
@@ -73,7 +75,7 @@ class Daemon:
         """
         self._autopilot = _autopilot_of(config, file)
         self._source = open_source(config, file)
-        self._config = config
+        self._config, self._file = config, file
         self._load_networks, self._models, self._recordings = load_networks, models, recordings
         self._service, self._clock = service, clock
         self._asked = Asked()
@@ -92,7 +94,8 @@ class Daemon:
         if refusal is None:
             try:
                 config = read()
-                _autopilot_of(config, "the new configuration")
+                _autopilot_of(config, self._file)
+                open_source(config, self._file)
             except FlockdError as error:
                 refusal = f"the configuration was not taken, and the old one stays: {error}"
             else:
@@ -168,7 +171,8 @@ class Daemon:
             requests=requests, take_off=take_off, chronicle=chronicle, telemetry=telemetry, lag=lag,
             thermometer=thermometer, wall_clock=WallClock(chronicle.event, clock), dead_tasks=dead,
         )  # fmt: skip
-        telemetry.announce(config.name, self._about(), self._taker(asyncio.get_running_loop(), chronicle))
+        taker = self._taker(asyncio.get_running_loop(), chronicle)
+        telemetry.announce(config.name, self._about(), taker, functools.partial(_picture, sight))
         return crew
 
     async def _networks(self) -> WatchedNetworks:
@@ -282,6 +286,11 @@ def _autopilot_of(config: DroneConfig, file: str) -> AutopilotParameters:
         problem = ConfigProblem(file, 0, "autopilot", "is missing; add it with the `address` of the autopilot")
         raise ConfigError([problem])
     return config.autopilot
+
+
+def _picture(sight: Sight, camera: str) -> bytes | None:
+    frame = None if sight.frames is None else sight.frames.frames.get(camera)
+    return None if frame is None else preview(frame)
 
 
 def _open_telemetry(config: DroneConfig) -> ZenohTelemetry:

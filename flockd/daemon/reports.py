@@ -19,7 +19,7 @@ STATUS_EVERY_S = 2.0
 
 async def tell_service(crew: Crew, service: ServiceManager) -> None:
     """Ready with the first frame; before that, and after it, what is the matter. For ever."""
-    while not crew.sight.saw_frames:
+    while crew.sight.frames is None:
         faults = [status.fault for status in crew.source.status().values() if status.fault]
         service.starting(f"waits for frames: {'; '.join(faults) or 'none came yet'}", START_MORE_S)
         await asyncio.sleep(START_LOOK_S)

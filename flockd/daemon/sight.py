@@ -63,7 +63,8 @@ class Sight:
         self._flight = 0
         self._failure: str | None = None
         self._took_s: deque[float] = deque(maxlen=STEPS_REMEMBERED)
-        self.saw_frames = False
+        self.frames: FrameSet | None = None
+        """The newest; None before the first."""
         self.newest: Look | None = None
         self.steps = 0
         self.failed = 0
@@ -88,7 +89,7 @@ class Sight:
             frames = await self._decoding.do(FRAME_DEADLINE_S, self._source.newest, FRAME_WAIT_S)
             if frames is None:
                 continue
-            self.saw_frames = True
+            self.frames = frames
             taken_s = self._clock()
             vehicle = self._vehicle_at(frames.time_s)
             if vehicle is not None:

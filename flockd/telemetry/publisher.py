@@ -17,6 +17,8 @@ from flockd.telemetry.topics import PREFIX, TOPICS, AboutMessage, AnswerMessage
 
 Ask = Callable[[str], AnswerMessage]
 """Takes an operator's command by name, on a thread of zenoh's; returns at once."""
+Look = Callable[[str], bytes | None]
+"""Gives a camera's newest picture as JPEG, on a thread of zenoh's; None where there is none."""
 
 
 class ZenohTelemetry:
@@ -57,8 +59,11 @@ class ZenohTelemetry:
         except zenoh.ZError:  # telemetry never ends a flight
             self._lost += 1
 
-    def announce(self, drone: str, about: AboutMessage, ask: Ask) -> None:
-        """Shows that a drone is alive for as long as this session is, says what it flies with, and takes commands."""
+    def announce(self, drone: str, about: AboutMessage, ask: Ask, look: Look) -> None:
+        """Shows that a drone is alive for as long as this session is, and answers who asks.
+
+        It tells what it flies with, takes commands, and shows what a camera sees.
+        """
         key = f"{self._prefix}/{checked_name(drone)}"
         self._kept += [
             self._session.liveliness().declare_token(f"{key}/alive"),
@@ -66,6 +71,7 @@ class ZenohTelemetry:
             self._session.declare_queryable(
                 f"{key}/ask/*", lambda query: _answer(query, ask(str(query.key_expr).rpartition("/")[2]))
             ),
+            self._session.declare_queryable(f"{key}/image/*", lambda query: _show(query, look)),
         ]
 
     def close(self) -> None:
@@ -97,6 +103,15 @@ class ZenohTelemetry:
 def _answer(query: zenoh.Query, message: Mapping[str, object]) -> None:
     """Answers under the key that was asked for; a query for several at once, as with `*`, is answered as one."""
     query.reply(query.key_expr, json.dumps(_finite(message), allow_nan=False), encoding=zenoh.Encoding.APPLICATION_JSON)
+
+
+def _show(query: zenoh.Query, look: Look) -> None:
+    camera = str(query.key_expr).rpartition("/")[2]
+    picture = look(camera)
+    if picture is None:
+        query.reply_err(f"camera {camera!r} has no picture", encoding=zenoh.Encoding.TEXT_PLAIN)
+    else:
+        query.reply(query.key_expr, picture, encoding=zenoh.Encoding.IMAGE_JPEG)
 
 
 def _finite(value: object) -> object:

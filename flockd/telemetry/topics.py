@@ -4,8 +4,9 @@ A key is `flockd/v1/<fleet>/<drone>/<topic>`; a message is a JSON object in UTF-
 Vectors are lists: NED is north, east, down. Times are seconds on the drone's monotonic clock.
 
 `state` to `timings` follow from each step of the pilot; `flight` and `computer` come from the daemon, at all times.
-Beside the topics, a drone in flight has a liveliness token `.../alive`, answers a query for `.../about` with an
-`AboutMessage`, and one for `.../ask/hold`, `land` or `resume` with an `AnswerMessage`.
+Beside the topics, a drone's daemon has a liveliness token `.../alive`, answers a query for `.../about` with an
+`AboutMessage`, one for `.../ask/hold`, `land` or `resume` with an `AnswerMessage`, and one for `.../image/<camera>`
+with a small JPEG of what that camera sees.
 """
 
 from __future__ import annotations

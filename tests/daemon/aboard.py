@@ -176,16 +176,23 @@ class Aboard:
 
     async def ask(self, what: str) -> dict[str, Any]:
         """The answer to a query, with zenoh alone as any other program would put it."""
+        answer: dict[str, Any] = json.loads(await self._query(what))
+        return answer
+
+    async def picture(self, camera: str) -> bytes:
+        return await self._query(f"image/{camera}")
+
+    async def _query(self, what: str) -> bytes:
         key = f"flockd/v1/test/tiny/{what}"
         for _ in range(20):  # until the two have found each other
             replies = await asyncio.to_thread(lambda: list(self.session.get(key, timeout=3.0)))
             if replies:
                 break
             await asyncio.sleep(0.1)
-        (sample,) = (reply.ok for reply in replies)
-        assert sample is not None
-        answer: dict[str, Any] = json.loads(sample.payload.to_bytes())
-        return answer
+        (reply,) = replies
+        answer = reply.ok or reply.err
+        assert answer is not None
+        return bytes(answer.payload.to_bytes())
 
     async def is_ready_in_the_air(self) -> None:
         """As after a restart in the air, once an operator has said that it may fly again."""

@@ -6,6 +6,7 @@ import asyncio
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -237,6 +238,10 @@ def test_the_configuration_is_read_again_on_the_ground_only(
             await ship.until_state("idle")
             about = await ship.ask("about")
             assert about["configuration"]["name"] == "tiny"
+            picture = cv2.imdecode(np.frombuffer(await ship.picture("front"), np.uint8), cv2.IMREAD_COLOR)
+            assert picture is not None
+            assert picture.shape == (48, 64, 3)
+            assert await ship.picture("bottom") == b"camera 'bottom' has no picture"
             ship.daemon.ask_to_reload(lambda: pytest.fail("read in the air"))
             await ship.until_event("the configuration was not read again, because the drone is armed or in the air")
             assert not ship.ending.done()

@@ -81,9 +81,9 @@ def test_who_may_watch_hears_and_who_may_command_commands(settings: dict[str, Pa
         return AnswerMessage(accepted=True, sentence="tried")
 
     with ZenohTelemetry("f", listen=[endpoint], settings=settings[DRONE]) as drone:
-        drone.announce("d", ABOUT, ask)
+        drone.announce("d", ABOUT, ask, lambda camera: None)
         assert _may(endpoint, drone, None) == (False, [])
-        assert _may(endpoint, drone, settings[WATCHER]) == (True, [])
+        assert _may(endpoint, drone, settings[WATCHER]) == (True, [ABOUT])
         assert asked == []
         assert _may(endpoint, drone, settings[OPERATOR]) == (True, [ABOUT, {"accepted": True, "sentence": "tried"}])
         assert asked == ["hold"]
