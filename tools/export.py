@@ -68,9 +68,9 @@ NETWORKS: dict[str, dict[str, Any]] = {
         },
     },
     "flow": {
-        "net": FlowNet,
+        "net": lambda: FlowNet(iterations=1),  # of the three trained with: DIS does the rest better
         "roles": ["flow"],
-        "description": "Optical flow on quarter-size images: best match anywhere, then three recurrent refinements",
+        "description": "Optical flow on quarter-size images: best match anywhere, then a recurrent refinement",
         "image_scale": 0.25,
         "size_multiple": 8,
         "golden_size": [120, 160],

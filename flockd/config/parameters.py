@@ -101,7 +101,7 @@ class GeometryParameters(Section):
     """IT_MAX of Algorithm 1."""
     max_threshold_m: Positive = 2.0
     """Beyond this the motion counts as not estimated."""
-    background_stride_px: Annotated[int, Field(ge=1, le=256)] = 12
+    background_stride_px: Annotated[int, Field(ge=1, le=256)] = 16
     max_depth_m: Positive = 40.0
     """Background farther away says little of the translation and is left out."""
     max_acceleration_m_s2: Positive = 6.0
@@ -113,10 +113,11 @@ class GeometryParameters(Section):
 class TrackingParameters(Section):
     """Neighbours over time."""
 
-    confirm_hits: Annotated[int, Field(ge=1)] = 2
-    confirm_probability: Annotated[float, Field(ge=0, lt=1)] = 0.9
-    """A track is confirmed when its sightings were drones with more than this probability on average."""
-    max_unseen_s: Positive = 2.0
+    confirm_hits: Annotated[int, Field(ge=1)] = 3
+    confirm_evidence: Annotated[float, Field(ge=0, lt=1)] = 0.75
+    """A track is confirmed while the average of its last ten steps is above this: a sighting that is a drone with
+    probability p counts 2 p - 1, a step without one 0."""
+    max_unseen_s: Positive = 1.5
     gate_sigma: Positive = 4.0
     """Association gate in standard deviations."""
     min_gate_m: Positive = 0.5

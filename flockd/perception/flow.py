@@ -10,6 +10,10 @@ import numpy as np
 from flockd.messages import Float32Array, UInt8Array
 from flockd.perception.session import OnnxModel
 
+_REFINED_TO_SCALE = 2
+"""DIS after a network stops at a quarter of the size: 0.3 px instead of 0.15 px of error at the median, at a quarter of
+the time, and an own motion just as good."""
+
 
 class Flow(Protocol):
     """Where every pixel of the first image has gone in the second."""
@@ -58,6 +62,8 @@ class DisFlow:
         start = self._start.flow(first, second) if self._start else np.zeros((*first.shape[:2], 2), np.float32)
         grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (first, second)]
         dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)  # one a call: it is not for two threads
+        if self._start:
+            dis.setFinestScale(_REFINED_TO_SCALE)
         return np.asarray(dis.calc(grey[0], grey[1], start), dtype=np.float32)
 
 

@@ -25,11 +25,14 @@ _MARGIN = 0.68
 """Half of a picture of a drone of known size is this many times its size wide."""
 _MAX_RESIZE = 1.7
 """The second picture's angle is at most this many times the first's, and at least as much smaller."""
+_WORTH_A_SECOND_LOOK = 0.2
 _SURE_OF_EXPECTED = 0.7
 _EXPECTED_GATE = 0.2
 """What is found where a drone was expected must be as near to that place as this share of its range, or 0.5 m."""
 _SAME_DRONE = 0.6
 """Two sightings closer than this share of their size are one drone seen by two cameras."""
+_SAME_BEARING, _SAME_RANGE = 0.4, 1.5
+"""Or in directions closer than this share of their angular size, with ranges that differ by less than this factor."""
 _BEARING_SIGMA_RAD = 0.004
 _MIN_RELATIVE_SIGMA = 0.005
 _DEPTH_MAP_RELATIVE_SIGMA = 0.08
@@ -167,7 +170,7 @@ class Observer:
     ) -> list[_Located]:
         """What the second stage finds where a drone is expected and none was segmented."""
         live = Rig({name: self._rig.cameras[name] for name in images})
-        candidates, places = [], []
+        candidates = []
         for one in expected:
             place = vehicle.R_ned_body.T @ one.position
             range_m = float(np.linalg.norm(place))
@@ -176,13 +179,11 @@ class Observer:
             cameras = tuple(name for name, pixel in live.pixels_of(place[None]).items() if np.isfinite(pixel).all())
             if not cameras or any(_angle(direction, f.position) < half_angle for f in found):
                 continue
-            candidates.append(_Candidate(cameras, direction, half_angle))
-            places.append(place)
+            candidates.append(_Candidate(cameras, direction, half_angle, expected=place))
         return [
             one
-            for one, place in zip(self._look(live, images, candidates), places, strict=True)
-            if one.is_drone > _SURE_OF_EXPECTED
-            and np.linalg.norm(one.position - place) < max(_EXPECTED_GATE * float(np.linalg.norm(place)), 0.5)
+            for one in self._look(live, images, candidates)
+            if one.is_drone > _SURE_OF_EXPECTED and _is_as_expected(one)
         ]
 
     def _look(self, live: Rig, images: Mapping[str, UInt8Array], candidates: Sequence[_Candidate]) -> list[_Located]:
@@ -191,11 +192,17 @@ class Observer:
         Where two cameras share the drone, the second picture shows it whole.
         """
         first = self._ranges(live, images, [(c.direction, c.half_angle, None) for c in candidates])
-        again = [
-            (_in_view(live, position, c), _half_angle(estimate.size_m, range_m, c.half_angle), range_m)
-            for c, (position, range_m, estimate) in zip(candidates, first, strict=True)
+        worth = [
+            (c, *seen) for c, seen in zip(candidates, first, strict=True) if seen[2].is_drone > _WORTH_A_SECOND_LOOK
         ]
-        second = self._ranges(live, images, again)
+        second = self._ranges(
+            live,
+            images,
+            [
+                (_in_view(live, position, c), _half_angle(estimate.size_m, range_m, c.half_angle), range_m)
+                for c, position, range_m, estimate in worth
+            ],
+        )
         return [
             _Located(
                 candidate=c,
@@ -204,7 +211,7 @@ class Observer:
                 size_m=estimate.size_m,
                 is_drone=min(estimate.is_drone, before.is_drone) if _NEAREST_M < range_m < _FARTHEST_M else 0.0,
             )
-            for c, (position, range_m, estimate), (_, _, before) in zip(candidates, second, first, strict=True)
+            for (c, _, _, before), (position, range_m, estimate) in zip(worth, second, strict=True)
         ]
 
     def _ranges(
@@ -271,6 +278,8 @@ class _Candidate:
     half_angle: float
     instance: Instance | None = None
     """None where no drone was segmented, but one is expected."""
+    expected: FloatArray | None = None
+    """(3,) where it is expected in the body, metres."""
 
     @property
     def area_px(self) -> float:
@@ -326,6 +335,14 @@ def _half_angle(size_m: float, range_m: float, before: float | None = None) -> f
     return float(np.clip(angle, *_HALF_ANGLES))
 
 
+def _is_as_expected(one: _Located) -> bool:
+    place = one.candidate.expected
+    if place is None:
+        return True
+    gate_m = max(_EXPECTED_GATE * float(np.linalg.norm(place)), 0.5)
+    return float(np.linalg.norm(one.position - place)) < gate_m
+
+
 def _in_view(live: Rig, position: FloatArray, candidate: _Candidate) -> FloatArray:
     """The direction to a position, or the candidate's own where no camera looks that way."""
     direction = position / np.linalg.norm(position)
@@ -337,8 +354,7 @@ def _merge(found: Sequence[_Located]) -> tuple[tuple[Sighting, ...], dict[tuple[
     groups: list[list[_Located]] = []
     for one in sorted(found, key=lambda item: -item.candidate.area_px):
         for group in groups:
-            size = max(group[0].size_m, one.size_m)
-            if np.linalg.norm(group[0].position - one.position) < max(_SAME_DRONE * size, 0.25):
+            if _is_same(group[0], one):
                 group.append(one)
                 break
         else:
@@ -363,6 +379,15 @@ def _merge(found: Sequence[_Located]) -> tuple[tuple[Sighting, ...], dict[tuple[
             if one.candidate.instance:
                 label_of[(one.candidate.cameras[0], one.candidate.instance.label)] = label
     return tuple(sightings), label_of
+
+
+def _is_same(a: _Located, b: _Located) -> bool:
+    """At the same spot, or so near to each other in the picture that one drone would hide the other."""
+    size_m = max(a.size_m, b.size_m)
+    if np.linalg.norm(a.position - b.position) < max(_SAME_DRONE * size_m, 0.25):
+        return True
+    near_m, far_m = sorted((float(np.linalg.norm(a.position)), float(np.linalg.norm(b.position))))
+    return far_m < _SAME_RANGE * near_m and _angle(a.position, b.position) < _SAME_BEARING * size_m / near_m
 
 
 def _without_outline(labels: UInt8Array) -> UInt8Array:

@@ -135,9 +135,9 @@ class _SeeingCrew:
             for i in range(count)
         ]
         self._autopilots = [SimulatedAutopilot(scenario.sensors, seed=scenario.seed, drone=i) for i in range(count)]
-        # Pilots share nothing but the networks, so their order does not matter: they fly as many at a time as there
-        # are cores. Rendering uses all cores by itself.
-        self._side_by_side = ThreadPoolExecutor(os.cpu_count())
+        # Pilots share nothing but the networks, so their order does not matter: all think at a time, for five one after
+        # the other on two cores would leave one core idle for the last. Rendering uses all cores by itself.
+        self._side_by_side = ThreadPoolExecutor(min(count, 2 * (os.cpu_count() or 1) + 1))
         self._outputs: list[PilotOutput] = []
 
     def decide(

@@ -20,6 +20,8 @@ _MANOEUVRE_TIME_S = 0.5
 """How long an acceleration lasts: turns its standard deviation into a spectral density."""
 _ROBUST_SIGMA = 2.5
 """Innovations beyond this many standard deviations count less and less (90 % of honest ones are nearer)."""
+_EVIDENCE_STEPS = 10
+"""How far back the question goes whether a track is a drone."""
 _ANGULAR_SIZE_SIGMA = 0.01
 """Relative error of a drone's angular size in one frame set."""
 
@@ -48,9 +50,11 @@ class _Track:
     last_seen_s: float
     sizes: deque[float]
     size_m: float
-    probability_sum: float
+    evidence: deque[float]
+    """Of the last steps, 2 p - 1 for the probability p of being a drone; 0 where it was not seen."""
     hits: int = 1
     confirmed: bool = False
+    was_confirmed: bool = False
 
 
 class Tracker:
@@ -105,6 +109,8 @@ class Tracker:
             else:
                 self._see(track, measurement)
             numbers.append(track.number)
+        for track in self._tracks:
+            self._weigh(track)
         self._tracks = [track for track in self._tracks if self._is_kept(track)]
         return tuple(numbers)
 
@@ -120,7 +126,7 @@ class Tracker:
                 size_m=track.size_m,
             )
             for track in self._tracks
-            if track.confirmed
+            if track.was_confirmed
         )
 
     def neighbours(self) -> tuple[Neighbour, ...]:
@@ -140,14 +146,17 @@ class Tracker:
             for track in self._tracks
         )
 
-    def _confirm(self, track: _Track) -> None:
-        """Once confirmed, a track stays so."""
-        sure = track.probability_sum / track.hits > self.parameters.confirm_probability
-        track.confirmed = track.confirmed or (sure and track.hits >= self.parameters.confirm_hits)
+    def _weigh(self, track: _Track) -> None:
+        """Is it a drone? Seen often enough, and on average of the last steps with enough evidence."""
+        if track.last_seen_s < self._time_s:
+            track.evidence.append(0.0)
+        evidence = sum(track.evidence) / len(track.evidence)
+        track.confirmed = track.hits >= self.parameters.confirm_hits and evidence > self.parameters.confirm_evidence
+        track.was_confirmed |= track.confirmed
 
     def _is_kept(self, track: _Track) -> bool:
         unseen_s = self._time_s - track.last_seen_s
-        return unseen_s <= (self.parameters.max_unseen_s if track.confirmed else 0.0)
+        return unseen_s <= (self.parameters.max_unseen_s if track.was_confirmed else 0.0)
 
     def _associate(self, measurements: Sequence[Measurement]) -> dict[int, _Track]:
         """Measurement index -> track, one to one: the likeliest pair first, then the next of those left.
@@ -193,17 +202,15 @@ class Tracker:
             last_seen_s=self._time_s,
             sizes=deque([measurement.size_m], maxlen=self.parameters.size_memory),
             size_m=measurement.size_m,
-            probability_sum=measurement.drone_probability,
+            evidence=deque([_evidence(measurement)], maxlen=_EVIDENCE_STEPS),
         )
-        self._confirm(track)
         _absorb_velocity(track, measurement)
         return track
 
     def _see(self, track: _Track, measurement: Measurement) -> None:
         track.last_seen_s = self._time_s
         track.hits += 1
-        track.probability_sum += measurement.drone_probability
-        self._confirm(track)
+        track.evidence.append(_evidence(measurement))
         track.sizes.append(measurement.size_m)
         track.size_m = float(np.median(track.sizes)) if track.sizes else measurement.size_m
         position, covariance = measurement.position, measurement.covariance
@@ -228,6 +235,10 @@ def range_from_size(measurement: Measurement, sizes: Sequence[float]) -> tuple[F
     blended_variance = variance * from_size_variance / (variance + from_size_variance)
     covariance = measurement.covariance + (blended_variance - variance) * np.outer(direction, direction)
     return blended * direction, covariance
+
+
+def _evidence(measurement: Measurement) -> float:
+    return max(0.0, 2.0 * measurement.drone_probability - 1.0)
 
 
 def _absorb_velocity(track: _Track, measurement: Measurement) -> None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -43,22 +42,32 @@ def _settled(position: Array = AHEAD, *, steps: int = 10, sigma_m: float = 0.05)
 
 
 def test_what_hardly_looks_like_a_drone_is_not_confirmed_however_often_it_is_seen() -> None:
-    tracker = Tracker(TrackingParameters(confirm_hits=2, confirm_probability=0.9))
+    tracker = Tracker(TrackingParameters(confirm_hits=3, confirm_evidence=0.75))
+    confirmed = []
+    for k in range(20):  # evidence 0.4 ten times, then 1: 5 of each are 0.7 on average, 4 and 6 0.76
+        tracker.predict(STEP_S, np.zeros(3))
+        tracker.update(k * STEP_S, [replace(_seen(AHEAD), drone_probability=0.7 if k < 10 else 1.0)])
+        confirmed.append(tracker.neighbours()[0].confirmed)
+    assert confirmed == [False] * 15 + [True] * 5
+
+
+def test_what_is_seen_every_other_time_loses_its_confirmation_but_not_at_once_its_track() -> None:
+    tracker = Tracker(TrackingParameters(confirm_hits=3, confirm_evidence=0.75, max_unseen_s=1.5))
+    confirmed = []
     for k in range(8):
         tracker.predict(STEP_S, np.zeros(3))
-        tracker.update(k * STEP_S, [replace(_seen(AHEAD), drone_probability=0.8)])
-        assert not tracker.neighbours()[0].confirmed
-    for k in range(8, 18):  # 8 of 0.8 and n of 1.0 are 0.9 on average when n is 8
-        tracker.predict(STEP_S, np.zeros(3))
-        tracker.update(k * STEP_S, [_seen(AHEAD)])
-        assert tracker.neighbours()[0].confirmed == (k >= 8 + 8)
+        tracker.update(k * STEP_S, [_seen(AHEAD)] if k in (0, 1, 2, 4, 6) else [])
+        confirmed.append(tracker.neighbours()[0].confirmed)
+    # seen so far, of how many: 1/1, 2/2, 3/3, 3/4, 4/5, 4/6, 5/7, 5/8
+    assert confirmed == [False, False, True, False, True, False, False, False]
 
 
 def test_a_flock_mate_is_expected_where_it_flies_to() -> None:
     tracker = Tracker(TrackingParameters())
-    _step(tracker, 0.0, AHEAD)
+    for k in range(2):
+        _step(tracker, k * STEP_S, AHEAD + np.array((0.1 * k, 0.0, 0.0)), sigma_m=0.01)
     assert tracker.expect(STEP_S, CRUISE) == ()  # not confirmed yet
-    for k in range(1, 20):  # it gains 0.2 m/s on the own drone
+    for k in range(2, 20):  # it gains 0.2 m/s on the own drone
         _step(tracker, k * STEP_S, AHEAD + np.array((0.1 * k, 0.0, 0.0)), sigma_m=0.01)
     now = AHEAD + np.array((1.9, 0.0, 0.0))
     (expected,) = tracker.expect(1.0, CRUISE)

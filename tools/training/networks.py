@@ -42,6 +42,24 @@ def _blocks(image: Tensor, size: int) -> Tensor:
     return x.reshape(n, 3 * size * size, h // size, w // size).float() / 127.5 - 1.0
 
 
+def _first_layer(layer: nn.Sequential, image: Tensor, planes: Tensor, size: int) -> Tensor:
+    """``layer`` on the image's blocks and the planes.
+
+    To run, not to train, it is one convolution on the image itself: a kernel of 3 blocks that steps by a block.
+    """
+    if layer.training:
+        return layer(torch.cat([_blocks(image, size), planes], 1))
+    convolution, norm = layer[0], layer[1]
+    scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)
+    weight = (convolution.weight * scale[:, None, None, None]).detach()
+    ours, others = weight[:, : 3 * size * size], weight[:, 3 * size * size :]
+    kernel = ours.reshape(-1, 3, size, size, 3, 3).permute(0, 1, 4, 2, 5, 3).reshape(-1, 3, 3 * size, 3 * size)
+    bias = (norm.bias - norm.running_mean * scale).detach()
+    x = image.permute(0, 3, 1, 2).float() / 127.5 - 1.0
+    x = F.conv2d(x, kernel.clone(), bias, stride=size, padding=size)
+    return F.relu(x + F.conv2d(planes, others.clone(), padding=1))
+
+
 class _Residual(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -89,9 +107,8 @@ class NeighboursNet(nn.Module):
         known = ground > 0
         log_ground = torch.log(ground.clamp(min=1.0 / MAX_DEPTH_M))
         planes = torch.cat([geometry[:, :2], torch.where(known, log_ground + 3.0, torch.zeros_like(ground))], 1)
-        fine = self.fine(torch.cat([_blocks(image, 2), planes], 1))
-        x = torch.cat([_blocks(image, 4), F.pixel_unshuffle(planes, 2)], 1)
-        x = self.stem(x) + self.fine_down(fine)
+        fine = _first_layer(self.fine, image, planes, 2)
+        x = _first_layer(self.stem, image, F.pixel_unshuffle(planes, 2), 4) + self.fine_down(fine)
         levels = [x]
         for down, body in zip(self.down, self.body, strict=True):
             x = body(down(x))
