@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -123,18 +124,16 @@ def _number(value: float | None, form: str, unit: str) -> str:
     return "" if value is None else f"{value:{form}}{unit}"
 
 
-def _show_live(drones: Any) -> int:
+def _show_live(drones: Callable[[], Iterable[Watched]]) -> int:
     """Until Ctrl-C."""
     from rich.live import Live
 
-    with Live(console=_console(), auto_refresh=False) as live:
-        try:
-            while True:
-                rows = rows_of(drones(), time.monotonic())
-                live.update(_table(rows) if rows else "no drone was heard yet", refresh=True)
-                time.sleep(REFRESH_S)
-        except KeyboardInterrupt:
-            return ExitCode.DONE
+    with suppress(KeyboardInterrupt), Live(console=_console(), auto_refresh=False) as live:
+        while True:
+            rows = rows_of(drones(), time.monotonic())
+            live.update(_table(rows) if rows else "no drone was heard yet", refresh=True)
+            time.sleep(REFRESH_S)
+    return ExitCode.DONE
 
 
 def _console() -> Any:
