@@ -62,6 +62,9 @@ EQUIVALENT: dict[str, str] = {
     "fence.py _inside: return bool(np.sum((east <= e1 + (e2 - e1) * (north - n1) / (n2 - n1))) % 2)": (
         "differs on the outline itself, which is neither inside nor outside"
     ),
+    "fence.py _inside: return (np.sum(east < e1 + (e2 - e1) * (north - n1) / (n2 - n1)) % 2)": (
+        "1 for True and 0 for False, of which only the truth is asked"
+    ),
     "fence.py _nearest_on_outline: sides = np.roll(corners, (1), axis=0) - corners": (
         "the same outline, the other way round"
     ),
