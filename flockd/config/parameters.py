@@ -114,9 +114,11 @@ class TrackingParameters(Section):
     """Neighbours over time."""
 
     confirm_hits: Annotated[int, Field(ge=1)] = 3
-    confirm_evidence: Annotated[float, Field(ge=0, lt=1)] = 0.75
-    """A track is confirmed while the average of its last ten steps is above this: a sighting that is a drone with
+    confirm_evidence: Annotated[float, Field(ge=0, lt=1)] = 0.85
+    """A track is confirmed when the average of its last ten steps is above this: a sighting that is a drone with
     probability p counts 2 p - 1, a step without one 0."""
+    keep_evidence: Annotated[float, Field(ge=0, lt=1)] = 0.6
+    """It stays confirmed while that average is above this."""
     max_unseen_s: Positive = 1.5
     gate_sigma: Positive = 4.0
     """Association gate in standard deviations."""

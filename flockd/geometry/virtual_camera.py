@@ -87,9 +87,11 @@ class VirtualCrop:
         R_camera_virtual = camera.T_body_camera.rotation.T @ self.T_body_virtual.rotation
         # Pixels of the image per radian both ways across the line of sight: their product is an area.
         per_radian = camera.camera.jacobian(R_camera_virtual[:, 2][None])[0] @ R_camera_virtual[:, :2]
-        minification = math.sqrt(abs(float(np.linalg.det(per_radian)))) / self.camera.focal_px
         # A camera that only sees the crop's rim may not see its middle; its pixels are then taken one by one.
-        return round(minification) if minification > _MINIFICATION else 1
+        if not np.isfinite(per_radian).all():
+            return 1
+        minification = math.sqrt(abs(float(np.linalg.det(per_radian)))) / self.camera.focal_px
+        return min(round(minification), *camera.camera.size) if minification > _MINIFICATION else 1
 
 
 def virtual_crop(rig: Rig, direction_body: FloatArray, half_angle_rad: float, size_px: int) -> VirtualCrop:

@@ -108,7 +108,6 @@ def _open(file: Path, manifest_path: Path, threads: int) -> ort.InferenceSession
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
-    options.enable_cpu_mem_arena = False  # 50 MB less for the shipped networks, and no slower
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         session = ort.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])

@@ -193,7 +193,9 @@ class Observer:
         """
         first = self._ranges(live, images, [(c.direction, c.half_angle, None) for c in candidates])
         worth = [
-            (c, *seen) for c, seen in zip(candidates, first, strict=True) if seen[2].is_drone > _WORTH_A_SECOND_LOOK
+            (c, *seen)
+            for c, seen in zip(candidates, first, strict=True)
+            if seen[2].is_drone > _WORTH_A_SECOND_LOOK and _NEAREST_M < seen[1] < _FARTHEST_M
         ]
         second = self._ranges(
             live,

@@ -151,7 +151,8 @@ class Tracker:
         if track.last_seen_s < self._time_s:
             track.evidence.append(0.0)
         evidence = sum(track.evidence) / len(track.evidence)
-        track.confirmed = track.hits >= self.parameters.confirm_hits and evidence > self.parameters.confirm_evidence
+        needed = self.parameters.keep_evidence if track.confirmed else self.parameters.confirm_evidence
+        track.confirmed = track.hits >= self.parameters.confirm_hits and evidence > needed
         track.was_confirmed |= track.confirmed
 
     def _is_kept(self, track: _Track) -> bool:
