@@ -42,7 +42,7 @@ def _settled(position: Array = AHEAD, *, steps: int = 10, sigma_m: float = 0.05)
 
 
 def test_what_hardly_looks_like_a_drone_is_not_confirmed_however_often_it_is_seen() -> None:
-    tracker = Tracker(TrackingParameters(confirm_hits=3, confirm_evidence=0.75))
+    tracker = Tracker(TrackingParameters(confirm_hits=3, confirm_evidence=0.75, keep_evidence=0.6))
     confirmed = []
     for k in range(20):  # evidence 0.4 ten times, then 1: 5 of each are 0.7 on average, 4 and 6 0.76
         tracker.predict(STEP_S, np.zeros(3))
@@ -52,14 +52,14 @@ def test_what_hardly_looks_like_a_drone_is_not_confirmed_however_often_it_is_see
 
 
 def test_what_is_seen_every_other_time_loses_its_confirmation_but_not_at_once_its_track() -> None:
-    tracker = Tracker(TrackingParameters(confirm_hits=3, confirm_evidence=0.75, max_unseen_s=1.5))
+    tracker = Tracker(TrackingParameters(confirm_hits=3, confirm_evidence=0.85, keep_evidence=0.7, max_unseen_s=1.5))
     confirmed = []
     for k in range(8):
         tracker.predict(STEP_S, np.zeros(3))
         tracker.update(k * STEP_S, [_seen(AHEAD)] if k in (0, 1, 2, 4, 6) else [])
         confirmed.append(tracker.neighbours()[0].confirmed)
     # seen so far, of how many: 1/1, 2/2, 3/3, 3/4, 4/5, 4/6, 5/7, 5/8
-    assert confirmed == [False, False, True, False, True, False, False, False]
+    assert confirmed == [False, False, True, True, True, False, False, False]
 
 
 def test_a_flock_mate_is_expected_where_it_flies_to() -> None:
