@@ -166,3 +166,12 @@ def test_dis_loses_what_moves_far_unless_it_begins_near() -> None:
     refined = DisFlow(Roughly())
     assert refined.name == "roughly+dis"
     assert np.abs(np.median(refined.flow(first, second)[inside], axis=(0, 1)) - [-60.0, 0.0]).max() < 0.1
+
+
+def test_the_network_of_flow_is_sharpened_by_dis_unless_told_otherwise() -> None:
+    first, second = shifted_pictures((9, -5), (480, 640))
+    network = OnnxFlow(OnnxModel(MODELS / "flow.yaml", threads=1))
+    for refinement, expected in (("none", network), ("dis", DisFlow(network))):
+        config = PerceptionConfig.model_validate({"flow_refinement": refinement})
+        found = Perception(config, MODELS).flow("camera", first, second)
+        np.testing.assert_allclose(found, expected.flow(first, second), atol=0.05)

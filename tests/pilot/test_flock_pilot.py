@@ -13,7 +13,7 @@ from flockd.data import data_path
 from flockd.geometry import rotation_angle_deg
 from flockd.messages import Float32Array, FrameSet, PilotOutput, UInt8Array, VehicleState
 from flockd.perception import Picture, RangeEstimate, SceneMaps
-from flockd.pilot import FlockPilot
+from flockd.pilot import FlockPilot, views
 from flockd.sim.photographer import Photographer
 from flockd.sim.truth_perception import ROLES, TruthPerception
 from flockd.sim.vehicles import Vehicles
@@ -187,3 +187,21 @@ def test_an_impossible_ego_motion_is_refused_but_not_for_ever() -> None:
         known.append(output.ego_motion is not None)
         assert (output.ego_motion is not None) != any("that fast" in reason for reason in output.reasons)
     assert known == [False, False, True, True]
+
+
+@pytest.mark.parametrize(
+    ("range_m", "turned_deg", "same"),
+    [
+        (4.2, 0.5, True),  # at the same spot
+        (5.4, 1.0, True),  # two cameras' opinions of one drone: one behind the other would be hidden
+        (7.0, 1.0, False),  # too far behind to be the same, however hidden
+        (5.4, 8.0, False),  # beside it
+    ],
+)
+def test_two_sightings_in_one_direction_are_one_drone(range_m: float, turned_deg: float, same: bool) -> None:
+    ahead, turned = np.array([1.0, 0.0, 0.0]), math.radians(turned_deg)
+    aside = np.array([math.cos(turned), math.sin(turned), 0.0])
+    one = views._Located(views._Candidate(("front",), ahead, 0.2), 4.0 * ahead, 0.1, size_m=0.7)
+    other = views._Located(views._Candidate(("left",), aside, 0.2), range_m * aside, 0.1, size_m=0.7)
+    sightings, _ = views._merge([one, other])
+    assert len(sightings) == (1 if same else 2)
