@@ -108,6 +108,7 @@ def _render_pair(
         part["R_ned_camera"][index, k] = R_ned_camera
         part["height"][index, k] = -positions[k][2] - world.height_at(positions[k][:1], positions[k][1:2])[0]
         _note_drones(part, index, k, view, R_ned_camera, positions[k], drone_positions[k], shown)
+        part["drone_rotation"][index, k] = R_ned_camera.T @ drone_rotations[k]
     flow, valid = true_flow(
         views[0], views[1], matrix,
         R_ned_camera=(attitudes[0] @ R_BODY_CAMERA, attitudes[1] @ R_BODY_CAMERA),

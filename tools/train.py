@@ -102,7 +102,7 @@ class DistanceTask(Task):
     Pictures come from a pool that is renewed a little with every batch: cutting one costs more than learning from it.
     """
 
-    pool_size = 50_000
+    pool_size = 100_000
     renewed_in_a_batch = 6
 
     def __init__(self, pairs: PairSet, negatives: Path | None) -> None:
@@ -130,14 +130,16 @@ class DistanceTask(Task):
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         """See ``Task``."""
-        out, families = self.net(batch["picture"])
+        batch = _flipped(batch)
+        out, families, motors = self.net(batch["picture"])
         there = batch["drone"]
         error = (out[:, 0] - batch["target"][:, 0]).abs()
         centre = (out[:, 1:3] - batch["target"][:, 1:3]).abs().clamp(max=30).sum(1)
         nll = error / torch.exp(out[:, 3]) * 1.414 + out[:, 3]
         family = F.cross_entropy(families, batch["family"], reduction="none")
         apparent = (out[:, 5] - batch["apparent"]).abs()
-        each = 0.3 * nll + 2.0 * error + 0.05 * centre + 0.3 * family + apparent
+        where = -(_motor_map(batch["motors"]) * motors).sum(1)
+        each = 0.3 * nll + 2.0 * error + 0.05 * centre + 0.3 * family + 2.0 * apparent + 0.1 * where
         seen = there > 0.5
         right = (out[:, 4] > 0) == seen
         figures = {
@@ -151,6 +153,29 @@ class DistanceTask(Task):
         }
         exists = F.binary_cross_entropy_with_logits(out[:, 4], there)
         return (each * there).sum() / there.sum().clamp(min=1) + 0.5 * exists, figures
+
+
+def _flipped(batch: Batch) -> Batch:
+    """Half of the pictures, another half each time, left to right, in another light."""
+    n = len(batch["picture"])
+    mirror = torch.rand(n) < 0.5
+    sign = torch.where(mirror, -1.0, 1.0)
+    light = torch.exp(0.1 * torch.randn(n, 1, 1, 1) + 0.04 * torch.randn(n, 1, 1, 3))
+    picture = torch.where(mirror[:, None, None, None], batch["picture"].flip(2), batch["picture"])
+    picture = (picture.float() * light + 5.0 * torch.randn(n, 1, 1, 1)).clamp(0, 255).to(torch.uint8)
+    target, motors = batch["target"].clone(), batch["motors"].clone()
+    target[:, 1] *= sign
+    motors[:, :, 0] *= sign[:, None]
+    return {**batch, "picture": picture, "target": target, "motors": motors}
+
+
+def _motor_map(motors: Tensor, sigma: float = 2.0) -> Tensor:
+    """(n, 4, 2) places in px from the picture's middle -> (n, 48 * 48) shares of a map of half its size."""
+    at = 2.0 * torch.arange(48) + 1.0 - 48.0
+    across = torch.exp(-((at - motors[:, :, 0:1]) ** 2) / (2 * sigma**2))
+    along = torch.exp(-((at - motors[:, :, 1:2]) ** 2) / (2 * sigma**2))
+    map_ = torch.einsum("nkv,nku->nvu", along, across).flatten(1)
+    return map_ / map_.sum(1, keepdim=True).clamp(min=0.1)
 
 
 class FlowTask(Task):

@@ -25,6 +25,7 @@ from tools.training.networks import MAX_DEPTH_M
 
 Sample = dict[str, NDArray[Any]]
 SIZES_M = [drone_model(family, 0).size_m for family in range(FAMILIES)]
+HUBS = [drone_model(family, 0).hubs for family in range(FAMILIES)]
 
 
 def neighbours_sample(
@@ -85,25 +86,28 @@ def distance_sample(
     centre = np.asarray(pairs["drone_centre"][pair, k, d], np.float64)
     range_m = float(np.linalg.norm(centre))
     # How much of the picture the drone fills must say nothing about metres: it is drawn apart from family and range.
-    fill = float(np.exp(np.clip(rng.normal(np.log(1.35), 0.27), np.log(0.7), np.log(2.4))))
+    # Half of the pictures are like the second look's, aimed by the first.
+    aimed = rng.random() < 0.5
+    fill = float(np.exp(np.clip(rng.normal(np.log(1.35), 0.1 if aimed else 0.27), np.log(0.7), np.log(2.4))))
     half_width = SIZES_M[int(pairs["drone_family"][pair, d])] / 2 * fill
-    shift_m = rng.normal(0, 0.15 if rng.random() < 0.5 else 0.03, 2) * half_width
+    shift_m = rng.normal(0, 0.03 if aimed else 0.15, 2) * half_width
     right, down = _across(centre)
     aim = R_BODY_CAMERA @ _in_view(centre + shift_m[0] * right + shift_m[1] * down, focal)
     rig = Rig({"camera": rig_camera(focal)})
     crop = virtual_crop(rig, aim / np.linalg.norm(aim), float(np.arctan(half_width / range_m)), 96)
     picture, _ = crop.sample({"camera": image})
-    place = crop.camera.project(crop.T_body_virtual.inverse().apply((R_BODY_CAMERA @ centre)[None]))[0] - 48.0
+    family = int(pairs["drone_family"][pair, d])
+    hubs = centre + HUBS[family] @ np.asarray(pairs["drone_rotation"][pair, k, d], np.float64).T
+    points = np.vstack([centre[None], hubs]) @ R_BODY_CAMERA.T
+    place, *motors = crop.camera.project(crop.T_body_virtual.inverse().apply(points)) - 48.0
     if augment:
         (picture,) = photometric([picture], rng)
-        if rng.random() < 0.5:
-            picture, place = np.ascontiguousarray(picture[:, ::-1]), place * [-1, 1]
     target = np.array([np.log(range_m / crop.camera.matrix[0, 0]), *place], np.float32)
-    family = int(pairs["drone_family"][pair, d])
     apparent = np.log(SIZES_M[family]) - target[0]
     return {
         "picture": picture,
         "target": target,
+        "motors": np.asarray(motors, np.float32),
         "family": np.array(family),
         "apparent": np.array(apparent, np.float32),
         "drone": np.array(1.0, np.float32),
@@ -132,6 +136,7 @@ def no_drone_sample(pairs: PairSet, negative: NDArray[Any] | None, rng: np.rando
     return {
         "picture": picture,
         "target": np.zeros(3, np.float32),
+        "motors": np.zeros((4, 2), np.float32),
         "family": np.array(0),
         "apparent": np.array(0.0, np.float32),
         "drone": np.array(0.0, np.float32),
