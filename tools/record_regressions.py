@@ -4,7 +4,7 @@
 
 - ``normal``: three drones on their way.
 - ``crossing``: five drones fly through one another's pictures, 1 to 4 m away.
-- ``faults``: a camera lost, a black picture, a torn one, a time stamp twice, one that goes back, then no frames for 1 s.
+- ``faults``: a camera lost, a black picture, a torn one, a time stamp twice, one that goes back, a second of nothing.
 
 Pictures are a quarter of the real size and JPEG, so that a recording is well under a megabyte. After a change that is
 meant to change outputs (new networks, say), `--only references` writes the expectations again from the same recordings.
@@ -110,7 +110,7 @@ def with_faults(drone: DroneConfig, steps: Sequence[Step]) -> tuple[DroneConfig,
     """The same flight with something wrong with every step of its second half."""
     changed = list(steps)
     changed[4] = _with_images(changed[4], {"right": None})
-    changed[5] = _with_images(changed[5], {"front": np.zeros_like})
+    changed[5] = _with_images(changed[5], {"front": _black})
     changed[6] = _with_images(changed[6], {"left": _torn})
     changed[7] = _at(changed[7], changed[6][0].time_s)
     changed[8] = _at(changed[8], changed[6][0].time_s - 0.25)
@@ -121,10 +121,18 @@ def with_faults(drone: DroneConfig, steps: Sequence[Step]) -> tuple[DroneConfig,
 def _with_images(step: Step, changes: Mapping[str, Change | None]) -> Step:
     frames: dict[str, Frame] = {}
     for name, frame in step[0].frames.items():
-        change = changes.get(name, lambda image: image)
+        change = changes.get(name, _as_it_is)
         if change is not None:
             frames[name] = replace(frame, image=change(frame.image))
     return replace(step[0], frames=frames), step[1]
+
+
+def _as_it_is(image: UInt8Array) -> UInt8Array:
+    return image
+
+
+def _black(image: UInt8Array) -> UInt8Array:
+    return np.zeros_like(image)
 
 
 def _torn(image: UInt8Array) -> UInt8Array:

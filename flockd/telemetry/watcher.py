@@ -73,6 +73,10 @@ class FleetWatcher:
         with self._lock:
             return tuple(self._drones.values())
 
+    def reached(self) -> int:
+        """How many peers and routers it is connected to."""
+        return len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
+
     def close(self) -> None:
         """Ends the session."""
         self._session.close()  # type: ignore[no-untyped-call]
