@@ -180,5 +180,5 @@ class PilotOutput:
     """Time each stage took, as measured by the caller's clock; empty without one."""
 
 
-ScaleSource = Literal["network", "height"]
+ScaleSource = Literal["network", "height", "velocity"]
 OwnVelocitySource = Literal["vision", "autopilot"]

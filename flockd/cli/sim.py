@@ -47,7 +47,9 @@ def add(commands: Commands) -> None:
         help="fly by sight, or on everybody's exact state without looking (default: learned)",
     )
     parser.add_argument("--flow", metavar="NAME", help="the model for optical flow, or `dis`")
-    parser.add_argument("--scale", choices=("network", "height"), help="where the background's scale comes from")
+    parser.add_argument(
+        "--scale", choices=("network", "height", "velocity"), help="where the background's scale comes from"
+    )
     parser.add_argument("--drones", metavar="N", type=positive_count, help="size of the flock")
     parser.add_argument("--duration", metavar="S", type=positive_number, help="seconds to fly")
     parser.add_argument("--seed", metavar="N", type=seed, help="of the world and of all noise")

@@ -78,6 +78,10 @@ class PerceptionConfig(Section):
     """`dis` is OpenCV's DIS flow instead of a network."""
     flow_refinement: Literal["dis", "none"] = "dis"
     """A network's flow finds what moved far; DIS then makes it exact."""
+    flow_refinement_scale: Annotated[int, Field(ge=0, le=5)] = 2
+    """Where DIS after a network stops: at a 2^n-th of the size. 2 is for flight: a quarter of the time, and an own
+    motion as good where depth is a network's. With a sensor's depth 1 is better, and what datasets are replayed with.
+    """
     depth: str = "neighbours"
     segmentation: str = "neighbours"
     distance: str = "distance"
@@ -85,11 +89,15 @@ class PerceptionConfig(Section):
     models_dir: str | None = None
     """Folder of the manifests; by default the one that comes with flockd."""
     threads: Annotated[int, Field(ge=1, le=64)] = 2
+    provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = "cpu"
+    """What ONNX Runtime computes with. Another one than this is never used in its place."""
+    engines_dir: str | None = None
+    """Where `flockd models prepare` keeps what a provider has built; by default `engines` beside the manifests."""
     deadline_s: Positive = 1.0
     """In flight, a network that has not answered one call by then is stuck, and is ended."""
     scale: ScaleSource = "height"
-    """The background's metric scale: `network` (pure RGB, as in the paper) or `height` (attitude and height above
-    ground from the autopilot)."""
+    """The background's metric scale: `network` (pure RGB, as in the paper), `height` (attitude and height above ground
+    from the autopilot) or `velocity` (attitude and velocity from the autopilot; the drone has to move)."""
 
 
 class GeometryParameters(Section):
