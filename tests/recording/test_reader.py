@@ -118,7 +118,7 @@ def test_a_step_without_its_vehicle_is_the_last_of_a_killed_one_or_an_error(tmp_
         list(Recording(odd.path).steps())
 
 
-KILLS = 8
+KILLS = 20
 FLYING = f"""
 import os, random, signal, sys, time
 from pathlib import Path
