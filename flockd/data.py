@@ -1,4 +1,4 @@
-"""Finds the files that come with flockd: ready-made configurations and model files."""
+"""Finds the files that come with flockd: ready-made configurations, model files and systemd units."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 from flockd.errors import UnavailableError
 
 
-def data_path(folder: Literal["config", "models"]) -> Path:
+def data_path(folder: Literal["config", "models", "systemd"]) -> Path:
     """The folder of that name: inside an installed package, beside the package in a checkout.
 
     Raises UnavailableError when it is in neither.

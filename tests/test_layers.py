@@ -30,9 +30,11 @@ MAY_IMPORT = {
     "datasets": BASE | {"geometry", "perception", "pilot"},
     "sim": BASE
     | {"geometry", "perception", "tracking", "flocking", "safety", "pilot", "telemetry", "recording", "report"},
-    "report": BASE | {"geometry", "flocking", "sim"},
+    "report": BASE | {"geometry", "flocking", "pilot", "recording", "sim"},
+    "view": BASE | {"geometry", "pilot", "recording"},
     "daemon": BASE | {"perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"},
-    "cli": BASE | {"perception", "pilot", "telemetry", "recording", "datasets", "sim", "report", "daemon"},
+    "doctor": BASE | {"geometry", "perception", "pilot", "sources", "autopilot", "telemetry", "daemon"},
+    "cli": BASE | {"perception", "pilot", "telemetry", "recording", "datasets", "sim", "report", "daemon", "doctor"},
 }
 """What each folder may import of the others."""
 
@@ -128,7 +130,12 @@ ANSWERS = PACKAGE / "telemetry" / "publisher.py"
 
 
 @pytest.mark.parametrize(
-    ("library", "adapter"), [("mavsdk", "autopilot/mavsdk_link.py"), ("pymavlink", "autopilot/stand_in.py")]
+    ("library", "adapter"),
+    [
+        ("mavsdk", "autopilot/mavsdk_link.py"),
+        ("pymavlink", "autopilot/stand_in.py"),
+        ("rerun", "view/rerun_file.py"),
+    ],
 )
 def test_an_outside_library_sits_behind_one_file(library: str, adapter: str) -> None:
     assert [path for path in MODULES if library in _libraries(path)] == [PACKAGE / adapter]
@@ -151,5 +158,13 @@ def test_no_drone_reads_telemetry_to_fly() -> None:
         text = path.read_text(encoding="utf-8")
         for word, allowed in readers.items():
             assert word not in text or path in allowed, path
-        if _folder(path) != "cli":
+        if _folder(path) not in {"cli", "doctor"}:
             assert "flockd.telemetry.watcher" not in _imports(path), path
+
+
+def test_the_doctor_sees_of_the_daemon_what_everybody_sees() -> None:
+    import flockd.daemon
+
+    public = {"flockd.daemon", *(f"flockd.daemon.{name}" for name in flockd.daemon.__all__)}
+    for path in (path for path in MODULES if _folder(path) == "doctor"):
+        assert {name for name in _imports(path) if name.startswith("flockd.daemon")} <= public, path

@@ -134,6 +134,8 @@ class AutopilotStandIn:
             "COM_OBL_RC_ACT": 5,
             "COM_LOW_BAT_ACT": 0,
             "GF_ACTION": 2,
+            "GF_MAX_HOR_DIST": 0.0,
+            "GF_MAX_VER_DIST": 0.0,
         }
         """An int is an INT32 parameter, a float a REAL32 one."""
         self.setpoints: deque[tuple[float, Setpoint]] = deque(maxlen=MAX_SETPOINTS_KEPT)

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from flockd import __version__
-from flockd.cli import config, models, record, replay, report, run, sim, status
+from flockd.cli import config, doctor, models, record, replay, report, run, sim, status
 from flockd.cli.parser import Parser, add_commands
 from flockd.errors import ExitCode, FlockdError, UnavailableError
 
@@ -52,5 +52,6 @@ def _parser() -> Parser:
         examples=("flockd sim", "flockd config check config/paper_flight.yaml"),
     )
     parser.add_argument("--version", action="version", version=f"flockd {__version__}")
-    add_commands(parser, (run.add, status.add, sim.add, report.add, record.add, replay.add, config.add, models.add))
+    commands = (run, status, doctor, sim, report, record, replay, config, models)
+    add_commands(parser, [command.add for command in commands])
     return parser

@@ -97,13 +97,9 @@ def opened(path: Path) -> Recording:
 
 def models_of(config: DroneConfig) -> dict[str, str]:
     """SHA-256 of each model that a configuration uses, by name. Raises ModelError."""
-    from flockd.data import data_path
-    from flockd.perception.manifest import load_manifest
+    from flockd.perception import load_manifest, manifests_of
 
-    wanted = config.perception
-    folder = Path(wanted.models_dir) if wanted.models_dir else data_path("models")
-    names = {wanted.flow, wanted.depth, wanted.segmentation, wanted.distance} - {"dis", "none"}
-    manifests = [load_manifest(Path(n) if n.endswith(".yaml") else folder / f"{n}.yaml")[0] for n in sorted(names)]
+    manifests = [load_manifest(path)[0] for path in sorted(manifests_of(config.perception))]
     return {manifest.name: manifest.sha256 for manifest in manifests}
 
 

@@ -2,7 +2,7 @@
 
 from flockd.perception.flow import DisFlow, Flow, OnnxFlow
 from flockd.perception.instances import UNSURE, Instance, group_instances
-from flockd.perception.manifest import Manifest, find_manifests, load_manifest
+from flockd.perception.manifest import Manifest, find_manifests, load_manifest, manifests_of, models_folder
 from flockd.perception.roles import Perception, Picture, RangeEstimate, SceneMaps
 from flockd.perception.session import OnnxModel
 
@@ -21,4 +21,6 @@ __all__ = [
     "find_manifests",
     "group_instances",
     "load_manifest",
+    "manifests_of",
+    "models_folder",
 ]

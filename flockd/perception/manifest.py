@@ -10,7 +10,8 @@ from typing import Annotated, Literal
 import yaml
 from pydantic import Field, ValidationError
 
-from flockd.config.parameters import Positive, Section
+from flockd.config.parameters import PerceptionConfig, Positive, Section
+from flockd.data import data_path
 from flockd.errors import ModelError
 
 Role = Literal["flow", "depth", "segmentation", "distance"]
@@ -89,6 +90,31 @@ def check_hash(manifest: Manifest, model: Path, path: Path) -> None:
             f"{path}: sha256: {model} has {digest[:12]}... and not {manifest.sha256[:12]}..., so the model file was "
             "changed or damaged; restore it, or export it again with its manifest"
         )
+
+
+def models_folder(config: PerceptionConfig) -> Path:
+    """Where a configuration's models are known by their names: its own folder, else the one that comes with flockd.
+
+    Raises ModelError when its own is not there.
+    """
+    if config.models_dir is None:
+        return data_path("models")
+    folder = Path(config.models_dir)
+    if not folder.is_dir():
+        raise ModelError(f"perception.models_dir: {folder} is no folder; name the one that holds the models' manifests")
+    return folder
+
+
+def manifest_path(folder: Path, name: str) -> Path:
+    """Of a model by its name in a folder, or of one that is named by its manifest's path."""
+    return Path(name) if name.endswith(".yaml") else folder / f"{name}.yaml"
+
+
+def manifests_of(config: PerceptionConfig) -> tuple[Path, ...]:
+    """The manifests of all models that a configuration names, each once. Raises ModelError for a missing folder."""
+    names = (config.flow, config.depth, config.segmentation, config.distance)
+    folder = models_folder(config)
+    return tuple(dict.fromkeys(manifest_path(folder, name) for name in names if name not in {"dis", "none"}))
 
 
 def find_manifests(folder: Path) -> tuple[Path, ...]:

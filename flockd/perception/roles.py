@@ -14,7 +14,7 @@ from flockd.errors import ModelError
 from flockd.messages import Float32Array, FloatArray, UInt8Array
 from flockd.perception.flow import DisFlow, Flow, OnnxFlow
 from flockd.perception.instances import UNSURE, Instance, group_instances
-from flockd.perception.manifest import Role
+from flockd.perception.manifest import Role, manifest_path
 from flockd.perception.session import OnnxModel
 
 _EAGER_LOGIT = -1.5
@@ -140,7 +140,7 @@ class Perception:
         return DisFlow(network) if config.flow_refinement == "dis" else network
 
     def _model(self, name: str, role: Role) -> OnnxModel:
-        path = Path(name) if name.endswith(".yaml") else self._dir / f"{name}.yaml"
+        path = manifest_path(self._dir, name)
         key = str(path)
         if key not in self._models:
             if not path.is_file():

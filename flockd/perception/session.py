@@ -29,6 +29,11 @@ class OnnxModel:
         self._check_names()
         self.check_golden()
 
+    @property
+    def provider(self) -> str:
+        """What really runs it, by ONNX Runtime's own account, which may not be what was asked for."""
+        return str(self._session.get_providers()[0])
+
     def run(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         """The outputs by name. ``FloatingPointError`` when one is not finite."""
         names = list(self.manifest.outputs)

@@ -6,12 +6,10 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 from flockd.config.parameters import DroneConfig
-from flockd.data import data_path
 from flockd.flocking import FlockingLaw, course, desired_velocity
 from flockd.geometry import build_rig
 from flockd.messages import (
@@ -26,7 +24,7 @@ from flockd.messages import (
     VehicleState,
     VelocityCommand,
 )
-from flockd.perception import Perception
+from flockd.perception import Perception, models_folder
 from flockd.pilot.motions import ego_motion, neighbour_motions
 from flockd.pilot.views import Observer, Perceiver, RigView
 from flockd.tracking import ExpectedNeighbour, Measurement, Tracker, sighting_covariance
@@ -198,9 +196,8 @@ class FlockPilot:
 
 
 def load_perception(config: DroneConfig) -> Perception:
-    """The networks that a configuration names."""
-    models = config.perception.models_dir
-    return Perception(config.perception, Path(models) if models else data_path("models"))
+    """The networks that a configuration names. Raises ModelError."""
+    return Perception(config.perception, models_folder(config.perception))
 
 
 def _measurement(

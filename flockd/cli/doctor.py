@@ -1,0 +1,114 @@
+"""`flockd doctor`: examines a drone on the ground before it flies."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flockd.cli.output import progress, say, say_json
+from flockd.cli.parser import Commands, positive_number
+from flockd.errors import ExitCode, UsageError
+
+if TYPE_CHECKING:
+    from flockd.doctor import Finding
+
+SECONDS = 4.0
+STYLES = {"FAILURE": "bold red", "WARNING": "yellow", "PASS": "green"}
+"""The worst first."""
+
+
+def add(commands: Commands) -> None:
+    """Adds the command."""
+    from flockd.doctor import CHECKS
+
+    examples = (
+        "flockd doctor --config config/quadrotor.yaml",
+        "sudo -u flockd flockd doctor --config /etc/flockd/drone.yaml --record /var/lib/flockd",
+        "flockd doctor --config config/quadrotor.yaml --only cameras --seconds 30",
+        "flockd doctor --config config/simulator.yaml --json",
+    )
+    description = (
+        "Examine a drone on the ground: cameras, models, autopilot, computer, telemetry. Only looks: never arms, "
+        "switches modes or sends setpoints."
+    )
+    parser = commands("doctor", description, examples)
+    parser.add_argument("--config", metavar="FILE", type=Path, required=True, help="the drone's configuration")
+    parser.add_argument("--record", metavar="DIR", type=Path, help="where `flockd run` is to record flights")
+    parser.add_argument("--unit", metavar="FILE", type=Path, help="the systemd unit; by default the installed one")
+    parser.add_argument(
+        "--seconds",
+        metavar="S",
+        type=positive_number,
+        default=SECONDS,
+        help=f"watch the cameras this long ({SECONDS:g})",
+    )
+    parser.add_argument(
+        "--only", metavar="CHECK", action="append", choices=CHECKS, help=f"only this one, of {', '.join(CHECKS)}"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(run=_run)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from flockd.config import load_drone
+    from flockd.doctor import CHECKS, Level, examine, plan
+
+    config = load_drone(args.config)
+    if args.unit is not None and not args.unit.is_file():
+        raise UsageError(f"{args.unit}: is no file; name the unit with --unit")
+    checks = plan(
+        config,
+        recordings=args.record,
+        unit=args.unit,
+        seconds=args.seconds,
+        environment=os.environ,
+        only=args.only or CHECKS,
+    )
+    with progress("examining", "checks") as tell:
+        found = examine(checks, tell)
+    if args.json:
+        say_json(_as_json(config.name, found))
+    else:
+        _print(config.name, found)
+    failed = any(finding.level is Level.FAILURE for findings in found.values() for finding in findings)
+    return ExitCode.CHECK_FAILED if failed else ExitCode.DONE
+
+
+def _as_json(drone: str, found: Mapping[str, Sequence[Finding]]) -> dict[str, object]:
+    rows = [
+        {"check": check, "about": f.about, "level": str(f.level), "measured": f.measured, "mend": f.mend or None}
+        for check, findings in found.items()
+        for f in findings
+    ]
+    return {"drone": drone, "ok": all(row["level"] != "FAILURE" for row in rows), "findings": rows}
+
+
+def _print(drone: str, found: Mapping[str, Sequence[Finding]]) -> None:
+    """The worst first, each with its mend below."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    findings = sorted((f for group in found.values() for f in group), key=lambda f: list(STYLES).index(f.level))
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for finding in findings:
+        told = Text(finding.measured)
+        if finding.mend:
+            told.append(f"\nmend: {finding.mend}", style="italic")
+        table.add_row(Text(finding.level, STYLES[finding.level]), finding.about, told)
+    Console(markup=False, highlight=False).print(table)
+    counts = {level: sum(finding.level == level for finding in findings) for level in STYLES}
+    say(
+        f"\n{drone}: {_plural(counts['FAILURE'], 'failure')}, {_plural(counts['WARNING'], 'warning')}, "
+        f"{counts['PASS']} passed"
+    )
+
+
+def _plural(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"

@@ -1,0 +1,82 @@
+"""Models: whole, with the right answer, run by the right provider, and fast enough for the step."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from flockd.config import DroneConfig
+from flockd.doctor.finding import Finding, Level, failed, passed, warned
+from flockd.errors import ModelError
+from flockd.messages import Frame, FrameSet, PilotOutput, VehicleState
+from flockd.perception import OnnxModel, manifests_of
+from flockd.perception.session import golden_image
+from flockd.pilot import FlockPilot
+
+STEPS = 4
+"""The first finds no images before it, and warms up."""
+FULL = 0.8
+"""Of the step that thinking may take, before it is told: a neighbour or two more take their time too."""
+HEIGHT_M = 5.0
+
+
+def check_models(config: DroneConfig) -> Iterator[Finding]:
+    """Each model of the configuration, and then how long a step takes with all of them."""
+    whole = True
+    for finding in _each(config):
+        whole = whole and finding.level is not Level.FAILURE
+        yield finding
+    if whole:
+        yield judge_steps(config, time_steps(config))
+
+
+def _each(config: DroneConfig) -> Iterator[Finding]:
+    for path in manifests_of(config.perception):
+        about = f"model {path.stem}"
+        try:
+            model = OnnxModel(path, threads=config.perception.threads)
+        except ModelError as error:
+            measured, _, mend = str(error).rpartition("; ")
+            yield failed(about, measured, mend)
+            continue
+        size_mb = path.with_name(model.manifest.file).stat().st_size / 1e6
+        yield passed(about, f"hash and golden answer are right, {size_mb:.1f} MB, run by {model.provider}")
+
+
+def time_steps(config: DroneConfig) -> list[tuple[float, PilotOutput]]:
+    """Whole steps of the pilot on pictures that show nothing, at the size of the cameras: seconds, and the stages."""
+    pilot = FlockPilot(config, stopwatch=time.perf_counter)
+    timed = []
+    for number in range(STEPS):
+        time_s = number * config.step_s
+        frames = {
+            camera.name: Frame(camera.name, golden_image(camera.size_px, seed=number), time_s, number)
+            for camera in config.rig.cameras
+        }
+        vehicle = VehicleState(time_s, np.eye(3), HEIGHT_M, np.zeros(3))
+        begun_s = time.perf_counter()
+        output = pilot.step(FrameSet(time_s, frames), vehicle)
+        timed.append((time.perf_counter() - begun_s, output))
+    return timed
+
+
+def judge_steps(config: DroneConfig, timed: list[tuple[float, PilotOutput]]) -> Finding:
+    """Whether the steps leave time to spare."""
+    took_s = statistics.median(seconds for seconds, _ in timed[1:])
+    stages = timed[-1][1].stages_ms
+    longest = ", ".join(f"{stage} {stages[stage]:.0f}" for stage in sorted(stages, key=lambda s: -stages[s])[:3])
+    count, threads = len(config.rig.cameras), config.perception.threads
+    measured = (
+        f"a step takes {1e3 * took_s:.0f} of {1e3 * config.step_s:.0f} ms with {threads} "
+        f"{'threads' if threads > 1 else 'thread'} and {count} {'cameras' if count > 1 else 'camera'} ({longest})"
+    )
+    load = took_s / config.step_s
+    mend = "give perception.threads more cores, raise step_s, take smaller images, or `perception.flow: dis`"
+    if load > config.safety.degraded_load:
+        return failed("step", f"{measured}: above safety.degraded_load, so it would always fly slowly", mend)
+    if load > FULL * config.safety.degraded_load:
+        return warned("step", f"{measured}: little is left for what else the computer does", mend)
+    return passed("step", measured)
