@@ -22,6 +22,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.optim.swa_utils import AveragedModel
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
@@ -252,15 +253,21 @@ def begin_with(net: nn.Module, weights: dict[str, Tensor]) -> None:
 
 
 def train(task: Task, out: Path, budget_s: float, seed: int) -> None:
-    """One cosine-shaped run of ``budget_s`` seconds of training."""
+    """One cosine-shaped run of ``budget_s`` seconds of training.
+
+    What is kept is the mean of the weights over about the last thousand steps: each step's own errs to all sides.
+    """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     net = task.net.to(device).to(memory_format=torch.channels_last)
+    mean = AveragedModel(net, avg_fn=_recent_mean, use_buffers=True)
     optimiser = torch.optim.AdamW(net.parameters(), lr=task.rate, weight_decay=1e-4)
     spent, step = 0.0, 0
     checkpoint = out / "checkpoint.pt"
     if checkpoint.is_file():
         state = torch.load(checkpoint, map_location=device)
-        net.load_state_dict(state["net"])
+        net.load_state_dict(state["last"])
+        mean.module.load_state_dict(state["net"])
+        mean.n_averaged.fill_(state["step"])
         optimiser.load_state_dict(state["optimiser"])
         spent, step = state["spent"], state["step"]
     rng = np.random.Generator(np.random.PCG64([seed, step]))
@@ -281,6 +288,7 @@ def train(task: Task, out: Path, budget_s: float, seed: int) -> None:
             loss.backward()
             nn.utils.clip_grad_norm_(net.parameters(), 1.0)
             optimiser.step()
+            mean.update_parameters(net)
         recent.append({"loss": float(loss.detach()), **figures})
         step += 1
         spent += time.monotonic() - begin
@@ -288,10 +296,21 @@ def train(task: Task, out: Path, budget_s: float, seed: int) -> None:
             _note(out, step, spent, recent)
             recent, last_print = [], spent
         if spent - last_save > 150 or spent >= budget_s:
-            state = {"net": net.state_dict(), "optimiser": optimiser.state_dict(), "spent": spent, "step": step}
+            state = {
+                "net": mean.module.state_dict(), "last": net.state_dict(), "optimiser": optimiser.state_dict(),
+                "spent": spent, "step": step,
+            }  # fmt: skip
             torch.save(state, checkpoint.with_suffix(".new"))
             checkpoint.with_suffix(".new").replace(checkpoint)
             last_save = spent
+
+
+def _recent_mean(mean: Tensor, new: Tensor, count: Tensor) -> Tensor:
+    """Of floating-point weights; counters are taken as they are."""
+    if not mean.is_floating_point():
+        return new
+    share = max(1e-3, 1.0 / (1.0 + 0.1 * float(count)))
+    return mean + share * (new - mean)
 
 
 def _stack(samples: list[Sample], device: torch.device) -> Batch:
