@@ -27,6 +27,7 @@ MAY_IMPORT = {
     "autopilot": BASE,
     "telemetry": BASE,
     "recording": BASE | {"telemetry"},  # for the table of topics, which says what is recorded
+    "calibration": BASE | {"geometry"},
     "datasets": BASE | {"geometry", "perception", "pilot"},
     "sim": BASE
     | {"geometry", "perception", "tracking", "flocking", "safety", "pilot", "telemetry", "recording", "report"},
@@ -34,7 +35,9 @@ MAY_IMPORT = {
     "view": BASE | {"geometry", "pilot", "recording"},
     "daemon": BASE | {"perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"},
     "doctor": BASE | {"geometry", "perception", "pilot", "sources", "autopilot", "telemetry", "daemon"},
-    "cli": BASE | {"perception", "pilot", "telemetry", "recording", "datasets", "sim", "report", "daemon", "doctor"},
+    "cli": BASE
+    | {"perception", "pilot", "telemetry", "recording", "datasets", "sim", "report", "daemon", "doctor"}
+    | {"calibration", "sources"},
 }
 """What each folder may import of the others."""
 

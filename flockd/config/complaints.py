@@ -175,7 +175,8 @@ def _wanted(root: Schema, schema: Schema, unit: str) -> str:
                 return f"a list of {count} numbers{unit}"
             return "a list of at least 1 entry" if schema.get("minItems") else "a list"
         case _:
-            return f"a section with {', '.join(sorted(schema.get('properties', {})))}"
+            keys = schema.get("required") or schema.get("properties", {})  # what must be there, or else what may
+            return f"a section with {', '.join(sorted(keys))}"
 
 
 def _wanted_number(schema: Schema, unit: str) -> str:

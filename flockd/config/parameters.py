@@ -26,6 +26,22 @@ class Section(BaseModel):
     )
 
 
+class MeasurementConfig(Section):
+    """Where calibrated numbers come from: for people, nothing flies by it. `flockd calibrate` writes it."""
+
+    date: Annotated[str, Field(pattern=r"^\d{4}-\d{2}-\d{2}$")]
+    camera: str
+    """Its serial number, or what else identifies it."""
+    source: str
+    """What it was measured from."""
+    views: Annotated[int, Field(ge=1)]
+    """Of a board, or pairs of images of what lay about."""
+    residual_px: NonNegative | None = None
+    """Root mean square of what the fit left over."""
+    residual_deg: NonNegative | None = None
+    """The same, of a fit to attitudes."""
+
+
 class IntrinsicsConfig(Section):
     """A camera's projection, in pixels; pixel centres at +0.5."""
 
@@ -36,6 +52,7 @@ class IntrinsicsConfig(Section):
     cy: Positive
     distortion: tuple[float, ...] = ()
     """Pinhole: k1 k2 p1 p2 [k3] (OpenCV). Wide angle: k1 k2 k3 k4 of the equidistant model. Empty: none."""
+    measured: MeasurementConfig | None = None
 
 
 class ExtrinsicsConfig(Section):
@@ -45,6 +62,7 @@ class ExtrinsicsConfig(Section):
     yaw_deg: float = 0.0
     pitch_deg: float = 0.0
     roll_deg: float = 0.0
+    measured: MeasurementConfig | None = None
 
 
 class CameraConfig(Section):
@@ -61,6 +79,8 @@ class RigConfig(Section):
     """All cameras of the drone."""
 
     cameras: Annotated[tuple[CameraConfig, ...], Field(min_length=1)]
+    time_offset_s: Annotated[float, Field(ge=-1, le=1)] = 0.0
+    """Added to the time stamp of a frame, the time at which the autopilot had the attitude it was taken in."""
 
     @model_validator(mode="after")
     def _names_are_unique(self) -> Self:

@@ -91,7 +91,7 @@ class Sight:
                 continue
             self.frames = frames
             taken_s = self._clock()
-            vehicle = self._vehicle_at(frames.time_s)
+            vehicle = self._vehicle_at(frames.time_s + self._config.rig.time_offset_s)
             if vehicle is not None:
                 await self._step(taken_s, frames, vehicle)
             now = self._clock()

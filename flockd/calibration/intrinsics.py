@@ -1,0 +1,273 @@
+"""From views of a board to a camera: the lens that puts every corner where it was seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from flockd.calibration.errors import CalibrationError
+from flockd.calibration.least_squares import Normal, Solution, minimise
+from flockd.calibration.poses import first_poses, jacobian_of_move, moved, pose_of_board
+from flockd.calibration.views import View
+from flockd.geometry import Camera, PinholeCamera, RigidTransform, WideAngleCamera
+from flockd.messages import FloatArray
+
+Model = Literal["pinhole", "wide_angle"]
+MODELS: tuple[Model, ...] = ("pinhole", "wide_angle")
+MIN_VIEWS = 6
+_COEFFICIENTS = {"pinhole": 5, "wide_angle": 4}
+_FIRST_FOCALS = {
+    "pinhole": np.geomspace(0.3, 4.0, 9),
+    "wide_angle": 1.0 / np.radians(np.linspace(60.0, 240.0, 9)),
+}
+"""Focal lengths to begin with, in widths of the picture."""
+_OUTLIER, _OUTLIER_PX = 2.5, 0.1
+"""A view is dropped whose residual is more than this times the median's, and this much above it."""
+_MOST_DROPPED = 1 / 3
+_MOST_ROUNDS = 5
+_COEFFICIENT_STEP = 1e-6
+_FOCAL_SIGMA = 0.01
+"""A focal length that the views leave more uncertain than this is not known."""
+_CENTRE_SIGMA = 0.01
+"""The same for the principal point, in widths of the picture."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """A calibrated camera, and how well the views agree on it."""
+
+    model: Model
+    camera: Camera
+    sigma: FloatArray
+    """Standard deviations of fx, fy, cx, cy and the distortion, from the residuals: what noise alone leaves open."""
+    views: tuple[View, ...]
+    """Those it was fitted to."""
+    poses: tuple[RigidTransform, ...]
+    """``T_camera_board`` of each."""
+    dropped: tuple[tuple[View, float], ...]
+    """Views that did not fit the others, each with its residual in pixels."""
+
+    def residuals(self) -> list[FloatArray]:
+        """For each view (n, 2) pixels, seen less predicted."""
+        return [_residuals(self.camera, view, pose) for view, pose in zip(self.views, self.poses, strict=True)]
+
+    @property
+    def rms_px(self) -> float:
+        """Root of the mean squared distance of all corners."""
+        return _rms(np.concatenate(self.residuals()))
+
+    @property
+    def rms_of_views_px(self) -> tuple[float, ...]:
+        """The same for each view."""
+        return tuple(_rms(residuals) for residuals in self.residuals())
+
+    @property
+    def max_px(self) -> float:
+        """The largest distance of any corner."""
+        return float(np.linalg.norm(np.concatenate(self.residuals()), axis=1).max())
+
+    @property
+    def tilts_deg(self) -> tuple[float, ...]:
+        """How far the board was turned away from the line of sight, in each view."""
+        return tuple(tilt_deg(view, pose) for view, pose in zip(self.views, self.poses, strict=True))
+
+    @property
+    def reaches_corners(self) -> bool:
+        """Whether the lens, as fitted, says for the whole picture where it looks."""
+        width, height = self.camera.size
+        edges = np.array([(u, v) for u in (0.0, width / 2, width) for v in (0.0, height / 2, height)])
+        return bool(np.isfinite(self.camera.rays(edges)).all())
+
+    @property
+    def field_of_view_deg(self) -> tuple[float, float]:
+        """From left to right and from top to bottom through the principal point; NaN where it does not reach."""
+        (width, height), cx, cy = self.camera.size, self.camera.matrix[0, 2], self.camera.matrix[1, 2]
+        rays = self.camera.rays(np.array([(0.0, cy), (width, cy), (cx, 0.0), (cx, height)]))
+        angles = np.degrees(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]))
+        return float(angles[0] + angles[1]), float(angles[2] + angles[3])
+
+
+def calibrate(views: Sequence[View], size: tuple[int, int], model: Model) -> Lens:
+    """The camera of this model with the least squared residual.
+
+    Raises CalibrationError for too few views, and for views from which the camera cannot be known: all square to it,
+    or not of one flat board.
+    """
+    if len(views) < MIN_VIEWS:
+        raise CalibrationError(f"{len(views)} usable views of the board are too few; show it at least {MIN_VIEWS} times")
+    state = _begin(views, size, model)
+    dropped: list[tuple[View, float]] = []
+    kept = list(views)
+    for _ in range(_MOST_ROUNDS):
+        solution = _fit(kept, state)
+        state = solution.state
+        rms = np.array([_rms(_residuals(state.camera, *one)) for one in zip(kept, state.poses, strict=True)])
+        limit = max(_OUTLIER * float(np.median(rms)), float(np.median(rms)) + _OUTLIER_PX)
+        if (rms <= limit).all():
+            break
+        dropped += [(view, float(value)) for view, value in zip(kept, rms, strict=True) if value > limit]
+        state = _State(
+            state.camera, tuple(pose for pose, value in zip(state.poses, rms, strict=True) if value <= limit)
+        )
+        kept = [view for view, value in zip(kept, rms, strict=True) if value <= limit]
+        if len(dropped) > _MOST_DROPPED * len(views) or len(kept) < MIN_VIEWS:
+            raise CalibrationError(
+                f"{len(dropped)} of {len(views)} views contradict the others; use a flat, rigid board, focus that "
+                "stays as it is, and the board's own numbers of squares"
+            )
+    corners = sum(len(view.seen.ids) for view in kept)
+    sigma = solution.sigma(2 * corners, len(solution.normal.gradient))[: 4 + _COEFFICIENTS[model]]
+    lens = Lens(model, state.camera, sigma, tuple(kept), state.poses, tuple(dropped))
+    _check_known(lens)
+    return lens
+
+
+def tilt_deg(view: View, pose: RigidTransform) -> float:
+    """How far the board is turned away from the line of sight to its middle, 0 to 90."""
+    middle = pose.apply(view.seen.points).mean(axis=0)
+    along = float(pose.rotation[:, 2] @ middle / np.linalg.norm(middle))
+    return math.degrees(math.acos(min(abs(along), 1.0)))
+
+
+def rough_tilts_deg(views: Sequence[View], size: tuple[int, int], model: Model) -> list[float]:
+    """Tilts of the board before its camera is calibrated: good enough for advice."""
+    if len(views) < 2:
+        return [0.0] * len(views)
+    found = _begin(views, size, model)
+    return [tilt_deg(view, pose) for view, pose in zip(views, found.poses, strict=True)]
+
+
+def _check_known(lens: Lens) -> None:
+    fx, fy = lens.camera.matrix[0, 0], lens.camera.matrix[1, 1]
+    focal = float(max(lens.sigma[0] / fx, lens.sigma[1] / fy))
+    centre = float(max(lens.sigma[2:4])) / lens.camera.size[0]
+    tilted = max(lens.tilts_deg)
+    if not (focal < _FOCAL_SIGMA and centre < _CENTRE_SIGMA) or tilted < 10.0:
+        known = f"to {100 * focal:.1f} %" if focal < 1.0 else "not at all"
+        raise CalibrationError(
+            f"the views tell the focal length {known}, as the board was tilted by {tilted:.0f} degrees at most; show "
+            "it tilted by 30 to 45 degrees to each side, up and down, and all over the picture"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    camera: Camera
+    poses: tuple[RigidTransform, ...]
+
+
+def _begin(views: Sequence[View], size: tuple[int, int], model: Model) -> _State:
+    """The best of a few plain lenses, with the board's pose in each view."""
+    best: tuple[float, Camera] | None = None
+    for focal in _FIRST_FOCALS[model]:
+        camera = _camera(model, size, np.array([focal * size[0], focal * size[0], size[0] / 2, size[1] / 2]))
+        errors = [_first_error(camera, view) for view in views]
+        if best is None or float(np.median(errors)) < best[0]:
+            best = float(np.median(errors)), camera
+    assert best is not None
+    camera = _with_zero_distortion(best[1])
+    poses = [pose_of_board(camera, view.seen) for view in views]
+    lost = [view.name for view, pose in zip(views, poses, strict=True) if pose is None]
+    if lost:
+        raise CalibrationError(f"{lost[0]}: what is seen is no flat board; remove it, or check the board's squares")
+    return _State(camera, tuple(pose for pose in poses if pose is not None))
+
+
+def _first_error(camera: Camera, view: View) -> float:
+    poses = first_poses(camera, view.seen)
+    errors = [_rms(_residuals(camera, view, pose)) for pose in poses]
+    finite = [error for error in errors if math.isfinite(error)]
+    return min(finite) if finite else math.inf
+
+
+def _fit(views: Sequence[View], state: _State) -> Solution[_State]:
+    return minimise(state, lambda now: _normal(views, now), _move)
+
+
+def _normal(views: Sequence[View], state: _State) -> Normal:
+    """Blocks: the lens, then six for each view."""
+    lens = len(_numbers(state.camera))
+    size = lens + 6 * len(views)
+    gradient, hessian, cost = np.zeros(size), np.zeros((size, size)), 0.0
+    points = np.concatenate([pose.apply(view.seen.points) for view, pose in zip(views, state.poses, strict=True)])
+    seen = np.concatenate([view.seen.pixels for view in views])
+    residuals = state.camera.project(points) - seen
+    by_point, by_lens = state.camera.jacobian(points), _jacobian_of_lens(state.camera, points)
+    if not (np.isfinite(residuals).all() and np.isfinite(by_point).all() and np.isfinite(by_lens).all()):
+        return Normal(math.inf, gradient, np.eye(size))
+    start = 0
+    for index, (view, pose) in enumerate(zip(views, state.poses, strict=True)):
+        part = slice(start, start + len(view.seen.ids))
+        start = part.stop
+        r = residuals[part].ravel()
+        A = by_lens[part].reshape(-1, lens)
+        B = (by_point[part] @ jacobian_of_move(pose, view.seen.points)).reshape(-1, 6)
+        own = slice(lens + 6 * index, lens + 6 * index + 6)
+        cost += float(r @ r)
+        gradient[:lens] += A.T @ r
+        gradient[own] = B.T @ r
+        hessian[:lens, :lens] += A.T @ A
+        hessian[:lens, own] = A.T @ B
+        hessian[own, :lens] = hessian[:lens, own].T
+        hessian[own, own] = B.T @ B
+    return Normal(cost, gradient, hessian)
+
+
+def _move(state: _State, step: FloatArray) -> _State:
+    numbers = _numbers(state.camera)
+    changed = numbers + step[: len(numbers)]
+    # A focal length that shrinks to nothing or turns its sign is no camera; the step is refused by its cost.
+    changed[:2] = np.maximum(changed[:2], 0.2 * numbers[:2])
+    steps = step[len(numbers) :].reshape(-1, 6)
+    poses = tuple(moved(pose, own) for pose, own in zip(state.poses, steps, strict=True))
+    return _State(_camera_like(state.camera, changed), poses)
+
+
+def _jacobian_of_lens(camera: Camera, points: FloatArray) -> FloatArray:
+    """(n, 2, 4 + coefficients) derivative of the pixels by fx, fy, cx, cy and the distortion."""
+    numbers = _numbers(camera)
+    derivative = np.zeros((len(points), 2, len(numbers)))
+    pixels = camera.project(points)
+    derivative[:, [0, 1], [0, 1]] = (pixels - numbers[2:4]) / numbers[:2]
+    derivative[:, [0, 1], [2, 3]] = 1.0
+    for index in range(4, len(numbers)):
+        step = np.zeros(len(numbers))
+        step[index] = _COEFFICIENT_STEP
+        more, less = _camera_like(camera, numbers + step), _camera_like(camera, numbers - step)
+        derivative[:, :, index] = (more.project(points) - less.project(points)) / (2 * _COEFFICIENT_STEP)
+    return derivative
+
+
+def _numbers(camera: Camera) -> FloatArray:
+    m = camera.matrix
+    return np.array([m[0, 0], m[1, 1], m[0, 2], m[1, 2], *camera.distortion])
+
+
+def _camera_like(camera: Camera, numbers: FloatArray) -> Camera:
+    return _camera("pinhole" if isinstance(camera, PinholeCamera) else "wide_angle", camera.size, numbers)
+
+
+def _camera(model: Model, size: tuple[int, int], numbers: FloatArray) -> Camera:
+    fx, fy, cx, cy, *distortion = (float(number) for number in numbers)
+    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    kind = PinholeCamera if model == "pinhole" else WideAngleCamera
+    return kind(matrix, size, tuple(distortion))
+
+
+def _with_zero_distortion(camera: Camera) -> Camera:
+    """The same lens, with coefficients to be fitted."""
+    numbers = _numbers(camera)
+    model: Model = "pinhole" if isinstance(camera, PinholeCamera) else "wide_angle"
+    return _camera(model, camera.size, np.concatenate([numbers, np.zeros(_COEFFICIENTS[model])]))
+
+
+def _residuals(camera: Camera, view: View, pose: RigidTransform) -> FloatArray:
+    return view.seen.pixels - camera.project(pose.apply(view.seen.points))
+
+
+def _rms(residuals: FloatArray) -> float:
+    return float(np.sqrt((residuals**2).sum(axis=1).mean()))

@@ -1,0 +1,127 @@
+"""Chooses from many pictures of a board those that calibrate a camera, and says why it refuses the others."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from flockd.calibration.board import BoardFinder, Detection
+from flockd.calibration.coverage import Coverage
+from flockd.calibration.errors import CalibrationError
+from flockd.calibration.sharpness import edge_width_px
+from flockd.messages import FloatArray, UInt8Array
+
+Refusal = Literal["no board", "blurred", "moving", "like another"]
+_SHARP_PX, _SHARP_SHARE = 4.0, 0.003
+"""Widest edge of a sharp view: so many pixels, or this share of a large picture's width."""
+_ALIKE = 0.03
+"""Two views whose corners are this much of the picture's width apart, on average, say the same."""
+_STILL = 0.003
+"""The same, of a board that is held still from one frame to the next."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One picture of the board."""
+
+    name: str
+    """Of the file, or the frame's number or time."""
+    seen: Detection
+    edge_px: float
+    """See `sharpness.edge_width_px`."""
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A picture that is not used."""
+
+    name: str
+    why: Refusal
+    edge_px: float | None = None
+    """Of a blurred one."""
+
+
+class Collector:
+    """Takes pictures of one camera one after the other. All are of one size: another is a CalibrationError."""
+
+    def __init__(self, finder: BoardFinder, most: int, max_edge_px: float | None = None) -> None:
+        """Keeps at most ``most`` views: beyond that, of two that are alike one goes."""
+        self._finder, self._most, self._max_edge_px = finder, most, max_edge_px
+        self._first = ""
+        self._before: Detection | None = None
+        self.size: tuple[int, int] | None = None
+        """Width, height; None before the first picture."""
+        self.views: list[View] = []
+        self.refused: list[Refused] = []
+        self.coverage: Coverage | None = None
+
+    def offer(self, name: str, image: UInt8Array, *, moving: bool = False) -> Refusal | None:
+        """Takes a (h, w, 3) RGB picture; gives what it is refused for, None for one that is now a view.
+
+        ``moving``: pictures follow each other so fast that a board in motion shows between them.
+        """
+        self._check_size(name, (image.shape[1], image.shape[0]))
+        assert self.coverage is not None
+        grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+        self.coverage.add_light(grey)
+        seen = self._finder.find(grey)
+        before, self._before = self._before, seen
+        if seen is None:
+            return self._refuse(Refused(name, "no board"))
+        edge_px = edge_width_px(grey, seen, self._finder.spec)
+        if edge_px > self.max_edge_px:
+            return self._refuse(Refused(name, "blurred", edge_px))
+        if moving and (before is None or self._apart(before, seen) > _STILL):
+            return self._refuse(Refused(name, "moving"))
+        if any(self._apart(view.seen, seen) < _ALIKE for view in self.views):
+            return self._refuse(Refused(name, "like another"))
+        self.views.append(View(name, seen, edge_px))
+        self.coverage.add(seen.pixels)
+        if len(self.views) > self._most:
+            self._drop_the_most_alike()
+        return None
+
+    @property
+    def max_edge_px(self) -> float:
+        """Above it a view is blurred."""
+        if self._max_edge_px is not None or self.size is None:
+            return self._max_edge_px or _SHARP_PX
+        return max(_SHARP_PX, _SHARP_SHARE * self.size[0])
+
+    def counts(self) -> dict[Refusal, int]:
+        """How many were refused, by reason."""
+        return dict(Counter(refused.why for refused in self.refused))
+
+    def _check_size(self, name: str, size: tuple[int, int]) -> None:
+        if self.size is None:
+            self.size, self._first, self.coverage = size, name, Coverage(size)
+        elif size != self.size:
+            raise CalibrationError(
+                f"{name}: is {size[0]} x {size[1]} pixels and {self._first} is {self.size[0]} x {self.size[1]}; "
+                "calibrate with pictures of one size only"
+            )
+
+    def _refuse(self, refused: Refused) -> Refusal:
+        self.refused.append(refused)
+        return refused.why
+
+    def _apart(self, first: Detection, second: Detection) -> float:
+        """Mean distance of the corners that both show, as a share of the width; infinite where they show others."""
+        _, a, b = np.intersect1d(first.ids, second.ids, assume_unique=True, return_indices=True)
+        if len(a) < 0.6 * max(len(first.ids), len(second.ids)) or self.size is None:
+            return float("inf")
+        return float(np.linalg.norm(first.pixels[a] - second.pixels[b], axis=1).mean()) / self.size[0]
+
+    def _drop_the_most_alike(self) -> None:
+        apart = np.array([[self._apart(a.seen, b.seen) if a is not b else np.inf for b in self.views] for a in self.views])
+        gone = self.views.pop(int(np.unravel_index(np.argmin(apart), apart.shape)[1]))
+        self._refuse(Refused(gone.name, "like another"))
+
+
+def all_pixels(views: list[View]) -> FloatArray:
+    """(n, 2) the corners of all views."""
+    return np.concatenate([view.seen.pixels for view in views]) if views else np.empty((0, 2))
