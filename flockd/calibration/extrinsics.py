@@ -1,0 +1,244 @@
+"""Where cameras sit beside each other, from a board that two or more of them see at the same time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockd.calibration.board import Detection
+from flockd.calibration.errors import CalibrationError
+from flockd.calibration.least_squares import Normal, Solution, minimise
+from flockd.calibration.poses import jacobian_of_move, moved, pose_of_board
+from flockd.geometry import Camera, RigidTransform, rotation_angle_deg
+from flockd.messages import FloatArray
+
+MIN_SHARED = 3
+"""Boards that two neighbours have to see together."""
+_OUTLIER, _OUTLIER_PX = 2.5, 0.2
+_MOST_DROPPED = 1 / 3
+_MOST_ROUNDS = 5
+_SIGMA_DEG, _SIGMA_M = 0.5, 0.02
+"""A camera whose place the boards leave more uncertain than this is not known."""
+_METRES_A_DEGREE = 0.01
+"""How turns and shifts are weighed where only one number can be compared."""
+
+
+@dataclass(frozen=True, eq=False)
+class SharedBoard:
+    """The board at one time, as seen by each camera that saw it."""
+
+    name: str
+    seen: Mapping[str, Detection]
+
+
+@dataclass(frozen=True, eq=False)
+class Mounting:
+    """Where one camera sits, and how sure that is."""
+
+    T_body_camera: RigidTransform
+    sigma_deg: float
+    """Standard deviation of its turn about the worst of the body's axes: what noise alone leaves open."""
+    sigma_m: float
+    """Of its place along the worst of the body's axes."""
+    rms_px: float
+    boards: int
+    """Boards that it saw together with another camera."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigFit:
+    """The cameras in the body, with the reference camera where it was said to be."""
+
+    reference: str
+    mountings: Mapping[str, Mounting]
+    rms_px: float
+    dropped: tuple[tuple[str, float], ...]
+    """Names of boards that did not fit the others, with their residuals in pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    mounts: tuple[RigidTransform, ...]
+    """``T_body_camera``, in the order of the cameras."""
+    boards: tuple[RigidTransform, ...]
+    """``T_body_board``"""
+
+
+def calibrate_rig(
+    cameras: Mapping[str, Camera], boards: Sequence[SharedBoard], reference: str, T_body_reference: RigidTransform
+) -> RigFit:
+    """Places every camera in the body from boards that it shares with its neighbours.
+
+    Raises CalibrationError where a camera shares too few boards with those that are linked to the reference, or where
+    the boards contradict each other.
+    """
+    names = tuple(cameras)
+    poses = [_poses(cameras, board) for board in boards]
+    shared = [index for index, found in enumerate(poses) if len(found) > 1]
+    kept, poses = [boards[index] for index in shared], [poses[index] for index in shared]
+    state = _begin(names, kept, poses, reference, T_body_reference)
+    given, dropped = len(kept), list[tuple[str, float]]()
+    fixed = names.index(reference)
+    for _ in range(_MOST_ROUNDS):
+        problem = _Problem(tuple(cameras.values()), names, kept, fixed)
+        solution = minimise(state, problem.normal, problem.move)
+        state = solution.state
+        rms = np.array([_rms(np.concatenate(list(one.values()))) for one in problem.residuals(state)])
+        limit = max(_OUTLIER * float(np.median(rms)), float(np.median(rms)) + _OUTLIER_PX)
+        if (rms <= limit).all():
+            break
+        dropped += [(board.name, float(value)) for board, value in zip(kept, rms, strict=True) if value > limit]
+        state = _State(state.mounts, tuple(p for p, value in zip(state.boards, rms, strict=True) if value <= limit))
+        kept = [board for board, value in zip(kept, rms, strict=True) if value <= limit]
+        if len(dropped) > _MOST_DROPPED * given:
+            raise CalibrationError(
+                f"{len(dropped)} of {given} boards contradict the others; hold the board still, let every camera take "
+                "its picture at the same time, and check the cameras' intrinsics"
+            )
+    return _told(names, problem, solution, reference, tuple(dropped))
+
+
+def _poses(cameras: Mapping[str, Camera], board: SharedBoard) -> dict[str, RigidTransform]:
+    found = {name: pose_of_board(cameras[name], seen) for name, seen in board.seen.items()}
+    return {name: pose for name, pose in found.items() if pose is not None}
+
+
+def _begin(
+    names: Sequence[str],
+    boards: Sequence[SharedBoard],
+    poses: Sequence[Mapping[str, RigidTransform]],
+    reference: str,
+    T_body_reference: RigidTransform,
+) -> _State:
+    """Each camera by way of the neighbour with which it shares most boards."""
+    mounts = {reference: T_body_reference}
+    while len(mounts) < len(names):
+        links = [
+            (sum(known in found and new in found for found in poses), known, new)
+            for known in mounts
+            for new in names
+            if new not in mounts
+        ]
+        count, known, new = max(links)
+        if count < MIN_SHARED:
+            others = ", ".join(mounts)
+            raise CalibrationError(
+                f"camera {new!r} shares {count} boards with {others}, and needs {MIN_SHARED}; show the board where "
+                "both see it, and hold it still"
+            )
+        steps = [found[known] @ found[new].inverse() for found in poses if known in found and new in found]
+        mounts[new] = mounts[known] @ _middle(steps)
+    in_body = []
+    for board, found in zip(boards, poses, strict=True):
+        best = max(found, key=lambda name: len(board.seen[name].ids))
+        in_body.append(mounts[best] @ found[best])
+    return _State(tuple(mounts[name] for name in names), tuple(in_body))
+
+
+def _middle(transforms: Sequence[RigidTransform]) -> RigidTransform:
+    """The one that is nearest to all the others: no outlier moves it."""
+
+    def distance(a: RigidTransform, b: RigidTransform) -> float:
+        turn = rotation_angle_deg(a.rotation.T @ b.rotation)
+        return turn * _METRES_A_DEGREE + float(np.linalg.norm(a.translation - b.translation))
+
+    return min(transforms, key=lambda one: sum(distance(one, other) for other in transforms))
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Blocks of six: the cameras but the reference, then the boards."""
+
+    cameras: tuple[Camera, ...]
+    names: tuple[str, ...]
+    boards: Sequence[SharedBoard]
+    fixed: int
+
+    def normal(self, state: _State) -> Normal:
+        size = 6 * (len(state.mounts) + len(state.boards))
+        gradient, hessian, cost = np.zeros(size), np.zeros((size, size)), 0.0
+        for board, camera, r, by_camera, by_board in self._terms(state):
+            if not (np.isfinite(r).all() and np.isfinite(by_camera).all()):
+                return Normal(math.inf, gradient[6:], np.eye(size - 6))
+            own = slice(6 * (len(state.mounts) + board), 6 * (len(state.mounts) + board + 1))
+            mount = slice(6 * camera, 6 * camera + 6)
+            cost += float(r @ r)
+            gradient[mount] += by_camera.T @ r
+            gradient[own] += by_board.T @ r
+            hessian[mount, mount] += by_camera.T @ by_camera
+            hessian[own, own] += by_board.T @ by_board
+            cross = by_camera.T @ by_board
+            hessian[mount, own] += cross
+            hessian[own, mount] += cross.T
+        free = np.delete(np.arange(size), slice(6 * self.fixed, 6 * self.fixed + 6))
+        return Normal(cost, gradient[free], hessian[np.ix_(free, free)])
+
+    def move(self, state: _State, step: FloatArray) -> _State:
+        steps = np.insert(step.reshape(-1, 6), self.fixed, 0.0, axis=0)
+        transforms = [moved(one, own) for one, own in zip((*state.mounts, *state.boards), steps, strict=True)]
+        return _State(tuple(transforms[: len(state.mounts)]), tuple(transforms[len(state.mounts) :]))
+
+    def residuals(self, state: _State) -> list[dict[str, FloatArray]]:
+        """For each board and each camera that saw it (n, 2) pixels, seen less predicted."""
+        found: list[dict[str, FloatArray]] = [{} for _ in self.boards]
+        for board, camera, r, _, _ in self._terms(state):
+            found[board][self.names[camera]] = -r.reshape(-1, 2)
+        return found
+
+    def _terms(self, state: _State) -> Iterator[tuple[int, int, FloatArray, FloatArray, FloatArray]]:
+        """Board, camera, residuals (2 n,), and their derivatives (2 n, 6) by the camera's mounting and the board."""
+        for index, (board, T_body_board) in enumerate(zip(self.boards, state.boards, strict=True)):
+            for name, seen in board.seen.items():
+                camera = self.names.index(name)
+                mount = state.mounts[camera]
+                in_body = T_body_board.apply(seen.points)
+                in_camera = (in_body - mount.translation) @ mount.rotation
+                residuals = self.cameras[camera].project(in_camera) - seen.pixels
+                by_body = self.cameras[camera].jacobian(in_camera) @ mount.rotation.T
+                # A camera that turns about its own place moves what it sees the other way.
+                by_mount = -jacobian_of_move(RigidTransform.identity(), in_body - mount.translation)
+                by_board = jacobian_of_move(T_body_board, seen.points)
+                yield (
+                    index,
+                    camera,
+                    residuals.ravel(),
+                    (by_body @ by_mount).reshape(-1, 6),
+                    (by_body @ by_board).reshape(-1, 6),
+                )
+
+
+def _told(
+    names: Sequence[str],
+    problem: _Problem,
+    solution: Solution[_State],
+    reference: str,
+    dropped: tuple[tuple[str, float], ...],
+) -> RigFit:
+    residuals = problem.residuals(solution.state)
+    numbers = sum(r.size for one in residuals for r in one.values())
+    sigma = solution.sigma(numbers, len(solution.normal.gradient)).reshape(-1, 6)
+    sigma = np.insert(sigma, problem.fixed, 0.0, axis=0)
+    mountings = {}
+    for index, name in enumerate(names):
+        own = [one[name] for one in residuals if name in one]
+        mounting = Mounting(
+            T_body_camera=solution.state.mounts[index],
+            sigma_deg=math.degrees(float(sigma[index, :3].max())),
+            sigma_m=float(sigma[index, 3:].max()),
+            rms_px=_rms(np.concatenate(own)) if own else 0.0,
+            boards=len(own),
+        )
+        if not (mounting.sigma_deg < _SIGMA_DEG and mounting.sigma_m < _SIGMA_M):
+            raise CalibrationError(
+                f"the boards leave the place of camera {name!r} uncertain by {mounting.sigma_deg:.2g} degrees and "
+                f"{100 * mounting.sigma_m:.2g} cm; show the board nearer, tilted, and in more places that both see"
+            )
+        mountings[name] = mounting
+    return RigFit(reference, mountings, _rms(np.concatenate([r for one in residuals for r in one.values()])), dropped)
+
+
+def _rms(residuals: FloatArray) -> float:
+    return float(np.sqrt((residuals**2).sum(axis=1).mean()))

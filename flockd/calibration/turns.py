@@ -1,0 +1,150 @@
+"""How far a camera turned between two pictures of whatever lay before it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from flockd.geometry import Camera
+from flockd.geometry.rotations import rotation_from_vector
+from flockd.messages import BoolArray, Float32Array, FloatArray, UInt8Array
+
+_MOST_POINTS, _QUALITY = 400, 0.01
+_APART = 1 / 60
+"""Least distance of two points, in widths of the picture."""
+_WINDOW_PX, _LEVELS = (21, 21), 4
+_THERE_AND_BACK_PX = 0.5
+_LEAST_POINTS = 40
+_ROUNDS, _STEPS = 6, 12
+_FEW_PX = 1.0
+"""Where a turn alone leaves no more than this, by the median, the camera's own shift does not show."""
+_MOST_PX = 2.0
+"""A turn that leaves more than this is none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """The camera at the second picture, in its own axes at the first."""
+
+    rotation: FloatArray
+    """(3, 3) ``x_first = rotation @ x_second``"""
+    residual_px: float
+    """Median of what is left over."""
+    points: int
+
+
+def turn_between(
+    camera: Camera, first: UInt8Array, second: UInt8Array, guesses: Sequence[FloatArray]
+) -> Turn | str:
+    """The turn from one (h, w) grey picture to the next, or the reason why there is none.
+
+    ``guesses`` (3, 3) say about where to look for what was in the first picture; the best is taken.
+    """
+    corners = cv2.goodFeaturesToTrack(first, _MOST_POINTS, _QUALITY, _APART * camera.size[0])
+    if corners is None or len(corners) < _LEAST_POINTS:
+        return "too few details in the picture"
+    start = np.asarray(corners, np.float32).reshape(-1, 2)
+    best: tuple[Float32Array, BoolArray] | None = None
+    for guess in guesses:
+        found = _followed(camera, first, second, start, guess)
+        if best is None or found[1].sum() > best[1].sum():
+            best = found
+    if best is None or best[1].sum() < _LEAST_POINTS:
+        return "the picture could not be followed"
+    end, kept = best
+    # OpenCV has pixel centres at whole numbers.
+    before, after = (camera.rays(points[kept].astype(np.float64) + 0.5) for points in (start, end))
+    imaged = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
+    return _turn(before[imaged], after[imaged], camera.focal_px)
+
+
+def _followed(
+    camera: Camera, first: UInt8Array, second: UInt8Array, start: Float32Array, guess: FloatArray
+) -> tuple[Float32Array, BoolArray]:
+    expected = camera.project(camera.rays(start.astype(np.float64) + 0.5) @ guess) - 0.5
+    lost = ~(np.isfinite(expected).all(axis=1) & camera.in_image(expected))
+    expected[lost] = start[lost]
+    options = {"winSize": _WINDOW_PX, "maxLevel": _LEVELS, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+    end, there, _ = cv2.calcOpticalFlowPyrLK(first, second, start, expected.astype(np.float32), **options)
+    back, again, _ = cv2.calcOpticalFlowPyrLK(second, first, end, start.copy(), **options)
+    kept = (there.ravel() == 1) & (again.ravel() == 1) & ~lost
+    kept &= np.linalg.norm(np.asarray(back) - start, axis=1) < _THERE_AND_BACK_PX
+    return np.asarray(end, np.float32), np.asarray(kept, np.bool_)
+
+
+def _turn(before: FloatArray, after: FloatArray, focal_px: float) -> Turn | str:
+    rotation, left = _pure_turn(before, after)
+    if np.median(left) * focal_px > _FEW_PX:
+        rotation, left = _turn_beside_a_shift(before, after, rotation)
+    residual_px = float(np.median(left)) * focal_px
+    if not residual_px < _MOST_PX:
+        return "what is seen does not move as one"
+    return Turn(rotation, residual_px, len(before))
+
+
+def _pure_turn(before: FloatArray, after: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The best rotation of directions (n, 3) where only far things are seen, and the angles (n,) it leaves."""
+    weights = np.ones(len(before))
+    for _ in range(_ROUNDS):
+        rotation = best_rotation(before, after, weights)
+        left = np.linalg.norm(before - after @ rotation.T, axis=1)
+        weights = _weights(left)
+    return rotation, left
+
+
+def best_rotation(to: FloatArray, vectors: FloatArray, weights: FloatArray) -> FloatArray:
+    """(3, 3) R with least ``sum w |to - R vectors|^2`` (Wahba's problem, by Kabsch)."""
+    u, _, vt = np.linalg.svd((to * weights[:, None]).T @ vectors)
+    rotation: FloatArray = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return rotation
+
+
+def _turn_beside_a_shift(
+    before: FloatArray, after: FloatArray, start: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The rotation for which both directions and one shift lie in a plane, at whatever distance each point is.
+
+    The shift drops out: it is the least eigenvector of the planes' normals (Kneip and Lynen 2013).
+    """
+    rotation, weights = start, np.ones(len(before))
+    left = weights
+    for _ in range(_STEPS):
+        turned = after @ rotation.T
+        normals = np.cross(before, turned)
+        shift = np.linalg.eigh((normals * weights[:, None]).T @ normals)[1][:, 0]
+        # How far the point lies off its epipolar plane, as an angle.
+        off = normals @ shift / np.maximum(np.linalg.norm(np.cross(before, shift), axis=1), 0.05)
+        left = np.abs(off)
+        weights = _weights(left)
+        # d (before x R after) . shift / d turn, with R' = exp(turn) R: before x (turn x turned) . shift
+        slope = np.cross(turned, np.cross(shift, before))
+        slope /= np.maximum(np.linalg.norm(np.cross(before, shift), axis=1), 0.05)[:, None]
+        # The shift follows the turn: only what it cannot take up counts.
+        along, across = _tangents(shift)
+        by_shift = np.stack([normals @ along, normals @ across], axis=1)
+        by_shift /= np.maximum(np.linalg.norm(np.cross(before, shift), axis=1), 0.05)[:, None]
+        J = np.concatenate([slope, by_shift], axis=1)
+        H = (J * weights[:, None]).T @ J
+        step = -np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(5), (J * weights[:, None]).T @ off)
+        rotation = rotation_from_vector(step[:3]) @ rotation
+        if float(np.linalg.norm(step[:3])) < 1e-8:
+            break
+    return rotation, left
+
+
+def _tangents(unit: FloatArray) -> tuple[FloatArray, FloatArray]:
+    helper = np.eye(3)[int(np.argmin(np.abs(unit)))]
+    along = np.cross(unit, helper)
+    along /= np.linalg.norm(along)
+    return along, np.cross(unit, along)
+
+
+def _weights(left: FloatArray) -> FloatArray:
+    """Cauchy's, with the scale of the median."""
+    scale = max(2.0 * float(np.median(np.abs(left))), math.radians(0.005))
+    weights: FloatArray = 1.0 / (1.0 + (left / scale) ** 2)
+    return weights
