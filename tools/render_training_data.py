@@ -20,6 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from tools.training import worlds
 from tools.training.dataset import FOCAL_PX, HEIGHT, MAX_DRONES, R_BODY_CAMERA, WIDTH, create_part, note
+from tools.training.scenes import attitude, drawn_attitude
 
 Array = NDArray[Any]
 
@@ -79,18 +80,18 @@ def _render_pair(
     height = float(rng.uniform(1.5, 8.0))
     ground = float(world.height_at(place[:1], place[1:2])[0])
     position = np.array([place[0], place[1], -(ground + height)])
-    attitude = _attitude(rng.uniform(-np.pi, np.pi), rng.normal(0, np.radians(7), 2))
+    start = drawn_attitude(rng)
     interval = float(rng.uniform(0.1, 0.5))
     velocity = np.append(_direction(rng) * rng.uniform(0, 2.0), rng.normal(0, 0.2))
-    turn = _attitude(rng.normal(0, np.radians(10)) * interval, rng.normal(0, np.radians(4), 2) * interval)
+    turn = attitude(rng.normal(0, np.radians(10)) * interval, rng.normal(0, np.radians(4), 2) * interval)
     positions = [position, position + velocity * interval]
-    attitudes = [attitude, attitude @ turn]
+    attitudes = [start, start @ turn]
     shown = np.arange(MAX_DRONES) < rng.choice([0, 1, 2, 3, 4, 5, 6], p=[0.05, 0.15, 0.2, 0.2, 0.15, 0.15, 0.1])
-    places = _drone_places(position, attitude, focal, rng)
+    places = _drone_places(position, start, focal, rng)
     places[:, 2] = np.minimum(places[:, 2], -(ground + 0.5))
     moves = (velocity + rng.normal(0, 0.4, (MAX_DRONES, 3))) * interval
-    turns = [_attitude(rng.uniform(-np.pi, np.pi), rng.normal(0, np.radians(7), 2)) for _ in range(MAX_DRONES)]
-    wobble = [_attitude(rng.normal(0, 0.1) * interval, rng.normal(0, 0.07, 2)) for _ in range(MAX_DRONES)]
+    turns = [drawn_attitude(rng) for _ in range(MAX_DRONES)]
+    wobble = [attitude(rng.normal(0, 0.1) * interval, rng.normal(0, 0.07, 2)) for _ in range(MAX_DRONES)]
     places[~shown] = np.nan
     drone_positions = [places, places + moves]
     drone_rotations = [np.array(turns), np.array([r @ w for r, w in zip(turns, wobble, strict=True)])]
@@ -147,15 +148,6 @@ def _drone_places(position: Array, attitude: Array, focal: float, rng: np.random
         rng.uniform(7.0, 20.0, MAX_DRONES),
     )
     return np.asarray(position + (rays * ranges[:, None]) @ (attitude @ R_BODY_CAMERA).T)
-
-
-def _attitude(yaw: float, tilt: Array) -> Array:
-    roll, pitch = tilt
-    cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
-    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    return np.asarray(about_z @ about_y @ about_x)
 
 
 def _direction(rng: np.random.Generator) -> Array:

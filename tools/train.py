@@ -1,7 +1,7 @@
 """Train one network on rendered pairs; resumes from its last checkpoint.
 
     python tools/train.py neighbours --data DATA --out RUNS/neighbours --minutes 40
-    python tools/train.py distance   --data DATA --out RUNS/distance --minutes 25
+    python tools/train.py distance   --data DATA --out RUNS/distance --minutes 90 --pictures P --negatives N.npy
     python tools/train.py flow       --data DATA --out RUNS/flow --minutes 40
 
 Writes OUT/checkpoint.pt and OUT/curve.csv every few minutes. Uses a GPU where there is one.
@@ -28,7 +28,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from tools.training.dataset import PairSet, open_pairs
 from tools.training.networks import MAX_DEPTH_M, DistanceNet, FlowNet, NeighboursNet
-from tools.training.samples import Sample, distance_sample, drone_list, flow_sample, neighbours_sample, no_drone_sample
+from tools.training.pictures import PictureFiles
+from tools.training.samples import Sample, flow_sample, neighbours_sample, no_drone_sample
 
 Batch = dict[str, Tensor]
 
@@ -100,34 +101,38 @@ class NeighboursTask(Task):
 class DistanceTask(Task):
     """Range of the drone in the middle of a picture.
 
-    Pictures come from a pool that is renewed a little with every batch: cutting one costs more than learning from it.
+    Drones come from the files of render_drone_pictures.py, as many as there are by now. What is no drone is cut from
+    whole images, into a pool that is renewed a little with every batch: cutting costs more than learning from it.
     """
 
-    pool_size = 100_000
-    renewed_in_a_batch = 6
+    pool_size = 20_000
+    renewed_in_a_batch = 2
+    no_drone_share = 0.25
 
-    def __init__(self, pairs: PairSet, negatives: Path | None) -> None:
+    def __init__(self, pairs: PairSet, negatives: Path, pictures: Path) -> None:
         super().__init__(DistanceNet(), 64, 2e-3)
-        self.pairs, self.drones = pairs, drone_list(pairs)
-        self.negatives = np.load(negatives) if negatives else None
+        self.pairs, self.negatives = pairs, np.load(negatives)
+        self.drones = PictureFiles(pictures)
         self.pool: list[Sample] = []
-        self.drawn = 0
+
+    def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
+        """See ``Task``."""
+        self.drones.look_for_more()
+        while len(self.pool) < self.pool_size:
+            self.pool.append(self._no_drone(rng))
+        for _ in range(self.renewed_in_a_batch):
+            self.pool[int(rng.integers(self.pool_size))] = self._no_drone(rng)
+        return super().batch_samples(rng)
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """See ``Task``."""
-        self.drawn += 1
-        if len(self.pool) < self.pool_size:
-            while len(self.pool) < self.pool_size:
-                self.pool.append(self._fresh(rng))
-        elif self.drawn % self.batch < self.renewed_in_a_batch:
-            self.pool[int(rng.integers(self.pool_size))] = self._fresh(rng)
-        return self.pool[int(rng.integers(self.pool_size))]
+        if rng.random() < self.no_drone_share:
+            return self.pool[int(rng.integers(self.pool_size))]
+        return self.drones.draw(rng)
 
-    def _fresh(self, rng: np.random.Generator) -> Sample:
-        if self.negatives is not None and rng.random() < 0.25:
-            hard = self.negatives[int(rng.integers(len(self.negatives)))] if rng.random() < 0.7 else None
-            return no_drone_sample(self.pairs, hard, rng)
-        return distance_sample(self.pairs, self.drones[int(rng.integers(len(self.drones)))], rng)
+    def _no_drone(self, rng: np.random.Generator) -> Sample:
+        hard = self.negatives[int(rng.integers(len(self.negatives)))] if rng.random() < 0.7 else None
+        return no_drone_sample(self.pairs, hard, rng)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         """See ``Task``."""
@@ -212,10 +217,13 @@ class FlowTask(Task):
 NETWORKS = ("neighbours", "distance", "flow")
 
 
-def _task(network: str, pairs: PairSet, negatives: Path | None) -> Task:
-    if network == "neighbours":
-        return NeighboursTask(pairs)
-    return DistanceTask(pairs, negatives) if network == "distance" else FlowTask(pairs)
+def _task(arguments: argparse.Namespace) -> Task:
+    pairs = open_pairs(arguments.data)
+    if arguments.network != "distance":
+        return NeighboursTask(pairs) if arguments.network == "neighbours" else FlowTask(pairs)
+    if arguments.negatives is None or arguments.pictures is None:
+        raise SystemExit("the distance network needs --pictures and --negatives")
+    return DistanceTask(pairs, arguments.negatives, arguments.pictures)
 
 
 def main() -> None:
@@ -226,6 +234,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--minutes", type=float, default=60.0, help="of training in all, over every resumption")
     parser.add_argument("--negatives", type=Path, help="what is no drone, for `distance`: file of mine_negatives.py")
+    parser.add_argument("--pictures", type=Path, help="drones, for `distance`: folder of render_drone_pictures.py")
     parser.add_argument("--rate", type=float, help="learning rate to begin with")
     parser.add_argument("--start", type=Path, help="weights to begin with: another run's checkpoint.pt")
     parser.add_argument("--threads", type=int, default=2)
@@ -234,7 +243,7 @@ def main() -> None:
     torch.manual_seed(arguments.seed)
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(1)
-    task = _task(arguments.network, open_pairs(arguments.data), arguments.negatives)
+    task = _task(arguments)
     task.rate = arguments.rate or task.rate
     if arguments.start:
         begin_with(task.net, torch.load(arguments.start, map_location="cpu")["net"])

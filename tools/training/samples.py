@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flockd.geometry import Rig, virtual_crop
+from flockd.geometry import Rig, VirtualCrop, virtual_crop
 from flockd.sim.drone_models import FAMILIES, drone_model
 from tools.training.augment import photometric
 from tools.training.dataset import (
@@ -76,40 +77,62 @@ def _window(pairs: PairSet, index: int, k: int, size: int, rng: np.random.Genera
     return int(corner[1]) // 2 * 2, int(corner[0]) // 2 * 2
 
 
+@dataclass(frozen=True, eq=False)
+class DroneInView:
+    """One drone before one camera."""
+
+    focal: float
+    centre: NDArray[np.float64]
+    """(3,) of the drone, in the camera's axes, metres."""
+    rotation: NDArray[np.float64]
+    """(3, 3) from the drone's body to the camera's axes."""
+    family: int
+
+
 def distance_sample(
     pairs: PairSet, drone: tuple[int, int, int], rng: np.random.Generator, *, augment: bool = True
 ) -> Sample:
     """A picture of one drone and its range, for ``DistanceNet``."""
     pair, k, d = drone
-    image = np.asarray(pairs["image"][pair][k])
-    focal = float(pairs["focal"][pair])
-    centre = np.asarray(pairs["drone_centre"][pair, k, d], np.float64)
-    range_m = float(np.linalg.norm(centre))
-    # How much of the picture the drone fills must say nothing about metres: it is drawn apart from family and range.
-    # Half of the pictures are like the second look's, aimed by the first.
+    seen = DroneInView(
+        float(pairs["focal"][pair]),
+        np.asarray(pairs["drone_centre"][pair, k, d], np.float64),
+        np.asarray(pairs["drone_rotation"][pair, k, d], np.float64),
+        int(pairs["drone_family"][pair, d]),
+    )
+    return picture_of(seen, crop_around(seen, rng), np.asarray(pairs["image"][pair][k]), rng, augment=augment)
+
+
+def crop_around(drone: DroneInView, rng: np.random.Generator) -> VirtualCrop:
+    """Where the second stage might look: half of the time as aimed by the first network, else by itself."""
     aimed = rng.random() < 0.5
+    # How much of the picture the drone fills must say nothing about metres: it is drawn apart from family and range.
     fill = float(np.exp(np.clip(rng.normal(np.log(1.35), 0.1 if aimed else 0.27), np.log(0.7), np.log(2.4))))
-    half_width = SIZES_M[int(pairs["drone_family"][pair, d])] / 2 * fill
+    half_width = SIZES_M[drone.family] / 2 * fill
     shift_m = rng.normal(0, 0.03 if aimed else 0.15, 2) * half_width
-    right, down = _across(centre)
-    aim = R_BODY_CAMERA @ _in_view(centre + shift_m[0] * right + shift_m[1] * down, focal)
-    rig = Rig({"camera": rig_camera(focal)})
-    crop = virtual_crop(rig, aim / np.linalg.norm(aim), float(np.arctan(half_width / range_m)), 96)
+    right, down = _across(drone.centre)
+    aim = R_BODY_CAMERA @ _in_view(drone.centre + shift_m[0] * right + shift_m[1] * down, drone.focal)
+    half_angle = float(np.arctan(half_width / np.linalg.norm(drone.centre)))
+    return virtual_crop(Rig({"camera": rig_camera(drone.focal)}), aim / np.linalg.norm(aim), half_angle, 96)
+
+
+def picture_of(
+    drone: DroneInView, crop: VirtualCrop, image: NDArray[Any], rng: np.random.Generator, *, augment: bool = True
+) -> Sample:
+    """What ``crop`` shows of the camera's ``image``, with the truth."""
     picture, _ = crop.sample({"camera": image})
-    family = int(pairs["drone_family"][pair, d])
-    hubs = centre + HUBS[family] @ np.asarray(pairs["drone_rotation"][pair, k, d], np.float64).T
-    points = np.vstack([centre[None], hubs]) @ R_BODY_CAMERA.T
+    hubs = drone.centre + HUBS[drone.family] @ drone.rotation.T
+    points = np.vstack([drone.centre[None], hubs]) @ R_BODY_CAMERA.T
     place, *motors = crop.camera.project(crop.T_body_virtual.inverse().apply(points)) - 48.0
     if augment:
         (picture,) = photometric([picture], rng)
-    target = np.array([np.log(range_m / crop.camera.matrix[0, 0]), *place], np.float32)
-    apparent = np.log(SIZES_M[family]) - target[0]
+    log_range = np.log(np.linalg.norm(drone.centre) / crop.camera.matrix[0, 0])
     return {
         "picture": picture,
-        "target": target,
+        "target": np.array([log_range, *place], np.float32),
         "motors": np.asarray(motors, np.float32),
-        "family": np.array(family),
-        "apparent": np.array(apparent, np.float32),
+        "family": np.array(drone.family),
+        "apparent": np.array(np.log(SIZES_M[drone.family]) - log_range, np.float32),
         "drone": np.array(1.0, np.float32),
     }
 

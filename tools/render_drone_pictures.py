@@ -1,0 +1,135 @@
+"""Render pictures of single drones as the distance network is shown them: many more than whole images would give.
+
+    python tools/render_drone_pictures.py OUT --worlds 300 --scenes 300
+
+Only the window of the camera's image that the pictures look at is drawn. Every drone stands in another place. One file
+a world, which `train.py distance --pictures OUT` takes up as they appear.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from tools.training import worlds
+from tools.training.dataset import FOCAL_PX, HEIGHT, R_BODY_CAMERA, WIDTH
+from tools.training.scenes import drawn_attitude
+
+Array = NDArray[Any]
+PICTURES_A_SCENE = 3
+PAINTED = 8
+"""Drones of each family in a world, painted differently."""
+MOST_DRONES = 3
+
+
+def main() -> None:
+    """Render every world, one file each."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--worlds", type=int, default=300)
+    parser.add_argument("--scenes", type=int, default=400, help="drones a world")
+    parser.add_argument("--processes", type=int, default=os.cpu_count())
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    os.environ["NUMBA_NUM_THREADS"] = "1"
+    # From the far end of the training worlds: other places than those of whole images.
+    jobs = [
+        (arguments.out / f"{seed}.npz", seed, arguments.scenes) for seed in worlds.TRAINING[::-1][: arguments.worlds]
+    ]
+    jobs = [job for job in jobs if not job[0].is_file()]
+    begin = time.monotonic()
+    with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
+        for done, _ in enumerate(pool.imap_unordered(_render_world, jobs), start=1):
+            print(f"{done}/{len(jobs)} worlds, {time.monotonic() - begin:.0f} s", flush=True)
+
+
+def _render_world(job: tuple[Path, int, int]) -> None:
+    from flockd.sim.drone_models import FAMILIES, drone_model  # noqa: PLC0415 - numba starts in the worker
+    from flockd.sim.world import World  # noqa: PLC0415
+
+    path, seed, count = job
+    rng = np.random.Generator(np.random.PCG64([seed, 1]))
+    world = World.generate(seed, ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])), keep_out=None)
+    places = world.free_points(count, rng, 2.0)
+    models = [[drone_model(family, int(rng.integers(1 << 31))) for _ in range(PAINTED)] for family in range(FAMILIES)]
+    samples = [sample for place in places for sample in _scene(world, place, models, rng)]
+    joined = {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
+    draft = path.with_suffix(".part")
+    with draft.open("wb") as file:
+        np.savez(file, **joined)
+    draft.replace(path)
+
+
+def _scene(world: Any, place: Array, models: list[list[Any]], rng: np.random.Generator) -> list[dict[str, Array]]:
+    """Pictures of one drone from one camera; other drones may stand before or behind it."""
+    from flockd.sim.renderer import Renderer  # noqa: PLC0415
+    from tools.training.samples import DroneInView, crop_around, picture_of  # noqa: PLC0415
+
+    focal = FOCAL_PX * float(np.exp(rng.normal(0, 0.08)))
+    ground = float(world.height_at(place[:1], place[1:2])[0])
+    position = np.array([place[0], place[1], -(ground + rng.uniform(1.5, 8.0))])
+    R_ned_camera = drawn_attitude(rng) @ R_BODY_CAMERA
+    count = int(rng.choice([1, 2, MOST_DRONES], p=[0.6, 0.25, 0.15]))
+    families = rng.integers(0, len(models), count)
+    drones = [models[family][int(rng.integers(PAINTED))] for family in families]
+    positions = _places(position, R_ned_camera, focal, count, rng)
+    positions[:, 2] = np.minimum(positions[:, 2], -(ground + 0.5))
+    rotations = np.array([drawn_attitude(rng) for _ in range(count)])
+    seen = DroneInView(
+        focal, R_ned_camera.T @ (positions[0] - position), R_ned_camera.T @ rotations[0], int(families[0])
+    )
+    if seen.centre[2] < 0.3:
+        return []
+    crops = [crop_around(seen, rng) for _ in range(PICTURES_A_SCENE)]
+    left, top, right, bottom = _window(crops)
+    matrix = np.array([[focal, 0.0, WIDTH / 2 - left], [0.0, focal, HEIGHT / 2 - top], [0.0, 0.0, 1.0]])
+    view = Renderer(world, drones).render(
+        matrix, (right - left, bottom - top), R_ned_camera, position,
+        drone_rotations=rotations, drone_positions=positions, shown=np.ones(count, np.bool_),
+    )  # fmt: skip
+    if np.count_nonzero(view.ids == 1) < 40:
+        return []
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    image[top:bottom, left:right] = view.rgb
+    return [picture_of(seen, crop, image, rng) for crop in crops]
+
+
+def _places(position: Array, R_ned_camera: Array, focal: float, count: int, rng: np.random.Generator) -> Array:
+    """The first drone anywhere in the picture or just across its border, the others in about the same direction."""
+    u = rng.uniform(-15, WIDTH + 15) - WIDTH / 2
+    v = np.clip(rng.normal(HEIGHT / 2, HEIGHT / 5), 0, HEIGHT) - HEIGHT / 2
+    rays = np.array([[u / focal, v / focal, 1.0]]) + np.vstack([np.zeros(3), rng.normal(0, 0.12, (count - 1, 3))])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    near = np.exp(rng.uniform(np.log(1.2), np.log(7.0), count))
+    ranges = np.where(rng.random(count) < 0.75, near, rng.uniform(7.0, 20.0, count))
+    return np.asarray(position + (rays * ranges[:, None]) @ R_ned_camera.T)
+
+
+def _window(crops: list[Any]) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom of the part of the image that the crops look at."""
+    edge = np.array([[u, v] for u in np.linspace(0, 96, 7) for v in np.linspace(0, 96, 7)])
+    pixels = np.vstack(
+        [
+            crop.rig.cameras["camera"].camera.project(
+                crop.camera.unproject(edge, np.ones(len(edge))) @ crop.T_body_virtual.rotation.T @ R_BODY_CAMERA
+            )
+            for crop in crops
+        ]
+    )
+    low = np.clip(np.floor(np.nanmin(pixels, 0)) - 3, 0, (WIDTH - 8, HEIGHT - 8)).astype(int)
+    high = np.clip(np.ceil(np.nanmax(pixels, 0)) + 3, low + 8, (WIDTH, HEIGHT)).astype(int)
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,44 @@
+"""Pictures of drones from a folder that may still be growing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from tools.training.samples import Sample
+
+_LOOK_EVERY = 200
+"""Calls between two looks into the folder."""
+
+
+class PictureFiles:
+    """Every sample of every file of ``render_drone_pictures.py``, in memory."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._files: dict[Path, Sample] = {}
+        self._ends = np.zeros(0, np.int64)
+        self._calls = 0
+        self.look_for_more()
+        if not self._files:
+            raise FileNotFoundError(f"{folder}: no pictures here; make them with tools/render_drone_pictures.py")
+
+    def look_for_more(self) -> None:
+        """Take up files that have appeared; looks only now and then."""
+        self._calls += 1
+        if self._calls % _LOOK_EVERY != 1:
+            return
+        for path in sorted(self._folder.glob("*.npz")):
+            if path not in self._files:
+                with np.load(path) as arrays:
+                    self._files[path] = dict(arrays)
+        self._ends = np.cumsum([len(file["drone"]) for file in self._files.values()])
+
+    def draw(self, rng: np.random.Generator) -> Sample:
+        """Any of them."""
+        index = int(rng.integers(self._ends[-1]))
+        which = int(np.searchsorted(self._ends, index, side="right"))
+        file = list(self._files.values())[which]
+        row = index - int(self._ends[which])
+        return {name: values[row] for name, values in file.items()}

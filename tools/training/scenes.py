@@ -1,0 +1,23 @@
+"""How drones and cameras are held in the rendered scenes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def attitude(yaw: float, tilt: NDArray[Any]) -> NDArray[np.float64]:
+    """R_ned_body (3, 3) of a heading, and roll and pitch (2,); all rad."""
+    roll, pitch = tilt
+    cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
+    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    return np.asarray(about_z @ about_y @ about_x)
+
+
+def drawn_attitude(rng: np.random.Generator) -> NDArray[np.float64]:
+    """Any heading, and the tilt of a multirotor on its way."""
+    return attitude(rng.uniform(-np.pi, np.pi), rng.normal(0, np.radians(7), 2))
