@@ -162,12 +162,14 @@ class DistanceTask(Task):
 
 
 def _flipped(batch: Batch) -> Batch:
-    """Half of the pictures, another half each time, left to right, in another light."""
+    """Another half of the pictures each time left to right, a quarter in strange colours, all in another light."""
     n = len(batch["picture"])
     mirror = torch.rand(n) < 0.5
     sign = torch.where(mirror, -1.0, 1.0)
     light = torch.exp(0.1 * torch.randn(n, 1, 1, 1) + 0.04 * torch.randn(n, 1, 1, 3))
     picture = torch.where(mirror[:, None, None, None], batch["picture"].flip(2), batch["picture"])
+    strange = (torch.rand(n) < 0.25)[:, None, None, None]
+    picture = torch.where(strange, picture[..., torch.randperm(3)], picture)
     picture = (picture.float() * light + 5.0 * torch.randn(n, 1, 1, 1)).clamp(0, 255).to(torch.uint8)
     target, motors = batch["target"].clone(), batch["motors"].clone()
     target[:, 1] *= sign
