@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from flockd.calibration.errors import CalibrationError
 from flockd.calibration.least_squares import Normal, minimise
-from flockd.calibration.turns import best_rotation
+from flockd.calibration.turns import CameraTurn, best_rotation
 from flockd.geometry.rotations import rotation_from_vector
 from flockd.messages import BoolArray, FloatArray
 
@@ -25,16 +26,6 @@ _MOST_RMS_SHARE = 0.3
 _LONGEST_GAP = 3.0
 """Attitudes farther apart than this times their median are not interpolated between."""
 _AXES = ("rolled", "pitched", "yawed")
-
-
-@dataclass(frozen=True, eq=False)
-class CameraTurn:
-    """How a camera turned from one picture to the next."""
-
-    start_s: float
-    end_s: float
-    rotation: FloatArray
-    """(3, 3) ``x_start = rotation @ x_end``, in the camera's axes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +84,7 @@ def align(turns: Sequence[CameraTurn], attitudes: Attitudes, max_offset_s: float
     offset_s, weights = problem.scan(max_offset_s)
     state = _State(best_rotation(problem.vehicle(offset_s), problem.camera, weights), offset_s)
     for _ in range(_ROUNDS):
-        solution = minimise(state, lambda now: problem.normal(now, weights), _move)
+        solution = minimise(state, partial(problem.normal, weights=weights), _move)
         state = solution.state
         weights = _weights(problem.residuals(state))
     left = problem.residuals(state)
@@ -122,7 +113,7 @@ def _check_known(found: Alignment, problem: _Problem, at_limit: bool) -> None:
     if not found.sigma_deg < _SIGMA_DEG:
         spread = np.abs(problem.vehicle(found.time_offset_s)).mean(axis=0)
         most = _AXES[int(np.argmax(spread))]
-        others = " and ".join(axis.removesuffix("ed") for axis in _AXES if axis != most).replace("roll", "roll")
+        others = " and ".join(axis.removesuffix("ed") for axis in _AXES if axis != most)
         raise CalibrationError(
             f"the drone {most} and hardly did anything else, so the camera's turn about that axis is known to "
             f"{found.sigma_deg:.1f} degrees only; {others} it too"

@@ -42,7 +42,9 @@ class BoardSpec:
         if min(self.columns, self.rows) < 3 or max(self.columns, self.rows) > 50:
             raise CalibrationError(f"a board of {self.columns}x{self.rows} squares is none; take 3 to 50 each way")
         if self.corner_count < MIN_CORNERS:
-            raise CalibrationError(f"a board of {self.columns}x{self.rows} squares has too few corners; take 5x4 or more")
+            raise CalibrationError(
+                f"a board of {self.columns}x{self.rows} squares has too few corners; take 5x4 or more"
+            )
         if not 0.0 < self.marker_m < self.square_m:
             raise CalibrationError("a marker has to be smaller than its square; make the marker 0.75 times as large")
         known, needed = int(self.dictionary.split("_")[1]), self.columns * self.rows // 2
@@ -88,7 +90,8 @@ class BoardFinder:
         corners, ids, _, _ = self._detector.detectBoard(grey)
         if ids is None or len(ids) < MIN_CORNERS:
             return None
-        points, pixels = self._board.matchImagePoints(corners, ids)
+        # The stubs want a list of pictures here, which would be wrong.
+        points, pixels = self._board.matchImagePoints(corners, ids)  # type: ignore[call-overload]
         points = np.asarray(points, np.float64).reshape(-1, 3)
         if min(len(np.unique(points[:, 0].round(9))), len(np.unique(points[:, 1].round(9)))) < 2:
             return None

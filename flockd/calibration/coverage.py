@@ -106,7 +106,7 @@ _ARROW_SCALE = 50.0
 
 
 def draw(coverage: Coverage, plot: Plot, title: str) -> UInt8Array:
-    """(h, w, 3) RGB picture: the cells with corners lighter, each corner a dot, its residual a line 50 times as long."""
+    """(h, w, 3) RGB picture: the cells with corners lighter, each corner a dot, its residual a line, 50 times."""
     width, height = coverage.size
     scale = _WIDTH_PX / width
     picture = np.empty((round(height * scale), _WIDTH_PX, 3), np.uint8)

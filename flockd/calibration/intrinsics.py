@@ -98,7 +98,9 @@ def calibrate(views: Sequence[View], size: tuple[int, int], model: Model) -> Len
     or not of one flat board.
     """
     if len(views) < MIN_VIEWS:
-        raise CalibrationError(f"{len(views)} usable views of the board are too few; show it at least {MIN_VIEWS} times")
+        raise CalibrationError(
+            f"{len(views)} usable views of the board are too few; show it at least {MIN_VIEWS} times"
+        )
     state = _begin(views, size, model)
     dropped: list[tuple[View, float]] = []
     kept = list(views)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -22,6 +24,8 @@ _LEAST_POINTS = 40
 _ROUNDS, _STEPS = 6, 12
 _FEW_PX = 1.0
 """Where a turn alone leaves no more than this, by the median, the camera's own shift does not show."""
+_LONGEST_S = 1.5
+"""Pictures farther apart are not compared."""
 _MOST_PX = 2.0
 """A turn that leaves more than this is none."""
 
@@ -37,9 +41,41 @@ class Turn:
     points: int
 
 
-def turn_between(
-    camera: Camera, first: UInt8Array, second: UInt8Array, guesses: Sequence[FloatArray]
-) -> Turn | str:
+@dataclass(frozen=True, eq=False)
+class CameraTurn:
+    """How a camera turned from one of its pictures to the next."""
+
+    start_s: float
+    end_s: float
+    rotation: FloatArray
+    """(3, 3) ``x_start = rotation @ x_end``, in the camera's axes."""
+
+
+class Follower:
+    """Takes one camera's pictures one after the other, and keeps how it turned meanwhile."""
+
+    def __init__(self, camera: Camera, R_body_camera: FloatArray) -> None:
+        """``R_body_camera`` (3, 3): about how it is mounted, as a guess where to look after a large turn."""
+        self._camera, self._R_body_camera = camera, R_body_camera
+        self._before: tuple[float, UInt8Array, FloatArray] | None = None
+        self.turns: list[CameraTurn] = []
+        self.lost: Counter[str] = Counter()
+        """How often there was no turn, by reason."""
+
+    def add(self, time_s: float, grey: UInt8Array, R_ned_body: FloatArray) -> None:
+        """The next (h, w) picture, and about the attitude (3, 3) it was taken in."""
+        before, self._before = self._before, (time_s, grey, R_ned_body)
+        if before is None or not 0.0 < time_s - before[0] < _LONGEST_S:
+            return
+        expected = self._R_body_camera.T @ before[2].T @ R_ned_body @ self._R_body_camera
+        found = turn_between(self._camera, before[1], grey, (np.eye(3), expected))
+        if isinstance(found, str):
+            self.lost[found] += 1
+        else:
+            self.turns.append(CameraTurn(before[0], time_s, found.rotation))
+
+
+def turn_between(camera: Camera, first: UInt8Array, second: UInt8Array, guesses: Sequence[FloatArray]) -> Turn | str:
     """The turn from one (h, w) grey picture to the next, or the reason why there is none.
 
     ``guesses`` (3, 3) say about where to look for what was in the first picture; the best is taken.
@@ -68,9 +104,9 @@ def _followed(
     expected = camera.project(camera.rays(start.astype(np.float64) + 0.5) @ guess) - 0.5
     lost = ~(np.isfinite(expected).all(axis=1) & camera.in_image(expected))
     expected[lost] = start[lost]
-    options = {"winSize": _WINDOW_PX, "maxLevel": _LEVELS, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
-    end, there, _ = cv2.calcOpticalFlowPyrLK(first, second, start, expected.astype(np.float32), **options)
-    back, again, _ = cv2.calcOpticalFlowPyrLK(second, first, end, start.copy(), **options)
+    follow = partial(cv2.calcOpticalFlowPyrLK, winSize=_WINDOW_PX, maxLevel=_LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
+    end, there, _ = follow(first, second, start, expected.astype(np.float32))
+    back, again, _ = follow(second, first, end, start.copy())
     kept = (there.ravel() == 1) & (again.ravel() == 1) & ~lost
     kept &= np.linalg.norm(np.asarray(back) - start, axis=1) < _THERE_AND_BACK_PX
     return np.asarray(end, np.float32), np.asarray(kept, np.bool_)
@@ -103,9 +139,7 @@ def best_rotation(to: FloatArray, vectors: FloatArray, weights: FloatArray) -> F
     return rotation
 
 
-def _turn_beside_a_shift(
-    before: FloatArray, after: FloatArray, start: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _turn_beside_a_shift(before: FloatArray, after: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The rotation for which both directions and one shift lie in a plane, at whatever distance each point is.
 
     The shift drops out: it is the least eigenvector of the planes' normals (Kneip and Lynen 2013).

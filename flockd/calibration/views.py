@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Literal
 
 import cv2
@@ -22,6 +24,8 @@ _ALIKE = 0.03
 """Two views whose corners are this much of the picture's width apart, on average, say the same."""
 _STILL = 0.003
 """The same, of a board that is held still from one frame to the next."""
+_SAME = 0.6
+"""Views that have a smaller share of their corners in common show different parts of the board."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +79,9 @@ class Collector:
         edge_px = edge_width_px(grey, seen, self._finder.spec)
         if edge_px > self.max_edge_px:
             return self._refuse(Refused(name, "blurred", edge_px))
-        if moving and (before is None or self._apart(before, seen) > _STILL):
+        if moving and (before is None or not is_still(before, seen, image.shape[1])):
             return self._refuse(Refused(name, "moving"))
-        if any(self._apart(view.seen, seen) < _ALIKE for view in self.views):
+        if any(_apart(view.seen, seen, image.shape[1]) < _ALIKE for view in self.views):
             return self._refuse(Refused(name, "like another"))
         self.views.append(View(name, seen, edge_px))
         self.coverage.add(seen.pixels)
@@ -88,9 +92,7 @@ class Collector:
     @property
     def max_edge_px(self) -> float:
         """Above it a view is blurred."""
-        if self._max_edge_px is not None or self.size is None:
-            return self._max_edge_px or _SHARP_PX
-        return max(_SHARP_PX, _SHARP_SHARE * self.size[0])
+        return self._max_edge_px or sharp_px(self.size[0] if self.size else 0)
 
     def counts(self) -> dict[Refusal, int]:
         """How many were refused, by reason."""
@@ -109,19 +111,33 @@ class Collector:
         self.refused.append(refused)
         return refused.why
 
-    def _apart(self, first: Detection, second: Detection) -> float:
-        """Mean distance of the corners that both show, as a share of the width; infinite where they show others."""
-        _, a, b = np.intersect1d(first.ids, second.ids, assume_unique=True, return_indices=True)
-        if len(a) < 0.6 * max(len(first.ids), len(second.ids)) or self.size is None:
-            return float("inf")
-        return float(np.linalg.norm(first.pixels[a] - second.pixels[b], axis=1).mean()) / self.size[0]
-
     def _drop_the_most_alike(self) -> None:
-        apart = np.array([[self._apart(a.seen, b.seen) if a is not b else np.inf for b in self.views] for a in self.views])
+        assert self.size is not None
+        apart = np.full((len(self.views), len(self.views)), np.inf)
+        for i, j in combinations(range(len(self.views)), 2):
+            apart[i, j] = _apart(self.views[i].seen, self.views[j].seen, self.size[0])
         gone = self.views.pop(int(np.unravel_index(np.argmin(apart), apart.shape)[1]))
         self._refuse(Refused(gone.name, "like another"))
 
 
-def all_pixels(views: list[View]) -> FloatArray:
+def sharp_px(width: int) -> float:
+    """The widest edge of a sharp view in a picture of this width."""
+    return max(_SHARP_PX, _SHARP_SHARE * width)
+
+
+def is_still(before: Detection, now: Detection, width: int) -> bool:
+    """Whether a board was held still from one frame to the next, in pictures of this width."""
+    return _apart(before, now, width) < _STILL
+
+
+def all_pixels(views: Sequence[View]) -> FloatArray:
     """(n, 2) the corners of all views."""
-    return np.concatenate([view.seen.pixels for view in views]) if views else np.empty((0, 2))
+    return np.concatenate([view.seen.pixels for view in views])
+
+
+def _apart(first: Detection, second: Detection, width: int) -> float:
+    """Mean distance of the corners that both show, as a share of the width; infinite where they show others."""
+    _, a, b = np.intersect1d(first.ids, second.ids, assume_unique=True, return_indices=True)
+    if len(a) < _SAME * max(len(first.ids), len(second.ids)):
+        return float("inf")
+    return float(np.linalg.norm(first.pixels[a] - second.pixels[b], axis=1).mean()) / width

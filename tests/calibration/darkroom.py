@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flockd.calibration.board import BoardSpec
-from flockd.messages import FloatArray, UInt8Array
+from flockd.messages import Float32Array, FloatArray, UInt8Array
 
 SPEC = BoardSpec()
 _TEXTURE_PX = 96
@@ -43,14 +43,14 @@ WIDE = Lens("wide_angle", (480, 360), 171.8, 171.2, 236.4, 183.9, (0.028, -0.011
 
 
 @cache
-def rays(lens: Lens, fine: int = 1) -> FloatArray:
+def rays(lens: Lens, fine: int = 1) -> Float32Array:
     """(h fine, w fine, 3) float32: the direction that each part of a pixel looks in, its z 1 or its length 1."""
     width, height = lens.size
     u = (np.arange(width * fine) + 0.5) / fine
     v = (np.arange(height * fine) + 0.5) / fine
     x, y = np.meshgrid((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy)
     found = _pinhole_rays(x, y, lens.k) if lens.model == "pinhole" else _fisheye_rays(x, y, lens.k)
-    return found.astype(np.float32)  # type: ignore[return-value]
+    return found.astype(np.float32)
 
 
 def _pinhole_rays(x: FloatArray, y: FloatArray, k: Sequence[float]) -> FloatArray:
@@ -131,8 +131,7 @@ def photograph(
 
 def developed(light: FloatArray, *, seed: int, noise: float, blur_px: float) -> UInt8Array:
     """Out of focus, with the sensor's noise, as RGB."""
-    if blur_px > 0:
-        light = cv2.GaussianBlur(light.astype(np.float32), (0, 0), blur_px)
-    light = light + np.random.default_rng(seed).normal(0.0, noise, light.shape)
-    grey = np.clip(np.round(light), 0, 255).astype(np.uint8)
+    focused = cv2.GaussianBlur(light.astype(np.float32), (0, 0), blur_px) if blur_px > 0 else light
+    noisy = np.asarray(focused) + np.random.default_rng(seed).normal(0.0, noise, light.shape)
+    grey = np.clip(np.round(noisy), 0, 255).astype(np.uint8)
     return np.repeat(grey[..., None], 3, axis=2)

@@ -1,0 +1,240 @@
+"""Pictures to calibrate with: from a folder, a video, a recording or a live camera, and what identifies the camera."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flockd.calibration.errors import CalibrationError
+from flockd.errors import UnavailableError, UsageError
+
+if TYPE_CHECKING:
+    import cv2
+
+    from flockd.config import DroneConfig
+    from flockd.messages import UInt8Array, VehicleState
+    from flockd.sources import FrameSource
+
+FIRST_FRAME_S = 10.0
+FRAME_WAIT_S = 0.2
+SYSFS = Path("/sys/class/video4linux")
+
+
+@dataclass(frozen=True, eq=False)
+class PictureSet:
+    """What several cameras saw at one time."""
+
+    name: str
+    images: Mapping[str, UInt8Array]
+    """(h, w, 3) RGB by camera."""
+    times_s: Mapping[str, float] = field(default_factory=dict)
+    """Of each camera's frame, where it is known."""
+    vehicle: VehicleState | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """Sets of pictures, one after the other."""
+
+    sets: Iterator[PictureSet]
+    count: int
+    """How many there are about; 0 for a live camera."""
+    live: bool
+    identities: Mapping[str, str]
+    """What is known to tell each camera from others: its serial number at best."""
+
+
+def from_folder(path: Path, camera: str) -> Pictures:
+    """All images of a folder, by name, as those of one camera. Raises CalibrationError where there are none."""
+    files = _images(path)
+    if not files:
+        raise CalibrationError(f"{path}: has no images; name the folder they are in")
+    sets = (PictureSet(file.name, {camera: _read(file)}) for file in files)
+    return Pictures(sets, len(files), live=False, identities={camera: f"not known (pictures in {path.name})"})
+
+
+def from_folders(path: Path, cameras: Sequence[str]) -> Pictures:
+    """A folder for each camera within one; images of the same name were taken at the same time."""
+    missing = [camera for camera in cameras if not (path / camera).is_dir()]
+    if missing:
+        raise CalibrationError(
+            f"{path / missing[0]}: is no folder; make one for each camera of the rig, with its images"
+        )
+    files = {camera: {file.stem: file for file in _images(path / camera)} for camera in cameras}
+    names = sorted({name for of_camera in files.values() for name in of_camera})
+    if not names:
+        raise CalibrationError(f"{path}: has no images in its cameras' folders")
+    sets = (
+        PictureSet(name, {camera: _read(found[name]) for camera, found in files.items() if name in found})
+        for name in names
+    )
+    identities = {camera: f"not known (pictures in {path.name}/{camera})" for camera in cameras}
+    return Pictures(sets, len(names), live=False, identities=identities)
+
+
+def from_video(path: Path, camera: str, every: int) -> Pictures:
+    """Every so manieth frame of a video. Raises CalibrationError for one that cannot be decoded."""
+    import cv2
+    import numpy as np
+
+    with _video(path) as video:
+        count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+        if not video.isOpened() or not video.read()[0]:
+            raise CalibrationError(f"{path}: is no video that can be decoded; restore it, or convert it to MP4")
+
+    def sets() -> Iterator[PictureSet]:
+        with _video(path) as video:
+            index = 0
+            while video.grab():
+                if index % every == 0:
+                    there, image = video.retrieve()
+                    if there:
+                        rgb = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+                        yield PictureSet(f"frame {index}", {camera: rgb})
+                index += 1
+
+    return Pictures(sets(), -(-count // every), live=False, identities={camera: f"not known (filmed in {path.name})"})
+
+
+def from_recording(path: Path, every: int) -> tuple[Pictures, DroneConfig]:
+    """Every so manieth step of a recording of ours, and the configuration in it. Raises RecordingError."""
+    from flockd.cli.record import opened
+
+    recording = opened(path)
+    config = recording.config
+    sets = (
+        PictureSet(
+            f"{step.frames.time_s - recording.start_s:.2f} s",
+            {name: frame.image for name, frame in step.frames.frames.items()},
+            {name: frame.time_s for name, frame in step.frames.frames.items()},
+            step.vehicle,
+        )
+        for step in recording.steps()
+        if step.number % every == 0
+    )
+    devices = {} if config.source is None else {camera.name: camera.device for camera in config.source.cameras}
+    identities = {
+        camera.name: _known(config, camera.name)
+        or f"not known ({camera.name} of {recording.drone}{_at(devices.get(camera.name))})"
+        for camera in config.rig.cameras
+    }
+    return Pictures(sets, -(-len(recording.contents.steps) // every), live=False, identities=identities), config
+
+
+def from_cameras(config: DroneConfig, file: str, seconds: float, enough: Callable[[], bool]) -> Pictures:
+    """Frames of a drone's live cameras, until it is enough, the time is up or Ctrl-C. Raises ConfigError.
+
+    Reading raises UnavailableError when no frame comes.
+    """
+    from flockd.sources import open_source
+
+    source = open_source(config, file)
+    devices = {} if config.source is None else {camera.name: camera.device for camera in config.source.cameras}
+    identities = {
+        camera.name: identity(Path(devices[camera.name])) if camera.name in devices else f"not known ({camera.name})"
+        for camera in config.rig.cameras
+    }
+    return Pictures(_frames(source, seconds, enough), 0, live=True, identities=identities)
+
+
+def identity(device: Path, sysfs: Path = SYSFS) -> str:
+    """What tells this camera from others: maker, product and serial number of a USB camera, else its name and place."""
+    entry = sysfs / device.resolve().name
+    usb = (entry / "device").resolve().parent
+    vendor, product, serial = (_text(usb / name) for name in ("idVendor", "idProduct", "serial"))
+    if vendor and product:
+        return f"USB {vendor}:{product} {f'serial {serial}' if serial else f'without a serial number, {device}'}"
+    return f"{_text(entry / 'name') or 'not known'}, {device}"
+
+
+def device_config(device: str, camera: str, size: tuple[int, int], pixel_format: str) -> DroneConfig:
+    """A drone that has nothing but this camera, with a lens made up for want of a better one. Raises UsageError."""
+    from pydantic import ValidationError
+
+    from flockd.config import DroneConfig
+
+    lens = {"fx": size[0] * 1.0, "fy": size[0] * 1.0, "cx": size[0] / 2, "cy": size[1] / 2}
+    try:
+        return DroneConfig.model_validate(
+            {
+                "rig": {"cameras": ({"name": camera, "size_px": size, "intrinsics": lens},)},
+                "source": {
+                    "kind": "v4l2",
+                    "cameras": ({"name": camera, "device": device, "pixel_format": pixel_format},),
+                },
+            }
+        )
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise UsageError(f"{device}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+
+
+def _frames(source: FrameSource, seconds: float, enough: Callable[[], bool]) -> Iterator[PictureSet]:
+    source.start()
+    began_s, seen = time.monotonic(), False
+    try:
+        while time.monotonic() - began_s < seconds and not enough():
+            frames = source.newest(FRAME_WAIT_S)
+            if frames is None:
+                if not seen and time.monotonic() - began_s > FIRST_FRAME_S:
+                    faults = [status.fault for status in source.status().values() if status.fault]
+                    raise UnavailableError(
+                        faults[0] if faults else "no camera gave a frame; check how it is plugged in"
+                    )
+                continue
+            seen = True
+            stamps = {name: frame.time_s for name, frame in frames.frames.items()}
+            images = {name: frame.image for name, frame in frames.frames.items()}
+            yield PictureSet(f"{time.monotonic() - began_s:.1f} s", images, stamps)
+    finally:
+        source.stop()
+
+
+def _images(folder: Path) -> list[Path]:
+    from flockd.datasets.images import SUFFIXES
+
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
+
+
+def _read(file: Path) -> UInt8Array:
+    from flockd.datasets.images import read_image
+
+    return read_image(file)
+
+
+@contextmanager
+def _video(path: Path) -> Iterator[cv2.VideoCapture]:
+    """As it was filmed, without a phone's note to turn the picture; closed at the end."""
+    import cv2
+
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # our own sentence says what is wrong with a file
+    logging = cv2.utils.logging
+    before = logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    logging.setLogLevel(before)
+    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    try:
+        yield video
+    finally:
+        video.release()
+
+
+def _known(config: DroneConfig, camera: str) -> str | None:
+    measured = next(one.intrinsics.measured for one in config.rig.cameras if one.name == camera)
+    return measured.camera if measured else None
+
+
+def _at(device: str | None) -> str:
+    return f", {device}" if device else ""
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return ""
