@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import functools
 import logging
 import os
 import signal
@@ -33,7 +34,7 @@ def add(commands: Commands) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     from flockd.config import load_drone
-    from flockd.daemon import ServiceManager, only_instance
+    from flockd.daemon import ServiceManager, event_loop_at, only_instance
 
     if args.record is not None and not args.record.is_dir():
         raise UsageError(f"{args.record}: is no folder; make it first, or name another with --record")
@@ -41,8 +42,9 @@ def _run(args: argparse.Namespace) -> int:
     service = ServiceManager(os.environ)
     config: DroneConfig | None = load_drone(args.config)
     while config is not None:
-        with only_instance(config.name, os.environ):
-            config = asyncio.run(_fly(config, args, service)).reload
+        event_loop = functools.partial(event_loop_at, config.speed_factor)
+        with only_instance(config.name, os.environ), asyncio.Runner(loop_factory=event_loop) as runner:
+            config = runner.run(_fly(config, args, service)).reload
     return ExitCode.DONE
 
 
@@ -50,7 +52,7 @@ async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceMa
     """With SIGTERM and Ctrl-C for standstill, Hold and the end, and SIGHUP for the configuration."""
     from flockd.cli.record import models_of
     from flockd.config import load_drone
-    from flockd.daemon import Daemon
+    from flockd.daemon import Daemon, clock_at
     from flockd.pilot.pilot import load_perception
 
     daemon = Daemon(
@@ -60,6 +62,7 @@ async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceMa
         models=models_of(config),
         recordings=args.record,
         service=service,
+        clock=clock_at(config.speed_factor),
     )
     loop = asyncio.get_running_loop()
     loop.add_signal_handler(signal.SIGTERM, daemon.ask_to_stop)

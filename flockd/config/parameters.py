@@ -325,6 +325,9 @@ class SharedMemoryParameters(Section):
     """zenoh endpoints of the program that publishes them."""
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
     """How often each camera's frames come; `safety.camera_timeout_periods` counts in these."""
+    speed_factor: Annotated[float, Field(ge=0.34, le=10)] = 1.0
+    """How fast a simulator's time passes: at 0.5, half a second of it in each real one, and all of flockd's times and
+    time-outs count in it. Slower than 0.34, and MAVSDK loses the autopilot between two heartbeats."""
 
 
 class SourceParameters(Section):
@@ -348,6 +351,8 @@ class SourceParameters(Section):
     def _fits_its_kind(self) -> Self:
         if self.kind == "shared_memory" and self.cameras:
             raise ValueError("a source of kind `shared_memory` has no devices; delete `cameras`")
+        if self.kind == "v4l2" and self.shared_memory.speed_factor != 1.0:
+            raise ValueError("real cameras know real time only; delete `shared_memory.speed_factor`")
         for camera in self.cameras:
             if self.set_tolerance_s * camera.rate_hz < 0.5:
                 raise ValueError(
@@ -462,6 +467,19 @@ class DroneConfig(Section):
     autopilot: AutopilotParameters | None = None
     """None: this drone's commands go nowhere but to the simulator."""
     telemetry: TelemetryParameters = TelemetryParameters()
+
+    @property
+    def speed_factor(self) -> float:
+        """How fast this drone's time passes: 1 unless it is simulated."""
+        return 1.0 if self.source is None else self.source.shared_memory.speed_factor
+
+    @model_validator(mode="after")
+    def _only_simulated_time_is_slow(self) -> Self:
+        if self.speed_factor != 1.0 and self.autopilot is not None and self.autopilot.address.startswith("serial:"):
+            raise ValueError(
+                "source.shared_memory.speed_factor is for simulations, and an autopilot on a cable is none; delete it"
+            )
+        return self
 
     @model_validator(mode="after")
     def _every_camera_has_its_device(self) -> Self:

@@ -3,5 +3,7 @@
 from flockd.daemon.daemon import Daemon, DaemonError, Ending
 from flockd.daemon.lock import only_instance
 from flockd.daemon.service import ServiceManager
+from flockd.daemon.simulated_time import event_loop_at
+from flockd.sources import clock_at
 
-__all__ = ["Daemon", "DaemonError", "Ending", "ServiceManager", "only_instance"]
+__all__ = ["Daemon", "DaemonError", "Ending", "ServiceManager", "clock_at", "event_loop_at", "only_instance"]

@@ -74,7 +74,7 @@ class Daemon:
         Raises ConfigError for a configuration that cannot be flown.
         """
         self._autopilot = _autopilot_of(config, file)
-        self._source = open_source(config, file)
+        self._source = open_source(config, file, clock=clock)
         self._config, self._file = config, file
         self._load_networks, self._models, self._recordings = load_networks, models, recordings
         self._service, self._clock = service, clock
@@ -169,7 +169,7 @@ class Daemon:
         crew = Crew(
             link=link, streamer=streamer, source=self._source, sight=sight, networks=networks, control=control,
             requests=requests, take_off=take_off, chronicle=chronicle, telemetry=telemetry, lag=lag,
-            thermometer=thermometer, wall_clock=WallClock(chronicle.event, clock), dead_tasks=dead,
+            thermometer=thermometer, wall_clock=WallClock(chronicle.event, time.monotonic), dead_tasks=dead,
         )  # fmt: skip
         taker = self._taker(asyncio.get_running_loop(), chronicle)
         telemetry.announce(config.name, self._about(), taker, functools.partial(_picture, sight))
@@ -181,7 +181,7 @@ class Daemon:
             networks = await loading.do(LOAD_S, self._load_networks)
         finally:
             loading.leave()
-        return WatchedNetworks(networks, self._config.perception.deadline_s)
+        return WatchedNetworks(networks, self._config.perception.deadline_s / self._config.speed_factor)
 
     async def _fly(self, crew: Crew) -> None:
         """One task a concern, until all is over."""

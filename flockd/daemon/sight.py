@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -84,7 +85,7 @@ class Sight:
 
     async def run(self) -> None:
         """Looks for ever. Raises LateError when decoding or a step hangs."""
-        due_s = self._clock()
+        due_s, frame_period_s = self._clock(), _frame_period_s(self._config)
         while True:
             frames = await self._decoding.do(FRAME_DEADLINE_S, self._source.newest, FRAME_WAIT_S)
             if frames is None:
@@ -96,7 +97,7 @@ class Sight:
                 await self._step(taken_s, frames, vehicle)
             now = self._clock()
             due_s = max(due_s + self._config.step_s, now)
-            await asyncio.sleep(due_s - now)
+            await asyncio.sleep(due_s - frame_period_s - now)  # the next frame is the one that comes when a step is due
 
     def leave(self) -> None:
         """Ends what runs; takes up to two seconds, from any thread."""
@@ -127,7 +128,7 @@ class Sight:
         self._on_step(frames, vehicle, output)
 
     def _fresh_pilot(self) -> FlockPilot:
-        return FlockPilot(self._config, self._networks, stopwatch=self._clock)
+        return FlockPilot(self._config, self._networks, stopwatch=time.perf_counter)
 
     def _note_failure(self, why: str) -> None:
         """Tells it when it is new, and counts it."""
@@ -141,3 +142,10 @@ class Sight:
             self.ego_motion_failures = 0 if look.output.ego_motion is not None else self.ego_motion_failures + 1
         seen = [look.time_s - neighbour.unseen_s for neighbour in look.output.neighbours if neighbour.confirmed]
         self.neighbour_seen_s = max([self.neighbour_seen_s, *seen])
+
+
+def _frame_period_s(config: DroneConfig) -> float:
+    """Of the slowest camera."""
+    assert config.source is not None
+    rates_hz = [camera.rate_hz for camera in config.source.cameras] or [config.source.shared_memory.rate_hz]
+    return 1.0 / min(rates_hz)

@@ -1,16 +1,22 @@
 """Where camera frames come from: devices of this computer, or another program's shared memory."""
 
+import time
+from collections.abc import Callable
+
 from flockd.config import DroneConfig
 from flockd.errors import ConfigError, ConfigProblem
 from flockd.sources.frames import CameraStatus, Count, FrameSource
 from flockd.sources.shared_memory import FramePublisher, SharedMemorySource
+from flockd.sources.simulated_time import clock_at
 from flockd.sources.v4l2 import V4l2Source
 
-__all__ = ["CameraStatus", "Count", "FramePublisher", "FrameSource", "open_source"]
+__all__ = ["CameraStatus", "Count", "FramePublisher", "FrameSource", "clock_at", "open_source"]
 
 
-def open_source(config: DroneConfig, file: str) -> FrameSource:
+def open_source(config: DroneConfig, file: str, *, clock: Callable[[], float] = time.monotonic) -> FrameSource:
     """The source that a drone's configuration asks for, not started yet; ``file`` is named in errors.
+
+    ``clock`` is that of shared memory: frames of devices have the kernel's.
 
     Raises ConfigError if it asks for none.
     """
@@ -18,4 +24,4 @@ def open_source(config: DroneConfig, file: str) -> FrameSource:
         raise ConfigError([ConfigProblem(file, 0, "source", "is missing; add it with kind `v4l2` or `shared_memory`")])
     if config.source.kind == "v4l2":
         return V4l2Source(config, config.source)
-    return SharedMemorySource(config, config.source)
+    return SharedMemorySource(config, config.source, clock=clock)
