@@ -7,12 +7,16 @@ import sys
 from collections.abc import Sequence
 
 from flockd import __version__
-from flockd.cli import config, doctor, models, record, replay, report, run, sim, status
+from flockd.cli import config, doctor, models, record, replay, report, run, sim, status, view
 from flockd.cli.parser import Parser, add_commands
 from flockd.errors import ExitCode, FlockdError, UnavailableError
 
 # Packages of an extra: without them a command is unavailable, not broken.
-EXTRAS = {"numba": "sim", "llvmlite": "sim", "matplotlib": "sim", "jinja2": "sim", "pyarrow": "parquet"}
+EXTRAS = {
+    **dict.fromkeys(("numba", "llvmlite", "matplotlib", "jinja2"), "sim"),
+    "pyarrow": "parquet",
+    "rerun": "view",
+}
 INTERRUPTED = 130
 
 
@@ -52,6 +56,6 @@ def _parser() -> Parser:
         examples=("flockd sim", "flockd config check config/paper_flight.yaml"),
     )
     parser.add_argument("--version", action="version", version=f"flockd {__version__}")
-    commands = (run, status, doctor, sim, report, record, replay, config, models)
+    commands = (run, status, doctor, sim, report, record, replay, view, config, models)
     add_commands(parser, [command.add for command in commands])
     return parser

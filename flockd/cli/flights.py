@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,8 +10,8 @@ from flockd.cli.output import say, say_json
 from flockd.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
+    from flockd.report.filmstrip import FilmstripFrame
     from flockd.sim.log import FlightLog
-    from flockd.sim.swarm import Flight
 
 LOG_NAME = "flight.npz"
 FILMSTRIP_NAME = "filmstrip.npz"
@@ -21,21 +21,26 @@ REPORT_NAME = "report.html"
 
 def prepare(directory: Path) -> None:
     """Makes the folder; raises UsageError when it holds something else than an earlier flight."""
+    check(directory)
+    directory.mkdir(parents=True, exist_ok=True)
+
+
+def check(directory: Path) -> None:
+    """Raises UsageError when a folder holds something else than an earlier flight."""
     if directory.exists() and not directory.is_dir():
         raise UsageError(f"{directory}: is a file; name a folder with --out")
     if directory.is_dir() and any(directory.iterdir()) and not (directory / LOG_NAME).is_file():
         raise UsageError(f"{directory}: holds other files than a flight's; name a new or empty folder with --out")
-    directory.mkdir(parents=True, exist_ok=True)
 
 
-def save(directory: Path, flight: Flight) -> None:
+def save(directory: Path, log: FlightLog, filmstrip: Sequence[FilmstripFrame]) -> None:
     """Writes the flight's log, and its pictures if there are any, over those of an earlier flight."""
     from flockd.report.filmstrip import save_filmstrip
 
-    flight.log.save(directory / LOG_NAME)
+    log.save(directory / LOG_NAME)
     (directory / FILMSTRIP_NAME).unlink(missing_ok=True)
-    if flight.filmstrip:
-        save_filmstrip(directory / FILMSTRIP_NAME, flight.filmstrip)
+    if filmstrip:
+        save_filmstrip(directory / FILMSTRIP_NAME, filmstrip)
 
 
 def write_findings(directory: Path, log: FlightLog) -> dict[str, Any]:
@@ -68,7 +73,7 @@ def tell(directory: Path, summary: Mapping[str, Any], *, as_json: bool) -> int:
 
 
 def _key_figures(summary: Mapping[str, Any]) -> dict[str, str]:
-    flock, neighbours = summary["flock"], summary["neighbours"]
+    flock, neighbours, own = summary["flock"], summary["neighbours"], summary["own_account"]
     figures = {
         "drones": f"{summary['drones']}",
         "flown": f"{summary['duration_s']:g} s",
@@ -76,6 +81,7 @@ def _key_figures(summary: Mapping[str, Any]) -> dict[str, str]:
         "closest two drones": _number(flock["min_distance_m"], "m", 2),
         "order at the end": _number(flock["order_tail"], "of 1", 3),
         "union at the end": _number(flock["union_tail"], "of 1", 2),
+        "own motion estimated": "" if summary["has_truth"] else _number(own["own_motion_ratio"], "of the steps", 3),
         "neighbours known within 10 m": _number(neighbours["recall_within_10m"], "of 1", 3),
         "false neighbours": _number(neighbours["false_per_drone_minute"], "a drone and minute", 2),
     }

@@ -103,7 +103,7 @@ def _run(args: argparse.Namespace) -> int:
     recording = opened(args.recording)
     config = _config(args, recording)
     start_s, end_s = stretch(recording, args)
-    warnings = [*_warnings(recording, start_s), *_changed_models(recording, config)]
+    warnings = [*faults(recording), *changes(recording, config, start_s)]
     for warning in warnings:
         complain(warning)
     expected = _reference(args)
@@ -154,26 +154,28 @@ def _config(args: argparse.Namespace, recording: Recording) -> DroneConfig:
     return config
 
 
-def _warnings(recording: Recording, start_s: float) -> Iterator[str]:
-    """What may keep a replay from being the flight."""
+def faults(recording: Recording) -> Iterator[str]:
+    """What is missing of a recording."""
     contents = recording.contents
-    first_step = next(number for number, time_s in contents.steps if time_s >= start_s)
-    if first_step > 0:
-        yield f"the replay begins with step {first_step}: the pilot remembers nothing before it, nor the time it flew"
     for path, damage in contents.damages:
         where = "ends early" if damage.at_end else "is damaged"
         yield f"{path}: {where} at byte {damage.offset}: {damage.reason}"
     for first, last in contents.gaps:
         yield f"{recording.path}: steps {first} to {last} are missing, so that what follows may come out differently"
+
+
+def changes(recording: Recording, config: DroneConfig, start_s: float) -> Iterator[str]:
+    """What may keep a replay from this time on, with these settings, from being the flight."""
+    contents = recording.contents
+    first_step = next(number for number, time_s in contents.steps if time_s >= start_s)
+    if first_step > 0:
+        yield f"the replay begins with step {first_step}: the pilot remembers nothing before it, nor the time it flew"
     if contents.flight["images"] != "png":
         yield f"{recording.path}: its images are {contents.flight['images']}, not what the flight saw to the last bit"
     if contents.flight.get("true_roles"):
         yield f"{recording.path}: was flown with true {contents.flight['true_roles']}, and is replayed by network"
-
-
-def _changed_models(recording: Recording, config: DroneConfig) -> Iterator[str]:
     for name, sha256 in models_of(config).items():
-        recorded = recording.contents.models.get(name)
+        recorded = contents.models.get(name)
         if recorded != sha256:
             flown = f"flew with {recorded[:12]}" if recorded else "flew without it"
             yield f"model {name} is {sha256[:12]} here, and the recording {flown}: outputs will differ"
@@ -214,7 +216,7 @@ def _replay(
                 replayed.stages_ms.setdefault(stage, []).append(ms)
             if recorder is not None:
                 recorder.drain()  # nobody waits for a replay, so nothing need be dropped
-                recorder.step(step.frames, step.vehicle, output)
+                recorder.step(step.frames, step.vehicle, output, step.truth)
             tell(len(replayed.outputs), total)
     return replayed
 
@@ -228,7 +230,8 @@ def _recording_to(out: Path, recording: Recording, config: DroneConfig) -> Itera
     from flockd.recording.streams import REPLAYED
 
     settings = RecordingConfig(images="png", file_mb=1e9, quota_mb=1e12)
-    facts = {REPLAYED: recording.path.name}
+    flown = recording.contents.flight
+    facts = {**{name: flown[name] for name in ("scenario", "seed") if name in flown}, REPLAYED: recording.path.name}
     with written_whole(out) as draft:
         with Recorder(
             draft, drone=recording.drone, config=config, settings=settings, models=models_of(config), facts=facts

@@ -1,33 +1,107 @@
-"""`flockd report`: the report of a recorded flight."""
+"""`flockd report`: the report of a flight, from its log or from its recordings."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
-from flockd.cli.flights import LOG_NAME, tell, write_findings
+from flockd.cli.flights import LOG_NAME, check, prepare, save, tell, write_findings
+from flockd.cli.output import complain, progress
 from flockd.cli.parser import Commands
+from flockd.cli.record import opened
+from flockd.cli.replay import changes, faults
 from flockd.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from flockd.report.filmstrip import FilmstripFrame
+    from flockd.sim.log import FlightLog
+
+SUFFIX = ".report"
+"""Of the folder beside a recording that its report goes to."""
 
 
 def add(commands: Commands) -> None:
     """Adds the command."""
-    examples = ("flockd report out/paper_flight-learned-seed0", "flockd report --json DIR")
-    parser = commands("report", "Write the summary and the report of a flight again, from its log.", examples)
-    parser.add_argument("directory", metavar="DIR", type=Path, help="folder that `flockd sim` wrote")
+    examples = (
+        "flockd report out/paper_flight-learned-seed0",
+        "flockd report out/short/recordings",
+        "flockd report kestrel-20261120T101500Z.mcap --out reports/kestrel",
+        "flockd report drone1.mcap --without-pictures --json",
+    )
+    description = "Write the summary and the report of a flight, from its folder or from recordings."
+    parser = commands("report", description, examples)
+    parser.add_argument(
+        "flight",
+        metavar="RECORDING",
+        type=Path,
+        help="a recording, a folder of one flight's, or what `flockd sim` wrote",
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, help=f"of a recording's report; default: NAME{SUFFIX}")
+    parser.add_argument(
+        "--without-pictures",
+        action="store_true",
+        help="do not fly a recording again for pictures of what its networks see",
+    )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     parser.set_defaults(run=_run)
 
 
 def _run(args: argparse.Namespace) -> int:
-    path = args.directory / LOG_NAME
-    if not path.is_file():
-        raise UsageError(f"{path}: does not exist; name a folder that `flockd sim` wrote")
+    if (args.flight / LOG_NAME).is_file():
+        return _again(args)
+    paths = _recordings(args.flight)
+    directory = args.out or args.flight.with_name(args.flight.resolve().name.removesuffix(".mcap") + SUFFIX)
+    check(directory)
+    log, pictures = _flight(paths, pictured=not args.without_pictures)
+    prepare(directory)
+    save(directory, log, pictures)
+    return tell(directory, write_findings(directory, log), as_json=args.json)
+
+
+def _again(args: argparse.Namespace) -> int:
+    """The report of a flight whose folder has its log."""
+    for option in ("out", "without_pictures"):
+        if getattr(args, option):
+            raise UsageError(f"--{option.replace('_', '-')} is for recordings, and {args.flight} has a flight's log")
     from flockd.sim.log import FlightLog
 
+    path = args.flight / LOG_NAME
     try:
         log = FlightLog.load(path)
     except (ValueError, EOFError, BadZipFile) as error:
         raise UsageError(f"{path}: is not a whole flight log ({error}); fly again with `flockd sim`") from error
-    return tell(args.directory, write_findings(args.directory, log), as_json=args.json)
+    return tell(args.flight, write_findings(args.flight, log), as_json=args.json)
+
+
+def _recordings(path: Path) -> tuple[Path, ...]:
+    """The recording that was named, or all in the folder that was."""
+    if not path.is_dir():
+        return (path,)
+    from flockd.report.from_recording import recordings_in
+
+    found = recordings_in(path)
+    if not found:
+        raise UsageError(f"{path}: holds neither a flight's {LOG_NAME} nor recordings; name another folder")
+    return found
+
+
+def _flight(paths: Sequence[Path], *, pictured: bool) -> tuple[FlightLog, tuple[FilmstripFrame, ...]]:
+    from flockd.report.from_recording import filmstrip, flight_log
+
+    recordings = [opened(path) for path in paths]
+    for recording in recordings:
+        for fault in faults(recording):
+            complain(fault)
+    with progress("reading", "steps") as tell_progress:
+        log = flight_log(recordings, tell_progress)
+    if not pictured:
+        return log, ()
+    first = min(recordings, key=lambda recording: log.meta["names"].index(recording.drone))
+    for change in changes(first, first.config, first.start_s):
+        complain(change)
+    with progress("computing the pictures again", "steps") as tell_progress:
+        return log, filmstrip(first, log, tell_progress)

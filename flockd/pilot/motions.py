@@ -27,6 +27,14 @@ def ego_motion(
     rig: Rig, previous: RigView, current: RigView, flows: Mapping[str, Float32Array], parameters: GeometryParameters
 ) -> EgoMotion:
     """The drone's own motion from the background (Eq. 7-21). ``ValueError`` says why there is none."""
+    pairs = background_pairs(rig, previous, current, flows, parameters)
+    return estimate_ego_motion(pairs, rig, current.time_s - previous.time_s, parameters)
+
+
+def background_pairs(
+    rig: Rig, previous: RigView, current: RigView, flows: Mapping[str, Float32Array], parameters: GeometryParameters
+) -> PointPairs:
+    """What stands still, seen in both views by the same camera. ``ValueError`` says why there is nothing."""
     pairs = []
     for name, flow in flows.items():
         camera = rig.cameras[name]
@@ -38,8 +46,7 @@ def ego_motion(
         pairs.append(lifted.select(lifted.labels == 0))
     if not pairs:
         raise ValueError("no camera has both frames")
-    interval_s = current.time_s - previous.time_s
-    return estimate_ego_motion(PointPairs.concatenate(pairs), rig, interval_s, parameters)
+    return PointPairs.concatenate(pairs)
 
 
 def neighbour_motions(
@@ -51,6 +58,23 @@ def neighbour_motions(
     parameters: GeometryParameters,
 ) -> tuple[dict[int, NeighbourMotion], list[str]]:
     """The motion of every neighbour in both views, by its current label (Eq. 22-37), and why some have none."""
+    motions: dict[int, NeighbourMotion] = {}
+    reasons = []
+    for label, pairs in neighbour_pairs(rig, previous, current, flows, parameters).items():
+        if pairs is None or len(pairs) < _MIN_DRONE_PAIRS:
+            reasons.append("neighbour motion: too few point pairs")
+            continue
+        try:
+            motions[label] = estimate_neighbour_motion(pairs, ego, parameters)
+        except ValueError as error:
+            reasons.append(f"neighbour motion: {error}")
+    return motions, reasons
+
+
+def neighbour_pairs(
+    rig: Rig, previous: RigView, current: RigView, flows: Mapping[str, Float32Array], parameters: GeometryParameters
+) -> dict[int, PointPairs | None]:
+    """What belongs to each neighbour in both views, by its current label."""
     same = _labels_by_flow(previous, current, flows)
     table = np.full(256, UNCLASSED, np.uint8)
     for before, after in same.items():
@@ -67,18 +91,7 @@ def neighbour_motions(
                     relabelled, current.cameras[name].labels, max_depth_m=parameters.max_depth_m,
                 )  # fmt: skip
                 found.append(lifted)
-    motions: dict[int, NeighbourMotion] = {}
-    reasons = []
-    for label, found in pairs.items():
-        joined = PointPairs.concatenate(found) if found else None
-        if joined is None or len(joined) < _MIN_DRONE_PAIRS:
-            reasons.append("neighbour motion: too few point pairs")
-            continue
-        try:
-            motions[label] = estimate_neighbour_motion(joined, ego, parameters)
-        except ValueError as error:
-            reasons.append(f"neighbour motion: {error}")
-    return motions, reasons
+    return {label: PointPairs.concatenate(found) if found else None for label, found in pairs.items()}
 
 
 def _labels_by_flow(previous: RigView, current: RigView, flows: Mapping[str, Float32Array]) -> dict[int, int]:

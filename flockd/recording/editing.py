@@ -14,7 +14,16 @@ from flockd.recording import foxglove
 from flockd.recording.codec import from_json
 from flockd.recording.mcap_file import Entry, McapFile, Note, RecordingError, read_records
 from flockd.recording.reader import Contents, Recording, head_of, is_calibration, makes_steps
-from flockd.recording.streams import CUT, END_NOTE, FLIGHT_NOTE, FRAMES, RECOVERED, VEHICLE, StepFrames
+from flockd.recording.streams import (
+    CUT,
+    END_NOTE,
+    FLIGHT_NOTE,
+    FRAMES,
+    PILOT_BEGAN,
+    RECOVERED,
+    VEHICLE,
+    StepFrames,
+)
 
 
 def recover(recording: Recording, target: Path) -> int:
@@ -22,7 +31,7 @@ def recover(recording: Recording, target: Path) -> int:
 
     Raises RecordingError when no step is whole, and OSError; then there is no target.
     """
-    return _copy(recording.contents, target, -np.inf, np.inf, {RECOVERED: recording.path.name})
+    return _copy(recording, target, -np.inf, np.inf, RECOVERED)
 
 
 def cut(recording: Recording, target: Path, start_s: float, end_s: float) -> int:
@@ -30,7 +39,7 @@ def cut(recording: Recording, target: Path, start_s: float, end_s: float) -> int
 
     Raises RecordingError when no whole step is in it, and OSError; then there is no target.
     """
-    return _copy(recording.contents, target, start_s, end_s, {CUT: recording.path.name})
+    return _copy(recording, target, start_s, end_s, CUT)
 
 
 @contextmanager
@@ -44,12 +53,15 @@ def written_whole(target: Path) -> Iterator[Path]:
         draft.unlink(missing_ok=True)
 
 
-def _copy(contents: Contents, target: Path, start_s: float, end_s: float, origin: dict[str, str]) -> int:
+def _copy(recording: Recording, target: Path, start_s: float, end_s: float, how: str) -> int:
+    contents, began_s = recording.contents, recording.pilot_began_s
     whole = _whole_steps(contents, start_s, end_s)
     if not whole:
         raise RecordingError(f"{contents.paths[0]}: holds no whole step there; nothing was written")
     flight, models, configuration = head_of(contents.paths[0])
-    facts = {**flight.facts, "recording": uuid.uuid4().hex, "part": "0", **origin}
+    facts = {**flight.facts, "recording": uuid.uuid4().hex, "part": "0", how: recording.path.name}
+    if began_s is not None:
+        facts[PILOT_BEGAN] = repr(began_s)
     with written_whole(target) as draft, McapFile(draft) as file:
         for record in (Note(FLIGHT_NOTE, facts), models, configuration):
             file.write(record)

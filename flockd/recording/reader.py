@@ -26,10 +26,13 @@ from flockd.recording.streams import (
     FRAMES,
     MODELS_NOTE,
     OUTPUT,
+    PILOT_BEGAN,
+    TRUTH,
     VEHICLE,
     StepFrames,
     part_path,
 )
+from flockd.recording.truth import Truth
 
 _MEND = "`flockd record recover` makes a recording without it"
 _IMAGE_SUFFIX, _CALIBRATION_SUFFIX = "/image", "/calibration"
@@ -45,6 +48,8 @@ class RecordedStep:
     vehicle: VehicleState
     output: Mapping[str, Any] | None
     """A `PilotOutput` as JSON, every number exact; None where the recording ends before it."""
+    truth: Truth | None
+    """Of a simulated flight."""
 
 
 @dataclass
@@ -120,6 +125,18 @@ class Recording:
         """From the first step to the last."""
         return self.contents.steps[-1][1] - self.start_s
 
+    @property
+    def has_truth(self) -> bool:
+        """Whether a simulator recorded where everybody truly was."""
+        return TRUTH.topic in self.contents.streams
+
+    @property
+    def pilot_began_s(self) -> float | None:
+        """When the pilot took its first step, from which it counts its time; None where that is not known."""
+        number, time_s = self.contents.steps[0]
+        known = self.contents.flight.get(PILOT_BEGAN)
+        return time_s if number == 0 else None if known is None else float(known)
+
     def steps(self, start_s: float = -np.inf, end_s: float = np.inf) -> Iterator[RecordedStep]:
         """The steps at these times (of the recording's clock) in the order in which they were flown.
 
@@ -148,6 +165,7 @@ class Recording:
                 return
             vehicle: VehicleState = from_json(VehicleState, json.loads(messages[VEHICLE.topic]))
             output = json.loads(messages[OUTPUT.topic]) if OUTPUT.topic in messages else None
+            truth = from_json(Truth, json.loads(messages[TRUTH.topic])) if TRUTH.topic in messages else None
             frames = {}
             for entry in listed.frames:
                 image = _picture(messages[foxglove.image_stream(entry.camera).topic])
@@ -156,7 +174,7 @@ class Recording:
             raise RecordingError(f"{self.path}: step {number} lost its message {error}; {_MEND}") from error
         except (ValueError, RecordingError) as error:
             raise RecordingError(f"{self.path}: step {number} cannot be read ({error}); {_MEND}") from error
-        yield RecordedStep(number, FrameSet(listed.time_s, frames), vehicle, output)
+        yield RecordedStep(number, FrameSet(listed.time_s, frames), vehicle, output, truth)
 
 
 def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
@@ -274,7 +292,7 @@ def is_calibration(topic: str) -> bool:
 
 def makes_steps(topic: str) -> bool:
     """Whether this stream's messages are parts of steps, numbered by their sequence."""
-    return topic in {FRAMES.topic, VEHICLE.topic, OUTPUT.topic} or is_image(topic)
+    return topic in {FRAMES.topic, VEHICLE.topic, OUTPUT.topic, TRUTH.topic} or is_image(topic)
 
 
 def _picture(message: bytes) -> UInt8Array:

@@ -25,6 +25,7 @@ from flockd.messages import Frame, FrameSet, PilotOutput, VehicleState
 from flockd.recording import foxglove
 from flockd.recording.codec import to_json
 from flockd.recording.mcap_file import Entry, Inclosure, McapFile, Note, RecordingError
+from flockd.recording.own_path import OwnPath
 from flockd.recording.reader import head_of
 from flockd.recording.streams import (
     CONFIGURATION,
@@ -36,12 +37,14 @@ from flockd.recording.streams import (
     MODELS_NOTE,
     OUTPUT,
     TABLE,
+    TRUTH,
     VEHICLE,
     FrameEntry,
     StepFrames,
     nanoseconds,
     part_path,
 )
+from flockd.recording.truth import Truth
 from flockd.telemetry import publish_step
 
 FLUSH_EVERY_S = 0.2
@@ -63,6 +66,7 @@ class _Step:
     frames: FrameSet
     vehicle: VehicleState
     output: PilotOutput
+    truth: Truth | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,11 +143,14 @@ class Recorder:
         """Why the recording ended before the flight; None while all is well."""
         return self._failure
 
-    def step(self, frames: FrameSet, vehicle: VehicleState, output: PilotOutput) -> None:
-        """Takes one step of the pilot: what went in and what came out, and all telemetry that follows from it."""
+    def step(self, frames: FrameSet, vehicle: VehicleState, output: PilotOutput, truth: Truth | None = None) -> None:
+        """Takes one step of the pilot: what went in and what came out, and all telemetry that follows from it.
+
+        A simulator adds the ``truth``, which no pilot knows.
+        """
         number, self._steps = self._steps, self._steps + 1
         size = sum(frame.image.nbytes for frame in frames.frames.values())
-        self._put(_Step(number, frames, vehicle, output), size + _SMALL_BYTES)
+        self._put(_Step(number, frames, vehicle, output, truth), size + _SMALL_BYTES)
 
     def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
         """Takes one telemetry message, if the table of topics wants it recorded; a `TelemetrySink`.
@@ -288,20 +295,16 @@ class _Direct:
 
 
 class _Track:
-    """The frames' places and the own path, for viewers: what the own velocity adds up to."""
+    """The frames' places and the own path, for viewers."""
 
     def __init__(self, rig: RigConfig) -> None:
         self._rig = rig
-        self._north_east = np.zeros(2)
-        self._time_s: float | None = None
+        self._path = OwnPath()
 
     def entries(self, step: _Step) -> Iterator[Entry]:
         """Where everything is at this step."""
         time_s, velocity = step.frames.time_s, step.output.velocity
-        if velocity is not None and self._time_s is not None:
-            self._north_east = self._north_east + velocity[:2] * (time_s - self._time_s)
-        self._time_s = time_s
-        position, R_ned_body = np.array([*self._north_east, -step.vehicle.height_m]), step.vehicle.R_ned_body
+        position, R_ned_body = self._path.go_on(time_s, velocity, step.vehicle.height_m), step.vehicle.R_ned_body
         stamp = nanoseconds(time_s)
         places = foxglove.transforms(stamp, position, R_ned_body, self._rig)
         yield Entry(foxglove.TRANSFORMS, stamp, step.number, places)
@@ -419,6 +422,8 @@ def _step_entries(
     yield _json_entry(FRAMES, time_s, step.number, StepFrames(step.number, time_s, tuple(kept)))
     yield _json_entry(VEHICLE, time_s, step.number, step.vehicle)
     yield from track.entries(step)
+    if step.truth is not None:
+        yield _json_entry(TRUTH, time_s, step.number, step.truth)
     yield _json_entry(OUTPUT, time_s, step.number, step.output)
 
 

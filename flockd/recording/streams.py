@@ -10,6 +10,7 @@ from typing import Any
 from flockd.messages import PilotOutput, VehicleState
 from flockd.recording.codec import json_schema
 from flockd.recording.mcap_file import Stream
+from flockd.recording.truth import Truth
 from flockd.telemetry import TOPICS
 
 FORMAT = "1"
@@ -19,6 +20,8 @@ MODELS_NOTE = "models"
 END_NOTE = "end"
 RECOVERED, CUT, REPLAYED = EDITED = ("recovered_from", "cut_from", "replayed_from")
 """Facts of a recording that was made of another."""
+PILOT_BEGAN = "pilot_began_s"
+"""A fact of what was cut or recovered: when the pilot took its first step, from which it counts its time."""
 CONFIGURATION = "configuration.json"
 
 
@@ -49,6 +52,8 @@ def _json_stream(topic: str, kind: Any) -> Stream:
 FRAMES = _json_stream("/frames", StepFrames)
 VEHICLE = _json_stream("/vehicle", VehicleState)
 OUTPUT = _json_stream("/output", PilotOutput)
+TRUTH = _json_stream("/truth", Truth)
+"""Of simulated flights."""
 TABLE = {key: _json_stream(f"/{key}", topic.type) for key, topic in TOPICS.items() if topic.recorded}
 """The telemetry that the table of topics wants recorded."""
 

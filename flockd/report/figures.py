@@ -346,6 +346,62 @@ def _legend(figure: Figure, log: FlightLog, *more: Line2D) -> None:
     figure.legend(handles=handles, loc="outside upper left", ncols=len(handles), handlelength=1.8, columnspacing=1.4)
 
 
+# ---------------------------------------------------------------------------------------------------- without truth
+
+
+def account_curves(log: FlightLog) -> Figure:
+    """What one recorded drone itself knew and wanted: speed, course, and the distances of the neighbours it tracked."""
+    time_s = log.time_s
+    own, command = log.own_velocity_estimate[:, 0, :2], log.command_velocity[:, 0]
+    drawn = (
+        (own, {"color": colour_of(0, FEW), "label": "own, as estimated"}),
+        (command, {"color": colour_of(3, FEW), "label": "commanded"}),
+        (log.desired, {"label": "desired", **_DESIRED}),
+    )
+    with rc_context(STYLE):
+        figure = Figure(figsize=(11.0, 6.3), layout="constrained")
+        speed, course, distance = figure.subplots(3, 1, sharex=True)
+        for velocity, style in drawn:
+            speed.plot(time_s, np.linalg.norm(velocity, axis=1), **style)
+            course.plot(time_s, _unwrapped_deg(velocity), **style)
+        _tracked_lines(distance, log)
+        speed.set(ylabel="airspeed, m/s")
+        course.set(ylabel="course, °")
+        distance.set(ylabel="distance, m", xlabel="time, s")
+        for axes in (speed, distance):
+            axes.set_ylim(bottom=0)
+        figure.align_ylabels([speed, course, distance])
+        handles, labels = speed.get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper left", ncols=len(handles))
+    return figure
+
+
+def _unwrapped_deg(velocity: FloatArray) -> FloatArray:
+    """(S,) direction of (S, 2) velocities without jumps by a full turn; NaN where it is not known."""
+    course = np.arctan2(velocity[:, 1], velocity[:, 0])
+    known = np.isfinite(course)
+    course[known] = np.unwrap(course[known])
+    return np.degrees(course)
+
+
+def _tracked_lines(axes: Axes, log: FlightLog) -> None:
+    """Horizontal distance of each track, in its colour, and its number at its end."""
+    steps, tracks = log.tracked[:, 0].astype(int), log.tracked[:, 2].astype(int)
+    metres = np.linalg.norm(log.tracked[:, 3:5], axis=1)
+    for track in np.unique(tracks):
+        mine = tracks == track
+        line = np.full(len(log.time_s), np.nan)
+        line[steps[mine]] = metres[mine]
+        axes.plot(log.time_s, line, color=colour_of(int(track), FEW), marker=".", markersize=3)
+        last = steps[mine][-1]
+        axes.annotate(
+            f"#{track}", (log.time_s[last], line[last]), xytext=(3, 0), textcoords="offset points", va="center",
+            fontsize=8,
+        )  # fmt: skip
+    if not len(tracks):
+        axes.text(0.5, 0.5, "no neighbour was tracked", transform=axes.transAxes, ha="center", color=MUTED)
+
+
 # -------------------------------------------------------------------------------------------------- errors of Fig. 5
 
 

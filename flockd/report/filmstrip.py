@@ -52,6 +52,13 @@ class FilmstripFrame:
     """Label to its distance from the drone in metres."""
     shrink: int = 1
     """How many camera pixels, each way, one pixel of these pictures stands for."""
+    name: str = ""
+    """Of the drone, where it has another than its number."""
+
+    @property
+    def title(self) -> str:
+        """Whose picture it is."""
+        return self.name or drone_name(self.drone)
 
     def __post_init__(self) -> None:
         for camera in self.cameras:
@@ -97,6 +104,7 @@ def save_filmstrip(path: Path, frames: Sequence[FilmstripFrame]) -> None:
                 "track_ids": {str(label): int(track) for label, track in frame.track_ids.items()},
                 "ranges": {str(label): float(metres) for label, metres in frame.ranges.items()},
                 "shrink": frame.shrink * _STORED_SHRINK,
+                "name": frame.name,
             }
         )
         for camera in frame.cameras:
@@ -137,6 +145,7 @@ def load_filmstrip(path: Path) -> tuple[FilmstripFrame, ...]:
                 track_ids={int(label): track for label, track in entry["track_ids"].items()},
                 ranges={int(label): metres for label, metres in entry["ranges"].items()},
                 shrink=entry["shrink"],
+                name=entry.get("name", ""),
             )
         )
     return tuple(frames)
@@ -220,7 +229,7 @@ def filmstrip_figure(frame: FilmstripFrame) -> Figure:
             return axes
 
         figure.text(
-            _LEFT / width, 1 - 0.12 / height, f"{drone_name(frame.drone)}, t = {frame.time_s:.1f} s",
+            _LEFT / width, 1 - 0.12 / height, f"{frame.title}, t = {frame.time_s:.1f} s",
             ha="left", va="top", fontsize=11, fontweight="bold",
         )  # fmt: skip
         for row, name in enumerate(("image", "depth", "flow")):

@@ -40,18 +40,31 @@ def write_report(directory: Path) -> Path:
     folder = directory / "figures"
     folder.mkdir(exist_ok=True)
     errors = figures.error_curves(log)
+    for old in folder.glob("*.png"):
+        old.unlink()
     page = _template().render(
         **_texts(summary, log),
-        trajectories=_embed(figures.trajectories(log), folder, "trajectories", "Paths and formation from above"),
-        curves=_embed(
-            figures.flight_curves(log), folder, "curves", "Airspeed, course, distances and deviations over time"
-        ),
+        **(_of_truth(log, folder) if log.has_truth else _of_account(log, folder)),
         errors=_embed(errors, folder, "errors", "Errors of the estimates over time") if errors else None,
         filmstrip=[_plate(frame, number, folder) for number, frame in enumerate(frames, start=1)],
     )
     path = directory / "report.html"
     path.write_text(page, encoding="utf-8")
     return path
+
+
+def _of_truth(log: FlightLog, folder: Path) -> dict[str, Markup | None]:
+    return {
+        "trajectories": _embed(figures.trajectories(log), folder, "trajectories", "Paths and formation from above"),
+        "curves": _embed(
+            figures.flight_curves(log), folder, "curves", "Airspeed, course, distances and deviations over time"
+        ),
+    }
+
+
+def _of_account(log: FlightLog, folder: Path) -> dict[str, Markup | None]:
+    description = "Airspeed, course and distances of neighbours over time, as the drone knew them"
+    return {"trajectories": None, "curves": _embed(figures.account_curves(log), folder, "account", description)}
 
 
 def _template() -> jinja2.Template:
@@ -89,7 +102,7 @@ def _plate(frame: FilmstripFrame, number: int, folder: Path) -> dict[str, Any]:
         "source": _data_url("image/webp", small),
         "width": picture.shape[1],
         "height": picture.shape[0],
-        "text": f"Images, depth and flow of {figures.drone_name(frame.drone)} at {frame.time_s:.1f} s",
+        "text": f"Images, depth and flow of {frame.title} at {frame.time_s:.1f} s",
     }
 
 
@@ -106,8 +119,10 @@ def _texts(summary: Summary, log: FlightLog) -> dict[str, Any]:
     """What the page says, formatted."""
     by_sight = summary["perception"] != EXACT_STATES
     return {
-        "title": f"flockd flight report: {summary['scenario']}, seed {summary['seed']}",
-        "setting": f"{summary['scenario']}, seed {summary['seed']}",
+        "title": f"flockd flight report: {_setting(summary)}",
+        "setting": _setting(summary),
+        "truth": summary["has_truth"],
+        "recomputed": summary["recorded"] is not None,
         "headline": _headline(summary),
         "lead": _lead(summary),
         "facts": _facts(summary, log),
@@ -122,11 +137,22 @@ def _texts(summary: Summary, log: FlightLog) -> dict[str, Any]:
         "circle_until": f"{summary['circle_until_s']:g}",
         "table2": _table2(summary),
         "table3": _table3(summary["table3"]),
-        "flock": _flock(summary["flock"]) if summary["drones"] > 1 else [],
-        "neighbours": _neighbours(summary["neighbours"]) if by_sight and summary["drones"] > 1 else [],
+        "flock": _flock(summary["flock"]) if summary["drones"] > 1 and summary["has_truth"] else [],
+        "neighbours": _neighbours(summary["neighbours"]) if _knows_neighbours(summary) else [],
         "stages": _stages(summary["stages_ms"]),
         "definitions": _DEFINITIONS,
     }
+
+
+def _setting(summary: Summary) -> str:
+    """What was flown, of a recording also by whom and when."""
+    parts = [summary["scenario"]]
+    if summary["seed"] is not None:
+        parts.append(f"seed {summary['seed']}")
+    if summary["recorded"] is not None:
+        names = [name for name in summary["recorded"] if name != summary["scenario"]]
+        parts += [f"recorded by {', '.join(names)}"] * bool(names) + [f"begun {summary['began']}"]
+    return ", ".join(parts)
 
 
 _WORDS = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten", "Eleven", "Twelve")
@@ -139,7 +165,7 @@ def _headline(summary: Summary) -> str:
     drones, flock = summary["drones"], summary["flock"]
     count = _WORDS[drones] if drones < len(_WORDS) else str(drones)
     start = f"{count} {'drone' if drones == 1 else 'drones'} flew {summary['duration_s']:g} s {_means(summary)}"
-    if drones == 1:
+    if drones == 1 or not summary["has_truth"]:
         return start
     if flock["min_distance_m"] < _TOUCH_M:
         return f"{start}, but came within {flock['min_distance_m']:.2f} m of each other"
@@ -162,18 +188,30 @@ _SCALES = {
 
 
 def _lead(summary: Summary) -> str:
-    step = f"A step every {summary['step_s']:g} s; {summary['wall_s']:.0f} s of computing."
+    step = f"A step every {summary['step_s']:g} s"
+    step += "." if summary["wall_s"] is None else f"; {summary['wall_s']:.0f} s of computing."
     if summary["perception"] == EXACT_STATES:
         return f"Every drone was told the true positions and velocities of all others. {step}"
-    knew = "Each drone knew its neighbours and its own motion" if summary["drones"] > 1 else "It knew its own motion"
+    who = "Each drone" if summary["drones"] > 1 else "It"
+    what = "its own motion" if summary["drones"] == 1 and summary["has_truth"] else "its neighbours and its own motion"
     means = f"perception: {summary['perception']}; flow: {summary['flow']}; {_SCALES[summary['scale']]}"
-    return f"{knew} from its cameras ({means}). {step}"
+    return f"{who} knew {what} from its cameras ({means}). {step}{_whose(summary)}"
+
+
+def _whose(summary: Summary) -> str:
+    """Where not every drone of the flight was recorded, and where there is no truth."""
+    recorded = summary["recorded"]
+    if not summary["has_truth"]:
+        return " The recording holds no truth, so all of this is the drone’s own account."
+    if recorded is None or len(recorded) == summary["drones"]:
+        return ""
+    return f" What was estimated and timed here is by {', '.join(recorded)} alone; the truth is of all drones."
 
 
 def _facts(summary: Summary, log: FlightLog) -> list[dict[str, str]]:
     flock, neighbours = summary["flock"], summary["neighbours"]
     facts = []
-    if summary["drones"] > 1:
+    if summary["drones"] > 1 and summary["has_truth"]:
         facts += [
             _fact("Closest two drones", _number(flock["min_distance_m"], 2), _closest(log), "m"),
             _fact("Order", _number(flock["order_tail"], 3), "1 is all flying one way"),
@@ -184,7 +222,16 @@ def _facts(summary: Summary, log: FlightLog) -> list[dict[str, str]]:
             _fact("Neighbours known", _number(100 * neighbours["recall_within_10m"], 1), "of those within 10 m", "%"),
             _fact("False neighbours", _number(neighbours["false_per_drone_minute"], 2), "per drone and minute"),
         ]
-    facts.append(_fact("Speed", _number(summary["realtime_factor"], 2), "of real time", "×"))
+    if not summary["has_truth"]:
+        account = summary["own_account"]
+        known = account["own_motion_ratio"]
+        most = account["most_neighbours_tracked"]
+        facts += [
+            _fact("Own motion", _number(None if known is None else 100 * known, 1), "of the steps, from the second on", "%"),
+            _fact("Neighbours tracked", _number(most, 0), "at most at one time"),
+        ]
+    if summary["realtime_factor"] is not None:
+        facts.append(_fact("Speed", _number(summary["realtime_factor"], 2), "of real time", "×"))
     return facts
 
 
@@ -269,6 +316,10 @@ def _cell(value: float | None, paper: float | None = None) -> dict[str, Any]:
     # The paper prints four digits, so ours is rounded to four before it is measured against them.
     met = value is not None and paper is not None and round(value, 4) <= paper
     return {"text": _number(value, 4), "met": met}
+
+
+def _knows_neighbours(summary: Summary) -> bool:
+    return summary["perception"] != EXACT_STATES and summary["drones"] > 1 and bool(summary["has_truth"])
 
 
 def _rows(values: Mapping[str, Any], names: Sequence[tuple[str, str, int]]) -> list[dict[str, str]]:

@@ -33,18 +33,23 @@ def summarise(log: FlightLog) -> Json:
     on for 10 s after the circle. `flock`: distances and `safety` between drone centres in three dimensions over all
     steps; order, union and connectivity are horizontal means over the last 10 s, with the law's observation distance as
     interaction distance. `neighbours`: the share of all drones within 10 m, at all steps, of which there was a
-    confirmed track, and new false tracks. A flight whose perception is "truth" saw nothing: its `neighbours` are null
-    and it is itself Table 3's "truth".
+    confirmed track, and new false tracks; of drones and steps that were recorded. A flight whose perception is "truth"
+    saw nothing: its `neighbours` are null and it is itself Table 3's "truth". Of a recording without truth
+    (`has_truth`) all of these are null. `own_account` is what the recorded drones themselves knew.
     """
     meta = log.meta
     return {
         **{key: meta[key] for key in ("scenario", "perception", "flow", "scale", "drones", "duration_s", "step_s")},
         **{key: meta[key] for key in ("seed", "wall_s", "circle_until_s")},
-        "realtime_factor": meta["duration_s"] / meta["wall_s"] if meta["wall_s"] > 0 else None,
+        "recorded": meta.get("recorded"),
+        "began": meta.get("began"),
+        "has_truth": log.has_truth,
+        "realtime_factor": meta["duration_s"] / meta["wall_s"] if meta["wall_s"] else None,
         "table2": _table_2(log),
         "table3": _table_3(log),
         "flock": _flock(log),
         "neighbours": _neighbours(log),
+        "own_account": _own_account(log),
         "stages_ms": {
             stage: {"p50": _finite(np.percentile(samples, 50)), "p95": _finite(np.percentile(samples, 95))}
             for stage, samples in log.stages_ms.items()
@@ -148,7 +153,12 @@ def _convergence(
     }
 
 
+_FLOCK = ("min_distance_m", "min_distance_after_10s_m", "order_tail", "union_tail", "connectivity_tail", "safety")
+
+
 def _flock(log: FlightLog) -> Json:
+    if not log.has_truth:
+        return dict.fromkeys(_FLOCK)
     steps = range(len(log.time_s))
     nearest = np.array([min_distance(log.position[s]) for s in steps])
     tail = np.flatnonzero(_tail(log))
@@ -164,16 +174,26 @@ def _flock(log: FlightLog) -> Json:
 
 
 def _neighbours(log: FlightLog) -> Json:
-    if not _is_by_sight(log):
+    if not (_is_by_sight(log) and log.has_truth):
         return {"recall_within_10m": None, "false_per_drone_minute": None}
     drones = log.position.shape[1]
     distances = np.linalg.norm(_relative_positions(log), axis=-1)
-    near = (distances <= RECALL_RANGE_M) & ~np.eye(drones, dtype=bool)
+    near = (distances <= RECALL_RANGE_M) & ~np.eye(drones, dtype=bool) & log.recorded[..., None]
     seen = np.asarray(np.isfinite(log.neighbour_position).all(axis=-1))
-    drone_minutes = drones * len(log.time_s) * log.meta["step_s"] / 60
+    drone_minutes = log.recorded.sum() * log.meta["step_s"] / 60
     return {
         "recall_within_10m": _mean(seen[near]),
         "false_per_drone_minute": float(log.false_tracks.sum() / drone_minutes),
+    }
+
+
+def _own_account(log: FlightLog) -> Json:
+    """How often the own motion was estimated, from the second step on, and how many neighbours were tracked at once."""
+    looked = log.recorded & _is_by_sight(log)
+    _, counts = np.unique(log.tracked[:, :2], axis=0, return_counts=True)
+    return {
+        "own_motion_ratio": _mean(np.isfinite(log.ego_inlier_ratio)[1:][looked[1:]]),
+        "most_neighbours_tracked": int(counts.max(initial=0)) if looked.any() and len(log.tracked) else None,
     }
 
 
@@ -189,7 +209,7 @@ def _is_by_sight(log: FlightLog) -> bool:
 def _is_settled(log: FlightLog) -> bool:
     """Whether the whole tail follows the circle's end, where Eq. 44 changes its branch."""
     tail = _tail(log)
-    return not tail.all() and bool(np.all(log.time_s[tail] >= log.meta["circle_until_s"]))
+    return log.has_truth and not tail.all() and bool(np.all(log.time_s[tail] >= log.meta["circle_until_s"]))
 
 
 def _tail(log: FlightLog) -> BoolArray:

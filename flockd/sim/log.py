@@ -1,23 +1,26 @@
-"""The record of a simulated flight: what was true, what was estimated and what was commanded, step by step."""
+"""The record of a flight: what was true, what was estimated and what was commanded, step by step."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from flockd.messages import FloatArray, IntArray
+from flockd.messages import BoolArray, FloatArray, IntArray
 
 _STAGE_PREFIX = "stage "
 
 
 @dataclass(frozen=True, eq=False)
 class FlightLog:
-    """S steps of N drones; NaN where there was no estimate. Raises ValueError for shapes that do not fit together."""
+    """S steps of N drones; NaN where there was no estimate, and where nobody knows the truth.
+
+    A drone that was not recorded in a step has no command in it. Raises ValueError for shapes that do not fit together.
+    """
 
     time_s: FloatArray
     """(S,) since the flight's start, when each step began."""
@@ -59,6 +62,18 @@ class FlightLog:
     meta: Mapping[str, Any]
     """What was flown, in values that go into JSON: scenario, perception ("truth": with exact states), flow, scale,
     drones, duration_s, step_s, seed, wall_s, circle_until_s, desired_distance_m, observation_distance_m, and more."""
+    tracked: FloatArray = field(default_factory=lambda: np.zeros((0, 6)))
+    """(K, 6) each confirmed track at each step: step, observer, track, and metres north, east and down of it."""
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether it is known where the drones truly were."""
+        return bool(np.isfinite(self.position).all())
+
+    @property
+    def recorded(self) -> BoolArray:
+        """(S, N): which drones' steps are in it."""
+        return np.asarray(np.isfinite(self.command_velocity).all(axis=2))
 
     def __post_init__(self) -> None:
         steps, drones = self.position.shape[:2]
@@ -91,7 +106,7 @@ class FlightLog:
     def save(self, path: Path) -> None:
         """Write one compressed `.npz`."""
         arrays: dict[str, Any] = {
-            field.name: getattr(self, field.name) for field in fields(self) if field.name not in ("stages_ms", "meta")
+            part.name: getattr(self, part.name) for part in fields(self) if part.name not in ("stages_ms", "meta")
         }
         arrays |= {_STAGE_PREFIX + stage: samples for stage, samples in self.stages_ms.items()}
         with path.open("wb") as file:
@@ -107,7 +122,8 @@ class FlightLog:
             for name in list(arrays)
             if name.startswith(_STAGE_PREFIX)
         }
-        missing = {field.name for field in fields(cls)} - {"stages_ms"} - arrays.keys()
+        needed = {part.name for part in fields(cls) if part.default_factory is MISSING}
+        missing = needed - {"stages_ms"} - arrays.keys()
         if missing:
             raise ValueError(f"{path} is no flight log: it has no {', '.join(sorted(missing))}")
         meta = json.loads(str(arrays.pop("meta")))

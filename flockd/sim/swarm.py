@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
@@ -14,20 +14,22 @@ import numpy as np
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import UsageError
 from flockd.flocking import FlockingLaw, course, desired_velocity
-from flockd.messages import FloatArray, PilotOutput, VehicleState
+from flockd.messages import FloatArray, PilotOutput
 from flockd.perception import Perception
 from flockd.pilot import FlockPilot
 from flockd.pilot.pilot import load_perception
 from flockd.recording import Recorder
+from flockd.recording.truth import TrueDrone, Truth
 from flockd.report.filmstrip import FilmstripFrame
-from flockd.sim.log import FlightLog, match_neighbours
+from flockd.sim.log import FlightLog
+from flockd.sim.log_book import LogBook
 from flockd.sim.photographer import Photographer
+from flockd.sim.pictures import picture, pictured_steps
 from flockd.sim.truth import fly_truth, step_times
 from flockd.sim.truth_perception import ROLES, TruthPerception
 from flockd.sim.vehicles import SimulatedAutopilot, Vehicles
 from flockd.telemetry import TelemetrySink, publish_step
 
-FILMSTRIP_FRAMES = 6
 _FILMSTRIP_DRONE = 0
 
 
@@ -63,25 +65,39 @@ def fly(
         raise UsageError(f"there is no role {sorted(unknown)[0]!r} to swap for truth; choose from {', '.join(ROLES)}")
     begin = time.perf_counter()
     times = step_times(scenario)
-    recorder = _Recorder(scenario, times)
-    crew = _ExactCrew(scenario) if perception == "truth" else _SeeingCrew(scenario, swap, telemetry, recorders)
+    book = LogBook(times, len(scenario.vehicles))
+    companion = fly_truth(scenario)[1:]
+    crew = (
+        _ExactCrew(scenario) if perception == "truth" else _SeeingCrew(scenario, swap, telemetry, recorders, companion)
+    )
     yaw = course(scenario.drone.desired, 0.0)
     vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=yaw, seed=scenario.seed)
-    pictured = set(np.linspace(1, len(times) - 1, FILMSTRIP_FRAMES).astype(int).tolist())
+    pictured = pictured_steps(len(times))
     filmstrip = []
     for step, time_s in enumerate(times):
-        velocity, yaws = crew.decide(step, float(time_s), vehicles, recorder)
+        book.truth(step, vehicles.position, vehicles.velocity, vehicles.R_ned_body)
+        book.desired(step, desired_velocity(scenario.drone.desired, float(time_s)))
+        velocity, yaws = crew.decide(step, float(time_s), vehicles, book)
         if step in pictured:
-            filmstrip += crew.picture(float(time_s))
+            filmstrip += crew.picture()
         vehicles.step(velocity, yaws, scenario.drone.step_s)
         progress(step + 1, len(times))
-    facts = {
+    meta = {
+        "scenario": scenario.scenario,
+        "drones": len(scenario.vehicles),
+        "duration_s": scenario.duration_s,
+        "step_s": scenario.drone.step_s,
+        "seed": scenario.seed,
+        "circle_until_s": scenario.drone.desired.circle_until_s,
+        "desired_distance_m": scenario.drone.flocking.desired_distance_m,
+        "observation_distance_m": scenario.drone.flocking.observation_distance_m,
+        "separation_distance_m": scenario.drone.flocking.separation_distance_m,
         "perception": perception if not swap else f"learned, true {', '.join(sorted(swap))}",
         "flow": "none" if perception == "truth" else "truth" if "flow" in swap else scenario.drone.perception.flow,
         "scale": scenario.drone.perception.scale,
         "wall_s": time.perf_counter() - begin,
     }
-    return Flight(recorder.log(facts), tuple(filmstrip))
+    return Flight(book.log(meta, companion), tuple(filmstrip))
 
 
 class _ExactCrew:
@@ -91,25 +107,22 @@ class _ExactCrew:
         self._config = scenario.drone
         self._law = FlockingLaw(scenario.drone.flocking)
 
-    def decide(
-        self, step: int, time_s: float, vehicles: Vehicles, recorder: _Recorder
-    ) -> tuple[FloatArray, FloatArray]:
+    def decide(self, step: int, time_s: float, vehicles: Vehicles, book: LogBook) -> tuple[FloatArray, FloatArray]:
         """Velocity setpoints (n, 2) and headings (n,)."""
         positions, velocities = vehicles.position, vehicles.velocity
         count = len(positions)
         desired = desired_velocity(self._config.desired, time_s)
         commands = np.zeros((count, 2))
-        recorder.truth(step, vehicles, desired)
         for i in range(count):
             others = np.arange(count) != i
             relative = positions[others] - positions[i]
             commands[i], acceleration = self._law.command(
                 velocities[i, :2], relative[:, :2], velocities[others, :2], desired, self._config.step_s
             )
-            recorder.exact(step, i, others, relative, velocities, commands[i], acceleration)
+            book.exact(step, i, others, relative, velocities, commands[i], acceleration)
         return commands, np.full(count, course(self._config.desired, time_s))
 
-    def picture(self, time_s: float) -> list[FilmstripFrame]:
+    def picture(self) -> list[FilmstripFrame]:
         """Nothing was seen."""
         return []
 
@@ -123,8 +136,9 @@ class _SeeingCrew:
         swap: frozenset[str],
         telemetry: TelemetrySink | None,
         recorders: Sequence[Recorder],
+        companion: tuple[FloatArray, FloatArray],
     ) -> None:
-        self._scenario = scenario
+        self._companion = companion
         self._telemetry, self._recorders = telemetry, recorders
         self._photographer = Photographer(scenario)
         count = len(scenario.vehicles)
@@ -140,11 +154,8 @@ class _SeeingCrew:
         self._side_by_side = ThreadPoolExecutor(min(count, 2 * (os.cpu_count() or 1) + 1))
         self._outputs: list[PilotOutput] = []
 
-    def decide(
-        self, step: int, time_s: float, vehicles: Vehicles, recorder: _Recorder
-    ) -> tuple[FloatArray, FloatArray]:
+    def decide(self, step: int, time_s: float, vehicles: Vehicles, book: LogBook) -> tuple[FloatArray, FloatArray]:
         """Velocity setpoints (n, 2) and headings (n,)."""
-        recorder.truth(step, vehicles, desired_velocity(self._scenario.drone.desired, time_s))
         steps = []
         render_ms = []
         for i, pilot in enumerate(self._pilots):
@@ -156,123 +167,32 @@ class _SeeingCrew:
             state = self._autopilots[i].read(time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i])
             steps.append((pilot, frames, state))
         self._outputs = list(self._side_by_side.map(lambda one: one[0].step(one[1], one[2]), steps))
+        truth = self._truth(step, time_s, vehicles)
         for i, (output, (_, frames, state)) in enumerate(zip(self._outputs, steps, strict=True)):
             if self._telemetry is not None:
                 publish_step(self._telemetry, f"drone{i + 1}", state, output)
             if self._recorders:
                 self._recorders[i].drain()  # simulated time stands still, so nothing need ever be dropped
-                self._recorders[i].step(frames, state, output)
-            recorder.seen(step, i, output, state, vehicles, {"render": render_ms[i], **output.stages_ms})
+                self._recorders[i].step(frames, state, output, truth)
+            book.seen(step, i, output, state.R_ned_body, {"render": render_ms[i], **output.stages_ms})
         commands = [output.command for output in self._outputs]
         return np.array([c.velocity for c in commands]), np.array([c.yaw_rad for c in commands])
 
-    def picture(self, time_s: float) -> list[FilmstripFrame]:
-        """What the chosen drone's pilot worked with in the last step."""
-        pilot, output = self._pilots[_FILMSTRIP_DRONE], self._outputs[_FILMSTRIP_DRONE]
-        view = pilot.last_view
-        if view is None:
-            return []
-        cameras = view.cameras
-        return [
-            FilmstripFrame(
-                time_s=time_s,
-                drone=_FILMSTRIP_DRONE,
-                cameras=tuple(cameras),
-                images={name: c.image for name, c in cameras.items()},
-                depth={name: np.where(c.depth < 75.0, c.depth, np.float32(np.inf)) for name, c in cameras.items()},
-                labels={name: np.where(c.labels == 255, np.uint8(0), c.labels) for name, c in cameras.items()},
-                flow=dict(pilot.last_flows),
-                track_ids={s.label: t for s, t in zip(output.sightings, output.sighting_tracks, strict=True)},
-                ranges={s.label: float(np.linalg.norm(s.position)) for s in output.sightings},
+    def _truth(self, step: int, time_s: float, vehicles: Vehicles) -> Truth:
+        """For recordings only: no pilot is told."""
+        drones = (
+            TrueDrone(
+                name=f"drone{i + 1}",
+                position=vehicles.position[i],
+                velocity=vehicles.velocity[i],
+                R_ned_body=vehicles.R_ned_body[i],
+                exact_position=self._companion[0][step, i],
+                exact_velocity=self._companion[1][step, i],
             )
-        ]
+            for i in range(len(vehicles.position))
+        )
+        return Truth(time_s, tuple(drones))
 
-
-class _Recorder:
-    """Fills the flight log, and judges estimates against the truth."""
-
-    def __init__(self, scenario: ScenarioConfig, times: FloatArray) -> None:
-        steps, n = len(times), len(scenario.vehicles)
-        nan = np.nan
-        self._scenario, self._times = scenario, times
-        self.position, self.velocity = np.full((steps, n, 3), nan), np.full((steps, n, 3), nan)
-        self.attitude = np.full((steps, n, 3, 3), nan)
-        self.desired = np.full((steps, 2), nan)
-        self.command_velocity, self.command_acceleration = np.full((steps, n, 2), nan), np.full((steps, n, 2), nan)
-        self.ego_rotation, self.ego_translation = np.full((steps, n, 3, 3), nan), np.full((steps, n, 3), nan)
-        self.ego_inlier_ratio = np.full((steps, n), nan)
-        self.own_velocity = np.full((steps, n, 3), nan)
-        self.neighbour_position, self.neighbour_velocity = (np.full((steps, n, n, 3), nan) for _ in range(2))
-        self.sighting_position = np.full((steps, n, n, 3), nan)
-        self.false_tracks = np.zeros((steps, n), np.int64)
-        self._false_seen: list[set[int]] = [set() for _ in range(n)]
-        self.stages: dict[str, list[float]] = {}
-
-    def truth(self, step: int, vehicles: Vehicles, desired: FloatArray) -> None:
-        self.position[step], self.velocity[step] = vehicles.position, vehicles.velocity
-        self.attitude[step], self.desired[step] = vehicles.R_ned_body, desired
-
-    def exact(
-        self, step: int, i: int, others: FloatArray, relative: FloatArray, velocities: FloatArray,
-        command: FloatArray, acceleration: FloatArray,
-    ) -> None:  # fmt: skip
-        self.neighbour_position[step, i, others] = relative
-        self.neighbour_velocity[step, i, others] = velocities[others]
-        self.own_velocity[step, i] = velocities[i]
-        self.command_velocity[step, i], self.command_acceleration[step, i] = command, acceleration
-
-    def seen(
-        self, step: int, i: int, output: PilotOutput, state: VehicleState, vehicles: Vehicles,
-        stages_ms: Mapping[str, float],
-    ) -> None:  # fmt: skip
-        others = [j for j in range(len(vehicles.position)) if j != i]
-        true = vehicles.position[others] - vehicles.position[i]
-        confirmed = [n for n in output.neighbours if n.confirmed]
-        found = np.array([n.position for n in confirmed]).reshape(-1, 3)
-        matches = match_neighbours(found, true)
-        for estimate, truth in matches:
-            self.neighbour_position[step, i, others[truth]] = confirmed[estimate].position
-            self.neighbour_velocity[step, i, others[truth]] = confirmed[estimate].velocity
-        matched = {estimate for estimate, _ in matches}
-        false = {n.track for k, n in enumerate(confirmed) if k not in matched} - self._false_seen[i]
-        self._false_seen[i] |= false
-        self.false_tracks[step, i] = len(false)
-        sighted = np.array([state.R_ned_body @ s.position for s in output.sightings]).reshape(-1, 3)
-        for estimate, truth in match_neighbours(sighted, true):
-            self.sighting_position[step, i, others[truth]] = sighted[estimate]
-        ego = output.ego_motion
-        if ego is not None:
-            self.ego_rotation[step, i], self.ego_translation[step, i] = ego.rotation, ego.translation
-            self.ego_inlier_ratio[step, i] = ego.inliers / ego.pairs
-        if output.velocity is not None:
-            self.own_velocity[step, i] = output.velocity
-        self.command_velocity[step, i] = output.command.velocity
-        self.command_acceleration[step, i] = output.command.acceleration
-        for stage, ms in stages_ms.items():
-            self.stages.setdefault(stage, []).append(ms)
-
-    def log(self, facts: Mapping[str, object]) -> FlightLog:
-        scenario = self._scenario
-        _, truth_position, truth_velocity = fly_truth(scenario)
-        meta = {
-            "scenario": scenario.scenario,
-            "drones": len(scenario.vehicles),
-            "duration_s": scenario.duration_s,
-            "step_s": scenario.drone.step_s,
-            "seed": scenario.seed,
-            "circle_until_s": scenario.drone.desired.circle_until_s,
-            "desired_distance_m": scenario.drone.flocking.desired_distance_m,
-            "observation_distance_m": scenario.drone.flocking.observation_distance_m,
-            "separation_distance_m": scenario.drone.flocking.separation_distance_m,
-            **facts,
-        }
-        return FlightLog(
-            time_s=self._times, position=self.position, velocity=self.velocity, attitude=self.attitude,
-            desired=self.desired, command_velocity=self.command_velocity,
-            command_acceleration=self.command_acceleration, ego_rotation=self.ego_rotation,
-            ego_translation=self.ego_translation, ego_inlier_ratio=self.ego_inlier_ratio,
-            own_velocity_estimate=self.own_velocity, neighbour_position=self.neighbour_position,
-            neighbour_velocity=self.neighbour_velocity, sighting_position=self.sighting_position,
-            false_tracks=self.false_tracks, truth_position=truth_position, truth_velocity=truth_velocity,
-            stages_ms={stage: np.array(ms) for stage, ms in self.stages.items()}, meta=meta,
-        )  # fmt: skip
+    def picture(self) -> list[FilmstripFrame]:
+        """What the chosen drone's pilot worked with in the last step."""
+        return picture(self._pilots[_FILMSTRIP_DRONE], self._outputs[_FILMSTRIP_DRONE], _FILMSTRIP_DRONE)

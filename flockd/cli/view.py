@@ -1,0 +1,112 @@
+"""`flockd view`: a recording in Rerun."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from flockd.cli.output import complain, progress, say, say_json
+from flockd.cli.parser import Commands
+from flockd.cli.record import add_stretch, opened, refuse_existing, stretch
+from flockd.cli.replay import changes, faults
+from flockd.errors import ExitCode, UnavailableError, UsageError
+
+
+def add(commands: Commands) -> None:
+    """Adds the command."""
+    examples = (
+        "flockd view drone1.mcap",
+        "flockd view drone1.mcap --start 60 --end 70",
+        "flockd view drone1.mcap --save drone1.rrd --json",
+        "flockd view drone1.mcap --as-recorded",
+    )
+    description = "Show a recording in Rerun: images, drones, depth, point pairs, neighbours, commands and curves."
+    parser = commands("view", description, examples)
+    parser.add_argument("recording", metavar="RECORDING", type=Path)
+    add_stretch(parser)
+    parser.add_argument("--save", metavar="FILE", type=Path, help="write a file for Rerun (.rrd) and open nothing")
+    parser.add_argument(
+        "--as-recorded",
+        action="store_true",
+        help="do not fly again for what no recording holds: drones in the images, depth and point pairs",
+    )
+    parser.add_argument("--json", action="store_true", help="with --save: print the result as JSON")
+    parser.set_defaults(run=_run)
+
+
+def _run(args: argparse.Namespace) -> int:
+    import flockd.view.rerun_file  # noqa: F401 - so that nothing is computed when the extra is missing
+
+    if args.json and args.save is None:
+        raise UsageError("--json has no meaning without --save; add it")
+    if args.save is not None:
+        refuse_existing(args.save, "--save")
+        _tell(args, _write(args, args.save))
+        return ExitCode.DONE
+    _check_screen()
+    from flockd.view.rerun_file import open_viewer
+
+    with tempfile.TemporaryDirectory(prefix="flockd-") as folder:
+        path = Path(folder) / f"{args.recording.stem}.rrd"
+        _tell(args, _write(args, path))
+        code = open_viewer(path)
+    if code != 0:
+        raise UnavailableError(f"Rerun's viewer ended with code {code}; write a file for another computer with --save")
+    return ExitCode.DONE
+
+
+def _check_screen() -> None:
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise UnavailableError("there is no screen here to open Rerun on; write a file for it with --save FILE.rrd")
+
+
+def _write(args: argparse.Namespace, path: Path) -> dict[str, Any]:
+    from flockd.recording.editing import written_whole
+    from flockd.view.rerun_file import RerunFile
+    from flockd.view.scene import Scenes, texts
+
+    recording = opened(args.recording)
+    start_s, end_s = stretch(recording, args)
+    fly_again = not args.as_recorded
+    for warning in (*faults(recording), *(changes(recording, recording.config, start_s) if fly_again else ())):
+        complain(warning)
+    scenes = Scenes(recording, fly_again=fly_again)
+    total = sum(start_s <= time_s <= end_s for _, time_s in recording.contents.steps)
+    shown = 0
+    with written_whole(path) as draft, RerunFile(draft, recording.drone, scenes.rig) as file:
+        with progress("flying again" if fly_again else "reading", "steps") as tell:
+            for moment in scenes.moments(start_s, end_s):
+                file.show(moment)
+                shown += 1
+                tell(shown, total)
+        for time_s, text in texts(recording, start_s, end_s):
+            file.say(time_s, text)
+    return {
+        "recording": str(args.recording),
+        "file": str(path),
+        "drone": recording.drone,
+        "steps": shown,
+        "flown_again": scenes.compared,
+        "as_recorded": scenes.equal,
+    }
+
+
+def _tell(args: argparse.Namespace, result: Mapping[str, Any]) -> None:
+    if args.json:
+        say_json(result)
+        return
+    say(f"{result['drone']}: {result['steps']} steps")
+    if result["flown_again"]:
+        say(
+            "drones in the images, depth and point pairs were computed again from the recorded images; "
+            f"{result['as_recorded']} of {result['flown_again']} steps came out as recorded"
+        )
+    else:
+        say("without drones in the images, depth and point pairs, which no recording holds")
+    if args.save is not None:
+        say(f"file: {args.save}")

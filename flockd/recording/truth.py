@@ -1,0 +1,33 @@
+"""What only a simulator knows: recorded beside a flight, to judge it by. Nothing that flies reads it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flockd.messages import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class TrueDrone:
+    """Where one drone of the flock truly was."""
+
+    name: str
+    position: FloatArray
+    """(3,) m NED, from the world's origin."""
+    velocity: FloatArray
+    """(3,) m/s NED."""
+    R_ned_body: FloatArray
+    """(3, 3)"""
+    exact_position: FloatArray | None = None
+    """(3,) where it would be, had everybody known everybody's exact state from the start; None in such a flight."""
+    exact_velocity: FloatArray | None = None
+    """(3,) likewise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """The whole flock as one step began, the own drone among it."""
+
+    time_s: float
+    drones: tuple[TrueDrone, ...]
+    """In the same order in every step and every drone's recording."""

@@ -1,0 +1,103 @@
+"""Fills a flight log step by step, in the simulator or from recordings, and judges estimates against the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from flockd.messages import BoolArray, FloatArray, PilotOutput
+from flockd.sim.log import FlightLog, match_neighbours
+
+
+class LogBook:
+    """The log of a flight of ``drones`` drones whose steps begin at ``times`` (S,); NaN until it is told otherwise."""
+
+    def __init__(self, times: FloatArray, drones: int) -> None:
+        steps, n, nan = len(times), drones, np.nan
+        self._times = times
+        self._position, self._velocity = np.full((steps, n, 3), nan), np.full((steps, n, 3), nan)
+        self._attitude = np.full((steps, n, 3, 3), nan)
+        self._desired = np.full((steps, 2), nan)
+        self._command_velocity, self._command_acceleration = np.full((steps, n, 2), nan), np.full((steps, n, 2), nan)
+        self._ego_rotation, self._ego_translation = np.full((steps, n, 3, 3), nan), np.full((steps, n, 3), nan)
+        self._ego_inlier_ratio = np.full((steps, n), nan)
+        self._own_velocity = np.full((steps, n, 3), nan)
+        self._neighbour_position, self._neighbour_velocity = (np.full((steps, n, n, 3), nan) for _ in range(2))
+        self._sighting_position = np.full((steps, n, n, 3), nan)
+        self._false_tracks = np.zeros((steps, n), np.int64)
+        self._false_seen: list[set[int]] = [set() for _ in range(n)]
+        self._tracked: list[tuple[float, ...]] = []
+        self._stages: dict[str, list[float]] = {}
+
+    def truth(self, step: int, position: FloatArray, velocity: FloatArray, R_ned_body: FloatArray) -> None:
+        """Where all drones truly are as a step begins: (N, 3), (N, 3) and (N, 3, 3). Before what they saw in it."""
+        self._position[step], self._velocity[step], self._attitude[step] = position, velocity, R_ned_body
+
+    def desired(self, step: int, velocity: FloatArray) -> None:
+        """What the whole flock was meant to fly, (2,)."""
+        self._desired[step] = velocity
+
+    def exact(
+        self, step: int, i: int, others: BoolArray, relative: FloatArray, velocities: FloatArray,
+        command: FloatArray, acceleration: FloatArray,
+    ) -> None:  # fmt: skip
+        """What drone ``i`` was told, and decided."""
+        self._neighbour_position[step, i, others] = relative
+        self._neighbour_velocity[step, i, others] = velocities[others]
+        self._own_velocity[step, i] = velocities[i]
+        self._command_velocity[step, i], self._command_acceleration[step, i] = command, acceleration
+
+    def seen(
+        self, step: int, i: int, output: PilotOutput, R_ned_body: FloatArray, stages_ms: Mapping[str, float]
+    ) -> None:
+        """What drone ``i`` saw, with the attitude (3, 3) that its autopilot told it, and decided."""
+        if np.isfinite(self._position[step]).all():
+            self._judge(step, i, output, R_ned_body)
+        for neighbour in output.neighbours:
+            if neighbour.confirmed:
+                self._tracked.append((float(step), float(i), float(neighbour.track), *neighbour.position.tolist()))
+        ego = output.ego_motion
+        if ego is not None:
+            self._ego_rotation[step, i], self._ego_translation[step, i] = ego.rotation, ego.translation
+            self._ego_inlier_ratio[step, i] = ego.inliers / ego.pairs
+        if output.velocity is not None:
+            self._own_velocity[step, i] = output.velocity
+        self._command_velocity[step, i] = output.command.velocity
+        self._command_acceleration[step, i] = output.command.acceleration
+        for stage, ms in stages_ms.items():
+            self._stages.setdefault(stage, []).append(ms)
+
+    def _judge(self, step: int, i: int, output: PilotOutput, R_ned_body: FloatArray) -> None:
+        """Which neighbour and which sighting is which drone, and which is none."""
+        others = [j for j in range(self._position.shape[1]) if j != i]
+        true = self._position[step, others] - self._position[step, i]
+        confirmed = [n for n in output.neighbours if n.confirmed]
+        found = np.array([n.position for n in confirmed]).reshape(-1, 3)
+        matches = match_neighbours(found, true)
+        for estimate, truth in matches:
+            self._neighbour_position[step, i, others[truth]] = confirmed[estimate].position
+            self._neighbour_velocity[step, i, others[truth]] = confirmed[estimate].velocity
+        matched = {estimate for estimate, _ in matches}
+        false = {n.track for k, n in enumerate(confirmed) if k not in matched} - self._false_seen[i]
+        self._false_seen[i] |= false
+        self._false_tracks[step, i] = len(false)
+        sighted = np.array([R_ned_body @ s.position for s in output.sightings]).reshape(-1, 3)
+        for estimate, truth in match_neighbours(sighted, true):
+            self._sighting_position[step, i, others[truth]] = sighted[estimate]
+
+    def log(self, meta: Mapping[str, object], companion: tuple[FloatArray, FloatArray] | None) -> FlightLog:
+        """The log, with positions and velocities (S, N, 3) of the companion with exact states, if there is one."""
+        drones = self._position.shape[1]
+        truth_position, truth_velocity = companion or (np.zeros((0, drones, 3)), np.zeros((0, drones, 3)))
+        return FlightLog(
+            time_s=self._times, position=self._position, velocity=self._velocity, attitude=self._attitude,
+            desired=self._desired, command_velocity=self._command_velocity,
+            command_acceleration=self._command_acceleration, ego_rotation=self._ego_rotation,
+            ego_translation=self._ego_translation, ego_inlier_ratio=self._ego_inlier_ratio,
+            own_velocity_estimate=self._own_velocity, neighbour_position=self._neighbour_position,
+            neighbour_velocity=self._neighbour_velocity, sighting_position=self._sighting_position,
+            false_tracks=self._false_tracks, truth_position=truth_position, truth_velocity=truth_velocity,
+            stages_ms={stage: np.array(ms) for stage, ms in self._stages.items()}, meta=meta,
+            tracked=np.array(self._tracked).reshape(-1, 6),
+        )  # fmt: skip
