@@ -28,7 +28,7 @@ ALLOWED_DIFFERENCE = 2e-3
 """Between ONNX Runtime and torch, as a share of the output's largest value."""
 DATA = "Rendered by tools/render_training_data.py from seeded worlds; no foreign data."
 
-IMAGE = {"shape": ["n", "h", "w", 3], "dtype": "uint8", "meaning": "RGB image", "unit": "grey levels 0-255"}
+IMAGE = {"shape": [1, "h", "w", 3], "dtype": "uint8", "meaning": "RGB image", "unit": "grey levels 0-255"}
 NETWORKS: dict[str, dict[str, Any]] = {
     "neighbours": {
         "net": NeighboursNet,
@@ -39,16 +39,16 @@ NETWORKS: dict[str, dict[str, Any]] = {
         "inputs": {
             "image": IMAGE,
             "geometry": {
-                "shape": ["n", 3, "h/2", "w/2"],
+                "shape": [1, 3, "h/2", "w/2"],
                 "dtype": "float32",
                 "meaning": "ray tangents right and down; inverse depth of flat ground, 0 where unknown",
                 "unit": "1, 1, 1/m",
             },
         },
         "outputs": {
-            "depth": (["n", 1, "h/2", "w/2"], "depth along the optical axis; 80 is sky", "m"),
-            "drone": (["n", 1, "h/2", "w/2"], "logit of being on a drone", "1"),
-            "offset": (["n", 2, "h/2", "w/2"], "from the pixel to its drone's centre, right and down", "output px"),
+            "depth": ([1, 1, "h/2", "w/2"], "depth along the optical axis; 80 is sky", "m"),
+            "drone": ([1, 1, "h/2", "w/2"], "logit of being on a drone", "1"),
+            "offset": ([1, 2, "h/2", "w/2"], "from the pixel to its drone's centre, right and down", "output px"),
         },
     },
     "distance": {
@@ -78,7 +78,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
             "first": {**IMAGE, "meaning": "earlier RGB image, quarter size"},
             "second": {**IMAGE, "meaning": "later RGB image, quarter size"},
         },
-        "outputs": {"flow": (["n", 2, "h", "w"], "from first to second, right and down", "input px")},
+        "outputs": {"flow": ([1, 2, "h", "w"], "from first to second, right and down", "input px")},
     },
 }
 

@@ -3,7 +3,7 @@
 from flockd.perception.flow import DisFlow, Flow, OnnxFlow
 from flockd.perception.instances import UNSURE, Instance, group_instances
 from flockd.perception.manifest import Manifest, find_manifests, load_manifest, manifests_of, models_folder
-from flockd.perception.roles import Perception, Picture, RangeEstimate, SceneMaps
+from flockd.perception.roles import OpenDepth, Perception, Picture, RangeEstimate, SceneMaps
 from flockd.perception.session import OnnxModel
 
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "Manifest",
     "OnnxFlow",
     "OnnxModel",
+    "OpenDepth",
     "Perception",
     "Picture",
     "RangeEstimate",

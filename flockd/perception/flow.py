@@ -8,11 +8,8 @@ import cv2
 import numpy as np
 
 from flockd.messages import Float32Array, UInt8Array
+from flockd.perception.fitting import fit
 from flockd.perception.session import OnnxModel
-
-_REFINED_TO_SCALE = 2
-"""DIS after a network stops at a quarter of the size: 0.3 px instead of 0.15 px of error at the median, at a quarter of
-the time, and an own motion just as good."""
 
 
 class Flow(Protocol):
@@ -26,23 +23,20 @@ class Flow(Protocol):
 
 
 class OnnxFlow:
-    """A flow network; enters images of the size that its manifest asks for."""
+    """A flow network; enters images as its manifest asks for."""
 
     def __init__(self, model: OnnxModel) -> None:
         self.name = model.manifest.name
         self._model = model
-        self._scale = model.manifest.image_scale
-        self._multiple = model.manifest.size_multiple
 
     def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
         """See ``Flow``."""
         height, width = first.shape[:2]
-        size = (round(width * self._scale), round(height * self._scale))
-        small = [_padded(_resized(image, size), self._multiple)[None] for image in (first, second)]
-        (flow,) = self._model.run({"first": small[0], "second": small[1]}).values()
-        inner = np.moveaxis(flow[0, :, : size[1], : size[0]], 0, 2)
-        full = cv2.resize(inner, (width, height), interpolation=cv2.INTER_LINEAR)
-        full *= np.array([width / size[0], height / size[1]], np.float32)
+        fitting = fit(self._model.manifest, (width, height))
+        answers = self._model.answer({"first": [fitting.enter(first)], "second": [fitting.enter(second)]})
+        flow = fitting.inside(answers["flow"])[0]
+        full = cv2.resize(np.moveaxis(flow, 0, 2), (width, height), interpolation=cv2.INTER_LINEAR)
+        full /= np.array(fitting.scale, np.float32)
         return np.asarray(full, dtype=np.float32)
 
 
@@ -52,29 +46,20 @@ class DisFlow:
     It is exact to a fraction of a pixel where it converges, but loses what moves far; a network is the other way round.
     """
 
-    def __init__(self, start: Flow | None = None) -> None:
-        """``start``: the flow to begin with at the coarsest scale; None: no motion."""
+    def __init__(self, start: Flow | None = None, finest_scale: int = 1) -> None:
+        """``start``: the flow to begin with at the coarsest scale; None: no motion.
+
+        ``finest_scale``: it stops at a 2^n-th of the size. At a quarter it errs by 0.3 px instead of 0.15 px at the
+        median, in a quarter of the time.
+        """
         self.name = f"{start.name}+dis" if start else "dis"
         self._start = start
+        self._finest_scale = finest_scale
 
     def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
         """See ``Flow``."""
         start = self._start.flow(first, second) if self._start else np.zeros((*first.shape[:2], 2), np.float32)
         grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (first, second)]
         dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)  # one a call: it is not for two threads
-        if self._start:
-            dis.setFinestScale(_REFINED_TO_SCALE)
+        dis.setFinestScale(self._finest_scale)
         return np.asarray(dis.calc(grey[0], grey[1], start), dtype=np.float32)
-
-
-def _resized(image: UInt8Array, size: tuple[int, int]) -> UInt8Array:
-    if (image.shape[1], image.shape[0]) == size:
-        return image
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
-def _padded(image: UInt8Array, multiple: int) -> UInt8Array:
-    down, right = -image.shape[0] % multiple, -image.shape[1] % multiple
-    if not down and not right:
-        return image
-    return np.asarray(cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_REPLICATE), dtype=np.uint8)

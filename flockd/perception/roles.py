@@ -12,13 +12,26 @@ import numpy as np
 from flockd.config.parameters import PerceptionConfig
 from flockd.errors import ModelError
 from flockd.messages import Float32Array, FloatArray, UInt8Array
+from flockd.perception.fitting import fit
 from flockd.perception.flow import DisFlow, Flow, OnnxFlow
 from flockd.perception.instances import UNSURE, Instance, group_instances
-from flockd.perception.manifest import Role, manifest_path
+from flockd.perception.manifest import Answer, Content, Role, Unknown, manifest_path
+from flockd.perception.providers import engines_folder
 from flockd.perception.session import OnnxModel
 
 _EAGER_LOGIT = -1.5
 """Where a second stage weeds out what is none, the first proposes drones from this logit up."""
+_VERY_NEAR_M, _VERY_FAR_M = 1e-3, 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class OpenDepth:
+    """What a network says of depth while its scale is open."""
+
+    inverse: Float32Array
+    """(h, w): a factor makes 1/m of it."""
+    shift: bool
+    """Whether something has to be added as well: the inverse depth is known up to scale and shift."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,10 +39,12 @@ class SceneMaps:
     """What the networks say of one image."""
 
     depth: Float32Array
-    """(h, w) metres along the optical axis; the sky is very far."""
+    """(h, w) metres along the optical axis; the sky is very far. All NaN while the scale is open."""
     labels: UInt8Array
     """(h, w) 0 for background, then one value a drone; ``UNSURE`` for the part of a drone that may be background."""
     instances: tuple[Instance, ...]
+    open: OpenDepth | None = None
+    """What is there instead of metres, for `flockd.pilot.scale` to fix."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +84,12 @@ class Perception:
     def __init__(self, config: PerceptionConfig, models_dir: Path) -> None:
         self._models: dict[str, OnnxModel] = {}
         self._dir = models_dir
-        self._threads = config.threads
+        self._config = config
         cv2.setNumThreads(config.threads)
         self._flow = self._build_flow(config)
         self._depth = self._model(config.depth, "depth")
         self._segmentation = self._model(config.segmentation, "segmentation")
+        self._unknown = self._what_is_unknown(config)
         self._distance = None if config.distance == "none" else self._model(config.distance, "distance")
 
     @property
@@ -96,23 +112,17 @@ class Perception:
         ``geometry`` is (3, h/2, w/2): ray tangents right and down, and the inverse depth (1/m) of flat ground where
         attitude and height are to fix the scale, else 0.
         """
-        height, width = image.shape[:2]
-        padded, planes = _pad(image, geometry, self._depth.manifest.size_multiple)
-        outputs = self._depth.run({"image": padded[None], "geometry": planes[None]})
-        depth = outputs["depth"][0, 0, : height // 2, : width // 2]
+        size = (image.shape[1], image.shape[0])
+        answers = self._look(self._depth, image, geometry)
+        depth = np.asarray(cv2.resize(answers["depth"][0], size, interpolation=cv2.INTER_NEAREST), dtype=np.float32)
         if self._segmentation is not self._depth:
-            outputs = self._segmentation.run({"image": padded[None], "geometry": planes[None]})
-        logit = outputs["drone"][0, 0, : height // 2, : width // 2]
-        offset = outputs["offset"][0, :, : height // 2, : width // 2]
+            answers = self._look(self._segmentation, image, geometry)
+        logit, offset = self._at_map_scale(answers["drone"], size)[0], self._at_map_scale(answers["offset"], size)
         threshold = _EAGER_LOGIT if self.has_distance else 0.0
         labels, instances = group_instances(logit - np.float32(threshold), offset, scale=self.map_scale)
         labels[(labels > 0) & (logit < 0)] = UNSURE
-        size = (width, height)
-        return SceneMaps(
-            np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST), dtype=np.float32),
-            np.asarray(cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST), dtype=np.uint8),
-            instances,
-        )
+        labels = np.asarray(cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
+        return self._maps(depth, labels, instances, geometry)
 
     def ranges(self, pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
         """The second stage: range and centre of the drone in the middle of each picture."""
@@ -120,7 +130,7 @@ class Perception:
             raise ValueError("this configuration has no distance model")
         if not pictures:
             return ()
-        (out,) = self._distance.run({"picture": np.stack([picture.image for picture in pictures])}).values()
+        out = self._distance.answer({"picture": [picture.image for picture in pictures]})["range"]
         middle = self.picture_size / 2
         return tuple(
             RangeEstimate(
@@ -133,11 +143,60 @@ class Perception:
             for row, picture in zip(out, pictures, strict=True)
         )
 
+    def _look(self, model: OnnxModel, image: UInt8Array, geometry: Float32Array) -> dict[Answer, Float32Array]:
+        """What one model says of an image: maps (c, h, w) that show all of it, at the model's resolution."""
+        fitting = fit(model.manifest, (image.shape[1], image.shape[0]))
+        contents: dict[Content, Sequence[UInt8Array] | Float32Array] = {"image": [fitting.enter(image)]}
+        if "geometry" in model.manifest.contents:
+            contents["geometry"] = fitting.enter_planes(geometry, self.map_scale)[None]
+        return {name: fitting.inside(map_)[0] for name, map_ in model.answer(contents).items()}
+
+    def _at_map_scale(self, maps: Float32Array, image: tuple[int, int]) -> Float32Array:
+        """(c, h, w) at the resolution that drones are told apart in; two channels are pixels of the map."""
+        width, height = image[0] // self.map_scale, image[1] // self.map_scale
+        if maps.shape[1:] == (height, width):
+            return maps
+        resized = np.stack([cv2.resize(plane, (width, height), interpolation=cv2.INTER_LINEAR) for plane in maps])
+        if len(maps) == 2:
+            resized *= np.array([width / maps.shape[2], height / maps.shape[1]], np.float32)[:, None, None]
+        return np.asarray(resized, dtype=np.float32)
+
+    def _maps(
+        self, depth: Float32Array, labels: UInt8Array, instances: tuple[Instance, ...], geometry: Float32Array
+    ) -> SceneMaps:
+        """With metres of what the depth network says, or with what it leaves open."""
+        meaning = self._depth.manifest.answers["depth"].depth
+        is_inverse = meaning.quantity == "inverse_depth"
+        if meaning.focal_px:
+            size = (depth.shape[1], depth.shape[0])
+            longer = fit(self._depth.manifest, size).scale[0] * _focal_px(geometry, self.map_scale) / meaning.focal_px
+            depth = depth / longer if is_inverse else depth * longer
+        if self._unknown == "nothing":
+            metres = 1.0 / np.maximum(depth, 1.0 / _VERY_FAR_M) if is_inverse else depth
+            return SceneMaps(np.asarray(metres, np.float32), labels, instances)
+        inverse = depth if is_inverse else 1.0 / np.maximum(depth, _VERY_NEAR_M)
+        open_ = OpenDepth(np.asarray(inverse, np.float32), shift=self._unknown == "scale_and_shift")
+        return SceneMaps(np.full_like(depth, np.nan), labels, instances, open_)
+
+    def _what_is_unknown(self, config: PerceptionConfig) -> Unknown:
+        """What of the depth is left for the autopilot's height or velocity to fix. Raises ModelError."""
+        manifest = self._depth.manifest
+        unknown = manifest.answers["depth"].depth.unknown
+        if config.scale == "network" and unknown != "nothing":
+            raise ModelError(
+                f"perception.scale: depth model {config.depth!r} knows no metres, so `network` cannot give the scale; "
+                "write height or velocity, or choose a metric model"
+            )
+        takes_ground = "geometry" in manifest.contents
+        if unknown == "nothing" and (config.scale == "velocity" or (config.scale == "height" and not takes_ground)):
+            return "scale"
+        return unknown
+
     def _build_flow(self, config: PerceptionConfig) -> Flow:
         if config.flow == "dis":
             return DisFlow()
         network = OnnxFlow(self._model(config.flow, "flow"))
-        return DisFlow(network) if config.flow_refinement == "dis" else network
+        return DisFlow(network, config.flow_refinement_scale) if config.flow_refinement == "dis" else network
 
     def _model(self, name: str, role: Role) -> OnnxModel:
         path = manifest_path(self._dir, name)
@@ -148,7 +207,12 @@ class Perception:
                     f"perception.{role}: there is no model {name!r} ({path} is missing); "
                     f"choose one of {', '.join(sorted(p.stem for p in self._dir.glob('*.yaml'))) or 'none at hand'}"
                 )
-            self._models[key] = OnnxModel(path, threads=self._threads)
+            self._models[key] = OnnxModel(
+                path,
+                threads=self._config.threads,
+                provider=self._config.provider,
+                engines=engines_folder(self._config),
+            )
         model = self._models[key]
         if role not in model.manifest.roles:
             raise ModelError(
@@ -158,9 +222,7 @@ class Perception:
         return model
 
 
-def _pad(image: UInt8Array, geometry: Float32Array, multiple: int) -> tuple[UInt8Array, Float32Array]:
-    down, right = -image.shape[0] % multiple, -image.shape[1] % multiple
-    if not down and not right:
-        return image, geometry
-    padded = np.pad(image, ((0, down), (0, right), (0, 0)), mode="edge")
-    return padded, np.pad(geometry, ((0, 0), (0, down // 2), (0, right // 2)), mode="edge")
+def _focal_px(geometry: Float32Array, stride: int) -> float:
+    """Of the image, from how fast the rays' tangents change in its middle."""
+    row, column = geometry.shape[1] // 2, geometry.shape[2] // 2
+    return float(2 * stride / (geometry[0, row, column + 1] - geometry[0, row, column - 1]))

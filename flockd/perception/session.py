@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,11 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 
 from flockd.errors import ModelError
-from flockd.messages import UInt8Array
-from flockd.perception.manifest import Manifest, load_manifest
+from flockd.messages import Float32Array, UInt8Array
+from flockd.perception.fitting import entering, leaving
+from flockd.perception.manifest import Answer, Content, InputSpec, Manifest, OutputSpec, load_manifest
+from flockd.perception.providers import Prepared, Provider, Shapes, engine_folder, is_slow_to_build, open_session
+from flockd.perception.weights import fault_of_weights
 
 _GOLDEN_TOLERANCE = 0.02
 
@@ -21,12 +24,40 @@ _GOLDEN_TOLERANCE = 0.02
 class OnnxModel:
     """A model behind its manifest. ``run`` may be called from any thread."""
 
-    def __init__(self, path: Path, *, threads: int) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        threads: int,
+        provider: Provider = "cpu",
+        engines: Path | None = None,
+        preparing: bool = False,
+    ) -> None:
+        """Open and check it; ``ModelError`` says what is wrong, and where.
+
+        Args:
+            path: the manifest.
+            threads: on the CPU.
+            provider: what computes it; never another in its place.
+            engines: where providers keep what they build.
+            preparing: whether a provider that is slow to build may do so now.
+        """
         self.manifest, file = load_manifest(path)
         self._path = path
-        self._session = _open(file, path, threads)
+        _check_weights(file, path)
+        self._engines = engine_folder(engines, provider, self.manifest.name, self.manifest.sha256)
+        self._prepared = Prepared.load(self._engines)
+        self._may_build = preparing or not is_slow_to_build(provider)
+        if not self._may_build and self._prepared is None:
+            raise ModelError(
+                f"{path}: is not prepared for {provider}, which would build its engine for minutes; run "
+                "`flockd models prepare` first"
+            )
+        if self._engines is not None:
+            self._engines.mkdir(parents=True, exist_ok=True)
+        self._session = open_session(file, path, threads=threads, provider=provider, folder=self._engines)
         self._running: set[ort.RunOptions] = set()
-        self._check_names()
+        self._check_tensors()
         self.check_golden()
 
     @property
@@ -35,13 +66,35 @@ class OnnxModel:
         return str(self._session.get_providers()[0])
 
     def run(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """The outputs by name. ``FloatingPointError`` when one is not finite."""
+        """The outputs by name. ``FloatingPointError`` when one is not finite.
+
+        ``ValueError`` for inputs of a shape that an engine would first have to be built for, and ought not to now.
+        """
+        if not self._may_build and not (self._prepared and self._prepared.covers(shapes_of(feeds))):
+            raise ValueError(f"model {self.manifest.name} is not prepared for inputs of {shapes_of(feeds)}")
         names = list(self.manifest.outputs)
         outputs = dict(zip(names, self._answers(names, feeds), strict=True))
         for name, value in outputs.items():
             if not np.isfinite(value).all():
                 raise FloatingPointError(f"model {self.manifest.name}: output {name} is not finite")
         return outputs
+
+    def answer(self, contents: Mapping[Content, Sequence[UInt8Array] | Float32Array]) -> dict[Answer, Float32Array]:
+        """The outputs by what they give, in their units, for images (h, w, 3) RGB of the input's size."""
+        feeds = {}
+        for name, spec in self.manifest.inputs.items():
+            content = contents[spec.carries or name]  # type: ignore[index] # the manifest's names are checked
+            feeds[name] = content if isinstance(content, np.ndarray) else entering(spec, content)
+        specs = self.manifest.outputs
+        return {
+            specs[name].gives or name: leaving(specs[name], value)  # type: ignore[misc]
+            for name, value in self.run(feeds).items()
+        }
+
+    def keep_engines(self, shapes: Sequence[Shapes]) -> None:
+        """Note that the engines in the folder cover these shapes and all between them."""
+        if self._engines is not None:
+            Prepared.over(shapes).save(self._engines)
 
     def terminate(self) -> None:
         """Ends the runs that are under way, from any thread; ONNX Runtime then raises an error of its own in them."""
@@ -73,18 +126,50 @@ class OnnxModel:
                     "export the model and its manifest together"
                 )
 
-    def _check_names(self) -> None:
-        found_inputs = {i.name for i in self._session.get_inputs()}
-        found_outputs = {o.name for o in self._session.get_outputs()}
-        for kind, wanted, found in (
-            ("inputs", set(self.manifest.inputs), found_inputs),
-            ("outputs", set(self.manifest.outputs), found_outputs),
+    def _check_tensors(self) -> None:
+        found_inputs = {tensor.name: tensor for tensor in self._session.get_inputs()}
+        found_outputs = {tensor.name: tensor for tensor in self._session.get_outputs()}
+        inputs, outputs = self.manifest.inputs, self.manifest.outputs
+        # Every input wants something; of the outputs, some may be of no use.
+        for kind, wanted, found, fits in (
+            ("inputs", inputs, found_inputs, set(inputs) == set(found_inputs)),
+            ("outputs", outputs, found_outputs, set(outputs) <= set(found_outputs)),
         ):
-            if wanted != found:
+            if not fits:
                 raise ModelError(
                     f"{self._path}: {kind}: the manifest names {sorted(wanted)} but the model file has "
                     f"{sorted(found)}; make them agree"
                 )
+        for kind, specs, found in (("inputs", inputs, found_inputs), ("outputs", outputs, found_outputs)):
+            for name, spec in specs.items():
+                fault = _misfit(spec, found[name].type, found[name].shape)
+                if fault:
+                    raise ModelError(f"{self._path}: {kind}.{name}.{fault}; make them agree")
+
+
+def shapes_of(feeds: Mapping[str, NDArray[Any]]) -> dict[str, list[int]]:
+    """The inputs' shapes."""
+    return {name: list(value.shape) for name, value in feeds.items()}
+
+
+def _misfit(spec: InputSpec | OutputSpec, type_: str, shape: Sequence[int | str | None]) -> str | None:
+    """Where a manifest's and a model file's tensor differ. What is free in the file, the manifest may fix."""
+    of_file = {"tensor(float)": "float32"}.get(type_, type_.removeprefix("tensor(").removesuffix(")"))
+    if of_file != spec.dtype:
+        return f"dtype: the manifest says {spec.dtype} but the model file {of_file}"
+    if isinstance(spec, OutputSpec) and not shape:
+        return None  # exporters may leave out the shape of what comes out
+    may_be_free = isinstance(spec, OutputSpec)
+    if len(shape) == len(spec.shape) and all(
+        not isinstance(there, int) or here == there or (may_be_free and isinstance(here, str))
+        for here, there in zip(spec.shape, shape, strict=True)
+    ):
+        return None
+    return f"shape: the manifest says {_listed(spec.shape)} but the model file {_listed(shape)}"
+
+
+def _listed(shape: Sequence[int | str | None]) -> str:
+    return "[" + ", ".join("?" if size is None else str(size) for size in shape) + "]"
 
 
 def golden_image(size: tuple[int, int], seed: int = 0) -> UInt8Array:
@@ -94,29 +179,21 @@ def golden_image(size: tuple[int, int], seed: int = 0) -> UInt8Array:
 
 
 def golden_feeds(manifest: Manifest) -> dict[str, NDArray[Any]]:
-    """The golden input: a fixed picture for every 8-bit input, zeros for every other."""
+    """The golden input: a fixed picture for every image, zeros for the geometry."""
     width, height = manifest.golden_size
     feeds: dict[str, NDArray[Any]] = {}
     for index, (name, spec) in enumerate(manifest.inputs.items()):
-        if spec.dtype == "uint8":
-            feeds[name] = golden_image((width, height), index)[None]
+        if (spec.carries or name) == "geometry":
+            feeds[name] = np.zeros((1, 3, height // 2, width // 2), np.float32)
         else:
-            channels = spec.shape[1]
-            if not isinstance(channels, int):
-                raise ModelError(f"model {manifest.name}: inputs.{name}.shape: the channels must be a number")
-            feeds[name] = np.zeros((1, channels, height // 2, width // 2), np.float32)
+            feeds[name] = entering(spec, [golden_image((width, height), index)])
     return feeds
 
 
-def _open(file: Path, manifest_path: Path, threads: int) -> ort.InferenceSession:
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
-    options.log_severity_level = 3
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+def _check_weights(file: Path, manifest: Path) -> None:
     try:
-        session = ort.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # noqa: BLE001 - ONNX Runtime's own exception types are private
-        reason = str(error).splitlines()[0]
-        raise ModelError(f"{manifest_path}: file: {file} cannot be loaded ({reason}); restore it") from None
-    return session
+        fault = fault_of_weights(file.read_bytes())
+    except ValueError as error:
+        raise ModelError(f"{manifest}: file: {file} cannot be loaded ({error}); restore it") from None
+    if fault:
+        raise ModelError(f"{manifest}: file: {file}: {fault}")

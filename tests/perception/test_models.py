@@ -85,7 +85,7 @@ def test_another_models_weights_do_not_give_the_golden_answer(copies: Path) -> N
 
 def test_an_input_that_does_not_fit_the_manifest_is_refused(copies: Path) -> None:
     manifest = copies / "distance.yaml"
-    manifest.write_text(manifest.read_text().replace("  picture:", "  photograph:"))
+    manifest.write_text(manifest.read_text().replace("  picture:", "  photograph:\n    carries: picture"))
     with pytest.raises(ModelError, match=r"inputs: the manifest names \['photograph'\] but the model file has"):
         OnnxModel(manifest, threads=1)
 
@@ -171,7 +171,7 @@ def test_dis_loses_what_moves_far_unless_it_begins_near() -> None:
 def test_the_network_of_flow_is_sharpened_by_dis_unless_told_otherwise() -> None:
     first, second = shifted_pictures((9, -5), (480, 640))
     network = OnnxFlow(OnnxModel(MODELS / "flow.yaml", threads=1))
-    for refinement, expected in (("none", network), ("dis", DisFlow(network))):
+    for refinement, expected in (("none", network), ("dis", DisFlow(network, finest_scale=2))):
         config = PerceptionConfig.model_validate({"flow_refinement": refinement})
         found = Perception(config, MODELS).flow("camera", first, second)
         np.testing.assert_allclose(found, expected.flow(first, second), atol=0.05)
