@@ -25,6 +25,7 @@ import numpy as np
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import development as mavlink
 
+from flockd.autopilot.earth import metres_a_degree
 from flockd.messages import FloatArray, Setpoint
 
 Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "RTL", "OFFBOARD"]
@@ -38,13 +39,13 @@ DEFAULT_STREAMS_S = {31: 0.1, 32: 0.1, 245: 1.0, 1: 1.0, 24: 1.0, 230: 1.0, 242:
 TYPE_MASK = 2531
 """The one kind of setpoint it takes: horizontal velocity, height and yaw."""
 DISARM_AFTER_LANDING_S = 2.0
-TAKE_OFF_HEIGHT_M = 2.5
+TRUTH_S = 0.04
 ON_GROUND_M = 0.05
 ARRIVED_M = 0.3
 ALL_ESTIMATED = 1 | 2 | 4 | 8 | 16 | 32
 OFFBOARD_LOSS_MODES: dict[int, Mode] = {0: "RTL", 3: "RTL", 4: "LAND", 5: "LOITER"}
 """By COM_OBL_RC_ACT, no others; 0 would be position mode, which needs a remote control: the stand-in has none."""
-LATITUDE_DEG, LONGITUDE_DEG = 47.3977, 8.5456
+HOME_DEG = (47.3977, 8.5456)
 MAX_SETPOINTS_KEPT = 100_000
 SO_TIMESTAMPNS = 35
 """Of Linux: the kernel says when each packet came, however long this thread waited for a turn."""
@@ -122,9 +123,27 @@ class AutopilotStandIn:
         yaw_rad: float = 0.0,
         motion: Motion | None = None,
         heartbeat_s: float = 1.0,
+        home_deg: tuple[float, float] = HOME_DEG,
+        truth_port: int | None = None,
+        speed_factor: float = 1.0,
     ) -> None:
-        """Bind a socket; nothing is sent before `start`. A second between heartbeats is PX4's."""
+        """Bind a socket; nothing is sent before `start`.
+
+        Args:
+            port: of this computer, where a companion computer listens.
+            system_id: its MAV_SYS_ID.
+            height_m: in Hold at this height; 0: on the ground.
+            yaw_rad: which way it looks.
+            motion: flies it instead of a `PointMass`, in metres from its home.
+            heartbeat_s: between two; a second is PX4's.
+            home_deg: latitude and longitude of where it begins.
+            truth_port: where a simulator listens: it is told the true pose, as PX4 in software tells it, and may
+                command, as a ground station may.
+            speed_factor: how fast its time passes.
+        """
         self._heartbeat_s = heartbeat_s
+        self._home_deg = home_deg
+        self._speed_factor = speed_factor
         self.battery_share = 1.0
         self.estimate_ok = True
         self.silent = False
@@ -136,18 +155,21 @@ class AutopilotStandIn:
             "GF_ACTION": 2,
             "GF_MAX_HOR_DIST": 0.0,
             "GF_MAX_VER_DIST": 0.0,
+            "MIS_TAKEOFF_ALT": 2.5,
         }
         """An int is an INT32 parameter, a float a REAL32 one."""
         self.setpoints: deque[tuple[float, Setpoint]] = deque(maxlen=MAX_SETPOINTS_KEPT)
-        """When each came by the kernel's stamp, on the monotonic clock, and what it said."""
+        """When each came by the kernel's stamp, on the monotonic clock times the speed factor, and what it said."""
         self.refused_setpoints = 0
 
-        self._target = ("127.0.0.1", port)
+        self._link = ("127.0.0.1", port)
+        self._ground = None if truth_port is None else ("127.0.0.1", truth_port)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
         self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         self._mav = mavlink.MAVLink(self, srcSystem=system_id, srcComponent=1)
         self._mav.robust_parsing = True
+        self._truth = mavlink.MAVLink(_Outlet(self._socket, self._ground), srcSystem=system_id, srcComponent=1)
         self._motion = motion or PointMass(np.array([0.0, 0.0, -height_m]), yaw_rad)
         self._state = self._motion(Demand(np.zeros(2), -height_m, yaw_rad), 0.0)
         self._armed = height_m > 0.0
@@ -159,7 +181,7 @@ class AutopilotStandIn:
         self._streams_s = dict(DEFAULT_STREAMS_S)
         self._due_s: dict[int, float] = {}
         self._told_mode: Mode | None = None
-        self._started_s = time.monotonic()
+        self._started_s = self._clock()
         self._lock = threading.RLock()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="autopilot stand-in", daemon=True)
@@ -216,29 +238,35 @@ class AutopilotStandIn:
 
     def write(self, data: bytes) -> None:
         """Takes what pymavlink has packed."""
-        if not self.silent:
-            self._socket.sendto(data, self._target)
+        if self.silent:
+            return
+        self._socket.sendto(data, self._link)
+        if self._ground is not None:
+            self._socket.sendto(data, self._ground)
+
+    def _clock(self) -> float:
+        return self._speed_factor * time.monotonic()
 
     def _run(self) -> None:
-        flown_s = time.monotonic()
+        flown_s = self._clock()
         while not self._closing.is_set():
             self._receive_until(flown_s + TICK_S)
             with self._lock:
-                now = time.monotonic()
+                now = self._clock()
                 self._fly(min(now - flown_s, MAX_STEP_S))
                 self._send_streams(now)
             flown_s = now
 
     def _receive_until(self, deadline: float) -> None:
-        while (left_s := deadline - time.monotonic()) > 0:
-            self._socket.settimeout(left_s)
+        while (left_s := deadline - self._clock()) > 0:
+            self._socket.settimeout(left_s / self._speed_factor)
             try:
                 data, ancillary, _, _ = self._socket.recvmsg(4096, 64)
             except TimeoutError:
                 return
             if self.silent:
                 continue
-            arrived_s = _arrival(ancillary)
+            arrived_s = self._clock() - self._speed_factor * _age(ancillary)
             with self._lock:
                 for message in self._mav.parse_buffer(data) or ():
                     self._handle(message, arrived_s)
@@ -249,7 +277,7 @@ class AutopilotStandIn:
         """Whether setpoints are coming, by PX4's measure."""
         if not self.setpoints or not self.estimate_ok:
             return False
-        return time.monotonic() - self.setpoints[-1][0] < self.parameters["COM_OF_LOSS_T"]
+        return self._clock() - self.setpoints[-1][0] < self.parameters["COM_OF_LOSS_T"]
 
     def _update_mode(self) -> None:
         """The intended mode, or what PX4's failsafe puts in its place while offboard cannot run."""
@@ -292,13 +320,13 @@ class AutopilotStandIn:
             return
         self._state = self._motion(self._demand(), interval_s)
         height_m = -float(self._state.position[2])
-        if self._mode == "TAKEOFF" and height_m > TAKE_OFF_HEIGHT_M - 0.1:
+        if self._mode == "TAKEOFF" and height_m > self.parameters["MIS_TAKEOFF_ALT"] - 0.1:
             self.pilot_selects("LOITER")
         elif self._mode == "RTL" and float(np.linalg.norm(self._state.position[:2])) < ARRIVED_M:
             self.pilot_selects("LAND")
         elif self._mode == "LAND" and height_m < ON_GROUND_M:
-            self._landed_s = self._landed_s or time.monotonic()
-            if time.monotonic() - self._landed_s > DISARM_AFTER_LANDING_S:
+            self._landed_s = self._landed_s or self._clock()
+            if self._clock() - self._landed_s > DISARM_AFTER_LANDING_S:
                 self._disarm()
 
     def _demand(self) -> Demand:
@@ -307,7 +335,7 @@ class AutopilotStandIn:
                 setpoint = self.setpoints[-1][1]
                 return Demand(setpoint.velocity, -setpoint.height_m, setpoint.yaw_rad)
             case "TAKEOFF":
-                return Demand(np.zeros(2), -TAKE_OFF_HEIGHT_M, self._hold_yaw_rad)
+                return Demand(np.zeros(2), -self.parameters["MIS_TAKEOFF_ALT"], self._hold_yaw_rad)
             case "LAND":
                 return Demand(np.zeros(2), 0.5, self._hold_yaw_rad)
             case "RTL":
@@ -386,6 +414,7 @@ class AutopilotStandIn:
         }
         for number, sender in senders.items():
             self._send_if_due(now, number, self._streams_s[number], sender)
+        self._send_if_due(now, 115, TRUTH_S, self._send_truth)
         if self._mode != self._told_mode:
             self._send_if_due(now, 436, self._streams_s[436], self._send_mode)
 
@@ -395,7 +424,7 @@ class AutopilotStandIn:
             sender()
 
     def _boot_ms(self) -> int:
-        return int((time.monotonic() - self._started_s) * 1000)
+        return int((self._clock() - self._started_s) * 1000)
 
     def _custom_mode(self) -> int:
         _, main, sub = mavutil.px4_map[self._mode]
@@ -441,7 +470,7 @@ class AutopilotStandIn:
         self._mav.sys_status_send(0, 0, 0, 0, int(1000 * volts), -1, round(100 * self.battery_share), 0, 0, 0, 0, 0, 0)
 
     def _send_gps(self) -> None:
-        lat, lon, alt = int(LATITUDE_DEG * 1e7), int(LONGITUDE_DEG * 1e7), 488_000
+        lat, lon, alt = self._place(np.zeros(3))
         self._mav.gps_raw_int_send(self._boot_ms() * 1000, 3, lat, lon, alt, 100, 100, 0, 0, 12)
 
     def _send_estimator(self) -> None:
@@ -449,8 +478,21 @@ class AutopilotStandIn:
         self._mav.estimator_status_send(self._boot_ms() * 1000, flags, 0, 0, 0, 0, 0, 0, 0.1, 0.1)
 
     def _send_home(self) -> None:
-        lat, lon, alt = int(LATITUDE_DEG * 1e7), int(LONGITUDE_DEG * 1e7), 488_000
+        lat, lon, alt = self._place(np.zeros(3))
         self._mav.home_position_send(lat, lon, alt, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0)
+
+    def _send_truth(self) -> None:
+        attitude, place = quaternion_from_rotation(self._state.R_ned_body), self._place(self._state.position)
+        speeds = [round(100.0 * speed) for speed in self._state.velocity]
+        self._truth.hil_state_quaternion_send(0, attitude, 0, 0, 0, *place, *speeds, 0, 0, 0, 0, 0)
+
+    def _place(self, position: FloatArray) -> tuple[int, int, int]:
+        """Latitude and longitude in 1e-7 degrees, and millimetres above the ground, of metres from home."""
+        latitude_deg, longitude_deg = self._home_deg
+        north_m, east_m = metres_a_degree(latitude_deg)
+        latitude_deg += position[0] / north_m
+        longitude_deg += position[1] / east_m
+        return round(1e7 * latitude_deg), round(1e7 * longitude_deg), round(-1000.0 * position[2])
 
     def _send_version(self) -> None:
         """A version that no PX4 has, so that nobody takes it for one."""
@@ -469,6 +511,17 @@ class AutopilotStandIn:
         self._mav.param_value_send(name.encode(), wire, kind, len(self.parameters), index)
 
 
+class _Outlet:
+    """Where pymavlink writes what only the ground is told, if there is one."""
+
+    def __init__(self, sender: socket.socket, address: tuple[str, int] | None) -> None:
+        self._socket, self._address = sender, address
+
+    def write(self, data: bytes) -> None:
+        if self._address is not None:
+            self._socket.sendto(data, self._address)
+
+
 def quaternion_from_rotation(rotation: FloatArray) -> tuple[float, float, float, float]:
     """W x y z of a rotation (3, 3) by less than half a turn about any level axis, which is how a multirotor flies."""
     R = rotation
@@ -484,12 +537,11 @@ def quaternion_from_rotation(rotation: FloatArray) -> tuple[float, float, float,
     )
 
 
-def _arrival(ancillary: list[tuple[int, int, bytes]]) -> float:
-    """When a packet came by the kernel's stamp, on the monotonic clock."""
+def _age(ancillary: list[tuple[int, int, bytes]]) -> float:
+    """How long ago a packet came by the kernel's stamp, in real seconds."""
     (stamp,) = (data for level, kind, data in ancillary if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS))
     seconds, nanoseconds = struct.unpack("@ll", stamp)
-    ago_s = time.time() - (seconds + nanoseconds * 1e-9)
-    return time.monotonic() - float(ago_s)
+    return time.time() - float(seconds + nanoseconds * 1e-9)
 
 
 def _mode_by_number(main: int, sub: int) -> Mode | None:

@@ -1,0 +1,17 @@
+"""How many metres a degree is, near a place on the WGS 84 ellipsoid."""
+
+from __future__ import annotations
+
+import math
+
+EQUATOR_M = 6_378_137.0
+SQUARED_ECCENTRICITY = 6.694379990e-3
+
+
+def metres_a_degree(latitude_deg: float) -> tuple[float, float]:
+    """Of latitude and of longitude."""
+    latitude = math.radians(latitude_deg)
+    flattened = 1.0 - SQUARED_ECCENTRICITY * math.sin(latitude) ** 2
+    north = math.radians(EQUATOR_M * (1.0 - SQUARED_ECCENTRICITY) / flattened**1.5)
+    east = math.radians(EQUATOR_M * math.cos(latitude) / math.sqrt(flattened))
+    return north, east
