@@ -144,8 +144,8 @@ class DistanceTask(Task):
         nll = error / torch.exp(out[:, 3]) * 1.414 + out[:, 3]
         family = F.cross_entropy(families, batch["family"], reduction="none")
         apparent = (out[:, 5] - batch["apparent"]).abs()
-        where = -(_motor_map(batch["motors"]) * motors).sum(1)
-        each = 0.3 * nll + 2.0 * error + 0.05 * centre + 0.3 * family + 2.0 * apparent + 0.1 * where
+        where = -(_motor_maps(batch["motors"]) * motors).sum(2).mean(1)
+        each = 0.3 * nll + 2.0 * error + 0.05 * centre + 0.3 * family + 2.0 * apparent + 0.2 * where
         seen = there > 0.5
         right = (out[:, 4] > 0) == seen
         figures = {
@@ -177,13 +177,17 @@ def _flipped(batch: Batch) -> Batch:
     return {**batch, "picture": picture, "target": target, "motors": motors}
 
 
-def _motor_map(motors: Tensor, sigma: float = 2.0) -> Tensor:
-    """(n, 4, 2) places in px from the picture's middle -> (n, 48 * 48) shares of a map of half its size."""
+def _motor_maps(motors: Tensor, sigma: float = 1.5) -> Tensor:
+    """(n, 4, 2) places in px from the picture's middle -> (n, 4, 48 * 48) shares of maps of half its size.
+
+    From left to right; what lies outside the picture counts for its border.
+    """
+    order = motors[:, :, 0].argsort(1)
+    places = torch.gather(motors, 1, order[:, :, None].expand(-1, -1, 2)).clamp(-47.0, 47.0)
     at = 2.0 * torch.arange(48) + 1.0 - 48.0
-    across = torch.exp(-((at - motors[:, :, 0:1]) ** 2) / (2 * sigma**2))
-    along = torch.exp(-((at - motors[:, :, 1:2]) ** 2) / (2 * sigma**2))
-    map_ = torch.einsum("nkv,nku->nvu", along, across).flatten(1)
-    return map_ / map_.sum(1, keepdim=True).clamp(min=0.1)
+    across = torch.softmax(-((at - places[:, :, 0:1]) ** 2) / (2 * sigma**2), 2)
+    along = torch.softmax(-((at - places[:, :, 1:2]) ** 2) / (2 * sigma**2), 2)
+    return torch.einsum("nkv,nku->nkvu", along, across).flatten(2)
 
 
 class FlowTask(Task):

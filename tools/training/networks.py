@@ -129,9 +129,9 @@ class NeighboursNet(nn.Module):
 class DistanceNet(nn.Module):
     """Range of the drone in the middle of a picture.
 
-    Where in the picture the motors are is a map of half the picture's size; how far that map spreads tells how large
-    the drone appears, to a fraction of a pixel, whichever way it is turned. What the whole picture looks like tells
-    which shape of drone it is, hence its size in metres. Range is one over the other.
+    Maps of half the picture's size say where its four motors are, from the leftmost to the rightmost; how far they lie
+    apart tells how large the drone appears, to a fraction of a pixel. What the whole picture looks like tells which
+    shape of drone it is, hence its size in metres. Range is one over the other.
 
     Input: picture (n, 96, 96, 3) uint8 of a virtual camera that faces the drone. Outputs (n, 6):
     log of (range in m / focal length in px), the drone's centre right and down of the picture's centre in px,
@@ -141,8 +141,9 @@ class DistanceNet(nn.Module):
 
     size = 96
     widths = (24, 40, 64, 96, 128)
+    motors = 4
     maps = 8
-    """The first is of the motors; what the others look for is learnt."""
+    """The first are of the motors; what the others look for is learnt."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -154,12 +155,12 @@ class DistanceNet(nn.Module):
         self.up = nn.ModuleList([_conv(b, a, kernel=1) for a, b in pairwise(w)])
         self.merge = nn.ModuleList([_conv(a, a) for a in w[:4]])
         self.look = nn.Conv2d(w[0], self.maps, 1)
-        self.summary = nn.Sequential(nn.Linear(128 * 9 + 6 * self.maps, 160), nn.ReLU(True))
+        self.summary = nn.Sequential(nn.Linear(128 * 9 + 6 * self.maps + 2, 160), nn.ReLU(True))
         self.head = nn.Linear(160, 6)
         self.family = nn.Linear(160, MAX_FAMILIES)
 
     def forward(self, picture: Tensor) -> Tensor | tuple[Tensor, Tensor, Tensor]:
-        """One row a picture; in training also a logit for each family, and the motors' map (n, 48, 48), log."""
+        """One row a picture; in training also a logit for each family, and log maps of the motors (n, 4, 48 * 48)."""
         x = self.stem(_blocks(picture, 2))
         levels = [x]
         for down, body in zip(self.down, self.body, strict=True):
@@ -170,36 +171,44 @@ class DistanceNet(nn.Module):
             x = F.interpolate(self.up[i](x), scale_factor=2.0, mode="nearest")
             x = self.merge[i](x + self.lateral[i](levels[i]))
         where = _in_full_precision(self.look, x)
-        spread, moments = _moments(where)
-        x = _in_full_precision(self.summary, torch.cat([whole.float(), moments], 1))
+        middles, moments = _moments(where)
+        spread, shape = _spread(middles[:, : self.motors])
+        x = _in_full_precision(self.summary, torch.cat([whole.float(), moments, shape], 1))
         out = _in_full_precision(self.head, x)
         apparent = spread + out[:, 5:] + 1.0
         sigma = (out[:, 3:4] - 3.0).clamp(-7.0, 1.0)
         out = torch.cat([out[:, :1] - 0.5 - apparent, out[:, 1:3] * 10.0, sigma, out[:, 4:5], apparent], 1)
         if not self.training:
             return out
-        return out, _in_full_precision(self.family, x), where[:, 0].flatten(1).log_softmax(1)
+        return out, _in_full_precision(self.family, x), where[:, : self.motors].flatten(2).log_softmax(2)
 
 
 def _moments(where: Tensor) -> tuple[Tensor, Tensor]:
-    """Of maps (n, k, h, w) of logits: log of the first one's widest spread (n, 1), in picture pixels; and (n, 6 k) all.
-
-    The motors of a level drone lie on a circle, so from the side, at any heading, they spread alike.
-    """
+    """Of maps (n, k, h, w) of logits: their middles (n, k, 2) in picture pixels, and all their moments (n, 6 k)."""
     n, k, h, w = where.shape
     flat = where.flatten(2)
-    share = flat.softmax(2)
     v, u = torch.meshgrid(torch.arange(h).float() + 0.5 - h / 2, torch.arange(w).float() + 0.5 - w / 2, indexing="ij")
     u, v = 2.0 * u.to(where.device).flatten(), 2.0 * v.to(where.device).flatten()
-    basis = torch.stack([u, v, u * u, u * v, v * v], 1)
-    m = torch.matmul(share, basis)
+    m = torch.matmul(flat.softmax(2), torch.stack([u, v, u * u, u * v, v * v], 1))
     mu, mv = m[..., 0], m[..., 1]
     uu, uv, vv = m[..., 2] - mu * mu + 1.0, m[..., 3] - mu * mv, m[..., 4] - mv * mv + 1.0
+    spread = (uu + vv).clamp(min=0.5).log() / 2
+    features = torch.cat([mu / 20.0, mv / 20.0, spread, (uu - vv) / (uu + vv), uv / (uu + vv), flat.amax(2) / 10.0], 1)
+    return torch.stack([mu, mv], 2), features.reshape(n, 6 * k)
+
+
+def _spread(points: Tensor) -> tuple[Tensor, Tensor]:
+    """Log of the widest spread (n, 1) of points (n, k, 2) in px, and the shape of the cloud (n, 2).
+
+    The motors of a level drone lie on a circle or nearly so: from the side, at any heading, they spread about alike.
+    """
+    centred = points - points.mean(1, keepdim=True)
+    uu, vv = (centred**2).mean(1).unbind(1)
+    uv = (centred[..., 0] * centred[..., 1]).mean(1)
     half, difference = (uu + vv) / 2, torch.sqrt(((uu - vv) / 2) ** 2 + uv**2 + 1e-3)
-    wide, narrow = (half + difference).clamp(min=0.3).log() / 2, (half - difference).clamp(min=0.3).log() / 2
-    peak = flat.amax(2) / 10.0
-    features = torch.cat([mu / 20.0, mv / 20.0, wide - 2.5, narrow - 2.5, uv / half, peak], 1)
-    return wide[:, :1], features.reshape(n, 6 * k)
+    wide = (half + difference).clamp(min=1.0).log() / 2
+    narrow = (half - difference).clamp(min=0.3).log() / 2
+    return wide[:, None], torch.stack([wide - 2.5, narrow - wide + 1.0], 1)
 
 
 class _Encoder(nn.Module):
