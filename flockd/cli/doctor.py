@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -67,6 +68,7 @@ def _run(args: argparse.Namespace) -> int:
         environment=os.environ,
         only=args.only or CHECKS,
     )
+    logging.getLogger("flockd.autopilot").setLevel(logging.CRITICAL)  # what MAVSDK has to tell, the findings do
     with progress("examining", "checks") as tell:
         found = examine(checks, tell)
     if args.json:

@@ -9,8 +9,7 @@ from flockd.autopilot.mavsdk_link import AutopilotLink
 from flockd.autopilot.status import AutopilotError, AutopilotStatus, Firmware
 from flockd.config import DroneConfig
 from flockd.config.parameters import AutopilotParameters, GateParameters
-from flockd.doctor.examination import of_error
-from flockd.doctor.finding import Finding, failed, passed, warned
+from flockd.doctor.finding import Finding, failed, failed_as_told, passed, warned
 
 HEARD_S = 10.0
 OLDEST_TRIED = (1, 14)
@@ -30,14 +29,16 @@ def check_autopilot(config: DroneConfig) -> Iterator[Finding]:
 async def _ask(config: DroneConfig, parameters: AutopilotParameters) -> list[Finding]:
     link = await AutopilotLink.connect(parameters, timeout_s=HEARD_S)
     try:
-        found = [judge_heartbeat(link.system_id, link.status(), parameters)]
-        found.append(await _firmware(link))
+        found = [judge_heartbeat(link.system_id, link.status(), parameters), await _firmware(link)]
         for name, kind in KINDS.items():
             try:
                 value = await link.parameter(name, kind)
             except AutopilotError as error:
                 mend = f"see whether this firmware has {name}, and whether the link loses much"
                 found.append(failed(name, str(error), mend))
+                if link.status().heartbeat_age_s > parameters.max_heartbeat_age_s:
+                    found.append(judge_heartbeat(link.system_id, link.status(), parameters))
+                    break
             else:
                 found.append(JUDGES[name](value, config))
     finally:
@@ -49,16 +50,14 @@ async def _firmware(link: AutopilotLink) -> Finding:
     try:
         return judge_firmware(await link.firmware())
     except AutopilotError as error:
-        return of_error("firmware", error)
+        return failed_as_told("firmware", str(error))
 
 
 def judge_heartbeat(system_id: int, status: AutopilotStatus, parameters: AutopilotParameters) -> Finding:
     """Heard, and at rest."""
     measured = f"system {system_id} at {parameters.address}, heard {status.heartbeat_age_s:.1f} s ago"
     if status.heartbeat_age_s > parameters.max_heartbeat_age_s:
-        return failed(
-            "heartbeat", f"{measured}, and not since", "see to the cable, its baud rate, and who else uses it"
-        )
+        return failed("heartbeat", f"{measured} and not since", "see to the cable, its baud rate, and who else uses it")
     if status.armed:
         return warned("heartbeat", f"{measured}, and armed", "disarm it on the ground before you examine it")
     return passed("heartbeat", f"{measured}, disarmed, in flight mode {status.flight_mode}")

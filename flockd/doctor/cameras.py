@@ -14,11 +14,12 @@ import numpy as np
 
 from flockd.config import DroneConfig
 from flockd.config.parameters import CameraConfig, CameraDeviceParameters, SourceParameters
-from flockd.doctor.finding import Finding, failed, passed, warned
+from flockd.doctor.finding import Finding, failed, failed_as_told, passed, warned
 from flockd.doctor.lenses import coverage, lens_problems, width_deg
 from flockd.messages import UInt8Array
 from flockd.sources.images import CorruptImageError, ImageFormat, MjpegFormat, YuyvFormat
 from flockd.sources.shared_memory import SharedMemorySource
+from flockd.sources.v4l2 import MAX_AHEAD_S
 from flockd.sources.v4l2_device import CameraError, CapturedBuffer, Kernel, LinuxKernel, V4l2Device
 
 START_S = 5.0
@@ -29,6 +30,7 @@ SLOW, TOO_SLOW = 0.95, 0.8
 """Of the configured rate. Cheap cameras halve theirs by themselves in dim light."""
 UNEVEN, TOO_UNEVEN = 0.2, 0.5
 """Of a frame period, the 95th percentile of how far a frame is from its beat. By half a period sets fall apart."""
+RELIEF = "try another cable and port, fewer cameras on one USB bus, or a shorter exposure that is set by hand"
 DARK, BRIGHT = 12.0, 243.0
 """Of 0-255, the mean grey of a picture in which little can be seen."""
 
@@ -42,6 +44,7 @@ class Watched:
     stamps_s: list[float] = field(default_factory=list)
     """When each image was taken, as its time stamp says."""
     arrivals_s: list[float] = field(default_factory=list)
+    """When each was here, where its time stamp may be of another clock."""
     lost: int = 0
     """Gaps in the sequence numbers."""
     refused: Counter[str] = field(default_factory=Counter)
@@ -51,9 +54,10 @@ class Watched:
     @property
     def rate_hz(self) -> float:
         """As they came; 0 for less than two images."""
-        if len(self.arrivals_s) < 2:
+        times_s = self.arrivals_s or self.stamps_s
+        if len(times_s) < 2:
             return 0.0
-        return (len(self.arrivals_s) - 1) / max(self.arrivals_s[-1] - self.arrivals_s[0], 1e-9)
+        return (len(times_s) - 1) / max(times_s[-1] - times_s[0], 1e-9)
 
     def jitter_s(self) -> float:
         """95th percentile of how far an interval is from the nearest multiple of the usual one."""
@@ -88,10 +92,11 @@ def _judged(camera: CameraConfig, config: DroneConfig, watched: Watched | None) 
     if watched is not None and config.source is not None:
         device = next((entry for entry in config.source.cameras if entry.name == camera.name), None)
         rate_hz = device.rate_hz if device else config.source.shared_memory.rate_hz
-        problems += stream_problems(camera.name, watched, rate_hz, config.safety.max_dropped_share)
+        relief = RELIEF if device else "see what keeps the program that publishes them from it"
+        problems += stream_problems(camera.name, watched, rate_hz, config.safety.max_dropped_share, relief)
         problems += [] if device is None else _exposure_problems(device)
         told = [
-            f"{watched.rate_hz:.1f} of {rate_hz:g} images a second, jitter {1e3 * watched.jitter_s():.1f} ms, none lost",
+            f"{watched.rate_hz:.1f} of {rate_hz:g} images a second, jitter {1e3 * watched.jitter_s():.1f} ms, no gaps",
             f"{len(device.controls)} controls accepted" if device else "",
         ]
     size = "x".join(map(str, camera.size_px))
@@ -102,30 +107,29 @@ def _judged(camera: CameraConfig, config: DroneConfig, watched: Watched | None) 
         yield passed(f"camera {camera.name}", ", ".join(part for part in [*told, calibration] if part))
 
 
-def stream_problems(name: str, watched: Watched, rate_hz: float, max_dropped_share: float) -> Iterator[Finding]:
-    """What is wrong with the images that came."""
+def stream_problems(
+    name: str, watched: Watched, rate_hz: float, max_dropped_share: float, relief: str
+) -> Iterator[Finding]:
+    """What is wrong with the images that came; ``relief`` is what mends too few, uneven or damaged ones."""
     about = f"camera {name}"
     if watched.fault is not None:
-        measured, _, mend = watched.fault.removeprefix(f"{name}: ").rpartition("; ")
-        yield failed(about, measured, mend)
+        yield failed_as_told(about, watched.fault.removeprefix(f"{name}: "))
         return
     came, bad = len(watched.stamps_s), sum(watched.refused.values())
     share = (watched.lost + bad) / max(came + watched.lost + bad, 1)
     if watched.lost or bad:
         what = [f"{count} {reason}" for reason, count in (("lost", watched.lost), *watched.refused.items()) if count]
         measured = f"of {came + watched.lost + bad} images {', '.join(what)} ({share:.0%})"
-        mend = "try another cable and port, fewer cameras on one USB bus, or a lower rate_hz"
-        yield (failed if share > max_dropped_share else warned)(about, measured, mend)
+        yield (failed if share > max_dropped_share else warned)(about, measured, relief)
     pace = watched.rate_hz / rate_hz
     if pace < SLOW or pace > 2.0 - SLOW:
         measured = f"{watched.rate_hz:.1f} images a second instead of {rate_hz:g}"
-        mend = f"write rate_hz: {max(watched.rate_hz, 0.1):.0f}, shorten the exposure, or relieve the USB bus"
+        mend = f"{relief}, or write rate_hz: {max(watched.rate_hz, 0.1):.2g}"
         yield (failed if pace < TOO_SLOW else warned)(about, measured, mend)
     jitter_s = watched.jitter_s()
     if jitter_s * rate_hz > UNEVEN:
         measured = f"images come unevenly: {1e3 * jitter_s:.1f} ms off their beat of {1e3 / rate_hz:.1f} ms"
-        mend = "switch the automatic exposure off, and see what else keeps the computer or the USB bus busy"
-        yield (failed if jitter_s * rate_hz > TOO_UNEVEN else warned)(about, measured, mend)
+        yield (failed if jitter_s * rate_hz > TOO_UNEVEN else warned)(about, measured, relief)
     if watched.picture is not None:
         grey = float(watched.picture.mean())
         if not DARK <= grey <= BRIGHT:
@@ -149,7 +153,7 @@ def watch_devices(config: DroneConfig, source: SourceParameters, seconds: float,
     watched, threads = {}, {}
     for device in source.cameras:
         record = watched[device.name] = Watched()
-        arguments = (device, sizes[device.name], seconds, kernel, record, stopping)
+        arguments = (device, sizes[device.name], seconds, source, kernel, record, stopping)
         threads[device.name] = threading.Thread(target=_watch_device, args=arguments, daemon=True)
         threads[device.name].start()
     until_s = time.monotonic() + START_S + seconds + STOP_S
@@ -166,6 +170,7 @@ def _watch_device(
     device: CameraDeviceParameters,
     size: tuple[int, int],
     seconds: float,
+    source: SourceParameters,
     kernel: Kernel,
     record: Watched,
     stopping: threading.Event,
@@ -185,7 +190,7 @@ def _watch_device(
                 image_format = MjpegFormat(size)
             else:
                 image_format = YuyvFormat(size, camera.bytes_per_line)
-            _record(camera.read, image_format, seconds, record, stopping)
+            _record(camera.read, image_format, seconds, source, record, stopping)
     except CameraError as error:
         record.fault = str(error)
 
@@ -194,12 +199,14 @@ def _record(
     read: Callable[[float], CapturedBuffer | None],
     image_format: ImageFormat,
     seconds: float,
+    source: SourceParameters,
     record: Watched,
     stopping: threading.Event,
 ) -> None:
     """Everything from the first usable image on; the last one is decoded."""
     until_s, last = time.monotonic() + START_S, None
     sequence: int | None = None
+    repeats = 0
     while time.monotonic() < until_s and not stopping.is_set():
         captured = read(_LOOK_S)
         if captured is None:
@@ -207,14 +214,16 @@ def _record(
         if sequence is not None:
             record.lost += max(captured.sequence - sequence - 1, 0)
         sequence = captured.sequence
-        reason = _refusal(captured, image_format)
+        repeats = repeats + 1 if last is not None and captured.data == last.data else 0
+        reason = _refusal(captured, image_format, source.silence_s)
+        if reason is None and 0 < source.frozen_after <= repeats:
+            reason = "frozen"
         if reason is not None:
             record.refused[reason] += 1
             continue
         if not record.stamps_s:
             until_s = time.monotonic() + seconds
         record.stamps_s.append(captured.time_s)
-        record.arrivals_s.append(time.monotonic())
         last = captured
     if last is None:
         seen = ", ".join(f"{count} {reason}" for reason, count in record.refused.items())
@@ -227,12 +236,14 @@ def _record(
         record.refused[f"not to be decoded ({error})"] += 1
 
 
-def _refusal(captured: CapturedBuffer, image_format: ImageFormat) -> str | None:
+def _refusal(captured: CapturedBuffer, image_format: ImageFormat, silence_s: float) -> str | None:
     """As the source in flight would refuse it."""
     if captured.flagged:
         return "damaged by the driver's own account"
     if captured.clock == "unknown":
         return "without a monotonic time stamp"
+    if not -MAX_AHEAD_S <= time.monotonic() - captured.time_s <= silence_s:
+        return "with a time stamp far from now"
     try:
         image_format.check(captured.data)
     except CorruptImageError as error:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass
 
-from flockd.doctor.finding import Finding, failed
+from flockd.doctor.finding import Finding, failed, failed_as_told
 from flockd.errors import FlockdError
 
 
@@ -49,14 +49,13 @@ def _bounded(check: Check) -> tuple[Finding, ...]:
         mend = "something it asked does not answer: see what else this check says, and the kernel's log (`dmesg`)"
         return (*found, failed(check.name, measured, mend))
     error = ended.exception()
-    return tuple(found) if error is None else (*found, of_error(check.name, error))
+    return tuple(found) if error is None else (*found, _of_error(check.name, error))
 
 
-def of_error(about: str, error: BaseException) -> Finding:
-    """The failure that an error means. Our own errors end in their mend, after the last semicolon."""
+def _of_error(about: str, error: BaseException) -> Finding:
+    """The failure that an error means."""
     if isinstance(error, FlockdError):
-        measured, _, mend = str(error).rpartition("; ")
-        return failed(about, measured or mend, mend if measured else "mend that, and examine it again")
+        return failed_as_told(about, str(error))
     if isinstance(error, ImportError):
         return failed(about, f"a library cannot be loaded ({error})", "install flockd again, for this computer")
     if isinstance(error, OSError):

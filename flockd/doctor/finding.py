@@ -41,3 +41,9 @@ def warned(about: str, measured: str, mend: str) -> Finding:
 def failed(about: str, measured: str, mend: str) -> Finding:
     """It must not be like this."""
     return Finding(Level.FAILURE, about, measured, mend)
+
+
+def failed_as_told(about: str, sentence: str) -> Finding:
+    """The failure that an error's sentence tells of: our own end in their mend, after the last semicolon."""
+    measured, _, mend = sentence.rpartition("; ")
+    return failed(about, measured or mend, mend if measured else "mend that, and examine it again")

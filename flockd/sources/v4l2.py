@@ -18,7 +18,7 @@ _LOOK_S = 0.05
 _START_S = 3.0
 """Cameras may take this long to their first frame."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
-_MAX_AHEAD_S = 0.02
+MAX_AHEAD_S = 0.02
 """Drivers that work out time stamps from the camera's own clock may be this much ahead."""
 _STOP_S = 1.0
 """A thread that hangs in a driver for longer is left to end with the process."""
@@ -158,7 +158,7 @@ class _Camera:
         if captured.flagged:
             return "flagged"
         age_s = self._clock() - captured.time_s
-        if captured.clock == "unknown" or not -_MAX_AHEAD_S <= age_s <= self._silence_s:
+        if captured.clock == "unknown" or not -MAX_AHEAD_S <= age_s <= self._silence_s:
             return "time_stamp"
         try:
             image_format.check(captured.data)

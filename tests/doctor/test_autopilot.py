@@ -1,0 +1,171 @@
+"""What is asked of the autopilot over real MAVLink, and what is made of its answers. It is a stand-in, not PX4."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from flockd.autopilot.stand_in import AutopilotStandIn
+from flockd.autopilot.status import Firmware
+from flockd.config import DroneConfig, load_drone
+from flockd.config.parameters import AutopilotParameters, GateParameters, SafetyParameters
+from flockd.data import data_path
+from flockd.doctor import Check, Finding, Level, examine
+from tests.autopilot.conftest import HEARTBEAT_S, free_port
+
+try:
+    from flockd.doctor import autopilot
+    from flockd.doctor.autopilot import JUDGES, check_autopilot, judge_firmware
+    from tests.autopilot.flight import until
+except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
+    pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
+
+GOOD: dict[str, float | int] = {
+    "COM_OF_LOSS_T": 1.0,
+    "COM_OBL_RC_ACT": 5,
+    "COM_LOW_BAT_ACT": 3,
+    "GF_ACTION": 2,
+    "GF_MAX_HOR_DIST": 60.0,
+    "GF_MAX_VER_DIST": 15.0,
+}
+"""For the quadrotor's own fence of 50 m and 10 m of height."""
+LISTENS, REQUESTS_MESSAGE = 511, 512
+
+
+def _config(port: int) -> DroneConfig:
+    quadrotor = load_drone(data_path("config") / "quadrotor.yaml")
+    return quadrotor.model_copy(update={"autopilot": AutopilotParameters(address=f"udpin://127.0.0.1:{port}")})
+
+
+def _examined(port: int) -> dict[str, Finding]:
+    check = Check("autopilot", lambda: check_autopilot(_config(port)), limit_s=60.0)
+    return {finding.about: finding for finding in examine([check], lambda done, total: None)["autopilot"]}
+
+
+def test_an_autopilot_that_is_set_up_well_and_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    obey = AutopilotStandIn._obey
+
+    def noting(self: AutopilotStandIn, command: int, message: Any) -> int:
+        asked.append(command)
+        return obey(self, command, message)
+
+    monkeypatch.setattr(AutopilotStandIn, "_obey", noting)
+    port = free_port()
+    with AutopilotStandIn(port, heartbeat_s=HEARTBEAT_S) as stand_in:
+        stand_in.parameters.update(GOOD)
+        found = _examined(port)
+        assert (stand_in.armed, stand_in.mode) == (False, "LOITER")
+        assert not stand_in.setpoints
+        assert stand_in.refused_setpoints == 0
+        assert stand_in.parameters == {**stand_in.parameters, **GOOD}
+    assert set(asked) <= {LISTENS, REQUESTS_MESSAGE}, "it listens and asks, and commands nothing"
+    assert found.keys() == {"heartbeat", "firmware", *GOOD}
+    assert {about for about, finding in found.items() if finding.level is not Level.PASS} == {"firmware"}
+    assert found["firmware"].measured.startswith("PX4 0.0.1 is older than 1.14"), "the stand-in is not PX4"
+    assert "system 1 at udpin://127.0.0.1" in found["heartbeat"].measured
+    assert "disarmed, in flight mode hold" in found["heartbeat"].measured
+
+
+def test_bad_values_are_read_and_told_with_their_mend() -> None:
+    port = free_port()
+    with AutopilotStandIn(port, height_m=2.0, heartbeat_s=HEARTBEAT_S) as stand_in:
+        stand_in.parameters.update({**GOOD, "COM_OF_LOSS_T": 2.5, "COM_OBL_RC_ACT": 1, "GF_MAX_HOR_DIST": 0.0})
+        del stand_in.parameters["GF_ACTION"]
+        found = _examined(port)
+    assert found["COM_OF_LOSS_T"].level is Level.WARNING
+    assert found["COM_OF_LOSS_T"].measured.startswith("2.5 s: so long it flies on")
+    assert found["COM_OF_LOSS_T"].mend == "set COM_OF_LOSS_T to 1 s"
+    assert found["COM_OBL_RC_ACT"].level is Level.FAILURE
+    assert "drifts on" in found["COM_OBL_RC_ACT"].measured
+    assert found["GF_MAX_HOR_DIST"].level is Level.WARNING
+    assert found["GF_MAX_HOR_DIST"].mend == "set GF_MAX_HOR_DIST to 60 m, a little outside flockd's own"
+    assert found["GF_ACTION"].level is Level.FAILURE
+    assert "GF_ACTION could not be read (timeout)" in found["GF_ACTION"].measured
+    assert (found["heartbeat"].level, found["heartbeat"].measured[-9:]) == (Level.WARNING, "and armed")
+
+
+def test_nobody_there_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(autopilot, "HEARD_S", 0.3)
+    port = free_port()
+    (finding,) = _examined(port).values()
+    assert (finding.level, finding.about) == (Level.FAILURE, "autopilot")
+    assert finding.measured == f"no autopilot was heard at udpin://127.0.0.1:{port} within 0.3 s"
+    assert finding.mend.startswith("check autopilot.address")
+
+
+def test_an_autopilot_that_falls_silent_under_examination_is_a_failure() -> None:
+    port = free_port()
+
+    async def silenced(stand_in: AutopilotStandIn) -> list[Finding]:
+        """Cut the cable as soon as it is heard."""
+        config = _config(port)
+        assert config.autopilot is not None
+        asking = asyncio.create_task(autopilot._ask(config, config.autopilot))
+        await until(lambda: 242 in stand_in._due_s and stand_in._streams_s[436] == pytest.approx(0.05))
+        stand_in.silent = True
+        return await asking
+
+    with AutopilotStandIn(port, heartbeat_s=HEARTBEAT_S) as stand_in:
+        first, *rest = asyncio.run(silenced(stand_in))
+    assert (first.about, first.level) == ("heartbeat", Level.PASS)
+    assert [(finding.about, finding.level) for finding in rest] == [
+        ("firmware", Level.FAILURE),
+        ("COM_OF_LOSS_T", Level.FAILURE),
+        ("heartbeat", Level.FAILURE),
+    ]
+    assert rest[-1].measured.endswith(" s ago and not since")
+
+
+def test_no_autopilot_is_only_for_the_simulator() -> None:
+    (finding,) = check_autopilot(load_drone(data_path("config") / "simulator.yaml"))
+    assert finding.level is Level.WARNING
+    assert "can be simulated but not flown" in finding.measured
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "level"),
+    [
+        # PX4's own lists: 0 position, 1 altitude, 2 stabilized, 3 return, 4 land, 5 hold, 6 terminate, 7 disarm.
+        *[("COM_OBL_RC_ACT", value, Level.FAILURE) for value in (-1, 1, 2, 6, 7, 8)],
+        *[("COM_OBL_RC_ACT", value, Level.PASS) for value in (3, 4, 5)],
+        ("COM_OBL_RC_ACT", 0, Level.WARNING),
+        # 0 warning, 2 land, 3 return or land.
+        *[("COM_LOW_BAT_ACT", value, Level.WARNING) for value in (0, 4)],
+        *[("COM_LOW_BAT_ACT", value, Level.PASS) for value in (2, 3)],
+        # 0 none, 1 warning, 2 hold, 3 return, 4 terminate, 5 land.
+        *[("GF_ACTION", value, Level.WARNING) for value in (0, 1, 4)],
+        *[("GF_ACTION", value, Level.PASS) for value in (2, 3, 5)],
+        ("COM_OF_LOSS_T", 0.5, Level.FAILURE),  # no longer than the gaps that the streamer may leave
+        ("COM_OF_LOSS_T", 0.75, Level.PASS),
+        ("COM_OF_LOSS_T", 1.0, Level.PASS),
+        ("COM_OF_LOSS_T", 1.1, Level.WARNING),
+        ("GF_MAX_HOR_DIST", 0.0, Level.WARNING),
+        ("GF_MAX_HOR_DIST", 50.0, Level.WARNING),
+        ("GF_MAX_HOR_DIST", 51.0, Level.PASS),
+        ("GF_MAX_VER_DIST", 0.0, Level.WARNING),
+        ("GF_MAX_VER_DIST", 9.0, Level.WARNING),
+        ("GF_MAX_VER_DIST", 12.0, Level.PASS),
+    ],
+)
+def test_what_is_made_of_each_value(name: str, value: float, level: Level) -> None:
+    finding = JUDGES[name](value, _config(14540))
+    assert (finding.about, finding.level) == (name, level)
+    assert (finding.mend == "") == (level is Level.PASS)
+
+
+def test_a_fence_with_corners_reaches_as_far_as_the_farthest_inside_the_circle() -> None:
+    gate = GateParameters(fence_radius_m=None, fence_corners_m=((30.0, 40.0), (0.0, 10.0), (-10.0, 0.0)))
+    config = _config(14540).model_copy(update={"safety": SafetyParameters(gate=gate)})
+    assert "50 m" in JUDGES["GF_MAX_HOR_DIST"](49.0, config).measured
+    free = SafetyParameters(gate=GateParameters(fence_radius_m=None))
+    endless = JUDGES["GF_MAX_HOR_DIST"](0.0, config.model_copy(update={"safety": free}))
+    assert endless.mend == "set GF_MAX_HOR_DIST to where it must never fly"
+
+
+def test_other_firmware() -> None:
+    assert judge_firmware(Firmware("PX4", "1.16.0")).level is Level.PASS
+    assert judge_firmware(Firmware("PX4", "1.13.3")).level is Level.WARNING
+    assert judge_firmware(Firmware("autopilot 3", "4.5.7")).level is Level.FAILURE
