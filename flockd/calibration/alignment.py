@@ -5,19 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
 from flockd.calibration.errors import CalibrationError
-from flockd.calibration.least_squares import Normal, minimise
+from flockd.calibration.least_squares import Normal, Solution, minimise
 from flockd.calibration.turns import CameraTurn, best_rotation
 from flockd.geometry.rotations import rotation_from_vector
 from flockd.messages import BoolArray, FloatArray
 
 MIN_TURNS = 30
 _SCAN_S = 0.01
-_ROUNDS = 8
+_ROUNDS, _SETTLED = 8, 1e-3
+"""Fits with new weights, until no weight changes by more."""
+_CHAIN_S, _HALF = 0.4, 0.5
+_FITS = 0.2
+"""Weight above which a turn counts as one that fits."""
 _TIME_STEP_S = 1e-3
 _SIGMA_DEG, _SIGMA_S = 0.5, 0.01
 """What is more uncertain than this is not known."""
@@ -35,28 +39,35 @@ class Attitudes:
     times_s: FloatArray
     rotations: FloatArray
 
-    def at(self, times_s: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """(m, 3, 3) attitudes at these times (m,), and a mask (m,) of those that lie between two near ones.
+    @cached_property
+    def _bends(self) -> FloatArray:
+        """(n, 3, 3) second derivatives at the times, of natural cubic splines through each entry of the matrices."""
+        steps = np.diff(self.times_s)
+        slopes = np.diff(self.rotations, axis=0) / steps[:, None, None]
+        # Tridiagonal: forward, then back.
+        pivots, right = 2.0 * (steps[:-1] + steps[1:]), 6.0 * np.diff(slopes, axis=0)
+        for k in range(1, len(pivots)):
+            factor = steps[k] / pivots[k - 1]
+            pivots[k] -= factor * steps[k]
+            right[k] -= factor * right[k - 1]
+        bends = np.zeros_like(self.rotations)
+        for k in range(len(pivots) - 1, -1, -1):
+            bends[k + 1] = (right[k] - steps[k + 1] * bends[k + 2]) / pivots[k]
+        return bends
 
-        Cubic between neighbours, with rates from those beyond them.
-        """
-        steps_s = np.diff(self.times_s)
-        turns = logs(np.swapaxes(self.rotations[:-1], 1, 2) @ self.rotations[1:])
-        rates = turns / steps_s[:, None]
-        weights = steps_s[:, None]
-        inner = (rates[:-1] * weights[1:] + rates[1:] * weights[:-1]) / (weights[:-1] + weights[1:])
-        at_knots = np.concatenate([rates[:1], inner, rates[-1:]])
-        index = np.clip(np.searchsorted(self.times_s, times_s, side="right") - 1, 0, len(steps_s) - 1)
-        span = steps_s[index]
-        s = ((times_s - self.times_s[index]) / span)[:, None]
-        turn = (
-            (s**3 - 2 * s**2 + s) * at_knots[index] * span[:, None]
-            + (3 * s**2 - 2 * s**3) * turns[index]
-            + (s**3 - s**2) * at_knots[index + 1] * span[:, None]
-        )
+    def at(self, times_s: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """(m, 3, 3) attitudes at these times (m,), and a mask (m,) of those that lie between two near ones."""
+        steps = np.diff(self.times_s)
+        index = np.clip(np.searchsorted(self.times_s, times_s, side="right") - 1, 0, len(steps) - 1)
+        span = steps[index]
+        b = ((times_s - self.times_s[index]) / span)[:, None, None]
+        a, square = 1.0 - b, (span**2 / 6.0)[:, None, None]
+        near = a * self.rotations[index] + b * self.rotations[index + 1]
+        near += square * ((a**3 - a) * self._bends[index] + (b**3 - b) * self._bends[index + 1])
+        u, _, vt = np.linalg.svd(near)
         inside = (times_s >= self.times_s[0]) & (times_s <= self.times_s[-1])
-        inside &= span <= _LONGEST_GAP * float(np.median(steps_s))
-        return self.rotations[index] @ exponentials(turn), inside
+        inside &= span <= _LONGEST_GAP * float(np.median(steps))
+        return u @ vt, inside
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,15 +91,16 @@ def align(turns: Sequence[CameraTurn], attitudes: Attitudes, max_offset_s: float
     Raises CalibrationError where there are too few turns, where both contradict each other, and where the vehicle
     turned too little, or about one axis only, to tell.
     """
-    problem = _Problem.of(turns, attitudes, max_offset_s)
-    offset_s, weights = problem.scan(max_offset_s)
-    state = _State(best_rotation(problem.vehicle(offset_s), problem.camera, weights), offset_s)
-    for _ in range(_ROUNDS):
-        solution = minimise(state, partial(problem.normal, weights=weights), _move)
-        state = solution.state
-        weights = _weights(problem.residuals(state))
+    each = _Problem.of(turns, attitudes, max_offset_s)
+    offset_s, weights = each.scan(max_offset_s)
+    state, weights, _ = _fit(
+        each, _State(best_rotation(each.vehicle(offset_s), each.camera, weights), offset_s), weights
+    )
+    chains = _chained([turn for turn, weight in zip(each.turns, weights, strict=True) if weight > _FITS])
+    problem = _Problem.of(chains, attitudes, max_offset_s)
+    state, weights, solution = _fit(problem, state, np.ones(len(problem.turns)))
     left = problem.residuals(state)
-    good = weights > 0.2
+    good = weights > _FITS
     rms = float(np.sqrt((left[good] ** 2).sum(axis=1).mean()))
     size = float(np.sqrt((problem.vehicle(state.offset_s)[good] ** 2).sum(axis=1).mean()))
     if rms > _MOST_RMS_SHARE * size:
@@ -96,7 +108,10 @@ def align(turns: Sequence[CameraTurn], attitudes: Attitudes, max_offset_s: float
             f"the camera's turns and the vehicle's have nothing to do with each other: {math.degrees(rms):.2f} of "
             f"{math.degrees(size):.2f} degrees are left over; turn the drone faster, before something that stands still"
         )
-    sigma = solution.sigma(3 * int(good.sum()), 4)
+    shared = max(sum(turn.end_s - turn.start_s for turn in chains) / (chains[-1].end_s - chains[0].start_s), 1.0)
+    sigma = math.sqrt(shared) * solution.sigma(
+        3 * int(good.sum()), 4
+    )  # chains that overlap say less than they are many
     found = Alignment(
         R_body_camera=state.rotation,
         sigma_deg=math.degrees(float(sigma[:3].max())),
@@ -106,6 +121,32 @@ def align(turns: Sequence[CameraTurn], attitudes: Attitudes, max_offset_s: float
         turns=int(good.sum()),
     )
     _check_known(found, problem, abs(state.offset_s) >= max_offset_s)
+    return found
+
+
+def _fit(problem: _Problem, state: _State, weights: FloatArray) -> tuple[_State, FloatArray, Solution[_State]]:
+    for _ in range(_ROUNDS):
+        solution = minimise(state, partial(problem.normal, weights=weights), _move)
+        state, before, weights = solution.state, weights, _weights(problem.residuals(solution.state))
+        if float(np.abs(weights - before).max()) < _SETTLED:
+            break
+    return state, weights, solution
+
+
+def _chained(turns: Sequence[CameraTurn]) -> list[CameraTurn]:
+    """From each turn on, as many as take `_CHAIN_S` together, as one.
+
+    The noise of a short turn is as large as that of a long one; and where attitudes are interpolated it is smaller,
+    which would draw short turns there, whatever the offset.
+    """
+    found = []
+    for first, turn in enumerate(turns):
+        rotation, end_s = turn.rotation, turn.end_s
+        for after in turns[first + 1 :]:
+            if after.start_s != end_s or end_s - turn.start_s > _CHAIN_S - _HALF * (after.end_s - after.start_s):
+                break
+            rotation, end_s = rotation @ after.rotation, after.end_s
+        found.append(CameraTurn(turn.start_s, end_s, rotation))
     return found
 
 
@@ -133,6 +174,7 @@ class _State:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
+    turns: Sequence[CameraTurn]
     attitudes: Attitudes
     starts_s: FloatArray
     ends_s: FloatArray
@@ -144,23 +186,24 @@ class _Problem:
         """Of those turns that attitudes are known for, whatever the offset."""
         starts, ends = (np.array([getattr(turn, name) for turn in turns]) for name in ("start_s", "end_s"))
         known = np.ones(len(turns), np.bool_)
-        if len(attitudes.times_s) < MIN_TURNS or len(turns) < MIN_TURNS:
-            known[:] = False
-        for times in (starts, ends) if known.any() else ():
-            for offset in (-max_offset_s, 0.0, max_offset_s):
-                known &= attitudes.at(times + offset)[1]
-        if known.sum() < MIN_TURNS:
+        if min(len(attitudes.times_s), len(turns)) >= MIN_TURNS:
+            for times in (starts, ends):
+                for offset in (-max_offset_s, 0.0, max_offset_s):
+                    known &= attitudes.at(times + offset)[1]
+        count = min(int(known.sum()), len(attitudes.times_s))
+        if count < MIN_TURNS:
             raise CalibrationError(
-                f"{int(known.sum())} turns with attitudes are too few, {MIN_TURNS} are needed; record for longer"
+                f"{count} turns with attitudes are too few, {MIN_TURNS} are needed; record for longer"
             )
-        vectors = logs(np.array([turn.rotation for turn in turns]))
-        return cls(attitudes, starts[known], ends[known], vectors[known])
+        vectors = _logs(np.array([turn.rotation for turn in turns]))
+        used = [turn for turn, one in zip(turns, known, strict=True) if one]
+        return cls(used, attitudes, starts[known], ends[known], vectors[known])
 
     def vehicle(self, offset_s: float) -> FloatArray:
         """(n, 3) rotation vectors of the vehicle's turns meanwhile, in its axes."""
         first, _ = self.attitudes.at(self.starts_s + offset_s)
         second, _ = self.attitudes.at(self.ends_s + offset_s)
-        return logs(np.swapaxes(first, 1, 2) @ second)
+        return _logs(np.swapaxes(first, 1, 2) @ second)
 
     def scan(self, max_offset_s: float) -> tuple[float, FloatArray]:
         """The offset that leaves least, whatever the rotation, and the weights (n,) of the turns there."""
@@ -206,7 +249,7 @@ def _weights(left: FloatArray) -> FloatArray:
     return weights
 
 
-def logs(rotations: FloatArray) -> FloatArray:
+def _logs(rotations: FloatArray) -> FloatArray:
     """(n, 3) rotation vectors of rotations (n, 3, 3) by less than half a turn."""
     R = rotations
     twice_sine = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
@@ -215,17 +258,3 @@ def logs(rotations: FloatArray) -> FloatArray:
     factor = np.where(sine > 1e-12, angle / np.maximum(2 * sine, 1e-300), 0.5)
     vectors: FloatArray = twice_sine * factor[:, None]
     return vectors
-
-
-def exponentials(vectors: FloatArray) -> FloatArray:
-    """(n, 3, 3) rotations by rotation vectors (n, 3)."""
-    angle = np.linalg.norm(vectors, axis=1)
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    small = angle < 1e-8
-    safe = np.where(small, 1.0, angle)
-    sine = np.where(small, 1.0, np.sin(safe) / safe)
-    one_minus_cosine = np.where(small, 0.5, (1 - np.cos(safe)) / safe**2)
-    found: FloatArray = np.eye(3) + sine[:, None, None] * cross + one_minus_cosine[:, None, None] * (cross @ cross)
-    return found

@@ -177,8 +177,9 @@ class _Problem:
         return Normal(cost, gradient[free], hessian[np.ix_(free, free)])
 
     def move(self, state: _State, step: FloatArray) -> _State:
-        steps = np.insert(step.reshape(-1, 6), self.fixed, 0.0, axis=0)
-        transforms = [moved(one, own) for one, own in zip((*state.mounts, *state.boards), steps, strict=True)]
+        free = [one for index, one in enumerate((*state.mounts, *state.boards)) if index != self.fixed]
+        transforms = [moved(one, own) for one, own in zip(free, step.reshape(-1, 6), strict=True)]
+        transforms.insert(self.fixed, state.mounts[self.fixed])
         return _State(tuple(transforms[: len(state.mounts)]), tuple(transforms[len(state.mounts) :]))
 
     def residuals(self, state: _State) -> list[dict[str, FloatArray]]:

@@ -34,6 +34,7 @@ _FOCAL_SIGMA = 0.01
 """A focal length that the views leave more uncertain than this is not known."""
 _CENTRE_SIGMA = 0.01
 """The same for the principal point, in widths of the picture."""
+_LEAST_TILT_DEG = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +73,8 @@ class Lens:
 
     @property
     def tilts_deg(self) -> tuple[float, ...]:
-        """How far the board was turned away from the line of sight, in each view."""
-        return tuple(tilt_deg(view, pose) for view, pose in zip(self.views, self.poses, strict=True))
+        """How far the board's plane was turned away from the picture's, in each view."""
+        return tuple(tilt_deg(pose) for pose in self.poses)
 
     @property
     def reaches_corners(self) -> bool:
@@ -128,19 +129,16 @@ def calibrate(views: Sequence[View], size: tuple[int, int], model: Model) -> Len
     return lens
 
 
-def tilt_deg(view: View, pose: RigidTransform) -> float:
-    """How far the board is turned away from the line of sight to its middle, 0 to 90."""
-    middle = pose.apply(view.seen.points).mean(axis=0)
-    along = float(pose.rotation[:, 2] @ middle / np.linalg.norm(middle))
-    return math.degrees(math.acos(min(abs(along), 1.0)))
+def tilt_deg(pose: RigidTransform) -> float:
+    """How far the board's plane is turned away from the picture's, 0 to 90."""
+    return math.degrees(math.acos(min(abs(float(pose.rotation[2, 2])), 1.0)))
 
 
 def rough_tilts_deg(views: Sequence[View], size: tuple[int, int], model: Model) -> list[float]:
     """Tilts of the board before its camera is calibrated: good enough for advice."""
     if len(views) < 2:
         return [0.0] * len(views)
-    found = _begin(views, size, model)
-    return [tilt_deg(view, pose) for view, pose in zip(views, found.poses, strict=True)]
+    return [tilt_deg(pose) for pose in _begin(views, size, model).poses]
 
 
 def _check_known(lens: Lens) -> None:
@@ -148,11 +146,17 @@ def _check_known(lens: Lens) -> None:
     focal = float(max(lens.sigma[0] / fx, lens.sigma[1] / fy))
     centre = float(max(lens.sigma[2:4])) / lens.camera.size[0]
     tilted = max(lens.tilts_deg)
-    if not (focal < _FOCAL_SIGMA and centre < _CENTRE_SIGMA) or tilted < 10.0:
-        known = f"to {100 * focal:.1f} %" if focal < 1.0 else "not at all"
+    known = focal < _FOCAL_SIGMA and centre < _CENTRE_SIGMA
+    if tilted < _LEAST_TILT_DEG:
         raise CalibrationError(
-            f"the views tell the focal length {known}, as the board was tilted by {tilted:.0f} degrees at most; show "
-            "it tilted by 30 to 45 degrees to each side, up and down, and all over the picture"
+            f"the board was tilted by {tilted:.0f} degrees at most, so that the focal length cannot be told from the "
+            "distance; show it tilted by 30 to 45 degrees to each side, up and down, and all over the picture"
+        )
+    if not known:
+        raise CalibrationError(
+            f"the views leave the focal length uncertain by {100 * focal:.2g} % and the principal point by "
+            f"{100 * centre:.2g} % of the width, with a residual of {lens.rms_px:.2f} px; show the board tilted, and "
+            "all over the picture, or choose another model"
         )
 
 

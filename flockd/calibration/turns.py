@@ -22,7 +22,7 @@ _WINDOW_PX, _LEVELS = (21, 21), 4
 _THERE_AND_BACK_PX = 0.5
 _LEAST_POINTS = 40
 _ROUNDS, _STEPS = 6, 12
-_FEW_PX = 1.0
+_FEW_PX = 0.35
 """Where a turn alone leaves no more than this, by the median, the camera's own shift does not show."""
 _LONGEST_S = 1.5
 """Pictures farther apart are not compared."""
