@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import inspect
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ MAY_IMPORT = {
     "messages": set(),
     "errors": set(),
     "data": {"errors"},
+    "peer": {"errors"},
     "config": {"messages", "errors"},
     "geometry": BASE,
     "perception": BASE,
@@ -23,14 +25,15 @@ MAY_IMPORT = {
     "flocking": BASE,
     "safety": BASE,
     "pilot": BASE | {"geometry", "perception", "tracking", "flocking", "safety"},
-    "sources": BASE,
+    "sources": BASE | {"peer"},
     "autopilot": BASE,
-    "telemetry": BASE,
+    "telemetry": BASE | {"peer"},
     "recording": BASE | {"telemetry"},  # for the table of topics, which says what is recorded
     "calibration": BASE | {"geometry"},
     "datasets": BASE | {"geometry", "perception", "pilot"},
     "sim": BASE
-    | {"geometry", "perception", "tracking", "flocking", "safety", "pilot", "telemetry", "recording", "report"},
+    | {"geometry", "perception", "tracking", "flocking", "safety", "pilot", "telemetry", "recording", "report"}
+    | {"sources", "autopilot"},  # real daemons are fed frames and given autopilots
     "report": BASE | {"geometry", "flocking", "pilot", "recording", "sim"},
     "view": BASE | {"geometry", "pilot", "recording"},
     "daemon": BASE | {"perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"},
@@ -124,6 +127,8 @@ def test_what_flies_needs_none_of_the_simulators_libraries() -> None:
         assert not _libraries(path) & TOOL_LIBRARIES, path
 
 
+PEER = PACKAGE / "peer.py"
+"""Opens and closes sessions, whatever goes through them."""
 FRAMES_OVER_ZENOH = PACKAGE / "sources" / "shared_memory.py"
 """A drone's own camera frames may come over zenoh, under keys that no telemetry has."""
 WATCHER = PACKAGE / "telemetry" / "watcher.py"
@@ -156,13 +161,31 @@ def test_no_drone_reads_telemetry_to_fly() -> None:
         "declare_querier": set(),
     }
     for path in MODULES:
-        if _folder(path) != "telemetry" and path != FRAMES_OVER_ZENOH:
+        if _folder(path) != "telemetry" and path not in {FRAMES_OVER_ZENOH, PEER}:
             assert "zenoh" not in _libraries(path), path
         text = path.read_text(encoding="utf-8")
         for word, allowed in readers.items():
             assert word not in text or path in allowed, path
         if _folder(path) not in {"cli", "doctor"}:
             assert "flockd.telemetry.watcher" not in _imports(path), path
+
+
+def test_one_file_opens_and_closes_sessions() -> None:
+    for path in (path for path in MODULES if "zenoh" in _libraries(path) and path != PEER):
+        text = path.read_text(encoding="utf-8")
+        assert "zenoh.open" not in text, path
+        assert "zenoh.Config" not in text, path
+        assert "session.close" not in text, path
+
+
+def test_no_drone_is_told_the_truth() -> None:
+    """A simulator records where everybody truly is, for those who look at recordings; a pilot is given its own senses."""
+    from flockd.pilot import FlockPilot
+
+    for path in MODULES:
+        if _folder(path) not in {"sim", "recording", "report", "view"}:
+            assert "flockd.recording.truth" not in _imports(path), path
+    assert list(inspect.signature(FlockPilot.step).parameters) == ["self", "frames", "vehicle"]
 
 
 def test_the_doctor_sees_of_the_daemon_what_everybody_sees() -> None:

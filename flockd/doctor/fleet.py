@@ -11,7 +11,7 @@ from flockd.doctor.finding import Finding, failed, passed, warned
 from flockd.telemetry.watcher import FleetWatcher
 
 LISTEN_S = 3.0
-"""Others try again every 2 s to reach this drone."""
+"""Others try again every second to reach this drone."""
 
 
 def check_fleet(config: DroneConfig, listen_s: float = LISTEN_S) -> Iterator[Finding]:

@@ -8,7 +8,6 @@ time in seconds (float64). Where shared memory cannot be had, the same messages 
 from __future__ import annotations
 
 import functools
-import json
 import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -19,8 +18,8 @@ import zenoh
 from zenoh import shm
 
 from flockd.config.parameters import DroneConfig, SourceParameters
-from flockd.errors import UnavailableError
 from flockd.messages import Frame, FrameSet
+from flockd.peer import PeerError, close_peer, open_peer
 from flockd.sources.frames import CameraStatus, RawFrame
 from flockd.sources.images import RgbFormat
 from flockd.sources.intake import Intake
@@ -58,7 +57,7 @@ class FramePublisher:
 
     def close(self) -> None:
         """Ends the session."""
-        self._session.close()  # type: ignore[no-untyped-call]
+        close_peer(self._session)
 
     def __enter__(self) -> Self:
         return self
@@ -72,7 +71,7 @@ class FramePublisher:
         try:
             return shm.ShmProvider.default_backend(_POOL_BYTES)
         except zenoh.ZError as error:
-            self._note(_without_shared_memory(error))
+            self._note(_without_shared_memory(str(error).split(" at ")[0]))
             return None
 
     def _payload(self, data: bytes) -> bytes | shm.ZShmMut:
@@ -81,7 +80,7 @@ class FramePublisher:
         try:
             block = self._pool.alloc(len(data), shm.GarbageCollect())
         except zenoh.ZError as error:  # full: readers hold what they have not copied yet
-            self._note(_without_shared_memory(error))
+            self._note(_without_shared_memory(str(error).split(" at ")[0]))
             return data
         block[:] = data
         return block
@@ -140,7 +139,7 @@ class SharedMemorySource:
         """See ``FrameSource``."""
         self._intake.stop()
         if self._session is not None:
-            self._session.close()  # type: ignore[no-untyped-call]
+            close_peer(self._session)
 
     def _receive(self, camera: str, sample: zenoh.Sample) -> None:
         """On a thread of zenoh's."""
@@ -164,32 +163,13 @@ class SharedMemorySource:
 
 
 def _open(*, listen: Sequence[str], connect: Sequence[str]) -> tuple[zenoh.Session, str | None]:
-    """A peer that knows nobody but these endpoints, and a note if it has to do without shared memory."""
+    """A session, and a note if it has to do without shared memory."""
     try:
-        return zenoh.open(_peer_config(listen, connect, shared_memory=True)), None
-    except zenoh.ZError as error:
-        try:
-            session = zenoh.open(_peer_config(listen, connect, shared_memory=False))
-        except zenoh.ZError as still:
-            reason = str(still).split(" at ")[0].split(": [")[0]
-            endpoints = ", ".join([*listen, *connect])
-            raise UnavailableError(f"frames cannot use {endpoints} ({reason}); name another endpoint") from still
-        return session, _without_shared_memory(error)
+        return open_peer("frames", listen, connect, shared_memory=True), None
+    except PeerError as error:
+        session = open_peer("frames", listen, connect, shared_memory=False)
+        return session, _without_shared_memory(error.reason)
 
 
-def _peer_config(listen: Sequence[str], connect: Sequence[str], *, shared_memory: bool) -> zenoh.Config:
-    """A peer opens without a router, unlike a client; it tries for ever to reach who is not there yet."""
-    config = zenoh.Config()
-    config.insert_json5("mode", '"peer"')
-    config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5("scouting/gossip/enabled", "false")
-    config.insert_json5("listen/endpoints", json.dumps(list(listen)))
-    config.insert_json5("connect/endpoints", json.dumps(list(connect)))
-    config.insert_json5("connect/retry", json.dumps({"period_init_ms": 100, "period_max_ms": 1000}))
-    config.insert_json5("transport/shared_memory/enabled", json.dumps(shared_memory))
-    return config
-
-
-def _without_shared_memory(error: zenoh.ZError) -> str:
-    reason = str(error).split(" at ")[0]
+def _without_shared_memory(reason: str) -> str:
     return f"frames go through a socket instead of shared memory ({reason}): slower, and otherwise the same"

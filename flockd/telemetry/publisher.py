@@ -12,8 +12,10 @@ from typing import Self
 import numpy as np
 import zenoh
 
-from flockd.telemetry.peer import DEFAULT_ENDPOINT, checked_name, open_peer
-from flockd.telemetry.topics import PREFIX, TOPICS, AboutMessage, AnswerMessage
+from flockd.peer import close_peer, open_peer
+from flockd.telemetry.topics import PREFIX, TOPICS, AboutMessage, AnswerMessage, checked_name
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 Ask = Callable[[str], AnswerMessage]
 """Takes an operator's command by name, on a thread of zenoh's; returns at once."""
@@ -41,7 +43,7 @@ class ZenohTelemetry:
         self._publishers: dict[tuple[str, str], zenoh.Publisher] = {}
         self._kept: list[object] = []
         self._lost = 0
-        self._session = open_peer(listen, connect, settings)
+        self._session = open_peer("telemetry", listen, connect, settings=settings)
 
     @property
     def lost(self) -> int:
@@ -76,7 +78,7 @@ class ZenohTelemetry:
 
     def close(self) -> None:
         """Ends the session; later messages are lost, and counted."""
-        self._session.close()  # type: ignore[no-untyped-call]
+        close_peer(self._session)
 
     def __enter__(self) -> Self:
         return self

@@ -11,10 +11,19 @@ with a small JPEG of what that camera sees.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import TypedDict
 
 PREFIX = "flockd/v1"
+_NAME = re.compile(r"[A-Za-z0-9_.-]+")
+
+
+def checked_name(name: str) -> str:
+    """The name; raises ValueError for one that does not fit into a key."""
+    if not _NAME.fullmatch(name):
+        raise ValueError(f"{name!r} does not fit into a key; use letters, digits, '_', '.' and '-'")
+    return name
 
 
 class StateMessage(TypedDict):

@@ -13,8 +13,8 @@ from typing import Any, Self
 
 import zenoh
 
-from flockd.telemetry.peer import checked_name, open_peer
-from flockd.telemetry.topics import PREFIX, TOPICS
+from flockd.peer import close_peer, open_peer
+from flockd.telemetry.topics import PREFIX, TOPICS, checked_name
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class FleetWatcher:
         self._drones: dict[tuple[str, str], Watched] = {}
         self.malformed = 0
         """Messages that are none."""
-        self._session = open_peer(listen, connect, settings)
+        self._session = open_peer("telemetry", listen, connect, settings=settings)
         drones = f"{PREFIX}/{'*' if fleet is None else checked_name(fleet)}/*"
         self._subscribers = [
             self._session.declare_subscriber(f"{drones}/{topic}", self._take_message) for topic in TOPICS
@@ -79,7 +79,7 @@ class FleetWatcher:
 
     def close(self) -> None:
         """Ends the session."""
-        self._session.close()  # type: ignore[no-untyped-call]
+        close_peer(self._session)
 
     def __enter__(self) -> Self:
         return self

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import zenoh
 
+from flockd import peer
 from flockd.config.parameters import (
     CameraConfig,
     DroneConfig,
@@ -140,16 +141,16 @@ with FramePublisher(listen=[{endpoint!r}]) as publisher:
 def test_without_shared_memory_the_same_bytes_come_through_the_socket_with_a_note(
     endpoint: str, source: SharedMemorySource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole_config = shared_memory._peer_config
+    whole_config = peer._config
     refusals: list[bool] = []
 
-    def without(listen: object, connect: object, *, shared_memory: bool) -> zenoh.Config:
+    def without(listen: object, connect: object, settings: None, shared_memory: bool | None) -> zenoh.Config:
         if shared_memory:
             refusals.append(True)
             raise zenoh.ZError("Unable to create POSIX shm segment: OS error 30 at segment.rs:85.")
-        return whole_config([endpoint], [], shared_memory=False)
+        return whole_config([endpoint], [], None, False)
 
-    monkeypatch.setattr(shared_memory, "_peer_config", without)
+    monkeypatch.setattr(peer, "_config", without)
     with FramePublisher(listen=[endpoint]) as publisher:
         assert refusals == [True]
         assert publisher.notes() == (
