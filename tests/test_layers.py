@@ -39,7 +39,7 @@ MAY_IMPORT = {
     "daemon": BASE | {"perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"},
     "doctor": BASE | {"geometry", "perception", "pilot", "sources", "autopilot", "telemetry", "daemon"},
     "cli": BASE
-    | {"perception", "pilot", "telemetry", "recording", "datasets", "sim", "report", "daemon", "doctor"}
+    | {"perception", "pilot", "telemetry", "recording", "datasets", "sim", "report", "view", "daemon", "doctor"}
     | {"calibration", "sources"},
 }
 """What each folder may import of the others."""
@@ -179,7 +179,7 @@ def test_one_file_opens_and_closes_sessions() -> None:
 
 
 def test_no_drone_is_told_the_truth() -> None:
-    """A simulator records where everybody truly is, for those who look at recordings; a pilot is given its own senses."""
+    """A simulator records where everybody truly is, for those who look at recordings; a pilot gets its own senses."""
     from flockd.pilot import FlockPilot
 
     for path in MODULES:
