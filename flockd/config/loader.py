@@ -15,6 +15,12 @@ from flockd.config.parameters import DroneConfig
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import ConfigError
 
+ROLES = ("flow", "depth", "segmentation", "distance")
+PATHS = {("perception", key) for key in ("models_dir", *ROLES)} | {("telemetry", "zenoh_config")}
+"""Keys of a drone whose values are paths; of a model's role only where it ends in `.yaml`, else it is a name."""
+OVERRIDE = "override"
+"""Stands where else a file's name does."""
+
 Model = TypeVar("Model", bound=BaseModel)
 Overrides = Mapping[str, Value]
 
@@ -86,6 +92,22 @@ def _merge_drone(document: Document, folder: Path) -> None:
     document.spoiled.update((*key, *path) for path in drone.spoiled)
 
 
+def _anchor(document: Document) -> None:
+    """Makes relative paths absolute: they count from the folder of the file they stand in, wherever flockd is run.
+
+    Those of an override stay as they are, for its writer to know what they count from.
+    """
+    for path, place in document.places.items():
+        section: Value = document.values
+        for part in path[:-1]:
+            section = section.get(str(part)) if isinstance(section, dict) else None
+        if path[-2:] not in PATHS or place.file == OVERRIDE or not isinstance(section, dict):
+            continue
+        written, key = section.get(str(path[-1])), str(path[-1])
+        if isinstance(written, str) and (key not in ROLES or written.endswith(".yaml")):
+            section[key] = str((Path(place.file).parent / written).resolve())
+
+
 def _override(document: Document, overrides: Overrides) -> None:
     """Sets single values; a problem with one is told of the override, not of the file."""
     for key, value in overrides.items():
@@ -101,11 +123,12 @@ def _override(document: Document, overrides: Overrides) -> None:
             values = inner
         else:
             values[path[-1]] = value
-            document.places[path] = Place("override", 0, key, "")
+            document.places[path] = Place(OVERRIDE, 0, key, "")
             document.spoiled.discard(path)
 
 
 def _validated(model: type[Model], document: Document) -> Model:
+    _anchor(document)
     try:
         config = model.model_validate(document.values)
     except ValidationError as error:

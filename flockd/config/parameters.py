@@ -92,7 +92,10 @@ class RigConfig(Section):
 
 
 class PerceptionConfig(Section):
-    """Which model fills which role. A name is a manifest in `models/`, or a path to one."""
+    """Which model fills which role. A name is a manifest in `models_dir`, or a path to one that ends in `.yaml`.
+
+    A relative path counts from the folder of the configuration file.
+    """
 
     flow: str = "flow"
     """`dis` is OpenCV's DIS flow instead of a network."""
@@ -107,7 +110,7 @@ class PerceptionConfig(Section):
     distance: str = "distance"
     """Second stage: a drone's range from its picture alone. `none`: the depth map decides."""
     models_dir: str | None = None
-    """Folder of the manifests; by default the one that comes with flockd."""
+    """Folder of the manifests, from the configuration file's own; by default the one that comes with flockd."""
     threads: Annotated[int, Field(ge=1, le=64)] = 2
     provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = "cpu"
     """What ONNX Runtime computes with. Another one than this is never used in its place."""
@@ -430,7 +433,8 @@ class TelemetryParameters(Section):
     connect: tuple[str, ...] = ()
     """zenoh endpoints, of a router or of `flockd status --listen`, that this drone tries to reach for ever."""
     zenoh_config: str | None = None
-    """A file of zenoh's own settings to begin with, for TLS and access control; see `config/zenoh_tls.json5`."""
+    """A file of zenoh's own settings to begin with, for TLS and access control; see `config/zenoh_tls.json5`. A
+    relative path counts from the folder of the configuration file."""
     commands: tuple[OperatorCommand, ...] = ()
     """What operators may ask over telemetry; by default nothing."""
 

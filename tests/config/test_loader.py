@@ -9,7 +9,8 @@ import pytest
 
 from flockd.config import Overrides, load_drone, load_scenario, schema_of
 from flockd.config.document import core_scalar
-from flockd.errors import ConfigError, ConfigProblem
+from flockd.errors import ConfigError, ConfigProblem, ModelError
+from flockd.pilot.pilot import load_perception
 
 CONFIG = Path(__file__).parents[2] / "config"
 
@@ -254,6 +255,42 @@ def test_overrides_win_over_both_files() -> None:
     assert scenario.drone.perception.flow == "dis"
     assert scenario.drone.perception.depth == "neighbours", "the rest of the section stays"
     assert scenario.drone.flocking.weight.kind == "nearest"
+
+
+def test_a_relative_path_counts_from_the_folder_of_the_file_it_stands_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drones, elsewhere = tmp_path / "drones", tmp_path / "elsewhere"
+    drones.mkdir()
+    elsewhere.mkdir()
+    perception = "perception: {models_dir: ../models, flow: mine/flow.yaml, depth: /opt/depth.yaml, distance: none}\n"
+    (drones / "drone.yaml").write_text(f"{DRONE}{perception}telemetry: {{zenoh_config: tls.json5}}\n", encoding="utf-8")
+    (tmp_path / "scenario.yaml").write_text(SCENARIO.replace("drone.yaml", "drones/drone.yaml"), encoding="utf-8")
+    monkeypatch.chdir(elsewhere)
+    alone, flown = load_drone("../drones/drone.yaml"), load_scenario("../scenario.yaml").drone
+    for drone in (alone, flown):
+        assert drone.perception.models_dir == str(tmp_path / "models")
+        assert drone.perception.flow == str(drones / "mine" / "flow.yaml")
+        assert drone.telemetry.zenoh_config == str(drones / "tls.json5")
+        assert (drone.perception.depth, drone.perception.distance) == ("/opt/depth.yaml", "none")
+        assert drone.perception.segmentation == "neighbours", "a name is not a path"
+    overridden = load_drone("../drones/drone.yaml", {"perception.models_dir": "here"})
+    assert overridden.perception.models_dir == "here", "who overrides it stands elsewhere"
+
+
+def test_models_that_are_not_there_are_told_with_where_they_were_looked_for(tmp_path: Path) -> None:
+    (tmp_path / "models").mkdir()
+    (tmp_path / "drone.yaml").write_text(_with("perception: {models_dir: modles}"), encoding="utf-8")
+    with pytest.raises(ModelError, match=rf"^perception\.models_dir: {tmp_path}/modles is no folder; name the one "):
+        load_perception(load_drone(tmp_path / "drone.yaml"))
+    (tmp_path / "drone.yaml").write_text(_with("perception: {models_dir: models}"), encoding="utf-8")
+    with pytest.raises(
+        ModelError, match=rf"^perception\.flow: there is no model 'flow' \({tmp_path}/models/flow\.yaml "
+    ):
+        load_perception(load_drone(tmp_path / "drone.yaml"))
+    (tmp_path / "drone.yaml").write_text(_with("perception: {flow: my/flow.yaml}"), encoding="utf-8")
+    with pytest.raises(ModelError, match=rf"\({tmp_path}/my/flow\.yaml is missing\)"):
+        load_perception(load_drone(tmp_path / "drone.yaml"))
 
 
 def test_a_wrong_override_is_told_as_such() -> None:
