@@ -16,7 +16,7 @@ from flockd.config.scenario import ScenarioConfig
 from flockd.errors import ConfigError
 
 ROLES = ("flow", "depth", "segmentation", "distance")
-PATHS = {("perception", key) for key in ("models_dir", *ROLES)} | {("telemetry", "zenoh_config")}
+PATHS = {("perception", key) for key in ("models_dir", "engines_dir", *ROLES)} | {("telemetry", "zenoh_config")}
 """Keys of a drone whose values are paths; of a model's role only where it ends in `.yaml`, else it is a name."""
 OVERRIDE = "override"
 """Stands where else a file's name does."""

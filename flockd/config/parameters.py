@@ -94,7 +94,7 @@ class RigConfig(Section):
 class PerceptionConfig(Section):
     """Which model fills which role. A name is a manifest in `models_dir`, or a path to one that ends in `.yaml`.
 
-    A relative path counts from the folder of the configuration file.
+    Relative paths count from the folder of the configuration file.
     """
 
     flow: str = "flow"
@@ -110,7 +110,7 @@ class PerceptionConfig(Section):
     distance: str = "distance"
     """Second stage: a drone's range from its picture alone. `none`: the depth map decides."""
     models_dir: str | None = None
-    """Folder of the manifests, from the configuration file's own; by default the one that comes with flockd."""
+    """Folder of the manifests; by default the one that comes with flockd."""
     threads: Annotated[int, Field(ge=1, le=64)] = 2
     provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = "cpu"
     """What ONNX Runtime computes with. Another one than this is never used in its place."""

@@ -15,6 +15,7 @@ from flockd.doctor.finding import Finding, Level, failed, failed_as_told, passed
 from flockd.errors import ModelError
 from flockd.messages import Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
 from flockd.perception import OnnxModel, manifests_of
+from flockd.perception.providers import engines_folder
 from flockd.pilot import FlockPilot, Perceiver
 
 STEPS = 4
@@ -38,10 +39,11 @@ def check_models(config: DroneConfig) -> Iterator[Finding]:
 
 
 def _each(config: DroneConfig) -> Iterator[Finding]:
-    for path in manifests_of(config.perception):
+    wanted = config.perception
+    for path in manifests_of(wanted):
         about = f"model {path.stem}"
         try:
-            model = OnnxModel(path, threads=config.perception.threads)
+            model = OnnxModel(path, threads=wanted.threads, provider=wanted.provider, engines=engines_folder(wanted))
         except ModelError as error:
             yield failed_as_told(about, str(error))
             continue

@@ -263,13 +263,14 @@ def test_a_relative_path_counts_from_the_folder_of_the_file_it_stands_in(
     drones, elsewhere = tmp_path / "drones", tmp_path / "elsewhere"
     drones.mkdir()
     elsewhere.mkdir()
-    perception = "perception: {models_dir: ../models, flow: mine/flow.yaml, depth: /opt/depth.yaml, distance: none}\n"
+    perception = "perception: {models_dir: ../models, engines_dir: e, flow: mine/flow.yaml, depth: /opt/depth.yaml, distance: none}\n"
     (drones / "drone.yaml").write_text(f"{DRONE}{perception}telemetry: {{zenoh_config: tls.json5}}\n", encoding="utf-8")
     (tmp_path / "scenario.yaml").write_text(SCENARIO.replace("drone.yaml", "drones/drone.yaml"), encoding="utf-8")
     monkeypatch.chdir(elsewhere)
     alone, flown = load_drone("../drones/drone.yaml"), load_scenario("../scenario.yaml").drone
     for drone in (alone, flown):
         assert drone.perception.models_dir == str(tmp_path / "models")
+        assert drone.perception.engines_dir == str(drones / "e")
         assert drone.perception.flow == str(drones / "mine" / "flow.yaml")
         assert drone.telemetry.zenoh_config == str(drones / "tls.json5")
         assert (drone.perception.depth, drone.perception.distance) == ("/opt/depth.yaml", "none")
