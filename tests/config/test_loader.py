@@ -263,7 +263,8 @@ def test_a_relative_path_counts_from_the_folder_of_the_file_it_stands_in(
     drones, elsewhere = tmp_path / "drones", tmp_path / "elsewhere"
     drones.mkdir()
     elsewhere.mkdir()
-    perception = "perception: {models_dir: ../models, engines_dir: e, flow: mine/flow.yaml, depth: /opt/depth.yaml, distance: none}\n"
+    folders = "models_dir: ../models, engines_dir: e"
+    perception = f"perception: {{{folders}, flow: mine/flow.yaml, depth: /opt/depth.yaml, distance: none}}\n"
     (drones / "drone.yaml").write_text(f"{DRONE}{perception}telemetry: {{zenoh_config: tls.json5}}\n", encoding="utf-8")
     (tmp_path / "scenario.yaml").write_text(SCENARIO.replace("drone.yaml", "drones/drone.yaml"), encoding="utf-8")
     monkeypatch.chdir(elsewhere)
