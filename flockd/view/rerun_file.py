@@ -52,6 +52,8 @@ class RerunFile:
         self._recording = rr.RecordingStream("flockd", recording_id=f"flockd-{drone}")
         self._recording.save(path, default_blueprint=_blueprint(rig))
         self._recording.send_recording_name(drone)
+        self._recording.set_log_time_enabled(False)  # when the file was written is of no interest
+        self._recording.set_log_tick_enabled(False)
         self._log("world", rr.ViewCoordinates.FRD, static=True)  # as north, east and down lie to each other
         for camera in rig.cameras.values():
             self._mount(camera)
@@ -182,13 +184,13 @@ class RerunFile:
 
 def open_viewer(path: Path) -> int:
     """Shows a file in Rerun's viewer until that is closed; gives its exit code."""
-    environment = {name: value for name, value in os.environ.items() if name != _FORCES_STATISTICS}
-    return subprocess.run(viewer_command(path), env=environment | _ENVIRONMENT, check=False).returncode
+    command = [sys.executable, "-m", "rerun_cli", str(path), "--bind", "127.0.0.1", "--port", "auto"]
+    return subprocess.run(command, env=viewer_environment(), check=False).returncode
 
 
-def viewer_command(path: Path) -> list[str]:
-    """What starts the viewer, in a process of its own."""
-    return [sys.executable, "-m", "rerun_cli", str(path), "--bind", "127.0.0.1", "--port", "auto"]
+def viewer_environment() -> dict[str, str]:
+    """In which Rerun's programs keep to themselves."""
+    return {name: value for name, value in os.environ.items() if name != _FORCES_STATISTICS} | _ENVIRONMENT
 
 
 def _blueprint(rig: Rig) -> Any:
