@@ -75,6 +75,7 @@ def tell(directory: Path, summary: Mapping[str, Any], *, as_json: bool) -> int:
 def _key_figures(summary: Mapping[str, Any]) -> dict[str, str]:
     flock, neighbours, own = summary["flock"], summary["neighbours"], summary["own_account"]
     figures = {
+        "autopilot": summary["autopilot"] or "",
         "drones": f"{summary['drones']}",
         "flown": f"{summary['duration_s']:g} s",
         "speed": _number(summary["realtime_factor"], "x real time", 2),

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flockd.cli import fleet
 from flockd.cli.flights import prepare, save, tell, write_findings
 from flockd.cli.output import complain, progress
 from flockd.cli.parser import Commands, positive_count, positive_number, seed
@@ -37,6 +38,8 @@ def add(commands: Commands) -> None:
         "flockd sim --perception truth --json > truth.json",
         "flockd sim my_flight.yaml --flow dis --seed 7",
         "flockd sim --record --duration 20",
+        "flockd sim --autopilot standin --drones 2 --duration 20",
+        "FLOCKD_PX4=~/PX4-Autopilot/build/px4_sitl_default flockd sim --autopilot px4 --speed-factor 0.4",
     )
     parser = commands("sim", "Fly a simulated flock by sight, and report how it went.", examples)
     parser.add_argument("scenario", nargs="?", metavar="SCENARIO", type=Path, help="by default the paper's flight")
@@ -45,6 +48,18 @@ def add(commands: Commands) -> None:
         choices=("learned", "truth"),
         default="learned",
         help="fly by sight, or on everybody's exact state without looking (default: learned)",
+    )
+    parser.add_argument(
+        "--autopilot",
+        choices=("standin", "px4"),
+        help="fly with a real `flockd run` a drone, and this autopilot (default: with the simulator's own pilots); "
+        "`px4` needs FLOCKD_PX4, the SITL build folder of PX4",
+    )
+    parser.add_argument(
+        "--speed-factor",
+        metavar="F",
+        type=positive_number,
+        help=f"with --autopilot: how fast simulated time passes (default: {fleet.DEFAULT_SPEED_FACTOR})",
     )
     parser.add_argument("--flow", metavar="NAME", help="the model for optical flow, or `dis`")
     parser.add_argument(
@@ -60,7 +75,9 @@ def add(commands: Commands) -> None:
         default=frozenset(),
         help=f"answer these roles exactly instead of by network: {', '.join(ROLES)}",
     )
-    parser.add_argument("--out", metavar="DIR", type=Path, help="default: out/SCENARIO-PERCEPTION-seedN")
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, help="default: out/SCENARIO-PERCEPTION-seedN, or -AUTOPILOT-"
+    )
     parser.add_argument("--telemetry", action="store_true", help="publish over zenoh while flying")
     parser.add_argument("--record", action="store_true", help="write a recording of each drone to DIR/recordings")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -80,6 +97,8 @@ def _run(args: argparse.Namespace) -> int:
     scenario = _scenario(args)
     directory = args.out or Path("out") / _folder_name(scenario, args)
     prepare(directory)
+    if args.autopilot is not None:
+        return fleet.fly(args, scenario, directory)
     from flockd.sim.swarm import fly
 
     with ExitStack() as stack:
@@ -129,6 +148,7 @@ def _recorders(
 
 
 def _check_options(args: argparse.Namespace) -> None:
+    fleet.check_options(args)
     if args.perception == "truth":
         idle = [option for option in ("flow", "scale", "swap", "telemetry", "record") if getattr(args, option)]
         if idle:
@@ -152,7 +172,8 @@ def _scenario(args: argparse.Namespace) -> ScenarioConfig:
 
 def _folder_name(scenario: ScenarioConfig, args: argparse.Namespace) -> str:
     swapped = "".join(f"-true-{role}" for role in sorted(args.swap))
-    return f"{_plain(scenario.scenario)}-{args.perception}{swapped}-seed{scenario.seed}"
+    flown = args.autopilot or f"{args.perception}{swapped}"
+    return f"{_plain(scenario.scenario)}-{flown}-seed{scenario.seed}"
 
 
 def _plain(name: str) -> str:

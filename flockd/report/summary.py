@@ -35,7 +35,8 @@ def summarise(log: FlightLog) -> Json:
     interaction distance. `neighbours`: the share of all drones within 10 m, at all steps, of which there was a
     confirmed track, and new false tracks; of drones and steps that were recorded. A flight whose perception is "truth"
     saw nothing: its `neighbours` are null and it is itself Table 3's "truth". Of a recording without truth
-    (`has_truth`) all of these are null. `own_account` is what the recorded drones themselves knew.
+    (`has_truth`) all of these are null. `own_account` is what the recorded drones themselves knew. `autopilot` names
+    what real daemons flew, and `fleet` tells how they did; both are null where the simulator flew the pilots itself.
     """
     meta = log.meta
     return {
@@ -43,6 +44,8 @@ def summarise(log: FlightLog) -> Json:
         **{key: meta[key] for key in ("seed", "wall_s", "circle_until_s")},
         "recorded": meta.get("recorded"),
         "began": meta.get("began"),
+        "autopilot": meta.get("autopilot"),
+        "fleet": meta.get("fleet"),
         "has_truth": log.has_truth,
         "realtime_factor": meta["duration_s"] / meta["wall_s"] if meta["wall_s"] else None,
         "table2": _table_2(log),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import cv2
 import numpy as np
 
@@ -13,8 +15,19 @@ from flockd.messages import FloatArray, Frame, FrameSet, UInt8Array
 from flockd.sim.drone_models import FAMILIES, drone_model
 from flockd.sim.renderer import Renderer
 from flockd.sim.truth_perception import Shot
-from flockd.sim.vehicles import Vehicles
 from flockd.sim.world import World
+
+
+class Flock(Protocol):
+    """Where all drones are."""
+
+    @property
+    def position(self) -> FloatArray:
+        """(n, 3) metres NED."""
+
+    @property
+    def R_ned_body(self) -> FloatArray:  # noqa: N802 - the field's own notation
+        """(n, 3, 3)"""
 
 
 class Photographer:
@@ -45,7 +58,7 @@ class Photographer:
         self._renderer = Renderer(world, models)
         self._noise = _ImageNoise(scenario.sensors.image_noise, scenario.seed)
 
-    def photograph(self, drone: int, step: int, time_s: float, vehicles: Vehicles) -> tuple[FrameSet, Shot]:
+    def photograph(self, drone: int, step: int, time_s: float, vehicles: Flock) -> tuple[FrameSet, Shot]:
         """The frame set of one drone, and the truth behind it."""
         others = [i for i in range(self._count) if i != drone]
         R_ned_body, position = vehicles.R_ned_body[drone], vehicles.position[drone]

@@ -1,0 +1,196 @@
+"""Autopilots for the daemons of a simulated fleet: PX4 in software, or stand-ins."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, Self
+
+import numpy as np
+
+from flockd.autopilot.stand_in import AutopilotStandIn, Demand, MotionState
+from flockd.config.scenario import ScenarioConfig, StartConfig, VehicleConfig
+from flockd.errors import UnavailableError, UsageError
+from flockd.sim.ground_station import home_deg
+from flockd.sim.processes import Program, Programs
+from flockd.sim.vehicles import Vehicles
+
+PX4_FOLDER = "FLOCKD_PX4"
+"""The environment variable that names PX4's SITL build folder."""
+OFFBOARD_PORT, TRUTH_PORT = 14540, 19410
+"""Of PX4's instance 0."""
+MAX_INSTANCES = 10
+"""PX4 sends all further ones to one port."""
+AGILE_DRAG = 0.1
+"""PX4's own default of 1.0 makes a quadrotor that takes eight seconds to reach 3 m/s."""
+MAX_CLIMB_M_S = 1.5
+CLIMB_TIME_S = 1.0
+"""From a height error to the climb that is asked for; that one is answered in a quarter of it: no overshoot."""
+
+
+@dataclass(frozen=True)
+class Ports:
+    """UDP ports of one vehicle on this computer."""
+
+    offboard: int
+    """Where its daemon listens."""
+    truth: int
+    """Where the simulator does."""
+
+
+class Autopilots(Protocol):
+    """One autopilot a vehicle, on the ground below its start until somebody brings it up."""
+
+    name: str
+    """For the report."""
+    ports: tuple[Ports, ...]
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    def start(self) -> None:
+        """Starts all."""
+
+    def programs(self) -> Sequence[Program]:
+        """Those that are programs of their own."""
+
+
+class StandIns:
+    """Autopilot stand-ins that fly the simulator's own vehicles."""
+
+    name = "stand-in"
+
+    def __init__(self, scenario: ScenarioConfig, speed_factor: float) -> None:
+        self._scenario, self._speed_factor = scenario, speed_factor
+        self.ports = tuple(Ports(_free_port(), _free_port()) for _ in scenario.vehicles)
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    def start(self) -> None:
+        """See `Autopilots`."""
+        for i, (vehicle, ports) in enumerate(zip(self._scenario.vehicles, self.ports, strict=True)):
+            position = np.array(vehicle.position_m)
+            stand_in = AutopilotStandIn(
+                ports.offboard,
+                system_id=i + 1,
+                motion=_Flown(self._scenario.vehicle, self._scenario.seed + i),
+                home_deg=home_deg(position),
+                truth_port=ports.truth,
+                speed_factor=self._speed_factor,
+            )
+            stand_in.parameters["MIS_TAKEOFF_ALT"] = -float(position[2])
+            self._stack.enter_context(stand_in)
+
+    def programs(self) -> Sequence[Program]:
+        """See `Autopilots`."""
+        return ()
+
+
+class Px4s:
+    """Instances of PX4 SITL that fly its own simulated quadrotor (SIH)."""
+
+    name = "PX4 SITL"
+
+    def __init__(
+        self, scenario: ScenarioConfig, speed_factor: float, environment: Mapping[str, str], folder: Path
+    ) -> None:
+        """Each works in a folder under ``folder``. Raises UnavailableError where there is no PX4."""
+        if len(scenario.vehicles) > MAX_INSTANCES:
+            raise UsageError(f"PX4 gives ports to {MAX_INSTANCES} vehicles, not {len(scenario.vehicles)}; fly fewer")
+        self._build = px4_folder(environment)
+        self._scenario, self._speed_factor, self._folder = scenario, speed_factor, folder
+        self._environment = dict(environment)
+        self.ports = tuple(Ports(OFFBOARD_PORT + i, TRUTH_PORT + i) for i in range(len(scenario.vehicles)))
+        self._programs = Programs()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._programs.__exit__(kind, error, trace)
+
+    def start(self) -> None:
+        """See `Autopilots`."""
+        for i, vehicle in enumerate(self._scenario.vehicles):
+            position = np.array(vehicle.position_m)
+            latitude_deg, longitude_deg = home_deg(position)
+            working = self._folder / f"px4_{i}"
+            working.mkdir(parents=True)
+            settings = {
+                "PX4_SIM_MODEL": "sihsim_quadx",
+                "PX4_SIM_SPEED_FACTOR": f"{self._speed_factor:g}",
+                "PX4_HOME_LAT": f"{latitude_deg:.9f}",
+                "PX4_HOME_LON": f"{longitude_deg:.9f}",
+                "PX4_HOME_ALT": "0",
+                "PX4_PARAM_MIS_TAKEOFF_ALT": f"{-position[2]:g}",
+                "PX4_PARAM_SIH_KDV": f"{AGILE_DRAG:g}",
+                "PX4_PARAM_SDLOG_MODE": "-1",
+                # PX4 shortens this one by the speed factor, as if it counted in real seconds.
+                "PX4_PARAM_COM_OF_LOSS_T": "1.0",
+                "PX4_PARAM_COM_OBL_RC_ACT": "5",
+            }
+            command = [str(self._build / "bin/px4"), "-i", f"{i}", "-d", str(self._build / "etc"), "-w", str(working)]
+            log = self._folder / f"px4_{i}.log"
+            self._programs.start(f"PX4 instance {i}", command, {**self._environment, **settings}, working, log)
+
+    def programs(self) -> Sequence[Program]:
+        """See `Autopilots`."""
+        return tuple(self._programs)
+
+
+def px4_folder(environment: Mapping[str, str]) -> Path:
+    """PX4's SITL build folder. Raises UnavailableError where none is named or it holds no PX4."""
+    named = environment.get(PX4_FOLDER)
+    wanted = "set it to PX4's SITL build folder, which holds bin/px4 and etc/"
+    if not named:
+        raise UnavailableError(f"there is no PX4: {PX4_FOLDER} is not set; {wanted}")
+    folder = Path(named).absolute()
+    if not os.access(folder / "bin/px4", os.X_OK) or not (folder / "etc").is_dir():
+        raise UnavailableError(f"there is no PX4 in {folder}, which {PX4_FOLDER} names; {wanted}")
+    return folder
+
+
+class _Flown:
+    """One of the simulator's vehicles, from its home on the ground; climbs as a critically damped one."""
+
+    def __init__(self, config: VehicleConfig, seed: int) -> None:
+        self._vehicles = Vehicles([StartConfig(position_m=(0.0, 0.0, 0.0))], config, seed=seed)
+        self._down_m, self._sink_m_s = 0.0, 0.0
+
+    def __call__(self, demand: Demand, interval_s: float) -> MotionState:
+        """Flies on."""
+        if interval_s > 0.0:
+            self._vehicles.step(demand.velocity[None], np.array([demand.yaw_rad]), interval_s)
+            wanted = min(max((demand.down_m - self._down_m) / CLIMB_TIME_S, -MAX_CLIMB_M_S), MAX_CLIMB_M_S)
+            self._sink_m_s += (wanted - self._sink_m_s) * min(1.0, 4.0 * interval_s / CLIMB_TIME_S)
+            self._down_m += self._sink_m_s * interval_s
+        if self._down_m >= 0.0:
+            self._down_m, self._sink_m_s = 0.0, min(0.0, self._sink_m_s)
+        return MotionState(
+            np.array([*self._vehicles.position[0, :2], self._down_m]),
+            np.array([*self._vehicles.velocity[0, :2], self._sink_m_s]),
+            self._vehicles.R_ned_body[0],
+        )
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

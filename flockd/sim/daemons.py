@@ -1,0 +1,152 @@
+"""The daemons of a simulated fleet: real `flockd run` processes, each with a configuration of its own."""
+
+from __future__ import annotations
+
+import socket
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import yaml
+
+import flockd
+from flockd.config import DroneConfig
+from flockd.config.parameters import RecordingConfig
+from flockd.config.scenario import ScenarioConfig
+from flockd.errors import ConfigError, ConfigProblem
+from flockd.sim.autopilots import Ports
+from flockd.sim.processes import Program, Programs
+
+READY, STATUS = "READY=1", "STATUS="
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+RECORDING = RecordingConfig(images="jpeg", jpeg_quality=80, file_mb=20000.0)
+"""One file for a flight, which costs the daemon little."""
+_RUN = "import sys; from flockd.cli import main; sys.exit(main())"
+
+
+def fleet_configs(
+    scenario: ScenarioConfig, sitl: DroneConfig, *, ports: Sequence[Ports], endpoint: str, fleet: str,
+    speed_factor: float,
+) -> tuple[DroneConfig, ...]:  # fmt: skip
+    """What each drone of a scenario flies with.
+
+    The pilot is the scenario's; source, autopilot, safety and telemetry are those of ``sitl``. Raises ConfigError
+    where ``sitl`` lacks one of them.
+    """
+    if sitl.source is None or sitl.source.kind != "shared_memory":
+        raise ConfigError([ConfigProblem("fleet", 0, "source", "has to be of kind `shared_memory`; write it so")])
+    if sitl.autopilot is None:
+        raise ConfigError([ConfigProblem("fleet", 0, "autopilot", "is missing; add it")])
+    configs = []
+    for i, port in enumerate(ports):
+        name = f"drone{i + 1}"
+        frames = {"drone": name, "connect": (endpoint,), "speed_factor": speed_factor}
+        shared_memory = sitl.source.shared_memory.model_copy(update=frames)
+        address = {"address": f"udpin://127.0.0.1:{port.offboard}", "system_id": i + 1}
+        parts = {
+            "name": name,
+            "source": sitl.source.model_copy(update={"shared_memory": shared_memory}),
+            "autopilot": sitl.autopilot.model_copy(update=address),
+            "safety": sitl.safety,
+            "telemetry": sitl.telemetry.model_copy(update={"fleet": fleet}),
+            "recording": RECORDING,
+        }
+        configs.append(scenario.drone.model_copy(update=parts))
+    return tuple(configs)
+
+
+class Daemons:
+    """One `flockd run` for each configuration, between ``__enter__`` and ``__exit__``; listens as systemd would."""
+
+    def __init__(
+        self, configs: Sequence[DroneConfig], *, folder: Path, recordings: Path, environment: Mapping[str, str]
+    ) -> None:
+        """Configurations and logs go to ``folder``, recordings to ``recordings``; sockets and locks to ``folder`` too.
+
+        Args:
+            configs: of the drones.
+            folder: an existing one, whose path is short enough for a socket.
+            recordings: an existing one.
+            environment: this process's own.
+        """
+        self._configs, self._folder, self._recordings = configs, folder, recordings
+        package = str(Path(flockd.__file__).parents[1])
+        known = environment.get("PYTHONPATH")
+        self._environment = {
+            **environment,
+            **ONE_THREAD,
+            "PYTHONPATH": f"{package}:{known}" if known else package,
+            "XDG_RUNTIME_DIR": str(folder),
+        }
+        self._programs = Programs()
+        self._listeners = [_Listener(folder / config.name) for config in configs]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._programs.__exit__(kind, error, trace)
+        for listener in self._listeners:
+            listener.close()
+
+    def start(self) -> None:
+        """Starts all."""
+        for config, listener in zip(self._configs, self._listeners, strict=True):
+            file = self._folder / f"{config.name}.yaml"
+            values = config.model_dump(mode="json", exclude_defaults=True)
+            file.write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
+            options = ["--config", str(file), "--record", str(self._recordings)]
+            self._programs.start(
+                config.name,
+                [sys.executable, "-c", _RUN, "run", *options],
+                {**self._environment, "NOTIFY_SOCKET": str(listener.path)},
+                self._folder,
+                self._folder / f"{config.name}.log",
+            )
+
+    def programs(self) -> tuple[Program, ...]:
+        """In the order of the configurations."""
+        return tuple(self._programs)
+
+    def status(self, number: int) -> str:
+        """What one said of itself last; empty before it has started."""
+        return self._listeners[number].listen().status
+
+    def is_ready(self, number: int) -> bool:
+        """Its networks are loaded, its autopilot is heard and it sees."""
+        return self._listeners[number].listen().ready
+
+    def end(self) -> dict[str, int]:
+        """Ends all as SIGTERM does: standstill, Hold, the end of the recording. Exit codes by name."""
+        self._programs.end()
+        return {program.name: program.process.returncode for program in self._programs}
+
+
+class _Listener:
+    """What a service manager hears of one daemon."""
+
+    def __init__(self, base: Path) -> None:
+        self.path = base.with_suffix(".notify")
+        self.ready, self.status = False, ""
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(str(self.path))
+        self._socket.setblocking(False)
+
+    def listen(self) -> Self:
+        """Takes in all that has come."""
+        while True:
+            try:
+                lines = self._socket.recv(4096).decode(errors="replace").splitlines()
+            except BlockingIOError:
+                return self
+            self.ready = self.ready or READY in lines
+            for line in lines:
+                if line.startswith(STATUS):
+                    self.status = line.removeprefix(STATUS)
+
+    def close(self) -> None:
+        self._socket.close()

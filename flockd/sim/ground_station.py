@@ -1,0 +1,280 @@
+"""What stands on the ground beside a fleet of simulated autopilots: a pilot's ground station, and the truth.
+
+Both come over the link on which PX4 in software tells a simulator its true pose; the stand-in tells it the same way.
+"""
+
+from __future__ import annotations
+
+import math
+import select
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import numpy as np
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import development as mavlink
+
+from flockd.autopilot.earth import metres_a_degree
+from flockd.errors import UnavailableError
+from flockd.messages import FloatArray
+from flockd.sim.vehicles import euler_rotation
+
+Mode = Literal["LOITER", "TAKEOFF", "LAND", "OFFBOARD"]
+"""By pymavlink's names; LOITER is Hold."""
+
+SYSTEM_ID = 255
+HEARTBEAT_S = 1.0
+LOOK_S = 0.05
+MODE_HZ = 20.0
+MAX_FORWARD_S = 0.2
+"""A pose older than this is not carried on."""
+REFERENCE_DEG = (1.0, 1.0)
+"""The origin of the world. PX4 keeps its home as float32, whose steps are a centimetre here, and 0.4 m in Europe."""
+_HEARD = {
+    name: int(getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
+    for name in (
+        "HEARTBEAT",
+        "HIL_STATE_QUATERNION",
+        "CURRENT_MODE",
+        "SYSTEM_TIME",
+        "STATUSTEXT",
+        "AUTOPILOT_VERSION",
+    )
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Where a flock of n drones is, NED metres from the world's origin."""
+
+    position: FloatArray
+    """(n, 3)"""
+    velocity: FloatArray
+    """(n, 3) m/s."""
+    R_ned_body: FloatArray
+    """(n, 3, 3)"""
+
+
+@dataclass(frozen=True, eq=False)
+class _Pose:
+    time_s: float
+    position: FloatArray
+    velocity: FloatArray
+    R_ned_body: FloatArray
+    turn_rad_s: FloatArray
+
+
+@dataclass
+class _Vehicle:
+    """One autopilot, as heard last."""
+
+    number: int
+    socket: socket.socket
+    mav: Any = None
+    address: tuple[str, int] | None = None
+    pose: _Pose | None = None
+    mode: int | None = None
+    armed: bool = False
+    booted_s: tuple[float, float] | None = None
+    """On its clock, and then on ours."""
+    version: str | None = None
+    text: str = ""
+
+    def write(self, data: bytes) -> None:
+        if self.address is not None:
+            self.socket.sendto(data, self.address)
+
+
+class GroundStation:
+    """Hears the truth of all vehicles on ``ports`` and commands them, between ``__enter__`` and ``__exit__``.
+
+    Times are on ``clock``. Vehicles are counted from 0, and vehicle i has the MAV_SYS_ID i + 1.
+    """
+
+    def __init__(self, ports: Sequence[int], clock: Callable[[], float]) -> None:
+        """Raises UnavailableError for a port that is taken."""
+        self._clock = clock
+        self._vehicles = [_Vehicle(number, _bound(port)) for number, port in enumerate(ports)]
+        for vehicle in self._vehicles:
+            vehicle.mav = mavlink.MAVLink(vehicle, srcSystem=SYSTEM_ID, srcComponent=mavlink.MAV_COMP_ID_MISSIONPLANNER)
+            vehicle.mav.robust_parsing = True
+        self._closing = threading.Event()
+        self._lock = threading.Lock()
+        self._thread = threading.Thread(target=self._run, name="ground station", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._closing.set()
+        self._thread.join()
+        for vehicle in self._vehicles:
+            vehicle.socket.close()
+
+    def heard(self, number: int) -> bool:
+        """It has said where it is, and in which mode."""
+        vehicle = self._vehicles[number]
+        return vehicle.pose is not None and vehicle.mode is not None
+
+    def ask_for_news(self) -> None:
+        """Lets all tell their mode as it changes, their time, and their version."""
+        for vehicle in self._vehicles:
+            self._command(vehicle, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, _HEARD["CURRENT_MODE"], 1e6 / MODE_HZ)
+            self._command(vehicle, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, _HEARD["SYSTEM_TIME"], 1e6)
+            self._command(vehicle, mavlink.MAV_CMD_REQUEST_MESSAGE, _HEARD["AUTOPILOT_VERSION"])
+
+    def poses(self) -> Poses:
+        """Of all as of now, carried on from what was heard last."""
+        now = self._clock()
+        with self._lock:
+            heard = [vehicle.pose for vehicle in self._vehicles]
+        assert all(pose is not None for pose in heard), "wait until all are heard"
+        carried = [_carried_on(pose, now) for pose in heard if pose is not None]
+        return Poses(*(np.array([getattr(pose, name) for pose in carried]) for name in Poses.__annotations__))
+
+    def mode_is(self, number: int, mode: Mode) -> bool:
+        """It flies in this mode."""
+        _, main, sub = mavutil.px4_map[mode]
+        return self._vehicles[number].mode == main << 16 | sub << 24
+
+    def is_armed(self, number: int) -> bool:
+        """Its motors run."""
+        return self._vehicles[number].armed
+
+    def last_words(self, number: int) -> str:
+        """What it told people last; empty if it never did."""
+        return self._vehicles[number].text
+
+    def version(self, number: int) -> str | None:
+        """Of its firmware, as in `1.18.0`; None while it is not known."""
+        return self._vehicles[number].version
+
+    def uptime_s(self, number: int) -> tuple[float, float] | None:
+        """Seconds since it started by its own clock, and when it said so on ours; None where it does not say."""
+        return self._vehicles[number].booted_s
+
+    def arm(self, number: int) -> None:
+        """Asks for the motors; `is_armed` tells."""
+        self._command(self._vehicles[number], mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
+
+    def select(self, number: int, mode: Mode) -> None:
+        """Asks for a mode; `mode_is` tells."""
+        _, main, sub = mavutil.px4_map[mode]
+        self._command(self._vehicles[number], mavlink.MAV_CMD_DO_SET_MODE, 1, main, sub)
+
+    def _command(self, vehicle: _Vehicle, command: int, *numbers: float) -> None:
+        values = (*numbers, *[0.0] * (7 - len(numbers)))
+        with self._lock:
+            vehicle.mav.command_long_send(vehicle.number + 1, 1, command, 0, *values)
+
+    def _run(self) -> None:
+        by_socket = {vehicle.socket: vehicle for vehicle in self._vehicles}
+        due_s = time.monotonic()
+        while not self._closing.is_set():
+            for ready in select.select(list(by_socket), [], [], LOOK_S)[0]:
+                self._receive(by_socket[ready])
+            if time.monotonic() >= due_s:
+                due_s = time.monotonic() + HEARTBEAT_S
+                self._send_heartbeats()
+
+    def _send_heartbeats(self) -> None:
+        with self._lock:
+            for vehicle in self._vehicles:
+                vehicle.mav.heartbeat_send(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0)
+
+    def _receive(self, vehicle: _Vehicle) -> None:
+        data, vehicle.address = vehicle.socket.recvfrom(65536)
+        now = self._clock()
+        with self._lock:
+            for packet in _packets(data):
+                for message in vehicle.mav.parse_buffer(packet) or ():
+                    if message.get_srcSystem() == vehicle.number + 1:
+                        _note(vehicle, message, now)
+
+
+def home_deg(position: FloatArray) -> tuple[float, float]:
+    """Latitude and longitude of a place, metres NED from the world's origin."""
+    north_m, east_m = metres_a_degree(REFERENCE_DEG[0])
+    return REFERENCE_DEG[0] + float(position[0]) / north_m, REFERENCE_DEG[1] + float(position[1]) / east_m
+
+
+def _note(vehicle: _Vehicle, message: Any, now: float) -> None:
+    match message.get_type():
+        case "HIL_STATE_QUATERNION":
+            vehicle.pose = _pose(message, now)
+        case "HEARTBEAT":
+            vehicle.mode = int(message.custom_mode)
+            vehicle.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        case "CURRENT_MODE":
+            vehicle.mode = int(message.custom_mode)
+        case "SYSTEM_TIME":
+            vehicle.booted_s = message.time_boot_ms * 1e-3, now
+        case "STATUSTEXT":
+            vehicle.text = message.text.strip()
+        case "AUTOPILOT_VERSION":
+            vehicle.version = ".".join(str(message.flight_sw_version >> shift & 0xFF) for shift in (24, 16, 8))
+        case _:
+            pass
+
+
+def _pose(message: Any, now: float) -> _Pose:
+    north_m, east_m = metres_a_degree(REFERENCE_DEG[0])
+    north = (message.lat * 1e-7 - REFERENCE_DEG[0]) * north_m
+    east = (message.lon * 1e-7 - REFERENCE_DEG[1]) * east_m
+    return _Pose(
+        time_s=now,
+        position=np.array([north, east, -message.alt * 1e-3]),
+        velocity=np.array([message.vx, message.vy, message.vz]) * 1e-2,
+        R_ned_body=_rotation(message.attitude_quaternion),
+        turn_rad_s=np.array([message.rollspeed, message.pitchspeed, message.yawspeed]),
+    )
+
+
+def _carried_on(pose: _Pose, now: float) -> _Pose:
+    """Where it is now if neither velocity nor turn has changed."""
+    elapsed_s = min(max(now - pose.time_s, 0.0), MAX_FORWARD_S)
+    return _Pose(
+        now,
+        pose.position + elapsed_s * pose.velocity,
+        pose.velocity,
+        pose.R_ned_body @ euler_rotation(*(elapsed_s * pose.turn_rad_s)),
+        pose.turn_rad_s,
+    )
+
+
+def _rotation(quaternion: Sequence[float]) -> FloatArray:
+    w, x, y, z = np.array(quaternion) / np.linalg.norm(quaternion)
+    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
+    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return euler_rotation(roll, pitch, yaw)
+
+
+def _packets(data: bytes) -> Iterator[bytes]:
+    """The MAVLink 2 packets of a datagram that say what is listened to; the others cost too much to decode."""
+    begin = 0
+    while begin + 12 <= len(data) and data[begin] == mavlink.PROTOCOL_MARKER_V2:
+        end = begin + 12 + data[begin + 1] + (13 if data[begin + 2] & 1 else 0)
+        if int.from_bytes(data[begin + 7 : begin + 10], "little") in _HEARD.values():
+            yield data[begin:end]
+        begin = end
+
+
+def _bound(port: int) -> socket.socket:
+    bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        bound.bind(("127.0.0.1", port))
+    except OSError as error:
+        bound.close()
+        raise UnavailableError(
+            f"UDP port {port} cannot be used ({error.strerror}); end the other simulation that uses it"
+        ) from error
+    return bound

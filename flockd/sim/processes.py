@@ -1,0 +1,102 @@
+"""Programs that run beside the simulator, and that never outlive it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Self
+
+END_S = 15.0
+"""To end when told to, before it is killed."""
+_LAST_WORDS_BYTES = 4000
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """One that was started."""
+
+    name: str
+    log: Path
+    """What it writes."""
+    process: subprocess.Popen[bytes]
+
+    @property
+    def ended(self) -> int | None:
+        """Its exit code; None while it runs."""
+        return self.process.poll()
+
+    def last_words(self) -> str:
+        """The last line of its log."""
+        with self.log.open("rb") as file:
+            file.seek(max(0, self.log.stat().st_size - _LAST_WORDS_BYTES))
+            lines = file.read().decode(errors="replace").split("\n")
+        return next((line.strip() for line in reversed(lines) if line.strip()), "nothing")
+
+    def cpu_s(self) -> float:
+        """Seconds of processor time it has used so far; 0 once it has ended."""
+        try:
+            numbers = Path(f"/proc/{self.process.pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+        except OSError:
+            return 0.0
+        return (int(numbers[11]) + int(numbers[12])) / os.sysconf("SC_CLK_TCK")
+
+
+class Programs:
+    """All of one kind, between ``__enter__`` and ``__exit__``.
+
+    Each has a session of its own, so that Ctrl-C reaches the simulator alone, which then ends them in order.
+    """
+
+    def __init__(self) -> None:
+        self._programs: list[Program] = []
+        self._files: list[IO[bytes]] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.end()
+        for file in self._files:
+            file.close()
+
+    def __iter__(self) -> Iterator[Program]:
+        return iter(self._programs)
+
+    def start(
+        self, name: str, command: Sequence[str], environment: Mapping[str, str], folder: Path, log: Path
+    ) -> Program:
+        """Starts one in ``folder``; all it writes goes to the file ``log``."""
+        file = log.open("wb")
+        self._files.append(file)
+        process = subprocess.Popen(
+            command,
+            cwd=folder,
+            env=dict(environment),
+            stdin=subprocess.DEVNULL,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+        self._programs.append(Program(name, log, process))
+        return self._programs[-1]
+
+    def end(self) -> None:
+        """Tells all that run to end and waits for them; who does not is killed, with all it has started."""
+        running = [program for program in self._programs if program.ended is None]
+        for program in running:
+            program.process.terminate()
+        until_s = time.monotonic() + END_S
+        for program in running:
+            try:
+                program.process.wait(max(0.0, until_s - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                os.killpg(program.process.pid, signal.SIGKILL)
+                program.process.wait()
