@@ -178,19 +178,17 @@ def _frames(source: FrameSource, seconds: float, enough: Callable[[], bool]) -> 
     source.start()
     began_s, seen = time.monotonic(), False
     try:
-        while time.monotonic() - began_s < seconds and not enough():
+        while (since_s := time.monotonic() - began_s) < seconds and not enough():
             frames = source.newest(FRAME_WAIT_S)
-            if frames is None:
-                if not seen and time.monotonic() - began_s > FIRST_FRAME_S:
-                    faults = [status.fault for status in source.status().values() if status.fault]
-                    raise UnavailableError(
-                        faults[0] if faults else "no camera gave a frame; check how it is plugged in"
-                    )
-                continue
-            seen = True
-            stamps = {name: frame.time_s for name, frame in frames.frames.items()}
-            images = {name: frame.image for name, frame in frames.frames.items()}
-            yield PictureSet(f"{time.monotonic() - began_s:.1f} s", images, stamps)
+            if frames is not None:
+                seen = True
+                stamps = {name: frame.time_s for name, frame in frames.frames.items()}
+                yield PictureSet(f"{since_s:.1f} s", {name: one.image for name, one in frames.frames.items()}, stamps)
+            elif not seen and since_s > FIRST_FRAME_S:
+                break
+        if not seen:
+            faults = [status.fault for status in source.status().values() if status.fault]
+            raise UnavailableError(faults[0] if faults else "no camera gave a frame; check how it is plugged in")
     finally:
         source.stop()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -62,6 +63,7 @@ def boards_between(first: str, second: str, count: int, seed: int) -> list[Rigid
     return found
 
 
+@cache
 def shared_boards() -> list[SharedBoard]:
     collector = SharedCollector(BoardFinder(SPEC))
     boards = boards_between("front", "right", 7, 1) + boards_between("front", "left", 7, 2)
