@@ -40,7 +40,7 @@ MAY_IMPORT = {
     "doctor": BASE | {"geometry", "perception", "pilot", "sources", "autopilot", "telemetry", "daemon"},
     "cli": BASE
     | {"perception", "pilot", "telemetry", "recording", "datasets", "sim", "report", "view", "daemon", "doctor"}
-    | {"calibration", "sources"},
+    | {"calibration", "geometry", "sources"},
 }
 """What each folder may import of the others."""
 

@@ -129,7 +129,7 @@ def photograph(
     return developed(light, seed=seed, noise=noise, blur_px=blur_px)
 
 
-def developed(light: FloatArray, *, seed: int, noise: float, blur_px: float) -> UInt8Array:
+def developed(light: FloatArray | Float32Array, *, seed: int, noise: float, blur_px: float) -> UInt8Array:
     """Out of focus, with the sensor's noise, as RGB."""
     focused = cv2.GaussianBlur(light.astype(np.float32), (0, 0), blur_px) if blur_px > 0 else light
     noisy = np.asarray(focused) + np.random.default_rng(seed).normal(0.0, noise, light.shape)
@@ -180,7 +180,7 @@ def photograph_room(lens: Lens, R_room_camera: FloatArray, position: FloatArray,
         reach = np.where(seen > 0, _ROOM - at, -_ROOM - at) / seen
     wall = np.argmin(reach, axis=-1)
     hit = at + np.take_along_axis(reach, wall[..., None], axis=-1) * seen
-    light = np.zeros(seen.shape[:2], np.float32)
+    light: Float32Array = np.zeros(seen.shape[:2], np.float32)
     for axis in range(3):
         for side in range(2):
             u, v = (hit[..., other] / _ROOM[other] for other in ((axis + 1) % 3, (axis + 2) % 3))
