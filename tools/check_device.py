@@ -1,0 +1,301 @@
+"""Check flockd on a real kernel and a real init: virtual cameras and systemd, in a virtual machine made for it.
+
+sudo python tools/check_device.py                               # from nothing; downloads about 300 MB
+sudo python tools/check_device.py --cache /var/cache/flockd     # keeps what it built for the next time
+
+Needs Linux on x86-64 with qemu-system-x86, mmdebstrap and e2fsprogs, and no KVM: the processor is emulated. The machine
+runs Debian 12 with its own kernel and systemd; flockd is installed by the very lines of the README, and its unit runs
+`flockd run` with the shipped networks. The autopilot is flockd's stand-in, and as an emulated processor is slow, the
+pictures are small and the steps far apart. The machine's clock counts instructions, a nanosecond each: how busy this
+computer is changes how long the check takes, and nothing of what it measures.
+
+Exit code 0, 1 a check failed, 69 something needed is not there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+PROGRAMS = {"qemu-system-x86_64": "qemu-system-x86", "mmdebstrap": "mmdebstrap", "mkfs.ext4": "e2fsprogs"}
+"""And the Debian package of each."""
+PACKAGES = (
+    *("systemd-sysv", "udev", "dbus", "kmod", "sudo", "iproute2", "python3", "python3-venv", "v4l-utils"),
+    *("linux-image-amd64", "linux-headers-amd64", "v4l2loopback-dkms", "initramfs-tools", "zstd"),
+)
+BOOT_MODULES = ("virtio_pci", "virtio_blk", "ext4")
+SOURCES = (
+    *("flockd", "models", "config", "systemd"),
+    *("pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE"),
+)
+"""What the README's lines need of this folder."""
+SECTION = "### Install it as a service"
+STAND_IN = "pymavlink>=2.4.40"
+PYTHON = "3.11"
+"""Debian's."""
+SYSTEM_PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
+IMAGE_MB, MEMORY_MB = 4096, 2048
+PATIENCE_S = 3600.0
+DONE, FAILED, UNAVAILABLE = 0, 1, 69
+UNIT = """\
+[Unit]
+Description=flockd's device check
+RequiresMountsFor=/mnt/check /mnt/findings
+[Service]
+Type=oneshot
+WorkingDirectory=/mnt/check
+Environment=PYTHONPATH=/opt/stand-in PYTHONDONTWRITEBYTECODE=1 PYTHONUNBUFFERED=1
+ExecStart=sh check.sh
+ExecStopPost=systemctl poweroff --no-block
+StandardOutput=journal+console
+StandardError=journal+console
+[Install]
+WantedBy=multi-user.target
+"""
+FSTAB = """\
+/dev/vda / ext4 defaults 0 0
+check /mnt/check 9p trans=virtio,version=9p2000.L,ro 0 0
+findings /mnt/findings 9p trans=virtio,version=9p2000.L 0 0
+"""
+
+
+class UnavailableError(Exception):
+    """Something needed is not there; the text says what."""
+
+
+def main() -> int:
+    """Builds, boots, listens, and prints."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cache", type=Path, metavar="DIR", help="keep the machine's files here, and use those there")
+    parser.add_argument("--only", nargs="+", default=[], metavar="GROUP", help="of capture, sandbox and service")
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    try:
+        _need_all()
+        with _folder(arguments.cache) as folder:
+            return _check(folder, arguments.only, as_json=arguments.json)
+    except UnavailableError as error:
+        print(f"check_device: {error}", file=sys.stderr)
+        return UNAVAILABLE
+
+
+def _check(folder: Path, only: Sequence[str], *, as_json: bool) -> int:
+    begun_s = time.monotonic()
+    rows: list[dict[str, Any]] = []
+    install, start = _readme_lines()
+    image = _build(folder, install)
+    _note("booting")
+    for line in _run(folder, image, start, only):
+        if "check" in line:
+            rows.append(line)
+            if not as_json:
+                print(_row(line), flush=True)
+        elif "group" in line:
+            _note(f"{line['group']}: {line['took_s']} s of the machine's time")
+    failed = [row for row in rows if not row["passed"]]
+    wall_s = time.monotonic() - begun_s
+    if as_json:
+        print(json.dumps({"passed": not failed, "wall_s": round(wall_s, 1), "checks": rows}, indent=1))
+    else:
+        print(f"{len(rows) - len(failed)} of {len(rows)} passed, in {wall_s:.0f} s")
+    return FAILED if failed else DONE
+
+
+def _need_all() -> None:
+    """Raises UnavailableError unless everything is there."""
+    if platform.system() != "Linux" or platform.machine() != "x86_64":
+        raise UnavailableError("builds a machine for x86-64 and needs Linux on one")
+    missing = sorted({package for program, package in PROGRAMS.items() if shutil.which(program) is None})
+    if missing:
+        raise UnavailableError(f"{', '.join(missing)} is not installed; `sudo apt install {' '.join(missing)}`")
+    if os.geteuid() != 0:
+        raise UnavailableError("the files of a Debian belong to root, who must run this; begin the command with sudo")
+
+
+@contextmanager
+def _folder(cache: Path | None) -> Iterator[Path]:
+    """Where the machine's files are."""
+    if cache is not None:
+        cache.mkdir(parents=True, exist_ok=True)
+        yield cache.resolve()
+        return
+    with tempfile.TemporaryDirectory(prefix="flockd-device-", dir="/var/tmp") as folder:
+        yield Path(folder)
+
+
+def _readme_lines() -> tuple[str, str]:
+    """What the README says to install flockd as a service, and to start it."""
+    _, _, section = (ROOT / "README.md").read_text(encoding="utf-8").partition(SECTION)
+    blocks: list[str] = re.findall(r"```sh\n(.*?)```", section, re.DOTALL)
+    return blocks[0], blocks[1]
+
+
+def _build(folder: Path, install: str) -> Path:
+    """The machine's disk, with flockd installed. Raises UnavailableError when something cannot be fetched."""
+    system = folder / "system"
+    if not (folder / "system.done").exists():
+        _note("building a Debian")
+        shutil.rmtree(system, ignore_errors=True)
+        _debian(system)
+        (folder / "system.done").touch()
+    _note("installing flockd")
+    _install(system, _wheels(folder), install)
+    _note("writing the disk")
+    image = folder / "disk.img"
+    image.unlink(missing_ok=True)
+    _command("mkfs.ext4", "-q", "-O", "^has_journal", "-d", str(system), str(image), f"{IMAGE_MB}M")
+    return image
+
+
+def _debian(system: Path) -> None:
+    """A tree of files, with a kernel that has the virtual cameras."""
+    listed = r"\n".join(BOOT_MODULES)
+    few_modules = (
+        'mkdir -p "$1/etc/initramfs-tools/conf.d" && echo MODULES=list > "$1/etc/initramfs-tools/conf.d/check" && '
+        f'printf "{listed}\\n" > "$1/etc/initramfs-tools/modules"'
+    )
+    without = [f"--dpkgopt=path-exclude=/usr/share/{what}/*" for what in ("doc", "man", "locale", "info")]
+    _command(
+        "mmdebstrap", "--quiet", "--variant=apt", f"--include={','.join(PACKAGES)}", *without,
+        f"--essential-hook={few_modules}", "bookworm", str(system),
+    )  # fmt: skip
+
+
+def _wheels(folder: Path) -> Path:
+    """What flockd and the stand-in need from the package index, for the machine's Python."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    wanted = [*project["build-system"]["requires"], *project["project"]["dependencies"], STAND_IN]
+    wheels = folder / f"wheels-{hashlib.sha256(' '.join(wanted).encode()).hexdigest()[:8]}"
+    if wheels.exists():
+        return wheels
+    with tempfile.TemporaryDirectory(dir=folder) as fresh:
+        kinds = [f"--platform=manylinux_2_{minor}_x86_64" for minor in range(17, 37)]
+        options = ["--quiet", "--only-binary=:all:", f"--python-version={PYTHON}", "--platform=manylinux2014_x86_64"]
+        _command(sys.executable, "-m", "pip", "download", *options, *kinds, f"--dest={fresh}", *wanted)
+        Path(fresh).rename(wheels)
+        Path(fresh).mkdir()
+    return wheels
+
+
+def _install(system: Path, wheels: Path, install: str) -> None:
+    """Runs the README's lines in the machine's files, as on a drone, but for where pip finds its packages."""
+    for old in ("opt/flockd", "opt/stand-in", "etc/flockd", "root/flockd"):
+        shutil.rmtree(system / old, ignore_errors=True)
+    source, shelf = system / "root/flockd", system / "root/wheels"
+    source.mkdir()
+    for name in SOURCES:
+        origin = ROOT / name
+        if origin.is_dir():
+            shutil.copytree(origin, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(origin, source / name)
+    shutil.copytree(wheels, shelf)
+    (system / "etc/pip.conf").write_text("[global]\nno-index = true\nfind-links = /root/wheels\n", encoding="utf-8")
+    (system / "etc/fstab").write_text(FSTAB, encoding="utf-8")
+    (system / "etc/hostname").write_text("drone\n", encoding="utf-8")
+    (system / "etc/hosts").write_text("127.0.0.1 localhost drone\n", encoding="utf-8")
+    _inside(system, f"cd /root/flockd\n{install}")
+    _inside(system, f"/opt/flockd/bin/pip install --quiet --target /opt/stand-in '{STAND_IN}'")
+    shutil.copy(ROOT / "tools/device_check/drone.yaml", system / "etc/flockd/drone.yaml")
+    (system / "etc/systemd/system/device-check.service").write_text(UNIT, encoding="utf-8")
+    wanted = system / "etc/systemd/system/multi-user.target.wants/device-check.service"
+    wanted.unlink(missing_ok=True)
+    wanted.symlink_to("../device-check.service")
+    shutil.rmtree(shelf)
+
+
+def _inside(system: Path, lines: str) -> None:
+    """In a clean environment: this computer's settings for pip are not the machine's."""
+    _command("chroot", str(system), "env", "-i", f"PATH={SYSTEM_PATH}", "HOME=/root", "bash", "-ec", lines)
+
+
+def _run(folder: Path, image: Path, start: str, only: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Boots, and gives what the machine writes down, line by line, until it has switched itself off."""
+    shared, findings = folder / "check", folder / "findings"
+    for fresh in (shared, findings):
+        shutil.rmtree(fresh, ignore_errors=True)
+        fresh.mkdir()
+    shutil.copytree(ROOT / "tools/device_check", shared / "tools/device_check")
+    (shared / "start.sh").write_text(start, encoding="utf-8")
+    command = "exec /opt/flockd/bin/python -m tools.device_check.guest /mnt/findings/lines start.sh"
+    (shared / "check.sh").write_text(" ".join([command, *only]), encoding="utf-8")
+    machine = subprocess.Popen(_qemu(folder, image, shared, findings), stdin=subprocess.DEVNULL)
+    try:
+        yield from _lines(findings / "lines", machine)
+    finally:
+        machine.kill()
+        machine.wait()
+
+
+def _qemu(folder: Path, image: Path, shared: Path, findings: Path) -> list[str]:
+    boot = folder / "system/boot"
+    return [
+        "qemu-system-x86_64", "-nodefaults", "-no-reboot", "-display", "none", "-machine", "pc,accel=tcg",
+        "-cpu", "Nehalem", "-m", str(MEMORY_MB), "-icount", "shift=0,sleep=off", "-rtc", "clock=vm",
+        "-kernel", str(next(boot.glob("vmlinuz-*"))), "-initrd", str(next(boot.glob("initrd.img-*"))),
+        "-append", "root=/dev/vda rw console=ttyS0 quiet",
+        "-drive", f"file={image},format=raw,if=virtio,snapshot=on",
+        "-virtfs", f"local,path={shared},mount_tag=check,security_model=none,readonly=on",
+        "-virtfs", f"local,path={findings},mount_tag=findings,security_model=none",
+        "-serial", f"file:{folder / 'console.log'}",
+    ]  # fmt: skip
+
+
+def _lines(file: Path, machine: subprocess.Popen[bytes]) -> Iterator[dict[str, Any]]:
+    """As they come; a machine that ends without its last word is a failed check."""
+    begun_s, read, line = time.monotonic(), 0, dict[str, Any]()
+    while "done" not in line:
+        over = machine.poll() is not None or time.monotonic() - begun_s > PATIENCE_S
+        whole = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+        for text in whole[read:]:
+            line = json.loads(text)
+            yield line
+        read = len(whole)
+        if over and "done" not in line:
+            console = (file.parent.parent / "console.log").read_text(encoding="utf-8", errors="replace")
+            print(console[-4000:], file=sys.stderr)
+            what = "ended or hung before all checks were done; the end of its console stands above"
+            yield {"check": "the machine", "passed": False, "measured": what, "wanted": "to run to its end"}
+            return
+        time.sleep(0.5)
+
+
+def _row(line: dict[str, Any]) -> str:
+    verdict = "PASS" if line["passed"] else "FAIL"
+    return f"{verdict}  {line['check']:32s} {line['measured']}  (wanted: {line['wanted']})"
+
+
+def _command(*command: str) -> None:
+    """Raises UnavailableError with the end of what a command that failed has told."""
+    result = subprocess.run(command, capture_output=True, text=True, check=False, env=_environment())
+    if result.returncode:
+        told = (result.stdout + result.stderr).strip().splitlines()[-3:]
+        raise UnavailableError(f"{Path(command[0]).name} failed ({'; '.join(told)})")
+
+
+def _environment() -> dict[str, str]:
+    return {**os.environ, "PATH": f"{SYSTEM_PATH}:{os.environ.get('PATH', '')}", "LC_ALL": "C"}
+
+
+def _note(what: str) -> None:
+    """For whoever waits."""
+    print(f"[{time.strftime('%H:%M:%S')}] {what}", file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""What `tools/check_device.py` runs inside its virtual machine."""
