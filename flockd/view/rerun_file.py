@@ -33,6 +33,8 @@ _ENVIRONMENT = {
 _FORCES_STATISTICS = "FORCE_RERUN_ANALYTICS"
 
 _BODY, _TIMELINE = "world/drone", "time"
+_HERE = "world/here"
+"""Where the drone is, with north where it always is: what the 3D views look at."""
 _DEPTH_UNITS_A_METRE = 100.0
 _FARTHEST_M = 75.0
 _JPEG_QUALITY = 90
@@ -64,6 +66,7 @@ class RerunFile:
         self._recording.set_time("step", sequence=moment.number)
         place = moment.place
         self._track.append(place.position.tolist())
+        self._log(_HERE, rr.Transform3D(translation=place.position))
         self._log(_BODY, rr.Transform3D(translation=place.position, mat3x3=place.R_ned_body))
         for name, image in moment.images.items():
             if name in self._rig.cameras:
@@ -195,10 +198,12 @@ def viewer_environment() -> dict[str, str]:
 
 def _blueprint(rig: Rig) -> Any:
     seen = [
-        rrb.Spatial2DView(name=name, origin=f"{_BODY}/{name}", contents=["$origin/image", "$origin/labels"])
+        rrb.Spatial2DView(name=name, origin=f"{_BODY}/{name}", contents=["$origin", "$origin/image", "$origin/labels"])
         for name in rig.cameras
     ]
     depth = [rrb.Spatial2DView(name=name, origin=f"{_BODY}/{name}", contents=["$origin/depth"]) for name in rig.cameras]
+    clear = [f"- /{_BODY}/{name}/depth" for name in rig.cameras]  # what is far would hide the neighbours
+    eye = rrb.EyeControls3D(position=(-9.0, -3.0, -6.0), look_target=(0.0, 0.0, 0.0))
     curves = [
         rrb.TimeSeriesView(name=title, origin=f"curves/{name}")
         for name, title in {
@@ -211,7 +216,10 @@ def _blueprint(rig: Rig) -> Any:
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(
-                rrb.Spatial3DView(name="3D", origin="world"),
+                rrb.Tabs(
+                    rrb.Spatial3DView(name="3D", origin=_HERE, contents=["/world/**", *clear], eye_controls=eye),
+                    rrb.Spatial3DView(name="depth in 3D", origin=_HERE, contents="/world/**", eye_controls=eye),
+                ),
                 rrb.TextLogView(name="log", origin="log"),
                 row_shares=[4, 1],
             ),

@@ -46,7 +46,8 @@ class Maps:
     """By camera, m along the optical axis."""
     pairs: Mapping[str, FloatArray]
     """(n, 2, 3) m NED, by kind: both ends of each point pair as the own motion places them. `still`: background that
-    it brings together within Algorithm 1's threshold, `rejected`: that it does not, `drone K`: of the neighbour with label K."""
+    it brings together within Algorithm 1's threshold, `rejected`: that it does not, `drone K`: of the neighbour
+    with label K."""
 
 
 @dataclass(frozen=True, eq=False)
