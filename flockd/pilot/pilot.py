@@ -13,6 +13,7 @@ from flockd.config.parameters import DroneConfig
 from flockd.flocking import FlockingLaw, course, desired_velocity
 from flockd.geometry import build_rig
 from flockd.messages import (
+    BoolArray,
     EgoMotion,
     Float32Array,
     FloatArray,
@@ -27,7 +28,7 @@ from flockd.messages import (
 from flockd.perception import Perception, models_folder
 from flockd.pilot.motions import ego_motion, neighbour_motions
 from flockd.pilot.views import Observer, Perceiver, RigView
-from flockd.tracking import ExpectedNeighbour, Measurement, Tracker, sighting_covariance
+from flockd.tracking import Blind, ExpectedNeighbour, Measurement, Tracker, sighting_covariance
 
 _OWN_DISPLACEMENT_SIGMA_M = 0.02
 _MAX_REFUSALS = 2
@@ -179,7 +180,23 @@ class FlockPilot:
         measurements = [
             _measurement(s, view.vehicle.R_ned_body, previous, motions.get(s.label)) for s in view.sightings
         ]
-        return self._tracker.update(view.time_s, measurements, velocity)
+        return self._tracker.update(view.time_s, measurements, velocity, self._blind(view))
+
+    def _blind(self, view: RigView) -> Blind | None:
+        """Where only cameras look that gave nothing in this step; None: they all did."""
+        gone = self._rig.cameras.keys() - view.cameras.keys()
+        if not gone:
+            return None
+
+        def blind(places: FloatArray) -> BoolArray:
+            pixels = self._rig.pixels_of(places @ view.vehicle.R_ned_body)  # row by row R^T p: into the body's axes
+            shown = {name: np.isfinite(uv).all(axis=1) for name, uv in pixels.items()}
+            of_gone = np.any([shown[name] for name in gone], axis=0)
+            of_others = np.any([shown[name] for name in view.cameras], axis=0)
+            hidden: BoolArray = of_gone & ~of_others
+            return hidden
+
+        return blind
 
     def _command(self, view: RigView, neighbours: Sequence[Neighbour], velocity: FloatArray | None) -> VelocityCommand:
         elapsed_s = view.time_s - (self._first_time_s or 0.0)

@@ -4,6 +4,6 @@ from __future__ import annotations
 
 from flockd.config.parameters import TrackingParameters
 from flockd.tracking.measurement import Measurement, sighting_covariance
-from flockd.tracking.tracker import ExpectedNeighbour, Tracker
+from flockd.tracking.tracker import Blind, ExpectedNeighbour, Tracker
 
-__all__ = ["ExpectedNeighbour", "Measurement", "Tracker", "TrackingParameters", "sighting_covariance"]
+__all__ = ["Blind", "ExpectedNeighbour", "Measurement", "Tracker", "TrackingParameters", "sighting_covariance"]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from flockd.config.parameters import TrackingParameters
-from flockd.messages import FloatArray, Neighbour
+from flockd.messages import BoolArray, FloatArray, Neighbour
 from flockd.tracking.measurement import Measurement
 
 _RELATIVE_SPEED_SIGMA_M_S = 0.7
@@ -24,6 +24,9 @@ _EVIDENCE_STEPS = 10
 """How far back the question goes whether a track is a drone."""
 _ANGULAR_SIZE_SIGMA = 0.01
 """Relative error of a drone's angular size in one frame set."""
+
+Blind = Callable[[FloatArray], BoolArray]
+"""Of places (n, 3), metres NED from the own drone: which (n,) no camera could show at this time."""
 
 _POSITION = np.hstack([np.eye(3), np.zeros((3, 3))])
 _VELOCITY = np.hstack([np.zeros((3, 3)), np.eye(3)])
@@ -51,7 +54,7 @@ class _Track:
     sizes: deque[float]
     size_m: float
     evidence: deque[float]
-    """Of the last steps, 2 p - 1 for the probability p of being a drone; 0 where it was not seen."""
+    """Of the last steps in which it could be seen, 2 p - 1 for the probability p of being a drone; 0 if it was not."""
     hits: int = 1
     confirmed: bool = False
     was_confirmed: bool = False
@@ -91,12 +94,17 @@ class Tracker:
             track.covariance = transition @ track.covariance @ transition.T + noise
 
     def update(
-        self, time_s: float, measurements: Sequence[Measurement], own_velocity: FloatArray | None = None
+        self,
+        time_s: float,
+        measurements: Sequence[Measurement],
+        own_velocity: FloatArray | None = None,
+        blind: Blind | None = None,
     ) -> tuple[int, ...]:
         """Take in one frame set's measurements at `time_s`; the track number of each, new where it fits no track.
 
         `own_velocity` (3,) NED m/s is what a new track starts with: flock mates move alike. A track not yet confirmed
-        is forgotten when it is missed once, a confirmed one when unseen for longer than `max_unseen_s`.
+        is forgotten when it is missed once, a confirmed one when unseen for longer than `max_unseen_s`. That a track
+        is missed where the rig is `blind` says nothing against it, but it ages as any other. None: blind nowhere.
         """
         self._time_s = time_s
         matches = self._associate(measurements)
@@ -109,8 +117,8 @@ class Tracker:
             else:
                 self._see(track, measurement)
             numbers.append(track.number)
-        for track in self._tracks:
-            self._weigh(track)
+        for track, hidden in zip(self._tracks, self._hidden(blind), strict=True):
+            self._weigh(track, hidden)
         self._tracks = [track for track in self._tracks if self._is_kept(track)]
         return tuple(numbers)
 
@@ -146,9 +154,14 @@ class Tracker:
             for track in self._tracks
         )
 
-    def _weigh(self, track: _Track) -> None:
+    def _hidden(self, blind: Blind | None) -> Sequence[bool]:
+        if blind is None or not self._tracks:
+            return [False] * len(self._tracks)
+        return [bool(one) for one in blind(np.array([track.state[:3] for track in self._tracks]))]
+
+    def _weigh(self, track: _Track, hidden: bool) -> None:
         """Is it a drone? Seen often enough, and on average of the last steps with enough evidence."""
-        if track.last_seen_s < self._time_s:
+        if track.last_seen_s < self._time_s and not hidden:
             track.evidence.append(0.0)
         evidence = sum(track.evidence) / len(track.evidence)
         needed = self.parameters.keep_evidence if track.confirmed else self.parameters.confirm_evidence

@@ -122,6 +122,23 @@ def test_the_rest_of_the_rig_flies_on_without_one_camera() -> None:
     assert len(output.sightings) == 1
 
 
+@pytest.mark.parametrize(("gone", "confirmed"), [("front", True), ("back", False)])
+def test_a_neighbour_before_a_camera_that_is_gone_stays_confirmed(gone: str, confirmed: bool) -> None:
+    """It flies ahead and then is not found twice: because nobody looks there, or although somebody does."""
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+    for _ in range(3):
+        assert len(flyer.step().sightings) == 1
+        flyer.move()
+    flyer.vehicles.position[1] += [0.0, 0.0, -60.0]  # far above, where no camera looks
+    for _ in range(2):
+        frames, state = flyer.look()
+        output = flyer.pilot.step(FrameSet(frames.time_s, {n: f for n, f in frames.frames.items() if n != gone}), state)
+        flyer.move()
+    (neighbour,) = output.neighbours
+    assert neighbour.unseen_s == pytest.approx(2 * STEP_S)
+    assert neighbour.confirmed is confirmed
+
+
 def test_a_network_gone_astray_costs_its_frame_only(monkeypatch: pytest.MonkeyPatch) -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
     sound = flyer.truth.scene

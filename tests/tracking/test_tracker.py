@@ -62,6 +62,36 @@ def test_what_is_seen_every_other_time_loses_its_confirmation_but_not_at_once_it
     assert confirmed == [False, False, True, True, True, False, False, False]
 
 
+@pytest.mark.parametrize(("blind_ahead", "confirmed"), [(False, [True, False, False]), (True, [True, True, True])])
+def test_who_flies_where_the_rig_is_blind_is_not_doubted_but_ages(blind_ahead: bool, confirmed: list[bool]) -> None:
+    """Three times seen, then unseen: the evidence is 3 of 4, then 3 of 5, which is no more than 0.6."""
+    tracker = Tracker(TrackingParameters(confirm_hits=3, keep_evidence=0.6, max_unseen_s=1.5))
+    for k in range(3):
+        _step(tracker, k * STEP_S, AHEAD)
+
+    def blind(places: Array) -> NDArray[np.bool_]:
+        assert places.shape == (1, 3)
+        hidden: NDArray[np.bool_] = (places[:, 0] > 0.0) == blind_ahead
+        return hidden
+
+    told = []
+    for k in range(3, 7):
+        tracker.predict(STEP_S, CRUISE * STEP_S)
+        tracker.update(k * STEP_S, [], CRUISE, blind)
+        told += [neighbour.confirmed for neighbour in tracker.neighbours()]
+    assert told == confirmed, "and after 1.5 s it is gone, however blind"
+
+
+def test_evidence_goes_on_where_it_stood_when_the_rig_sees_again() -> None:
+    tracker, now_s = _settled(steps=3)
+    tracker.predict(STEP_S, CRUISE * STEP_S)
+    tracker.update(now_s + STEP_S, [], CRUISE, lambda places: np.ones(len(places), bool))
+    _step(tracker, now_s + 2 * STEP_S)
+    (missed_once,) = tracker.neighbours()
+    assert missed_once.confirmed, "3 of 4 steps in which it could be seen"
+    assert missed_once.unseen_s == pytest.approx(1.0)
+
+
 def test_a_flock_mate_is_expected_where_it_flies_to() -> None:
     tracker = Tracker(TrackingParameters())
     for k in range(2):
