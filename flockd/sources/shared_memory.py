@@ -29,8 +29,8 @@ PREFIX = "flockd-frames/v1"
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7448"
 _HEADER = struct.Struct("<4sHHQd")
 _MAGIC = b"rgb8"
-_POOL_BYTES = 64 << 20
-"""Three sets of five drones with four 640x480 cameras each."""
+_POOL_BYTES = 16 << 20
+"""For one drone, in whose memory it counts: four sets of four 640x480 cameras."""
 
 
 class FramePublisher:
@@ -42,14 +42,15 @@ class FramePublisher:
     def __init__(self, *, listen: Sequence[str] = (DEFAULT_ENDPOINT,)) -> None:
         self._session, note = _open(listen=listen, connect=())
         self._notes = [note] if note else []
-        self._pool = None if note else self._shared_pool()
+        self._shares = note is None
+        self._pools: dict[str, shm.ShmProvider | None] = {}
         self._publishers: dict[tuple[str, str], zenoh.Publisher] = {}
 
     def publish(self, drone: str, frame: Frame) -> None:
         """Sends one frame; its image is copied."""
         height, width, _ = frame.image.shape
         header = _HEADER.pack(_MAGIC, width, height, frame.sequence, frame.time_s)
-        self._publisher(drone, frame.camera).put(self._payload(frame.image.tobytes()), attachment=header)
+        self._publisher(drone, frame.camera).put(self._payload(drone, frame.image.tobytes()), attachment=header)
 
     def notes(self) -> tuple[str, ...]:
         """What a person should know although nothing is wrong: each is one sentence."""
@@ -67,23 +68,26 @@ class FramePublisher:
     ) -> None:
         self.close()
 
-    def _shared_pool(self) -> shm.ShmProvider | None:
-        try:
-            return shm.ShmProvider.default_backend(_POOL_BYTES)
-        except zenoh.ZError as error:
-            self._note(_without_shared_memory(str(error).split(" at ")[0]))
-            return None
-
-    def _payload(self, data: bytes) -> bytes | shm.ZShmMut:
-        if self._pool is None:
+    def _payload(self, drone: str, data: bytes) -> bytes | shm.ZShmMut:
+        if drone not in self._pools:
+            self._pools[drone] = self._pool() if self._shares else None
+        pool = self._pools[drone]
+        if pool is None:
             return data
         try:
-            block = self._pool.alloc(len(data), shm.GarbageCollect())
+            block = pool.alloc(len(data), shm.GarbageCollect())
         except zenoh.ZError as error:  # full: readers hold what they have not copied yet
             self._note(_without_shared_memory(str(error).split(" at ")[0]))
             return data
         block[:] = data
         return block
+
+    def _pool(self) -> shm.ShmProvider | None:
+        try:
+            return shm.ShmProvider.default_backend(_POOL_BYTES)
+        except zenoh.ZError as error:
+            self._note(_without_shared_memory(str(error).split(" at ")[0]))
+            return None
 
     def _note(self, sentence: str) -> None:
         if sentence not in self._notes:

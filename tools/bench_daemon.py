@@ -1,0 +1,149 @@
+"""Measure what one daemon takes: seconds until it is ready, memory, processor; with shipped models and four cameras.
+
+python tools/bench_daemon.py [--seconds 20] [--json]
+
+A real `flockd run` with the configuration of PX4 SITL, beside an autopilot stand-in in Hold: pictures of 640x480 from
+shared memory, 2 sets a second, and a recording; in the environment that systemd's unit gives it. Memory is what Linux
+calls resident; pages shared with who sends the pictures are told apart. Exit code 1: ready after more than 3 s, or more
+than 350 MB.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import socket
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from flockd.autopilot.stand_in import AutopilotStandIn
+from flockd.config import DroneConfig, load
+from flockd.data import data_path
+from flockd.messages import Frame
+from flockd.perception.session import golden_image
+from flockd.sim.daemons import Daemons
+from flockd.sources import FramePublisher
+
+READY_BAR_S = 3.0
+MEMORY_BAR_MB = 350.0
+SETS_HZ = 2.0
+PATIENCE_S = 60.0
+
+
+def main() -> int:
+    """Measure and print; the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=20.0, help="after it is ready (20)")
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    found = measure(arguments.seconds)
+    if arguments.json:
+        print(json.dumps(found, indent=1))
+    else:
+        for name, value in found.items():
+            print(f"{name:40s} {value:8.2f}")
+    return 0 if found["ready, s"] <= READY_BAR_S and found["resident at most, MB"] <= MEMORY_BAR_MB else 1
+
+
+def measure(seconds: float) -> dict[str, float]:
+    """Every figure by name."""
+    port, endpoint = free_port(socket.SOCK_DGRAM), f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    config = at(port, endpoint)
+    with tempfile.TemporaryDirectory() as name, AutopilotStandIn(port, height_m=2.5):
+        folder = Path(name)
+        pictures = Pictures(config, endpoint)
+        with Daemons(
+            [config], folder=folder, recordings=folder, environment={**os.environ, **of_the_unit()}
+        ) as daemons:
+            begin = time.monotonic()
+            daemons.start()
+            program = daemons.programs()[0]
+            while not daemons.is_ready(0):
+                if program.ended is not None or time.monotonic() - begin > PATIENCE_S:
+                    raise SystemExit(f"the daemon did not become ready: {program.last_words()}")
+                pictures.show()
+            ready_s, cpu_s = time.monotonic() - begin, program.cpu_s()
+            resident = {}
+            until = time.monotonic() + seconds
+            while time.monotonic() < until:
+                pictures.show()
+                resident = status_mb(program.process.pid)
+            used = (program.cpu_s() - cpu_s) / seconds
+        pictures.close()
+    return {
+        "ready, s": ready_s,
+        "resident at most, MB": resident["VmHWM"],
+        "resident at the end, MB": resident["VmRSS"],
+        "of which shared with the frames' sender": resident["RssShmem"],
+        "cores used": used,
+    }
+
+
+def at(port: int, endpoint: str) -> DroneConfig:
+    """The configuration, with the ports that are free here."""
+    config = load(data_path("config") / "px4_sitl.yaml")
+    assert isinstance(config, DroneConfig)
+    assert config.source is not None
+    assert config.autopilot is not None
+    shared_memory = config.source.shared_memory.model_copy(update={"connect": (endpoint,)})
+    return config.model_copy(
+        update={
+            "source": config.source.model_copy(update={"shared_memory": shared_memory}),
+            "autopilot": config.autopilot.model_copy(update={"address": f"udpin://127.0.0.1:{port}"}),
+        }
+    )
+
+
+def of_the_unit() -> dict[str, str]:
+    """The environment that systemd gives the daemon."""
+    lines = (data_path("systemd") / "flockd.service").read_text(encoding="utf-8").splitlines()
+    pairs = " ".join(line.removeprefix("Environment=") for line in lines if line.startswith("Environment="))
+    return dict(pair.split("=", 1) for pair in pairs.split())
+
+
+class Pictures:
+    """A picture a camera that moves on from set to set: the same one again would be a frozen camera's."""
+
+    def __init__(self, config: DroneConfig, endpoint: str) -> None:
+        self._config = config
+        self._publisher = FramePublisher(listen=[endpoint])
+        self._images = {c.name: golden_image(c.size_px, i) for i, c in enumerate(config.rig.cameras)}
+        self._number, self._due_s = 0, time.monotonic()
+
+    def show(self) -> None:
+        """The next set, when it is time for it; returns after a moment in any case."""
+        if time.monotonic() >= self._due_s:
+            self._number, self._due_s = self._number + 1, self._due_s + 1.0 / SETS_HZ
+            now_s = time.monotonic()
+            for camera, image in self._images.items():
+                moved = np.roll(image, 2 * self._number, axis=1)
+                self._publisher.publish(self._config.name, Frame(camera, moved, now_s, self._number))
+        time.sleep(0.01)
+
+    def close(self) -> None:
+        """Ends the sending."""
+        self._publisher.close()
+
+
+def status_mb(pid: int) -> dict[str, float]:
+    """What Linux says of a process's memory."""
+    lines = (line.split() for line in Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines())
+    return {words[0].rstrip(":"): int(words[1]) / 1024 for words in lines if words[-1] == "kB"}
+
+
+def free_port(kind: socket.SocketKind) -> int:
+    """One that nobody uses now."""
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
