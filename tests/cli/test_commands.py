@@ -30,6 +30,7 @@ COMMANDS = [
     ["record", "cut"],
     ["record", "export"],
     ["replay"],
+    ["view"],
     ["calibrate"],
     ["calibrate", "camera"],
     ["calibrate", "rig"],
@@ -223,7 +224,7 @@ def test_a_folder_with_other_files_is_not_flown_into(tmp_path: Path, capsys: pyt
 def test_a_report_of_no_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["report", str(tmp_path)]) == 2
     assert capsys.readouterr().err == (
-        f"{tmp_path / 'flight.npz'}: does not exist; name a folder that `flockd sim` wrote\n"
+        f"{tmp_path}: holds neither a flight's flight.npz nor recordings; name another folder\n"
     )
 
 
