@@ -20,6 +20,7 @@ from flockd.errors import ModelError
 from flockd.messages import FrameSet, PilotOutput, VehicleState
 from flockd.recording import Recorder
 from flockd.recording.reader import Recording
+from flockd.report.from_recording import flight_log, recordings_in
 from flockd.sim.log import FlightLog
 from flockd.sim.start import with_drones
 from tests.recording.made_up import MODELS, MadeUpPilot, drone_config, record
@@ -268,6 +269,17 @@ def test_a_replay_of_a_simulated_flight_equals_it_bit_for_bit(flight: Flight, ca
         for step in Recording(path).steps():
             assert step.output is not None
             assert step.output["command"]["velocity"] == flight.log.command_velocity[step.number, index].tolist()
+
+
+@pytest.mark.parametrize("flight", ["dis"], indirect=True)
+def test_the_recordings_make_the_flights_own_log(flight: Flight) -> None:
+    """What the drones recorded is all that the report needs: to the last bit, with the truth and its companion."""
+    again = flight_log([Recording(path) for path in recordings_in(flight.folder)])
+    for part in fields(FlightLog):
+        if part.name not in ("stages_ms", "meta"):
+            assert getattr(again, part.name).tobytes() == getattr(flight.log, part.name).tobytes(), part.name
+    facts = ("drones", "duration_s", "step_s", "perception", "flow", "scale", "circle_until_s", "desired_distance_m")
+    assert {name: again.meta[name] for name in facts} == {name: flight.log.meta[name] for name in facts}
 
 
 @pytest.mark.parametrize("flight", ["dis"], indirect=True)

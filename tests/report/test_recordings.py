@@ -31,7 +31,7 @@ from flockd.recording.truth import TrueDrone, Truth
 from flockd.report.from_recording import filmstrip, flight_log, recordings_in
 from flockd.report.summary import summarise
 from flockd.sim.log import FlightLog
-from tests.recording.made_up import HEIGHT, MODELS, WIDTH, drone_config
+from tests.recording.made_up import HEIGHT, MODELS, WIDTH, MadeUpPilot, drone_config
 
 NAMES = ("drone1", "drone2")
 STEPS, STEP_S = 12, 0.5
@@ -219,6 +219,18 @@ def test_a_step_in_which_the_recorder_was_killed_does_not_count(flight: Path, tm
     _, err = told(capsys, 0, path, "--without-pictures")
     assert err.startswith(f"{path}: ends early at byte ")
     assert err.count("\n") == 1
+
+
+def test_a_replays_recording_keeps_the_truth(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flockd.pilot.FlockPilot", MadeUpPilot)
+    monkeypatch.setattr("flockd.cli.replay.models_of", lambda config: MODELS)
+    again = tmp_path / "again.mcap"
+    assert main(["replay", str(flight / "drone1.mcap"), "--out", str(again)]) == 0
+    flown, replayed = log_of(flight / "drone1.mcap"), log_of(again)
+    assert replayed.position.tobytes() == flown.position.tobytes()
+    assert replayed.truth_position.tobytes() == flown.truth_position.tobytes()
+    assert [replayed.meta[name] for name in ("scenario", "seed")] == ["side_by_side", 3]
+    assert replayed.command_velocity.tobytes() != flown.command_velocity.tobytes()  # another pilot's
 
 
 # --------------------------------------------------------------------------------------------------------- without it
