@@ -6,12 +6,13 @@ import asyncio
 import math
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from flockd.autopilot.stand_in import AutopilotStandIn, Demand, MotionState
+from flockd.autopilot.stand_in import TICK_S, AutopilotStandIn, Demand, MotionState
 from flockd.autopilot.status import AutopilotError, Firmware
 from flockd.config.parameters import AutopilotParameters
 from flockd.messages import Setpoint
@@ -206,6 +207,25 @@ def test_the_stand_in_runs_as_a_program_too(port: int) -> None:
             asyncio.run(story())
         finally:
             program.kill()
+
+
+def test_a_stand_in_that_is_late_for_every_tick_still_hears(port: int) -> None:
+    """As on a busy computer: to fly on takes it longer than a tick."""
+
+    def slow(demand: Demand, interval_s: float) -> MotionState:
+        if interval_s > 0.0:
+            time.sleep(2 * TICK_S)
+        return MotionState(np.array([0.0, 0.0, -2.5]), np.zeros(3), np.eye(3))
+
+    async def story() -> None:
+        link = await AutopilotLink.connect(_parameters(port))
+        assert await link.parameter("COM_OBL_RC_ACT", int) == 5
+        link.send_setpoint(north())
+        await until(lambda: len(stand_in.setpoints) == 1)
+        await link.close()
+
+    with AutopilotStandIn(port, height_m=2.5, motion=slow, heartbeat_s=HEARTBEAT_S) as stand_in:
+        asyncio.run(story())
 
 
 def test_nobody_there_is_told_with_what_to_check(port: int) -> None:

@@ -22,6 +22,7 @@ try:
     from flockd.recording.reader import Recording
     from tests.autopilot.flight import until
     from tests.daemon.aboard import SECONDS_TO_FAIL, SPEED_M_S, TinyPerceiver, aboard
+    from tests.starvation import tell
 except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
     pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
 
@@ -59,7 +60,7 @@ def test_from_the_ground_into_the_air_and_back_into_the_pilots_hands(tmp_path: P
             assert stand_in.mode == "POSCTL"
 
     with AutopilotStandIn(port, heartbeat_s=HEARTBEAT_S) as stand_in:
-        asyncio.run(story())
+        tell(story)
 
 
 def _tells_what_it_does(heard: object) -> None:
@@ -103,7 +104,7 @@ def test_one_camera_gone_is_a_slower_flight_and_all_gone_a_hover_and_then_hold(
             await asyncio.sleep(1.0)
             assert ship.state() == "silent", "no re-entry by itself"
 
-    asyncio.run(story())
+    tell(story)
 
 
 def test_networks_astray_or_stuck_degrade_and_sigterm_ends_in_hold(
@@ -132,7 +133,7 @@ def test_networks_astray_or_stuck_degrade_and_sigterm_ends_in_hold(
             assert "STOPPING=1" in ship.service
             assert stand_in.setpoints[-1][0] - asked_s < 2.0
 
-    asyncio.run(story())
+    tell(story)
     (path,) = tmp_path.glob("tiny-*.mcap")
     _replays_to_the_last_bit(Recording(path))
 
@@ -167,7 +168,7 @@ def test_a_dead_control_task_is_held_by_the_last_resort(
             with pytest.raises(DaemonError, match=r"a task died \(control: ArithmeticError\('for the test'\)\)"):
                 await ship.ending
 
-    asyncio.run(story())
+    tell(story)
 
 
 def test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe(
@@ -187,7 +188,7 @@ def test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe(
             await ship.until_state("silent")
             assert len(stand_in.setpoints) == before, "one more, and PX4 would be in offboard again"
 
-    asyncio.run(story())
+    tell(story)
 
 
 def test_any_other_dead_task_is_a_hold_too(
@@ -207,7 +208,7 @@ def test_any_other_dead_task_is_a_hold_too(
             with pytest.raises(DaemonError, match="sight: ArithmeticError"):
                 await ship.ending
 
-    asyncio.run(story())
+    tell(story)
 
 
 def test_arming_and_taking_off_by_itself_where_configured(tmp_path: Path) -> None:
@@ -223,7 +224,7 @@ def test_arming_and_taking_off_by_itself_where_configured(tmp_path: Path) -> Non
             await until(lambda: stand_in.mode == "LAND", SECONDS_TO_FAIL)
 
     with AutopilotStandIn(port, heartbeat_s=HEARTBEAT_S) as stand_in:
-        asyncio.run(story())
+        tell(story)
 
 
 def _wrong() -> DroneConfig:
@@ -255,11 +256,11 @@ def test_the_configuration_is_read_again_on_the_ground_only(
             ship.daemon.ask_to_reload(lambda: other)
             assert await ship.ending == Ending(other)
 
-    asyncio.run(story())
+    tell(story)
     (tmp_path / "ground").mkdir()
     second = free_port()
     with AutopilotStandIn(second, heartbeat_s=HEARTBEAT_S) as on_ground:
-        asyncio.run(on_the_ground(on_ground, second))
+        tell(lambda: on_the_ground(on_ground, second))
 
 
 def test_it_can_be_told_to_stop_before_an_autopilot_is_heard(tmp_path: Path, port: int) -> None:
@@ -271,4 +272,4 @@ def test_it_can_be_told_to_stop_before_an_autopilot_is_heard(tmp_path: Path, por
             async with asyncio.timeout(SECONDS_TO_FAIL):
                 assert await ship.ending == Ending(None)
 
-    asyncio.run(story())
+    tell(story)
