@@ -22,6 +22,8 @@ SITL = "px4_sitl.yaml"
 LOGS, RECORDINGS = "logs", "recordings"
 DEFAULT_SPEED_FACTOR = 0.35
 """Two cores then keep up with five drones."""
+SPEED_FACTORS = (0.34, 10.0)
+"""What a daemon's configuration allows."""
 
 
 def check_options(args: argparse.Namespace) -> None:
@@ -30,6 +32,9 @@ def check_options(args: argparse.Namespace) -> None:
         if args.speed_factor is not None:
             raise UsageError("--speed-factor is for real daemons; drop it, or name their --autopilot")
         return
+    slowest, fastest = SPEED_FACTORS
+    if args.speed_factor is not None and not slowest <= args.speed_factor <= fastest:
+        raise UsageError(f"--speed-factor {args.speed_factor:g} is not from {slowest:g} to {fastest:g}; choose another")
     own = {"--perception truth": args.perception == "truth", "--swap": args.swap, "--telemetry": args.telemetry}
     idle = [option for option, given in own.items() if given]
     if idle:

@@ -189,7 +189,10 @@ _SCALES = {
 
 def _lead(summary: Summary) -> str:
     step = f"A step every {summary['step_s']:g} s"
-    step += "." if summary["wall_s"] is None else f"; {summary['wall_s']:.0f} s of computing."
+    if summary["fleet"]:
+        step += f"; a daemon each, with {summary['autopilot']}, at {summary['fleet']['speed_factor']:g} times real time."
+    else:
+        step += "." if summary["wall_s"] is None else f"; {summary['wall_s']:.0f} s of computing."
     if summary["perception"] == EXACT_STATES:
         return f"Every drone was told the true positions and velocities of all others. {step}"
     who = "Each drone" if summary["drones"] > 1 else "It"
