@@ -156,8 +156,8 @@ def _check_known(found: Alignment, problem: _Problem, at_limit: bool) -> None:
         most = _AXES[int(np.argmax(spread))]
         others = " and ".join(axis.removesuffix("ed") for axis in _AXES if axis != most)
         raise CalibrationError(
-            f"the drone {most} and hardly did anything else, so the camera's turn about that axis is known to "
-            f"{found.sigma_deg:.1f} degrees only; {others} it too"
+            f"the camera's turn in the body is known to {found.sigma_deg:.1f} degrees only, as the drone mostly {most};"
+            f" {others} it as much, and for longer"
         )
     if not found.sigma_s < _SIGMA_S or at_limit:
         raise CalibrationError(

@@ -11,7 +11,7 @@ import numpy as np
 
 from flockd.calibration.errors import CalibrationError
 from flockd.calibration.least_squares import Normal, Solution, minimise
-from flockd.calibration.poses import first_poses, jacobian_of_move, moved, pose_of_board
+from flockd.calibration.poses import first_poses, jacobian_of_move, moved
 from flockd.calibration.views import View
 from flockd.geometry import Camera, PinholeCamera, RigidTransform, WideAngleCamera
 from flockd.messages import FloatArray
@@ -168,26 +168,25 @@ class _State:
 
 def _begin(views: Sequence[View], size: tuple[int, int], model: Model) -> _State:
     """The best of a few plain lenses, with the board's pose in each view."""
-    best: tuple[float, Camera] | None = None
+    best: tuple[float, Camera, list[tuple[float, RigidTransform | None]]] | None = None
     for focal in _FIRST_FOCALS[model]:
         camera = _camera(model, size, np.array([focal * size[0], focal * size[0], size[0] / 2, size[1] / 2]))
-        errors = [_first_error(camera, view) for view in views]
-        if best is None or float(np.median(errors)) < best[0]:
-            best = float(np.median(errors)), camera
+        poses = [_first_pose(camera, view) for view in views]
+        error = float(np.median([error for error, _ in poses]))
+        if best is None or error < best[0]:
+            best = error, camera, poses
     assert best is not None
-    camera = _with_zero_distortion(best[1])
-    poses = [pose_of_board(camera, view.seen) for view in views]
-    lost = [view.name for view, pose in zip(views, poses, strict=True) if pose is None]
+    lost = [view.name for view, (_, pose) in zip(views, best[2], strict=True) if pose is None]
     if lost:
         raise CalibrationError(f"{lost[0]}: what is seen is no flat board; remove it, or check the board's squares")
-    return _State(camera, tuple(pose for pose in poses if pose is not None))
+    return _State(_with_zero_distortion(best[1]), tuple(pose for _, pose in best[2] if pose is not None))
 
 
-def _first_error(camera: Camera, view: View) -> float:
-    poses = first_poses(camera, view.seen)
-    errors = [_rms(_residuals(camera, view, pose)) for pose in poses]
-    finite = [error for error in errors if math.isfinite(error)]
-    return min(finite) if finite else math.inf
+def _first_pose(camera: Camera, view: View) -> tuple[float, RigidTransform | None]:
+    """The board's likelier pose, after its residual; none, after infinity, where it fits none."""
+    found = [(_rms(_residuals(camera, view, pose)), pose) for pose in first_poses(camera, view.seen)]
+    finite = [one for one in found if math.isfinite(one[0])]
+    return min(finite, key=lambda one: one[0]) if finite else (math.inf, None)
 
 
 def _fit(views: Sequence[View], state: _State) -> Solution[_State]:

@@ -24,6 +24,8 @@ _LEAST_POINTS = 40
 _ROUNDS, _STEPS = 6, 12
 _FEW_PX = 0.35
 """Where a turn alone leaves no more than this, by the median, the camera's own shift does not show."""
+_AHEAD, _ESSENTIAL_ANGLE = 0.3, 0.003
+"""Least cosine from the optical axis, and tolerance in radians, of what five-point solutions are made from."""
 _LONGEST_S = 1.5
 """Pictures farther apart are not compared."""
 _MOST_PX = 2.0
@@ -115,11 +117,31 @@ def _followed(
 def _turn(before: FloatArray, after: FloatArray, focal_px: float) -> Turn | str:
     rotation, left = _pure_turn(before, after)
     if np.median(left) * focal_px > _FEW_PX:
-        rotation, left = _turn_beside_a_shift(before, after, rotation)
+        starts = [rotation, *_essential_turn(before, after, rotation)]
+        rotation, left = min(
+            (_turn_beside_a_shift(before, after, start) for start in starts),
+            key=lambda found: float(np.median(found[1])),
+        )
     residual_px = float(np.median(left)) * focal_px
     if not residual_px < _MOST_PX:
         return "what is seen does not move as one"
     return Turn(rotation, residual_px, len(before))
+
+
+def _essential_turn(before: FloatArray, after: FloatArray, near: FloatArray) -> list[FloatArray]:
+    """Where to begin when the shift is large: from five points at a time; of its two rotations the one like ``near``.
+
+    None where too little is seen within a pinhole's reach.
+    """
+    ahead = (before[:, 2] > _AHEAD) & (after[:, 2] > _AHEAD)
+    if ahead.sum() < _LEAST_POINTS:
+        return []
+    first, second = (rays[ahead, :2] / rays[ahead, 2:] for rays in (after, before))
+    essential = cv2.findEssentialMat(first, second, np.eye(3), cv2.RANSAC, 0.999, _ESSENTIAL_ANGLE)[0]
+    if essential is None or essential.shape != (3, 3):
+        return []
+    rotations = [np.asarray(one, np.float64) for one in cv2.decomposeEssentialMat(essential)[:2]]
+    return [max(rotations, key=lambda rotation: float(np.trace(near.T @ rotation)))]
 
 
 def _pure_turn(before: FloatArray, after: FloatArray) -> tuple[FloatArray, FloatArray]:
