@@ -11,7 +11,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from flockd.cli.flights import save, tell, write_findings
+from flockd.cli.flights import FLEET_LOGS, save, tell, write_findings
 from flockd.cli.output import complain, progress
 from flockd.errors import ExitCode, UsageError
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from flockd.config import ScenarioConfig
 
 SITL = "px4_sitl.yaml"
-LOGS, RECORDINGS = "logs", "recordings"
+RECORDINGS = "recordings"
 DEFAULT_SPEED_FACTOR = 0.35
 """Two cores then keep up with five drones."""
 SPEED_FACTORS = (0.34, 10.0)
@@ -55,7 +55,7 @@ def fly(args: argparse.Namespace, scenario: ScenarioConfig, directory: Path) -> 
             load_drone(data_path("config") / SITL),
             kind=args.autopilot,
             speed_factor=args.speed_factor or DEFAULT_SPEED_FACTOR,
-            logs=directory / LOGS,
+            logs=directory / FLEET_LOGS,
             recordings=_emptied(directory / RECORDINGS) if args.record else None,
             environment=os.environ,
             progress=tell_progress,
@@ -69,7 +69,7 @@ def fly(args: argparse.Namespace, scenario: ScenarioConfig, directory: Path) -> 
         f"the daemon of {drone} ended with exit code {code}" for drone, code in fleet["exit_codes"].items() if code
     ]
     for sentence in [*faults, *fleet["notes"]]:
-        complain(f"{sentence}; see {directory / LOGS}" if sentence in faults else sentence)
+        complain(f"{sentence}; see {directory / FLEET_LOGS}" if sentence in faults else sentence)
     return ExitCode.CHECK_FAILED if faults else code
 
 

@@ -17,6 +17,8 @@ LOG_NAME = "flight.npz"
 FILMSTRIP_NAME = "filmstrip.npz"
 SUMMARY_NAME = "summary.json"
 REPORT_NAME = "report.html"
+FLEET_LOGS = "logs"
+"""What the programs of a fleet wrote and flew with."""
 
 
 def prepare(directory: Path) -> None:
@@ -29,7 +31,8 @@ def check(directory: Path) -> None:
     """Raises UsageError when a folder holds something else than an earlier flight."""
     if directory.exists() and not directory.is_dir():
         raise UsageError(f"{directory}: is a file; name a folder with --out")
-    if directory.is_dir() and any(directory.iterdir()) and not (directory / LOG_NAME).is_file():
+    marks = (directory / LOG_NAME, directory / FLEET_LOGS / "drone1.yaml")  # the second of a fleet that never took off
+    if directory.is_dir() and any(directory.iterdir()) and not any(mark.is_file() for mark in marks):
         raise UsageError(f"{directory}: holds other files than a flight's; name a new or empty folder with --out")
 
 

@@ -74,7 +74,7 @@ def fly_fleet(
         sitl: the configuration whose source, autopilot, safety and telemetry the daemons have.
         kind: of the autopilots.
         speed_factor: how fast simulated time passes.
-        logs: a folder that is made anew, for what all programs write.
+        logs: a folder for what all programs write and fly with, over what an earlier fleet's did.
         recordings: a folder for the daemons' recordings; None: they are deleted.
         environment: this process's own.
         progress: told (simulated seconds done, seconds in all).
@@ -307,10 +307,17 @@ def _kept(folder: Path, logs: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        shutil.rmtree(logs, ignore_errors=True)
-        logs.mkdir(parents=True)
-        for path in (*folder.glob("*.log"), *folder.glob("*.yaml")):
+        written = _logs_in(folder)
+        if written:
+            logs.mkdir(parents=True, exist_ok=True)
+        for earlier in _logs_in(logs):
+            earlier.unlink()
+        for path in written:
             shutil.copy(path, logs)
+
+
+def _logs_in(folder: Path) -> list[Path]:
+    return [*folder.glob("*.log"), *folder.glob("drone*.yaml")]
 
 
 def _free_endpoint() -> str:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -14,6 +15,7 @@ from typing import IO, Self
 
 END_S = 15.0
 """To end when told to, before it is killed."""
+INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _LAST_WORDS_BYTES = 4000
 
 
@@ -73,30 +75,46 @@ class Programs:
     def start(
         self, name: str, command: Sequence[str], environment: Mapping[str, str], folder: Path, log: Path
     ) -> Program:
-        """Starts one in ``folder``; all it writes goes to the file ``log``."""
-        file = log.open("wb")
-        self._files.append(file)
-        process = subprocess.Popen(
-            command,
-            cwd=folder,
-            env=dict(environment),
-            stdin=subprocess.DEVNULL,
-            stdout=file,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-        self._programs.append(Program(name, log, process))
+        """Starts one in ``folder``; all it writes goes to the file ``log``. For the main thread, as `end`."""
+        with _uninterrupted():
+            file = log.open("wb")
+            self._files.append(file)
+            process = subprocess.Popen(
+                command,
+                cwd=folder,
+                env=dict(environment),
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+            self._programs.append(Program(name, log, process))
         return self._programs[-1]
 
     def end(self) -> None:
         """Tells all that run to end and waits for them; who does not is killed, with all it has started."""
-        running = [program for program in self._programs if program.ended is None]
-        for program in running:
-            program.process.terminate()
-        until_s = time.monotonic() + END_S
-        for program in running:
-            try:
-                program.process.wait(max(0.0, until_s - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                os.killpg(program.process.pid, signal.SIGKILL)
-                program.process.wait()
+        with _uninterrupted():
+            running = [program for program in self._programs if program.ended is None]
+            for program in running:
+                program.process.terminate()
+            until_s = time.monotonic() + END_S
+            for program in running:
+                try:
+                    program.process.wait(max(0.0, until_s - time.monotonic()))
+                except subprocess.TimeoutExpired:
+                    os.killpg(program.process.pid, signal.SIGKILL)
+                    program.process.wait()
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Ctrl-C and its like wait until the end of this: between them and a program there is nothing to end it."""
+    came: list[int] = []
+    before = {number: signal.signal(number, lambda number, _: came.append(number)) for number in INTERRUPTS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if came:
+            signal.raise_signal(came[0])

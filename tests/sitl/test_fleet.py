@@ -1,0 +1,196 @@
+"""A fleet of real daemons: two with autopilot stand-ins, from rendered frames, over real MAVLink; PX4 where it is."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flockd.autopilot.stand_in import AutopilotStandIn
+from flockd.cli import main
+from flockd.data import data_path
+from tests.autopilot.conftest import free_port
+
+try:
+    import mavsdk.mavsdk  # noqa: F401 - only to see whether it loads
+except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
+    pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
+
+from flockd.sim.ground_station import GroundStation, home_deg
+from flockd.sim.log import FlightLog
+
+SECONDS_TO_START = 120.0
+PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
+
+
+def _scenario(folder: Path, drones: int, **drone: object) -> Path:
+    """A flight low above the ground with tiny pictures; the own velocity comes from the autopilot."""
+    lens = {"fx": 32.0, "fy": 32.0, "cx": 32.0, "cy": 24.0}
+    cameras = [
+        {"name": name, "size_px": [64, 48], "intrinsics": lens, "extrinsics": {"yaw_deg": yaw}}
+        for name, yaw in (("front", 0.0), ("back", 180.0))
+    ]
+    values = {"rig": {"cameras": cameras}, "own_velocity": "autopilot", "perception": {"flow": "dis"}, **drone}
+    (folder / "tiny.yaml").write_text(json.dumps(values), encoding="utf-8")
+    vehicles = [{"position_m": [0.0, 6.0 * i, -1.5]} for i in range(drones)]
+    flight = {"scenario": "tiny", "duration_s": 3.0, "drone": "tiny.yaml", "vehicles": vehicles}
+    path = folder / "flight.yaml"
+    path.write_text(json.dumps(flight), encoding="utf-8")
+    return path
+
+
+def _left_behind(mark: str) -> list[str]:
+    """Command lines of processes that know of a folder."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            command = (entry / "cmdline").read_bytes()
+            known = (entry / "environ").read_bytes() + command
+        except OSError:
+            continue
+        if mark.encode() in known and int(entry.name) != os.getpid():
+            found.append(command.replace(b"\0", b" ").decode())
+    return found
+
+
+def test_two_daemons_fly_from_rendered_frames_and_the_report_is_the_simulators(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    out = tmp_path / "out"
+    scenario = _scenario(tmp_path, drones=2)
+    options = ["--autopilot", "standin", "--speed-factor", "1", "--out", str(out), "--json"]
+    code = main(["sim", str(scenario), *options])
+    told = capsys.readouterr()
+    assert code == 0, told.err
+    summary = json.loads(told.out)
+    assert summary == json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert (summary["autopilot"], summary["drones"], summary["perception"]) == ("stand-in", 2, "learned")
+    assert summary["fleet"]["handed_over"] == {}
+    assert summary["fleet"]["exit_codes"] == {"drone1": 0, "drone2": 0}
+    assert summary["realtime_factor"] == pytest.approx(1.0, rel=0.05)
+    assert "stand-in" in (out / "report.html").read_text(encoding="utf-8")
+
+    log = FlightLog.load(out / "flight.npz")
+    assert len(log.time_s) == summary["fleet"]["frame_sets"] >= 4
+    np.testing.assert_allclose(log.position[0, :, 2], -1.5, atol=0.2)  # MIS_TAKEOFF_ALT
+    np.testing.assert_allclose(log.position[0, 1, :2] - log.position[0, 0, :2], [0.0, 6.0], atol=0.1)
+    np.testing.assert_allclose(log.velocity[-1, :, :2], [[1.0, 0.0]] * 2, atol=0.3)  # Eq. 43 at 0 s
+    assert log.recorded.any(axis=0).all()
+    assert {path.name for path in (out / "logs").iterdir()} == {
+        f"drone{i}.{suffix}" for i in (1, 2) for suffix in ("log", "yaml")
+    }
+    assert not (out / "recordings").exists()
+    assert _left_behind(str(tmp_path)) == []
+
+
+def test_nobody_is_left_behind_when_it_is_told_to_end(tmp_path: Path) -> None:
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    options = ["--autopilot", "standin", "--out", str(tmp_path / "out")]
+    run = "import sys; from flockd.cli import main; sys.exit(main())"
+    with subprocess.Popen(
+        [sys.executable, "-c", run, "sim", str(_scenario(tmp_path, drones=1)), *options],
+        cwd=data_path("config").parent, env=environment, stderr=subprocess.PIPE, text=True,
+    ) as simulator:  # fmt: skip
+        until_s = time.monotonic() + SECONDS_TO_START
+        while not list(tmp_path.glob("flockd-*/drone1.log")):
+            assert simulator.poll() is None, simulator.communicate()
+            assert time.monotonic() < until_s
+            time.sleep(0.05)
+        simulator.send_signal(signal.SIGTERM)
+        _, told = simulator.communicate(timeout=60.0)
+    assert simulator.returncode == 130
+    assert told.splitlines()[-1] == "interrupted"
+    assert _left_behind(str(tmp_path)) == []
+    assert (tmp_path / "out/logs/drone1.yaml").is_file()
+
+
+def test_a_daemon_that_does_not_come_up_ends_the_flight_with_its_own_words(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenario = _scenario(tmp_path, drones=1, perception={"flow": "dis", "distance": "none", "depth": "nothing"})
+    assert main(["sim", str(scenario), "--autopilot", "standin", "--out", str(tmp_path / "out")]) == 69
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("drone1 ended with exit code 78 (")
+    assert "nothing" in last
+
+
+def test_without_px4_it_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["sim", str(_scenario(tmp_path, drones=1)), "--autopilot", "px4", "--out", str(tmp_path / "out")]
+    wanted = "set it to PX4's SITL build folder, which holds bin/px4 and etc/\n"
+    monkeypatch.delenv("FLOCKD_PX4", raising=False)
+    assert main(command) == 69
+    assert capsys.readouterr().err == f"there is no PX4: FLOCKD_PX4 is not set; {wanted}"
+    monkeypatch.setenv("FLOCKD_PX4", str(tmp_path))
+    assert main(command) == 69
+    assert capsys.readouterr().err == f"there is no PX4 in {tmp_path}, which FLOCKD_PX4 names; {wanted}"
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--speed-factor", "0.5"], "--speed-factor is for real daemons; drop it, or name their --autopilot"),
+        (
+            ["--autopilot", "standin", "--speed-factor", "0.2"],
+            "--speed-factor 0.2 is not from 0.34 to 10; choose another",
+        ),
+        (
+            ["--autopilot", "standin", "--perception", "truth"],
+            "--perception truth has no meaning with real daemons, which look and tell by themselves; drop it",
+        ),
+    ],
+)
+def test_options_that_do_not_go_together(options: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sim", *options]) == 2
+    assert capsys.readouterr().err == f"{told}\n"
+
+
+def test_the_ground_station_knows_where_everybody_truly_is() -> None:
+    """Two metres up, three north and four east of the world's origin, told in degrees and turned by a quarter."""
+    port = free_port()
+    with (
+        GroundStation([port], time.monotonic) as station,
+        AutopilotStandIn(
+            free_port(), height_m=2.0, yaw_rad=np.pi / 2, home_deg=home_deg(np.array([3.0, 4.0])), truth_port=port
+        ) as stand_in,
+    ):
+        until_s = time.monotonic() + 10.0
+        while not (station.heard(0) and station.is_armed(0)):
+            assert time.monotonic() < until_s
+            time.sleep(0.01)
+        poses = station.poses()
+        np.testing.assert_allclose(poses.position, [[3.0, 4.0, -2.0]], atol=0.01)
+        np.testing.assert_allclose(poses.R_ned_body[0], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-6)
+        assert station.mode_is(0, "LOITER")
+        station.select(0, "LAND")
+        while not station.mode_is(0, "LAND"):
+            assert time.monotonic() < until_s
+            time.sleep(0.01)
+        assert stand_in.mode == "LAND"
+
+
+@PX4
+@pytest.mark.slow
+def test_px4_flies_by_sight(tmp_path: Path) -> None:
+    """Two drones of the paper's flight; PX4's own simulated quadrotors, the shipped networks, full pictures."""
+    out = tmp_path / "out"
+    options = ["--autopilot", "px4", "--drones", "2", "--duration", "20", "--out", str(out)]
+    assert main(["sim", *options]) == 0
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert summary["autopilot"].startswith("PX4 SITL ")
+    assert summary["flock"]["min_distance_m"] > 1.0
+    assert summary["flock"]["union_tail"] == 1.0
+    assert summary["table2"]["before"]["translation_x_m"]["median"] < 0.05
+    log = FlightLog.load(out / "flight.npz")
+    speed = np.linalg.norm(log.velocity[-10:, :, :2].mean(axis=0), axis=-1)
+    np.testing.assert_allclose(speed, 1.0, atol=0.3)
