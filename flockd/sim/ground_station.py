@@ -143,7 +143,7 @@ class GroundStation:
     def mode_is(self, number: int, mode: Mode) -> bool:
         """It flies in this mode."""
         _, main, sub = mavutil.px4_map[mode]
-        return self._vehicles[number].mode == main << 16 | sub << 24
+        return bool(self._vehicles[number].mode == main << 16 | sub << 24)
 
     def is_armed(self, number: int) -> bool:
         """Its motors run."""
