@@ -240,8 +240,6 @@ def _refusal(captured: CapturedBuffer, image_format: ImageFormat, silence_s: flo
     """As the source in flight would refuse it."""
     if captured.flagged:
         return "damaged by the driver's own account"
-    if captured.clock == "unknown":
-        return "without a monotonic time stamp"
     if not -MAX_AHEAD_S <= time.monotonic() - captured.time_s <= silence_s:
         return "with a time stamp far from now"
     try:

@@ -197,7 +197,7 @@ def test_gaps_in_the_sequence_are_frames_lost(start: Start) -> None:
         (JPEGS[1][:20_000], FLAG_MONOTONIC, 0.0, "corrupt"),
         (b"", FLAG_MONOTONIC, 0.0, "corrupt"),
         (jpeg(scene()[::2, ::2]), FLAG_MONOTONIC, 0.0, "corrupt"),
-        (JPEGS[1], FLAG_CLOCK_UNKNOWN, 0.0, "time_stamp"),
+        (JPEGS[1], FLAG_CLOCK_UNKNOWN, 1.7e9, "time_stamp"),
         (JPEGS[1], FLAG_MONOTONIC, 5.0, "time_stamp"),
         (JPEGS[1], FLAG_MONOTONIC, 1.7e9, "time_stamp"),
         (JPEGS[1], FLAG_MONOTONIC, -100.0, "time_stamp"),
@@ -219,6 +219,13 @@ def test_what_is_worth_nothing_is_dropped_and_counted_and_the_next_is_fine(
     counts = dict(source.status()["front"].counts)
     assert counts.pop("lost", 0) in {0, 1}
     assert counts == {"received": 3, "used": 2, "opened": 1, count: 1}
+
+
+def test_a_driver_may_leave_the_name_of_its_clock_out_if_its_stamps_are_of_now(start: Start) -> None:
+    kernel = FakeKernel(front=FakeCamera())
+    source = start(kernel, _camera())
+    kernel.send("front", JPEGS[0], flags=FLAG_CLOCK_UNKNOWN, time_s=time.monotonic())
+    assert _next(source).frames["front"].sequence == 0
 
 
 def test_what_only_the_decoder_notices_leaves_its_camera_out_of_the_set(start: Start) -> None:
