@@ -7,8 +7,9 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -30,13 +31,14 @@ def load() -> None:
     devices = ["n_devs=2", "node_types=0x1,0x101", "vid_cap_nr=10,12", "vid_out_nr=-1,11"]
     ends = ["num_inputs=1,1", "input_types=0,3", "num_outputs=1,1", "output_types=1,1"]  # a webcam; HDMI to HDMI
     run("modprobe", "vivid", *devices, *ends)
-    run("modprobe", "v4l2loopback", "devices=1", "video_nr=20", "card_label=front", "exclusive_caps=1")
+    run("modprobe", "v4l2loopback", "devices=1", "video_nr=20", "card_label=front")
     run("udevadm", "settle")
     for device in (WEBCAM, CABLE):
         control(device, "timestamp_source")  # stamped when the picture begins; else the stamps lie in the future
     for device in (CABLE_OUT, CABLE):
         run("v4l2-ctl", "-d", device, "--set-dv-bt-timings", f"index={_vga(device)}")
     control(CABLE, "loop_video")
+    control(CABLE, "osd_text_mode", 2)  # nothing written over the pictures
 
 
 def control(device: str, name: str, value: int = 1) -> float:
@@ -62,14 +64,12 @@ def run(*command: str) -> str:
 class Feeder:
     """The process behind a camera."""
 
-    def __init__(self, device: str, pixel_format: str, size: tuple[int, int], rate_hz: float) -> None:
-        """Begins with the first picture. Raises RuntimeError when there is none."""
-        module = [sys.executable, "-m", "tools.device_check.feeder"]
-        command = [*module, device, pixel_format, *map(str, size), str(rate_hz)]
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    def __init__(self, *command: str) -> None:
+        """Begins once the process has said something, which it does with its first picture."""
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
         assert self._process.stdout is not None
-        if not self._process.stdout.readline():
-            raise RuntimeError(f"{device} cannot be fed: {' '.join(command)} ended at once")
+        if not self._process.stdout.read(1):
+            raise RuntimeError(f"{' '.join(command)}: ended at once")
 
     def fall_silent(self) -> float:
         """No more pictures; since when, on the monotonic clock."""
@@ -87,10 +87,22 @@ class Feeder:
         self._process.wait()
 
 
+def loopback(size: tuple[int, int], rate_hz: float) -> Feeder:
+    """Feeds the loopback camera with Motion-JPEG."""
+    module = [sys.executable, "-m", "tools.device_check.feeder"]
+    return Feeder(*module, LOOPBACK, *map(str, size), str(rate_hz))
+
+
+def cable(pictures: Sequence[bytes]) -> Feeder:
+    """Feeds the HDMI output with frames, over and over."""
+    with tempfile.NamedTemporaryFile(delete=False) as file:
+        file.write(b"".join(pictures))
+    return Feeder("v4l2-ctl", "-d", CABLE_OUT, "--stream-out-mmap", f"--stream-from={file.name}", "--stream-loop")
+
+
 @contextmanager
-def feeding(device: str, pixel_format: str, size: tuple[int, int], rate_hz: float) -> Iterator[Feeder]:
-    """A camera that is fed as long as the block runs."""
-    feeder = Feeder(device, pixel_format, size, rate_hz)
+def feeding(feeder: Feeder) -> Iterator[Feeder]:
+    """Until the end of the block."""
     try:
         yield feeder
     finally:

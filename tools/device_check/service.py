@@ -24,7 +24,7 @@ from flockd.sources.images import MjpegFormat
 from flockd.sources.v4l2_device import CameraError, V4l2Device
 from flockd.telemetry.watcher import FleetWatcher
 from tools.device_check import pictures
-from tools.device_check.cameras import LOOPBACK, WEBCAM, Feeder, control, run
+from tools.device_check.cameras import WEBCAM, Feeder, control, loopback, run
 from tools.device_check.findings import Finding
 from tools.device_check.waiting import PATIENCE_S, until
 
@@ -81,7 +81,7 @@ class Service:
             "not ready without frames", state == "activating", f"{state} after {waited_s:.0f} s, {told!r}", "activating"
         )
         freed_s = time.monotonic()
-        self._front = Feeder(LOOPBACK, "mjpeg", FRONT_SIZE, RATE_HZ)
+        self._front = loopback(FRONT_SIZE, RATE_HZ)
         starting.wait(PATIENCE_S)
         took_s, state = time.monotonic() - freed_s, _shown("ActiveState")
         yield Finding(
