@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import sys
 from collections.abc import Mapping, Sequence
@@ -27,18 +28,17 @@ _RUN = "import sys; from flockd.cli import main; sys.exit(main())"
 
 
 def fleet_configs(
-    scenario: ScenarioConfig, sitl: DroneConfig, *, ports: Sequence[Ports], endpoint: str, fleet: str,
-    speed_factor: float,
-) -> tuple[DroneConfig, ...]:  # fmt: skip
+    scenario: ScenarioConfig, sitl: DroneConfig, *, ports: Sequence[Ports], endpoint: str, speed_factor: float
+) -> tuple[DroneConfig, ...]:
     """What each drone of a scenario flies with.
 
     The pilot is the scenario's; source, autopilot, safety and telemetry are those of ``sitl``. Raises ConfigError
     where ``sitl`` lacks one of them.
     """
     if sitl.source is None or sitl.source.kind != "shared_memory":
-        raise ConfigError([ConfigProblem("fleet", 0, "source", "has to be of kind `shared_memory`; write it so")])
+        raise ConfigError([ConfigProblem("px4_sitl.yaml", 0, "source", "has to be of kind `shared_memory`; write it so")])
     if sitl.autopilot is None:
-        raise ConfigError([ConfigProblem("fleet", 0, "autopilot", "is missing; add it")])
+        raise ConfigError([ConfigProblem("px4_sitl.yaml", 0, "autopilot", "is missing; add it")])
     configs = []
     for i, port in enumerate(ports):
         name = f"drone{i + 1}"
@@ -50,7 +50,9 @@ def fleet_configs(
             "source": sitl.source.model_copy(update={"shared_memory": shared_memory}),
             "autopilot": sitl.autopilot.model_copy(update=address),
             "safety": sitl.safety,
-            "telemetry": sitl.telemetry.model_copy(update={"fleet": fleet}),
+            "telemetry": sitl.telemetry.model_copy(
+                update={"fleet": re.sub(r"[^A-Za-z0-9_.-]+", "-", scenario.scenario)}
+            ),
             "recording": RECORDING,
         }
         configs.append(scenario.drone.model_copy(update=parts))

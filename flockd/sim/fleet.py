@@ -90,9 +90,7 @@ def fly_fleet(
         films.mkdir(parents=True, exist_ok=True)
         autopilots = stack.enter_context(_autopilots(scenario, kind, speed_factor, environment, folder))
         ports, endpoint = autopilots.ports, _free_endpoint()
-        configs = fleet_configs(
-            scenario, sitl, ports=ports, endpoint=endpoint, fleet=scenario.scenario, speed_factor=speed_factor
-        )
+        configs = fleet_configs(scenario, sitl, ports=ports, endpoint=endpoint, speed_factor=speed_factor)
         names = [config.name for config in configs]
         assert configs[0].source is not None
         station = stack.enter_context(GroundStation([port.truth for port in ports], clock))
