@@ -1,9 +1,18 @@
 """The daemon on the drone: owns time, devices, threads and failure around the pure line."""
 
 from flockd.daemon.daemon import Daemon, DaemonError, Ending
-from flockd.daemon.lock import only_instance
+from flockd.daemon.lock import only_instance, service_lock
 from flockd.daemon.service import ServiceManager
 from flockd.daemon.simulated_time import event_loop_at
 from flockd.sources import clock_at
 
-__all__ = ["Daemon", "DaemonError", "Ending", "ServiceManager", "clock_at", "event_loop_at", "only_instance"]
+__all__ = [
+    "Daemon",
+    "DaemonError",
+    "Ending",
+    "ServiceManager",
+    "clock_at",
+    "event_loop_at",
+    "only_instance",
+    "service_lock",
+]

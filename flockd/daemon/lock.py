@@ -18,7 +18,7 @@ SERVICE_FOLDER = Path("/run/flockd")
 @contextmanager
 def only_instance(drone: str, environment: Mapping[str, str]) -> Iterator[None]:
     """Holds the drone's lock file. Raises UnavailableError while another process holds it; a dead one holds nothing."""
-    path = _folder(environment) / f"flockd-{drone}.lock"
+    path = _lock(_folder(environment), drone)
     with path.open("a+", encoding="utf-8") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -33,6 +33,15 @@ def only_instance(drone: str, environment: Mapping[str, str]) -> Iterator[None]:
         file.write(f"{os.getpid()}\n")
         file.flush()
         yield
+
+
+def service_lock(drone: str) -> Path:
+    """The lock file of a flockd that runs as a service; who may not write there cannot see whether it is held."""
+    return _lock(SERVICE_FOLDER, drone)
+
+
+def _lock(folder: Path, drone: str) -> Path:
+    return folder / f"flockd-{drone}.lock"
 
 
 def _folder(environment: Mapping[str, str]) -> Path:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from flockd.daemon import only_instance
+from flockd.daemon import only_instance, service_lock
 from flockd.data import data_path
 from flockd.doctor.finding import Finding, failed, passed, warned
 from flockd.errors import UnavailableError
@@ -21,6 +22,10 @@ BAR, MUCH = 1.5, 5.0
 
 def check_instance(drone: str, environment: Mapping[str, str]) -> Iterator[Finding]:
     """Whether the drone's lock is free. ``environment`` is the process's own."""
+    lock = service_lock(drone)
+    if lock.exists() and not os.access(lock, os.R_OK | os.W_OK):
+        yield _unseen(str(lock))
+        return
     try:
         with only_instance(drone, environment):
             pass
@@ -29,10 +34,14 @@ def check_instance(drone: str, environment: Mapping[str, str]) -> Iterator[Findi
         mend = "stop it while you examine (`systemctl stop flockd`): it holds the cameras and the autopilot's link"
         yield failed("instance", measured, mend)
     except PermissionError as error:
-        mend = "examine as the user that flies: `sudo -u flockd flockd doctor ...`"
-        yield warned("instance", f"{error.filename} belongs to another user, so who holds it cannot be seen", mend)
+        yield _unseen(str(error.filename))
     else:
         yield passed("instance", f"no other flockd flies {drone} on this computer")
+
+
+def _unseen(lock: str) -> Finding:
+    mend = "examine as the user that flies: `sudo -u flockd flockd doctor ...`"
+    return warned("instance", f"{lock} belongs to another user, so who holds it cannot be seen", mend)
 
 
 def check_unit(unit: Path | None) -> Iterator[Finding]:

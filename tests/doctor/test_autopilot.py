@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import Any
 
 import pytest
@@ -16,9 +15,9 @@ from flockd.doctor import Check, Finding, Level, examine
 from tests.autopilot.conftest import HEARTBEAT_S, free_port
 
 try:
+    from flockd.autopilot.mavsdk_link import AutopilotLink
     from flockd.doctor import autopilot
     from flockd.doctor.autopilot import JUDGES, check_autopilot, judge_firmware
-    from tests.autopilot.flight import until
 except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
     pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
 
@@ -96,27 +95,28 @@ def test_nobody_there_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     assert finding.mend.startswith("check autopilot.address")
 
 
-def test_an_autopilot_that_falls_silent_under_examination_is_a_failure() -> None:
+def test_an_autopilot_that_falls_silent_under_examination_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     port = free_port()
+    read = AutopilotLink.parameter
 
-    async def silenced(stand_in: AutopilotStandIn) -> list[Finding]:
-        """Cut the cable as soon as it is heard."""
-        config = _config(port)
-        assert config.autopilot is not None
-        asking = asyncio.create_task(autopilot._ask(config, config.autopilot))
-        await until(lambda: 242 in stand_in._due_s and stand_in._streams_s[436] == pytest.approx(0.05))
-        stand_in.silent = True
-        return await asking
+    async def cut(self: AutopilotLink, name: str, kind: type[float]) -> float:
+        """The cable, before the second question."""
+        stand_in.silent = name == "COM_OBL_RC_ACT"
+        return await read(self, name, kind)
 
+    monkeypatch.setattr(AutopilotLink, "parameter", cut)
     with AutopilotStandIn(port, heartbeat_s=HEARTBEAT_S) as stand_in:
-        first, *rest = asyncio.run(silenced(stand_in))
-    assert (first.about, first.level) == ("heartbeat", Level.PASS)
-    assert [(finding.about, finding.level) for finding in rest] == [
-        ("firmware", Level.FAILURE),
-        ("COM_OF_LOSS_T", Level.FAILURE),
+        stand_in.parameters.update(GOOD)
+        check = Check("autopilot", lambda: check_autopilot(_config(port)), limit_s=60.0)
+        found = examine([check], lambda done, total: None)["autopilot"]
+    assert [(finding.about, finding.level) for finding in found] == [
+        ("heartbeat", Level.PASS),
+        ("firmware", Level.WARNING),
+        ("COM_OF_LOSS_T", Level.PASS),
+        ("COM_OBL_RC_ACT", Level.FAILURE),
         ("heartbeat", Level.FAILURE),
     ]
-    assert rest[-1].measured.endswith(" s ago and not since")
+    assert found[-1].measured.endswith(" s ago and not since")
 
 
 def test_no_autopilot_is_only_for_the_simulator() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
@@ -95,6 +96,21 @@ def test_a_lock_of_another_user_cannot_be_seen(tmp_path: Path, monkeypatch: pyte
     (finding,) = check_instance("drone1", {})
     assert finding.level is Level.WARNING
     assert "/run/flockd/flockd-drone1.lock belongs to another user" in finding.measured
+
+
+def test_the_lock_of_the_service_cannot_be_seen_by_who_may_not_write_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock = tmp_path / "flockd-drone1.lock"
+    lock.write_text("1234\n", encoding="ascii")
+    monkeypatch.setattr(service, "service_lock", lambda drone: tmp_path / f"flockd-{drone}.lock")
+    access = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: path != lock and access(path, mode))
+    environment = {"XDG_RUNTIME_DIR": str(tmp_path)}
+    (finding,) = check_instance("drone1", environment)
+    assert finding.level is Level.WARNING
+    assert finding.measured.startswith(f"{lock} belongs to another user")
+    assert next(iter(check_instance("drone2", environment))).level is Level.PASS
 
 
 @needs_systemd
