@@ -66,7 +66,7 @@ def _render_world(job: tuple[Path, int, int]) -> None:
     joined = {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
     draft = path.with_suffix(".part")
     with draft.open("wb") as file:
-        np.savez(file, **joined)
+        np.savez(file, allow_pickle=False, **joined)
     draft.replace(path)
 
 

@@ -64,10 +64,10 @@ def label_pixels(labels: NDArray[np.integer], label: int, limit: int) -> FloatAr
     found = cv2.findNonZero((labels == label).view(np.uint8))  # a tenth of the time of np.nonzero
     if found is None:
         return np.empty((0, 2))
-    pixels = found.reshape(-1, 2)
+    pixels = np.asarray(found, np.float64).reshape(-1, 2)
     if len(pixels) > limit:
         pixels = pixels[np.linspace(0, len(pixels) - 1, limit).astype(np.int64)]
-    return pixels.astype(np.float64) + 0.5
+    return pixels + 0.5
 
 
 def lift_matches(

@@ -21,7 +21,7 @@ def mounted(**extrinsics: float) -> RigCamera:
         name="one",
         size_px=(480, 640),
         intrinsics=INTRINSICS,
-        extrinsics=ExtrinsicsConfig(position_m=(0.1, 0.2, 0.3), **extrinsics),
+        extrinsics=ExtrinsicsConfig.model_validate({"position_m": (0.1, 0.2, 0.3), **extrinsics}),
     )
     return build_rig(RigConfig(cameras=(config,))).cameras["one"]
 
