@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 SITL = "px4_sitl.yaml"
 RECORDINGS = "recordings"
-DEFAULT_SPEED_FACTOR = 0.35
+DEFAULT_SPEED_FACTOR = 0.25
 """Two cores then keep up with five drones."""
-SPEED_FACTORS = (0.34, 10.0)
+SPEED_FACTORS = (0.1, 10.0)
 """What a daemon's configuration allows."""
 
 
