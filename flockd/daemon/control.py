@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import bisect
 import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from flockd.autopilot.mavsdk_link import AutopilotLink
@@ -17,6 +19,7 @@ from flockd.config import DroneConfig
 from flockd.daemon.inspection import Asked, Inspector, position_from_home
 from flockd.daemon.requests import Requests, Wish
 from flockd.daemon.sight import Sight
+from flockd.geometry.rotations import rotation_from_vector
 from flockd.messages import FloatArray, Setpoint, VehicleState, VelocityCommand
 from flockd.safety import (
     Action,
@@ -77,12 +80,30 @@ class VehicleHistory:
             self._states.popleft()
 
     def at(self, time_s: float) -> VehicleState | None:
-        """The state nearest in time; for frames of another clock, as a simulator's may be, the newest."""
+        """The state at that time, between two that are known; for frames of another clock, the newest."""
         if not self._states:
             return None
         if not self._states[0].time_s - HISTORY_S <= time_s <= self._states[-1].time_s + HISTORY_S:
             return self._states[-1]
-        return min(self._states, key=lambda state: abs(state.time_s - time_s))
+        later = bisect.bisect_left(self._states, time_s, key=lambda state: state.time_s)
+        if later in (0, len(self._states)):
+            return self._states[max(0, later - 1)]
+        return _between(self._states[later - 1], self._states[later], time_s)
+
+
+def _between(before: VehicleState, after: VehicleState, time_s: float) -> VehicleState:
+    """As if it had turned and moved evenly from the one to the other."""
+    share = (time_s - before.time_s) / (after.time_s - before.time_s)
+    turn, _ = cv2.Rodrigues(before.R_ned_body.T @ after.R_ned_body)
+    velocity = after.velocity_ned
+    if velocity is not None and before.velocity_ned is not None:
+        velocity = before.velocity_ned + share * (velocity - before.velocity_ned)
+    return VehicleState(
+        time_s=time_s,
+        R_ned_body=before.R_ned_body @ rotation_from_vector(share * np.asarray(turn, np.float64).ravel()),
+        height_m=before.height_m + share * (after.height_m - before.height_m),
+        velocity_ned=velocity,
+    )
 
 
 class Control:

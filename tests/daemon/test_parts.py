@@ -226,6 +226,14 @@ def test_frames_get_the_vehicle_state_of_their_time() -> None:
     history = VehicleHistory()
     assert history.at(1.0) is None
     for number in range(100):
-        history.add(VehicleState(100.0 + 0.05 * number, np.eye(3), height_m=float(number)))
-    at = {time_s: history.at(time_s) for time_s in (104.62, 104.95, 103.0, math.inf, 7.0)}
-    assert [state and state.height_m for state in at.values()] == [92.0, 99.0, 60.0, 99.0, 99.0]
+        yaw = math.radians(number)
+        turned = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+        velocity = np.array([0.1 * number, 0.0, 0.0])
+        history.add(VehicleState(100.0 + 0.05 * number, turned, height_m=float(number), velocity_ned=velocity))
+    found = [history.at(time_s) for time_s in (104.62, 104.95, 103.0, math.inf, 7.0)]
+    assert [state and state.height_m for state in found] == pytest.approx([92.4, 99.0, 60.0, 99.0, 99.0])
+    between = found[0]
+    assert between is not None
+    assert between.velocity_ned is not None
+    assert between.velocity_ned[0] == pytest.approx(9.24)
+    assert math.degrees(math.atan2(between.R_ned_body[1, 0], between.R_ned_body[0, 0])) == pytest.approx(92.4)
