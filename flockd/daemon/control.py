@@ -19,7 +19,6 @@ from flockd.config import DroneConfig
 from flockd.daemon.inspection import Asked, Inspector, position_from_home
 from flockd.daemon.requests import Requests, Wish
 from flockd.daemon.sight import Sight
-from flockd.geometry.rotations import rotation_from_vector
 from flockd.messages import FloatArray, Setpoint, VehicleState, VelocityCommand
 from flockd.safety import (
     Action,
@@ -95,12 +94,13 @@ def _between(before: VehicleState, after: VehicleState, time_s: float) -> Vehicl
     """As if it had turned and moved evenly from the one to the other."""
     share = (time_s - before.time_s) / (after.time_s - before.time_s)
     turn, _ = cv2.Rodrigues(before.R_ned_body.T @ after.R_ned_body)
+    part, _ = cv2.Rodrigues(share * np.asarray(turn, np.float64))
     velocity = after.velocity_ned
     if velocity is not None and before.velocity_ned is not None:
         velocity = before.velocity_ned + share * (velocity - before.velocity_ned)
     return VehicleState(
         time_s=time_s,
-        R_ned_body=before.R_ned_body @ rotation_from_vector(share * np.asarray(turn, np.float64).ravel()),
+        R_ned_body=before.R_ned_body @ np.asarray(part, np.float64),
         height_m=before.height_m + share * (after.height_m - before.height_m),
         velocity_ned=velocity,
     )
