@@ -91,6 +91,8 @@ class _Camera:
         self._clock = clock
         self._delivered = False
         """Whether this opening of the device has brought a usable frame."""
+        self._has_delivered = False
+        """Whether any has."""
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"camera-{self._name}", daemon=True)
 
@@ -133,12 +135,16 @@ class _Camera:
         """Until it is asked to stop; raises CameraError when the camera fails or falls silent."""
         image_format = self._image_format(device)
         usable_s, refused = self._clock(), None
+        left_over = self._has_delivered  # drivers may begin again with the last picture of before, stamped as of now
         while not self._stopping.is_set():
             captured = device.read(_LOOK_S)
-            if captured is not None:
+            if captured is not None and left_over:
+                self._intake.count(self._name, "received", "late")
+                left_over = False
+            elif captured is not None:
                 refused = self._take(captured, image_format)
                 if refused is None:
-                    usable_s, self._delivered = self._clock(), True
+                    usable_s, self._delivered, self._has_delivered = self._clock(), True, True
             limit_s = self._silence_s if self._delivered else max(_START_S, self._silence_s)
             if self._clock() - usable_s > limit_s:
                 last = f"; the last was refused ({refused.replace('_', ' ')})" if refused else ""
