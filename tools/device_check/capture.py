@@ -144,10 +144,10 @@ def falls_silent() -> Iterator[Finding]:
         after = _counts(source)
         spoke_s = feeder.go_on()
         back_s = until(lambda: _status(source).fault is None, "the camera to be back", look_s=LOOK_S)
-    refused, stale = _grown(before, after, "time_stamp"), _grown(before, after, "received")
+    refused, stale = _grown(before, after, "late"), _grown(before, after, "received")
     yield Finding(
         "a silent camera",
-        noticed_s - silent_s <= SILENCE_S + 0.1 and refused == stale,
+        noticed_s - silent_s <= SILENCE_S + 0.1 and 0 < refused == stale,
         f"noticed after {noticed_s - silent_s:.2f} s, {refused} of {stale} old frames refused, "
         f"back {back_s - spoke_s:.2f} s after it spoke again",
         f"noticed within {SILENCE_S + 0.1:g} s, no old frame taken",
