@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import socket
@@ -10,35 +9,21 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from flockd.config import DroneConfig
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import UnavailableError
-from flockd.flocking import desired_velocity
-from flockd.flocking.metrics import order, union
-from flockd.messages import FloatArray, PilotOutput
-from flockd.pilot import FlockPilot
-from flockd.pilot.pilot import load_perception
-from flockd.recording.codec import from_json
-from flockd.recording.mcap_file import Entry, read_records
-from flockd.recording.reader import Recording
-from flockd.recording.streams import OUTPUT, VEHICLE
-from flockd.report.filmstrip import FilmstripFrame
 from flockd.sim.autopilots import Autopilots, Px4s, StandIns
 from flockd.sim.daemons import Daemons, fleet_configs
-from flockd.sim.film_crew import FilmCrew, Shooting
+from flockd.sim.film_crew import FilmCrew
+from flockd.sim.fleet_log import Flown, filmstrip, flight_log
 from flockd.sim.ground_station import GroundStation
-from flockd.sim.log import FlightLog
-from flockd.sim.log_book import LogBook
-from flockd.sim.pictures import picture, pictured_steps
 from flockd.sim.processes import Program
 from flockd.sim.swarm import Flight
-from flockd.sim.truth import fly_truth
 from flockd.sources import clock_at
 
 AutopilotKind = Literal["standin", "px4"]
@@ -51,9 +36,6 @@ ARM_S, CLIMB_S, READY_S, OFFBOARD_S, LAND_S = 60.0, 60.0, 60.0, 10.0, 60.0
 LOOK_S = 0.05
 ASK_AGAIN_S = 1.0
 ON_GROUND_M, AT_HEIGHT_M = 0.5, 1.0
-END_OF_FLIGHT_S = 20.0
-"""Over which the order and the union at the end are told."""
-_FILMSTRIP_DRONE = 0
 
 
 def fly_fleet(
@@ -106,27 +88,7 @@ def fly_fleet(
         fleet.take_off()
         flown = fleet.fly(progress)
         fleet.land(flown)
-        log = _log(scenario, configs, flown, films, speed_factor)
-        return Flight(log, _filmstrip(films, flown))
-
-
-@dataclass
-class _Flown:
-    """What the simulator knows of a flight."""
-
-    began_s: float
-    ended_s: float = 0.0
-    wall_s: float = 0.0
-    shootings: tuple[Shooting, ...] = ()
-    cores: dict[str, float] = field(default_factory=dict)
-    """How many processor cores each kind of program kept busy."""
-    handed_over: dict[str, str] = field(default_factory=dict)
-    """Why a drone did not fly to the end, by its name."""
-    autopilot: str = ""
-    clock_rates: list[float] = field(default_factory=list)
-    """Seconds of each autopilot's clock in one of the simulation's."""
-    exit_codes: dict[str, int] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
+        return Flight(flight_log(scenario, configs, flown, films, speed_factor), filmstrip(films, flown))
 
 
 class _Fleet:
@@ -178,9 +140,9 @@ class _Fleet:
             "did not go into offboard",
         )
 
-    def fly(self, progress: Progress) -> _Flown:
+    def fly(self, progress: Progress) -> Flown:
         """Watches until the time is over."""
-        flown = _Flown(self._clock())
+        flown = Flown(self._clock())
         wall_s, cpu_s, booted = time.monotonic(), self._cpu_s(), [self._station.uptime_s(i) for i in self._all]
         total_s = self._scenario.duration_s
         while (flying_s := self._clock() - flown.began_s) < total_s:
@@ -200,7 +162,7 @@ class _Fleet:
         flown.shootings = tuple(s for s in self._crew.shootings() if flown.began_s <= s.time_s < flown.ended_s)
         return flown
 
-    def land(self, flown: _Flown) -> None:
+    def land(self, flown: Flown) -> None:
         """The daemons end, which leaves the drones in Hold, and the pilots land them."""
         flown.notes += self._crew.notes()
         self._needed = self._autopilots.programs()
@@ -213,13 +175,16 @@ class _Fleet:
         except UnavailableError as error:  # the flight is over, and worth its report
             flown.notes.append(str(error))
 
-    def _notice(self, flown: _Flown, flying_s: float) -> None:
-        """A drone that is not in offboard any more, or whose daemon has ended."""
+    def _notice(self, flown: Flown, flying_s: float) -> None:
+        """A drone that is not in offboard any more, or of which a program has ended."""
+        autopilots = self._autopilots.programs()
         for i, program in zip(self._all, self._daemons.programs(), strict=True):
             if program.name in flown.handed_over:
                 continue
             if program.ended is not None:
                 why = f"its daemon ended with exit code {program.ended} ({program.last_words()})"
+            elif autopilots and autopilots[i].ended is not None:
+                why = f"its autopilot ended with exit code {autopilots[i].ended} ({autopilots[i].last_words()})"
             elif not self._station.mode_is(i, "OFFBOARD"):
                 why = f"it left offboard ({self._said(i)})"
             else:
@@ -328,115 +293,3 @@ def _rate(before: tuple[float, float] | None, after: tuple[float, float] | None)
     if before is None or after is None or after[1] <= before[1]:
         return None
     return (after[0] - before[0]) / (after[1] - before[1])
-
-
-# What came of it
-
-
-def _log(
-    scenario: ScenarioConfig,
-    configs: Sequence[DroneConfig],
-    flown: _Flown,
-    recordings: Path,
-    speed_factor: float,
-) -> FlightLog:
-    """The flight's log: the truth of the film crew, and what the daemons recorded of themselves."""
-    shootings, drone = flown.shootings, configs[0]
-    begin_s = shootings[0].time_s
-    times = np.array([shooting.time_s - begin_s for shooting in shootings])
-    book = LogBook(times, len(configs))
-    for row, shooting in enumerate(shootings):
-        book.truth(row, shooting.poses.position, shooting.poses.velocity, shooting.poses.R_ned_body)
-        book.desired(row, desired_velocity(drone.desired, float(times[row])))
-    rows = {shooting.time_s: row for row, shooting in enumerate(shootings)}
-    looked, longest_s, spanning = [], 0.0, 0
-    for i, config in enumerate(configs):
-        steps = [(rows[o.time_s], o, R) for o, R in _outputs(recordings, config.name) if o.time_s in rows]
-        for before, (row, output, R_ned_body) in zip([None, *steps], steps, strict=False):
-            spans_more = False
-            if before is not None:
-                longest_s = max(longest_s, times[row] - times[before[0]])
-                spans_more = row - before[0] != 1 and output.ego_motion is not None
-                spanning += spans_more
-            # The log compares a motion with the truth of one frame set before: it cannot take one that spans more.
-            told = replace(output, ego_motion=None) if spans_more else output
-            book.seen(row, i, told, R_ned_body, output.stages_ms)
-        looked.append(len(steps))
-    late_s = [shooting.took_s for shooting in shootings]
-    position = np.array([shooting.poses.position[:, :2] for shooting in shootings])
-    velocity = np.array([shooting.poses.velocity[:, :2] for shooting in shootings])
-    end = np.flatnonzero(times >= times[-1] - END_OF_FLIGHT_S)
-    fleet: dict[str, Any] = {
-        "speed_factor": speed_factor,
-        "cores": {name: round(cores, 3) for name, cores in flown.cores.items()},
-        "frame_sets": len(shootings),
-        "frame_sets_looked_at": dict(zip((config.name for config in configs), looked, strict=True)),
-        "longest_step_s": float(longest_s),
-        "motions_over_more_than_one_frame_set": spanning,
-        "frames_late_s": {"p50": float(np.percentile(late_s, 50)), "p95": float(np.percentile(late_s, 95))},
-        "autopilot_clock_rates": [round(rate, 4) for rate in flown.clock_rates],
-        "order_last_20s": float(np.mean([order(velocity[s]) for s in end])),
-        "union_last_20s": float(np.mean([union(position[s], drone.flocking.observation_distance_m) for s in end])),
-        "handed_over": flown.handed_over,
-        "exit_codes": flown.exit_codes,
-        "notes": flown.notes,
-    }
-    meta = {
-        "scenario": scenario.scenario,
-        "drones": len(configs),
-        "duration_s": scenario.duration_s,
-        "step_s": drone.step_s,
-        "seed": scenario.seed,
-        "circle_until_s": drone.desired.circle_until_s,
-        "desired_distance_m": drone.flocking.desired_distance_m,
-        "observation_distance_m": drone.flocking.observation_distance_m,
-        "separation_distance_m": drone.flocking.separation_distance_m,
-        "perception": "learned",
-        "flow": drone.perception.flow,
-        "scale": drone.perception.scale,
-        "wall_s": flown.wall_s,
-        "autopilot": flown.autopilot,
-        "fleet": fleet,
-    }
-    return book.log(meta, _companion(scenario, times))
-
-
-def _companion(scenario: ScenarioConfig, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The same flight on exact states, at the times of the frame sets."""
-    steps_s, position, velocity = fly_truth(scenario)
-    flat = [values.reshape(len(steps_s), -1) for values in (position, velocity)]
-    at = [np.stack([np.interp(times, steps_s, column) for column in values.T], axis=1) for values in flat]
-    shape = (len(times), *position.shape[1:])
-    return at[0].reshape(shape), at[1].reshape(shape)
-
-
-def _outputs(recordings: Path, drone: str) -> Iterator[tuple[PilotOutput, FloatArray]]:
-    """What one drone's pilot found in each step of its flight, and the attitude its autopilot told it."""
-    for path in sorted(recordings.glob(f"{drone}-*.mcap")):
-        outputs: dict[int, PilotOutput] = {}
-        attitudes: dict[int, FloatArray] = {}
-        for record in read_records(path):
-            if isinstance(record, Entry) and record.stream.topic == OUTPUT.topic:
-                outputs[record.sequence] = from_json(PilotOutput, json.loads(record.data))
-            elif isinstance(record, Entry) and record.stream.topic == VEHICLE.topic:
-                attitudes[record.sequence] = np.reshape(json.loads(record.data)["R_ned_body"], (3, 3))
-        yield from ((outputs[step], attitudes[step]) for step in sorted(outputs.keys() & attitudes.keys()))
-
-
-def _filmstrip(recordings: Path, flown: _Flown) -> tuple[FilmstripFrame, ...]:
-    """A few moments of one drone, seen again: a fresh pilot for each, with two frame sets of the recording."""
-    drone = f"drone{_FILMSTRIP_DRONE + 1}"
-    path = min(recordings.glob(f"{drone}-*.mcap"), default=None)
-    if path is None:
-        return ()
-    recording = Recording(path)
-    perception = load_perception(recording.config)
-    times = [time_s for _, time_s in recording.contents.steps]
-    strip: list[FilmstripFrame] = []
-    for index in sorted(pictured_steps(len(times))):
-        pilot = FlockPilot(recording.config, perception)
-        for step in recording.steps(times[max(index - 1, 0)], times[index]):
-            output = pilot.step(step.frames, step.vehicle)
-        begin_s = flown.shootings[0].time_s
-        strip += [replace(frame, time_s=frame.time_s - begin_s) for frame in picture(pilot, output, _FILMSTRIP_DRONE)]
-    return tuple(strip)

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
 
-END_S = 15.0
+END_S = 30.0
 """To end when told to, before it is killed."""
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _LAST_WORDS_BYTES = 4000
