@@ -101,7 +101,7 @@ def main() -> None:
     feeds = golden_feeds(manifest)
     _write_onnx(net, feeds, list(spec["outputs"]), file)
     outputs = _compare(net, feeds, file)
-    document = manifest.model_dump(mode="json")
+    document = manifest.model_dump(mode="json", exclude_defaults=True)
     document["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
     for name, value in outputs.items():
         document["outputs"][name]["golden_mean"] = float(value.mean())

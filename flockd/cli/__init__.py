@@ -23,6 +23,7 @@ INTERRUPTED = 130
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit code; an expected error is one sentence on stderr."""
     args = _parser().parse_args(arguments)
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # before ONNX Runtime is imported: it keeps statistics
     try:
         code: int = args.run(args)
         sys.stdout.flush()

@@ -120,7 +120,7 @@ def test_a_step_without_its_vehicle_is_the_last_of_a_killed_one_or_an_error(tmp_
 
 KILLS = 20
 FLYING = f"""
-import os, random, signal, sys, time
+import os, random, select, signal, sys, time
 from pathlib import Path
 from tests.recording.made_up import MadeUpPilot, drone_config, inputs
 from flockd.recording import Recorder
@@ -142,6 +142,8 @@ for number in range({KILLS}):
     if child == 0:
         fly(path, pipe[1])
     children.append((random.Random(number).uniform(0.5, 2.5), child, pipe))
+for _, _, (reading, writing) in children:
+    select.select([reading], [], [])  # all have begun
 began = time.monotonic()
 for moment, child, (reading, writing) in sorted(children):
     time.sleep(max(0.0, began + moment - time.monotonic()))
