@@ -22,7 +22,8 @@ DROP_IN = Path("/run/systemd/system/flockd.service.d/probe.conf")
 ANSWERS = Path("/run/probe.json")
 PROBE = Path(__file__).with_name("sandbox_probe.py")
 OPEN_FOLDERS = {"/etc/open", "/home/open", "/opt/open", "/srv/open", "/usr/open", "/var/open"}
-OPEN_DEVICES = {"/dev/open-kmsg": stat.S_IFCHR, "/dev/open-disk": stat.S_IFBLK}
+OPEN_DISK = Path("/dev/open-disk")
+OPEN_DEVICES = {str(OPEN_DISK), "/dev/fuse", "/dev/net/tun"}
 FOLDERS = {"/var/lib/flockd", "/run/flockd"}
 PRIVATE_FOLDERS = {"/tmp", "/var/tmp"}
 DEVICES = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom", "/dev/tty", "/dev/ptmx", "/dev/pts/")
@@ -42,7 +43,8 @@ FOREIGN_ADDRESS = "203.0.113.1/32"
 def holds() -> Iterator[Finding]:
     """Inside against outside."""
     _open_the_outside()
-    outside, inside = _probe_outside(), _probe_inside()
+    inside = _probe_inside()  # first: systemd makes the unit's folders
+    outside = _probe_outside()
     yield _folders(inside, outside)
     yield _devices(inside, outside)
     for part in ("memory", "rights", "network"):
@@ -61,11 +63,9 @@ def _open_the_outside() -> None:
     for folder in OPEN_FOLDERS:
         Path(folder).mkdir(exist_ok=True)
         Path(folder).chmod(0o1777)
-    numbers = {"/dev/open-kmsg": os.makedev(1, 11), "/dev/open-disk": Path("/dev/vda").stat().st_rdev}
-    for device, kind in OPEN_DEVICES.items():
-        if not Path(device).exists():
-            os.mknod(device, kind, numbers[device])
-        Path(device).chmod(0o666)
+    if not OPEN_DISK.exists():
+        os.mknod(OPEN_DISK, stat.S_IFBLK, Path("/dev/vda").stat().st_rdev)
+    OPEN_DISK.chmod(0o666)
     run("ip", "address", "replace", FOREIGN_ADDRESS, "dev", "lo")
 
 
@@ -116,7 +116,7 @@ def _devices(inside: Mapping[str, Any], outside: Mapping[str, Any]) -> Finding:
     forbidden = set(outside["devices opened"]) - opened
     return Finding(
         "sandbox: devices",
-        not strange and bool(listed) and forbidden >= OPEN_DEVICES.keys(),
+        not strange and bool(listed) and forbidden >= OPEN_DEVICES,
         f"opens {', '.join([*listed, *sorted(strange)])}; not {', '.join(sorted(forbidden))}",
         "cameras, serial ports and what every program may",
     )

@@ -72,7 +72,7 @@ def _opened_devices() -> Iterator[str]:
     for folder, _, names in os.walk("/dev"):
         for name in names:
             path = Path(folder, name)
-            mode = path.stat().st_mode if path.exists() else 0
+            mode = path.lstat().st_mode
             if stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
                 ways = (os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY, os.O_RDWR | os.O_NONBLOCK | os.O_NOCTTY)
                 if DONE in [_attempt(functools.partial(_open, path, way)) for way in ways]:
