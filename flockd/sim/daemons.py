@@ -36,7 +36,9 @@ def fleet_configs(
     where ``sitl`` lacks one of them.
     """
     if sitl.source is None or sitl.source.kind != "shared_memory":
-        raise ConfigError([ConfigProblem("px4_sitl.yaml", 0, "source", "has to be of kind `shared_memory`; write it so")])
+        raise ConfigError(
+            [ConfigProblem("px4_sitl.yaml", 0, "source", "has to be of kind `shared_memory`; write it so")]
+        )
     if sitl.autopilot is None:
         raise ConfigError([ConfigProblem("px4_sitl.yaml", 0, "autopilot", "is missing; add it")])
     configs = []
