@@ -1,11 +1,11 @@
 """Measure what one daemon takes: seconds until it is ready, memory, processor; with shipped models and four cameras.
 
-python tools/bench_daemon.py [--seconds 20] [--json]
+python tools/bench_daemon.py [--seconds 20] [--recording DRONE.mcap] [--json]
 
 A real `flockd run` with the configuration of PX4 SITL, beside an autopilot stand-in in Hold: pictures of 640x480 from
-shared memory, 2 sets a second, and a recording; in the environment that systemd's unit gives it. Memory is what Linux
-calls resident; pages shared with who sends the pictures are told apart. Exit code 1: ready after more than 3 s, or more
-than 350 MB.
+shared memory (a recording's, or plain ones without drones), 2 sets a second, and a recording; in the environment that
+systemd's unit gives it. Memory is what Linux calls resident; pages shared with who sends the pictures are told apart.
+Exit code 1: ready after more than 3 s, or more than 350 MB.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import socket
 import sys
 import tempfile
 import time
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -28,12 +29,14 @@ from flockd.config import DroneConfig, load
 from flockd.data import data_path
 from flockd.messages import Frame
 from flockd.perception.session import golden_image
+from flockd.recording.reader import Recording
 from flockd.sim.daemons import Daemons
 from flockd.sources import FramePublisher
 
 READY_BAR_S = 3.0
 MEMORY_BAR_MB = 350.0
 SETS_HZ = 2.0
+SETS = 60
 PATIENCE_S = 60.0
 
 
@@ -41,9 +44,10 @@ def main() -> int:
     """Measure and print; the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0, help="after it is ready (20)")
+    parser.add_argument("--recording", type=Path, help="of a drone with the same cameras: what this one is shown")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    found = measure(arguments.seconds)
+    found = measure(arguments.seconds, arguments.recording)
     if arguments.json:
         print(json.dumps(found, indent=1))
     else:
@@ -52,13 +56,13 @@ def main() -> int:
     return 0 if found["ready, s"] <= READY_BAR_S and found["resident at most, MB"] <= MEMORY_BAR_MB else 1
 
 
-def measure(seconds: float) -> dict[str, float]:
+def measure(seconds: float, recording: Path | None) -> dict[str, float]:
     """Every figure by name."""
     port, endpoint = free_port(socket.SOCK_DGRAM), f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     config = at(port, endpoint)
     with tempfile.TemporaryDirectory() as name, AutopilotStandIn(port, height_m=2.5):
         folder = Path(name)
-        pictures = Pictures(config, endpoint)
+        pictures = Pictures(config, endpoint, recording)
         with Daemons(
             [config], folder=folder, recordings=folder, environment={**os.environ, **of_the_unit()}
         ) as daemons:
@@ -109,12 +113,18 @@ def of_the_unit() -> dict[str, str]:
 
 
 class Pictures:
-    """A picture a camera that moves on from set to set: the same one again would be a frozen camera's."""
+    """Set after set of what the cameras see, each in its turn."""
 
-    def __init__(self, config: DroneConfig, endpoint: str) -> None:
-        self._config = config
+    def __init__(self, config: DroneConfig, endpoint: str, recording: Path | None) -> None:
+        self._drone = config.name
         self._publisher = FramePublisher(listen=[endpoint])
-        self._images = {c.name: golden_image(c.size_px, i) for i, c in enumerate(config.rig.cameras)}
+        if recording is None:
+            plain = {c.name: golden_image(c.size_px, i) for i, c in enumerate(config.rig.cameras)}
+            # The same picture again would be a frozen camera's.
+            self._sets = [{name: np.roll(image, 2 * k, axis=1) for name, image in plain.items()} for k in range(SETS)]
+        else:
+            steps = islice(Recording(recording).steps(), SETS)
+            self._sets = [{name: frame.image for name, frame in step.frames.frames.items()} for step in steps]
         self._number, self._due_s = 0, time.monotonic()
 
     def show(self) -> None:
@@ -122,9 +132,8 @@ class Pictures:
         if time.monotonic() >= self._due_s:
             self._number, self._due_s = self._number + 1, self._due_s + 1.0 / SETS_HZ
             now_s = time.monotonic()
-            for camera, image in self._images.items():
-                moved = np.roll(image, 2 * self._number, axis=1)
-                self._publisher.publish(self._config.name, Frame(camera, moved, now_s, self._number))
+            for camera, image in self._sets[self._number % len(self._sets)].items():
+                self._publisher.publish(self._drone, Frame(camera, image, now_s, self._number))
         time.sleep(0.01)
 
     def close(self) -> None:

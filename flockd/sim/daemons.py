@@ -22,6 +22,8 @@ from flockd.sim.processes import Program, Programs
 
 READY, STATUS = "READY=1", "STATUS="
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+SMALL = {"MALLOC_ARENA_MAX": "2"}
+"""As systemd's unit sets it: fewer, fuller pools of memory."""
 RECORDING = RecordingConfig(images="jpeg", jpeg_quality=80, file_mb=20000.0)
 """One file for a flight, which costs the daemon little."""
 _RUN = "import sys; from flockd.cli import main; sys.exit(main())"
@@ -81,6 +83,7 @@ class Daemons:
         self._environment = {
             **environment,
             **ONE_THREAD,
+            **SMALL,
             "PYTHONPATH": f"{package}:{known}" if known else package,
             "XDG_RUNTIME_DIR": str(folder),
         }
