@@ -1,38 +1,92 @@
-"""`flockd models`: which networks are at hand, and whether they are whole."""
+"""`flockd models`: which networks are at hand, whether they are whole, how fast they are, and their engines."""
 
 from __future__ import annotations
 
 import argparse
+import statistics
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from flockd.cli.output import say, say_json
-from flockd.cli.parser import Commands, Parser, add_commands
+from flockd.cli.output import progress, say, say_json
+from flockd.cli.parser import Commands, Parser, add_commands, positive_count
 from flockd.errors import ExitCode, ModelError, UnavailableError
 
+if TYPE_CHECKING:
+    from flockd.config import DroneConfig
+    from flockd.perception import OnnxModel
+    from flockd.perception.providers import Provider
+
 THREADS = 2
+RUNS = 9
+"""The median of so many is told, after one that nobody counts."""
+MOST_PICTURES = 16
+"""Drones that the second stage looks at in one batch."""
 
 
 def add(commands: Commands) -> None:
     """Adds the command."""
-    parser = commands("models", "List and verify the networks.", ("flockd models list", "flockd models verify"))
-    add_commands(parser, (_add_list, _add_verify))
+    description = "List, verify, time and prepare the networks."
+    examples = ("flockd models list", "flockd models verify", "flockd models bench --threads 1,2")
+    parser = commands("models", description, examples)
+    add_commands(parser, (_add_list, _add_verify, _add_bench, _add_prepare))
 
 
 def _add_list(commands: Commands) -> None:
     examples = ("flockd models list", "flockd models list --json", "flockd models list --dir my_models")
-    _add_options(commands("list", "List each model with its roles.", examples)).set_defaults(run=_list)
+    _add_options(commands("list", "List each model with its roles; a damaged one is refused.", examples), _list)
 
 
 def _add_verify(commands: Commands) -> None:
     examples = ("flockd models verify", "flockd models verify --json")
-    description = "Check each model file against its manifest: hash, inputs, outputs and the answer to a known input."
-    _add_options(commands("verify", description, examples)).set_defaults(run=_verify)
+    description = "Check each model file against its manifest: hash, weights, inputs, outputs, and a known answer."
+    _add_options(commands("verify", description, examples), _verify)
 
 
-def _add_options(parser: Parser) -> Parser:
+def _add_bench(commands: Commands) -> None:
+    examples = (
+        "flockd models bench",
+        "flockd models bench --threads 1,2,4 --size 640x480 --json",
+        "flockd models bench --dir models_of_others --provider cuda",
+    )
+    description = "Time each model, for each provider and number of threads: milliseconds a run, the median."
+    parser = _add_options(commands("bench", description, examples), _bench)
+    parser.add_argument("--provider", metavar="NAME,...", help="cpu, cuda, tensorrt, openvino (default: all there are)")
+    parser.add_argument("--threads", metavar="N,...", type=_counts, default=(1, 2), help="on the CPU (default: 1,2)")
+    parser.add_argument("--size", metavar="WxH", type=_size, default=(640, 480), help="of the image (default: 640x480)")
+    parser.add_argument("--runs", metavar="N", type=positive_count, default=RUNS, help=f"to time (default: {RUNS})")
+
+
+def _add_prepare(commands: Commands) -> None:
+    examples = ("flockd models prepare --config my_drone.yaml", "flockd models prepare --config my_drone.yaml --json")
+    description = (
+        "Build what a drone's provider needs for its models and cameras, ahead of flight. TensorRT takes minutes, and "
+        "a flight with it is refused before; OpenVINO starts sooner; CPU and CUDA have nothing to build."
+    )
+    parser = commands("prepare", description, examples)
+    parser.add_argument("--config", metavar="FILE", type=Path, required=True, help="the drone's configuration")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(run=_prepare)
+
+
+def _add_options(parser: Parser, run: Any) -> Parser:
     parser.add_argument("--dir", type=Path, help="folder of the manifests; by default the one that comes with flockd")
     parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(run=run)
     return parser
+
+
+def _counts(text: str) -> tuple[int, ...]:
+    return tuple(positive_count(part) for part in text.split(","))
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, x, height = text.partition("x")
+    if not (x and width.isdecimal() and height.isdecimal() and int(width) >= 32 and int(height) >= 32):
+        raise argparse.ArgumentTypeError(f"{text!r} is no size of at least 32x32, as in 640x480")
+    return int(width), int(height)
 
 
 def _list(args: argparse.Namespace) -> int:
@@ -41,13 +95,14 @@ def _list(args: argparse.Namespace) -> int:
 
     from flockd.perception.manifest import load_manifest
 
-    models = [load_manifest(path)[0] for path in _manifests(args.dir)]
+    models = [load_manifest(path) for path in _manifests(args.dir)]
     if args.json:
-        say_json([model.model_dump(mode="json") for model in models])
+        say_json([model.model_dump(mode="json") for model, _ in models])
         return ExitCode.DONE
-    table = Table("model", "roles", "file", "licence", "what it is", box=None, pad_edge=False)
-    for model in models:
-        table.add_row(model.name, ", ".join(model.roles), model.file, model.licence, model.description)
+    table = Table("model", "roles", "MB", "sha256", "licence", "what it is", box=None, pad_edge=False)
+    for model, file in models:
+        size_mb = f"{file.stat().st_size / 1e6:.1f}"
+        table.add_row(model.name, ", ".join(model.roles), size_mb, model.sha256[:12], model.licence, model.description)
     Console(markup=False, highlight=False).print(table)
     return ExitCode.DONE
 
@@ -69,6 +124,137 @@ def _verify(args: argparse.Namespace) -> int:
         for name, fault in faults.items():
             say(f"{name}: fine" if fault is None else fault)
     return ExitCode.CHECK_FAILED if any(faults.values()) else ExitCode.DONE
+
+
+@dataclass(frozen=True)
+class _Timing:
+    model: str
+    provider: str
+    threads: int
+    input: str
+    """What enters, as in `first 1x120x160x3`."""
+    median_ms: float | None
+    least_ms: float | None
+    fault: str | None
+    """Why it does not run there."""
+
+
+def _bench(args: argparse.Namespace) -> int:
+    from rich.console import Console
+    from rich.table import Table
+
+    timings = []
+    providers = _providers(args.provider)
+    manifests = _manifests(args.dir)
+    with progress("timing", "combinations") as tell:
+        for timing in _timings(manifests, providers, args):
+            timings.append(timing)
+            tell(len(timings), len(manifests) * len(providers) * len(args.threads))
+    if args.json:
+        say_json([asdict(timing) for timing in timings])
+    else:
+        table = Table("model", "provider", "threads", "ms, median", "least", "input", box=None, pad_edge=False)
+        for t in timings:
+            told = [f"{t.median_ms:.1f}", f"{t.least_ms:.1f}", t.input] if t.fault is None else ["-", "-", t.fault]
+            table.add_row(t.model, t.provider, str(t.threads), *told)
+        Console(markup=False, highlight=False).print(table)
+    return ExitCode.CHECK_FAILED if any(timing.fault for timing in timings) else ExitCode.DONE
+
+
+def _providers(text: str | None) -> Sequence[Provider]:
+    from flockd.errors import UsageError
+    from flockd.perception.providers import PROVIDERS, available
+
+    if text is None:
+        return available()
+    named = [provider for provider in PROVIDERS if provider in text.split(",")]
+    strangers = sorted(set(text.split(",")) - set(PROVIDERS))
+    if strangers:
+        raise UsageError(f"--provider: {strangers[0]!r} is none of {', '.join(PROVIDERS)}; choose of these")
+    return named
+
+
+def _timings(manifests: Sequence[Path], providers: Sequence[Provider], args: argparse.Namespace) -> Iterator[_Timing]:
+    from flockd.perception import OnnxModel
+    from flockd.perception.session import feeds_for, shapes_of
+
+    for path in manifests:
+        for provider in providers:
+            for threads in args.threads:
+                try:
+                    model = OnnxModel(path, threads=threads, provider=provider, preparing=True)
+                except ModelError as error:
+                    yield _Timing(path.stem, provider, threads, "", None, None, str(error))
+                    continue
+                feeds = feeds_for(model.manifest, args.size)
+                taken_ms = sorted(_times_ms(model, feeds, args.runs))
+                entered = ", ".join(f"{n} {'x'.join(map(str, shape))}" for n, shape in shapes_of(feeds).items())
+                yield _Timing(path.stem, provider, threads, entered, statistics.median(taken_ms), taken_ms[0], None)
+
+
+def _times_ms(model: OnnxModel, feeds: Any, runs: int) -> list[float]:
+    model.run(feeds)
+    taken = []
+    for _ in range(runs):
+        begun_s = time.perf_counter()
+        model.run(feeds)
+        taken.append(1e3 * (time.perf_counter() - begun_s))
+    return taken
+
+
+def _prepare(args: argparse.Namespace) -> int:
+    from flockd.config import ScenarioConfig, load
+    from flockd.perception import manifests_of
+
+    loaded = load(args.config)
+    config = loaded.drone if isinstance(loaded, ScenarioConfig) else loaded
+    paths = manifests_of(config.perception)
+    told = []
+    with progress("preparing", "models") as tell:
+        for path in paths:
+            told.append(_prepare_one(path, config))
+            tell(len(told), len(paths))
+    if args.json:
+        say_json(told)
+        return ExitCode.DONE
+    for one in told:
+        start = f"starts in {one['start_s']:.2f} s"
+        if one["engines"] is None:
+            say(f"{one['model']}: nothing to prepare for {config.perception.provider}; {start}")
+        else:
+            say(f"{one['model']}: prepared in {one['prepare_s']:.1f} s, {start}: {one['engines']}")
+    return ExitCode.DONE
+
+
+def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
+    """Runs a model on all that it will see of these cameras, keeps what that built, and opens it again as in flight."""
+    from flockd.perception import OnnxModel
+    from flockd.perception.providers import builds_engines, engines_folder
+    from flockd.perception.session import feeds_for, golden_feeds, shapes_of
+
+    wanted = config.perception
+    options: Any = {"threads": wanted.threads, "provider": wanted.provider, "engines": engines_folder(wanted)}
+    begun_s = time.perf_counter()
+    if builds_engines(wanted.provider):
+        model = OnnxModel(path, **options, preparing=True)
+        sizes = sorted({camera.size_px for camera in config.rig.cameras})
+        feeds = [
+            golden_feeds(model.manifest),
+            *(feeds_for(model.manifest, size, pictures) for size in sizes for pictures in (1, MOST_PICTURES)),
+        ]
+        for each in feeds:
+            model.run(each)
+        model.keep_engines([shapes_of(each) for each in feeds])
+        del model  # some providers write their cache when a session ends
+    prepared_s = time.perf_counter()
+    engines = OnnxModel(path, **options).engines
+    return {
+        "model": path.stem,
+        "provider": wanted.provider,
+        "engines": None if engines is None else str(engines),
+        "prepare_s": prepared_s - begun_s,
+        "start_s": time.perf_counter() - prepared_s,
+    }
 
 
 def _manifests(folder: Path | None) -> tuple[Path, ...]:

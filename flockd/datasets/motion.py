@@ -76,7 +76,7 @@ class RecordedDepth:
     def scene(self, camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:
         """The learned drones, and the recorded depth."""
         scene = self._learned.scene(camera, image, geometry)
-        return scene if self._depth is None else replace(scene, depth=self._depth)
+        return scene if self._depth is None else replace(scene, depth=self._depth, open=None)
 
     def ranges(self, pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
         """The learned ranges."""

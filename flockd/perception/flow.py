@@ -10,6 +10,10 @@ import numpy as np
 from flockd.messages import Float32Array, UInt8Array
 from flockd.perception.fitting import fit
 from flockd.perception.session import OnnxModel
+from flockd.perception.shift import global_shift, likeness
+
+_EXPLAINS = 0.6
+"""Images that are less like each other than this along a flow say that it went astray: the camera turned too far."""
 
 
 class Flow(Protocol):
@@ -44,6 +48,7 @@ class DisFlow:
     """OpenCV's dense inverse search (Kroeger et al. 2016): alone for small computers, or after another flow.
 
     It is exact to a fraction of a pixel where it converges, but loses what moves far; a network is the other way round.
+    Where the network too loses its way, one shift of the whole image is tried as the start.
     """
 
     def __init__(self, start: Flow | None = None, finest_scale: int = 1) -> None:
@@ -58,8 +63,23 @@ class DisFlow:
 
     def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
         """See ``Flow``."""
-        start = self._start.flow(first, second) if self._start else np.zeros((*first.shape[:2], 2), np.float32)
-        grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (first, second)]
+        before, after = _grey(first), _grey(second)
+        if self._start is None:
+            return self._from(np.zeros((*before.shape, 2), np.float32), before, after)
+        flow = self._from(self._start.flow(first, second), before, after)
+        explained = likeness(before, after, flow)
+        if explained >= _EXPLAINS:
+            return flow
+        shifted = np.full_like(flow, global_shift(before, after))
+        other = self._from(shifted, before, after)
+        return other if likeness(before, after, other) > explained else flow
+
+    def _from(self, start: Float32Array, first: UInt8Array, second: UInt8Array) -> Float32Array:
+        """The flow between grey images; ``start`` is changed."""
         dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)  # one a call: it is not for two threads
         dis.setFinestScale(self._finest_scale)
-        return np.asarray(dis.calc(grey[0], grey[1], start), dtype=np.float32)
+        return np.asarray(dis.calc(first, second, start), dtype=np.float32)
+
+
+def _grey(image: UInt8Array) -> UInt8Array:
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)

@@ -160,6 +160,11 @@ def _listed(shapes: Shapes) -> dict[str, list[int]]:
     return {name: [int(size) for size in shape] for name, shape in shapes.items()}
 
 
+def builds_engines(provider: Provider) -> bool:
+    """Whether it can do work ahead of flight and keep it."""
+    return provider in _BUILDS
+
+
 def is_slow_to_build(provider: Provider) -> bool:
     """Whether models must be prepared for it before they fly."""
     return provider in _SLOW_TO_BUILD

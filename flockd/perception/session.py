@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from flockd.errors import ModelError
 from flockd.messages import Float32Array, UInt8Array
-from flockd.perception.fitting import entering, leaving
+from flockd.perception.fitting import entering, fit, leaving
 from flockd.perception.manifest import Answer, Content, InputSpec, Manifest, OutputSpec, load_manifest
 from flockd.perception.providers import Prepared, Provider, Shapes, engine_folder, is_slow_to_build, open_session
 from flockd.perception.weights import fault_of_weights
@@ -90,6 +90,11 @@ class OnnxModel:
             specs[name].gives or name: leaving(specs[name], value)  # type: ignore[misc]
             for name, value in self.run(feeds).items()
         }
+
+    @property
+    def engines(self) -> Path | None:
+        """The folder of what its provider builds; None where it builds nothing."""
+        return self._engines
 
     def keep_engines(self, shapes: Sequence[Shapes]) -> None:
         """Note that the engines in the folder cover these shapes and all between them."""
@@ -187,6 +192,23 @@ def golden_feeds(manifest: Manifest) -> dict[str, NDArray[Any]]:
             feeds[name] = np.zeros((1, 3, height // 2, width // 2), np.float32)
         else:
             feeds[name] = entering(spec, [golden_image((width, height), index)])
+    return feeds
+
+
+def feeds_for(manifest: Manifest, image: tuple[int, int], pictures: int = 1) -> dict[str, NDArray[Any]]:
+    """What enters for images (width, height) of a camera, or for so many pictures of drones, with nothing in them."""
+    fitting = fit(manifest, image)
+    feeds: dict[str, NDArray[Any]] = {}
+    for name, spec in manifest.inputs.items():
+        content = spec.carries or name
+        if content == "geometry":
+            planes = np.zeros((3, image[1] // 2, image[0] // 2), np.float32)
+            feeds[name] = fitting.enter_planes(planes, 2)[None]
+        elif content == "picture":
+            size = manifest.fixed_size or manifest.golden_size
+            feeds[name] = entering(spec, [golden_image(size, seed) for seed in range(pictures)])
+        else:
+            feeds[name] = entering(spec, [fitting.enter(golden_image(image))])
     return feeds
 
 

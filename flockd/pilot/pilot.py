@@ -25,8 +25,9 @@ from flockd.messages import (
     VehicleState,
     VelocityCommand,
 )
-from flockd.perception import Perception, models_folder
+from flockd.perception import Perception, SceneMaps, models_folder
 from flockd.pilot.motions import ego_motion, neighbour_motions
+from flockd.pilot.scale import VelocityScale
 from flockd.pilot.views import Observer, Perceiver, RigView
 from flockd.tracking import Blind, ExpectedNeighbour, Measurement, Tracker, sighting_covariance
 
@@ -50,6 +51,7 @@ class FlockPilot:
         self._rig = build_rig(config.rig)
         self._perceiver = perceiver or load_perception(config)
         self._observer = Observer(self._rig, self._perceiver, height_fixes_scale=config.perception.scale == "height")
+        self._scale = VelocityScale(self._rig) if config.perception.scale == "velocity" else None
         self._tracker = Tracker(config.tracking)
         self._law = FlockingLaw(config.flocking)
         self._stopwatch = stopwatch
@@ -81,11 +83,14 @@ class FlockPilot:
             self._first_time_s = frames.time_s
         maps, reasons = self._observer.scenes(frames, vehicle)
         laps.end("scene")
+        previous, reasons = self._pair_with(frames.time_s, reasons)
+        flows = self._flows(previous, frames, maps)
+        laps.end("flow")
+        if self._scale:
+            maps, why = self._fixed(self._scale, previous, vehicle, maps, flows)
+            reasons += why
         view = self._observer.view(frames, vehicle, maps, reasons, self._expected(frames.time_s))
         laps.end("distance")
-        previous, reasons = self._pair_with(view, reasons)
-        flows = self._flows(previous, view)
-        laps.end("flow")
         ego, displacement = self._ego_motion(previous, view, flows, reasons)
         laps.end("ego_motion")
         motions: dict[int, NeighbourMotion] = {}
@@ -119,16 +124,31 @@ class FlockPilot:
             return ()
         return self._tracker.expect(time_s - self._previous.time_s, self._velocity)
 
-    def _pair_with(self, view: RigView, reasons: list[str]) -> tuple[RigView | None, list[str]]:
-        if self._previous is not None and view.time_s <= self._previous.time_s:
+    def _pair_with(self, time_s: float, reasons: list[str]) -> tuple[RigView | None, list[str]]:
+        if self._previous is not None and time_s <= self._previous.time_s:
             return None, [*reasons, "time stamps do not increase: the pair starts anew"]
         return self._previous, reasons
 
-    def _flows(self, previous: RigView | None, view: RigView) -> dict[str, Float32Array]:
+    def _flows(
+        self, previous: RigView | None, frames: FrameSet, maps: Mapping[str, SceneMaps]
+    ) -> dict[str, Float32Array]:
         if previous is None:
             return {}
-        both = [name for name in view.cameras if name in previous.cameras]
-        return {n: self._perceiver.flow(n, previous.cameras[n].image, view.cameras[n].image) for n in both}
+        both = [name for name in maps if name in previous.cameras]
+        return {n: self._perceiver.flow(n, previous.cameras[n].image, frames.frames[n].image) for n in both}
+
+    @staticmethod
+    def _fixed(
+        scale: VelocityScale,
+        previous: RigView | None,
+        vehicle: VehicleState,
+        maps: Mapping[str, SceneMaps],
+        flows: Mapping[str, Float32Array],
+    ) -> tuple[dict[str, SceneMaps], list[str]]:
+        """The maps with their scale from the autopilot's velocity."""
+        before = previous.vehicle if previous else None
+        labels = {name: view.labels for name, view in previous.cameras.items()} if previous else {}
+        return scale.fix(before, vehicle, labels, maps, flows)
 
     def _ego_motion(
         self, previous: RigView | None, view: RigView, flows: Mapping[str, Float32Array], reasons: list[str]

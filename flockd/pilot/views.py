@@ -12,6 +12,7 @@ import numpy as np
 from flockd.geometry import Rig, RigCamera, ground_inverse_depth, virtual_crop
 from flockd.messages import Float32Array, FloatArray, Frame, FrameSet, Sighting, UInt8Array, VehicleState
 from flockd.perception import UNSURE, Instance, Picture, RangeEstimate, SceneMaps
+from flockd.pilot.scale import fix_by_height
 from flockd.tracking import ExpectedNeighbour
 
 UNCLASSED = UNSURE
@@ -108,7 +109,9 @@ class Observer:
                 reasons.append(f"camera {name}: {fault}")
                 continue
             try:
-                maps[name] = self._perceiver.scene(name, frame.image, self._geometry(camera, vehicle))
+                geometry = self._geometry(camera, vehicle)
+                scene = self._perceiver.scene(name, frame.image, geometry)
+                maps[name] = fix_by_height(scene, geometry[2]) if self._height_fixes_scale else scene
             except (FloatingPointError, ValueError) as error:  # a network gone astray; a height below the ground
                 reasons.append(f"camera {name}: {error}")
         return maps, reasons
