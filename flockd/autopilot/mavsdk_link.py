@@ -370,7 +370,9 @@ async def _open(mavsdk: Mavsdk, address: str, executor: ThreadPoolExecutor) -> N
     result = await asyncio.get_running_loop().run_in_executor(executor, mavsdk.add_any_connection, address)
     if result != ConnectionResult.SUCCESS:
         reason = ConnectionResult(result).name.lower().replace("_", " ")
-        raise AutopilotError(f"autopilot.address: {address} cannot be opened ({reason}); check the address and the cable")
+        raise AutopilotError(
+            f"autopilot.address: {address} cannot be opened ({reason}); check the address and the cable"
+        )
 
 
 async def _find_system(
