@@ -190,7 +190,8 @@ _SCALES = {
 def _lead(summary: Summary) -> str:
     step = f"A step every {summary['step_s']:g} s"
     if summary["fleet"]:
-        step += f"; a daemon each, with {summary['autopilot']}, at {summary['fleet']['speed_factor']:g} times real time."
+        speed = summary["fleet"]["speed_factor"]
+        step += f"; a daemon each, with {summary['autopilot']}, at {speed:g} times real time."
     else:
         step += "." if summary["wall_s"] is None else f"; {summary['wall_s']:.0f} s of computing."
     if summary["perception"] == EXACT_STATES:
@@ -230,7 +231,7 @@ def _facts(summary: Summary, log: FlightLog) -> list[dict[str, str]]:
         known = account["own_motion_ratio"]
         most = account["most_neighbours_tracked"]
         facts += [
-            _fact("Own motion", _number(None if known is None else 100 * known, 1), "of the steps, from the second on", "%"),
+            _fact("Own motion", _number(known and 100 * known, 1), "of the steps, from the second on", "%"),
             _fact("Neighbours tracked", _number(most, 0), "at most at one time"),
         ]
     if summary["realtime_factor"] is not None:
