@@ -121,6 +121,11 @@ class OnnxModel:
             outputs = self.run(golden_feeds(self.manifest))
         except FloatingPointError as error:
             raise ModelError(f"{self._path}: {error} on the golden input; restore the model file") from None
+        except Exception as error:  # noqa: BLE001 - ONNX Runtime's own exception types are private
+            raise ModelError(
+                f"{self._path}: {self.provider} cannot run {self.manifest.file} ({_reason(error)}); choose another "
+                "perception.provider or restore the model file"
+            ) from None
         for name, spec in self.manifest.outputs.items():
             mean, deviation = float(outputs[name].mean()), float(outputs[name].std())
             allowed = _GOLDEN_TOLERANCE * (abs(spec.golden_mean) + spec.golden_deviation) + 1e-6
@@ -210,6 +215,11 @@ def feeds_for(manifest: Manifest, image: tuple[int, int], pictures: int = 1) -> 
         else:
             feeds[name] = entering(spec, [fitting.enter(golden_image(image))])
     return feeds
+
+
+def _reason(error: Exception) -> str:
+    """ONNX Runtime's, without the places in its source."""
+    return str(error).splitlines()[0].rpartition("Status Message: ")[2].rpartition("] ")[2]
 
 
 def _check_weights(file: Path, manifest: Path) -> None:

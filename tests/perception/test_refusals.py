@@ -20,6 +20,7 @@ from flockd.errors import ModelError
 from flockd.perception import OnnxModel, Perception
 from flockd.perception.providers import Prepared, available
 from flockd.perception.weights import fault_of_weights
+from tests.perception.foreign import SIZE, image_input, map_output, write_model
 
 MODELS = data_path("models")
 ROOT = Path(__file__).parents[2]
@@ -178,9 +179,8 @@ def test_a_provider_that_onnx_runtime_silently_replaces_is_an_error(monkeypatch:
     """As on a computer with onnxruntime-gpu and no driver: it is listed, and does not start."""
     listed = ["CUDAExecutionProvider", "CPUExecutionProvider"]
     monkeypatch.setattr(ort, "get_available_providers", lambda: listed)
-    with pytest.raises(
-        ModelError, match=r"CUDAExecutionProvider does not start here, and .* took CPUExecutionProvider"
-    ):
+    told = r"CUDAExecutionProvider does not start here, and .* took CPUExecutionProvider"
+    with pytest.warns(UserWarning, match="not in available"), pytest.raises(ModelError, match=told):
         OnnxModel(MODELS / "flow.yaml", threads=1, provider="cuda")
 
 
@@ -202,3 +202,17 @@ def test_what_was_prepared_covers_what_lies_between(tmp_path: Path) -> None:
     assert not prepared.covers({"first": (1, 100, 200)})
     assert not prepared.covers({"second": (1, 100, 200, 3)})
     assert Prepared.load(tmp_path / "elsewhere") is None
+
+
+def test_a_provider_that_cannot_run_a_model_is_told_in_one_sentence(tmp_path: Path) -> None:
+    """It loads, and fails with the golden input."""
+    width, height = SIZE
+    weights = {"shape": np.array([1, 3, height, width + 1], np.int64)}
+    path = write_model(
+        tmp_path, "broken", "flow", [helper.make_node("Reshape", ["a", "shape"], ["flow"])],
+        inputs={"a": image_input(carries="first"), "second": image_input()},
+        outputs={"flow": map_output([1, "c", height, "w"])},
+        weights=weights, golden=False,
+    )  # fmt: skip
+    with pytest.raises(ModelError, match=r"broken\.yaml: CPUExecutionProvider cannot run broken\.onnx \(.*; choose"):
+        OnnxModel(path, threads=1)
