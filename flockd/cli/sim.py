@@ -39,7 +39,7 @@ def add(commands: Commands) -> None:
         "flockd sim my_flight.yaml --flow dis --seed 7",
         "flockd sim --record --duration 20",
         "flockd sim --autopilot standin --drones 2 --duration 20",
-        "FLOCKD_PX4=~/PX4-Autopilot/build/px4_sitl_default flockd sim --autopilot px4",
+        "flockd sim config/px4_flight.yaml --autopilot px4",
     )
     parser = commands("sim", "Fly a simulated flock by sight, and report how it went.", examples)
     parser.add_argument("scenario", nargs="?", metavar="SCENARIO", type=Path, help="by default the paper's flight")

@@ -167,13 +167,15 @@ def test_images_that_are_worth_nothing(film: dict[str, Any], level: Level, told:
 
 
 def test_time_stamps_of_another_clock_are_no_image_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some drivers do not name their clock: what counts is whether the stamps are of now."""
     monkeypatch.setattr(cameras, "START_S", 0.3)
     kernel = FakeKernel(front=FakeCamera())
     with _filming(kernel, "front", flags=lambda number: FLAG_CLOCK_UNKNOWN):
-        found = _examined(_config("front"), kernel)
-    _problem(found, Level.FAILURE, "no usable image came within 0.3 s (")
+        (finding,) = _examined(_config("front"), kernel)["camera front"]
+    assert finding.level is Level.PASS, finding
     with _filming(kernel, "front", old_s=2.0):
         found = _examined(_config("front"), kernel)
+    _problem(found, Level.FAILURE, "no usable image came within 0.3 s (")
     _problem(found, Level.FAILURE, "with a time stamp far from now")
 
 
