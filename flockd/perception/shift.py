@@ -54,7 +54,7 @@ def likeness(first: UInt8Array, second: UInt8Array, flow: Float32Array) -> float
     """
     a, b = _small(first), _small(second)
     height, width = a.shape
-    small = cv2.resize(flow, (width, height), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(flow, (width, height), interpolation=cv2.INTER_NEAREST)  # enough, and a third of the time
     x = np.arange(width, dtype=np.float32) + small[..., 0] * np.float32(width / first.shape[1])
     y = np.arange(height, dtype=np.float32)[:, None] + small[..., 1] * np.float32(height / first.shape[0])
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
