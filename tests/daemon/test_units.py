@@ -40,7 +40,7 @@ def test_little_is_exposed(name: str) -> None:
 def test_the_template_is_the_unit_but_for_its_names() -> None:
     unit, template = ((UNITS / name).read_text(encoding="utf-8").splitlines() for name in NAMES)
     differ = {line.partition("=")[0] for line in set(unit) ^ set(template) if not line.startswith("#")}
-    assert differ == {"Description", "ExecStart", "InaccessiblePaths"}
+    assert differ == {"Description", "ExecStart", "TemporaryFileSystem"}
 
 
 @pytest.mark.parametrize("name", NAMES)

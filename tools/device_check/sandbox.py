@@ -25,12 +25,13 @@ OPEN_FOLDERS = {"/etc/open", "/home/open", "/opt/open", "/srv/open", "/usr/open"
 OPEN_DISK = Path("/dev/open-disk")
 OPEN_DEVICES = {str(OPEN_DISK), "/dev/fuse", "/dev/net/tun"}
 FOLDERS = {"/var/lib/flockd", "/run/flockd"}
-PRIVATE_FOLDERS = {"/tmp", "/var/tmp"}
+PRIVATE_FOLDERS = {"/dev/shm", "/tmp", "/var/tmp"}
+MARK = "seen-from-outside"
 DEVICES = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom", "/dev/tty", "/dev/ptmx", "/dev/pts/")
 """What every program may open."""
 LISTED = ("/dev/video", "/dev/ttyS")
-HARMLESS = {"to this computer"}
-"""What must go through."""
+NEEDED = {"to this computer", "map a file in memory executable"}
+"""What has to go through: libffi needs the second for MAVSDK's callbacks, as the unit says."""
 TELLING = {
     *("map writable and executable", "make written memory executable", "attach shared memory executable"),
     *("map a written file executable", "map a file in memory executable", "start a written program"),
@@ -63,6 +64,8 @@ def _open_the_outside() -> None:
     for folder in OPEN_FOLDERS:
         Path(folder).mkdir(exist_ok=True)
         Path(folder).chmod(0o1777)
+    for folder in PRIVATE_FOLDERS:
+        Path(folder, MARK).touch()
     if not OPEN_DISK.exists():
         os.mknod(OPEN_DISK, stat.S_IFBLK, Path("/dev/vda").stat().st_rdev)
     OPEN_DISK.chmod(0o666)
@@ -100,12 +103,14 @@ def _folders(inside: Mapping[str, Any], outside: Mapping[str, Any]) -> Finding:
     """What can be written inside, beside what is private to the unit and gone with it."""
     writable = set(inside["writable folders"])
     strange = {folder for folder in writable if not _is_within(folder, FOLDERS | PRIVATE_FOLDERS)}
+    shared = sorted(folder for folder in PRIVATE_FOLDERS if f"{folder}/{MARK}" in inside["marks"])
     forbidden = set(outside["writable folders"]) - writable
     return Finding(
         "sandbox: folders",
-        not strange and writable >= FOLDERS and forbidden >= OPEN_FOLDERS,
-        f"writes {', '.join(sorted(writable))}; not {', '.join(sorted(forbidden))}",
-        f"{', '.join(sorted(FOLDERS))}, and a {' and '.join(sorted(PRIVATE_FOLDERS))} of its own",
+        not strange and not shared and writable >= FOLDERS and forbidden >= OPEN_FOLDERS,
+        f"writes {', '.join(sorted(writable))}, shares {', '.join(shared) or 'none of them'}; "
+        f"not {', '.join(sorted(forbidden))}",
+        f"{', '.join(sorted(FOLDERS))}; {', '.join(sorted(PRIVATE_FOLDERS))} of its own",
     )
 
 
@@ -123,13 +128,15 @@ def _devices(inside: Mapping[str, Any], outside: Mapping[str, Any]) -> Finding:
 
 
 def _attempts(part: str, inside: Mapping[str, str], outside: Mapping[str, str]) -> Finding:
-    allowed = sorted(what for what, answer in inside.items() if answer == "done" and what not in HARMLESS)
+    allowed = sorted(what for what, answer in inside.items() if answer == "done" and what not in NEEDED)
     powerless = sorted(what for what, answer in outside.items() if answer != "done" and what in TELLING)
-    broken = sorted(what for what, answer in inside.items() if answer != "done" and what in HARMLESS)
+    broken = sorted(what for what, answer in inside.items() if answer != "done" and what in NEEDED)
     refused = ", ".join(f"{what} {answer}" for what, answer in inside.items() if answer != "done")
-    told = f"{', '.join(allowed) or 'nothing'} allowed; refused: {refused}"
+    needed = ", ".join(sorted(NEEDED & inside.keys()))
+    told = f"{', '.join(allowed) or 'nothing'} allowed{f' but {needed}, which it needs' if needed else ''}; "
+    told += f"refused: {refused}"
     told += f"; outside could not either: {', '.join(powerless)}" if powerless else ""
-    return Finding(f"sandbox: {part}", not allowed and not powerless and not broken, told, "all refused")
+    return Finding(f"sandbox: {part}", not allowed and not powerless and not broken, told, "all others refused")
 
 
 def _is_within(folder: str, roots: set[str]) -> bool:

@@ -37,6 +37,7 @@ def main() -> None:
     """Prints the answers."""
     answers = {
         "writable folders": sorted(_writable_folders()),
+        "marks": [str(path) for folder in ("/dev/shm", "/tmp", "/var/tmp") for path in Path(folder).glob("seen-*")],
         "devices opened": sorted(_opened_devices()),
         "memory": _attempts(_memory()),
         "rights": _attempts(_rights()),
