@@ -397,6 +397,10 @@ class AutopilotParameters(Section):
     """By default the pilot arms, brings the drone up and switches to offboard."""
     height_m: Positive | None = None
     """Height above home to fly at; by default the height at which the flight begins."""
+    max_velocity_trim_m_s: NonNegative = 0.5
+    """Where the autopilot's velocity and the cameras' differ, setpoints are corrected by up to this: an autopilot flies
+    by its own estimate, which GNSS alone leaves off by 0.1 to 0.3 m/s. 0: not at all. Does nothing with `own_velocity:
+    autopilot`."""
     low_battery_share: Share = 0.2
     """The battery counts as low when the autopilot says that no more than this is left."""
 

@@ -19,6 +19,7 @@ from flockd.config import DroneConfig
 from flockd.daemon.inspection import Asked, Inspector, position_from_home
 from flockd.daemon.requests import Requests, Wish
 from flockd.daemon.sight import Sight
+from flockd.daemon.trim import VelocityTrim
 from flockd.messages import FloatArray, Setpoint, VehicleState, VelocityCommand
 from flockd.safety import (
     Action,
@@ -119,6 +120,7 @@ class Control:
         inspector: Inspector,
         requests: Requests,
         history: VehicleHistory,
+        trim: VelocityTrim,
         asked: Asked,
         on_tick: Callable[[Decision, Decision], None],
         clock: Callable[[], float],
@@ -127,9 +129,10 @@ class Control:
         assert config.autopilot is not None
         self._autopilot = config.autopilot
         self._link, self._streamer, self._door, self._sight = link, streamer, door, sight
-        self._inspector, self._requests, self._history, self._asked = inspector, requests, history, asked
-        self._on_tick, self._clock = on_tick, clock
+        self._inspector, self._requests, self._history, self._trim = inspector, requests, history, trim
+        self._asked, self._on_tick, self._clock = asked, on_tick, clock
         self._supervisor = Supervisor(config.safety)
+        self._enough_looks = max(2, config.tracking.confirm_hits)
         self._height_m = math.nan
         self._yaw_rad = math.nan
         self._flight = 0
@@ -189,14 +192,14 @@ class Control:
         self._streamer.beat()
 
     def _command(self, now: float) -> tuple[FloatArray, float, float]:
-        """Velocity, heading, and when that was decided: standstill until this flight's pilot has looked twice.
+        """Velocity, heading, and when that was decided: standstill until this flight's pilot has looked often enough.
 
         It knows neither its own motion nor its neighbours before that.
         """
         look = self._sight.newest
-        if look is None or look.flight != self._flight or look.number < 2:
-            return np.zeros(2), self._yaw_rad, now
-        return look.output.command.velocity, look.output.command.yaw_rad, look.time_s
+        if look is None or look.flight != self._flight or look.number < self._enough_looks:
+            return self._trim.velocity, self._yaw_rad, now
+        return look.output.command.velocity + self._trim.velocity, look.output.command.yaw_rad, look.time_s
 
     def _around(self, now: float, status: AutopilotStatus, vehicle: VehicleState | None) -> Surroundings:
         known = vehicle is not None and vehicle.velocity_ned is not None

@@ -13,6 +13,7 @@ from flockd.daemon.control import Control
 from flockd.daemon.networks import WatchedNetworks
 from flockd.daemon.requests import Requests, TakeOff
 from flockd.daemon.sight import Sight
+from flockd.daemon.trim import VelocityTrim
 from flockd.sources import FrameSource
 from flockd.telemetry.publisher import ZenohTelemetry
 
@@ -33,6 +34,7 @@ class Crew:
     telemetry: ZenohTelemetry
     lag: LoopLag
     thermometer: Thermometer
+    trim: VelocityTrim
     wall_clock: WallClock
     dead_tasks: dict[str, str]
     """Why each task that has ended did, by name."""

@@ -70,6 +70,7 @@ def _flight_message(crew: Crew, now: float) -> FlightMessage:
         heartbeat_age_s=status.heartbeat_age_s,
         battery_share=status.battery_share,
         height_m=None if vehicle is None else vehicle.height_m,
+        velocity_trim=[float(v) for v in crew.trim.velocity],
         silence=stream.silence,
         setpoints_sent=stream.sent,
         setpoints_missed=stream.missed,

@@ -125,6 +125,8 @@ class FlightMessage(TypedDict):
     """0 to 1."""
     height_m: float | None
     """Above home, up positive."""
+    velocity_trim: list[float]
+    """m/s north and east, added to the pilot's commands: the autopilot's velocity less the cameras'."""
     silence: str | None
     """Why no setpoint goes to the autopilot; null while they do."""
     setpoints_sent: int
