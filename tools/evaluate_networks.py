@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,12 +25,16 @@ from flockd.geometry import Rig
 from flockd.messages import Frame, FrameSet, Sighting, VehicleState
 from flockd.perception import UNSURE, DisFlow, Perception
 from flockd.pilot.views import Observer
+from flockd.sim.drone_models import drone_model
 from tools.training.dataset import HEIGHT, R_BODY_CAMERA, WIDTH, PairSet, open_pairs, rig_camera
+from tools.training.samples import SIZES_M
 
 Array = NDArray[Any]
 BAROMETER_SIGMA_M = 0.1
 GATE = 0.3
 """A sighting is a drone's if it is nearer to it than this share of its range, or 0.5 m."""
+WHOLE_HIDES = 0.02
+"""A drone counts as whole when no more of its outline is hidden than this."""
 RANGES_M = ((1.5, 5.0), (5.0, 10.0), (10.0, 20.0))
 
 
@@ -74,7 +79,7 @@ def evaluate(pairs: PairSet, perception: Perception, indices: Iterable[int]) -> 
                 labels = maps["camera"].labels[1::2, 1::2]
                 _mask((labels > 0) & (labels != UNSURE), ids, pairs, index, found)
                 sightings = observer.view(frames, vehicle, maps, ()).sightings
-                _distances(sightings, pairs, index, found)
+                _distances(sightings, pairs, index, depth, ids, found)
         flow = np.asarray(pairs["flow"][index], np.float32)
         valid = np.asarray(pairs["flow_valid"][index])
         for name, guess in (("flow", perception.flow("camera", *images)), ("dis", dis.flow(*images))):
@@ -144,7 +149,24 @@ def _mask(guess: Array, ids: Array, pairs: PairSet, index: int, found: _Found) -
         found.iou.append(float((mine & said).sum() / max((mine | said).sum(), 1)))
 
 
-def _distances(sightings: tuple[Sighting, ...], pairs: PairSet, index: int, found: _Found) -> None:
+def _hidden_share(pairs: PairSet, index: int, drone: int, depth: Array, ids: Array) -> float:
+    """How much of the drone's outline, as if a thread ran around it, something nearer hides; what is cut off apart."""
+    family = int(pairs["drone_family"][index, drone])
+    centre = np.asarray(pairs["drone_centre"][index, 0, drone], np.float64)
+    corners = drone_model(family, 0).vertices @ np.asarray(pairs["drone_rotation"][index, 0, drone], np.float64).T
+    corners = (corners + centre)[(corners + centre)[:, 2] > 0.05]
+    half_px = float(pairs["focal"][index]) / 2 * corners[:, :2] / corners[:, 2:] + np.array([WIDTH, HEIGHT]) / 4
+    outline = np.zeros(ids.shape, np.uint8)
+    cv2.fillConvexPoly(outline, cv2.convexHull(np.round(half_px).astype(np.int32)), 1)
+    nearer = depth < centre[2] - SIZES_M[family] / 2
+    others = np.flatnonzero(pairs["drone_centre"][index, 0, :, 2] < centre[2]) + 1
+    nearer |= np.isin(ids, others)
+    return float((nearer & (outline > 0)).sum() / max(int(outline.sum()), 1))
+
+
+def _distances(
+    sightings: tuple[Sighting, ...], pairs: PairSet, index: int, depth: Array, ids: Array, found: _Found
+) -> None:
     found.images += 1
     free = list(sightings)
     pixels = pairs["drone_pixels"][index, 0]
@@ -155,6 +177,7 @@ def _distances(sightings: tuple[Sighting, ...], pairs: PairSet, index: int, foun
         range_m = float(np.linalg.norm(true))
         left, top, right, bottom = pairs["drone_box"][index, 0, drone]
         whole = left > 1 and top > 1 and right < WIDTH - 1 and bottom < HEIGHT - 1
+        whole &= _hidden_share(pairs, index, int(drone), depth, ids) < WHOLE_HIDES
         near = [s for s in free if np.linalg.norm(s.position - true) < max(GATE * range_m, 0.5)]
         best = min(near, key=lambda s: float(np.linalg.norm(s.position - true)), default=None)
         error, sigma = 0.0, 1.0

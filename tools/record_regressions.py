@@ -31,6 +31,7 @@ from flockd.data import data_path
 from flockd.messages import Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
 from flockd.pilot import FlockPilot
 from flockd.recording import Recorder
+from flockd.recording.truth import Truth
 from flockd.sim.swarm import fly
 
 Step = tuple[FrameSet, VehicleState]
@@ -57,7 +58,7 @@ def main() -> None:
     arguments = parser.parse_args()
     flights: Mapping[str, Callable[[], tuple[DroneConfig, list[Step]]]] = {
         "normal": lambda: flown(NORMAL, seed=21),
-        "crossing": lambda: flown(CROSSING, seed=22),
+        "crossing": lambda: flown(CROSSING, seed=25),
         "faults": lambda: with_faults(*flown(NORMAL, seed=23)),
     }
     for name, make in flights.items():
@@ -86,7 +87,7 @@ class _Keeper:
     def drain(self) -> None:
         """All is kept at once."""
 
-    def step(self, frames: FrameSet, vehicle: VehicleState, output: PilotOutput) -> None:
+    def step(self, frames: FrameSet, vehicle: VehicleState, output: PilotOutput, truth: Truth | None) -> None:
         """Keep what went in."""
         self.steps.append((frames, vehicle))
 

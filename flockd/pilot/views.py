@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -25,8 +26,12 @@ _SURE = 0.5
 _MARGIN = 0.68
 """Half of a picture of a drone of known size is this many times its size wide."""
 _MAX_RESIZE = 1.7
-"""The second picture's angle is at most this many times the first's, and at least as much smaller."""
-_WORTH_A_SECOND_LOOK = 0.2
+"""A further picture's angle is at most this many times the last one's, and at least as much smaller."""
+_MOST_LOOKS = 4
+_WORTH_ANOTHER_LOOK = 0.2
+_SAME_AIM, _SAME_SIZE = 0.1, 1.15
+"""Two pictures show the same if one is moved by less than this share of half its width, and resized by less than this.
+"""
 _SURE_OF_EXPECTED = 0.7
 _EXPECTED_GATE = 0.2
 """What is found where a drone was expected must be as near to that place as this share of its range, or 0.5 m."""
@@ -190,34 +195,29 @@ class Observer:
         ]
 
     def _look(self, live: Rig, images: Mapping[str, UInt8Array], candidates: Sequence[_Candidate]) -> list[_Located]:
-        """The second stage, twice: the second picture is cut to the drone's size, with it in the middle.
+        """The second stage, at least twice: each further picture is cut to the drone's size, with it in the middle.
 
-        Where two cameras share the drone, the second picture shows it whole.
+        Where two cameras share the drone, they show it whole. It looks until the next picture would be the same again.
         """
-        first = self._ranges(live, images, [(c.direction, c.half_angle, None) for c in candidates])
-        worth = [
-            (c, *seen)
-            for c, seen in zip(candidates, first, strict=True)
-            if seen[2].is_drone > _WORTH_A_SECOND_LOOK and _NEAREST_M < seen[1] < _FARTHEST_M
-        ]
-        second = self._ranges(
-            live,
-            images,
-            [
-                (_in_view(live, position, c), _half_angle(estimate.size_m, range_m, c.half_angle), range_m)
-                for c, position, range_m, estimate in worth
-            ],
-        )
-        return [
-            _Located(
-                candidate=c,
-                position=position,
-                range_sigma_m=max(estimate.relative_sigma, _MIN_RELATIVE_SIGMA) * range_m,
-                size_m=estimate.size_m,
-                is_drone=min(estimate.is_drone, before.is_drone) if _NEAREST_M < range_m < _FARTHEST_M else 0.0,
-            )
-            for (c, _, _, before), (position, range_m, estimate) in zip(worth, second, strict=True)
-        ]
+        found: list[_Located] = []
+        looks = [_Look(c, c.direction, c.half_angle) for c in candidates]
+        for number in range(1, _MOST_LOOKS + 1):
+            seen = self._ranges(live, images, [(look.direction, look.half_angle, look.range_m) for look in looks])
+            again = []
+            for look, (position, range_m, estimate) in zip(looks, seen, strict=True):
+                is_drone = min(look.is_drone, estimate.is_drone)
+                if is_drone <= _WORTH_ANOTHER_LOOK or not _NEAREST_M < range_m < _FARTHEST_M:
+                    continue
+                direction = _in_view(live, position, look.candidate)
+                half_angle = _half_angle(estimate.size_m, range_m, look.half_angle)
+                further = _Look(look.candidate, direction, half_angle, range_m, is_drone)
+                if number == 1 or (number < _MOST_LOOKS and not _shows_the_same(look, further)):
+                    again.append(further)
+                    continue
+                sigma_m = max(estimate.relative_sigma, _MIN_RELATIVE_SIGMA) * range_m
+                found.append(_Located(look.candidate, position, sigma_m, estimate.size_m, is_drone))
+            looks = again
+        return found
 
     def _ranges(
         self, live: Rig, images: Mapping[str, UInt8Array], aims: Sequence[tuple[FloatArray, float, float | None]]
@@ -293,6 +293,19 @@ class _Candidate:
 
 
 @dataclass(frozen=True, eq=False)
+class _Look:
+    """One picture for the second stage."""
+
+    candidate: _Candidate
+    direction: FloatArray
+    half_angle: float
+    range_m: float | None = None
+    """Of what it should show; None: not known yet."""
+    is_drone: float = 1.0
+    """The least probability that an earlier look gave."""
+
+
+@dataclass(frozen=True, eq=False)
 class _Located:
     candidate: _Candidate
     position: FloatArray
@@ -338,6 +351,12 @@ def _half_angle(size_m: float, range_m: float, before: float | None = None) -> f
     if before is not None:
         angle = float(np.clip(angle, before / _MAX_RESIZE, before * _MAX_RESIZE))
     return float(np.clip(angle, *_HALF_ANGLES))
+
+
+def _shows_the_same(look: _Look, further: _Look) -> bool:
+    moved = _angle(look.direction, further.direction) / look.half_angle
+    resized = abs(math.log(further.half_angle / look.half_angle))
+    return moved < _SAME_AIM and resized < math.log(_SAME_SIZE)
 
 
 def _is_as_expected(one: _Located) -> bool:
