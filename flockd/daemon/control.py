@@ -19,8 +19,8 @@ from flockd.config import DroneConfig
 from flockd.daemon.inspection import Asked, Inspector, position_from_home
 from flockd.daemon.requests import Requests, Wish
 from flockd.daemon.sight import Sight
-from flockd.daemon.trim import VelocityTrim
 from flockd.messages import FloatArray, Setpoint, VehicleState, VelocityCommand
+from flockd.pilot.trim import VelocityTrim
 from flockd.safety import (
     Action,
     Decision,

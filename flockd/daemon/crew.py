@@ -13,7 +13,7 @@ from flockd.daemon.control import Control
 from flockd.daemon.networks import WatchedNetworks
 from flockd.daemon.requests import Requests, TakeOff
 from flockd.daemon.sight import Sight
-from flockd.daemon.trim import VelocityTrim
+from flockd.pilot.trim import VelocityTrim
 from flockd.sources import FrameSource
 from flockd.telemetry.publisher import ZenohTelemetry
 

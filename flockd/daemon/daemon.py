@@ -27,10 +27,10 @@ from flockd.daemon.reports import tell_for_ever, tell_service
 from flockd.daemon.requests import Requests, TakeOff
 from flockd.daemon.service import ServiceManager
 from flockd.daemon.sight import Sight
-from flockd.daemon.trim import VelocityTrim
 from flockd.daemon.worker import BusyError, LateError, Worker
 from flockd.errors import ConfigError, ConfigProblem, FlockdError
 from flockd.messages import FrameSet, PilotOutput, VehicleState
+from flockd.pilot.trim import VelocityTrim
 from flockd.safety import Decision, Event, Gate, State
 from flockd.sources import open_source
 from flockd.telemetry.publisher import ZenohTelemetry

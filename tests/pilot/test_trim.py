@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from flockd.daemon.trim import VelocityTrim
 from flockd.messages import EgoMotion, FloatArray, PilotOutput, VehicleState, VelocityCommand
+from flockd.pilot.trim import VelocityTrim
 
 STEP_S = 0.5
 YAW_RAD = 0.7
