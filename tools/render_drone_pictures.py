@@ -54,14 +54,16 @@ def main() -> None:
 
 
 def _render_world(job: tuple[Path, int, int]) -> None:
-    from flockd.sim.drone_models import FAMILIES, drone_model  # noqa: PLC0415 - numba starts in the worker
+    from flockd.sim.drone_models import drone_model  # noqa: PLC0415 - numba starts in the worker
     from flockd.sim.world import World  # noqa: PLC0415
 
     path, seed, count = job
     rng = np.random.Generator(np.random.PCG64([seed, 1]))
     world = World.generate(seed, ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])), keep_out=None)
     places = world.free_points(count, rng, 2.0)
-    models = [[drone_model(family, int(rng.integers(1 << 31))) for _ in range(PAINTED)] for family in range(FAMILIES)]
+    models = {
+        family: [drone_model(family, int(rng.integers(1 << 31))) for _ in range(PAINTED)] for family in worlds.FAMILIES
+    }
     samples = [sample for place in places for sample in _scene(world, place, models, rng)]
     joined = {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
     draft = path.with_suffix(".part")
@@ -70,7 +72,7 @@ def _render_world(job: tuple[Path, int, int]) -> None:
     draft.replace(path)
 
 
-def _scene(world: Any, place: Array, models: list[list[Any]], rng: np.random.Generator) -> list[dict[str, Array]]:
+def _scene(world: Any, place: Array, models: dict[int, list[Any]], rng: np.random.Generator) -> list[dict[str, Array]]:
     """Pictures of one drone from one camera; other drones may stand before or behind it."""
     from flockd.sim.renderer import Renderer  # noqa: PLC0415
     from tools.training.samples import DroneInView, crop_around, picture_of  # noqa: PLC0415
@@ -80,8 +82,8 @@ def _scene(world: Any, place: Array, models: list[list[Any]], rng: np.random.Gen
     position = np.array([place[0], place[1], -(ground + rng.uniform(1.5, 8.0))])
     R_ned_camera = drawn_attitude(rng) @ R_BODY_CAMERA
     count = int(rng.choice([1, 2, MOST_DRONES], p=[0.6, 0.25, 0.15]))
-    families = rng.integers(0, len(models), count)
-    drones = [models[family][int(rng.integers(PAINTED))] for family in families]
+    families = rng.choice(worlds.FAMILIES, count)
+    drones = [models[int(family)][int(rng.integers(PAINTED))] for family in families]
     positions = _places(position, R_ned_camera, focal, count, rng)
     positions[:, 2] = np.minimum(positions[:, 2], -(ground + 0.5))
     rotations = np.array([drawn_attitude(rng) for _ in range(count)])

@@ -1,6 +1,8 @@
 """Render training pairs: two camera images a fraction of a second apart, with depth, drones and flow as truth.
 
 python tools/render_training_data.py OUT --worlds 120 --pairs 30 --split training
+
+With ``--families unseen`` its drones are of the families that no network is trained on.
 """
 
 from __future__ import annotations
@@ -30,13 +32,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--split", choices=["training", "validation", "test"], default="training")
+    parser.add_argument("--families", choices=["training", "unseen"], default="training")
     parser.add_argument("--worlds", type=int, default=120)
     parser.add_argument("--pairs", type=int, default=30, help="pairs a world")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     arguments = parser.parse_args()
     seeds = {"training": worlds.TRAINING, "validation": worlds.VALIDATION, "test": worlds.TEST}[arguments.split]
+    families = {"training": worlds.FAMILIES, "unseen": worlds.UNSEEN_FAMILIES}[arguments.families]
     os.environ["NUMBA_NUM_THREADS"] = "1"
-    jobs = [(arguments.out / f"part-{i:04d}", seeds[i], arguments.pairs) for i in range(arguments.worlds)]
+    jobs = [(arguments.out / f"part-{i:04d}", seeds[i], arguments.pairs, families) for i in range(arguments.worlds)]
     jobs = [job for job in jobs if not (job[0] / "made.json").is_file()]
     begin = time.monotonic()
     with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
@@ -44,24 +48,24 @@ def main() -> None:
             print(f"{done}/{len(jobs)} worlds, {time.monotonic() - begin:.0f} s", flush=True)
 
 
-def _render_world(job: tuple[Path, int, int]) -> None:
-    from flockd.sim.drone_models import FAMILIES, drone_model  # noqa: PLC0415 - numba starts in the worker
+def _render_world(job: tuple[Path, int, int, range]) -> None:
+    from flockd.sim.drone_models import drone_model  # noqa: PLC0415 - numba starts in the worker
     from flockd.sim.renderer import Renderer  # noqa: PLC0415
     from flockd.sim.world import World  # noqa: PLC0415
 
-    folder, seed, count = job
+    folder, seed, count, allowed = job
     rng = np.random.Generator(np.random.PCG64(seed))
     world = World.generate(seed, ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])), keep_out=None)
     part = create_part(folder, count)
     places = world.free_points(count, rng, 2.0)
     for index in range(count):
-        families = rng.integers(0, FAMILIES, MAX_DRONES)
+        families = rng.choice(allowed, MAX_DRONES)
         drones = [drone_model(int(f), int(rng.integers(1 << 31))) for f in families]
         renderer = Renderer(world, drones)
         _render_pair(renderer, world, places[index], families, part, index, rng)
     for array in part.values():
         array.flush()  # type: ignore[attr-defined]
-    note(folder, seed=seed, pairs=count)
+    note(folder, seed=seed, pairs=count, families=list(allowed))
 
 
 def _render_pair(

@@ -125,6 +125,36 @@ class _Craft:
                 heading,
             )
 
+    def loft(self, rings: list[FloatArray], colours: list[FloatArray]) -> None:
+        """A closed skin over rings (n, 3) of equally many points; a colour for each band between two rings.
+
+        The first ring on top, each clockwise seen from above.
+        """
+        sides = len(rings[0])
+        k = np.arange(sides)
+        following = (k + 1) % sides
+        faces = []
+        for band in range(len(colours)):
+            high, low = band * sides, (band + 1) * sides
+            faces += [
+                np.stack([k + high, following + high, k + low], 1),
+                np.stack([following + high, following + low, k + low], 1),
+            ]
+        foot, middle = (len(rings) - 1) * sides, len(rings) * sides
+        faces += [
+            np.stack([following, k, np.full(sides, middle)], 1),
+            np.stack([k + foot, following + foot, np.full(sides, middle + 1)], 1),
+        ]
+        bands = np.repeat(np.array(colours), 2 * sides, axis=0)
+        ends = np.repeat(np.array([colours[0], colours[-1]]), sides, axis=0)
+        vertices = np.vstack([*rings, rings[0].mean(0)[None], rings[-1].mean(0)[None]])
+        self.mesh.add(vertices, np.vstack(faces), int(self.skin[0]), np.vstack([bands, ends]), (0.3, 0.3))
+
+    def ball(self, centre: tuple[float, float, float], radius: float, colour: FloatArray) -> None:
+        slope = np.radians([-70, -35, 0, 35, 70])
+        rings = [_oval(r, r, z) + centre for r, z in zip(radius * np.cos(slope), radius * np.sin(slope), strict=True)]
+        self.loft(rings, [colour] * (len(rings) - 1))
+
     def rotor(self, x: float, y: float, z: float, radius: float, motor: tuple[float, float], *, accent: bool) -> None:
         """A motor standing on (x, y, z), with its propeller. ``motor``: radius and height."""
         top = z - motor[1]
@@ -346,6 +376,156 @@ def _long_legs(c: _Craft) -> None:
             c.rod((x, 0.06 * y, 0.01), (1.4 * x, 0.17 * y, 0.26), 0.008, [c.frame, c.body])
 
 
-_BUILDERS = (_thin_x, _thick_pod, _folding, _racer, _h_frame, _plus, _ducted, _long_legs)
+def _oval(along: float, across: float, z: float) -> FloatArray:
+    """Ring of 12 points on an ellipse of these half widths."""
+    angle = np.arange(12) * math.pi / 6
+    return np.column_stack([along * np.cos(angle), across * np.sin(angle), np.full(12, z)])
+
+
+def _outline(right: list[tuple[float, float]], z: float, scale: float = 1.0) -> FloatArray:
+    """Ring through the points of the right half, nose to tail, and their mirror images."""
+    points = np.array(right + [(x, -y) for x, y in reversed(right)])
+    return np.column_stack([points * scale, np.full(len(points), z)])
+
+
+def _bumper(c: _Craft) -> None:
+    """A palm-sized toy: an egg of a body within two rails around all rotors."""
+    c.loft(
+        [_oval(a, b, z) for a, b, z in ((0.02, 0.015, -0.034), (0.042, 0.03, -0.024), (0.055, 0.036, -0.006),
+                                        (0.045, 0.03, 0.01), (0.02, 0.014, 0.016))],
+        [c.body, c.body * 0.8, c.rear, c.frame],
+    )  # fmt: skip
+    for y in (-0.014, 0.014):
+        c.ball((0.047, y, -0.012), 0.0095, c.front)
+    c.box((-0.05, 0, -0.006), (0.008, 0.012, 0.008), c.metal)
+    around = [
+        (sx * 0.06 + 0.049 * math.cos(turn), sy * 0.064 + 0.049 * math.sin(turn))
+        for sx, sy, start in ((1, 1, 0), (-1, 1, 90), (-1, -1, 180), (1, -1, 270))
+        for turn in np.radians([start, start + 45, start + 90])
+    ]
+    for i, ((ax, ay), (bx, by)) in enumerate(zip(around, around[1:] + around[:1], strict=True)):
+        accent = c.front if ax + bx > 0 else c.rear
+        for z in (-0.024, 0.0):
+            c.rod((ax, ay, z), (bx, by, z), 0.0028, [accent], 4)
+        if i % 3 != 1:
+            c.rod((ax, ay, -0.024), (ax, ay, 0.0), 0.0022, [c.frame], 4)
+    for x, y in _corners(0.06, 0.064):
+        c.beam((0.3 * x, 0.3 * y, 0.002), (1.57 * x, 1.57 * y, 0.002), (0.004, 0.0025), [c.frame])
+        c.rotor(x, y, 0.0, 0.0423, (0.007, 0.016), accent=False)
+
+
+def _dome(c: _Craft) -> None:
+    """A light-show drone: a domed body with a lamp under it, on stilts."""
+    c.loft(
+        [_oval(r, r, z) for r, z in ((0.02, -0.088), (0.05, -0.078), (0.072, -0.055), (0.08, -0.02), (0.08, 0.004),
+                                     (0.055, 0.018))],
+        [c.body, c.body, c.body * 0.8, c.rear, c.frame],
+    )  # fmt: skip
+    c.ball((0, 0, 0.03), 0.04, c.front)
+    c.rod((0, 0, -0.085), (0, 0, -0.115), 0.005, [c.metal])
+    c.box((0.078, 0, -0.02), (0.008, 0.024, 0.012), c.front)
+    for x, y in _corners(0.1025, 0.1025):
+        accent = c.front if x > 0 else c.rear
+        c.rod((0.4 * x, 0.4 * y, -0.008), (x, y, -0.008), 0.012, [c.frame, accent], 8)
+        c.rotor(x, y, -0.014, 0.1, (0.014, 0.024), accent=True)
+        c.rod((0.4 * x, 0.4 * y, 0.01), (0.62 * x, 0.62 * y, 0.11), 0.0045, [c.frame, accent])
+
+
+def _dead_cat(c: _Craft) -> None:
+    """Two long narrow decks, the front arms bent wide and back to clear the camera's view."""
+    deck = [(0.2, 0.025), (0.1, 0.045), (-0.14, 0.032), (-0.17, 0.02)]
+    c.loft([_outline(deck, 0.0), _outline(deck, 0.005)], [c.frame])
+    c.loft([_outline(deck, -0.036, 0.92), _outline(deck, -0.032, 0.92)], [c.body])
+    for x, y in _corners(0.12, 0.028):
+        c.rod((x, y, 0), (x, y, -0.033), 0.005, [c.metal])
+    c.box((-0.06, 0, -0.056), (0.075, 0.024, 0.02), c.rear)
+    c.box((0.02, 0, -0.018), (0.06, 0.02, 0.012), c.body * 0.7)
+    c.box((0.185, 0, -0.018), (0.012, 0.022, 0.013), c.front)
+    c.rod((0.2, 0, -0.014), (0.222, 0, -0.014), 0.012, [c.frame, np.full(3, 0.02)], 8)
+    for y in (-1.0, 1.0):
+        c.rod((-0.15, 0.015 * y, -0.034), (-0.2, 0.06 * y, -0.12), 0.004, [c.frame, c.rear])
+        c.beam((0.03, 0.03 * y, 0.01), (0.02, 0.14 * y, 0.01), (0.012, 0.006), [c.frame])
+        c.beam((0.02, 0.135 * y, 0.01), (0.115, 0.235 * y, 0.01), (0.011, 0.006), [c.frame, c.front])
+        c.beam((-0.1, 0.02 * y, 0.01), (-0.17, 0.16 * y, 0.01), (0.011, 0.006), [c.frame, c.rear])
+        c.box((0.02, 0.138 * y, 0.04), (0.006, 0.004, 0.03), c.frame)
+        c.box((-0.13, 0.08 * y, 0.04), (0.006, 0.004, 0.03), c.frame)
+    for x, y in ((0.115, 0.235), (-0.17, 0.16), (-0.17, -0.16), (0.115, -0.235)):
+        c.rotor(x, y, 0.004, 0.1215, (0.0165, 0.026), accent=True)
+
+
+def _courier(c: _Craft) -> None:
+    """A delivery van of a drone: a big box of a body, a parcel hung under it."""
+    side = [(0.16, 0.085), (-0.16, 0.085)]
+    c.loft(
+        [_outline(side, z, scale) for z, scale in ((-0.1, 0.75), (-0.07, 1.0), (0.01, 1.0), (0.03, 0.85))],
+        [c.body * 0.85, c.body, c.frame],
+    )
+    c.box((0.16, 0, -0.035), (0.006, 0.06, 0.022), c.front)
+    c.box((-0.16, 0, -0.035), (0.006, 0.06, 0.022), c.rear)
+    for y in (-0.085, 0.085):
+        c.box((0.0, y, -0.03), (0.09, 0.002, 0.018), c.front)
+    c.rod((-0.08, 0, -0.1), (-0.08, 0, -0.118), 0.03, [c.metal], 10)
+    card = np.array([0.33, 0.21, 0.11]) * c.rng.uniform(0.6, 1.5)
+    c.box((0, 0, 0.115), (0.1, 0.08, 0.06), card)
+    c.box((0, 0, 0.115), (0.1015, 0.014, 0.0615), np.full(3, 0.5))
+    for x, y in _corners(0.06, 0.05):
+        c.rod((x, y, 0.02), (x, y, 0.058), 0.004, [c.frame])
+    for x, y in _corners(0.235, 0.161):
+        accent = c.front if x > 0 else c.rear
+        c.beam((0.5 * x, 0.42 * y, -0.06), (x, y, -0.06), (0.015, 0.013), [c.body, c.frame, accent])
+        c.rotor(x, y, -0.072, 0.12515, (0.02, 0.034), accent=False)
+        c.rod((0.75 * x, 0.75 * y, -0.055), (0.75 * x, 0.95 * y, 0.2), 0.007, [c.frame, accent])
+    for y in (-0.153, 0.153):
+        c.rod((-0.21, y, 0.2), (0.21, y, 0.2), 0.008, [c.rear, c.frame, c.front])
+
+
+def _dragonfly(c: _Craft) -> None:
+    """A slender body with a tail and two big eyes, short arms ahead and long ones astern."""
+    half = [(0.11, 0.01), (0.09, 0.027), (0.02, 0.024), (-0.06, 0.012), (-0.17, 0.006)]
+    c.loft(
+        [_outline(half, z, scale) for z, scale in ((-0.026, 0.6), (-0.014, 1.0), (0.008, 1.0), (0.018, 0.7))],
+        [c.body, c.body * 0.8, c.frame],
+    )
+    for y in (-0.02, 0.02):
+        c.ball((0.098, y, -0.002), 0.017, c.front)
+    c.ball((-0.168, 0, -0.003), 0.014, c.rear)
+    c.box((0.02, 0, -0.03), (0.03, 0.011, 0.006), c.metal)
+    for y in (-1.0, 1.0):
+        c.beam((0.06, 0.015 * y, -0.012), (0.085, 0.085 * y, -0.012), (0.007, 0.004), [c.body, c.front])
+        c.beam((0.01, 0.015 * y, 0.006), (-0.12, 0.11 * y, 0.006), (0.006, 0.004), [c.body, c.frame, c.rear])
+        c.rod((-0.12, 0.11 * y, 0.006), (-0.12, 0.11 * y, 0.04), 0.004, [c.rear])
+        c.rod((0.07, 0.018 * y, 0.0), (0.085, 0.03 * y, 0.04), 0.004, [c.frame])
+    for x, y, z in ((0.085, 0.085, -0.014), (-0.12, 0.11, 0.004), (-0.12, -0.11, 0.004), (0.085, -0.085, -0.014)):
+        c.rotor(x, y, z, 0.0636, (0.0105, 0.018), accent=True)
+
+
+def _wide_nose(c: _Craft) -> None:
+    """A manta of a camera drone: wide ahead, a finned tail, a ball of a camera in a fork under the nose."""
+    half = [(0.155, 0.05), (0.125, 0.112), (0.05, 0.118), (-0.16, 0.03)]
+    c.loft(
+        [_outline(half, z, scale) for z, scale in ((-0.052, 0.65), (-0.032, 0.97), (0.004, 1.0), (0.022, 0.8))],
+        [c.body, c.body, c.body * 0.7],
+    )
+    c.box((0.146, 0, -0.012), (0.008, 0.045, 0.01), c.front)
+    c.box((-0.13, 0, -0.07), (0.034, 0.0045, 0.042), c.rear)
+    c.box((-0.01, 0, -0.055), (0.05, 0.03, 0.008), c.frame)
+    for y in (-0.05, 0.05):
+        c.rod((0.09, y, 0.01), (0.09, y, 0.08), 0.006, [c.metal])
+    c.rod((0.09, -0.05, 0.078), (0.09, 0.05, 0.078), 0.006, [c.metal])
+    c.ball((0.09, 0, 0.078), 0.04, c.frame)
+    c.rod((0.12, 0, 0.078), (0.136, 0, 0.078), 0.019, [np.full(3, 0.02)], 10)
+    for y in (-1.0, 1.0):
+        c.beam((0.09, 0.09 * y, -0.012), (0.125, 0.185 * y, -0.012), (0.016, 0.009), [c.body, c.front])
+        c.rod((-0.1, 0.02 * y, -0.01), (-0.165, 0.14 * y, -0.004), 0.01, [c.frame, c.body, c.rear], 8)
+        c.rod((-0.03, 0.06 * y, 0.01), (-0.05, 0.1 * y, 0.13), 0.006, [c.frame, c.rear])
+        c.rod((-0.13, 0.105 * y, 0.13), (0.06, 0.095 * y, 0.13), 0.0065, [c.frame])
+    for x, y in ((0.125, 0.185), (-0.165, 0.14), (-0.165, -0.14), (0.125, -0.185)):
+        c.rotor(x, y, -0.012, 0.1122, (0.017, 0.028), accent=x > 0)
+
+
+_BUILDERS = (
+    _thin_x, _thick_pod, _folding, _racer, _h_frame, _plus, _ducted, _long_legs,
+    _bumper, _dome, _dead_cat, _courier, _dragonfly, _wide_nose,
+)  # fmt: skip
 FAMILIES: int = len(_BUILDERS)
 """How many shapes there are."""

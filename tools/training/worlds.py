@@ -1,6 +1,13 @@
-"""Which worlds are for what. Training, validation and test worlds never meet; flights use seeds below all of them."""
+"""Which worlds and which drones are for what.
+
+Training, validation and test worlds never meet; flights use seeds below all of them. Families are rows of
+``flockd.sim.drone_models``: the unseen ones are left out of training, to test on drones that no network knows.
+"""
 
 FLIGHTS = range(0, 1_000_000)
 TRAINING = range(1_000_000, 2_000_000)
 VALIDATION = range(2_000_000, 3_000_000)
 TEST = range(3_000_000, 4_000_000)
+
+FAMILIES = range(12)
+UNSEEN_FAMILIES = range(12, 14)
