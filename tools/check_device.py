@@ -21,12 +21,14 @@ import os
 import platform
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 import tomllib
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -46,6 +48,8 @@ SOURCES = (
 """What the README's lines need of this folder."""
 SECTION = "### Install it as a service"
 STAND_IN = "pymavlink>=2.4.40"
+COMPILE = "import flockd.autopilot.stand_in"
+"""What it needs of a dozen MAVLink dialects, and no more."""
 PYTHON = "3.11"
 """Debian's."""
 SYSTEM_PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
@@ -61,6 +65,7 @@ Type=oneshot
 WorkingDirectory=/mnt/check
 Environment=PYTHONPATH=/opt/stand-in PYTHONDONTWRITEBYTECODE=1 PYTHONUNBUFFERED=1
 ExecStart=sh check.sh
+ExecStopPost=sh -c 'journalctl -b > /mnt/findings/journal'
 ExecStopPost=systemctl poweroff --no-block
 StandardOutput=journal+console
 StandardError=journal+console
@@ -87,6 +92,7 @@ def main() -> int:
     arguments = parser.parse_args()
     try:
         _need_all()
+        signal.signal(signal.SIGTERM, _end)
         with _folder(arguments.cache) as folder:
             return _check(folder, arguments.only, as_json=arguments.json)
     except UnavailableError as error:
@@ -148,13 +154,15 @@ def _readme_lines() -> tuple[str, str]:
 def _build(folder: Path, install: str) -> Path:
     """The machine's disk, with flockd installed. Raises UnavailableError when something cannot be fetched."""
     system = folder / "system"
-    if not (folder / "system.done").exists():
-        _note("building a Debian")
-        shutil.rmtree(system, ignore_errors=True)
-        _debian(system)
-        (folder / "system.done").touch()
-    _note("installing flockd")
-    _install(system, _wheels(folder), install)
+    with ThreadPoolExecutor(1) as aside:
+        wheels = aside.submit(_wheels, folder)
+        if not (folder / "system.done").exists():
+            _note("building a Debian")
+            shutil.rmtree(system, ignore_errors=True)
+            _debian(system)
+            (folder / "system.done").touch()
+        _note("installing flockd")
+        _install(system, wheels.result(), install)
     _note("writing the disk")
     image = folder / "disk.img"
     image.unlink(missing_ok=True)
@@ -171,8 +179,8 @@ def _debian(system: Path) -> None:
     )
     without = [f"--dpkgopt=path-exclude=/usr/share/{what}/*" for what in ("doc", "man", "locale", "info")]
     _command(
-        "mmdebstrap", "--quiet", "--variant=apt", f"--include={','.join(PACKAGES)}", *without,
-        f"--essential-hook={few_modules}", "bookworm", str(system),
+        "mmdebstrap", "--quiet", "--variant=apt", f"--include={','.join(PACKAGES)}", "--dpkgopt=force-unsafe-io",
+        *without, f"--essential-hook={few_modules}", "bookworm", str(system),
     )  # fmt: skip
 
 
@@ -210,7 +218,8 @@ def _install(system: Path, wheels: Path, install: str) -> None:
     (system / "etc/hostname").write_text("drone\n", encoding="utf-8")
     (system / "etc/hosts").write_text("127.0.0.1 localhost drone\n", encoding="utf-8")
     _inside(system, f"cd /root/flockd\n{install}")
-    _inside(system, f"/opt/flockd/bin/pip install --quiet --target /opt/stand-in '{STAND_IN}'")
+    stand_in = f"pip install --quiet --no-compile --target /opt/stand-in '{STAND_IN}'"
+    _inside(system, f"/opt/flockd/bin/{stand_in}\nPYTHONPATH=/opt/stand-in /opt/flockd/bin/python -c '{COMPILE}'")
     shutil.copy(ROOT / "tools/device_check/drone.yaml", system / "etc/flockd/drone.yaml")
     (system / "etc/systemd/system/device-check.service").write_text(UNIT, encoding="utf-8")
     wanted = system / "etc/systemd/system/multi-user.target.wants/device-check.service"
@@ -290,6 +299,11 @@ def _command(*command: str) -> None:
 
 def _environment() -> dict[str, str]:
     return {**os.environ, "PATH": f"{SYSTEM_PATH}:{os.environ.get('PATH', '')}", "LC_ALL": "C"}
+
+
+def _end(number: int, _frame: object) -> None:
+    """Told to end: takes the virtual machine with it."""
+    sys.exit(128 + number)
 
 
 def _note(what: str) -> None:

@@ -30,6 +30,8 @@ PICTURES_A_SCENE = 3
 PAINTED = 8
 """Drones of each family in a world, painted differently."""
 MOST_DRONES = 3
+WITH_DISTRACTORS, DISTRACTOR_ALONE = 0.3, 0.06
+"""Shares of the scenes: a bird or the like before or behind the drone, and in its place."""
 
 
 def main() -> None:
@@ -73,9 +75,10 @@ def _render_world(job: tuple[Path, int, int]) -> None:
 
 
 def _scene(world: Any, place: Array, models: dict[int, list[Any]], rng: np.random.Generator) -> list[dict[str, Array]]:
-    """Pictures of one drone from one camera; other drones may stand before or behind it."""
+    """Pictures of one drone from one camera; other drones and distractors may stand before or behind it."""
     from flockd.sim.renderer import Renderer  # noqa: PLC0415
-    from tools.training.samples import DroneInView, crop_around, picture_of  # noqa: PLC0415
+    from tools.training.distractions import drawn_distraction  # noqa: PLC0415
+    from tools.training.samples import DroneInView, crop_around, crop_at, picture_of, picture_of_no_drone  # noqa: PLC0415
 
     focal = FOCAL_PX * float(np.exp(rng.normal(0, 0.08)))
     ground = float(world.height_at(place[:1], place[1:2])[0])
@@ -92,17 +95,31 @@ def _scene(world: Any, place: Array, models: dict[int, list[Any]], rng: np.rando
     )
     if seen.centre[2] < 0.3:
         return []
-    crops = [crop_around(seen, rng) for _ in range(PICTURES_A_SCENE)]
+    alone, beside = rng.random() < DISTRACTOR_ALONE, rng.random() < WITH_DISTRACTORS
+    others = []
+    if alone or beside:
+        ray = positions[0] - position + (0.0 if alone else 0.25) * rng.normal(0, 0.5, 3)
+        others = [drawn_distraction(position, ray / np.linalg.norm(ray), ground, rng).at(0.0)]
+    if alone:
+        positions[:] = np.nan  # nobody, and nobody's shadow
+        centre = R_ned_camera.T @ (others[0].position - position)
+        if centre[2] < 0.3:
+            return []
+        crops = [crop_at(centre, others[0].thing.size_m, focal, rng) for _ in range(PICTURES_A_SCENE)]
+    else:
+        crops = [crop_around(seen, rng) for _ in range(PICTURES_A_SCENE)]
     left, top, right, bottom = _window(crops)
     matrix = np.array([[focal, 0.0, WIDTH / 2 - left], [0.0, focal, HEIGHT / 2 - top], [0.0, 0.0, 1.0]])
     view = Renderer(world, drones).render(
         matrix, (right - left, bottom - top), R_ned_camera, position,
-        drone_rotations=rotations, drone_positions=positions, shown=np.ones(count, np.bool_),
+        drone_rotations=rotations, drone_positions=positions, shown=np.full(count, not alone), distractors=others,
     )  # fmt: skip
-    if np.count_nonzero(view.ids == 1) < 40:
+    if np.count_nonzero(view.distractors if alone else view.ids == 1) < 40:
         return []
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     image[top:bottom, left:right] = view.rgb
+    if alone:
+        return [picture_of_no_drone(crop, image, rng) for crop in crops]
     return [picture_of(seen, crop, image, rng) for crop in crops]
 
 

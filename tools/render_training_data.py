@@ -2,7 +2,8 @@
 
 python tools/render_training_data.py OUT --worlds 120 --pairs 30 --split training
 
-With ``--families unseen`` its drones are of the families that no network is trained on.
+A third of the scenes have birds and the like in them. With ``--families unseen`` the drones are of the families that
+no network is trained on.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from tools.training.dataset import FOCAL_PX, HEIGHT, MAX_DRONES, R_BODY_CAMERA, 
 from tools.training.scenes import attitude, drawn_attitude
 
 Array = NDArray[Any]
+WITH_DISTRACTORS = 1 / 3
+"""Share of the scenes."""
 
 
 def main() -> None:
@@ -78,6 +81,7 @@ def _render_pair(
     rng: np.random.Generator,
 ) -> None:
     from flockd.sim.renderer import true_flow  # noqa: PLC0415
+    from tools.training.distractions import drawn_distractions  # noqa: PLC0415
 
     focal = FOCAL_PX * float(np.exp(rng.normal(0, 0.08)))
     matrix = np.array([[focal, 0.0, WIDTH / 2], [0.0, focal, HEIGHT / 2], [0.0, 0.0, 1.0]])
@@ -99,12 +103,15 @@ def _render_pair(
     places[~shown] = np.nan
     drone_positions = [places, places + moves]
     drone_rotations = [np.array(turns), np.array([r @ w for r, w in zip(turns, wobble, strict=True)])]
+    count = int(rng.integers(1, 5)) if rng.random() < WITH_DISTRACTORS else 0
+    others = drawn_distractions(count, position, start @ R_BODY_CAMERA, focal, ground, rng)
     views = []
     for k in range(2):
         R_ned_camera = attitudes[k] @ R_BODY_CAMERA
         view = renderer.render(
             matrix, (WIDTH, HEIGHT), R_ned_camera, positions[k],
             drone_rotations=drone_rotations[k], drone_positions=drone_positions[k], shown=shown,
+            distractors=[other.at(k * interval) for other in others],
         )  # fmt: skip
         views.append(view)
         part["image"][index, k] = view.rgb

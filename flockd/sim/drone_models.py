@@ -126,29 +126,8 @@ class _Craft:
             )
 
     def loft(self, rings: list[FloatArray], colours: list[FloatArray]) -> None:
-        """A closed skin over rings (n, 3) of equally many points; a colour for each band between two rings.
-
-        The first ring on top, each clockwise seen from above.
-        """
-        sides = len(rings[0])
-        k = np.arange(sides)
-        following = (k + 1) % sides
-        faces = []
-        for band in range(len(colours)):
-            high, low = band * sides, (band + 1) * sides
-            faces += [
-                np.stack([k + high, following + high, k + low], 1),
-                np.stack([following + high, following + low, k + low], 1),
-            ]
-        foot, middle = (len(rings) - 1) * sides, len(rings) * sides
-        faces += [
-            np.stack([following, k, np.full(sides, middle)], 1),
-            np.stack([k + foot, following + foot, np.full(sides, middle + 1)], 1),
-        ]
-        bands = np.repeat(np.array(colours), 2 * sides, axis=0)
-        ends = np.repeat(np.array([colours[0], colours[-1]]), sides, axis=0)
-        vertices = np.vstack([*rings, rings[0].mean(0)[None], rings[-1].mean(0)[None]])
-        self.mesh.add(vertices, np.vstack(faces), int(self.skin[0]), np.vstack([bands, ends]), (0.3, 0.3))
+        """A closed skin over rings (n, 3), the first on top, each clockwise seen from above; see ``Mesh.loft``."""
+        self.mesh.loft(rings, int(self.skin[0]), np.array(colours), (0.3, 0.3))
 
     def ball(self, centre: tuple[float, float, float], radius: float, colour: FloatArray) -> None:
         slope = np.radians([-70, -35, 0, 35, 70])

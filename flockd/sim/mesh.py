@@ -146,6 +146,28 @@ class Mesh:
             triangles, colours = triangles[keep], colours[keep]
         self.add(vertices, triangles, texture, colours, tile)
 
+    def loft(
+        self, rings: list[FloatArray], texture: int, tint: FloatArray, tile: tuple[float, float] = (1.0, 1.0)
+    ) -> None:
+        """A closed skin over rings (n, 3) of equally many points, right-handed about the way from first to last.
+
+        ``tint`` (len(rings) - 1, 3): of the bands between the rings.
+        """
+        sides = len(rings[0])
+        k = np.arange(sides)
+        following = (k + 1) % sides
+        faces = []
+        for band in range(len(rings) - 1):
+            low, high = band * sides, (band + 1) * sides
+            faces.append(np.stack([k + low, following + low, k + high], 1))
+            faces.append(np.stack([following + low, following + high, k + high], 1))
+        last, middle = (len(rings) - 1) * sides, len(rings) * sides
+        faces.append(np.stack([following, k, np.full(sides, middle)], 1))
+        faces.append(np.stack([k + last, following + last, np.full(sides, middle + 1)], 1))
+        colours = np.vstack([np.repeat(tint, 2 * sides, axis=0), np.repeat(tint[[0, -1]], sides, axis=0)])
+        vertices = np.vstack([*rings, rings[0].mean(0)[None], rings[-1].mean(0)[None]])
+        self.add(vertices, np.vstack(faces), texture, colours, tile)
+
     def blob(
         self,
         centre: FloatArray,

@@ -16,12 +16,15 @@ from numpy.typing import NDArray
 
 from flockd.messages import BoolArray, Float32Array, FloatArray, IntArray, UInt8Array
 from flockd.sim import _raster, textures
+from flockd.sim.distractors import Distractor, Placed
 from flockd.sim.drone_models import DroneModel, machine_texels
 from flockd.sim.mesh import face_normals
 from flockd.sim.sky import SKY_BITS
 from flockd.sim.world import GROUND_MAP_BITS, World
 
 Indices = NDArray[np.int32]
+_DISTRACTOR = 255
+"""Id while an image is drawn; afterwards distractors are nobody."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,15 +36,17 @@ class View:
     depth: Float32Array
     """(h, w) metres along the optical axis at the pixel's centre; inf for sky."""
     ids: UInt8Array
-    """(h, w) 0 for the world and sky, k for drone k - 1."""
+    """(h, w) 0 for the world, sky and distractors, k for drone k - 1."""
+    distractors: BoolArray
+    """(h, w) where something in the air is seen that is no drone."""
 
 
 class Renderer:
     """Draws one world and one flock from any camera. Holds no state that changes between images."""
 
     def __init__(self, world: World, drones: Sequence[DroneModel]) -> None:
-        if len(drones) > 255:
-            raise ValueError(f"ids are bytes: at most 255 drones, not {len(drones)}")
+        if len(drones) >= _DISTRACTOR:
+            raise ValueError(f"ids are bytes: at most {_DISTRACTOR - 1} drones, not {len(drones)}")
         self._world = world
         self._drones = tuple(drones)
         self._machine = machine_texels()
@@ -62,6 +67,7 @@ class Renderer:
         drone_rotations: FloatArray,
         drone_positions: FloatArray,
         shown: BoolArray | Sequence[int] | IntArray,
+        distractors: Sequence[Placed] = (),
     ) -> View:
         """One image.
 
@@ -69,7 +75,7 @@ class Renderer:
         takes optical RDF axes to NED, ``position_ned`` (3,) m. ``drone_rotations`` (n, 3, 3) are R_ned_body and
         ``drone_positions`` (n, 3) NED m, one of each drone of the constructor. ``shown``: a mask (n,) or indices; the
         others are not seen, but every drone with a finite position casts its shadow. Poses of another number than the
-        drones raise ``ValueError``.
+        drones raise ``ValueError``. ``distractors`` are seen like drones, but have no id and no shadow.
         """
         world = self._world
         width, height = size
@@ -100,17 +106,34 @@ class Renderer:
                 world.ground_detail, world.extent_m, world.shadow_map, world.shadow_frame, world.light,
                 world.fog_per_m, world.sky, SKY_BITS, world.tone, blobs, blob_rows, sharp, depth,
             )  # fmt: skip
-            view = View(rgb=sharp.copy(), depth=depth, ids=np.zeros((height, width), dtype=np.uint8))
+            view = View(
+                rgb=sharp.copy(),
+                depth=depth,
+                ids=np.zeros((height, width), dtype=np.uint8),
+                distractors=np.zeros((height, width), dtype=np.bool_),
+            )
             _raster.smooth_edges(hit, world.texture, planes, self._linear, world.tone, sharp, view.rgb)
         chosen = np.arange(count)[np.asarray(shown)] if len(np.asarray(shown)) else np.arange(0)
-        distance = np.linalg.norm(positions[chosen] - origin, axis=1)
-        for k in chosen[np.argsort(-distance, kind="stable")]:
-            self._draw(int(k), rotations[k], positions[k], K, inverse_K, R, origin, focal, view)
+        things: list[tuple[int, DroneModel | Distractor, FloatArray, FloatArray, FloatArray]] = [
+            (int(k) + 1, self._drones[k], self._normals[k], rotations[k], positions[k]) for k in chosen
+        ]
+        for placed in distractors:
+            normals = face_normals(placed.thing.vertices.astype(np.float64), placed.thing.triangles)
+            things.append((_DISTRACTOR, placed.thing, normals, placed.rotation, placed.position))
+        distance = np.array([np.linalg.norm(position - origin) for *_, position in things])
+        for i in np.argsort(-distance, kind="stable"):
+            identity, model, normals, rotation, position = things[i]
+            self._draw(identity, model, normals, rotation, position, K, inverse_K, R, origin, focal, view)
+        if distractors:
+            np.equal(view.ids, _DISTRACTOR, out=view.distractors)
+            view.ids[view.distractors] = 0
         return view
 
     def _draw(
         self,
-        k: int,
+        identity: int,
+        model: DroneModel | Distractor,
+        normals: FloatArray,
         rotation: FloatArray,
         position: FloatArray,
         K: FloatArray,
@@ -120,8 +143,8 @@ class Renderer:
         focal: float,
         view: View,
     ) -> None:
-        """Lay drone k over the view, supersampled within its bounding rectangle."""
-        world, model = self._world, self._drones[k]
+        """Lay one thing over the view, supersampled within its bounding rectangle."""
+        world = self._world
         height, width = view.ids.shape
         vertices = np.ascontiguousarray(model.vertices.astype(np.float64) @ rotation.T + (position - origin))
         P = K @ R.T
@@ -137,9 +160,9 @@ class Renderer:
             hit, inverse_depth = _fill(rows, planes, wide, high)
             _raster.shade_drone(
                 hit, inverse_depth, planes, left, top, inverse_K, R, origin, focal, np.ascontiguousarray(rotation),
-                position, self._normals[k] @ rotation.T, model.texture, model.uv, model.colours, self._machine,
+                position, normals @ rotation.T, model.texture, model.uv, model.colours, self._machine,
                 textures.TEXTURE_BITS, world.shadow_map, world.shadow_frame, world.light, world.fog_per_m, world.tone,
-                self._linear, k + 1, view.rgb, view.depth, view.ids,
+                self._linear, identity, view.rgb, view.depth, view.ids,
             )  # fmt: skip
 
     def _shadows(
@@ -218,7 +241,8 @@ def true_flow(
     """Where every pixel of the first image went in the second: flow (h, w, 2) in pixels, valid (h, w).
 
     Poses come in pairs (first, second), shaped as for ``Renderer.render``. Sky moves as a point at infinity. Valid: in
-    front of the second camera, within its image, and seen there (same id, and a depth that agrees).
+    front of the second camera, within its image, and seen there (same id, and a depth that agrees); never on a
+    distractor, which moves as it likes.
     """
     h, w = first.ids.shape
     K = np.asarray(matrix, dtype=np.float64)
@@ -236,4 +260,4 @@ def true_flow(
         b[k + 1] = R2.T @ (turn @ (p1 - drone_positions[0][k]) + drone_positions[1][k] - p2)
     inverse_K = np.linalg.inv(K)
     _raster.flow(first.depth, first.ids, second.depth, second.ids, K @ A @ inverse_K, b @ K.T, flow, valid)
-    return flow, valid
+    return flow, valid & ~first.distractors

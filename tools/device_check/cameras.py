@@ -16,12 +16,15 @@ from pathlib import Path
 from flockd.sources.v4l2_device import VIDIOC_QUERYCTRL, VIDIOC_S_CTRL, Control, QueryControl, control_name
 
 WEBCAM = "/dev/video10"
-"""Of vivid: shows its own test pattern, in sizes and rates as USB cameras have them, and breaks in every way it can."""
+"""Of vivid: shows its own pattern, in sizes and rates as USB cameras have them, and breaks in every way it can."""
 CABLE_OUT, CABLE = "/dev/video11", "/dev/video12"
 """Of vivid: an HDMI output, and the camera at the other end of its cable."""
 LOOPBACK = "/dev/video20"
 """Of v4l2loopback: a camera of Motion-JPEG."""
 _NEXT = 0x80000000  # V4L2_CTRL_FLAG_NEXT_CTRL
+_WHITE = 6
+"""A test pattern in which the networks see nothing: in the coloured bars they see drones."""
+_COUNTERS, _NOTHING = 1, 2
 
 
 def load() -> None:
@@ -37,8 +40,10 @@ def load() -> None:
         control(device, "timestamp_source")  # stamped when the picture begins; else the stamps lie in the future
     for device in (CABLE_OUT, CABLE):
         run("v4l2-ctl", "-d", device, "--set-dv-bt-timings", f"index={_vga(device)}")
+    control(WEBCAM, "test_pattern", _WHITE)
+    control(WEBCAM, "osd_text_mode", _COUNTERS)  # so that no two pictures are the same
     control(CABLE, "loop_video")
-    control(CABLE, "osd_text_mode", 2)  # nothing written over the pictures
+    control(CABLE, "osd_text_mode", _NOTHING)  # written over the pictures
 
 
 def control(device: str, name: str, value: int = 1) -> float:

@@ -13,6 +13,9 @@ COUNT = 16
 """Then they begin again; no two that follow each other are the same."""
 Size = tuple[int, int]
 """Width, height."""
+_SKY, _GRASS = (215, 190, 170), (80, 130)
+"""The colour, blue first; from how bright to how bright."""
+_PASSING_PX = 4
 
 
 @functools.cache
@@ -30,8 +33,11 @@ def yuyv(size: Size, number: int) -> bytes:
 
 
 def _scene(size: Size, number: int) -> UInt8Array:
-    """Soft blobs that move a little from one to the next, as a landscape does that is flown over."""
+    """Sky above grass that passes by. Nothing looks like a drone: to range one takes an emulated processor long."""
     width, height = size
-    coarse = np.random.default_rng(0).integers(0, 256, (height // 8 + 4, width // 8 + 2 * COUNT, 3), np.uint8)
-    whole = cv2.resize(coarse, None, fx=8, fy=8, interpolation=cv2.INTER_CUBIC)
-    return np.ascontiguousarray(whole[:height, 2 * number : 2 * number + width])
+    wide, high = width + _PASSING_PX * COUNT, height - height // 2
+    blades = np.random.default_rng(0).integers(*_GRASS, (high // 2, wide // 2, 3), dtype=np.uint8)
+    grass = cv2.resize(blades, (wide, high))
+    picture = np.full((height, width, 3), _SKY, np.uint8)
+    picture[height // 2 :] = grass[:, _PASSING_PX * number :][:, :width]
+    return picture

@@ -104,16 +104,21 @@ def distance_sample(
 
 
 def crop_around(drone: DroneInView, rng: np.random.Generator) -> VirtualCrop:
+    """Where the second stage might look at a drone."""
+    return crop_at(drone.centre, SIZES_M[drone.family], drone.focal, rng)
+
+
+def crop_at(centre: NDArray[Any], size_m: float, focal: float, rng: np.random.Generator) -> VirtualCrop:
     """Where the second stage might look: half of the time as aimed by the first network, else by itself."""
     aimed = rng.random() < 0.5
     # How much of the picture the drone fills must say nothing about metres: it is drawn apart from family and range.
     fill = float(np.exp(np.clip(rng.normal(np.log(1.35), 0.1 if aimed else 0.27), np.log(0.7), np.log(2.4))))
-    half_width = SIZES_M[drone.family] / 2 * fill
+    half_width = size_m / 2 * fill
     shift_m = rng.normal(0, 0.03 if aimed else 0.15, 2) * half_width
-    right, down = _across(drone.centre)
-    aim = R_BODY_CAMERA @ _in_view(drone.centre + shift_m[0] * right + shift_m[1] * down, drone.focal)
-    half_angle = float(np.arctan(half_width / np.linalg.norm(drone.centre)))
-    return virtual_crop(Rig({"camera": rig_camera(drone.focal)}), aim / np.linalg.norm(aim), half_angle, 96)
+    right, down = _across(centre)
+    aim = R_BODY_CAMERA @ _in_view(centre + shift_m[0] * right + shift_m[1] * down, focal)
+    half_angle = float(np.arctan(half_width / np.linalg.norm(centre)))
+    return virtual_crop(Rig({"camera": rig_camera(focal)}), aim / np.linalg.norm(aim), half_angle, 96)
 
 
 def picture_of(
@@ -154,7 +159,12 @@ def no_drone_sample(pairs: PairSet, negative: NDArray[Any] | None, rng: np.rando
     aim = R_BODY_CAMERA @ np.array([*((middle - (WIDTH / 2, HEIGHT / 2)) / focal), 1.0])
     half_angle = float(np.arctan(max(half_px, 4.0) / focal))
     crop = virtual_crop(Rig({"camera": rig_camera(focal)}), aim / np.linalg.norm(aim), half_angle, 96)
-    picture, _ = crop.sample({"camera": np.asarray(pairs["image"][pair][k])})
+    return picture_of_no_drone(crop, np.asarray(pairs["image"][pair][k]), rng)
+
+
+def picture_of_no_drone(crop: VirtualCrop, image: NDArray[Any], rng: np.random.Generator) -> Sample:
+    """What ``crop`` shows of the camera's ``image``, where nothing is to be found."""
+    picture, _ = crop.sample({"camera": image})
     (picture,) = photometric([picture], rng)
     return {
         "picture": picture,

@@ -1,0 +1,1 @@
+"""How good the shipped networks are, on worlds that they never saw."""

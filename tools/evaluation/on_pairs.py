@@ -1,0 +1,164 @@
+"""What the networks make of rendered pairs of images: drones found, their distances, masks, depth, flow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flockd.geometry import Rig
+from flockd.messages import Frame, FrameSet, Sighting, VehicleState
+from flockd.perception import UNSURE, DisFlow, Perception
+from flockd.pilot.views import Observer
+from flockd.sim.drone_models import drone_model
+from tools.training.dataset import HEIGHT, R_BODY_CAMERA, WIDTH, PairSet, rig_camera
+from tools.training.samples import SIZES_M
+
+Array = NDArray[Any]
+BAROMETER_SIGMA_M = 0.1
+MIN_PIXELS = 6
+"""Drones of which less is to be seen do not count, neither as found nor as missed."""
+MASK_WITHIN_M = 10.0
+WHOLE_HIDES = 0.02
+"""A drone is whole when it is inside the image and no more of its outline is hidden than this."""
+
+
+@dataclass(frozen=True)
+class Drone:
+    """One drone in one image, and what was made of it."""
+
+    range_m: float
+    width_px: float
+    whole: bool
+    found: bool
+    error: float
+    """Of its range, relative; 0 where it was not found."""
+    sigma: float
+    """What was said of that error's standard deviation."""
+
+
+class Findings:
+    """Everything that is gathered over all pairs."""
+
+    def __init__(self) -> None:
+        self.images = 0
+        self.false = 0
+        """Sightings that are no drone's, or a drone's second one."""
+        self.drones: list[Drone] = []
+        self.iou: list[float] = []
+        self.depth: dict[bool, list[float]] = {False: [], True: []}
+        """Relative error of the background's depth in each image, without and with height and attitude."""
+        self.flow: dict[tuple[str, bool], list[Array]] = {}
+        """End-point errors, px, of ("network" or "dis", on drones)."""
+
+    def errors(self, low_m: float, high_m: float, *, whole: bool) -> Array:
+        """Relative range errors of the drones that were found."""
+        return np.array([d.error for d in self.drones if d.found and d.whole is whole and low_m <= d.range_m < high_m])
+
+    def inside(self, sigmas: float) -> float:
+        """Share of the whole drones' range errors that are within so many of their own standard deviations."""
+        return float(np.mean([abs(d.error) < sigmas * d.sigma for d in self.drones if d.found and d.whole]))
+
+    def found(self, low_px: float, high_px: float) -> float:
+        """Share of the drones whose box is so wide."""
+        return float(np.mean([d.found for d in self.drones if low_px <= d.width_px < high_px]))
+
+    def flow_errors(self, name: str, *, on_drones: bool) -> Array:
+        """All of them."""
+        return np.concatenate(self.flow[name, on_drones])
+
+
+def look_at_pairs(pairs: PairSet, perception: Perception, indices: Iterable[int]) -> Findings:
+    """The second stage and all, on each pair's first image; the flow on both."""
+    rng = np.random.Generator(np.random.PCG64(0))
+    dis, found = DisFlow(), Findings()
+    for index in indices:
+        rig = Rig({"camera": rig_camera(float(pairs["focal"][index]))})
+        images = np.asarray(pairs["image"][index])
+        R_ned_camera = np.asarray(pairs["R_ned_camera"][index, 0], np.float64)
+        height = float(pairs["height"][index, 0]) + float(rng.normal(0, BAROMETER_SIGMA_M))
+        frames = FrameSet(0.0, {"camera": Frame("camera", images[0], 0.0, 0)})
+        vehicle = VehicleState(0.0, R_ned_camera @ R_BODY_CAMERA.T, height)
+        depth, ids = np.asarray(pairs["depth"][index][0], np.float32), np.asarray(pairs["ids"][index][0])
+        for with_height in (False, True):
+            observer = Observer(rig, perception, height_fixes_scale=with_height)
+            maps, _ = observer.scenes(frames, vehicle)
+            found.depth[with_height].append(_depth_error(maps["camera"].depth[1::2, 1::2], depth, ids))
+        labels = maps["camera"].labels[1::2, 1::2]
+        _masks((labels > 0) & (labels != UNSURE), ids, pairs, index, found)
+        _drones(observer.view(frames, vehicle, maps, ()).sightings, pairs, index, depth, ids, found)
+        flow = np.asarray(pairs["flow"][index], np.float32)
+        valid = np.asarray(pairs["flow_valid"][index])
+        for name, guess in (("network", perception.flow("camera", *images)), ("dis", dis.flow(*images))):
+            error = np.linalg.norm(np.moveaxis(guess[1::2, 1::2], 2, 0) - flow, axis=0)
+            for on_drones in (False, True):
+                found.flow.setdefault((name, on_drones), []).append(error[valid & ((ids > 0) == on_drones)])
+    return found
+
+
+def _depth_error(guess: Array, true: Array, ids: Array) -> float:
+    near = (ids == 0) & (true < 60.0)
+    return float(np.mean(np.abs(guess[near] - true[near]) / true[near])) if near.any() else 0.0
+
+
+def _masks(guess: Array, ids: Array, pairs: PairSet, index: int, found: Findings) -> None:
+    """IoU of every near drone, over its box with a margin."""
+    for drone in np.flatnonzero(pairs["drone_pixels"][index, 0] > 30):
+        if np.linalg.norm(pairs["drone_centre"][index, 0, drone]) > MASK_WITHIN_M:
+            continue
+        left, top, right, bottom = (pairs["drone_box"][index, 0, drone] / 2).astype(int)
+        part = np.s_[max(0, top - 3) : bottom + 3, max(0, left - 3) : right + 3]
+        other = (ids[part] > 0) & (ids[part] != drone + 1)
+        mine, said = (ids[part] == drone + 1), guess[part] & ~other
+        found.iou.append(float((mine & said).sum() / max((mine | said).sum(), 1)))
+
+
+def _drones(
+    sightings: tuple[Sighting, ...], pairs: PairSet, index: int, depth: Array, ids: Array, found: Findings
+) -> None:
+    """A sighting is a drone's if it lies in the drone's direction, however wrong its range is."""
+    found.images += 1
+    free = list(sightings)
+    pixels = pairs["drone_pixels"][index, 0]
+    for drone in np.argsort(-pixels):
+        if pixels[drone] < MIN_PIXELS:
+            continue
+        true = R_BODY_CAMERA @ np.asarray(pairs["drone_centre"][index, 0, drone], np.float64)
+        range_m = float(np.linalg.norm(true))
+        half_angle = SIZES_M[int(pairs["drone_family"][index, drone])] / 2 / range_m
+        left, top, right, bottom = pairs["drone_box"][index, 0, drone]
+        inside = left > 1 and top > 1 and right < WIDTH - 1 and bottom < HEIGHT - 1
+        best = min(free, key=lambda s: _angle(s.position, true), default=None)
+        if best is not None and _angle(best.position, true) > half_angle:
+            best = None
+        error, sigma = 0.0, 1.0
+        if best is not None:
+            free.remove(best)
+            distance = float(np.linalg.norm(best.position))
+            error, sigma = distance / range_m - 1.0, best.range_sigma_m / distance
+        whole = inside and _hidden_share(pairs, index, int(drone), depth, ids) < WHOLE_HIDES
+        found.drones.append(Drone(range_m, float(right - left), bool(whole), best is not None, error, sigma))
+    found.false += len(free)
+
+
+def _angle(a: Array, b: Array) -> float:
+    return float(np.arccos(np.clip(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)), -1, 1)))
+
+
+def _hidden_share(pairs: PairSet, index: int, drone: int, depth: Array, ids: Array) -> float:
+    """How much of the drone's outline, as if a thread ran around it, something nearer hides; what is cut off apart."""
+    family = int(pairs["drone_family"][index, drone])
+    centre = np.asarray(pairs["drone_centre"][index, 0, drone], np.float64)
+    corners = drone_model(family, 0).vertices @ np.asarray(pairs["drone_rotation"][index, 0, drone], np.float64).T
+    corners = (corners + centre)[(corners + centre)[:, 2] > 0.05]
+    half_px = float(pairs["focal"][index]) / 2 * corners[:, :2] / corners[:, 2:] + np.array([WIDTH, HEIGHT]) / 4
+    outline = np.zeros(ids.shape, np.uint8)
+    cv2.fillConvexPoly(outline, cv2.convexHull(np.round(half_px).astype(np.int32)), 1)
+    nearer = depth < centre[2] - SIZES_M[family] / 2
+    others = np.flatnonzero(pairs["drone_centre"][index, 0, :, 2] < centre[2]) + 1
+    nearer |= np.isin(ids, others)
+    return float((nearer & (outline > 0)).sum() / max(int(outline.sum()), 1))

@@ -1,0 +1,75 @@
+"""How well a whole rig knows its own motion in worlds that it never saw."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockd.config import DroneConfig
+from flockd.geometry import Rig, build_rig
+from flockd.messages import Frame, FrameSet, VehicleState
+from flockd.perception import Perception
+from flockd.pilot import FlockPilot
+from flockd.sim.renderer import Renderer
+from flockd.sim.world import World
+from tools.training.scenes import drawn_attitude
+
+Array = NDArray[Any]
+STEP_M, STEP_S = 0.5, 0.5
+CLEARANCE_M = 2.0
+HEIGHTS_M = (2.0, 6.0)
+BAROMETER_SIGMA_M = 0.1
+NOISE = 2.0
+"""Grey levels."""
+
+
+def ego_motion_errors(
+    config: DroneConfig, perception: Perception, seeds: Sequence[int], steps_a_world: int
+) -> dict[str, list[float]]:
+    """Translation errors in metres of single steps, by what fixes the scale; NaN where there was no estimate."""
+    errors: dict[str, list[float]] = {"network": [], "height": []}
+    for seed in seeds:
+        for steps, moved in _steps(seed, steps_a_world, build_rig(config.rig)):
+            R_ned_body = steps[0][1].R_ned_body
+            for scale, found in errors.items():
+                settings = config.perception.model_copy(update={"scale": scale})
+                pilot = FlockPilot(config.model_copy(update={"perception": settings}), perception)
+                ego = [pilot.step(*step) for step in steps][-1].ego_motion
+                found.append(np.nan if ego is None else float(np.linalg.norm(R_ned_body @ ego.translation - moved)))
+    return errors
+
+
+def _steps(seed: int, count: int, rig: Rig) -> Iterator[tuple[list[tuple[FrameSet, VehicleState]], Array]]:
+    """What a pilot is given before and after a step, and the step (3,) m NED, from places all over a world."""
+    rng = np.random.Generator(np.random.PCG64([seed, 3]))
+    world = World.generate(seed, ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])), keep_out=None)
+    renderer = Renderer(world, [])
+    for place in world.free_points(count, rng, CLEARANCE_M):
+        ground = float(world.height_at(place[:1], place[1:2])[0])
+        height, heading = float(rng.uniform(*HEIGHTS_M)), float(rng.uniform(-np.pi, np.pi))
+        start = np.array([place[0], place[1], -(ground + height)])
+        moved = np.array([STEP_M * np.cos(heading), STEP_M * np.sin(heading), 0.0])
+        R_ned_body, barometer_m = drawn_attitude(rng), height + float(rng.normal(0, BAROMETER_SIGMA_M))
+        steps = []
+        for k in range(2):
+            frames = _photographed(renderer, rig, R_ned_body, start + k * moved, k, rng)
+            steps.append((FrameSet(k * STEP_S, frames), VehicleState(k * STEP_S, R_ned_body, barometer_m)))
+        yield steps, moved
+
+
+def _photographed(
+    renderer: Renderer, rig: Rig, R_ned_body: Array, position: Array, k: int, rng: np.random.Generator
+) -> dict[str, Frame]:
+    frames = {}
+    for name, mounted in rig.cameras.items():
+        view = renderer.render(
+            mounted.camera.matrix, mounted.camera.size, R_ned_body @ mounted.T_body_camera.rotation,
+            position + R_ned_body @ mounted.T_body_camera.translation,
+            drone_rotations=np.empty((0, 3, 3)), drone_positions=np.empty((0, 3)), shown=(),
+        )  # fmt: skip
+        noisy = view.rgb + rng.normal(0, NOISE, view.rgb.shape)
+        frames[name] = Frame(name, np.clip(np.round(noisy), 0, 255).astype(np.uint8), k * STEP_S, k)
+    return frames
