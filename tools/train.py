@@ -4,7 +4,7 @@
     python tools/train.py distance   --data DATA --out RUNS/distance --minutes 90 --pictures P --negatives N.npy
     python tools/train.py flow       --data DATA --out RUNS/flow --minutes 40
 
-Writes OUT/checkpoint.pt and OUT/curve.csv every few minutes. Uses a GPU where there is one.
+Writes OUT/checkpoint.pt, OUT/curve.csv and a picture of it every few minutes. Uses a GPU where there is one.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -317,6 +318,7 @@ def train(task: Task, out: Path, budget_s: float, seed: int) -> None:
             }  # fmt: skip
             torch.save(state, checkpoint.with_suffix(".new"))
             checkpoint.with_suffix(".new").replace(checkpoint)
+            _draw_curve(out)
             last_save = spent
 
 
@@ -343,6 +345,19 @@ def _note(out: Path, step: int, spent: float, recent: list[dict[str, float]]) ->
         curve.write_text("step,seconds," + ",".join(means) + "\n")
     with curve.open("a") as file:
         file.write(f"{step},{spent:.0f}," + ",".join(f"{v:.6f}" for v in means.values()) + "\n")
+
+
+def _draw_curve(out: Path) -> None:
+    """One small plot a figure, over minutes of training."""
+    with (out / "curve.csv").open() as file:
+        names = file.readline().strip().split(",")[2:]
+        rows = np.array([[float(value) for value in line.split(",")] for line in file])
+    figure = Figure(figsize=(4.0 * len(names), 3.0), layout="constrained")
+    for name, axes, values in zip(names, figure.subplots(1, len(names)), rows[:, 2:].T, strict=True):
+        axes.plot(rows[:, 1] / 60.0, values, linewidth=0.8)
+        axes.set(title=name, xlabel="minutes", yscale="log" if (values > 0).all() else "linear")
+        axes.grid(alpha=0.3, which="both")
+    figure.savefig(out / "curve.png", dpi=80)
 
 
 if __name__ == "__main__":
