@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numba
 import numpy as np
@@ -368,11 +368,9 @@ def test_a_bird_is_seen_and_is_nobody(scenes: list[Scene]) -> None:
     assert not without.distractors.any()
     u, v = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
     rays = np.stack([u, v, np.ones_like(u)], -1).reshape(-1, 3) @ np.linalg.inv(MATRIX).T @ scene.R.T
-    there = DroneModel(**{**vars(scene.drones[0]), "vertices": gull.flapped(0.4).vertices, "triangles": gull.triangles})
-    depth, ids = _cast(
-        scene.world, [*scene.drones, there], np.array([*scene.rotations, np.eye(3)]), np.array([*scene.positions, start]),
-        scene.position, rays,
-    )  # fmt: skip
+    solid = replace(scene.drones[0], vertices=gull.flapped(0.4).vertices, triangles=gull.triangles)
+    rotations, positions = np.array([*scene.rotations, np.eye(3)]), np.array([*scene.positions, start])
+    depth, ids = _cast(scene.world, [*scene.drones, solid], rotations, positions, scene.position, rays)
     seen = views[0].distractors
     assert seen.sum() > 500
     assert (seen == (ids == 6).reshape(seen.shape)).mean() > 0.999
