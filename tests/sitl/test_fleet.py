@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -48,7 +49,12 @@ def _scenario(folder: Path, drones: int, **drone: object) -> Path:
 
 def _left_behind(mark: str) -> list[str]:
     """Command lines of processes that know of a folder."""
-    found = []
+    return list(_processes(mark).values())
+
+
+def _processes(mark: str) -> dict[int, str]:
+    """Numbers and command lines of other processes that know of a folder."""
+    found = {}
     for entry in Path("/proc").glob("[0-9]*"):
         try:
             command = (entry / "cmdline").read_bytes()
@@ -56,7 +62,7 @@ def _left_behind(mark: str) -> list[str]:
         except OSError:
             continue
         if mark.encode() in known and int(entry.name) != os.getpid():
-            found.append(command.replace(b"\0", b" ").decode())
+            found[int(entry.name)] = command.replace(b"\0", b" ").decode()
     return found
 
 
@@ -194,3 +200,32 @@ def test_px4_flies_by_sight(tmp_path: Path) -> None:
     log = FlightLog.load(out / "flight.npz")
     speed = np.linalg.norm(log.velocity[-10:, :, :2].mean(axis=0), axis=-1)
     np.testing.assert_allclose(speed, 1.0, atol=0.3)
+
+
+@PX4
+@pytest.mark.slow
+def test_px4_enters_its_failsafe_when_its_daemon_is_frozen(tmp_path: Path) -> None:
+    """No setpoint for a second is a failsafe of PX4 in offboard: it ends with another mode."""
+    out = tmp_path / "out"
+    run = "import sys; from flockd.cli import main; sys.exit(main())"
+    options = ["--autopilot", "px4", "--drones", "2", "--duration", "20", "--out", str(out)]
+    with subprocess.Popen(
+        [sys.executable, "-c", run, "sim", *options], cwd=data_path("config").parent,
+        env={**os.environ, "TMPDIR": str(tmp_path)}, stderr=subprocess.PIPE, text=True,
+    ) as simulator:  # fmt: skip
+        assert simulator.stderr is not None
+        frozen_s = 0.0
+        for line in simulator.stderr:
+            flying = re.match(r"flying: (\d+) of 20 s", line)
+            if flying and int(flying[1]) >= 5 and not frozen_s:
+                known = _processes(str(tmp_path)).items()
+                (daemon,) = [number for number, command in known if re.search(r" run --config .*/drone1.yaml", command)]
+                os.kill(daemon, signal.SIGSTOP)
+                frozen_s = float(flying[1])
+    assert simulator.returncode == 1
+    fleet = json.loads((out / "summary.json").read_text(encoding="utf-8"))["fleet"]
+    left = re.match(r"after ([\d.]+) s it left offboard .*Failsafe", fleet["handed_over"]["drone1"])
+    assert left is not None, fleet
+    assert 0.2 < float(left[1]) - frozen_s < 2.0, "COM_OF_LOSS_T is a second of real time, a quarter of simulated time"
+    assert set(fleet["handed_over"]) == {"drone1"}
+    assert fleet["exit_codes"] == {"drone1": -signal.SIGKILL, "drone2": 0}
