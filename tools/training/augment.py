@@ -37,3 +37,20 @@ def photometric(images: list[Image], rng: np.random.Generator) -> list[Image]:
             changed = np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR))
         out.append(np.asarray(changed, dtype=np.uint8))
     return out
+
+
+def motion_blur(images: list[Image], rng: np.random.Generator) -> list[Image]:
+    """Half of the time each image smeared along a line of its own, as by a camera that turns while it exposes."""
+    if rng.random() < 0.5:
+        return images
+    return [_smeared(image, rng.uniform(0.0, 0.05) * image.shape[1], rng.uniform(0.0, np.pi)) for image in images]
+
+
+def _smeared(image: Image, length_px: float, angle: float) -> Image:
+    reach = int(np.ceil(length_px / 2)) + 1
+    ends = reach + np.outer([-0.5, 0.5], length_px * np.array([np.cos(angle), np.sin(angle)]))
+    kernel = np.zeros((2 * reach + 1, 2 * reach + 1), np.float32)
+    for share in np.linspace(0.0, 1.0, 4 * reach):
+        u, v = ends[0] + share * (ends[1] - ends[0])
+        kernel[round(v), round(u)] += 1.0
+    return np.asarray(cv2.filter2D(image, -1, kernel / kernel.sum()), dtype=np.uint8)

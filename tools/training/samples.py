@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flockd.geometry import Rig, VirtualCrop, virtual_crop
 from flockd.sim.drone_models import FAMILIES, drone_model
-from tools.training.augment import photometric
+from tools.training.augment import motion_blur, photometric
 from tools.training.dataset import (
     HEIGHT,
     R_BODY_CAMERA,
@@ -179,13 +179,19 @@ def picture_of_no_drone(crop: VirtualCrop, image: NDArray[Any], rng: np.random.G
 def flow_sample(
     pairs: PairSet, index: int, rng: np.random.Generator, size: tuple[int, int], *, augment: bool = True
 ) -> Sample:
-    """Two quarter-size images and the flow between them, cropped to ``size`` (height, width)."""
+    """Two quarter-size images and the flow between them, cropped to ``size`` (height, width).
+
+    Augmented, half of the second images are the first one warped: larger motions and turns than drones make in a step.
+    """
     first, second = (_quarter(image) for image in pairs["image"][index])
-    flow = _pairwise(pairs["flow"][index].astype(np.float32)).mean((-3, -1)) / 4.0
-    valid = np.asarray(_pairwise(pairs["flow_valid"][index]).all((-3, -1)))
     ids = _pairwise(pairs["ids"][index][0]).max((-3, -1))
+    if augment and rng.random() < 0.5:
+        second, flow, valid = warped(first, second, rng)
+    else:
+        flow = _pairwise(pairs["flow"][index].astype(np.float32)).mean((-3, -1)) / 4.0
+        valid = np.asarray(_pairwise(pairs["flow_valid"][index]).all((-3, -1)))
     if augment:
-        first, second = photometric([first, second], rng)
+        first, second = motion_blur(photometric([first, second], rng), rng)
         if rng.random() < 0.5:
             first, second, valid, ids = first[:, ::-1], second[:, ::-1], valid[:, ::-1], ids[:, ::-1]
             flow = flow[:, :, ::-1] * np.array([-1, 1], np.float32)[:, None, None]
@@ -199,6 +205,33 @@ def flow_sample(
         "valid": np.ascontiguousarray(valid[window]),
         "drone": np.ascontiguousarray(ids[window] > 0),
     }
+
+
+def warped(
+    image: NDArray[np.uint8], behind: NDArray[np.uint8], rng: np.random.Generator
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
+    """The image after a motion of its own plane, the flow (2, h, w) that led there, and where it is known.
+
+    ``behind`` (h, w, 3) shows where nothing of the image came to lie.
+    """
+    height, width = image.shape[:2]
+    middle = np.array([width / 2, height / 2])
+    angle, zoom = rng.normal(0, np.radians(10)), np.exp(rng.normal(0, 0.12))
+    turn = zoom * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    turn = turn @ (np.eye(2) + rng.normal(0, 0.04, (2, 2)))
+    shift = rng.normal(0, 0.12, 2) * width
+    tilt = rng.normal(0, 0.1, 2) / width
+    away, back = np.eye(3), np.eye(3)
+    away[:2, 2], back[:2, 2] = -middle, middle + shift
+    motion = np.eye(3)
+    motion[:2, :2], motion[2, :2] = turn, tilt
+    motion = back @ motion @ away
+    second = cv2.warpPerspective(image, motion, (width, height), dst=behind.copy(), borderMode=cv2.BORDER_TRANSPARENT)
+    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    places = cv2.perspectiveTransform(np.stack([u, v], 2), motion)
+    flow = np.moveaxis(places - np.stack([u, v], 2), 2, 0).astype(np.float32)
+    inside = (places >= 0).all(2) & (places[..., 0] <= width - 1) & (places[..., 1] <= height - 1)
+    return np.asarray(second, np.uint8), flow, np.asarray(inside)
 
 
 def drone_list(pairs: PairSet, min_pixels: int = 40) -> list[tuple[int, int, int]]:
