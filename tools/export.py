@@ -96,6 +96,7 @@ def main() -> None:
     state = torch.load(arguments.checkpoint, map_location="cpu")
     net.load_state_dict(state["net"])
     net.eval()
+    arguments.out.mkdir(parents=True, exist_ok=True)
     file = arguments.out / f"{arguments.network}.onnx"
     manifest = _manifest(arguments.network, spec, dict(a.split("=", 1) for a in arguments.accuracy), state)
     feeds = golden_feeds(manifest)

@@ -1,0 +1,70 @@
+"""From seeded worlds to a network that flies: rendering, training, resuming, exporting. Needs the extra `train`."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="the extra `train` is not installed")
+
+from flockd.cli import main
+from flockd.data import data_path
+from tools.training import worlds
+from tools.training.samples import warped
+
+TOOLS = Path(__file__).resolve().parents[2] / "tools"
+
+
+def run(tool: str, *options: str | Path) -> str:
+    command = [sys.executable, str(TOOLS / tool), *map(str, options)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_a_network_is_trained_resumed_and_exported_by_one_command_each(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, runs, models = tmp_path / "data", tmp_path / "runs", tmp_path / "models"
+    run("render_training_data.py", data, "--worlds", "1", "--pairs", "2", "--processes", "1")
+    training = ("flow", "--data", data, "--out", runs, "--threads", "1")
+    run("train.py", *training, "--minutes", "0.05")
+    first = (runs / "curve.csv").read_text(encoding="utf-8").splitlines()
+    run("train.py", *training, "--minutes", "0.1")
+    second = (runs / "curve.csv").read_text(encoding="utf-8").splitlines()
+    assert second[: len(first)] == first, "resumed, not begun anew"
+    steps = [int(line.split(",")[0]) for line in second[1:]]
+    assert steps == sorted(set(steps))
+    assert cv2.imread(str(runs / "curve.png")) is not None
+
+    run("export.py", "flow", "--checkpoint", runs / "checkpoint.pt", "--out", models)
+    for name in ("neighbours", "distance"):
+        for suffix in ("yaml", "onnx"):
+            (models / f"{name}.{suffix}").write_bytes((data_path("models") / f"{name}.{suffix}").read_bytes())
+    assert main(["models", "verify", "--dir", str(models)]) == 0, capsys.readouterr()
+
+
+def test_worlds_for_training_validation_test_and_flights_never_meet() -> None:
+    parts = [worlds.FLIGHTS, worlds.TRAINING, worlds.VALIDATION, worlds.TEST]
+    assert all(a.stop <= b.start for a, b in pairwise(parts))
+    assert not set(worlds.FAMILIES) & set(worlds.UNSEEN_FAMILIES)
+
+
+def test_a_warped_image_goes_where_its_flow_says() -> None:
+    rng = np.random.default_rng(5)
+    smooth = cv2.GaussianBlur(rng.integers(0, 255, (160, 120, 3), dtype=np.uint8), (0, 0), 3.0)
+    for _ in range(5):
+        second, flow, valid = warped(smooth, np.zeros_like(smooth), rng)
+        u, v = np.meshgrid(np.arange(120, dtype=np.float32), np.arange(160, dtype=np.float32))
+        fetched = cv2.remap(second, u + flow[0], v + flow[1], cv2.INTER_LINEAR)
+        away = np.abs(fetched.astype(float) - smooth).max(axis=2)
+        inner = cv2.erode(valid.astype(np.uint8), np.ones((5, 5))) > 0
+        assert inner.mean() > 0.2
+        assert np.median(away[inner]) <= 2.0
+        assert np.median(np.abs(np.roll(smooth, 7, axis=1).astype(float) - smooth).max(axis=2)) > 5.0, "it has texture"
