@@ -482,6 +482,17 @@ class DroneConfig(Section):
         return 1.0 if self.source is None else self.source.shared_memory.speed_factor
 
     @model_validator(mode="after")
+    def _the_gate_lets_the_trim_through(self) -> Self:
+        gate_m_s, law_m_s = self.safety.gate.max_speed_m_s, self.flocking.max_speed_m_s
+        trim_m_s = 0.0 if self.autopilot is None else self.autopilot.max_velocity_trim_m_s
+        if law_m_s + trim_m_s > gate_m_s:
+            raise ValueError(
+                f"flocking.max_speed_m_s {law_m_s:g} and autopilot.max_velocity_trim_m_s {trim_m_s:g} are together above "
+                f"safety.gate.max_speed_m_s, which would refuse them; write {gate_m_s - law_m_s:g} or less for the trim"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _only_simulated_time_is_slow(self) -> Self:
         if self.speed_factor != 1.0 and self.autopilot is not None and self.autopilot.address.startswith("serial:"):
             raise ValueError(

@@ -13,6 +13,7 @@ from flockd.errors import ConfigError
 from flockd.safety import GateParameters, SafetyParameters
 
 SIMULATOR = Path(__file__).parents[2] / "config" / "simulator.yaml"
+PX4_SITL = SIMULATOR.with_name("px4_sitl.yaml")
 
 
 @pytest.mark.parametrize(
@@ -50,6 +51,8 @@ def test_a_law_faster_than_the_gate_is_told_with_both_keys() -> None:
         ConfigError, match=r"flocking.max_speed_m_s 6 is above safety.gate.max_speed_m_s.*write 4 or less"
     ):
         load_drone(SIMULATOR, {"flocking.max_speed_m_s": 6.0})
+    with pytest.raises(ConfigError, match=r"together above safety.gate.max_speed_m_s.*write 0.3 or less for the trim"):
+        load_drone(PX4_SITL, {"flocking.max_speed_m_s": 3.7})
     both = load_drone(SIMULATOR, {"flocking.max_speed_m_s": 6.0, "safety.gate.max_speed_m_s": 6.0})
     assert both.safety.gate.max_speed_m_s == 6.0
 
