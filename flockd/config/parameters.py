@@ -487,7 +487,7 @@ class DroneConfig(Section):
         trim_m_s = 0.0 if self.autopilot is None else self.autopilot.max_velocity_trim_m_s
         if law_m_s + trim_m_s > gate_m_s:
             raise ValueError(
-                f"flocking.max_speed_m_s {law_m_s:g} and autopilot.max_velocity_trim_m_s {trim_m_s:g} are together above "
+                f"flocking.max_speed_m_s {law_m_s:g} and autopilot.max_velocity_trim_m_s {trim_m_s:g} are above "
                 f"safety.gate.max_speed_m_s, which would refuse them; write {gate_m_s - law_m_s:g} or less for the trim"
             )
         return self

@@ -58,7 +58,8 @@ def test_worlds_for_training_validation_test_and_flights_never_meet() -> None:
 
 def test_a_warped_image_goes_where_its_flow_says() -> None:
     rng = np.random.default_rng(5)
-    smooth = cv2.GaussianBlur(rng.integers(0, 255, (160, 120, 3), dtype=np.uint8), (0, 0), 3.0)
+    noise = rng.integers(0, 255, (160, 120, 3), dtype=np.uint8)
+    smooth = np.asarray(cv2.GaussianBlur(noise, (0, 0), 3.0), np.uint8)
     for _ in range(5):
         second, flow, valid = warped(smooth, np.zeros_like(smooth), rng)
         u, v = np.meshgrid(np.arange(120, dtype=np.float32), np.arange(160, dtype=np.float32))
