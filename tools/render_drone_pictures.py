@@ -30,8 +30,8 @@ PICTURES_A_SCENE = 3
 PAINTED = 8
 """Drones of each family in a world, painted differently."""
 MOST_DRONES = 3
-WITH_DISTRACTORS, DISTRACTOR_ALONE = 0.3, 0.06
-"""Shares of the scenes: a bird or the like before or behind the drone, and in its place."""
+WITH_DISTRACTORS, DISTRACTOR_ALONE = 0.3, 0.1
+"""Shares of the scenes: a bird or the like before or behind the drone, and in its place, where half are too far."""
 
 
 def main() -> None:
