@@ -65,7 +65,6 @@ Type=oneshot
 WorkingDirectory=/mnt/check
 Environment=PYTHONPATH=/opt/stand-in PYTHONDONTWRITEBYTECODE=1 PYTHONUNBUFFERED=1
 ExecStart=sh check.sh
-ExecStopPost=sh -c 'journalctl -b > /mnt/findings/journal'
 ExecStopPost=systemctl poweroff --no-block
 StandardOutput=journal+console
 StandardError=journal+console
