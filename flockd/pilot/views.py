@@ -202,6 +202,8 @@ class Observer:
         found: list[_Located] = []
         looks = [_Look(c, c.direction, c.half_angle) for c in candidates]
         for number in range(1, _MOST_LOOKS + 1):
+            if not looks:
+                break
             seen = self._ranges(live, images, [(look.direction, look.half_angle, look.range_m) for look in looks])
             again = []
             for look, (position, range_m, estimate) in zip(looks, seen, strict=True):

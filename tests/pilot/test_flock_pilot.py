@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -178,6 +179,28 @@ def test_a_drone_that_segmentation_misses_is_seen_where_it_is_expected(
     if still_there:
         place = flyer.vehicles.R_ned_body[0] @ output.sightings[0].position
         assert np.allclose(place, flyer.vehicles.position[1] - flyer.vehicles.position[0], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("wrong_by", "looks"), [((1.0,), 2), ((1.6, 1.0), 3), ((1.6, 1.3, 1.0), 4), ((1.6, 1.3, 1.6, 1.0, 1.3), 4)]
+)
+def test_a_drone_is_looked_at_until_the_picture_shows_it_well(
+    monkeypatch: pytest.MonkeyPatch, wrong_by: tuple[float, ...], looks: int
+) -> None:
+    """What a badly cut picture says of the range cuts the next one; the last word counts."""
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.3, -4.5)))
+    answers = flyer.truth.ranges
+    asked: list[int] = []
+
+    def ranges(pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
+        asked.append(len(pictures))
+        factor = wrong_by[min(len(asked), len(wrong_by)) - 1]
+        return tuple(replace(answer, range_m=factor * answer.range_m) for answer in answers(pictures))
+
+    monkeypatch.setattr(flyer.truth, "ranges", ranges)
+    (sighting,) = flyer.step().sightings
+    assert asked == [1] * looks
+    assert np.linalg.norm(sighting.position) == pytest.approx(math.hypot(3.0, 0.3), rel=0.01)
 
 
 def test_blind_cameras_still_give_a_finite_command() -> None:
