@@ -38,9 +38,8 @@ class OnnxFlow:
         height, width = first.shape[:2]
         fitting = fit(self._model.manifest, (width, height))
         answers = self._model.answer({"first": [fitting.enter(first)], "second": [fitting.enter(second)]})
-        flow = fitting.inside(answers["flow"])[0]
-        full = cv2.resize(np.moveaxis(flow, 0, 2), (width, height), interpolation=cv2.INTER_LINEAR)
-        full /= np.array(fitting.scale, np.float32)
+        flow = np.moveaxis(fitting.inside(answers["flow"])[0], 0, 2) / np.array(fitting.scale, np.float32)
+        full = cv2.resize(flow, (width, height), interpolation=cv2.INTER_LINEAR)
         return np.asarray(full, dtype=np.float32)
 
 
