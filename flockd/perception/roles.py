@@ -21,6 +21,8 @@ from flockd.perception.session import OnnxModel
 
 _EAGER_LOGIT = -1.5
 """Where a second stage weeds out what is none, the first proposes drones from this logit up."""
+_AT_A_TIME = 24
+"""Pictures in one run of the distance network, so that an image full of ghosts does not take more memory."""
 _VERY_NEAR_M, _VERY_FAR_M = 1e-3, 1e3
 
 
@@ -130,7 +132,12 @@ class Perception:
             raise ValueError("this configuration has no distance model")
         if not pictures:
             return ()
-        out = self._distance.answer({"picture": [picture.image for picture in pictures]})["range"]
+        out = np.concatenate(
+            [
+                self._distance.answer({"picture": [picture.image for picture in pictures[i : i + _AT_A_TIME]]})["range"]
+                for i in range(0, len(pictures), _AT_A_TIME)
+            ]
+        )
         middle = self.picture_size / 2
         return tuple(
             RangeEstimate(
