@@ -198,7 +198,7 @@ class Control:
         """
         look = self._sight.newest
         if look is None or look.flight != self._flight or look.number < self._enough_looks:
-            return self._trim.velocity, self._yaw_rad, now
+            return np.zeros(2), self._yaw_rad, now
         return look.output.command.velocity + self._trim.velocity, look.output.command.yaw_rad, look.time_s
 
     def _around(self, now: float, status: AutopilotStatus, vehicle: VehicleState | None) -> Surroundings:

@@ -34,7 +34,7 @@ class VelocityTrim:
     def step(self, vehicle: VehicleState, output: PilotOutput) -> None:
         """After each step of the pilot, with the vehicle's state that it got.
 
-        Without ego-motion, or without the autopilot's velocity at both of its ends, the trim stays as it was.
+        Without ego-motion, or without a finite velocity of the autopilot at both of its ends, the trim stays as it was.
         """
         before, self._before = self._before, vehicle
         ego = output.ego_motion
@@ -44,4 +44,6 @@ class VelocityTrim:
             return  # a state from another time than the frames
         believed = (before.velocity_ned + vehicle.velocity_ned) / 2  # the mean over the interval, as the measured one
         wrong = (believed - before.R_ned_body @ ego.velocity)[:2]
+        if not np.isfinite(wrong).all():
+            return  # it would never leave the mean again
         self._mean = _MEMORY * self._mean + (1 - _MEMORY) * limit_norm(wrong, 2 * self._limit_m_s)

@@ -11,7 +11,7 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import zenoh
@@ -118,7 +118,9 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
-def config_for(port: int, frames: str, telemetry: str, **autopilot: Any) -> DroneConfig:
+def config_for(
+    port: int, frames: str, telemetry: str, own_velocity: Literal["vision", "autopilot"], **autopilot: Any
+) -> DroneConfig:
     lens = IntrinsicsConfig(fx=32.0, fy=32.0, cx=32.0, cy=24.0)
     cameras = tuple(
         CameraConfig(name=name, size_px=(WIDTH, HEIGHT), intrinsics=lens, extrinsics=ExtrinsicsConfig(yaw_deg=yaw))
@@ -138,7 +140,7 @@ def config_for(port: int, frames: str, telemetry: str, **autopilot: Any) -> Dron
         autopilot=AutopilotParameters(address=f"udpin://127.0.0.1:{port}", **autopilot),
         telemetry=TelemetryParameters(fleet="test", listen=(telemetry,), commands=("resume", "land")),
         desired=DesiredVelocityParameters(speed_m_s=SPEED_M_S, circle_until_s=0.0),
-        own_velocity="autopilot",
+        own_velocity=own_velocity,
         yaw="hold",
     )
 
@@ -218,6 +220,7 @@ async def aboard(
     tmp_path: Path,
     *,
     recordings: Path | None = None,
+    own_velocity: Literal["vision", "autopilot"] = "autopilot",
     **autopilot: Any,
 ) -> AsyncIterator[Aboard]:
     """A daemon that runs, watched. The story ends it, or else it is asked to end."""
@@ -226,7 +229,7 @@ async def aboard(
     manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     manager.bind(str(tmp_path / "notify"))
     manager.setblocking(False)
-    config = config_for(port, frames, telemetry, **autopilot)
+    config = config_for(port, frames, telemetry, own_velocity, **autopilot)
     environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "1000000"}
     daemon = Daemon(
         config,

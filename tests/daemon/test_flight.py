@@ -21,7 +21,7 @@ try:
     from flockd.recording.codec import to_json
     from flockd.recording.reader import Recording
     from tests.autopilot.flight import until
-    from tests.daemon.aboard import SECONDS_TO_FAIL, SPEED_M_S, TinyPerceiver, aboard
+    from tests.daemon.aboard import CAMERAS, SECONDS_TO_FAIL, SPEED_M_S, TinyPerceiver, aboard
     from tests.starvation import tell
 except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
     pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
@@ -78,6 +78,33 @@ def _tells_what_it_does(heard: object) -> None:
     assert computer["recording"] is None
     assert set(heard["timings"].message["stages_ms"]) >= {"scene", "flow", "ego_motion", "flocking"}
     assert np.linalg.norm(heard["command"].message["velocity_ne"]) == pytest.approx(SPEED_M_S, abs=0.2)
+
+
+def test_eyes_that_lie_about_the_own_motion_add_half_a_metre_a_second_at_most_and_nothing_to_a_hover(
+    tmp_path: Path, port: int, stand_in: AutopilotStandIn
+) -> None:
+    """They see a standstill, whatever is flown: the trim is at its limit, and no farther."""
+
+    async def story() -> None:
+        async with aboard(stand_in, port, tmp_path, own_velocity="vision") as ship:
+            await ship.is_ready_in_the_air()
+            await until(lambda: len(stand_in.setpoints) > 5, SECONDS_TO_FAIL)
+            stand_in.pilot_selects("OFFBOARD")
+            await until(lambda: ship.heard()["flight"].message["velocity_trim"][0] > 0.49, SECONDS_TO_FAIL)
+            await asyncio.sleep(1.0)
+            asked = np.array(ship.heard()["command"].message["velocity_ne"])
+            assert np.linalg.norm(asked) < 0.9 * SPEED_M_S, "it believes that it stands, and speeds up slowly"
+            _, sent = stand_in.setpoints[-1]
+            np.testing.assert_allclose(np.asarray(sent.velocity)[:2] - asked, [0.5, 0.0], atol=0.02)
+
+            ship.cameras.silent |= set(CAMERAS)
+            silent_s = time.monotonic()
+            await until(lambda: stand_in.mode == "LOITER", SECONDS_TO_FAIL)
+            last = [sent for at_s, sent in stand_in.setpoints if at_s > silent_s + 1.2]
+            assert last, "the hover is sent"
+            assert all(np.linalg.norm(sent.velocity) < 0.01 for sent in last)
+
+    tell(story)
 
 
 def test_one_camera_gone_is_a_slower_flight_and_all_gone_a_hover_and_then_hold(

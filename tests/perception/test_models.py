@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import shutil
 from pathlib import Path
 
 import cv2
@@ -23,14 +22,6 @@ from flockd.sim.world import World
 MODELS = data_path("models")
 NAMES = ["distance", "flow", "neighbours"]
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture
-def copies(tmp_path: Path) -> Path:
-    """The shipped models, to be spoilt."""
-    folder = tmp_path / "models"
-    shutil.copytree(MODELS, folder)
-    return folder
 
 
 def test_three_models_fill_the_four_roles() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -24,14 +23,6 @@ from tests.perception.foreign import SIZE, image_input, map_output, write_model
 
 MODELS = data_path("models")
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture
-def copies(tmp_path: Path) -> Path:
-    """The shipped models, to be spoilt."""
-    folder = tmp_path / "models"
-    shutil.copytree(MODELS, folder)
-    return folder
 
 
 def sign_again(manifest: Path) -> None:

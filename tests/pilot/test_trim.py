@@ -76,4 +76,7 @@ def test_what_cannot_be_compared_leaves_the_trim_as_it_is() -> None:
     trim.step(vehicle(31, None), output(31, away))
     trim.step(vehicle(32, np.zeros(3)), output(32, away))
     trim.step(vehicle(40, np.zeros(3)), output(33, away))
+    for unheard_of in (math.nan, math.inf):
+        trim.step(vehicle(41, np.full(3, unheard_of)), output(41, away))
+        trim.step(vehicle(42, np.zeros(3)), output(42, away))
     assert trim.velocity == pytest.approx(before)
