@@ -119,7 +119,11 @@ def free_endpoint() -> str:
 
 
 def config_for(
-    port: int, frames: str, telemetry: str, own_velocity: Literal["vision", "autopilot"], **autopilot: Any
+    port: int,
+    frames: str,
+    telemetry: str,
+    own_velocity: Literal["vision", "autopilot"] = "autopilot",
+    **autopilot: Any,
 ) -> DroneConfig:
     lens = IntrinsicsConfig(fx=32.0, fy=32.0, cx=32.0, cy=24.0)
     cameras = tuple(

@@ -21,7 +21,7 @@ try:
     from flockd.recording.codec import to_json
     from flockd.recording.reader import Recording
     from tests.autopilot.flight import until
-    from tests.daemon.aboard import CAMERAS, SECONDS_TO_FAIL, SPEED_M_S, TinyPerceiver, aboard
+    from tests.daemon.aboard import CAMERAS, SECONDS_TO_FAIL, SPEED_M_S, STEP_S, TinyPerceiver, aboard
     from tests.starvation import tell
 except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
     pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
@@ -90,7 +90,10 @@ def test_eyes_that_lie_about_the_own_motion_add_half_a_metre_a_second_at_most_an
             await ship.is_ready_in_the_air()
             await until(lambda: len(stand_in.setpoints) > 5, SECONDS_TO_FAIL)
             stand_in.pilot_selects("OFFBOARD")
+            chosen_s = time.monotonic()
             await until(lambda: ship.heard()["flight"].message["velocity_trim"][0] > 0.49, SECONDS_TO_FAIL)
+            off_s = next(at_s for at_s, sent in stand_in.setpoints if np.linalg.norm(sent.velocity) > 0.01)
+            assert off_s - chosen_s > 2 * STEP_S - 0.1, "a neighbour counts from its third look on"
             await asyncio.sleep(1.0)
             asked = np.array(ship.heard()["command"].message["velocity_ne"])
             assert np.linalg.norm(asked) < 0.9 * SPEED_M_S, "it believes that it stands, and speeds up slowly"
