@@ -53,9 +53,14 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=10_000, help="of each folder at most this many")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rig-worlds", type=int, default=RIG_WORLDS, help="for the own motion; 0: leave it out")
+    parser.add_argument("--float", action="store_true", help="the float networks, not their 8-bit twins")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    perception = Perception(PerceptionConfig(threads=arguments.threads), arguments.models)
+    config = PerceptionConfig(threads=arguments.threads)
+    if arguments.float:
+        roles = ("flow", "depth", "segmentation", "distance")
+        config = config.model_copy(update={role: getattr(config, role).removesuffix("_int8") for role in roles})
+    perception = Perception(config, arguments.models)
 
     def findings(folder: Path) -> Findings:
         pairs = open_pairs(folder)

@@ -16,8 +16,8 @@ from flockd.errors import ExitCode, ModelError, UnavailableError
 
 if TYPE_CHECKING:
     from flockd.config import DroneConfig
+    from flockd.config.parameters import Provider
     from flockd.perception import OnnxModel
-    from flockd.perception.providers import Provider
 
 THREADS = 2
 RUNS = 9

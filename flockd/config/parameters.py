@@ -91,13 +91,17 @@ class RigConfig(Section):
         return self
 
 
+Provider = Literal["cpu", "cuda", "tensorrt", "openvino"]
+"""What computes the networks: ONNX Runtime's execution providers."""
+
+
 class PerceptionConfig(Section):
     """Which model fills which role. A name is a manifest in `models_dir`, or a path to one that ends in `.yaml`.
 
     Relative paths count from the folder of the configuration file.
     """
 
-    flow: str = "flow"
+    flow: str = "flow_int8"
     """`dis` is OpenCV's DIS flow instead of a network."""
     flow_refinement: Literal["dis", "none"] = "dis"
     """A network's flow finds what moved far; DIS then makes it exact."""
@@ -105,14 +109,14 @@ class PerceptionConfig(Section):
     """Where DIS after a network stops: at a 2^n-th of the size. 2 is for flight: a quarter of the time, and an own
     motion as good where depth is a network's. With a sensor's depth 1 is better, and what datasets are replayed with.
     """
-    depth: str = "neighbours"
-    segmentation: str = "neighbours"
-    distance: str = "distance"
+    depth: str = "neighbours_int8"
+    segmentation: str = "neighbours_int8"
+    distance: str = "distance_int8"
     """Second stage: a drone's range from its picture alone. `none`: the depth map decides."""
     models_dir: str | None = None
     """Folder of the manifests; by default the one that comes with flockd."""
     threads: Annotated[int, Field(ge=1, le=64)] = 2
-    provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = "cpu"
+    provider: Provider = "cpu"
     """What ONNX Runtime computes with. Another one than this is never used in its place."""
     engines_dir: str | None = None
     """Where `flockd models prepare` keeps what a provider has built; by default `engines` beside the manifests."""

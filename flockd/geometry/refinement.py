@@ -59,6 +59,8 @@ def refine_ego_motion(
     motion = initial
     for iteration in range(_MAX_STEPS):
         residuals, jacobians, parallax = _linearise(views, motion)
+        if iteration == 0:
+            at_first = residuals
         if iteration < _SCALED_STEPS:
             # While the motion is still rough, so are the size of the residuals and the direction of the parallax.
             whitening = _whitening(parallax)
@@ -73,8 +75,8 @@ def refine_ego_motion(
         step = -np.linalg.solve(normal, weighted.T @ white.ravel())
         motion = RigidTransform(rotation_from_vector(step[:3]), step[3:]) @ motion
         if iteration >= _SCALED_STEPS and np.abs(step).max() < _CONVERGED:
-            before, after = (_cost(views, candidate, whitening, scale) for candidate in (initial, motion))
-            return motion if after < before else None
+            at_last, _, _ = _linearise(views, motion)
+            return motion if _cost(at_last, whitening, scale) < _cost(at_first, whitening, scale) else None
     return None
 
 
@@ -140,7 +142,6 @@ def _sigma(white: FloatArray) -> float:
     return max(float(np.median(np.linalg.norm(white, axis=1))) / _RAYLEIGH_MEDIAN, 1e-3)
 
 
-def _cost(views: list[_View], motion: RigidTransform, whitening: FloatArray, scale: float) -> float:
-    residuals, _, _ = _linearise(views, motion)
+def _cost(residuals: FloatArray, whitening: FloatArray, scale: float) -> float:
     white = _times(whitening, residuals)
     return float(np.log1p((white**2).sum(axis=1) / scale**2).sum())

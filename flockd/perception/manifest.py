@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self
 import yaml
 from pydantic import Field, ValidationError, model_validator
 
-from flockd.config.parameters import PerceptionConfig, Positive, Section
+from flockd.config.parameters import PerceptionConfig, Positive, Provider, Section
 from flockd.data import data_path
 from flockd.errors import ModelError
 
@@ -115,6 +115,8 @@ class Manifest(Section):
     outputs: dict[str, OutputSpec]
     golden_size: tuple[int, int]
     """Width and height of the golden input image."""
+    providers: tuple[Provider, ...] = ()
+    """Those that it was made for; none: any."""
     licence: str
     data: str
     accuracy: dict[str, str]

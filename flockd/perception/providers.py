@@ -6,15 +6,13 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import onnxruntime as ort
 
-from flockd.config.parameters import PerceptionConfig
+from flockd.config.parameters import PerceptionConfig, Provider
 from flockd.errors import ModelError
 from flockd.perception.manifest import models_folder
 
-Provider = Literal["cpu", "cuda", "tensorrt", "openvino"]
 PROVIDERS: dict[Provider, str] = {
     "cpu": "CPUExecutionProvider",
     "cuda": "CUDAExecutionProvider",

@@ -11,11 +11,12 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
+from flockd.config.parameters import Provider
 from flockd.errors import ModelError
 from flockd.messages import Float32Array, UInt8Array
 from flockd.perception.fitting import entering, fit, leaving
 from flockd.perception.manifest import Answer, Content, InputSpec, Manifest, OutputSpec, load_manifest
-from flockd.perception.providers import Prepared, Provider, Shapes, engine_folder, is_slow_to_build, open_session
+from flockd.perception.providers import Prepared, Shapes, engine_folder, is_slow_to_build, open_session
 from flockd.perception.weights import fault_of_weights
 
 _GOLDEN_TOLERANCE = 0.02
@@ -44,6 +45,12 @@ class OnnxModel:
         """
         self.manifest, file = load_manifest(path)
         self._path = path
+        made_for = self.manifest.providers
+        if made_for and provider not in made_for:
+            raise ModelError(
+                f"{path}: {self.manifest.name} is made for {' and '.join(made_for)}, not for {provider}; name "
+                "another model (flockd's own without _int8 run everywhere), or another perception.provider"
+            )
         _check_weights(file, path)
         self._engines = engine_folder(engines, provider, self.manifest.name, self.manifest.sha256)
         self._prepared = Prepared.load(self._engines)

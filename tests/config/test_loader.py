@@ -253,7 +253,7 @@ def test_overrides_win_over_both_files() -> None:
     scenario = load_scenario(CONFIG / "paper_flight.yaml", overrides)
     assert scenario.seed == 7
     assert scenario.drone.perception.flow == "dis"
-    assert scenario.drone.perception.depth == "neighbours", "the rest of the section stays"
+    assert scenario.drone.perception.depth == "neighbours_int8", "the rest of the section stays"
     assert scenario.drone.flocking.weight.kind == "nearest"
 
 
@@ -275,7 +275,7 @@ def test_a_relative_path_counts_from_the_folder_of_the_file_it_stands_in(
         assert drone.perception.flow == str(drones / "mine" / "flow.yaml")
         assert drone.telemetry.zenoh_config == str(drones / "tls.json5")
         assert (drone.perception.depth, drone.perception.distance) == ("/opt/depth.yaml", "none")
-        assert drone.perception.segmentation == "neighbours", "a name is not a path"
+        assert drone.perception.segmentation == "neighbours_int8", "a name is not a path"
     overridden = load_drone("../drones/drone.yaml", {"perception.models_dir": "here"})
     assert overridden.perception.models_dir == "here", "who overrides it stands elsewhere"
 
@@ -287,7 +287,7 @@ def test_models_that_are_not_there_are_told_with_where_they_were_looked_for(tmp_
         load_perception(load_drone(tmp_path / "drone.yaml"))
     (tmp_path / "drone.yaml").write_text(_with("perception: {models_dir: models}"), encoding="utf-8")
     with pytest.raises(
-        ModelError, match=rf"^perception\.flow: there is no model 'flow' \({tmp_path}/models/flow\.yaml "
+        ModelError, match=rf"^perception\.flow: there is no model 'flow_int8' \({tmp_path}/models/flow_int8\.yaml "
     ):
         load_perception(load_drone(tmp_path / "drone.yaml"))
     (tmp_path / "drone.yaml").write_text(_with("perception: {flow: my/flow.yaml}"), encoding="utf-8")

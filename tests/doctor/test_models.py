@@ -36,15 +36,15 @@ def copies(tmp_path: Path) -> Path:
 
 
 def test_a_flipped_bit_is_a_failure_of_that_model_alone(copies: Path) -> None:
-    content = bytearray((copies / "distance.onnx").read_bytes())
+    content = bytearray((copies / "distance_int8.onnx").read_bytes())
     content[len(content) // 2] ^= 1
-    (copies / "distance.onnx").write_bytes(content)
+    (copies / "distance_int8.onnx").write_bytes(content)
     flow, neighbours, distance = check_models(_with(models_dir=str(copies)))
-    for finding, name in ((flow, "flow"), (neighbours, "neighbours")):
+    for finding, name in ((flow, "flow_int8"), (neighbours, "neighbours_int8")):
         assert (finding.level, finding.about) == (Level.PASS, f"model {name}")
         assert "hash and golden answer are right" in finding.measured
         assert "run by CPUExecutionProvider" in finding.measured
-    assert (distance.level, distance.about) == (Level.FAILURE, "model distance")
+    assert (distance.level, distance.about) == (Level.FAILURE, "model distance_int8")
     assert "was changed or damaged" in distance.measured
     assert distance.mend == "restore it, or export it again with its manifest"
 

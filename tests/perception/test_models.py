@@ -20,14 +20,16 @@ from flockd.sim.renderer import Renderer
 from flockd.sim.world import World
 
 MODELS = data_path("models")
-NAMES = ["distance", "flow", "neighbours"]
+NAMES = ["distance", "distance_int8", "flow", "flow_int8", "neighbours", "neighbours_int8"]
 ROOT = Path(__file__).parents[2]
 
 
-def test_three_models_fill_the_four_roles() -> None:
+def test_three_models_and_their_twins_fill_the_four_roles() -> None:
     manifests = [load_manifest(path)[0] for path in find_manifests(MODELS)]
     assert [m.name for m in manifests] == NAMES
-    assert sorted(role for m in manifests for role in m.roles) == ["depth", "distance", "flow", "segmentation"]
+    for twins in (False, True):
+        roles = [role for m in manifests if m.name.endswith("_int8") == twins for role in m.roles]
+        assert sorted(roles) == ["depth", "distance", "flow", "segmentation"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -84,9 +86,9 @@ def test_an_input_that_does_not_fit_the_manifest_is_refused(copies: Path) -> Non
 def test_the_simulator_refuses_a_flipped_bit_in_one_sentence(
     copies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    content = bytearray((copies / "neighbours.onnx").read_bytes())
+    content = bytearray((copies / "neighbours_int8.onnx").read_bytes())
     content[-100] ^= 8
-    (copies / "neighbours.onnx").write_bytes(content)
+    (copies / "neighbours_int8.onnx").write_bytes(content)
     drone = (ROOT / "config" / "simulator.yaml").read_text()
     drone = drone.replace("perception:\n", f"perception:\n  models_dir: {copies}\n")
     (tmp_path / "simulator.yaml").write_text(drone)
@@ -95,7 +97,7 @@ def test_the_simulator_refuses_a_flipped_bit_in_one_sentence(
     assert main(["sim", str(flight), "--duration", "1", "--out", str(tmp_path / "out")]) == 78
     error = capsys.readouterr().err
     assert error.count("\n") == 1
-    assert f"{copies / 'neighbours.yaml'}: sha256: {copies / 'neighbours.onnx'}" in error
+    assert f"{copies / 'neighbours_int8.yaml'}: sha256: {copies / 'neighbours_int8.onnx'}" in error
     assert "restore it" in error
 
 
@@ -105,7 +107,9 @@ def test_a_model_in_the_wrong_role_is_refused() -> None:
 
 
 def test_a_model_that_is_not_there_is_refused_with_those_that_are() -> None:
-    with pytest.raises(ModelError, match=r"perception\.flow: there is no model 'raft'.*distance, flow, neighbours"):
+    with pytest.raises(
+        ModelError, match=r"perception\.flow: there is no model 'raft'.*distance_int8, flow, flow_int8, neighbours"
+    ):
         Perception(PerceptionConfig(flow="raft"), MODELS)
 
 
@@ -161,7 +165,7 @@ def test_dis_loses_what_moves_far_unless_it_begins_near() -> None:
 
 def test_the_network_of_flow_is_sharpened_by_dis_unless_told_otherwise() -> None:
     first, second = shifted_pictures((9, -5), (480, 640))
-    network = OnnxFlow(OnnxModel(MODELS / "flow.yaml", threads=1))
+    network = OnnxFlow(OnnxModel(MODELS / "flow_int8.yaml", threads=1))
     for refinement, expected in (("none", network), ("dis", DisFlow(network, finest_scale=2))):
         config = PerceptionConfig.model_validate({"flow_refinement": refinement})
         found = Perception(config, MODELS).flow("camera", first, second)

@@ -13,11 +13,13 @@ from flockd.data import data_path
 from flockd.perception import load_manifest
 from tests.perception.foreign import one_channel_depth
 
+FLOAT = ("distance", "flow", "neighbours")
+
 
 def test_the_list_tells_hash_and_licence(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["models", "list", "--json"]) == 0
     listed = {model["name"]: model for model in json.loads(capsys.readouterr().out)}
-    assert sorted(listed) == ["distance", "flow", "neighbours"]
+    assert sorted(listed) == sorted([*FLOAT, *(f"{name}_int8" for name in FLOAT)])
     assert {model["licence"] for model in listed.values()} == {"Apache-2.0"}
     assert listed["flow"]["sha256"] == load_manifest(data_path("models") / "flow.yaml")[0].sha256
 
@@ -66,6 +68,6 @@ def test_on_the_cpu_there_is_nothing_to_prepare(tmp_path: Path, capsys: pytest.C
     assert load_drone(drone).perception.provider == "cpu"
     assert main(["models", "prepare", "--config", str(drone), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert [one["model"] for one in told] == ["flow", "neighbours", "distance"]
+    assert [one["model"] for one in told] == ["flow_int8", "neighbours_int8", "distance_int8"]
     assert all(one["engines"] is None and one["start_s"] > 0 for one in told)
     assert not (tmp_path / "engines").exists()

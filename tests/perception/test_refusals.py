@@ -90,7 +90,7 @@ def put_in_a_nan(manifest: Path) -> None:
 def test_a_start_with_a_spoilt_model_ends_with_one_sentence(
     spoil: Callable[[Path], None], told: str, copies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    spoil(copies / "neighbours.yaml")
+    spoil(copies / "neighbours_int8.yaml")
     drone = tmp_path / "drone.yaml"
     drone.write_text(
         (ROOT / "config" / "px4_sitl.yaml")
@@ -109,7 +109,7 @@ def test_a_start_with_a_spoilt_model_ends_with_one_sentence(
     assert main(["replay", str(tmp_path / "room"), "--config", str(drone)]) == 78
     sentences = capsys.readouterr().err.splitlines()
     assert [line for line in sentences if "perception.scale" not in line] == [sentences[-1]]
-    assert sentences[-1].startswith(str(copies / "neighbours.yaml"))
+    assert sentences[-1].startswith(str(copies / "neighbours_int8.yaml"))
     assert told in sentences[-1]
 
 
@@ -162,7 +162,15 @@ def test_a_provider_that_is_not_there_is_refused_and_nothing_takes_its_place() -
         ModelError,
         match=r"perception\.provider: this ONNX Runtime has no CUDAE.*; install onnxruntime-gpu in its place, or",
     ):
-        Perception(PerceptionConfig(provider="cuda"), MODELS)
+        Perception(PerceptionConfig(provider="cuda", flow="flow"), MODELS)
+
+
+@pytest.mark.parametrize("provider", ["cuda", "tensorrt", "openvino"])
+def test_a_network_in_8_bits_is_for_the_cpu_alone(provider: str) -> None:
+    """A GPU would run it slower than the float one and without a word, OpenVINO with other answers."""
+    config = PerceptionConfig.model_validate({"provider": provider})
+    with pytest.raises(ModelError, match=rf"flow_int8 is made for cpu, not for {provider}; name another"):
+        Perception(config, MODELS)
 
 
 @pytest.mark.skipif("cuda" in available(), reason="this computer can compute with CUDA")

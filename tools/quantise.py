@@ -1,0 +1,150 @@
+"""Make the 8-bit twin of a network: half the time on a CPU. The range of its numbers is learnt from rendered images.
+
+python tools/quantise.py models/neighbours.yaml --data DATA/training --out models
+python tools/quantise.py models/distance.yaml --data DATA/pictures --out models
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+import yaml
+from numpy.typing import NDArray
+from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+from onnxruntime.quantization.shape_inference import quant_pre_process
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from flockd.perception.fitting import fit
+from flockd.perception.manifest import Manifest, load_manifest
+from flockd.perception.session import OnnxModel, golden_feeds
+from tools.training.dataset import HEIGHT, WIDTH, ground_plane, open_pairs, ray_tangents
+
+Feeds = dict[str, NDArray[Any]]
+IMAGES, COMPARED = 32, 16
+WITHOUT_HEIGHT = 0.3
+"""Share of the images whose geometry says nothing of the ground."""
+IN_8_BITS = ("Conv", "Relu", "Resize")
+KEPT = ("head", "look")
+"""Layers with this in their names stay as they are: they write metres and places. So do sums, which in 8 bits cost ten
+times the accuracy that all else together does."""
+AT_MOST = 0.1
+"""Mean difference from the float network, as a share of the output's standard deviation, beyond which it is refused."""
+
+
+def main() -> None:
+    """Quantise one network."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("manifest", type=Path, help="of the float network")
+    parser.add_argument(
+        "--data", type=Path, required=True, help="folder of render_training_data.py, or render_drone_pictures.py"
+    )
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--accuracy", action="append", default=[], metavar="WHAT=FIGURE", help="measured accuracy")
+    arguments = parser.parse_args()
+    manifest, file = load_manifest(arguments.manifest)
+    draw = _pictures if "picture" in manifest.contents else _images
+    feeds = list(draw(manifest, arguments.data, IMAGES + COMPARED))
+    name = f"{manifest.name}_int8"
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    twin = arguments.out / f"{name}.onnx"
+    _quantise(file, feeds[:IMAGES], twin)
+    differences = _differences(file, twin, feeds[IMAGES:])
+    accuracy = dict(measured.split("=", 1) for measured in arguments.accuracy)
+    accuracy |= {
+        f"{output}, mean difference from {manifest.name}": f"{d} deviations" for output, d in differences.items()
+    }
+    document = manifest.model_dump(mode="json", exclude_defaults=True)
+    document |= {
+        "name": name,
+        "file": twin.name,
+        "sha256": hashlib.sha256(twin.read_bytes()).hexdigest(),
+        "description": f"{manifest.description}; in 8-bit numbers",
+        "providers": ["cpu"],
+        "accuracy": accuracy,
+        "command": f"{manifest.command}, tools/quantise.py",
+    }
+    outputs = ort.InferenceSession(str(twin), providers=["CPUExecutionProvider"]).run(None, golden_feeds(manifest))
+    for output, value in zip(document["outputs"].values(), outputs, strict=True):
+        output["golden_mean"], output["golden_deviation"] = float(value.mean()), float(value.std())
+    path = arguments.out / f"{name}.yaml"
+    path.write_text(yaml.safe_dump(document, sort_keys=False, width=110))
+    OnnxModel(path, threads=1)
+    print(f"{path}: {twin.stat().st_size / 1e6:.1f} MB; mean differences in deviations: {differences}")
+
+
+class _Reader(CalibrationDataReader):
+    def __init__(self, feeds: Sequence[Feeds]) -> None:
+        self._rest = iter(feeds)
+
+    def get_next(self) -> Feeds | None:
+        """As ONNX Runtime asks for them."""
+        return next(self._rest, None)
+
+
+def _quantise(file: Path, feeds: Sequence[Feeds], twin: Path) -> None:
+    """Weights of seven bits: sums of more overflow on processors without instructions made for this."""
+    with tempfile.TemporaryDirectory() as folder:
+        prepared = Path(folder) / "prepared.onnx"
+        quant_pre_process(str(file), str(prepared), skip_symbolic_shape=True)
+        nodes = onnx.load(str(prepared)).graph.node
+        kept = [node.name for node in nodes if any(part in node.name for part in KEPT)]
+        quantize_static(
+            str(prepared), str(twin), _Reader(feeds), quant_format=QuantFormat.QDQ,
+            activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8, per_channel=True, reduce_range=True,
+            op_types_to_quantize=list(IN_8_BITS), nodes_to_exclude=kept,
+        )  # fmt: skip
+
+
+def _images(manifest: Manifest, folder: Path, count: int) -> Iterator[Feeds]:
+    """Inputs drawn from the pairs."""
+    pairs = open_pairs(folder)
+    rng = np.random.Generator(np.random.PCG64(0))
+    fitting = fit(manifest, (WIDTH, HEIGHT))
+    for pair in rng.integers(pairs.count, size=count):
+        images = [fitting.enter(np.asarray(image)) for image in pairs["image"][int(pair)]]
+        focal = float(pairs["focal"][pair])
+        ground = ground_plane(focal, pairs["R_ned_camera"][pair, 0], float(pairs["height"][pair, 0]))
+        planes = np.concatenate([ray_tangents(focal), ground[None] * np.float32(rng.random() >= WITHOUT_HEIGHT)])
+        contents = {"image": images[0], "first": images[0], "second": images[1], "geometry": planes}
+        yield {name: contents[spec.carries or name][None] for name, spec in manifest.inputs.items()}
+
+
+def _pictures(manifest: Manifest, folder: Path, count: int) -> Iterator[Feeds]:
+    """Inputs of sixteen pictures each."""
+    (name,) = manifest.inputs
+    rng = np.random.Generator(np.random.PCG64(0))
+    files = sorted(folder.glob("*.npz"))[:count]
+    if not files:
+        raise SystemExit(f"{folder}: no pictures here; make them with tools/render_drone_pictures.py")
+    for index in range(count):
+        with np.load(files[index % len(files)]) as arrays:
+            yield {name: rng.choice(arrays["picture"], 16)}
+
+
+def _differences(file: Path, twin: Path, feeds: Sequence[Feeds]) -> dict[str, float]:
+    """Of each output, in its standard deviations."""
+    ours, theirs = (ort.InferenceSession(str(one), providers=["CPUExecutionProvider"]) for one in (twin, file))
+    names = [output.name for output in theirs.get_outputs()]
+    pairs = [(ours.run(names, feed), theirs.run(names, feed)) for feed in feeds]
+    differences = {}
+    for index, name in enumerate(names):
+        our, their = (np.stack([outputs[which][index] for outputs in pairs]) for which in (0, 1))
+        differences[name] = round(float(np.abs(our - their).mean() / their.std()), 4)
+    worst = max(differences, key=lambda name: differences[name])
+    if not differences[worst] <= AT_MOST:
+        raise SystemExit(f"{twin}: output {worst} differs by {differences[worst]} of its deviation: keep this in float")
+    return differences
+
+
+if __name__ == "__main__":
+    main()
