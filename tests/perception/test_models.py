@@ -15,7 +15,8 @@ from flockd.config.parameters import PerceptionConfig
 from flockd.data import data_path
 from flockd.errors import ModelError
 from flockd.messages import Float32Array, UInt8Array
-from flockd.perception import DisFlow, OnnxFlow, OnnxModel, Perception, find_manifests, load_manifest
+from flockd.perception import DisFlow, OnnxFlow, OnnxModel, Perception, Picture, find_manifests, load_manifest
+from flockd.sim.drone_models import drone_model
 from flockd.sim.renderer import Renderer
 from flockd.sim.world import World
 
@@ -161,6 +162,31 @@ def test_dis_loses_what_moves_far_unless_it_begins_near() -> None:
     refined = DisFlow(Roughly())
     assert refined.name == "roughly+dis"
     assert np.abs(np.median(refined.flow(first, second)[inside], axis=(0, 1)) - [-60.0, 0.0]).max() < 0.1
+
+
+def test_the_twins_in_8_bits_say_what_the_float_networks_say() -> None:
+    matrix = np.array([[222.0, 0.0, 160.0], [0.0, 222.0, 160.0], [0.0, 0.0, 1.0]])
+    R_ned_camera = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    view = Renderer(World.generate(11), [drone_model(3, 0), drone_model(6, 1)]).render(
+        matrix, (320, 320), R_ned_camera, np.array([0.0, 0.0, -4.0]),
+        drone_rotations=np.stack([np.eye(3)] * 2), drone_positions=np.array([[3.0, -0.8, -4.2], [4.0, 1.0, -3.8]]),
+        shown=[True, True],
+    )  # fmt: skip
+    image = np.ascontiguousarray(view.rgb)
+    roles = {"flow": "flow", "depth": "neighbours", "segmentation": "neighbours", "distance": "distance"}
+    twins = PerceptionConfig.model_validate({role: f"{name}_int8" for role, name in roles.items()})
+    ours, theirs = (Perception(config, MODELS) for config in (twins, PerceptionConfig.model_validate(roles)))
+    no_ground = np.zeros((3, 160, 160), np.float32)
+    our, their = (perception.scene("camera", image, no_ground) for perception in (ours, theirs))
+    assert np.median(np.abs(our.depth / their.depth - 1)[their.depth < 50]) < 0.03
+    both, any_ = ((f(our.labels > 0, their.labels > 0)).sum() for f in (np.logical_and, np.logical_or))
+    assert both / any_ > 0.8
+    windows = [image[v - 48 : v + 48, u - 48 : u + 48] for u, v in ((101, 145), (215, 171))]
+    pictures = [Picture(np.ascontiguousarray(window), 222.0, np.eye(3), np.zeros(3)) for window in windows]
+    for mine, other in zip(ours.ranges(pictures), theirs.ranges(pictures), strict=True):
+        assert other.is_drone > 0.5
+        assert mine.range_m == pytest.approx(other.range_m, rel=0.05)
+        np.testing.assert_allclose(mine.centre, other.centre, atol=1.5)
 
 
 def test_the_network_of_flow_is_sharpened_by_dis_unless_told_otherwise() -> None:

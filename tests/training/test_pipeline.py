@@ -44,6 +44,7 @@ def test_a_network_is_trained_resumed_and_exported_by_one_command_each(
     assert cv2.imread(str(runs / "curve.png")) is not None
 
     run("export.py", "flow", "--checkpoint", runs / "checkpoint.pt", "--out", models)
+    run("quantise.py", models / "flow.yaml", "--data", data, "--out", models)
     for name in ("neighbours", "distance"):
         for suffix in ("yaml", "onnx"):
             (models / f"{name}.{suffix}").write_bytes((data_path("models") / f"{name}.{suffix}").read_bytes())
