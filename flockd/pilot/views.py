@@ -39,6 +39,8 @@ _SAME_DRONE = 0.6
 """Two sightings closer than this share of their size are one drone seen by two cameras."""
 _SAME_BEARING, _SAME_RANGE = 0.4, 1.5
 """Or in directions closer than this share of their angular size, with ranges that differ by less than this factor."""
+_HIDES = 0.25
+"""Nothing is seen of what lies behind a drone within this share of its angular size from its middle."""
 _BEARING_SIGMA_RAD = 0.004
 _MIN_RELATIVE_SIGMA = 0.005
 _DEPTH_MAP_RELATIVE_SIGMA = 0.08
@@ -137,7 +139,7 @@ class Observer:
         found = self._locate(images, maps) if maps else []
         if maps and self._perceiver.has_distance:
             found += self._look_again(images, vehicle, found, expected)
-        sightings, label_of = _merge(found)
+        sightings, label_of = _merge(_one_in_line(found))
         views = {}
         for name, scene in maps.items():
             table = np.full(256, UNCLASSED, np.uint8)
@@ -373,6 +375,23 @@ def _in_view(live: Rig, position: FloatArray, candidate: _Candidate) -> FloatArr
     """The direction to a position, or the candidate's own where no camera looks that way."""
     direction = position / np.linalg.norm(position)
     return direction if live.covers(direction[None])[0] else candidate.direction
+
+
+def _one_in_line(found: Sequence[_Located]) -> list[_Located]:
+    """Without what would hide behind another, or that other: a part of a drone cut off by an image's border may look
+    like a whole one far behind it. The one whose range is the surer is true."""
+
+    def fits(one: _Located, other: _Located) -> bool:
+        near, far = sorted((one, other), key=lambda located: float(np.linalg.norm(located.position)))
+        near_m, far_m = float(np.linalg.norm(near.position)), float(np.linalg.norm(far.position))
+        hidden = _angle(near.position, far.position) < _HIDES * near.size_m / near_m
+        return not hidden or far_m < _SAME_RANGE * near_m  # the latter may be one drone, seen by two cameras
+
+    kept: list[_Located] = []
+    for one in sorted(found, key=lambda located: located.range_sigma_m / float(np.linalg.norm(located.position))):
+        if all(fits(one, other) for other in kept):
+            kept.append(one)
+    return kept
 
 
 def _merge(found: Sequence[_Located]) -> tuple[tuple[Sighting, ...], dict[tuple[str, int], int]]:
