@@ -68,7 +68,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
         },
     },
     "flow": {
-        "net": lambda: FlowNet(iterations=1),  # of the three trained with: DIS does the rest better
+        "net": FlowNet,
         "roles": ["flow"],
         "description": "Optical flow on quarter-size images: best match anywhere, then a recurrent refinement",
         "image_scale": 0.25,
@@ -89,10 +89,18 @@ def main() -> None:
     parser.add_argument("network", choices=NETWORKS)
     parser.add_argument("--checkpoint", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument(
+        "--iterations",
+        type=int,
+        default=1,
+        help="of the flow: it trains with 3, DIS does the rest better",
+    )
     parser.add_argument("--accuracy", action="append", default=[], metavar="WHAT=FIGURE", help="measured accuracy")
     arguments = parser.parse_args()
     spec = NETWORKS[arguments.network]
     net: nn.Module = spec["net"]()
+    if isinstance(net, FlowNet):
+        net.iterations = arguments.iterations
     state = torch.load(arguments.checkpoint, map_location="cpu")
     net.load_state_dict(state["net"])
     net.eval()
