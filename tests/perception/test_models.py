@@ -189,6 +189,26 @@ def test_the_twins_in_8_bits_say_what_the_float_networks_say() -> None:
         np.testing.assert_allclose(mine.centre, other.centre, atol=1.5)
 
 
+def test_a_mirror_image_is_as_far_away_and_shows_the_drone_on_the_other_side() -> None:
+    view = Renderer(World.generate(11), [drone_model(0, 0)]).render(
+        np.array([[100.0, 0.0, 48.0], [0.0, 100.0, 48.0], [0.0, 0.0, 1.0]]), (96, 96),
+        np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([0.0, 0.0, -4.0]),
+        drone_rotations=np.stack([cv2.Rodrigues(np.array([0.2, -0.4, 0.3]))[0]]), shown=[True],
+        drone_positions=np.array([[1.5, -0.1, -4.1]]),
+    )  # fmt: skip
+    images = np.ascontiguousarray(view.rgb), np.ascontiguousarray(view.rgb[:, ::-1])
+    network = OnnxModel(MODELS / "distance_int8.yaml", threads=1)
+    alone = network.answer({"picture": images})["range"]
+    assert not np.allclose(alone[0, [0, 2, 3]], alone[1, [0, 2, 3]], atol=1e-3), "the network itself errs on both apart"
+    pictures = [Picture(image, 100.0, np.eye(3), np.zeros(3)) for image in images]
+    one, other = Perception(PerceptionConfig(), MODELS).ranges(pictures)
+    assert one.range_m == pytest.approx(other.range_m, rel=1e-6)
+    assert (one.is_drone, one.relative_sigma) == pytest.approx((other.is_drone, other.relative_sigma))
+    np.testing.assert_allclose(one.centre, [96 - other.centre[0], other.centre[1]], atol=1e-4)
+    assert one.centre[0] == pytest.approx(48 - 100 / 15, abs=3.0)
+    assert one.range_m == pytest.approx(1.5, rel=0.15)
+
+
 def test_the_network_of_flow_is_sharpened_by_dis_unless_told_otherwise() -> None:
     first, second = shifted_pictures((9, -5), (480, 640))
     network = OnnxFlow(OnnxModel(MODELS / "flow_int8.yaml", threads=1))
