@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tools.training.samples import Sample
 
@@ -19,6 +20,7 @@ class PictureFiles:
         self._folder = folder
         self._files: dict[Path, Sample] = {}
         self._ends = np.zeros(0, np.int64)
+        self._of_family: list[NDArray[np.int64]] = []
         self._calls = 0
         self.look_for_more()
         if not self._files:
@@ -34,10 +36,13 @@ class PictureFiles:
                 with np.load(path) as arrays:
                     self._files[path] = dict(arrays)
         self._ends = np.cumsum([len(file["drone"]) for file in self._files.values()])
+        family = np.concatenate([np.where(file["drone"] > 0.5, file["family"], -1) for file in self._files.values()])
+        self._of_family = [np.flatnonzero(family == one) for one in np.unique(family)]
 
     def draw(self, rng: np.random.Generator) -> Sample:
-        """Any of them."""
-        index = int(rng.integers(self._ends[-1]))
+        """Any of them: every family, and what is none, as often, however many pictures there are of it."""
+        rows = self._of_family[int(rng.integers(len(self._of_family)))]
+        index = int(rows[int(rng.integers(len(rows)))])
         which = int(np.searchsorted(self._ends, index, side="right"))
         file = list(self._files.values())[which]
         row = index - int(self._ends[which])
