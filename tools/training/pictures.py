@@ -23,8 +23,6 @@ class PictureFiles:
         self._of_family: list[NDArray[np.int64]] = []
         self._calls = 0
         self.look_for_more()
-        if not self._files:
-            raise FileNotFoundError(f"{folder}: no pictures here; make them with tools/render_drone_pictures.py")
 
     def look_for_more(self) -> None:
         """Take up files that have appeared; looks only now and then."""
@@ -35,6 +33,8 @@ class PictureFiles:
             if path not in self._files:
                 with np.load(path) as arrays:
                     self._files[path] = dict(arrays)
+        if not self._files:
+            raise FileNotFoundError(f"{self._folder}: no pictures here; make them with tools/render_drone_pictures.py")
         self._ends = np.cumsum([len(file["drone"]) for file in self._files.values()])
         family = np.concatenate([np.where(file["drone"] > 0.5, file["family"], -1) for file in self._files.values()])
         self._of_family = [np.flatnonzero(family == one) for one in np.unique(family)]
