@@ -76,7 +76,8 @@ def refine_ego_motion(
         motion = RigidTransform(rotation_from_vector(step[:3]), step[3:]) @ motion
         if iteration >= _SCALED_STEPS and np.abs(step).max() < _CONVERGED:
             at_last, _, _ = _linearise(views, motion)
-            return motion if _cost(at_last, whitening, scale) < _cost(at_first, whitening, scale) else None
+            before, after = (_cost(residuals, whitening, scale) for residuals in (at_first, at_last))
+            return motion if after < before else None
     return None
 
 

@@ -116,15 +116,15 @@ def test_it_gets_ready_alone_reads_its_file_again_and_ends_when_told(
 def test_a_changed_model_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     models = tmp_path / "models"
     shutil.copytree(data_path("models"), models)
-    flow = bytearray((models / "flow.onnx").read_bytes())
+    flow = bytearray((models / "flow_int8.onnx").read_bytes())
     flow[len(flow) // 2] ^= 1
-    (models / "flow.onnx").write_bytes(flow)
+    (models / "flow_int8.onnx").write_bytes(flow)
     config = _written(tmp_path / "tiny.yaml", free_port(), free_endpoint(), free_endpoint())
     values = yaml.safe_load(config.read_text(encoding="utf-8"))
     values["perception"]["models_dir"] = str(models)
     config.write_text(yaml.safe_dump(values), encoding="utf-8")
     assert main(["run", "--config", str(config)]) == 78
-    assert "flow.yaml: sha256: " in capsys.readouterr().err
+    assert "flow_int8.yaml: sha256: " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
