@@ -1,4 +1,4 @@
-"""Drawing from pictures of drones that are rendered while training goes on."""
+"""Drawing from pictures of drones that are rendered while training goes on. Needs the extra `train`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+pytest.importorskip("torch", reason="the extra `train` is not installed")
 
 from tools.training.pictures import PictureFiles
 
