@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 THREADS = 2
 RUNS = 9
 """The median of so many is told, after one that nobody counts."""
-MOST_PICTURES = 16
-"""Drones that the second stage looks at in one batch."""
 
 
 def add(commands: Commands) -> None:
@@ -230,6 +228,7 @@ def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
     """Runs a model on all that it will see of these cameras, keeps what that built, and opens it again as in flight."""
     from flockd.perception import OnnxModel
     from flockd.perception.providers import builds_engines, engines_folder
+    from flockd.perception.roles import PICTURES_AT_A_TIME
     from flockd.perception.session import feeds_for, golden_feeds, shapes_of
 
     wanted = config.perception
@@ -240,7 +239,7 @@ def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
         sizes = sorted({camera.size_px for camera in config.rig.cameras})
         feeds = [
             golden_feeds(model.manifest),
-            *(feeds_for(model.manifest, size, pictures) for size in sizes for pictures in (1, MOST_PICTURES)),
+            *(feeds_for(model.manifest, size, pictures) for size in sizes for pictures in (1, PICTURES_AT_A_TIME)),
         ]
         for each in feeds:
             model.run(each)

@@ -21,7 +21,7 @@ from flockd.perception.session import OnnxModel
 
 _EAGER_LOGIT = -1.5
 """Where a second stage weeds out what is none, the first proposes drones from this logit up."""
-_AT_A_TIME = 24
+PICTURES_AT_A_TIME = 24
 """Pictures in one run of the distance network, so that an image full of ghosts does not take more memory."""
 _VERY_NEAR_M, _VERY_FAR_M = 1e-3, 1e3
 
@@ -139,8 +139,8 @@ class Perception:
         both = images + [np.ascontiguousarray(image[:, ::-1]) for image in images]
         answers = np.concatenate(
             [
-                self._distance.answer({"picture": both[i : i + _AT_A_TIME]})["range"]
-                for i in range(0, len(both), _AT_A_TIME)
+                self._distance.answer({"picture": both[i : i + PICTURES_AT_A_TIME]})["range"]
+                for i in range(0, len(both), PICTURES_AT_A_TIME)
             ]
         )
         out = _of_both(answers[: len(images)], answers[len(images) :])

@@ -49,7 +49,7 @@ class OnnxModel:
         if made_for and provider not in made_for:
             raise ModelError(
                 f"{path}: {self.manifest.name} is made for {' and '.join(made_for)}, not for {provider}; name "
-                "another model (flockd's own without _int8 run everywhere), or another perception.provider"
+                "another model (flockd's own without _int8 are made for any), or another perception.provider"
             )
         _check_weights(file, path)
         self._engines = engine_folder(engines, provider, self.manifest.name, self.manifest.sha256)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from flockd.data import data_path
 from flockd.errors import ModelError
 from flockd.messages import Float32Array, UInt8Array
 from flockd.perception import DisFlow, OnnxFlow, OnnxModel, Perception, Picture, find_manifests, load_manifest
+from flockd.perception.roles import PICTURES_AT_A_TIME
 from flockd.sim.drone_models import drone_model
 from flockd.sim.renderer import Renderer
 from flockd.sim.world import World
@@ -207,6 +209,23 @@ def test_a_mirror_image_is_as_far_away_and_shows_the_drone_on_the_other_side() -
     np.testing.assert_allclose(one.centre, [96 - other.centre[0], other.centre[1]], atol=1e-4)
     assert one.centre[0] == pytest.approx(48 - 100 / 15, abs=3.0)
     assert one.range_m == pytest.approx(1.5, rel=0.15)
+
+
+def test_many_pictures_go_in_batches_no_larger_than_what_is_prepared(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 256, (31, 96, 96, 3), dtype=np.uint8)
+    pictures = [Picture(image, 100.0, np.eye(3), np.zeros(3)) for image in images]
+    perception, answer, batches = Perception(PerceptionConfig(), MODELS), OnnxModel.answer, []
+
+    def noted(model: OnnxModel, contents: dict[Any, Any]) -> dict[Any, Float32Array]:
+        batches.append(len(contents["picture"]))
+        return answer(model, contents)
+
+    monkeypatch.setattr(OnnxModel, "answer", noted)
+    ranges = [estimate.range_m for estimate in perception.ranges(pictures)]
+    assert max(batches) == PICTURES_AT_A_TIME
+    assert sum(batches) == 2 * 31  # and their mirror images
+    np.testing.assert_allclose(ranges, [perception.ranges([picture])[0].range_m for picture in pictures], rtol=1e-3)
 
 
 def test_the_network_of_flow_is_sharpened_by_dis_unless_told_otherwise() -> None:
