@@ -6,7 +6,6 @@ python tools/export.py neighbours --checkpoint RUNS/neighbours/checkpoint.pt --o
 from __future__ import annotations
 
 import argparse
-import hashlib
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,14 +13,14 @@ from typing import Any
 import numpy as np
 import onnxruntime as ort
 import torch
-import yaml
 from numpy.typing import NDArray
 from torch import nn
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from flockd.perception.manifest import Manifest
-from flockd.perception.session import OnnxModel, golden_feeds
+from flockd.perception.session import golden_feeds
+from tools.training.manifests import write_manifest
 from tools.training.networks import DistanceNet, FlowNet, NeighboursNet
 
 ALLOWED_DIFFERENCE = 2e-3
@@ -110,14 +109,7 @@ def main() -> None:
     feeds = golden_feeds(manifest)
     _write_onnx(net, feeds, list(spec["outputs"]), file)
     outputs = _compare(net, feeds, file)
-    document = manifest.model_dump(mode="json", exclude_defaults=True)
-    document["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
-    for name, value in outputs.items():
-        document["outputs"][name]["golden_mean"] = float(value.mean())
-        document["outputs"][name]["golden_deviation"] = float(value.std())
-    path = arguments.out / f"{arguments.network}.yaml"
-    path.write_text(yaml.safe_dump(document, sort_keys=False, width=110))
-    OnnxModel(path, threads=1)
+    path = write_manifest(manifest.model_dump(mode="json", exclude_defaults=True), file, outputs)
     print(f"{path}: {file.stat().st_size / 1e6:.1f} MB, {state['step']} steps, checked")
 
 

@@ -7,7 +7,6 @@ python tools/quantise.py models/distance.yaml --data DATA/pictures --out models
 from __future__ import annotations
 
 import argparse
-import hashlib
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -17,7 +16,6 @@ from typing import Any
 import numpy as np
 import onnx
 import onnxruntime as ort
-import yaml
 from numpy.typing import NDArray
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 from onnxruntime.quantization.shape_inference import quant_pre_process
@@ -26,8 +24,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from flockd.perception.fitting import fit
 from flockd.perception.manifest import Manifest, load_manifest
-from flockd.perception.session import OnnxModel, golden_feeds
+from flockd.perception.session import golden_feeds
 from tools.training.dataset import HEIGHT, WIDTH, ground_plane, open_pairs, ray_tangents
+from tools.training.manifests import write_manifest
 
 Feeds = dict[str, NDArray[Any]]
 IMAGES, COMPARED = 32, 16
@@ -67,18 +66,14 @@ def main() -> None:
     document |= {
         "name": name,
         "file": twin.name,
-        "sha256": hashlib.sha256(twin.read_bytes()).hexdigest(),
         "description": f"{manifest.description}; in 8-bit numbers",
         "providers": ["cpu"],
         "accuracy": accuracy,
         "command": f"{manifest.command}, tools/quantise.py",
     }
-    outputs = ort.InferenceSession(str(twin), providers=["CPUExecutionProvider"]).run(None, golden_feeds(manifest))
-    for output, value in zip(document["outputs"].values(), outputs, strict=True):
-        output["golden_mean"], output["golden_deviation"] = float(value.mean()), float(value.std())
-    path = arguments.out / f"{name}.yaml"
-    path.write_text(yaml.safe_dump(document, sort_keys=False, width=110))
-    OnnxModel(path, threads=1)
+    names = list(manifest.outputs)
+    golden = ort.InferenceSession(str(twin), providers=["CPUExecutionProvider"]).run(names, golden_feeds(manifest))
+    path = write_manifest(document, twin, dict(zip(names, golden, strict=True)))
     print(f"{path}: {twin.stat().st_size / 1e6:.1f} MB; mean differences in deviations: {differences}")
 
 
@@ -142,6 +137,7 @@ def _differences(file: Path, twin: Path, feeds: Sequence[Feeds]) -> dict[str, fl
         differences[name] = round(float(np.abs(our - their).mean() / their.std()), 4)
     worst = max(differences, key=lambda name: differences[name])
     if not differences[worst] <= AT_MOST:
+        twin.unlink()
         raise SystemExit(f"{twin}: output {worst} differs by {differences[worst]} of its deviation: keep this in float")
     return differences
 

@@ -139,7 +139,7 @@ class Observer:
         found = self._locate(images, maps) if maps else []
         if maps and self._perceiver.has_distance:
             found += self._look_again(images, vehicle, found, expected)
-        sightings, label_of = _merge(_one_in_line(found))
+        sightings, label_of = _merge(_without_hidden(found))
         views = {}
         for name, scene in maps.items():
             table = np.full(256, UNCLASSED, np.uint8)
@@ -377,21 +377,17 @@ def _in_view(live: Rig, position: FloatArray, candidate: _Candidate) -> FloatArr
     return direction if live.covers(direction[None])[0] else candidate.direction
 
 
-def _one_in_line(found: Sequence[_Located]) -> list[_Located]:
-    """Without what would hide behind another, or that other: a part of a drone cut off by an image's border may look
-    like a whole one far behind it. The one whose range is the surer is true."""
+def _without_hidden(found: Sequence[_Located]) -> list[_Located]:
+    """Without what would be hidden behind a nearer one whose range is surer: a part of a drone cut off by an image's
+    border may look like a whole one far behind it. The nearer one always stays: better a ghost than one overlooked."""
 
-    def fits(one: _Located, other: _Located) -> bool:
-        near, far = sorted((one, other), key=lambda located: float(np.linalg.norm(located.position)))
+    def hides(near: _Located, far: _Located) -> bool:
         near_m, far_m = float(np.linalg.norm(near.position)), float(np.linalg.norm(far.position))
-        hidden = _angle(near.position, far.position) < _HIDES * near.size_m / near_m
-        return not hidden or far_m < _SAME_RANGE * near_m  # the latter may be one drone, seen by two cameras
+        surer = near.range_sigma_m / near_m < far.range_sigma_m / far_m
+        behind = far_m >= _SAME_RANGE * near_m  # within that, it may be one drone that two cameras see
+        return surer and behind and _angle(near.position, far.position) < _HIDES * near.size_m / near_m
 
-    kept: list[_Located] = []
-    for one in sorted(found, key=lambda located: located.range_sigma_m / float(np.linalg.norm(located.position))):
-        if all(fits(one, other) for other in kept):
-            kept.append(one)
-    return kept
+    return [one for one in found if not any(hides(other, one) for other in found)]
 
 
 def _merge(found: Sequence[_Located]) -> tuple[tuple[Sighting, ...], dict[tuple[str, int], int]]:

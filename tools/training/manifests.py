@@ -1,0 +1,24 @@
+"""Writes the manifest that belongs to a model file."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from numpy.typing import NDArray
+
+from flockd.perception import OnnxModel
+
+
+def write_manifest(document: dict[str, Any], file: Path, golden: Mapping[str, NDArray[Any]]) -> Path:
+    """``document`` beside ``file``, with the file's hash and its ``golden`` outputs; opened once, as flockd does."""
+    document["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
+    for name, value in golden.items():
+        document["outputs"][name] |= {"golden_mean": float(value.mean()), "golden_deviation": float(value.std())}
+    path = file.with_suffix(".yaml")
+    path.write_text(yaml.safe_dump(document, sort_keys=False, width=110))
+    OnnxModel(path, threads=1)
+    return path
