@@ -9,11 +9,12 @@ import numpy as np
 
 from flockd.messages import Float32Array, UInt8Array
 from flockd.perception.fitting import fit
+from flockd.perception.landmarks import flow_of_landmarks
 from flockd.perception.session import OnnxModel
-from flockd.perception.shift import global_shift, likeness
+from flockd.perception.shift import flow_of_shift, likeness
 
-_EXPLAINS = 0.6
-"""Images that are less like each other than this along a flow say that it went astray: the camera turned too far."""
+_EXPLAINS = 0.8
+"""Images that are less like each other than this along a flow say that it went astray: the camera moved too far."""
 
 
 class Flow(Protocol):
@@ -47,7 +48,7 @@ class DisFlow:
     """OpenCV's dense inverse search (Kroeger et al. 2016): alone for small computers, or after another flow.
 
     It is exact to a fraction of a pixel where it converges, but loses what moves far; a network is the other way round.
-    Where the network too loses its way, one shift of the whole image is tried as the start.
+    Where the network too loses its way, corners that look alike are tried as the start, then one shift of all.
     """
 
     def __init__(self, start: Flow | None = None, finest_scale: int = 1) -> None:
@@ -65,13 +66,17 @@ class DisFlow:
         before, after = _grey(first), _grey(second)
         if self._start is None:
             return self._from(np.zeros((*before.shape, 2), np.float32), before, after)
-        flow = self._from(self._start.flow(first, second), before, after)
-        explained = likeness(before, after, flow)
-        if explained >= _EXPLAINS:
-            return flow
-        shifted = np.full_like(flow, global_shift(before, after))
-        other = self._from(shifted, before, after)
-        return other if likeness(before, after, other) > explained else flow
+        best = self._from(self._start.flow(first, second), before, after)
+        explained = likeness(before, after, best)
+        for start_over in (flow_of_landmarks, flow_of_shift):
+            if explained >= _EXPLAINS:
+                break
+            start = start_over(before, after)
+            if start is None:
+                continue
+            other = self._from(start, before, after)
+            explained, best = max((explained, best), (likeness(before, after, other), other), key=lambda pair: pair[0])
+        return best
 
     def _from(self, start: Float32Array, first: UInt8Array, second: UInt8Array) -> Float32Array:
         """The flow between grey images; ``start`` is changed."""

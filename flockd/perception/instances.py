@@ -9,8 +9,6 @@ import numpy as np
 
 from flockd.messages import Float32Array, FloatArray, UInt8Array
 
-UNSURE = 255
-"""Label of pixels that belong to no drone for certain, nor to the background."""
 _CELL = 2  # votes are gathered in cells of this many map pixels
 _MAX_INSTANCES = 48
 """More than this in one image is a network gone astray; the weakest are joined to the others."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -11,10 +11,10 @@ import numpy as np
 
 from flockd.config.parameters import PerceptionConfig
 from flockd.errors import ModelError
-from flockd.messages import Float32Array, FloatArray, UInt8Array
+from flockd.messages import BoolArray, Float32Array, FloatArray, UInt8Array
 from flockd.perception.fitting import fit
 from flockd.perception.flow import DisFlow, Flow, OnnxFlow
-from flockd.perception.instances import UNSURE, Instance, group_instances
+from flockd.perception.instances import Instance, group_instances
 from flockd.perception.manifest import Answer, Content, Role, Unknown, manifest_path
 from flockd.perception.providers import engines_folder
 from flockd.perception.session import OnnxModel
@@ -43,10 +43,12 @@ class SceneMaps:
     depth: Float32Array
     """(h, w) metres along the optical axis; the sky is very far. All NaN while the scale is open."""
     labels: UInt8Array
-    """(h, w) 0 for background, then one value a drone; ``UNSURE`` for the part of a drone that may be background."""
+    """(h, w) 0 for background, then one value a drone."""
     instances: tuple[Instance, ...]
     open: OpenDepth | None = None
     """What is there instead of metres, for `flockd.pilot.scale` to fix."""
+    unsure: BoolArray | None = None
+    """(h, w) which pixels of the drones may just as well be background; None: no such."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,9 +124,10 @@ class Perception:
         logit, offset = self._at_map_scale(answers["drone"], size)[0], self._at_map_scale(answers["offset"], size)
         threshold = _EAGER_LOGIT if self.has_distance else 0.0
         labels, instances = group_instances(logit - np.float32(threshold), offset, scale=self.map_scale)
-        labels[(labels > 0) & (logit < 0)] = UNSURE
         labels = np.asarray(cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
-        return self._maps(depth, labels, instances, geometry)
+        unsure = cv2.resize((logit < 0).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        maps = self._maps(depth, labels, instances, geometry)
+        return replace(maps, unsure=unsure & (labels > 0))
 
     def ranges(self, pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
         """The second stage: range and centre of the drone in the middle of each picture.

@@ -16,6 +16,11 @@ _LEAST_OVERLAP = 0.3
 """Of an image: less than this in common can be like by chance."""
 
 
+def flow_of_shift(first: UInt8Array, second: UInt8Array) -> Float32Array:
+    """(h, w, 2) pixels from the grey image ``first`` (h, w) to ``second``: the same everywhere."""
+    return np.full((*first.shape, 2), global_shift(first, second), np.float32)
+
+
 def global_shift(first: UInt8Array, second: UInt8Array) -> tuple[float, float]:
     """How far the grey image ``first`` (h, w) has gone in ``second``, pixels right and down, if all of it moves alike.
 

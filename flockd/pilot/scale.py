@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,7 +42,7 @@ class Scale:
             return maps
         inverse = np.float32(self.factor) * maps.open.inverse + np.float32(self.shift)
         depth = 1.0 / np.maximum(inverse, np.float32(1.0 / _VERY_FAR_M))
-        return SceneMaps(np.asarray(depth, np.float32), maps.labels, maps.instances)
+        return replace(maps, depth=np.asarray(depth, np.float32), open=None)
 
 
 def fix_by_height(maps: SceneMaps, ground: Float32Array) -> SceneMaps:

@@ -12,11 +12,11 @@ import numpy as np
 
 from flockd.geometry import Rig, RigCamera, ground_inverse_depth, virtual_crop
 from flockd.messages import Float32Array, FloatArray, Frame, FrameSet, Sighting, UInt8Array, VehicleState
-from flockd.perception import UNSURE, Instance, Picture, RangeEstimate, SceneMaps
+from flockd.perception import Instance, Picture, RangeEstimate, SceneMaps
 from flockd.pilot.scale import fix_by_height
 from flockd.tracking import ExpectedNeighbour
 
-UNCLASSED = UNSURE
+UNCLASSED = 255
 """Label of pixels too near a drone's outline to be sure of, and of drones that are not sighted."""
 _OUTLINE_PX = 5
 _FIRST_MARGIN = 1.3
@@ -136,7 +136,7 @@ class Observer:
         Where a drone is ``expected`` but not segmented, the second stage looks once more.
         """
         images = {name: frames.frames[name].image for name in maps}
-        found = self._locate(images, maps) if maps else []
+        found, refused = self._locate(images, maps) if maps else ([], set())
         if maps and self._perceiver.has_distance:
             found += self._look_again(images, vehicle, found, expected)
         sightings, label_of = _merge(_without_hidden(found))
@@ -145,8 +145,11 @@ class Observer:
             table = np.full(256, UNCLASSED, np.uint8)
             table[0] = 0
             for instance in scene.instances:
-                table[instance.label] = label_of.get((name, instance.label), UNCLASSED)
+                otherwise = 0 if instance in refused else UNCLASSED
+                table[instance.label] = label_of.get((name, instance.label), otherwise)
             labels = table[scene.labels]
+            if scene.unsure is not None:
+                labels[scene.unsure & (labels > 0)] = UNCLASSED
             depth = self._drone_depth(scene.depth, labels, self._rig.cameras[name], sightings)
             views[name] = CameraView(images[name], depth, _without_outline(labels))
         return RigView(frames.time_s, vehicle, views, sightings, tuple(reasons))
@@ -159,7 +162,10 @@ class Observer:
             ground = ground_inverse_depth(camera, vehicle.R_ned_body, vehicle.height_m, stride=stride)
         return np.concatenate([tangents, ground[None]])
 
-    def _locate(self, images: Mapping[str, UInt8Array], maps: Mapping[str, SceneMaps]) -> list[_Located]:
+    def _locate(
+        self, images: Mapping[str, UInt8Array], maps: Mapping[str, SceneMaps]
+    ) -> tuple[list[_Located], set[Instance]]:
+        """The drones among the instances, and which of them are surely none."""
         live = Rig({name: self._rig.cameras[name] for name in maps})
         candidates = [
             _Candidate((name,), *_aim(self._rig.cameras[name], instance), instance)
@@ -168,8 +174,9 @@ class Observer:
         ]
         if not self._perceiver.has_distance:
             located = [self._locate_by_depth(c, maps[c.cameras[0]]) for c in candidates]
-            return [one for one in located if one is not None]
-        return [one for one in self._look(live, images, candidates) if one.is_drone > _SURE]
+            return [one for one in located if one is not None], set()
+        found, refused = self._look(live, images, candidates)
+        return [one for one in found if one.is_drone > _SURE], {one.instance for one in refused if one.instance}
 
     def _look_again(
         self,
@@ -190,18 +197,19 @@ class Observer:
             if not cameras or any(_angle(direction, f.position) < half_angle for f in found):
                 continue
             candidates.append(_Candidate(cameras, direction, half_angle, expected=place))
-        return [
-            one
-            for one in self._look(live, images, candidates)
-            if one.is_drone > _SURE_OF_EXPECTED and _is_as_expected(one)
-        ]
+        located, _ = self._look(live, images, candidates)
+        return [one for one in located if one.is_drone > _SURE_OF_EXPECTED and _is_as_expected(one)]
 
-    def _look(self, live: Rig, images: Mapping[str, UInt8Array], candidates: Sequence[_Candidate]) -> list[_Located]:
+    def _look(
+        self, live: Rig, images: Mapping[str, UInt8Array], candidates: Sequence[_Candidate]
+    ) -> tuple[list[_Located], list[_Candidate]]:
         """The second stage, at least twice: each further picture is cut to the drone's size, with it in the middle.
 
         Where two cameras share the drone, they show it whole. It looks until the next picture would be the same again.
+        Also returns what is not worth another look.
         """
         found: list[_Located] = []
+        refused: list[_Candidate] = []
         looks = [_Look(c, c.direction, c.half_angle) for c in candidates]
         for number in range(1, _MOST_LOOKS + 1):
             if not looks:
@@ -210,7 +218,10 @@ class Observer:
             again = []
             for look, (position, range_m, estimate) in zip(looks, seen, strict=True):
                 is_drone = min(look.is_drone, estimate.is_drone)
-                if is_drone <= _WORTH_ANOTHER_LOOK or not _NEAREST_M < range_m < _FARTHEST_M:
+                if is_drone <= _WORTH_ANOTHER_LOOK:
+                    refused.append(look.candidate)
+                    continue
+                if not _NEAREST_M < range_m < _FARTHEST_M:
                     continue
                 direction = _in_view(live, position, look.candidate)
                 half_angle = _half_angle(estimate.size_m, range_m, look.half_angle)
@@ -221,7 +232,7 @@ class Observer:
                 sigma_m = max(estimate.relative_sigma, _MIN_RELATIVE_SIGMA) * range_m
                 found.append(_Located(look.candidate, position, sigma_m, estimate.size_m, is_drone))
             looks = again
-        return found
+        return found, refused
 
     def _ranges(
         self, live: Rig, images: Mapping[str, UInt8Array], aims: Sequence[tuple[FloatArray, float, float | None]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -86,7 +86,7 @@ class TruthPerception:
         learned = self._learned.scene(camera, image, geometry)
         depth = true.depth if "depth" in self._swap else learned.depth
         drones = true if "segmentation" in self._swap else learned
-        return SceneMaps(depth, drones.labels, drones.instances)
+        return replace(drones, depth=depth, open=None if "depth" in self._swap else learned.open)
 
     def ranges(self, pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
         """The true range of the drone nearest to each picture's middle, or the learned one."""

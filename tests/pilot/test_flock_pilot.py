@@ -203,6 +203,27 @@ def test_a_drone_is_looked_at_until_the_picture_shows_it_well(
     assert np.linalg.norm(sighting.position) == pytest.approx(math.hypot(3.0, 0.3), rel=0.01)
 
 
+@pytest.mark.parametrize(("is_drone", "sure", "unsure"), [(0.05, 0, 0), (0.35, 255, 255), (0.9, 1, 255)])
+def test_what_is_no_drone_belongs_to_the_background_again(
+    monkeypatch: pytest.MonkeyPatch, is_drone: float, sure: int, unsure: int
+) -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -4.0)))
+    frames, vehicle = flyer.look()
+    answers = flyer.truth.ranges
+    monkeypatch.setattr(
+        flyer.truth, "ranges", lambda pictures: tuple(replace(a, is_drone=is_drone) for a in answers(pictures))
+    )
+    observer = views.Observer(flyer.photographer.rig, flyer.truth, height_fixes_scale=False)
+    maps, _ = observer.scenes(frames, vehicle)
+    (name,) = [name for name, scene in maps.items() if scene.instances]
+    drone = maps[name].labels > 0
+    upper = drone & (np.cumsum(drone.any(axis=1)) < np.ptp(np.flatnonzero(drone.any(axis=1))) / 2)[:, None]
+    maps[name] = replace(maps[name], unsure=upper)
+    labels = observer.view(frames, vehicle, maps, ()).cameras[name].labels
+    assert set(labels[drone & ~upper]) == {sure}
+    assert set(labels[upper]) == {unsure}
+
+
 def test_blind_cameras_still_give_a_finite_command() -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0)))
     _, state = flyer.look()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flockd.geometry import Rig
 from flockd.messages import Frame, FrameSet, Sighting, VehicleState
-from flockd.perception import UNSURE, DisFlow, Perception
+from flockd.perception import DisFlow, Perception, SceneMaps
 from flockd.pilot.views import Observer
 from flockd.sim.drone_models import drone_model
 from tools.training.dataset import HEIGHT, R_BODY_CAMERA, WIDTH, PairSet, rig_camera
@@ -88,8 +88,7 @@ def look_at_pairs(pairs: PairSet, perception: Perception, indices: Iterable[int]
             observer = Observer(rig, perception, height_fixes_scale=with_height)
             maps, _ = observer.scenes(frames, vehicle)
             found.depth[with_height].append(_depth_error(maps["camera"].depth[1::2, 1::2], depth, ids))
-        labels = maps["camera"].labels[1::2, 1::2]
-        _masks((labels > 0) & (labels != UNSURE), ids, pairs, index, found)
+        _masks(_drone_pixels(maps["camera"])[1::2, 1::2], ids, pairs, index, found)
         _drones(observer.view(frames, vehicle, maps, ()).sightings, pairs, index, depth, ids, found)
         flow = np.asarray(pairs["flow"][index], np.float32)
         valid = np.asarray(pairs["flow_valid"][index])
@@ -103,6 +102,11 @@ def look_at_pairs(pairs: PairSet, perception: Perception, indices: Iterable[int]
 def _depth_error(guess: Array, true: Array, ids: Array) -> float:
     near = (ids == 0) & (true < 60.0)
     return float(np.mean(np.abs(guess[near] - true[near]) / true[near])) if near.any() else 0.0
+
+
+def _drone_pixels(maps: SceneMaps) -> Array:
+    drone = maps.labels > 0
+    return drone if maps.unsure is None else drone & ~maps.unsure
 
 
 def _masks(guess: Array, ids: Array, pairs: PairSet, index: int, found: Findings) -> None:
