@@ -46,6 +46,8 @@ WANTED: dict[str, tuple[float, float]] = {
     "distance errors inside 2 sigma": (92, 98),
     "background depth, relative error, RGB alone, median": (0, 12),
     "background depth, relative error, with height and attitude, median": (0, 2.5),
+    "background depth of a pixel, relative error, RGB alone, median": (0, 12),
+    "background depth of a pixel, relative error, with height and attitude, median": (0, 2.5),
     "own motion over 0.5 m, RGB alone, median": (0, 6),
     "own motion over 0.5 m, with height and attitude, median": (0, 1),
     "mask IoU, drones within 10 m, mean": (0.85, 1),
@@ -77,7 +79,7 @@ class Row:
         return WANTED.get(self.name)
 
     def __str__(self) -> str:
-        told = f"{self.name:68s} {self.value:10.4g} {self.unit:3s} {self.count:8d}"
+        told = f"{self.name:78s} {self.value:10.4g} {self.unit:3s} {self.count:8d}"
         if self.wanted is None:
             return told
         low, high = self.wanted
@@ -93,6 +95,7 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=10_000, help="of each folder at most this many")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rig-worlds", type=int, default=RIG_WORLDS, help="for the own motion; 0: leave it out")
+    parser.add_argument("--height-sigma", type=float, default=0.1, metavar="M", help="error of the height, metres")
     parser.add_argument("--float", action="store_true", help="the float networks, not their 8-bit twins")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
@@ -104,13 +107,14 @@ def main() -> None:
 
     def findings(folder: Path) -> Findings:
         pairs = open_pairs(folder)
-        return look_at_pairs(pairs, perception, range(min(pairs.count, arguments.pairs)))
+        indices = range(min(pairs.count, arguments.pairs))
+        return look_at_pairs(pairs, perception, indices, arguments.height_sigma)
 
     rows = list(rows_of_pairs(findings(arguments.data)))
     if arguments.unseen is not None:
         rows += rows_of_unseen(findings(arguments.unseen))
     if arguments.rig_worlds:
-        rows += rows_of_rigs(perception, arguments.rig_worlds)
+        rows += rows_of_rigs(perception, arguments.rig_worlds, arguments.height_sigma)
     rows += rows_of_cost(perception, open_pairs(arguments.data), arguments.threads)
     files = list(arguments.models.glob("*.onnx"))
     rows.append(Row("all networks", sum(file.stat().st_size for file in files) / 1e6, "MB", len(files)))
@@ -130,6 +134,9 @@ def rows_of_pairs(found: Findings) -> Iterator[Row]:
     for with_height, name in ((False, "RGB alone"), (True, "with height and attitude")):
         depth = found.depth[with_height]
         yield Row(f"background depth, relative error, {name}, median", 100 * float(np.median(depth)), "%", len(depth))
+        of_pixels = np.concatenate(found.depth_pixels[with_height])
+        what = f"background depth of a pixel, relative error, {name}, median"
+        yield Row(what, 100 * float(np.median(of_pixels)), "%", len(of_pixels))
     yield Row(f"mask IoU, drones within {MASK_WITHIN_M:g} m, mean", float(np.mean(found.iou)), "", len(found.iou))
     for low, high, name in ((12, np.inf, "at least 12"), (6, 12, "6 to 12")):
         count = sum(low <= drone.width_px < high for drone in found.drones)
@@ -171,10 +178,10 @@ def _distances(found: Findings, note: str) -> Iterator[Row]:
                 yield Row(f"distance{note}, {what}, {name}", 100 * float(figure(errors)), "%", len(errors))
 
 
-def rows_of_rigs(perception: Perception, count: int) -> Iterator[Row]:
+def rows_of_rigs(perception: Perception, count: int, height_sigma_m: float) -> Iterator[Row]:
     """The own motion, from the four cameras of the paper's drone."""
     drone = load_scenario(data_path("config") / "paper_flight.yaml").drone
-    errors = ego_motion_errors(drone, perception, worlds.TEST[1000 : 1000 + count], RIG_STEPS)
+    errors = ego_motion_errors(drone, perception, worlds.TEST[1000 : 1000 + count], RIG_STEPS, height_sigma_m)
     for scale, name in (("network", "RGB alone"), ("height", "with height and attitude")):
         known = np.array(errors[scale])[np.isfinite(errors[scale])]
         yield Row(f"own motion over 0.5 m, {name}, median", 100 * float(np.median(known)), "cm", len(known))

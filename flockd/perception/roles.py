@@ -21,6 +21,8 @@ from flockd.perception.session import OnnxModel
 
 _EAGER_LOGIT = -1.5
 """Where a second stage weeds out what is none, the first proposes drones from this logit up."""
+_SURE_LOGIT = 0.4
+"""Where pixels count as a drone's, of those it has proposed: its masks are a little too wide."""
 PICTURES_AT_A_TIME = 24
 """Pictures in one run of the distance network, so that an image full of ghosts does not take more memory."""
 _VERY_NEAR_M, _VERY_FAR_M = 1e-3, 1e3
@@ -122,10 +124,10 @@ class Perception:
         if self._segmentation is not self._depth:
             answers = self._look(self._segmentation, image, geometry)
         logit, offset = self._at_map_scale(answers["drone"], size)[0], self._at_map_scale(answers["offset"], size)
-        threshold = _EAGER_LOGIT if self.has_distance else 0.0
-        labels, instances = group_instances(logit - np.float32(threshold), offset, scale=self.map_scale)
+        eager, sure = (_EAGER_LOGIT, _SURE_LOGIT) if self.has_distance else (0.0, 0.0)
+        labels, instances = group_instances(logit - np.float32(eager), offset, scale=self.map_scale)
         labels = np.asarray(cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
-        unsure = cv2.resize((logit < 0).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        unsure = cv2.resize((logit < sure).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         maps = self._maps(depth, labels, instances, geometry)
         return replace(maps, unsure=unsure & (labels > 0))
 

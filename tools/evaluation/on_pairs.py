@@ -19,7 +19,6 @@ from tools.training.dataset import HEIGHT, R_BODY_CAMERA, WIDTH, PairSet, rig_ca
 from tools.training.samples import SIZES_M
 
 Array = NDArray[Any]
-BAROMETER_SIGMA_M = 0.1
 MIN_PIXELS = 6
 """Drones of which less is to be seen do not count, neither as found nor as missed."""
 MASK_WITHIN_M = 10.0
@@ -51,7 +50,9 @@ class Findings:
         self.drones: list[Drone] = []
         self.iou: list[float] = []
         self.depth: dict[bool, list[float]] = {False: [], True: []}
-        """Relative error of the background's depth in each image, without and with height and attitude."""
+        """Mean relative error of the background's depth in each image, without and with height and attitude."""
+        self.depth_pixels: dict[bool, list[Array]] = {False: [], True: []}
+        """The same of every sixteenth pixel."""
         self.flow: dict[tuple[str, bool], list[Array]] = {}
         """End-point errors, px, of ("network" or "dis", on drones)."""
 
@@ -72,22 +73,24 @@ class Findings:
         return np.concatenate(self.flow[name, on_drones])
 
 
-def look_at_pairs(pairs: PairSet, perception: Perception, indices: Iterable[int]) -> Findings:
-    """The second stage and all, on each pair's first image; the flow on both."""
+def look_at_pairs(pairs: PairSet, perception: Perception, indices: Iterable[int], height_sigma_m: float) -> Findings:
+    """The second stage and all, on each pair's first image; the flow on both. The autopilot's height errs."""
     rng = np.random.Generator(np.random.PCG64(0))
     dis, found = DisFlow(), Findings()
     for index in indices:
         rig = Rig({"camera": rig_camera(float(pairs["focal"][index]))})
         images = np.asarray(pairs["image"][index])
         R_ned_camera = np.asarray(pairs["R_ned_camera"][index, 0], np.float64)
-        height = float(pairs["height"][index, 0]) + float(rng.normal(0, BAROMETER_SIGMA_M))
+        height = float(pairs["height"][index, 0]) + float(rng.normal(0, height_sigma_m))
         frames = FrameSet(0.0, {"camera": Frame("camera", images[0], 0.0, 0)})
         vehicle = VehicleState(0.0, R_ned_camera @ R_BODY_CAMERA.T, height)
         depth, ids = np.asarray(pairs["depth"][index][0], np.float32), np.asarray(pairs["ids"][index][0])
         for with_height in (False, True):
             observer = Observer(rig, perception, height_fixes_scale=with_height)
             maps, _ = observer.scenes(frames, vehicle)
-            found.depth[with_height].append(_depth_error(maps["camera"].depth[1::2, 1::2], depth, ids))
+            off = _depth_errors(maps["camera"].depth[1::2, 1::2], depth, ids)
+            found.depth[with_height].append(float(off.mean()) if off.size else 0.0)
+            found.depth_pixels[with_height].append(off[::16])
         _masks(_drone_pixels(maps["camera"])[1::2, 1::2], ids, pairs, index, found)
         _drones(observer.view(frames, vehicle, maps, ()).sightings, pairs, index, depth, ids, found)
         flow = np.asarray(pairs["flow"][index], np.float32)
@@ -99,9 +102,9 @@ def look_at_pairs(pairs: PairSet, perception: Perception, indices: Iterable[int]
     return found
 
 
-def _depth_error(guess: Array, true: Array, ids: Array) -> float:
+def _depth_errors(guess: Array, true: Array, ids: Array) -> Array:
     near = (ids == 0) & (true < 60.0)
-    return float(np.mean(np.abs(guess[near] - true[near]) / true[near])) if near.any() else 0.0
+    return np.asarray(np.abs(guess[near] - true[near]) / true[near])
 
 
 def _drone_pixels(maps: SceneMaps) -> Array:

@@ -21,18 +21,17 @@ Array = NDArray[Any]
 STEP_M, STEP_S = 0.5, 0.5
 CLEARANCE_M = 2.0
 HEIGHTS_M = (2.0, 6.0)
-BAROMETER_SIGMA_M = 0.1
 NOISE = 2.0
 """Grey levels."""
 
 
 def ego_motion_errors(
-    config: DroneConfig, perception: Perception, seeds: Sequence[int], steps_a_world: int
+    config: DroneConfig, perception: Perception, seeds: Sequence[int], steps_a_world: int, height_sigma_m: float
 ) -> dict[str, list[float]]:
     """Translation errors in metres of single steps, by what fixes the scale; NaN where there was no estimate."""
     errors: dict[str, list[float]] = {"network": [], "height": []}
     for seed in seeds:
-        for steps, moved in _steps(seed, steps_a_world, build_rig(config.rig)):
+        for steps, moved in _steps(seed, steps_a_world, build_rig(config.rig), height_sigma_m):
             R_ned_body = steps[0][1].R_ned_body
             for scale, found in errors.items():
                 settings = config.perception.model_copy(update={"scale": scale})
@@ -42,7 +41,9 @@ def ego_motion_errors(
     return errors
 
 
-def _steps(seed: int, count: int, rig: Rig) -> Iterator[tuple[list[tuple[FrameSet, VehicleState]], Array]]:
+def _steps(
+    seed: int, count: int, rig: Rig, height_sigma_m: float
+) -> Iterator[tuple[list[tuple[FrameSet, VehicleState]], Array]]:
     """What a pilot is given before and after a step, and the step (3,) m NED, from places all over a world."""
     rng = np.random.Generator(np.random.PCG64([seed, 3]))
     world = World.generate(seed, ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])), keep_out=None)
@@ -52,11 +53,11 @@ def _steps(seed: int, count: int, rig: Rig) -> Iterator[tuple[list[tuple[FrameSe
         height, heading = float(rng.uniform(*HEIGHTS_M)), float(rng.uniform(-np.pi, np.pi))
         start = np.array([place[0], place[1], -(ground + height)])
         moved = np.array([STEP_M * np.cos(heading), STEP_M * np.sin(heading), 0.0])
-        R_ned_body, barometer_m = drawn_attitude(rng), height + float(rng.normal(0, BAROMETER_SIGMA_M))
+        R_ned_body, measured_m = drawn_attitude(rng), height + float(rng.normal(0, height_sigma_m))
         steps = []
         for k in range(2):
             frames = _photographed(renderer, rig, R_ned_body, start + k * moved, k, rng)
-            steps.append((FrameSet(k * STEP_S, frames), VehicleState(k * STEP_S, R_ned_body, barometer_m)))
+            steps.append((FrameSet(k * STEP_S, frames), VehicleState(k * STEP_S, R_ned_body, measured_m)))
         yield steps, moved
 
 
