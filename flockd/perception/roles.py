@@ -63,6 +63,9 @@ class Picture:
     R_body_camera: FloatArray
     position: FloatArray
     """(3,) of its optical centre in the body, metres."""
+    in_mirror: bool = False
+    """Whether the network is to be shown the mirror image, which it errs on differently. The answer is told as if not.
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,23 +135,19 @@ class Perception:
         return replace(maps, unsure=unsure & (labels > 0))
 
     def ranges(self, pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
-        """The second stage: range and centre of the drone in the middle of each picture.
-
-        Asked of each picture and of its mirror image, which the network errs on differently.
-        """
+        """The second stage: range and centre of the drone in the middle of each picture."""
         if self._distance is None:
             raise ValueError("this configuration has no distance model")
         if not pictures:
             return ()
-        images = [picture.image for picture in pictures]
-        both = images + [np.ascontiguousarray(image[:, ::-1]) for image in images]
-        answers = np.concatenate(
+        shown = [np.ascontiguousarray(p.image[:, ::-1]) if p.in_mirror else p.image for p in pictures]
+        out = np.concatenate(
             [
-                self._distance.answer({"picture": both[i : i + PICTURES_AT_A_TIME]})["range"]
-                for i in range(0, len(both), PICTURES_AT_A_TIME)
+                self._distance.answer({"picture": shown[i : i + PICTURES_AT_A_TIME]})["range"]
+                for i in range(0, len(shown), PICTURES_AT_A_TIME)
             ]
         )
-        out = _of_both(answers[: len(images)], answers[len(images) :])
+        out[[p.in_mirror for p in pictures], 1] *= -1.0
         middle = self.picture_size / 2
         return tuple(
             RangeEstimate(
@@ -244,13 +243,3 @@ def _focal_px(geometry: Float32Array, stride: int) -> float:
     """Of the image, from how fast the rays' tangents change in its middle."""
     row, column = geometry.shape[1] // 2, geometry.shape[2] // 2
     return float(2 * stride / (geometry[0, row, column + 1] - geometry[0, row, column - 1]))
-
-
-def _of_both(answers: Float32Array, mirrored: Float32Array) -> Float32Array:
-    """What the distance network says (n, 6) of pictures and of their mirror images as one: the mean, the surer counting
-    for more; a drone only where both see one."""
-    mirrored = mirrored * np.array([1, -1, 1, 1, 1, 1], np.float32)
-    weight = 1.0 / (1.0 + np.exp(2.0 * (answers[:, 3:4] - mirrored[:, 3:4])))
-    both = weight * answers + (1.0 - weight) * mirrored
-    both[:, 4] = np.minimum(answers[:, 4], mirrored[:, 4])
-    return np.asarray(both, np.float32)

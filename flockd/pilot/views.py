@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import cv2
@@ -28,6 +28,11 @@ _MARGIN = 0.68
 _MAX_RESIZE = 1.7
 """A further picture's angle is at most this many times the last one's, and at least as much smaller."""
 _MOST_LOOKS = 4
+_LAST_LOOK = ((1.0, True), (0.8, False), (1.25, True))
+"""At last three more pictures: how wide they are, of what suits the drone, and whether they show it in a mirror. The
+network errs on each differently."""
+_MEAN_SIGMA = 0.9
+"""The error of the mean of all these, as a share of what a single picture's would be."""
 _WORTH_ANOTHER_LOOK = 0.2
 _SAME_AIM, _SAME_SIZE = 0.1, 1.15
 """Two pictures show the same if one is moved by less than this share of half its width, and resized by less than this.
@@ -205,55 +210,77 @@ class Observer:
     ) -> tuple[list[_Located], list[_Candidate]]:
         """The second stage, at least twice: each further picture is cut to the drone's size, with it in the middle.
 
-        Where two cameras share the drone, they show it whole. It looks until the next picture would be the same again.
-        Also returns what is not worth another look.
+        Where two cameras share the drone, they show it whole. It looks until the next picture would be the same again,
+        then at some more at once. Also returns what is not worth another look.
         """
-        found: list[_Located] = []
+        settled: list[tuple[_Look, _Answer]] = []
         refused: list[_Candidate] = []
         looks = [_Look(c, c.direction, c.half_angle) for c in candidates]
         for number in range(1, _MOST_LOOKS + 1):
             if not looks:
                 break
-            seen = self._ranges(live, images, [(look.direction, look.half_angle, look.range_m) for look in looks])
             again = []
-            for look, (position, range_m, estimate) in zip(looks, seen, strict=True):
-                is_drone = min(look.is_drone, estimate.is_drone)
+            for look, answer in zip(looks, self._answers(live, images, looks), strict=True):
+                is_drone = min(look.is_drone, answer.is_drone)
                 if is_drone <= _WORTH_ANOTHER_LOOK:
                     refused.append(look.candidate)
                     continue
-                if not _NEAREST_M < range_m < _FARTHEST_M:
+                if not _NEAREST_M < answer.range_m < _FARTHEST_M:
                     continue
-                direction = _in_view(live, position, look.candidate)
-                half_angle = _half_angle(estimate.size_m, range_m, look.half_angle)
-                further = _Look(look.candidate, direction, half_angle, range_m, is_drone)
+                direction = _in_view(live, answer.position, look.candidate)
+                half_angle = _half_angle(answer.size_m, answer.range_m, look.half_angle)
+                further = _Look(look.candidate, direction, half_angle, answer.range_m, is_drone)
                 if number == 1 or (number < _MOST_LOOKS and not _shows_the_same(look, further)):
                     again.append(further)
-                    continue
-                sigma_m = max(estimate.relative_sigma, _MIN_RELATIVE_SIGMA) * range_m
-                found.append(_Located(look.candidate, position, sigma_m, estimate.size_m, is_drone))
+                else:
+                    settled.append((further, answer))
             looks = again
+        found = []
+        for look, answer in self._last_look(live, images, settled):
+            if answer.is_drone <= _WORTH_ANOTHER_LOOK:
+                refused.append(look.candidate)
+                continue
+            sigma_m = max(_MEAN_SIGMA * answer.relative_sigma, _MIN_RELATIVE_SIGMA) * answer.range_m
+            found.append(_Located(look.candidate, answer.position, sigma_m, answer.size_m, answer.is_drone))
         return found, refused
 
-    def _ranges(
-        self, live: Rig, images: Mapping[str, UInt8Array], aims: Sequence[tuple[FloatArray, float, float | None]]
-    ) -> list[tuple[FloatArray, float, RangeEstimate]]:
-        """For each (direction, half angle, range if known): position in the body, distance from it, all estimated."""
-        crops = [virtual_crop(live, direction, angle, self._perceiver.picture_size) for direction, angle, _ in aims]
+    def _last_look(
+        self, live: Rig, images: Mapping[str, UInt8Array], settled: Sequence[tuple[_Look, _Answer]]
+    ) -> list[tuple[_Look, _Answer]]:
+        """The same looks with what their last answers and some more pictures say together."""
+        looks = [
+            replace(look, half_angle=wide * look.half_angle, in_mirror=in_mirror)
+            for look, _ in settled
+            for wide, in_mirror in _LAST_LOOK
+        ]
+        more = self._answers(live, images, looks)
+        count = len(_LAST_LOOK)
+        return [
+            (look, _together(look.is_drone, [answer, *more[count * i : count * (i + 1)]]))
+            for i, (look, answer) in enumerate(settled)
+        ]
+
+    def _answers(self, live: Rig, images: Mapping[str, UInt8Array], looks: Sequence[_Look]) -> list[_Answer]:
+        """What the second stage says of each look, in the body's axes."""
+        if not looks:
+            return []
+        crops = [virtual_crop(live, look.direction, look.half_angle, self._perceiver.picture_size) for look in looks]
         pictures = [
             Picture(
-                image=crop.sample(images, range_m=range_m)[0],
+                image=crop.sample(images, range_m=look.range_m)[0],
                 focal_px=crop.camera.focal_px,
                 R_body_camera=crop.T_body_virtual.rotation,
                 position=crop.T_body_virtual.translation,
+                in_mirror=look.in_mirror,
             )
-            for crop, (_, _, range_m) in zip(crops, aims, strict=True)
+            for crop, look in zip(crops, looks, strict=True)
         ]
-        out = []
+        answers = []
         for crop, estimate in zip(crops, self._perceiver.ranges(pictures), strict=True):
             ray = crop.camera.rays(estimate.centre[None])[0]
             position = crop.T_body_virtual.apply(estimate.range_m * ray[None])[0]
-            out.append((position, float(np.linalg.norm(position)), estimate))
-        return out
+            answers.append(_Answer(position, estimate.relative_sigma, estimate.size_m, estimate.is_drone))
+        return answers
 
     def _locate_by_depth(self, candidate: _Candidate, scene: SceneMaps) -> _Located | None:
         """Eq. 37 on the depth map alone: the centre of the bounding box of the drone's points."""
@@ -318,6 +345,23 @@ class _Look:
     """Of what it should show; None: not known yet."""
     is_drone: float = 1.0
     """The least probability that an earlier look gave."""
+    in_mirror: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class _Answer:
+    """What the second stage says of one look, or of several."""
+
+    position: FloatArray
+    """(3,) in the body, metres."""
+    relative_sigma: float
+    size_m: float
+    is_drone: float
+
+    @property
+    def range_m(self) -> float:
+        """From the body."""
+        return float(np.linalg.norm(self.position))
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,6 +416,25 @@ def _shows_the_same(look: _Look, further: _Look) -> bool:
     moved = _angle(look.direction, further.direction) / look.half_angle
     resized = abs(math.log(further.half_angle / look.half_angle))
     return moved < _SAME_AIM and resized < math.log(_SAME_SIZE)
+
+
+def _together(is_drone: float, answers: Sequence[_Answer]) -> _Answer:
+    """The mean of log range, direction, log size and log sigma, the surer counting for more; a drone only where all see
+    one."""
+    sigmas = np.array([answer.relative_sigma for answer in answers])
+    weights = sigmas**-2 / (sigmas**-2).sum()
+
+    def mean(values: Sequence[float] | FloatArray) -> float:
+        return float(np.exp(weights @ np.log(values)))
+
+    ranges = np.array([answer.range_m for answer in answers])
+    direction = weights @ (np.array([answer.position for answer in answers]) / ranges[:, None])
+    return _Answer(
+        position=mean(ranges) * direction / np.linalg.norm(direction),
+        relative_sigma=mean(sigmas),
+        size_m=mean([answer.size_m for answer in answers]),
+        is_drone=min(is_drone, *(answer.is_drone for answer in answers)),
+    )
 
 
 def _is_as_expected(one: _Located) -> bool:

@@ -182,7 +182,7 @@ def test_a_drone_that_segmentation_misses_is_seen_where_it_is_expected(
 
 
 @pytest.mark.parametrize(
-    ("wrong_by", "looks"), [((1.0,), 2), ((1.6, 1.0), 3), ((1.6, 1.3, 1.0), 4), ((1.6, 1.3, 1.6, 1.0, 1.3), 4)]
+    ("wrong_by", "looks"), [((1.0,), 2), ((1.6, 1.0), 3), ((1.6, 1.3, 1.0), 4), ((1.6, 1.3, 1.6, 1.0), 4)]
 )
 def test_a_drone_is_looked_at_until_the_picture_shows_it_well(
     monkeypatch: pytest.MonkeyPatch, wrong_by: tuple[float, ...], looks: int
@@ -199,8 +199,28 @@ def test_a_drone_is_looked_at_until_the_picture_shows_it_well(
 
     monkeypatch.setattr(flyer.truth, "ranges", ranges)
     (sighting,) = flyer.step().sightings
-    assert asked == [1] * looks
+    assert asked == [1] * looks + [3]
     assert np.linalg.norm(sighting.position) == pytest.approx(math.hypot(3.0, 0.3), rel=0.01)
+
+
+def test_the_last_pictures_count_by_how_sure_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a drone 3 m away: the settled look says 3 m, the further ones 6, 3 and 3 m."""
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
+    answers = flyer.truth.ranges
+    mirrors: list[list[bool]] = []
+
+    def ranges(pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
+        mirrors.append([picture.in_mirror for picture in pictures])
+        told = [replace(answer, relative_sigma=0.05, is_drone=0.9) for answer in answers(pictures)]
+        if len(told) == 3:
+            told[0] = replace(told[0], range_m=6.0, relative_sigma=0.1, is_drone=0.8)
+        return tuple(told)
+
+    monkeypatch.setattr(flyer.truth, "ranges", ranges)
+    (sighting,) = flyer.step().sightings
+    assert mirrors[-1] == [True, False, True]
+    assert np.linalg.norm(sighting.position) == pytest.approx(3.0 * 2 ** (1 / 13), rel=0.005)  # 1 of 1 + 3 * 4
+    assert sighting.drone_probability == pytest.approx(0.8)
 
 
 @pytest.mark.parametrize(("is_drone", "sure", "unsure"), [(0.05, 0, 0), (0.35, 255, 255), (0.9, 1, 255)])
