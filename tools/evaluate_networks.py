@@ -31,6 +31,8 @@ from tools.training.dataset import HEIGHT, WIDTH, PairSet, open_pairs
 RANGES_M = ((1.5, 5.0), (5.0, 10.0), (10.0, 20.0))
 RIG_WORLDS, RIG_STEPS = 12, 4
 IMAGES_TIMED = 60
+PICTURES_OF_A_DRONE = (1, 1, 3)
+"""As many as it takes one after another, mostly: see ``flockd.pilot.views``."""
 
 
 WANTED: dict[str, tuple[float, float]] = {
@@ -198,7 +200,8 @@ def rows_of_cost(perception: Perception, pairs: PairSet, threads: int) -> Iterat
         picture = Picture(np.ascontiguousarray(image[:side, :side]), 60.0, np.eye(3), np.zeros(3))
         begin = time.perf_counter()
         perception.scene("camera", image, geometry)
-        perception.ranges([picture] * 4)
+        for pictures in PICTURES_OF_A_DRONE:
+            perception.ranges([picture] * 4 * pictures)
         times.append(time.perf_counter() - begin)
     name = f"depth, masks and four drones' distances of an image, {threads} threads"
     yield Row(name, 1e3 * float(np.median(times)), "ms", len(times))

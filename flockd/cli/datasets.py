@@ -22,8 +22,6 @@ _ANY_ACCELERATION_M_S2 = 1e9
 """A camera in somebody's hand keeps to no drone's limits."""
 _STRIDE_PX = 6
 """One camera has to do for the four of a drone."""
-_FINEST_SCALE = 1
-"""Nobody waits for a replay: DIS sharpens the flow at half of the size, not only at a quarter."""
 _OF_RECORDINGS = ("speed", "start", "end", "out", "diff", "reference", "update_reference", "tolerance")
 _OF_DATASETS = ("depth", "stride", "flow", "calibration", "trajectory")
 
@@ -102,7 +100,7 @@ def _config(args: argparse.Namespace, dataset: Dataset) -> tuple[DroneConfig, li
             # The polish trusts depth as little as a network's deserves; a sensor's is better than that.
             refine=args.depth != "recorded",
         )
-        perception = PerceptionConfig(scale="network", flow_refinement_scale=_FINEST_SCALE)
+        perception = PerceptionConfig(scale="network", flow_refinement="dis")
         config = DroneConfig(rig=rig, geometry=geometry, perception=perception)
     else:
         loaded = load(args.config)

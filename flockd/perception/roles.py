@@ -213,7 +213,9 @@ class Perception:
         if config.flow == "dis":
             return DisFlow()
         network = OnnxFlow(self._model(config.flow, "flow"))
-        return DisFlow(network, config.flow_refinement_scale) if config.flow_refinement == "dis" else network
+        if config.flow_refinement == "none":
+            return network
+        return DisFlow(network, config.flow_refinement_scale, quick=config.flow_refinement == "quick_dis")
 
     def _model(self, name: str, role: Role) -> OnnxModel:
         path = manifest_path(self._dir, name)

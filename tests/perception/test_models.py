@@ -230,7 +230,11 @@ def test_many_pictures_go_in_batches_no_larger_than_what_is_prepared(monkeypatch
 def test_the_network_of_flow_is_sharpened_by_dis_unless_told_otherwise() -> None:
     first, second = shifted_pictures((9, -5), (480, 640))
     network = OnnxFlow(OnnxModel(MODELS / "flow_int8.yaml", threads=1))
-    for refinement, expected in (("none", network), ("dis", DisFlow(network, finest_scale=2))):
+    for refinement, expected in (
+        ("none", network),
+        ("dis", DisFlow(network)),
+        ("quick_dis", DisFlow(network, quick=True)),
+    ):
         config = PerceptionConfig.model_validate({"flow_refinement": refinement})
         found = Perception(config, MODELS).flow("camera", first, second)
-        np.testing.assert_allclose(found, expected.flow(first, second), atol=0.05)
+        np.testing.assert_allclose(found, expected.flow(first, second), atol=1e-4)
