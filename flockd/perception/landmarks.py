@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 
 from flockd.messages import Float32Array, FloatArray, UInt8Array
 
-_MOST_CORNERS = 3000
+_MOST_CORNERS = 2000
 _LEAST_CONTRAST = 5
 """Grey levels; a blurred image has no strong corners."""
 _CELL_PX = 32
 _MOST_A_CELL = 25
 """Else all corners are in one plant."""
+_MOST_MATCHES = 1000
 _NEIGHBOURS = 12
 _LEAST_MATCHES = 20
 _AGREE_PX, _AGREE_SHARE = 6.0, 0.2
@@ -57,6 +58,7 @@ def _matches(first: UInt8Array, second: UInt8Array) -> tuple[FloatArray, FloatAr
     if not len(before) or not len(after):
         return np.empty((0, 2)), np.empty((0, 2))
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(looks_before, looks_after)
+    pairs = sorted(pairs, key=lambda pair: pair.distance)[:_MOST_MATCHES]
     start = before[[pair.queryIdx for pair in pairs]]
     return start, after[[pair.trainIdx for pair in pairs]] - start
 
