@@ -207,7 +207,7 @@ def test_what_a_mirror_shows_is_told_as_if_there_were_none() -> None:
     np.testing.assert_allclose(other.centre, [96 - raw.centre[0], raw.centre[1]], atol=0.05)
     for told in (one, other):
         assert told.centre[0] == pytest.approx(48 - 100 / 15, abs=3.0)
-        assert told.range_m == pytest.approx(1.5, rel=0.15)
+        assert told.range_m == pytest.approx(1.5, rel=0.25)
 
 
 def test_many_pictures_go_in_batches_no_larger_than_what_is_prepared(monkeypatch: pytest.MonkeyPatch) -> None:
