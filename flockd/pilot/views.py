@@ -232,7 +232,7 @@ class Observer:
                 further = _Look(look.candidate, direction, half_angle, answer.range_m, is_drone)
                 if number == 1 or (number < _MOST_LOOKS and not _shows_the_same(look, further)):
                     again.append(further)
-                else:
+                elif is_drone > _SURE:  # others would not get surer
                     settled.append((further, answer))
             looks = again
         found = []
