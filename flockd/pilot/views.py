@@ -247,7 +247,7 @@ class Observer:
     def _last_look(
         self, live: Rig, images: Mapping[str, UInt8Array], settled: Sequence[tuple[_Look, _Answer]]
     ) -> list[tuple[_Look, _Answer]]:
-        """The same looks with what their last answers and some more pictures say together."""
+        """The same looks with what their last answers and some more pictures say together, where all say something."""
         looks = [
             replace(look, half_angle=wide * look.half_angle, in_mirror=in_mirror)
             for look, _ in settled
@@ -255,10 +255,12 @@ class Observer:
         ]
         more = self._answers(live, images, looks)
         count = len(_LAST_LOOK)
-        return [
-            (look, _together(look.is_drone, [answer, *more[count * i : count * (i + 1)]]))
-            for i, (look, answer) in enumerate(settled)
-        ]
+        together = []
+        for i, (look, answer) in enumerate(settled):
+            answers = [answer, *more[count * i : count * (i + 1)]]
+            if all(_NEAREST_M < one.range_m < _FARTHEST_M and one.relative_sigma > 0 for one in answers):
+                together.append((look, _together(look.is_drone, answers)))
+        return together
 
     def _answers(self, live: Rig, images: Mapping[str, UInt8Array], looks: Sequence[_Look]) -> list[_Answer]:
         """What the second stage says of each look, in the body's axes."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -221,6 +222,21 @@ def test_the_last_pictures_count_by_how_sure_they_are(monkeypatch: pytest.Monkey
     assert mirrors[-1] == [True, False, True]
     assert np.linalg.norm(sighting.position) == pytest.approx(3.0 * 2 ** (1 / 13), rel=0.005)  # 1 of 1 + 3 * 4
     assert sighting.drone_probability == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("lie", [{"range_m": math.inf}, {"range_m": math.nan}, {"relative_sigma": 0.0}])
+def test_a_last_picture_that_tells_nonsense_gives_no_sighting(
+    monkeypatch: pytest.MonkeyPatch, lie: dict[str, Any]
+) -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
+    answers = flyer.truth.ranges
+
+    def ranges(pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
+        first, *others = answers(pictures)
+        return (replace(first, **lie) if others else first, *others)
+
+    monkeypatch.setattr(flyer.truth, "ranges", ranges)
+    assert not flyer.step().sightings
 
 
 @pytest.mark.parametrize(("is_drone", "sure", "unsure"), [(0.05, 0, 0), (0.35, 255, 255), (0.9, 1, 255)])
