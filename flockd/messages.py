@@ -20,6 +20,10 @@ UInt16Array = NDArray[np.uint16]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
+UNCLASSED = 255
+"""Label of pixels that are not to be used: too near a drone's outline to be sure of, or a drone's that is not sighted.
+Other labels are 0 for the background, then one value a drone."""
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:

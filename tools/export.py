@@ -53,7 +53,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "distance": {
         "net": DistanceNet,
         "roles": ["distance"],
-        "description": "Range of the drone in the middle of a picture, its centre and the uncertainty",
+        "description": "Range of the drone in the middle of a picture, its centre, the uncertainty, and its pixels",
         "size_multiple": 1,
         "golden_size": [96, 96],
         "inputs": {"picture": {**IMAGE, "shape": ["n", 96, 96, 3]}},
@@ -63,7 +63,8 @@ NETWORKS: dict[str, dict[str, Any]] = {
                 "log(range / focal length), centre right and down of the middle, log of the first's deviation, "
                 "logit of a drone being there, log(size * focal length / range)",
                 "log(m/px), px, px, 1, 1, log(px)",
-            )
+            ),
+            "mask": (["n", 96, 96], "logit of being this drone's", "1"),
         },
     },
     "flow": {

@@ -30,7 +30,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from tools.training.dataset import PairSet, open_pairs
 from tools.training.networks import MAX_DEPTH_M, DistanceNet, FlowNet, NeighboursNet
 from tools.training.pictures import PictureFiles
-from tools.training.samples import Sample, flow_sample, neighbours_sample, no_drone_sample
+from tools.training.samples import (
+    Sample,
+    distance_sample,
+    drone_list,
+    flow_sample,
+    neighbours_sample,
+    no_drone_sample,
+)
 
 Batch = dict[str, Tensor]
 
@@ -100,45 +107,54 @@ class NeighboursTask(Task):
 
 
 class DistanceTask(Task):
-    """Range of the drone in the middle of a picture.
+    """Range of the drone in the middle of a picture, and which pixels are its own.
 
-    Drones come from the files of render_drone_pictures.py, as many as there are by now. What is no drone is cut from
-    whole images, into a pool that is renewed a little with every batch: cutting costs more than learning from it.
+    Most drones come from the files of render_drone_pictures.py, as many as there are by now. What is no drone, and the
+    drones whose pixels are known, are cut from whole images, into two pools that are renewed a little with every batch:
+    cutting costs more than learning from it.
     """
 
     pool_size = 20_000
-    renewed_in_a_batch = 2
-    no_drone_share = 0.25
+    renewed_in_a_batch = 3
+    no_drone_share, masked_share = 0.25, 0.35
 
     def __init__(self, pairs: PairSet, negatives: Path, pictures: Path) -> None:
         super().__init__(DistanceNet(), 64, 2e-3)
         self.pairs, self.negatives = pairs, np.load(negatives)
         self.drones = PictureFiles(pictures)
-        self.pool: list[Sample] = []
+        self.whole = drone_list(pairs)
+        self.no_drones: list[Sample] = []
+        self.masked: list[Sample] = []
 
     def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
         """See ``Task``."""
         self.drones.look_for_more()
-        while len(self.pool) < self.pool_size:
-            self.pool.append(self._no_drone(rng))
-        for _ in range(self.renewed_in_a_batch):
-            self.pool[int(rng.integers(self.pool_size))] = self._no_drone(rng)
+        for pool, draw in ((self.no_drones, self._no_drone), (self.masked, self._masked)):
+            while len(pool) < self.pool_size:
+                pool.append(draw(rng))
+            for _ in range(self.renewed_in_a_batch):
+                pool[int(rng.integers(self.pool_size))] = draw(rng)
         return super().batch_samples(rng)
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """See ``Task``."""
-        if rng.random() < self.no_drone_share:
-            return self.pool[int(rng.integers(self.pool_size))]
-        return self.drones.draw(rng)
+        kind = rng.random()
+        if kind < self.no_drone_share + self.masked_share:
+            pool = self.no_drones if kind < self.no_drone_share else self.masked
+            return pool[int(rng.integers(self.pool_size))]
+        return {**self.drones.draw(rng), **_empty_mask(known=False)}
+
+    def _masked(self, rng: np.random.Generator) -> Sample:
+        return distance_sample(self.pairs, self.whole[int(rng.integers(len(self.whole)))], rng)
 
     def _no_drone(self, rng: np.random.Generator) -> Sample:
         hard = self.negatives[int(rng.integers(len(self.negatives)))] if rng.random() < 0.7 else None
-        return no_drone_sample(self.pairs, hard, rng)
+        return {**no_drone_sample(self.pairs, hard, rng), **_empty_mask(known=True)}
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         """See ``Task``."""
         batch = _flipped(batch)
-        out, families, motors = self.net(batch["picture"])
+        out, masks, families, motors = self.net(batch["picture"])
         there = batch["drone"]
         error = (out[:, 0] - batch["target"][:, 0]).abs()
         centre = (out[:, 1:3] - batch["target"][:, 1:3]).abs().clamp(max=30).sum(1)
@@ -159,7 +175,25 @@ class DistanceTask(Task):
             "other": float(right[~seen].float().mean()) if (~seen).any() else float("nan"),
         }
         exists = F.binary_cross_entropy_with_logits(out[:, 4], there)
-        return (each * there).sum() / there.sum().clamp(min=1) + 0.5 * exists, figures
+        mask_loss, figures["iou"] = _mask_loss(masks.float(), batch["mask"].float() / 255, batch["mask_known"], seen)
+        return (each * there).sum() / there.sum().clamp(min=1) + 0.5 * exists + mask_loss, figures
+
+
+def _empty_mask(*, known: bool) -> Sample:
+    return {"mask": np.zeros((96, 96), np.uint8), "mask_known": np.array(known, np.float32)}
+
+
+def _mask_loss(logits: Tensor, mask: Tensor, known: Tensor, seen: Tensor) -> tuple[Tensor, float]:
+    """Of (n, ., .) masks where they are known; and the mean IoU of the drones among them."""
+    bce = F.binary_cross_entropy_with_logits(logits, mask, reduction="none").mean((1, 2))
+    probability = torch.sigmoid(logits)
+    both, either = (probability * mask).sum((1, 2)), (probability + mask).sum((1, 2))
+    dice = 1 - (2 * both + 20) / (either + 20)
+    drone = known * seen
+    loss = (2.0 * bce * known).sum() / known.sum().clamp(min=1) + 0.3 * (dice * drone).sum() / drone.sum().clamp(min=1)
+    guess, mine = logits > 0, mask > 0.5
+    iou = (guess & mine).sum((1, 2)) / (guess | mine).sum((1, 2)).clamp(min=1)
+    return loss, float((iou * drone).sum() / drone.sum().clamp(min=1))
 
 
 def _flipped(batch: Batch) -> Batch:
@@ -172,10 +206,11 @@ def _flipped(batch: Batch) -> Batch:
     strange = (torch.rand(n) < 0.25)[:, None, None, None]
     picture = torch.where(strange, picture[..., torch.randperm(3)], picture)
     picture = (picture.float() * light + 5.0 * torch.randn(n, 1, 1, 1)).clamp(0, 255).to(torch.uint8)
+    mask = torch.where(mirror[:, None, None], batch["mask"].flip(2), batch["mask"])
     target, motors = batch["target"].clone(), batch["motors"].clone()
     target[:, 1] *= sign
     motors[:, :, 0] *= sign[:, None]
-    return {**batch, "picture": picture, "target": target, "motors": motors}
+    return {**batch, "picture": picture, "mask": mask, "target": target, "motors": motors}
 
 
 def _motor_maps(motors: Tensor, sigma: float = 1.5) -> Tensor:

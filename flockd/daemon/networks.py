@@ -56,9 +56,9 @@ class WatchedNetworks:
         """See `Perceiver`, and so for the next three."""
         return self._networks.has_distance
 
-    def flow(self, camera: str, first: UInt8Array, second: UInt8Array) -> Float32Array:
+    def flow(self, camera: str, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
         """Raises NetworkStuckError; so do the next two."""
-        answer: Float32Array = self._call(self._networks.flow, camera, first, second)
+        answer: Float32Array = self._call(self._networks.flow, camera, first, second, labels)
         return answer
 
     def scene(self, camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:

@@ -69,9 +69,9 @@ class RecordedDepth:
         """The depth of the next step's image; None: what is learned."""
         self._depth = depth
 
-    def flow(self, camera: str, first: UInt8Array, second: UInt8Array) -> Float32Array:
+    def flow(self, camera: str, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
         """The learned flow."""
-        return self._learned.flow(camera, first, second)
+        return self._learned.flow(camera, first, second, labels)
 
     def scene(self, camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:
         """The learned drones, and the recorded depth."""

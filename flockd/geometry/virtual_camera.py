@@ -17,6 +17,8 @@ from flockd.geometry.transform import RigidTransform
 from flockd.messages import BoolArray, Float32Array, FloatArray, UInt8Array
 
 _GREY = 128
+_AT_A_TIME = 30_000
+"""OpenCV samples no more places in a row."""
 _MINIFICATION = 1.5
 """Image pixels per crop pixel from which on single samples would alias."""
 
@@ -52,6 +54,18 @@ class VirtualCrop:
             crop[seen] = drawn[seen]
             valid |= seen
         return crop, valid
+
+    def look_up(self, values: Float32Array, points_body: FloatArray) -> Float32Array:
+        """(n,) what a map (size, size) over the picture says at points (n, 3) of the body; NaN where not in it."""
+        pixels = self.camera.project(self.T_body_virtual.inverse().apply(points_body))
+        inside = self.camera.in_image(pixels)
+        found = np.full(len(points_body), np.nan, np.float32)
+        places = (pixels[inside] - 0.5).astype(np.float32)
+        for start in range(0, len(places), _AT_A_TIME):
+            u, v = places[start : start + _AT_A_TIME].T[:, :, None]
+            part = cv2.remap(values, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            found[np.flatnonzero(inside)[start : start + _AT_A_TIME]] = part[:, 0]
+        return found
 
     def _maps(self, images: Mapping[str, UInt8Array], range_m: float | None) -> dict[str, Float32Array]:
         """For each camera that is needed, u and v (2, size, size) of what it fills the crop with; NaN elsewhere."""

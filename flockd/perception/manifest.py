@@ -18,8 +18,8 @@ Role = Literal["flow", "depth", "segmentation", "distance"]
 Content = Literal["first", "second", "image", "geometry", "picture"]
 """What flockd can put into an input: the earlier and the later image of a pair, one image, its rays and flat ground
 (see `Perception.scene`), the picture of one drone."""
-Answer = Literal["flow", "depth", "drone", "offset", "range"]
-"""What flockd can take from an output."""
+Answer = Literal["flow", "depth", "drone", "offset", "range", "mask"]
+"""What flockd can take from an output; the mask may be missing."""
 Unknown = Literal["nothing", "scale", "scale_and_shift"]
 
 _NEEDED: dict[Role, tuple[set[Content], set[Answer]]] = {

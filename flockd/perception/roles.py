@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,6 +12,8 @@ import numpy as np
 from flockd.config.parameters import PerceptionConfig
 from flockd.errors import ModelError
 from flockd.messages import BoolArray, Float32Array, FloatArray, UInt8Array
+from flockd.perception.background_flow import settle_background
+from flockd.perception.drone_flow import follow_drones
 from flockd.perception.fitting import fit
 from flockd.perception.flow import DisFlow, Flow, OnnxFlow
 from flockd.perception.instances import Instance, group_instances
@@ -51,6 +53,8 @@ class SceneMaps:
     """What is there instead of metres, for `flockd.pilot.scale` to fix."""
     unsure: BoolArray | None = None
     """(h, w) which pixels of the drones may just as well be background; None: no such."""
+    logit: Float32Array | None = None
+    """(h, w) / `Perception.map_scale`, of each pixel being any drone's; None: the labels are all that is known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +85,8 @@ class RangeEstimate:
     """The drone's size from tip to tip; errs like the range does, but is the same in every picture of one drone."""
     is_drone: float = 1.0
     """Probability that there is a drone at all."""
+    mask: Float32Array | None = None
+    """(size, size) logit of each pixel of the picture being that drone's; None: the model does not say."""
 
 
 class Perception:
@@ -111,9 +117,13 @@ class Perception:
         for model in self._models.values():
             model.terminate()
 
-    def flow(self, camera: str, first: UInt8Array, second: UInt8Array) -> Float32Array:
-        """(h, w, 2) pixels from the first image to the second."""
-        return self._flow.flow(first, second)
+    def flow(self, camera: str, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
+        """(h, w, 2) pixels from the first image to the second.
+
+        ``labels`` (h, w) of the first image: one value a drone, 0 and 255 none. Each drone's flow is found by itself.
+        """
+        flow = settle_background(self._flow.flow(first, second), first, second, labels)
+        return follow_drones(flow, first, second, labels)
 
     def scene(self, camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:
         """Depth and drones of one image.
@@ -132,7 +142,7 @@ class Perception:
         labels = np.asarray(cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
         unsure = cv2.resize((logit < sure).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         maps = self._maps(depth, labels, instances, geometry)
-        return replace(maps, unsure=unsure & (labels > 0))
+        return replace(maps, unsure=unsure & (labels > 0), logit=logit)
 
     def ranges(self, pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
         """The second stage: range and centre of the drone in the middle of each picture."""
@@ -141,12 +151,17 @@ class Perception:
         if not pictures:
             return ()
         shown = [np.ascontiguousarray(p.image[:, ::-1]) if p.in_mirror else p.image for p in pictures]
-        out = np.concatenate(
-            [
-                self._distance.answer({"picture": shown[i : i + PICTURES_AT_A_TIME]})["range"]
-                for i in range(0, len(shown), PICTURES_AT_A_TIME)
+        answers = [
+            self._distance.answer({"picture": shown[i : i + PICTURES_AT_A_TIME]})
+            for i in range(0, len(shown), PICTURES_AT_A_TIME)
+        ]
+        out = np.concatenate([answer["range"] for answer in answers])
+        masks: Sequence[Float32Array | None] = [None] * len(pictures)
+        if "mask" in answers[0]:
+            masks = [
+                np.ascontiguousarray(m[:, ::-1]) if p.in_mirror else m
+                for p, m in zip(pictures, _masks(answers), strict=True)
             ]
-        )
         out[[p.in_mirror for p in pictures], 1] *= -1.0
         middle = self.picture_size / 2
         return tuple(
@@ -156,8 +171,9 @@ class Perception:
                 centre=np.array([middle + row[1], middle + row[2]], np.float64),
                 size_m=float(np.exp(row[0] + row[5])),
                 is_drone=float(1.0 / (1.0 + np.exp(-row[4]))),
+                mask=mask,
             )
-            for row, picture in zip(out, pictures, strict=True)
+            for row, picture, mask in zip(out, pictures, masks, strict=True)
         )
 
     def _look(self, model: OnnxModel, image: UInt8Array, geometry: Float32Array) -> dict[Answer, Float32Array]:
@@ -239,6 +255,10 @@ class Perception:
                 "choose another"
             )
         return model
+
+
+def _masks(answers: Sequence[Mapping[Answer, Float32Array]]) -> Float32Array:
+    return np.concatenate([answer["mask"][:, 0] for answer in answers])
 
 
 def _focal_px(geometry: Float32Array, stride: int) -> float:

@@ -16,8 +16,8 @@ from flockd.geometry import (
     label_pixels,
     lift_matches,
 )
-from flockd.messages import EgoMotion, Float32Array, NeighbourMotion
-from flockd.pilot.views import UNCLASSED, RigView
+from flockd.messages import UNCLASSED, EgoMotion, Float32Array, NeighbourMotion
+from flockd.pilot.views import RigView
 
 _PIXELS_A_DRONE = 300
 _MIN_DRONE_PAIRS = 12

@@ -134,8 +134,8 @@ class FlockPilot:
     ) -> dict[str, Float32Array]:
         if previous is None:
             return {}
-        both = [name for name in maps if name in previous.cameras]
-        return {n: self._perceiver.flow(n, previous.cameras[n].image, frames.frames[n].image) for n in both}
+        both = {name: previous.cameras[name] for name in maps if name in previous.cameras}
+        return {n: self._perceiver.flow(n, v.image, frames.frames[n].image, v.labels) for n, v in both.items()}
 
     @staticmethod
     def _fixed(

@@ -11,13 +11,21 @@ import cv2
 import numpy as np
 
 from flockd.geometry import Rig, RigCamera, ground_inverse_depth, virtual_crop
-from flockd.messages import Float32Array, FloatArray, Frame, FrameSet, Sighting, UInt8Array, VehicleState
+from flockd.messages import (
+    UNCLASSED,
+    Float32Array,
+    FloatArray,
+    Frame,
+    FrameSet,
+    Sighting,
+    UInt8Array,
+    VehicleState,
+)
 from flockd.perception import Instance, Picture, RangeEstimate, SceneMaps
+from flockd.pilot.outlines import Mask, Outliner
 from flockd.pilot.scale import fix_by_height
 from flockd.tracking import ExpectedNeighbour
 
-UNCLASSED = 255
-"""Label of pixels too near a drone's outline to be sure of, and of drones that are not sighted."""
 _OUTLINE_PX = 5
 _FIRST_MARGIN = 1.3
 """A picture of a drone is this much wider than its box."""
@@ -67,8 +75,8 @@ class Perceiver(Protocol):
         """Whether there is a second stage for a drone's range."""
         ...
 
-    def flow(self, camera: str, first: UInt8Array, second: UInt8Array) -> Float32Array:
-        """(h, w, 2) pixels from the first image to the second."""
+    def flow(self, camera: str, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
+        """(h, w, 2) pixels from the first image to the second; ``labels`` (h, w) say which of the first are drones."""
         ...
 
     def scene(self, camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:
@@ -109,6 +117,7 @@ class Observer:
         self._perceiver = perceiver
         self._height_fixes_scale = height_fixes_scale
         self._tangents = {name: _ray_tangents(c, perceiver.map_scale) for name, c in rig.cameras.items()}
+        self._outliners = {name: Outliner(c, perceiver.map_scale) for name, c in rig.cameras.items()}
 
     def scenes(self, frames: FrameSet, vehicle: VehicleState) -> tuple[dict[str, SceneMaps], list[str]]:
         """The networks' maps of every camera that can be used, and why the others cannot."""
@@ -144,7 +153,7 @@ class Observer:
         found, refused = self._locate(images, maps) if maps else ([], set())
         if maps and self._perceiver.has_distance:
             found += self._look_again(images, vehicle, found, expected)
-        sightings, label_of = _merge(_without_hidden(found))
+        sightings, label_of, masks_of = _merge(_without_hidden(found))
         views = {}
         for name, scene in maps.items():
             table = np.full(256, UNCLASSED, np.uint8)
@@ -155,6 +164,8 @@ class Observer:
             labels = table[scene.labels]
             if scene.unsure is not None:
                 labels[scene.unsure & (labels > 0)] = UNCLASSED
+            if scene.logit is not None:
+                labels = self._outliners[name].draw(labels, scene.logit, sightings, masks_of)
             depth = self._drone_depth(scene.depth, labels, self._rig.cameras[name], sightings)
             views[name] = CameraView(images[name], depth, _without_outline(labels))
         return RigView(frames.time_s, vehicle, views, sightings, tuple(reasons))
@@ -241,7 +252,9 @@ class Observer:
                 refused.append(look.candidate)
                 continue
             sigma_m = max(_MEAN_SIGMA * answer.relative_sigma, _MIN_RELATIVE_SIGMA) * answer.range_m
-            found.append(_Located(look.candidate, answer.position, sigma_m, answer.size_m, answer.is_drone))
+            found.append(
+                _Located(look.candidate, answer.position, sigma_m, answer.size_m, answer.is_drone, answer.masks)
+            )
         return found, refused
 
     def _last_look(
@@ -278,10 +291,11 @@ class Observer:
             for crop, look in zip(crops, looks, strict=True)
         ]
         answers = []
-        for crop, estimate in zip(crops, self._perceiver.ranges(pictures), strict=True):
+        for look, crop, estimate in zip(looks, crops, self._perceiver.ranges(pictures), strict=True):
             ray = crop.camera.rays(estimate.centre[None])[0]
             position = crop.T_body_virtual.apply(estimate.range_m * ray[None])[0]
-            answers.append(_Answer(position, estimate.relative_sigma, estimate.size_m, estimate.is_drone))
+            masks = () if estimate.mask is None else (Mask(crop, estimate.mask, look.half_angle),)
+            answers.append(_Answer(position, estimate.relative_sigma, estimate.size_m, estimate.is_drone, masks))
         return answers
 
     def _locate_by_depth(self, candidate: _Candidate, scene: SceneMaps) -> _Located | None:
@@ -359,6 +373,7 @@ class _Answer:
     relative_sigma: float
     size_m: float
     is_drone: float
+    masks: tuple[Mask, ...] = ()
 
     @property
     def range_m(self) -> float:
@@ -373,6 +388,7 @@ class _Located:
     range_sigma_m: float
     size_m: float
     is_drone: float = 1.0
+    masks: tuple[Mask, ...] = ()
 
 
 def _fault(frame: Frame | None, camera: RigCamera) -> str | None:
@@ -436,6 +452,7 @@ def _together(is_drone: float, answers: Sequence[_Answer]) -> _Answer:
         relative_sigma=mean(sigmas),
         size_m=mean([answer.size_m for answer in answers]),
         is_drone=min(is_drone, *(answer.is_drone for answer in answers)),
+        masks=tuple(mask for answer in answers for mask in answer.masks),
     )
 
 
@@ -466,8 +483,13 @@ def _without_hidden(found: Sequence[_Located]) -> list[_Located]:
     return [one for one in found if not any(hides(other, one) for other in found)]
 
 
-def _merge(found: Sequence[_Located]) -> tuple[tuple[Sighting, ...], dict[tuple[str, int], int]]:
-    """One sighting a drone: what two cameras place at the same spot is one. Also (camera, instance) -> label."""
+def _merge(
+    found: Sequence[_Located],
+) -> tuple[tuple[Sighting, ...], dict[tuple[str, int], int], dict[int, list[Mask]]]:
+    """One sighting a drone: what two cameras place at the same spot is one.
+
+    Also (camera, instance) -> label, and the masks of each label.
+    """
     groups: list[list[_Located]] = []
     for one in sorted(found, key=lambda item: -item.candidate.area_px):
         for group in groups:
@@ -476,7 +498,7 @@ def _merge(found: Sequence[_Located]) -> tuple[tuple[Sighting, ...], dict[tuple[
                 break
         else:
             groups.append([one])
-    sightings, label_of = [], {}
+    sightings, label_of, masks_of = [], {}, {}
     for label, group in enumerate(groups[: UNCLASSED - 1], start=1):
         weights = np.array([one.range_sigma_m**-2 for one in group])
         position = (weights[:, None] * np.array([one.position for one in group])).sum(0) / weights.sum()
@@ -492,10 +514,11 @@ def _merge(found: Sequence[_Located]) -> tuple[tuple[Sighting, ...], dict[tuple[
                 label=label,
             )
         )
+        masks_of[label] = [mask for one in group for mask in one.masks]
         for one in group:
             if one.candidate.instance:
                 label_of[(one.candidate.cameras[0], one.candidate.instance.label)] = label
-    return tuple(sightings), label_of
+    return tuple(sightings), label_of, masks_of
 
 
 def _is_same(a: _Located, b: _Located) -> bool:

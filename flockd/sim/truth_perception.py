@@ -58,10 +58,10 @@ class TruthPerception:
         """What the next step's frames truly hold."""
         self._before, self._now = self._now, shot
 
-    def flow(self, camera: str, first: UInt8Array, second: UInt8Array) -> Float32Array:
+    def flow(self, camera: str, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
         """The true or the learned flow."""
         if "flow" not in self._swap:
-            return self._learned.flow(camera, first, second)
+            return self._learned.flow(camera, first, second, labels)
         before, now = _known(self._before), _known(self._now)
         flow, _ = true_flow(
             before.views[camera], now.views[camera], _matrix(self._rig, camera),

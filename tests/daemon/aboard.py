@@ -69,7 +69,7 @@ class TinyPerceiver:
         if self.ends_when_told:
             self.hangs.clear()
 
-    def flow(self, camera: str, first: UInt8Array, second: UInt8Array) -> Float32Array:
+    def flow(self, camera: str, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
         if self.astray > 0:
             self.astray -= 1
             raise FloatingPointError("model tiny: output flow is not finite")

@@ -68,7 +68,7 @@ class Onlooker:
         self._flow = DisFlow()
         self._depth: Iterator[FloatArray] = iter(depth)
 
-    def flow(self, camera: str, first: UInt8Array, second: UInt8Array) -> Float32Array:
+    def flow(self, camera: str, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
         return self._flow.flow(first, second)
 
     def scene(self, camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:

@@ -159,3 +159,14 @@ def test_the_widest_crop_can_be_drawn_wherever_the_rig_looks() -> None:
             picture, seen = virtual_crop(RIG, direction, np.radians(35.0), 24).sample(images)
             assert (picture[seen] == 90).all()
             assert seen.mean() > 0.5
+
+
+def test_a_map_over_the_picture_is_looked_up_at_places_of_the_body() -> None:
+    crop = virtual_crop(RIG, np.array([0.9, 0.3, 0.2]), 0.2, 96)
+    pixels = np.random.default_rng(0).uniform(1.0, 95.0, (40_000, 2))
+    points = crop.T_body_virtual.apply(crop.camera.unproject(pixels, np.full(len(pixels), 3.0)))
+    columns = np.broadcast_to(np.arange(96, dtype=np.float32) + 0.5, (96, 96))
+    np.testing.assert_allclose(crop.look_up(columns.copy(), points), pixels[:, 0], atol=0.05)
+    np.testing.assert_allclose(crop.look_up(columns.T.copy(), points), pixels[:, 1], atol=0.05)
+    beside = crop.T_body_virtual.apply(np.array([[0.0, 1.0, 3.0], [0.0, 0.0, -3.0]]))
+    assert np.isnan(crop.look_up(columns.copy(), beside)).all()

@@ -32,7 +32,7 @@ class NoNetworks:
     map_scale = 2
     has_distance = True
 
-    def flow(self, camera: str, first: UInt8Array, second: UInt8Array) -> Float32Array:
+    def flow(self, camera: str, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
         raise AssertionError("asked for a learned flow")
 
     def scene(self, camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:
@@ -300,7 +300,7 @@ def test_two_sightings_in_one_direction_are_one_drone(range_m: float, turned_deg
     aside = np.array([math.cos(turned), math.sin(turned), 0.0])
     one = views._Located(views._Candidate(("front",), ahead, 0.2), 4.0 * ahead, 0.1, size_m=0.7)
     other = views._Located(views._Candidate(("left",), aside, 0.2), range_m * aside, 0.1, size_m=0.7)
-    sightings, _ = views._merge([one, other])
+    sightings, *_ = views._merge([one, other])
     assert len(sightings) == (1 if same else 2)
 
 

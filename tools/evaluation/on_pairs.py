@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.geometry import Rig
-from flockd.messages import Frame, FrameSet, Sighting, VehicleState
-from flockd.perception import DisFlow, Perception, SceneMaps
+from flockd.messages import UNCLASSED, Frame, FrameSet, Sighting, VehicleState
+from flockd.perception import DisFlow, Perception
 from flockd.pilot.views import Observer
 from flockd.sim.drone_models import drone_model
 from tools.training.dataset import HEIGHT, R_BODY_CAMERA, WIDTH, PairSet, rig_camera
@@ -91,11 +91,14 @@ def look_at_pairs(pairs: PairSet, perception: Perception, indices: Iterable[int]
             off = _depth_errors(maps["camera"].depth[1::2, 1::2], depth, ids)
             found.depth[with_height].append(float(off.mean()) if off.size else 0.0)
             found.depth_pixels[with_height].append(off[::16])
-        _masks(_drone_pixels(maps["camera"])[1::2, 1::2], ids, pairs, index, found)
-        _drones(observer.view(frames, vehicle, maps, ()).sightings, pairs, index, depth, ids, found)
+        view = observer.view(frames, vehicle, maps, ())
+        labels = view.cameras["camera"].labels
+        _masks(((labels > 0) & (labels != UNCLASSED))[1::2, 1::2], ids, pairs, index, found)
+        _drones(view.sightings, pairs, index, depth, ids, found)
         flow = np.asarray(pairs["flow"][index], np.float32)
         valid = np.asarray(pairs["flow_valid"][index])
-        for name, guess in (("network", perception.flow("camera", *images)), ("dis", dis.flow(*images))):
+        ours = perception.flow("camera", images[0], images[1], labels)
+        for name, guess in (("network", ours), ("dis", dis.flow(images[0], images[1]))):
             error = np.linalg.norm(np.moveaxis(guess[1::2, 1::2], 2, 0) - flow, axis=0)
             for on_drones in (False, True):
                 found.flow.setdefault((name, on_drones), []).append(error[valid & ((ids > 0) == on_drones)])
@@ -105,11 +108,6 @@ def look_at_pairs(pairs: PairSet, perception: Perception, indices: Iterable[int]
 def _depth_errors(guess: Array, true: Array, ids: Array) -> Array:
     near = (ids == 0) & (true < 60.0)
     return np.asarray(np.abs(guess[near] - true[near]) / true[near])
-
-
-def _drone_pixels(maps: SceneMaps) -> Array:
-    drone = maps.labels > 0
-    return drone if maps.unsure is None else drone & ~maps.unsure
 
 
 def _masks(guess: Array, ids: Array, pairs: PairSet, index: int, found: Findings) -> None:

@@ -136,7 +136,8 @@ class DistanceNet(nn.Module):
     Input: picture (n, 96, 96, 3) uint8 of a virtual camera that faces the drone. Outputs (n, 6):
     log of (range in m / focal length in px), the drone's centre right and down of the picture's centre in px,
     log of the standard deviation of the first, logit of there being a drone at all, log of the drone's size in px
-    as it would appear from the side (its size in m times focal length over range).
+    as it would appear from the side (its size in m times focal length over range). And (n, 96, 96): for each pixel the
+    logit of being this drone's.
     """
 
     size = 96
@@ -155,12 +156,16 @@ class DistanceNet(nn.Module):
         self.up = nn.ModuleList([_conv(b, a, kernel=1) for a, b in pairwise(w)])
         self.merge = nn.ModuleList([_conv(a, a) for a in w[:4]])
         self.look = nn.Conv2d(w[0], self.maps, 1)
+        self.mask = nn.Sequential(_conv(w[0], w[0]), nn.Conv2d(w[0], 4, 1), nn.PixelShuffle(2))
         self.summary = nn.Sequential(nn.Linear(128 * 9 + 6 * self.maps + 2, 160), nn.ReLU(True))
         self.head = nn.Linear(160, 6)
         self.family = nn.Linear(160, MAX_FAMILIES)
 
-    def forward(self, picture: Tensor) -> Tensor | tuple[Tensor, Tensor, Tensor]:
-        """One row a picture; in training also a logit for each family, and log maps of the motors (n, 4, 48 * 48)."""
+    def forward(self, picture: Tensor) -> tuple[Tensor, ...]:
+        """One row and one mask a picture.
+
+        In training also a logit for each family, and log maps of the motors (n, 4, 48 * 48).
+        """
         x = self.stem(_blocks(picture, 2))
         levels = [x]
         for down, body in zip(self.down, self.body, strict=True):
@@ -170,7 +175,7 @@ class DistanceNet(nn.Module):
         for i in reversed(range(len(self.merge))):
             x = F.interpolate(self.up[i](x), scale_factor=2.0, mode="nearest")
             x = self.merge[i](x + self.lateral[i](levels[i]))
-        where = _in_full_precision(self.look, x)
+        where, mask = _in_full_precision(self.look, x), self.mask(x)[:, 0]
         middles, moments = _moments(where)
         spread, shape = _spread(middles[:, : self.motors])
         x = _in_full_precision(self.summary, torch.cat([whole.float(), moments, shape], 1))
@@ -179,8 +184,8 @@ class DistanceNet(nn.Module):
         sigma = (out[:, 3:4] - 3.0).clamp(-7.0, 1.0)
         out = torch.cat([out[:, :1] - 0.5 - apparent, out[:, 1:3] * 10.0, sigma, out[:, 4:5], apparent], 1)
         if not self.training:
-            return out
-        return out, _in_full_precision(self.family, x), where[:, : self.motors].flatten(2).log_softmax(2)
+            return out, mask
+        return out, mask, _in_full_precision(self.family, x), where[:, : self.motors].flatten(2).log_softmax(2)
 
 
 def _moments(where: Tensor) -> tuple[Tensor, Tensor]:

@@ -92,7 +92,7 @@ class DroneInView:
 def distance_sample(
     pairs: PairSet, drone: tuple[int, int, int], rng: np.random.Generator, *, augment: bool = True
 ) -> Sample:
-    """A picture of one drone and its range, for ``DistanceNet``."""
+    """A picture of one drone, its range and which of the pixels are its own, for ``DistanceNet``."""
     pair, k, d = drone
     seen = DroneInView(
         float(pairs["focal"][pair]),
@@ -100,7 +100,18 @@ def distance_sample(
         np.asarray(pairs["drone_rotation"][pair, k, d], np.float64),
         int(pairs["drone_family"][pair, d]),
     )
-    return picture_of(seen, crop_around(seen, rng), np.asarray(pairs["image"][pair][k]), rng, augment=augment)
+    crop = crop_around(seen, rng)
+    sample = picture_of(seen, crop, np.asarray(pairs["image"][pair][k]), rng, augment=augment)
+    return {**sample, "mask": _mask_of(crop, pairs["ids"][pair][k] == d + 1), "mask_known": np.array(1.0, np.float32)}
+
+
+def _mask_of(crop: VirtualCrop, mine: NDArray[Any]) -> NDArray[np.uint8]:
+    """(96, 96) how much of each of the crop's pixels is the drone's, 0-255, of every second pixel of an image."""
+    to_half = np.array([[0.5, 0.0, -0.5], [0.0, 0.5, -0.5]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    full = cv2.warpAffine(np.uint8(255) * mine.astype(np.uint8), to_half, (WIDTH, HEIGHT), flags=flags)
+    picture, seen = crop.sample({"camera": np.repeat(full[:, :, None], 3, 2)})
+    return np.where(seen, picture[:, :, 0], np.uint8(0))
 
 
 def crop_around(drone: DroneInView, rng: np.random.Generator) -> VirtualCrop:

@@ -1,0 +1,96 @@
+"""Which pixels are whose where the second stage looked: finer than the whole image's map, and each drone by itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from flockd.geometry import RigCamera, VirtualCrop
+from flockd.messages import UNCLASSED, BoolArray, Float32Array, FloatArray, Sighting, UInt8Array
+
+_TO_THE_CORNERS = 1.5
+"""Of a picture, from its middle, as a share of the way to its borders."""
+_SURELY_NOT = -20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Mask:
+    """Which pixels of a picture are its drone's."""
+
+    crop: VirtualCrop
+    logit: Float32Array
+    """(size, size)"""
+    half_angle: float
+
+
+class Outliner:
+    """Draws one camera's drones."""
+
+    def __init__(self, camera: RigCamera, stride: int) -> None:
+        """``stride``: image pixels per pixel of the first stage's map."""
+        self._camera, self._stride = camera, stride
+        width, height = camera.camera.size
+        # A pixel of the map tells of the last one of its block: those are the ones that networks are trained on.
+        u, v = np.meshgrid(*(np.arange(stride, size + 1, stride) - 0.5 for size in (width, height)))
+        rays = camera.camera.rays(np.stack([u.ravel(), v.ravel()], 1)) @ camera.T_body_camera.rotation.T
+        self._rays: Float32Array = np.asarray(rays.reshape(*u.shape, 3), dtype=np.float32)
+
+    def draw(
+        self,
+        labels: UInt8Array,
+        logit: Float32Array,
+        sightings: Sequence[Sighting],
+        masks_of: Mapping[int, Sequence[Mask]],
+    ) -> UInt8Array:
+        """The camera's labels (h, w) with each sighting's pixels as both stages see them.
+
+        Args:
+            labels: (h, w) as the first stage alone has them.
+            logit: (h / stride, w / stride) of a pixel being any drone's, as the first stage says.
+            sightings: of the whole rig.
+            masks_of: the second stage's, by the sighting's label; none where it does not tell.
+        """
+        labels, highest = labels.copy(), np.zeros(labels.shape, np.float32)
+        for sighting in sightings:
+            masks = masks_of[sighting.label]
+            if self._camera.name not in sighting.cameras or not masks:
+                continue
+            box, looked_at, said = self._said(sighting.position, masks, logit)
+            mine = said > highest[box]
+            labels[box][looked_at & (labels[box] == sighting.label)] = UNCLASSED
+            labels[box][mine] = sighting.label
+            highest[box][mine] = said[mine]
+        return labels
+
+    def _said(
+        self, position: FloatArray, masks: Sequence[Mask], logit: Float32Array
+    ) -> tuple[tuple[slice, slice], BoolArray, Float32Array]:
+        """A part of the image, where in it the second stage looked, and the logit of each pixel being this drone's.
+
+        The pictures' mean, and what the first stage says of the pixel being any drone's, add up.
+        """
+        stride, range_m = self._stride, float(np.linalg.norm(position))
+        widest = min(_TO_THE_CORNERS * max(mask.half_angle for mask in masks), math.pi / 2)
+        rows, columns = np.nonzero(self._rays @ (position / range_m).astype(np.float32) > math.cos(widest))
+        if not len(rows):
+            return (slice(0), slice(0)), np.zeros((0, 0), np.bool_), np.zeros((0, 0), np.float32)
+        points = self._camera.T_body_camera.translation + range_m * self._rays[rows, columns].astype(np.float64)
+        seen = np.stack([mask.crop.look_up(mask.logit, points) for mask in masks])
+        told = np.isfinite(seen)
+        top, left, bottom, right = rows.min(), columns.min(), rows.max() + 1, columns.max() + 1
+        looked_at = np.zeros((bottom - top, right - left), np.uint8)
+        looked_at[rows - top, columns - left] = told.any(0)
+        mean = np.where(told, seen, 0.0).sum(0) / np.maximum(told.sum(0), 1)
+        said = np.full(looked_at.shape, _SURELY_NOT, np.float32)
+        said[rows - top, columns - left] = np.where(told.any(0), mean + logit[rows, columns], _SURELY_NOT)
+        size = int(right - left) * stride, int(bottom - top) * stride
+        back = np.array([[1.0, 0.0, 1.0 - stride], [0.0, 1.0, 1.0 - stride]]) / stride
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        fine = cv2.warpAffine(said, back, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        where = cv2.resize(looked_at, size, interpolation=cv2.INTER_NEAREST) > 0
+        box = slice(top * stride, bottom * stride), slice(left * stride, right * stride)
+        return box, np.asarray(where), np.asarray(fine, np.float32)

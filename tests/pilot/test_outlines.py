@@ -1,0 +1,101 @@
+"""Pixels belong to whom both stages say."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from flockd.config import load_scenario
+from flockd.data import data_path
+from flockd.geometry import Rig, RigCamera, build_rig, virtual_crop
+from flockd.messages import UNCLASSED, BoolArray, Float32Array, FloatArray, Sighting
+from flockd.pilot.outlines import Mask, Outliner
+
+SIZE = 96
+RIG: Rig = build_rig(load_scenario(data_path("config") / "paper_flight.yaml").drone.rig)
+FRONT: RigCamera = RIG.cameras["front"]
+WIDTH, HEIGHT = FRONT.camera.size
+PLAIN = np.zeros((HEIGHT // 2, WIDTH // 2), np.float32)
+AHEAD = np.array([4.0, 0.3, 0.2])
+RADIUS = 0.06
+"""Of a drone's disc, radians."""
+
+
+def sighting(label: int, position: FloatArray, *cameras: str) -> Sighting:
+    return Sighting(position, 0.1, 0.004, 0.9, 0.5, cameras or ("front",), label)
+
+
+def mask_of(position: FloatArray, half_angle: float, *, radius: float = RADIUS, height: float = 5.0) -> Mask:
+    """A disc about a place: so high inside, as low outside."""
+    crop = virtual_crop(RIG, position, half_angle, SIZE)
+    v, u = np.mgrid[:SIZE, :SIZE] + 0.5
+    reach = crop.camera.focal_px * math.tan(radius)
+    inside = np.hypot(u - SIZE / 2, v - SIZE / 2) < reach
+    return Mask(crop, np.where(inside, height, -height).astype(np.float32), half_angle)
+
+
+def disc(position: FloatArray, radius: float = RADIUS) -> BoolArray:
+    """The image's pixels that look so nearly that way."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    rays = FRONT.camera.rays(np.stack([u.ravel(), v.ravel()], 1)) @ FRONT.T_body_camera.rotation.T
+    return np.asarray((rays @ (position / np.linalg.norm(position)) > math.cos(radius)).reshape(HEIGHT, WIDTH))
+
+
+def overlap(one: BoolArray, other: BoolArray) -> float:
+    return float((one & other).sum() / (one | other).sum())
+
+
+@pytest.mark.parametrize("half_angle", [0.1, 0.2])
+def test_the_second_stage_draws_what_the_first_only_boxed(half_angle: float) -> None:
+    true = disc(AHEAD)
+    rows, columns = np.nonzero(true)
+    labels = np.zeros((HEIGHT, WIDTH), np.uint8)
+    box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    labels[box] = 3
+    drawn = Outliner(FRONT, 2).draw(labels, PLAIN, [sighting(3, AHEAD)], {3: [mask_of(AHEAD, half_angle)]})
+    assert overlap(drawn == 3, true) > 0.95
+    corners = labels.astype(bool) & ~true
+    assert np.mean(drawn[corners] == UNCLASSED) > 0.9, "what one stage took for a drone is not background yet"
+    assert (drawn[(labels == 0) & (drawn != 3)] == 0).all()
+
+
+def test_both_stages_count_and_all_pictures() -> None:
+    left = np.zeros((HEIGHT // 2, WIDTH // 2), np.float32)
+    u = int(np.nonzero(disc(AHEAD))[1].mean())
+    left[:, : u // 2] = -7.0  # outweighs 5, not 5 and 15 by their mean
+    outliner, true = Outliner(FRONT, 2), disc(AHEAD)
+    nothing = np.zeros((HEIGHT, WIDTH), np.uint8)
+    one = outliner.draw(nothing, left, [sighting(1, AHEAD)], {1: [mask_of(AHEAD, 0.2)]}) == 1
+    assert overlap(one, true & (np.arange(WIDTH) >= u)) > 0.9
+    several = [mask_of(AHEAD, 0.2), mask_of(AHEAD, 0.15, height=15.0)]
+    assert overlap(outliner.draw(nothing, left, [sighting(1, AHEAD)], {1: several}) == 1, true) > 0.9
+
+
+def test_a_pixel_that_two_drones_claim_is_the_surer_ones() -> None:
+    beside = AHEAD + np.array([0.0, 0.3, 0.0])  # their discs overlap
+    masks = {1: [mask_of(AHEAD, 0.2)], 2: [mask_of(beside, 0.2, height=9.0)]}
+    both = [sighting(1, AHEAD), sighting(2, beside)]
+    for order in (both, both[::-1]):
+        drawn = Outliner(FRONT, 2).draw(np.zeros((HEIGHT, WIDTH), np.uint8), PLAIN, order, masks)
+        assert overlap(drawn == 2, disc(beside)) > 0.9
+        assert overlap(drawn == 1, disc(AHEAD) & ~disc(beside)) > 0.9
+
+
+def test_where_the_second_stage_does_not_tell_the_labels_stay() -> None:
+    labels = np.zeros((HEIGHT, WIDTH), np.uint8)
+    labels[300:320, 200:240] = 1
+    outliner, mask = Outliner(FRONT, 2), mask_of(AHEAD, 0.2)
+    for seen, masks in ((sighting(1, AHEAD), []), (sighting(1, AHEAD, "left"), [mask])):
+        assert (outliner.draw(labels, PLAIN, [seen], {1: masks}) == labels).all()
+    behind = np.array([-4.0, 0.0, 0.0])
+    assert (outliner.draw(labels, PLAIN, [sighting(1, behind)], {1: [mask_of(behind, 0.2)]}) == labels).all()
+
+
+def test_what_a_picture_does_not_show_stays_as_the_first_stage_has_it() -> None:
+    labels = disc(AHEAD, 0.3).astype(np.uint8)
+    drawn = Outliner(FRONT, 2).draw(labels, PLAIN, [sighting(1, AHEAD)], {1: [mask_of(AHEAD, 0.1)]})
+    far: Float32Array = np.asarray(disc(AHEAD, 0.3) & ~disc(AHEAD, 0.16), np.float32)
+    assert (drawn[far > 0] == 1).all()
+    assert overlap(drawn[disc(AHEAD, 0.09)] == 1, disc(AHEAD)[disc(AHEAD, 0.09)]) > 0.95
