@@ -46,7 +46,8 @@ def settle_background(flow: Float32Array, first: UInt8Array, second: UInt8Array,
     before, after = _shrunk(first, size), _shrunk(second, size)
     coarse = np.asarray(cv2.resize(flow, size, interpolation=cv2.INTER_AREA) / _CELL_PX, np.float32)
     reach = 2 * (_NEAR_DRONE_PX // _CELL_PX) + 1
-    drones = cv2.resize(((labels > 0) & (labels != UNCLASSED)).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    drone_pixels = ((labels > 0) & (labels != UNCLASSED)).astype(np.uint8)
+    drones = cv2.resize(drone_pixels, size, interpolation=cv2.INTER_NEAREST)
     free = cv2.dilate(drones, np.ones((reach, reach), np.uint8)) == 0
     texture = _texture(before)
     weight = texture * free / (1.0 + (_difference(before, after, coarse) / _NOISE) ** 2) + np.float32(_LEAST_WEIGHT)
@@ -55,8 +56,7 @@ def settle_background(flow: Float32Array, first: UInt8Array, second: UInt8Array,
     unknown = np.where(free, 1.0 / (1.0 + (texture / _TEXTURED) ** 2), 1.0).astype(np.float32)
     change *= unknown[..., None]
     full = cv2.resize(_CELL_PX * change, (width, height), interpolation=cv2.INTER_LINEAR)
-    background = (labels == 0).astype(np.uint8)
-    return np.asarray(cv2.add(flow, full, dst=flow.copy(), mask=background), np.float32)
+    return np.asarray(cv2.add(flow, full, dst=flow.copy(), mask=1 - drone_pixels), np.float32)
 
 
 def _shrunk(image: UInt8Array, size: tuple[int, int]) -> Float32Array:

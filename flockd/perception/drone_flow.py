@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flockd.messages import UNCLASSED, BoolArray, Float32Array, FloatArray, UInt8Array
 
-_LEAST_PIXELS, _MOST_PIXELS = 12, 400
+_LEAST_PIXELS, _MOST_PIXELS = 12, 600
 """Of a drone, for its motion to be found at all; and as many of them as are looked at."""
 _CERTAIN, _PLAUSIBLE = 0.85, 0.5
 """Likeness of a drone before and after: from here on no other place is tried; below this, none is believed."""
@@ -20,9 +20,9 @@ _REACH_PX = 80
 """As far from where its surroundings went a drone is searched for."""
 _SURROUNDINGS_PX = 16
 _PLACES = 3
-_STEPS: tuple[tuple[float, int, int], ...] = ((2.0, 1, 6), (2.0, 3, 6), (1.0, 6, 6), (0.6, 6, 6))
-"""How smooth the images are, how many terms the motion has (a shift, affine, of second order), and how often they are
-mended."""
+_STEPS: tuple[tuple[float, int, int], ...] = ((2.0, 1, 8), (2.0, 3, 10), (1.0, 6, 15), (0.6, 10, 15))
+"""How smooth the images are, how many terms the motion has (a shift, affine, of second, of third order), and how often
+they are mended at most."""
 _STIFFNESS = 0.005
 _GAIN = 0.01
 _CONVERGED_PX = 0.01
@@ -30,16 +30,18 @@ _LONGEST_STEP_PX = 3.0
 _MARGIN_PX = 24
 _LEAST_NOISE = 2.0
 """Grey levels by which a pixel may differ without counting for less."""
-_MOST_RELIEF_PX = 2.0
+_MOST_RELIEF_PX = 3.0
 """What single pixels may move apart from the whole drone."""
+_RELIEF_SMOOTHNESS, _RELIEF_SLOPES = 10.0, 20.0
+"""Weights of neighbours moving alike and of the image's slopes being kept, where 5 is that of the grey levels."""
 
 
 def follow_drones(flow: Float32Array, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
     """The flow with that of each drone found by itself, wherever that can be.
 
     A drone is searched for by its colours around where its surroundings went, unless it is where the flow says. Its
-    motion is a polynomial of second order, as a flat thing's nearly is, found by aligning its pixels (Lucas & Kanade
-    1981; Baker & Matthews 2004), then what single pixels differ from it (variational refinement, Brox et al. 2004).
+    motion is a polynomial of third order, found by aligning its pixels (Lucas & Kanade 1981; Baker & Matthews 2004);
+    to that comes what single pixels differ from it (variational refinement, Brox et al. 2004).
 
     Args:
         flow: (h, w, 2) pixels from the first image to the second.
@@ -126,7 +128,7 @@ class _Motion:
     """(2,) of the drone, u and v."""
     size_px: float
     terms: FloatArray
-    """(1, 3 or 6, 2) what each term adds right and down."""
+    """(1, 3, 6 or 10, 2) what each term adds right and down."""
     likeness: float = 0.0
     """Correlation of the drone's colours before and after."""
 
@@ -135,9 +137,10 @@ class _Motion:
         return self.basis(rows, columns)[:, : len(self.terms)] @ self.terms
 
     def basis(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
-        """(n, 6) the terms' factors."""
+        """(n, 10) the terms' factors."""
         x, y = (columns - self.middle[0]) / self.size_px, (rows - self.middle[1]) / self.size_px
-        return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)
+        xx, yy = x * x, y * y
+        return np.stack([np.ones_like(x), x, y, xx, x * y, yy, xx * x, xx * y, x * yy, yy * y], 1)
 
 
 def _roughly(before: _Before, second: UInt8Array, start: FloatArray) -> _Motion | None:
@@ -146,7 +149,7 @@ def _roughly(before: _Before, second: UInt8Array, start: FloatArray) -> _Motion 
 
 
 def _finely(before: _Before, second: UInt8Array, motion: _Motion | None) -> _Motion | None:
-    """The best motion of second order near an affine one."""
+    """The best motion of third order near an affine one."""
     return _fitted(before, second, motion, slice(2, None)) if motion else None
 
 
@@ -289,8 +292,10 @@ def _relief(drone: _Outline, first: UInt8Array, second: UInt8Array, motion: _Mot
     contrast = float(np.clip(np.cov(were, are)[0, 1] / max(float(are.var()), 1.0), 0.5, 2.0))
     after = np.clip(were.mean() + contrast * (after - are.mean()), 0, 255)
     refinement = cv2.VariationalRefinement.create()
-    refinement.setAlpha(5.0)
-    refinement.setSorIterations(20)
+    refinement.setAlpha(_RELIEF_SMOOTHNESS)
+    refinement.setGamma(_RELIEF_SLOPES)
+    refinement.setFixedPointIterations(10)
+    refinement.setSorIterations(40)
     images = before.astype(np.uint8), after.astype(np.uint8)
     relief = refinement.calc(*images, np.zeros((*before.shape, 2), np.float32))[rows, columns]
     length = np.linalg.norm(relief, axis=1, keepdims=True)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from flockd.messages import UNCLASSED, Float32Array, UInt8Array
+from flockd.messages import Float32Array, UInt8Array
 from flockd.perception.background_flow import settle_background
 
 HEIGHT, WIDTH = 320, 400
@@ -71,13 +71,6 @@ def test_beside_a_drone_the_background_does_not_move_with_it() -> None:
     settled = settle_background(flow, first, second, labels)
     assert np.median(np.linalg.norm(settled[beside] - MOVED, axis=1)) < 0.5
     assert (settled[labels == 1] == flow[labels == 1]).all()
-
-
-def test_pixels_that_are_not_to_be_used_stay_as_they_are() -> None:
-    first, second = images()
-    labels = np.full_like(NO_DRONES, UNCLASSED)
-    flow = told((1.0, 1.0))
-    assert (settle_background(flow, first, second, labels) == flow).all()
 
 
 @pytest.mark.parametrize("of", [(0.0, 0.0), (7.0, 3.0)])

@@ -15,8 +15,9 @@ from flockd.cli import main
 from flockd.config.parameters import PerceptionConfig
 from flockd.data import data_path
 from flockd.errors import ModelError
-from flockd.messages import UNCLASSED, Float32Array, UInt8Array
+from flockd.messages import Float32Array, UInt8Array
 from flockd.perception import DisFlow, OnnxFlow, OnnxModel, Perception, Picture, find_manifests, load_manifest
+from flockd.perception.background_flow import settle_background
 from flockd.perception.roles import PICTURES_AT_A_TIME
 from flockd.sim.drone_models import drone_model
 from flockd.sim.renderer import Renderer
@@ -236,6 +237,7 @@ def test_the_network_of_flow_is_sharpened_by_dis_unless_told_otherwise() -> None
         ("quick_dis", DisFlow(network, quick=True)),
     ):
         config = PerceptionConfig.model_validate({"flow_refinement": refinement})
-        unclassed = np.full(first.shape[:2], UNCLASSED, np.uint8)  # no drones, and no background to be settled
-        found = Perception(config, MODELS).flow("camera", first, second, unclassed)
-        np.testing.assert_allclose(found, expected.flow(first, second), atol=1e-4)
+        no_drones = np.zeros(first.shape[:2], np.uint8)
+        found = Perception(config, MODELS).flow("camera", first, second, no_drones)
+        settled = settle_background(expected.flow(first, second), first, second, no_drones)
+        np.testing.assert_allclose(found, settled, atol=1e-4)
