@@ -20,8 +20,8 @@ _REACH_PX = 80
 """As far from where its surroundings went a drone is searched for."""
 _SURROUNDINGS_PX = 16
 _PLACES = 3
-_STEPS: tuple[tuple[float, int, int], ...] = ((2.0, 1, 8), (2.0, 3, 10), (1.0, 6, 15), (0.6, 10, 15))
-"""How smooth the images are, how many terms the motion has (a shift, affine, of second, of third order), and how often
+_STEPS: tuple[tuple[float, int, int], ...] = ((2.0, 3, 12), (1.0, 6, 10), (0.6, 10, 12))
+"""How smooth the images are, how many terms the motion has (affine, of second, of third order), and how often
 they are mended at most."""
 _STIFFNESS = 0.005
 _GAIN = 0.01
@@ -49,13 +49,11 @@ def follow_drones(flow: Float32Array, first: UInt8Array, second: UInt8Array, lab
         second: (h, w, 3) RGB.
         labels: (h, w) of the first image: one value a drone, 0 and 255 no drone.
     """
-    found = flow.copy()
-    for label in np.unique(labels):
-        if label in (0, UNCLASSED):
-            continue
-        rows, columns = np.nonzero(labels == label)
-        if len(rows) >= _LEAST_PIXELS:
-            _follow(_Outline(rows, columns), flow, first, second, found, labels)
+    areas = np.bincount(labels.ravel(), minlength=UNCLASSED + 1)
+    areas[[0, UNCLASSED]] = 0
+    found = flow.copy() if areas.any() else flow
+    for label in np.flatnonzero(areas >= _LEAST_PIXELS):
+        _follow(_Outline(*np.nonzero(labels == label)), flow, first, second, found, labels)
     return found
 
 
@@ -145,12 +143,12 @@ class _Motion:
 
 def _roughly(before: _Before, second: UInt8Array, start: FloatArray) -> _Motion | None:
     """The best affine motion near a shift; None where it leads out of the image."""
-    return _fitted(before, second, _Motion(before.middle, before.size_px, start[None]), slice(0, 2))
+    return _fitted(before, second, _Motion(before.middle, before.size_px, start[None]), slice(0, 1))
 
 
 def _finely(before: _Before, second: UInt8Array, motion: _Motion | None) -> _Motion | None:
     """The best motion of third order near an affine one."""
-    return _fitted(before, second, motion, slice(2, None)) if motion else None
+    return _fitted(before, second, motion, slice(1, None)) if motion else None
 
 
 def _fitted(before: _Before, second: UInt8Array, motion: _Motion, steps: slice) -> _Motion | None:
