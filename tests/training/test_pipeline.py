@@ -16,7 +16,8 @@ pytest.importorskip("torch", reason="the extra `train` is not installed")
 from flockd.cli import main
 from flockd.data import data_path
 from tools.training import worlds
-from tools.training.samples import warped
+from tools.training.dataset import FOCAL_PX, HEIGHT, MAX_DRONES, WIDTH, PairSet
+from tools.training.samples import distance_sample, warped
 
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
 
@@ -70,3 +71,26 @@ def test_a_warped_image_goes_where_its_flow_says() -> None:
         assert inner.mean() > 0.2
         assert np.median(away[inner]) <= 2.0
         assert np.median(np.abs(np.roll(smooth, 7, axis=1).astype(float) - smooth).max(axis=2)) > 5.0, "it has texture"
+
+
+def test_the_mask_of_a_picture_is_the_drone_that_it_faces() -> None:
+    """A red drone and a blue one beside it; the picture of the red one masks what is red."""
+    rng = np.random.default_rng(2)
+    image, ids = np.zeros((2, HEIGHT, WIDTH, 3), np.uint8), np.zeros((2, HEIGHT, WIDTH), np.uint8)
+    for number, (colour, left) in enumerate((((255, 0, 0), 220), ((0, 0, 255), 262)), start=1):
+        part = np.s_[0, 300:340, left : left + 40]
+        image[part], ids[part] = colour, number
+    centres = np.full((1, 2, MAX_DRONES, 3), np.nan)
+    centres[0, 0, :2] = [[(left + 20 - WIDTH / 2) / FOCAL_PX * 4, 0.0, 4.0] for left in (220, 262)]
+    arrays = {
+        "image": image[None], "ids": ids[None, :, 1::2, 1::2], "focal": np.array([FOCAL_PX]), "drone_centre": centres,
+        "drone_rotation": np.broadcast_to(np.eye(3), (1, 2, MAX_DRONES, 3, 3)),
+        "drone_family": np.zeros((1, MAX_DRONES), np.int16),
+    }  # fmt: skip
+    for _ in range(10):
+        sample = distance_sample(PairSet(arrays, 1), (0, 0, 0), rng, augment=False)
+        red = sample["picture"][:, :, 0] > 127
+        mask = sample["mask"] > 127
+        assert red.sum() > 200
+        assert (mask & red).sum() / (mask | red).sum() > 0.9
+        assert sample["mask_known"] == 1.0
