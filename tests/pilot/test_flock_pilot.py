@@ -224,6 +224,7 @@ def test_the_last_pictures_count_by_how_sure_they_are(monkeypatch: pytest.Monkey
     assert sighting.drone_probability == pytest.approx(0.8)
 
 
+@pytest.mark.filterwarnings("ignore:invalid value")
 @pytest.mark.parametrize("lie", [{"range_m": math.inf}, {"range_m": math.nan}, {"relative_sigma": 0.0}])
 def test_a_last_picture_that_tells_nonsense_gives_no_sighting(
     monkeypatch: pytest.MonkeyPatch, lie: dict[str, Any]
