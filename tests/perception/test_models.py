@@ -15,7 +15,7 @@ from flockd.cli import main
 from flockd.config.parameters import PerceptionConfig
 from flockd.data import data_path
 from flockd.errors import ModelError
-from flockd.messages import Float32Array, UInt8Array
+from flockd.messages import BoolArray, Float32Array, UInt8Array
 from flockd.perception import DisFlow, OnnxFlow, OnnxModel, Perception, Picture, find_manifests, load_manifest
 from flockd.perception.background_flow import settle_background
 from flockd.perception.roles import PICTURES_AT_A_TIME
@@ -241,3 +241,25 @@ def test_the_network_of_flow_is_sharpened_by_dis_unless_told_otherwise() -> None
         found = Perception(config, MODELS).flow("camera", first, second, no_drones)
         settled = settle_background(expected.flow(first, second), first, second, no_drones)
         np.testing.assert_allclose(found, settled, atol=1e-4)
+
+
+def test_the_second_stage_tells_which_pixels_are_the_drones_in_a_mirror_too() -> None:
+    K = np.array([[200.0, 0.0, 48.0], [0.0, 200.0, 48.0], [0.0, 0.0, 1.0]])
+    view = Renderer(World.generate(11), [drone_model(0, 0)]).render(
+        K, (96, 96), np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([0.0, 0.0, -4.0]),
+        drone_rotations=np.stack([cv2.Rodrigues(np.array([0.2, -0.4, 0.3]))[0]]), shown=[True],
+        drone_positions=np.array([[1.5, 0.0, -4.0]]),
+    )  # fmt: skip
+    pictures = [
+        Picture(np.ascontiguousarray(view.rgb), 200.0, np.eye(3), np.zeros(3), in_mirror=m) for m in (False, True)
+    ]
+    for told in Perception(PerceptionConfig(), MODELS).ranges(pictures):
+        assert told.mask is not None
+        assert told.mask.shape == (96, 96)
+        drone, said = view.ids > 0, told.mask > 0
+
+        def overlap(true: BoolArray, said: BoolArray = said) -> float:
+            return float((true & said).sum() / (true | said).sum())
+
+        assert overlap(drone) > 0.45  # its arms are a pixel wide
+        assert overlap(drone) > 1.3 * overlap(drone[:, ::-1])
