@@ -31,7 +31,7 @@ from tools.training.dataset import HEIGHT, WIDTH, PairSet, open_pairs
 RANGES_M = ((1.5, 5.0), (5.0, 10.0), (10.0, 20.0))
 RIG_WORLDS, RIG_STEPS = 12, 4
 IMAGES_TIMED = 60
-PICTURES_OF_A_DRONE = (1, 1, 3)
+PICTURES_OF_A_DRONE = (1, 1, 1)
 """As many as it takes one after another, mostly: see ``flockd.pilot.views``."""
 
 

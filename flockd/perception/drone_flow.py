@@ -25,7 +25,7 @@ _STEPS: tuple[tuple[float, int, int], ...] = ((2.0, 3, 12), (1.0, 6, 10), (0.6, 
 they are mended at most."""
 _STIFFNESS = 0.005
 _GAIN = 0.01
-_CONVERGED_PX = 0.01
+_CONVERGED_PX = 0.1
 _LONGEST_STEP_PX = 3.0
 _MARGIN_PX = 24
 _LEAST_NOISE = 2.0

@@ -200,41 +200,41 @@ def test_a_drone_is_looked_at_until_the_picture_shows_it_well(
 
     monkeypatch.setattr(flyer.truth, "ranges", ranges)
     (sighting,) = flyer.step().sightings
-    assert asked == [1] * looks + [3]
+    assert asked == [1] * (looks + 1)
     assert np.linalg.norm(sighting.position) == pytest.approx(math.hypot(3.0, 0.3), rel=0.01)
 
 
-def test_the_last_pictures_count_by_how_sure_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a drone 3 m away: the settled look says 3 m, the further ones 6, 3 and 3 m."""
+def test_the_picture_in_a_mirror_counts_by_how_sure_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a drone 3 m away: the settled look says 3 m, the mirror 6."""
     flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
     answers = flyer.truth.ranges
-    mirrors: list[list[bool]] = []
+    mirrors: list[bool] = []
 
     def ranges(pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
-        mirrors.append([picture.in_mirror for picture in pictures])
+        mirrors.extend(picture.in_mirror for picture in pictures)
         told = [replace(answer, relative_sigma=0.05, is_drone=0.9) for answer in answers(pictures)]
-        if len(told) == 3:
+        if mirrors[-1]:
             told[0] = replace(told[0], range_m=6.0, relative_sigma=0.1, is_drone=0.8)
         return tuple(told)
 
     monkeypatch.setattr(flyer.truth, "ranges", ranges)
     (sighting,) = flyer.step().sightings
-    assert mirrors[-1] == [True, False, True]
-    assert np.linalg.norm(sighting.position) == pytest.approx(3.0 * 2 ** (1 / 13), rel=0.005)  # 1 of 1 + 3 * 4
+    assert mirrors == [False, False, True]
+    assert np.linalg.norm(sighting.position) == pytest.approx(3.0 * 2 ** (1 / 5), rel=0.005)  # 1 of 1 + 4
     assert sighting.drone_probability == pytest.approx(0.8)
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")
 @pytest.mark.parametrize("lie", [{"range_m": math.inf}, {"range_m": math.nan}, {"relative_sigma": 0.0}])
-def test_a_last_picture_that_tells_nonsense_gives_no_sighting(
-    monkeypatch: pytest.MonkeyPatch, lie: dict[str, Any]
-) -> None:
+def test_a_mirror_that_tells_nonsense_gives_no_sighting(monkeypatch: pytest.MonkeyPatch, lie: dict[str, Any]) -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
     answers = flyer.truth.ranges
 
     def ranges(pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
-        first, *others = answers(pictures)
-        return (replace(first, **lie) if others else first, *others)
+        return tuple(
+            replace(answer, **lie) if picture.in_mirror else answer
+            for picture, answer in zip(pictures, answers(pictures), strict=True)
+        )
 
     monkeypatch.setattr(flyer.truth, "ranges", ranges)
     assert not flyer.step().sightings
