@@ -21,7 +21,7 @@ _LEAST_WEIGHT = 1e-4
 _TEXTURED = 1.0
 """With this much texture a place keeps half of its own flow."""
 _NEAR_DRONE_PX = 20
-_SAMPLED_CELLS = 6
+_SAMPLED_CELLS = 8
 _LEAST_TEXTURE = 0.5
 _LEAST_SAMPLES = 30
 _PLANE_TOLERANCE_CELLS = 1.0
@@ -56,7 +56,9 @@ def settle_background(flow: Float32Array, first: UInt8Array, second: UInt8Array,
     unknown = np.where(free, 1.0 / (1.0 + (texture / _TEXTURED) ** 2), 1.0).astype(np.float32)
     change *= unknown[..., None]
     full = cv2.resize(_CELL_PX * change, (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(cv2.add(flow, full, dst=flow.copy(), mask=1 - drone_pixels), np.float32)
+    if drones.any():
+        full[drone_pixels > 0] = 0.0
+    return np.asarray(cv2.add(flow, full, dst=full), np.float32)
 
 
 def _shrunk(image: UInt8Array, size: tuple[int, int]) -> Float32Array:

@@ -32,7 +32,7 @@ _LEAST_NOISE = 2.0
 """Grey levels by which a pixel may differ without counting for less."""
 _MOST_RELIEF_PX = 3.0
 """What single pixels may move apart from the whole drone."""
-_RELIEF_SMOOTHNESS, _RELIEF_SLOPES = 10.0, 20.0
+_RELIEF_SMOOTHNESS, _RELIEF_SLOPES = 5.0, 20.0
 """Weights of neighbours moving alike and of the image's slopes being kept, where 5 is that of the grey levels."""
 
 
@@ -49,9 +49,9 @@ def follow_drones(flow: Float32Array, first: UInt8Array, second: UInt8Array, lab
         second: (h, w, 3) RGB.
         labels: (h, w) of the first image: one value a drone, 0 and 255 no drone.
     """
-    areas = np.bincount(labels.ravel(), minlength=UNCLASSED + 1)
+    areas = cv2.calcHist([labels], [0], None, [256], [0.0, 256.0]).ravel()  # its shape depends on OpenCV
     areas[[0, UNCLASSED]] = 0
-    found = flow.copy() if areas.any() else flow
+    found = flow.copy() if (areas >= _LEAST_PIXELS).any() else flow
     for label in np.flatnonzero(areas >= _LEAST_PIXELS):
         _follow(_Outline(*np.nonzero(labels == label)), flow, first, second, found, labels)
     return found
@@ -205,7 +205,8 @@ def _mended(
 ) -> FloatArray | None:  # fmt: skip
     """Gauss-Newton on the terms and on how much brighter the drone has become; outliers count less."""
     count, grey = len(terms), level[:, 0]
-    brightness = np.stack([np.ones(len(grey)), (grey - grey.mean()) / 100.0], 1)
+    jacobian = np.ones((len(grey), 2 * count + 2))
+    jacobian[:, -1] = (grey - grey.mean()) / 100.0
     for _ in range(rounds):
         u, v = before.places(basis @ terms)
         seen = window.inside(u, v)
@@ -217,7 +218,8 @@ def _mended(
         noise = max(_LEAST_NOISE, 1.5 * _middle(np.abs(off[seen])))
         weight = seen / (1.0 + (off / (2.0 * noise)) ** 2)
         slope = (level[:, 1:] + there[:, 1:]) / 2  # of both images: converges from farther (Benhimane & Malis 2004)
-        jacobian = np.hstack([slope[:, :1] * basis, slope[:, 1:] * basis, brightness])
+        np.multiply(slope[:, :1], basis, out=jacobian[:, :count])
+        np.multiply(slope[:, 1:], basis, out=jacobian[:, count : 2 * count])
         weighted = weight[:, None] * jacobian
         normal = jacobian.T @ weighted
         stiff = np.full(2 * count + 2, 1e-6)
@@ -226,8 +228,8 @@ def _mended(
         stiff[-1] = _GAIN * len(grey)
         normal[np.diag_indices_from(normal)] += stiff
         step = np.linalg.solve(normal, off @ weighted)
-        change = np.stack([step[:count], step[count : 2 * count]], 1)
-        change *= min(1.0, _LONGEST_STEP_PX / max(float(np.abs(change[0]).max()), 1e-9))
+        change = step[: 2 * count].reshape(2, count).T
+        change = change * min(1.0, _LONGEST_STEP_PX / max(float(np.abs(change[0]).max()), 1e-9))
         terms = terms + change
         if np.abs(change).max() < _CONVERGED_PX:
             break
@@ -292,8 +294,7 @@ def _relief(drone: _Outline, first: UInt8Array, second: UInt8Array, motion: _Mot
     refinement = cv2.VariationalRefinement.create()
     refinement.setAlpha(_RELIEF_SMOOTHNESS)
     refinement.setGamma(_RELIEF_SLOPES)
-    refinement.setFixedPointIterations(10)
-    refinement.setSorIterations(40)
+    refinement.setSorIterations(20)
     images = before.astype(np.uint8), after.astype(np.uint8)
     relief = refinement.calc(*images, np.zeros((*before.shape, 2), np.float32))[rows, columns]
     length = np.linalg.norm(relief, axis=1, keepdims=True)
