@@ -47,7 +47,8 @@ def group_instances(
         return labels, ()
     votes = np.stack([columns + 0.5 + offset[0, rows, columns], rows + 0.5 + offset[1, rows, columns]], 1)
     centres = _vote_peaks(votes, (height, width))
-    nearest = np.argmin(((votes[:, None] - centres[None]) ** 2).sum(2), axis=1)
+    right, down = (votes[:, None, axis] - centres[None, :, axis] for axis in (0, 1))
+    nearest = np.argmin(right**2 + down**2, axis=1)
     found = []
     for index in range(len(centres)):
         mine = nearest == index
@@ -89,7 +90,8 @@ def _vote_peaks(votes: FloatArray, shape: tuple[int, int]) -> FloatArray:
             if len(kept) == _MAX_INSTANCES:
                 break
             kept.append(place)
-            strongest.append(float(((np.abs(votes - place).max(1)) < 6).sum()))
+            right, down = (np.abs(votes[:, axis] - place[axis]) < 6 for axis in (0, 1))
+            strongest.append(float((right & down).sum()))
     if not kept:
         kept.append(np.median(votes, axis=0))
     return np.array(kept)
