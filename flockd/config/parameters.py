@@ -104,7 +104,7 @@ class PerceptionConfig(Section):
     flow: str = "flow_int8"
     """`dis` is OpenCV's DIS flow instead of a network."""
     flow_refinement: Literal["dis", "quick_dis", "none"] = "quick_dis"
-    """A network's flow finds what moved far; DIS then makes it exact. `quick_dis` is for flight: 14 ms an image, where
+    """A network's flow finds what moved far; DIS then makes it exact. `quick_dis` is for flight: 12 ms an image, where
     `dis` takes 34; with a sensor's depth, on images that are blurred and moved far, that is worth its time.
     """
     flow_refinement_scale: Annotated[int, Field(ge=0, le=5)] = 1
