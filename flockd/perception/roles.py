@@ -122,7 +122,9 @@ class Perception:
 
         ``labels`` (h, w) of the first image: one value a drone, 0 and 255 none. Each drone's flow is found by itself.
         """
-        flow = settle_background(self._flow.flow(first, second), first, second, labels)
+        flow = self._flow.flow(first, second)
+        if self._config.flow_refinement == "quick_dis":
+            flow = settle_background(flow, first, second, labels)
         return follow_drones(flow, first, second, labels)
 
     def scene(self, camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:
