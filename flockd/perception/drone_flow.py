@@ -222,7 +222,7 @@ def _mended(
         np.multiply(slope[:, 1:], basis, out=jacobian[:, count : 2 * count])
         weighted = weight[:, None] * jacobian
         normal = jacobian.T @ weighted
-        stiff = np.full(2 * count + 2, 1e-6)
+        stiff = np.full(2 * count + 2, 1e-6 + 1e-10 * float(normal.trace()))  # stripes tell of one way only
         stiff[1:count] += _STIFFNESS * (normal[0, 0] + normal[count, count]) / 2
         stiff[count + 1 : 2 * count] = stiff[1:count]
         stiff[-1] = _GAIN * len(grey)

@@ -98,6 +98,12 @@ class OutputSpec(TensorSpec):
     golden_mean: float
     golden_deviation: float
 
+    @property
+    def map_size(self) -> tuple[int | str, ...]:
+        """Width and height of a map."""
+        axes = self.shape[1:3] if len(self.shape) == 3 or self.layout == "nhwc" else self.shape[2:4]
+        return axes[::-1]
+
 
 class Manifest(Section):
     """All that is known about one model."""
@@ -155,6 +161,9 @@ class Manifest(Section):
             fault = spec.fault_as_image() if content != "geometry" else None
             if fault:
                 raise ValueError(f"inputs: {content}: {fault}")
+        mask = self.answers.get("mask")
+        if "distance" in self.roles and mask and mask.map_size != self.contents["picture"].image_size:
+            raise ValueError("outputs: mask: shape: has to be as high and wide as the picture that enters")
         return self
 
 

@@ -16,7 +16,7 @@ from flockd.cli import main
 from flockd.config.parameters import PerceptionConfig
 from flockd.data import data_path
 from flockd.errors import ModelError
-from flockd.perception import OnnxModel, Perception
+from flockd.perception import OnnxModel, Perception, load_manifest
 from flockd.perception.providers import Prepared, available
 from flockd.perception.weights import fault_of_weights
 from tests.perception.foreign import SIZE, image_input, map_output, write_model
@@ -215,3 +215,14 @@ def test_a_provider_that_cannot_run_a_model_is_told_in_one_sentence(tmp_path: Pa
     )  # fmt: skip
     with pytest.raises(ModelError, match=r"broken\.yaml: CPUExecutionProvider cannot run broken\.onnx \(.*; choose"):
         OnnxModel(path, threads=1)
+
+
+def test_a_mask_of_another_size_than_its_picture_is_refused(tmp_path: Path) -> None:
+    for suffix in ("yaml", "onnx"):
+        (tmp_path / f"distance.{suffix}").write_bytes((MODELS / f"distance.{suffix}").read_bytes())
+    manifest = tmp_path / "distance.yaml"
+    inputs, outputs = manifest.read_text(encoding="utf-8").split("outputs:")
+    before, mask = outputs.split("  mask:")
+    manifest.write_text(f"{inputs}outputs:{before}  mask:{mask.replace('- 96', '- 48')}", encoding="utf-8")
+    with pytest.raises(ModelError, match="mask: shape: has to be as high and wide as the picture"):
+        load_manifest(manifest)
