@@ -23,7 +23,7 @@ from flockd.config import load_scenario
 from flockd.config.parameters import PerceptionConfig
 from flockd.data import data_path
 from flockd.perception import Perception, Picture
-from tools.evaluation.on_pairs import MASK_WITHIN_M, Findings, look_at_pairs
+from tools.evaluation.on_pairs import HEIGHT_SIGMAS_M, MASK_WITHIN_M, Findings, look_at_pairs
 from tools.evaluation.on_rigs import ego_motion_errors
 from tools.training import worlds
 from tools.training.dataset import HEIGHT, WIDTH, PairSet, open_pairs
@@ -34,6 +34,11 @@ IMAGES_TIMED = 60
 PICTURES_OF_A_DRONE = (1, 1, 1)
 """As many as it takes one after another, mostly: see ``flockd.pilot.views``."""
 
+WITH: dict[str | None, str] = {
+    None: "RGB alone",
+    **{given: f"attitude, height by {given} ({sigma:g} m)" for given, sigma in HEIGHT_SIGMAS_M.items()},
+}
+"""What the scale of depth comes from."""
 
 WANTED: dict[str, tuple[float, float]] = {
     "distance, whole, 1.5-5 m, median": (0, 0.6),
@@ -47,11 +52,8 @@ WANTED: dict[str, tuple[float, float]] = {
     "distance errors inside 1 sigma": (60, 76),
     "distance errors inside 2 sigma": (92, 98),
     "background depth, relative error, RGB alone, median": (0, 12),
-    "background depth, relative error, with height and attitude, median": (0, 2.5),
     "background depth of a pixel, relative error, RGB alone, median": (0, 12),
-    "background depth of a pixel, relative error, with height and attitude, median": (0, 2.5),
     "own motion over 0.5 m, RGB alone, median": (0, 6),
-    "own motion over 0.5 m, with height and attitude, median": (0, 1),
     "mask IoU, drones within 10 m, mean": (0.85, 1),
     "drones whose box is at least 12 px wide, found": (99, 100),
     "drones whose box is 6 to 12 px wide, found": (90, 100),
@@ -61,6 +63,15 @@ WANTED: dict[str, tuple[float, float]] = {
     "flow, mean end-point error as a share of OpenCV DIS medium's": (0, 0.6),
     "depth, masks and four drones' distances of an image, 2 threads": (0, 30),
     "all networks": (0, 25),
+    **{
+        f"{figure}, {WITH[given]}, median": (0, most)
+        for given in HEIGHT_SIGMAS_M
+        for figure, most in (
+            ("background depth, relative error", 2.5),
+            ("background depth of a pixel, relative error", 2.5),
+            ("own motion over 0.5 m", 1),
+        )
+    },
 }
 """Where the figures ought to be: what the networks are measured against, not what they reach."""
 
@@ -97,7 +108,6 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=10_000, help="of each folder at most this many")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rig-worlds", type=int, default=RIG_WORLDS, help="for the own motion; 0: leave it out")
-    parser.add_argument("--height-sigma", type=float, default=0.1, metavar="M", help="error of the height, metres")
     parser.add_argument("--float", action="store_true", help="the float networks, not their 8-bit twins")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
@@ -110,13 +120,13 @@ def main() -> None:
     def findings(folder: Path) -> Findings:
         pairs = open_pairs(folder)
         indices = range(min(pairs.count, arguments.pairs))
-        return look_at_pairs(pairs, perception, indices, arguments.height_sigma)
+        return look_at_pairs(pairs, perception, indices)
 
     rows = list(rows_of_pairs(findings(arguments.data)))
     if arguments.unseen is not None:
         rows += rows_of_unseen(findings(arguments.unseen))
     if arguments.rig_worlds:
-        rows += rows_of_rigs(perception, arguments.rig_worlds, arguments.height_sigma)
+        rows += rows_of_rigs(perception, arguments.rig_worlds)
     rows += rows_of_cost(perception, open_pairs(arguments.data), arguments.threads)
     files = list(arguments.models.glob("*.onnx"))
     rows.append(Row("all networks", sum(file.stat().st_size for file in files) / 1e6, "MB", len(files)))
@@ -133,10 +143,10 @@ def rows_of_pairs(found: Findings) -> Iterator[Row]:
     whole = sum(drone.found and drone.whole for drone in found.drones)
     for sigmas in (1, 2):
         yield Row(f"distance errors inside {sigmas} sigma", 100 * found.inside(sigmas), "%", whole)
-    for with_height, name in ((False, "RGB alone"), (True, "with height and attitude")):
-        depth = found.depth[with_height]
+    for given, name in WITH.items():
+        depth = found.depth[given]
         yield Row(f"background depth, relative error, {name}, median", 100 * float(np.median(depth)), "%", len(depth))
-        of_pixels = np.concatenate(found.depth_pixels[with_height])
+        of_pixels = np.concatenate(found.depth_pixels[given])
         what = f"background depth of a pixel, relative error, {name}, median"
         yield Row(what, 100 * float(np.median(of_pixels)), "%", len(of_pixels))
     yield Row(f"mask IoU, drones within {MASK_WITHIN_M:g} m, mean", float(np.mean(found.iou)), "", len(found.iou))
@@ -180,14 +190,14 @@ def _distances(found: Findings, note: str) -> Iterator[Row]:
                 yield Row(f"distance{note}, {what}, {name}", 100 * float(figure(errors)), "%", len(errors))
 
 
-def rows_of_rigs(perception: Perception, count: int, height_sigma_m: float) -> Iterator[Row]:
+def rows_of_rigs(perception: Perception, count: int) -> Iterator[Row]:
     """The own motion, from the four cameras of the paper's drone."""
     drone = load_scenario(data_path("config") / "paper_flight.yaml").drone
-    errors = ego_motion_errors(drone, perception, worlds.TEST[1000 : 1000 + count], RIG_STEPS, height_sigma_m)
-    for scale, name in (("network", "RGB alone"), ("height", "with height and attitude")):
-        known = np.array(errors[scale])[np.isfinite(errors[scale])]
+    errors = ego_motion_errors(drone, perception, worlds.TEST[1000 : 1000 + count], RIG_STEPS)
+    for given, name in WITH.items():
+        known = np.array(errors[given])[np.isfinite(errors[given])]
         yield Row(f"own motion over 0.5 m, {name}, median", 100 * float(np.median(known)), "cm", len(known))
-        yield Row(f"own motion over 0.5 m, {name}, estimated", 100 * len(known) / len(errors[scale]), "%", len(known))
+        yield Row(f"own motion over 0.5 m, {name}, estimated", 100 * len(known) / len(errors[given]), "%", len(known))
 
 
 def rows_of_cost(perception: Perception, pairs: PairSet, threads: int) -> Iterator[Row]:

@@ -15,7 +15,10 @@ from tools.training.pictures import PictureFiles
 def test_a_family_of_few_pictures_is_drawn_as_often_as_one_of_many(tmp_path: Path) -> None:
     for name, families, drones in (("a", [0] * 90 + [1] * 5, 1.0), ("b", [0] * 5, 0.0), ("c", [1], 1.0)):
         values = np.arange(len(families), dtype=np.float32)
-        np.savez(tmp_path / f"{name}.npz", family=families, drone=np.full(len(families), drones), apparent=values)
+        np.savez(
+            tmp_path / f"{name}.npz", family=families, drone=np.full(len(families), drones), apparent=values,
+            target=np.zeros((len(families), 3)),
+        )  # fmt: skip
     files, rng = PictureFiles(tmp_path), np.random.default_rng(0)
     drawn = [files.draw(rng) for _ in range(3000)]
     shares = [
@@ -26,6 +29,18 @@ def test_a_family_of_few_pictures_is_drawn_as_often_as_one_of_many(tmp_path: Pat
     assert shares == pytest.approx([1 / 3] * 3, abs=0.04)
     lonely = [sample for sample in drawn if sample["family"] == 1 and sample["drone"] > 0.5]
     assert {float(sample["apparent"]) for sample in lonely} == {0.0} | {float(n) for n in range(90, 95)}
+
+
+def test_pictures_like_the_last_look_at_a_drone_are_drawn_more_often_than_others(tmp_path: Path) -> None:
+    target = np.zeros((100, 3))
+    target[:80, 1], target[80:90, 2] = 20.0, -9.0
+    values = np.full(100, np.log(70.0))
+    values[90] = np.log(120.0)
+    np.savez(tmp_path / "a.npz", family=np.zeros(100), drone=np.ones(100), apparent=values, target=target)
+    files, rng = PictureFiles(tmp_path), np.random.default_rng(0)
+    drawn = [files.draw(rng) for _ in range(3000)]
+    like_it = [np.abs(sample["target"]).max() == 0.0 and sample["apparent"] < np.log(100.0) for sample in drawn]
+    assert np.mean(like_it) == pytest.approx(0.6 + 0.4 * 0.09, abs=0.03)
 
 
 def test_a_folder_without_pictures_says_how_to_make_them(tmp_path: Path) -> None:

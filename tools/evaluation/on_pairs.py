@@ -22,6 +22,8 @@ Array = NDArray[Any]
 MIN_PIXELS = 6
 """Drones of which less is to be seen do not count, neither as found nor as missed."""
 MASK_WITHIN_M = 10.0
+HEIGHT_SIGMAS_M = {"barometer": 0.1, "range finder": 0.03}
+"""Standard deviations of the height above ground that an autopilot gives, by what it measures it with."""
 WHOLE_HIDES = 0.02
 """A drone is whole when it is inside the image and no more of its outline is hidden than this."""
 
@@ -49,9 +51,9 @@ class Findings:
         """Sightings that are no drone's, or a drone's second one."""
         self.drones: list[Drone] = []
         self.iou: list[float] = []
-        self.depth: dict[bool, list[float]] = {False: [], True: []}
-        """Mean relative error of the background's depth in each image, without and with height and attitude."""
-        self.depth_pixels: dict[bool, list[Array]] = {False: [], True: []}
+        self.depth: dict[str | None, list[float]] = {given: [] for given in (None, *HEIGHT_SIGMAS_M)}
+        """Mean relative error of the background's depth in each image, by what measured the height, None: RGB alone."""
+        self.depth_pixels: dict[str | None, list[Array]] = {given: [] for given in self.depth}
         """The same of every sixteenth pixel."""
         self.flow: dict[tuple[str, bool], list[Array]] = {}
         """End-point errors, px, of ("network" or "dis", on drones)."""
@@ -73,24 +75,28 @@ class Findings:
         return np.concatenate(self.flow[name, on_drones])
 
 
-def look_at_pairs(pairs: PairSet, perception: Perception, indices: Iterable[int], height_sigma_m: float) -> Findings:
-    """The second stage and all, on each pair's first image; the flow on both. The autopilot's height errs."""
+def look_at_pairs(pairs: PairSet, perception: Perception, indices: Iterable[int]) -> Findings:
+    """The second stage and all, on each pair's first image; the flow on both. The autopilot's height errs.
+
+    Drones are what they are with a barometer.
+    """
     rng = np.random.Generator(np.random.PCG64(0))
     dis, found = DisFlow(), Findings()
     for index in indices:
         rig = Rig({"camera": rig_camera(float(pairs["focal"][index]))})
         images = np.asarray(pairs["image"][index])
         R_ned_camera = np.asarray(pairs["R_ned_camera"][index, 0], np.float64)
-        height = float(pairs["height"][index, 0]) + float(rng.normal(0, height_sigma_m))
+        height, wrong = float(pairs["height"][index, 0]), float(rng.standard_normal())
         frames = FrameSet(0.0, {"camera": Frame("camera", images[0], 0.0, 0)})
-        vehicle = VehicleState(0.0, R_ned_camera @ R_BODY_CAMERA.T, height)
         depth, ids = np.asarray(pairs["depth"][index][0], np.float32), np.asarray(pairs["ids"][index][0])
-        for with_height in (False, True):
-            observer = Observer(rig, perception, height_fixes_scale=with_height)
+        for given in (None, "range finder", "barometer"):
+            observer = Observer(rig, perception, height_fixes_scale=given is not None)
+            measured_m = height + HEIGHT_SIGMAS_M.get(given or "", 0.0) * wrong
+            vehicle = VehicleState(0.0, R_ned_camera @ R_BODY_CAMERA.T, measured_m)
             maps, _ = observer.scenes(frames, vehicle)
             off = _depth_errors(maps["camera"].depth[1::2, 1::2], depth, ids)
-            found.depth[with_height].append(float(off.mean()) if off.size else 0.0)
-            found.depth_pixels[with_height].append(off[::16])
+            found.depth[given].append(float(off.mean()) if off.size else 0.0)
+            found.depth_pixels[given].append(off[::16])
         view = observer.view(frames, vehicle, maps, ())
         labels = view.cameras["camera"].labels
         _masks(((labels > 0) & (labels != UNCLASSED))[1::2, 1::2], ids, pairs, index, found)

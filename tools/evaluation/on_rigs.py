@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from flockd.perception import Perception
 from flockd.pilot import FlockPilot
 from flockd.sim.renderer import Renderer
 from flockd.sim.world import World
+from tools.evaluation.on_pairs import HEIGHT_SIGMAS_M
 from tools.training.scenes import drawn_attitude
 
 Array = NDArray[Any]
@@ -26,25 +28,31 @@ NOISE = 2.0
 
 
 def ego_motion_errors(
-    config: DroneConfig, perception: Perception, seeds: Sequence[int], steps_a_world: int, height_sigma_m: float
-) -> dict[str, list[float]]:
-    """Translation errors in metres of single steps, by what fixes the scale; NaN where there was no estimate."""
-    errors: dict[str, list[float]] = {"network": [], "height": []}
+    config: DroneConfig, perception: Perception, seeds: Sequence[int], steps_a_world: int
+) -> dict[str | None, list[float]]:
+    """Translation errors in metres of single steps, by what measured the height (None: the network alone fixes the
+    scale); NaN where there was no estimate.
+    """
+    errors: dict[str | None, list[float]] = {given: [] for given in (None, *HEIGHT_SIGMAS_M)}
     for seed in seeds:
-        for steps, moved in _steps(seed, steps_a_world, build_rig(config.rig), height_sigma_m):
+        for steps, moved, wrong in _steps(seed, steps_a_world, build_rig(config.rig)):
             R_ned_body = steps[0][1].R_ned_body
-            for scale, found in errors.items():
-                settings = config.perception.model_copy(update={"scale": scale})
+            for given, found in errors.items():
+                settings = config.perception.model_copy(update={"scale": "height" if given else "network"})
                 pilot = FlockPilot(config.model_copy(update={"perception": settings}), perception)
-                ego = [pilot.step(*step) for step in steps][-1].ego_motion
+                off_m = HEIGHT_SIGMAS_M.get(given or "", 0.0) * wrong
+                ego = [
+                    pilot.step(frames, replace(vehicle, height_m=vehicle.height_m + off_m)) for frames, vehicle in steps
+                ][-1].ego_motion
                 found.append(np.nan if ego is None else float(np.linalg.norm(R_ned_body @ ego.translation - moved)))
     return errors
 
 
-def _steps(
-    seed: int, count: int, rig: Rig, height_sigma_m: float
-) -> Iterator[tuple[list[tuple[FrameSet, VehicleState]], Array]]:
-    """What a pilot is given before and after a step, and the step (3,) m NED, from places all over a world."""
+def _steps(seed: int, count: int, rig: Rig) -> Iterator[tuple[list[tuple[FrameSet, VehicleState]], Array, float]]:
+    """What a pilot is given before and after a step, and the step (3,) m NED, from places all over a world.
+
+    And by how many standard deviations the height's measurement errs.
+    """
     rng = np.random.Generator(np.random.PCG64([seed, 3]))
     world = World.generate(seed, ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])), keep_out=None)
     renderer = Renderer(world, [])
@@ -53,12 +61,12 @@ def _steps(
         height, heading = float(rng.uniform(*HEIGHTS_M)), float(rng.uniform(-np.pi, np.pi))
         start = np.array([place[0], place[1], -(ground + height)])
         moved = np.array([STEP_M * np.cos(heading), STEP_M * np.sin(heading), 0.0])
-        R_ned_body, measured_m = drawn_attitude(rng), height + float(rng.normal(0, height_sigma_m))
+        R_ned_body, wrong = drawn_attitude(rng), float(rng.standard_normal())
         steps = []
         for k in range(2):
             frames = _photographed(renderer, rig, R_ned_body, start + k * moved, k, rng)
-            steps.append((FrameSet(k * STEP_S, frames), VehicleState(k * STEP_S, R_ned_body, measured_m)))
-        yield steps, moved
+            steps.append((FrameSet(k * STEP_S, frames), VehicleState(k * STEP_S, R_ned_body, height)))
+        yield steps, moved, wrong
 
 
 def _photographed(

@@ -7,12 +7,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+Out = TypeVar("Out")
 MAX_DEPTH_M = 80.0
 """What the depth output says of the sky."""
 OFFSET_SCALE_PX = 16.0
@@ -28,11 +31,10 @@ def _conv(inputs: int, outputs: int, stride: int = 1, kernel: int = 3) -> nn.Seq
     )
 
 
-def _in_full_precision(layer: nn.Module, x: Tensor) -> Tensor:
+def _in_full_precision(layer: Callable[[Tensor], Out], x: Tensor) -> Out:
     """The layer on 32-bit numbers, also where training runs on 16-bit ones: metres need more than three digits."""
     with torch.autocast(x.device.type, enabled=False):
-        y: Tensor = layer(x.float())
-        return y
+        return layer(x.float())
 
 
 def _blocks(image: Tensor, size: int) -> Tensor:
@@ -152,12 +154,14 @@ class DistanceNet(nn.Module):
         self.stem = _conv(12, w[0])  # 48
         self.down = nn.ModuleList([_conv(a, b, stride=2) for a, b in pairwise(w)])  # 24, 12, 6, 3
         self.body = nn.ModuleList([_Residual(b) for b in w[1:]])
+        self.more = nn.ModuleDict({str(i): _Residual(w[i]) for i in (2, 3)})
         self.lateral = nn.ModuleList([nn.Conv2d(a, a, 1) for a in w[:4]])
         self.up = nn.ModuleList([_conv(b, a, kernel=1) for a, b in pairwise(w)])
         self.merge = nn.ModuleList([_conv(a, a) for a in w[:4]])
         self.look = nn.Conv2d(w[0], self.maps, 1)
         self.mask = nn.Sequential(_conv(w[0], w[0]), nn.Conv2d(w[0], 4, 1), nn.PixelShuffle(2))
         self.summary = nn.Sequential(nn.Linear(128 * 9 + 6 * self.maps + 2, 160), nn.ReLU(True))
+        self.thought = nn.Sequential(nn.Linear(160, 160), nn.ReLU(True), nn.Linear(160, 160))
         self.head = nn.Linear(160, 6)
         self.family = nn.Linear(160, MAX_FAMILIES)
 
@@ -168,17 +172,19 @@ class DistanceNet(nn.Module):
         """
         x = self.stem(_blocks(picture, 2))
         levels = [x]
-        for down, body in zip(self.down, self.body, strict=True):
+        for i, (down, body) in enumerate(zip(self.down, self.body, strict=True), start=1):
             x = body(down(x))
-            levels.append(x)
+            levels.append(self.more[str(i)](x) if str(i) in self.more else x)
+            x = levels[-1]
         whole = x.flatten(1)
         for i in reversed(range(len(self.merge))):
             x = F.interpolate(self.up[i](x), scale_factor=2.0, mode="nearest")
             x = self.merge[i](x + self.lateral[i](levels[i]))
         where, mask = _in_full_precision(self.look, x), self.mask(x)[:, 0]
-        middles, moments = _moments(where)
+        middles, moments = _in_full_precision(_moments, where)
         spread, shape = _spread(middles[:, : self.motors])
         x = _in_full_precision(self.summary, torch.cat([whole.float(), moments, shape], 1))
+        x = x + _in_full_precision(self.thought, x)
         out = _in_full_precision(self.head, x)
         apparent = spread + out[:, 5:] + 1.0
         sigma = (out[:, 3:4] - 3.0).clamp(-7.0, 1.0)

@@ -11,6 +11,9 @@ from tools.training.samples import Sample
 
 _LOOK_EVERY = 200
 """Calls between two looks into the folder."""
+_AIMED_SHARE = 0.6
+"""At least so many of the drones are in the middle and fill their picture: the last look at a drone is what counts."""
+_AIMED_OFF_PX, _AIMED_PX = 4.0, (60.0, 84.0)
 
 
 class PictureFiles:
@@ -21,6 +24,7 @@ class PictureFiles:
         self._files: dict[Path, Sample] = {}
         self._ends = np.zeros(0, np.int64)
         self._of_family: list[NDArray[np.int64]] = []
+        self._aimed_of_family: list[NDArray[np.int64]] = []
         self._calls = 0
         self.look_for_more()
 
@@ -37,13 +41,24 @@ class PictureFiles:
             raise FileNotFoundError(f"{self._folder}: no pictures here; make them with tools/render_drone_pictures.py")
         self._ends = np.cumsum([len(file["drone"]) for file in self._files.values()])
         family = np.concatenate([np.where(file["drone"] > 0.5, file["family"], -1) for file in self._files.values()])
+        aimed = np.concatenate([_aimed(file) for file in self._files.values()])
         self._of_family = [np.flatnonzero(family == one) for one in np.unique(family)]
+        self._aimed_of_family = [np.flatnonzero((family == one) & aimed) for one in np.unique(family)]
 
     def draw(self, rng: np.random.Generator) -> Sample:
         """Any of them: every family, and what is none, as often, however many pictures there are of it."""
-        rows = self._of_family[int(rng.integers(len(self._of_family)))]
+        one = int(rng.integers(len(self._of_family)))
+        rows = self._of_family[one]
+        if rng.random() < _AIMED_SHARE and len(self._aimed_of_family[one]):
+            rows = self._aimed_of_family[one]
         index = int(rows[int(rng.integers(len(rows)))])
         which = int(np.searchsorted(self._ends, index, side="right"))
         file = list(self._files.values())[which]
         row = index - int(self._ends[which])
         return {name: values[row] for name, values in file.items()}
+
+
+def _aimed(file: Sample) -> NDArray[np.bool_]:
+    low, high = np.log(_AIMED_PX)
+    off = np.linalg.norm(file["target"][:, 1:3], axis=1)
+    return np.asarray((off < _AIMED_OFF_PX) & (low < file["apparent"]) & (file["apparent"] < high))
