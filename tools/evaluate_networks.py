@@ -92,7 +92,7 @@ class Row:
         return WANTED.get(self.name)
 
     def __str__(self) -> str:
-        told = f"{self.name:78s} {self.value:10.4g} {self.unit:3s} {self.count:8d}"
+        told = f"{self.name:88s} {self.value:10.4g} {self.unit:3s} {self.count:8d}"
         if self.wanted is None:
             return told
         low, high = self.wanted

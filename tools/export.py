@@ -14,7 +14,7 @@ import numpy as np
 import onnxruntime as ort
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
@@ -25,6 +25,7 @@ from tools.training.networks import DistanceNet, FlowNet, NeighboursNet
 
 ALLOWED_DIFFERENCE = 2e-3
 """Between ONNX Runtime and torch, as a share of the output's largest value."""
+BEGUN_WITH_SHARE = 0.35
 DATA = "Rendered by tools/render_training_data.py from seeded worlds; no foreign data."
 
 IMAGE = {"shape": [1, "h", "w", 3], "dtype": "uint8", "meaning": "RGB image", "unit": "grey levels 0-255"}
@@ -95,6 +96,12 @@ def main() -> None:
         default=1,
         help="of the flow: it trains with 3, DIS does the rest better",
     )
+    parser.add_argument(
+        "--begun-with",
+        type=Path,
+        metavar="CHECKPOINT",
+        help=f"what the run was started with: the weights' mean, {BEGUN_WITH_SHARE:g} of it, is exported",
+    )
     parser.add_argument("--accuracy", action="append", default=[], metavar="WHAT=FIGURE", help="measured accuracy")
     arguments = parser.parse_args()
     spec = NETWORKS[arguments.network]
@@ -103,6 +110,8 @@ def main() -> None:
         net.iterations = arguments.iterations
     state = torch.load(arguments.checkpoint, map_location="cpu")
     net.load_state_dict(state["net"])
+    if arguments.begun_with:
+        draw_back(net, torch.load(arguments.begun_with, map_location="cpu")["net"])
     net.eval()
     arguments.out.mkdir(parents=True, exist_ok=True)
     file = arguments.out / f"{arguments.network}.onnx"
@@ -112,6 +121,20 @@ def main() -> None:
     outputs = _compare(net, feeds, file)
     path = write_manifest(manifest.model_dump(mode="json", exclude_defaults=True), file, outputs)
     print(f"{path}: {file.stat().st_size / 1e6:.1f} MB, {state['step']} steps, checked")
+
+
+def draw_back(net: nn.Module, start: dict[str, Tensor]) -> None:
+    """Weights between a run's end and its start err less than either (WiSE-FT, Wortsman et al. 2022).
+
+    Layers that the start did not have stay as they are.
+    """
+    weights = net.state_dict()
+    for name, old in start.items():
+        if name not in weights or weights[name].shape != old.shape:
+            raise SystemExit(f"--begun-with: its {name} is not the run's; give what the run was started with")
+        if old.is_floating_point():
+            weights[name] = torch.lerp(weights[name], old, BEGUN_WITH_SHARE)
+    net.load_state_dict(weights)
 
 
 def _manifest(name: str, spec: dict[str, Any], accuracy: dict[str, str], state: dict[str, Any]) -> Manifest:

@@ -38,7 +38,7 @@ _MAX_RESIZE = 1.7
 _MOST_LOOKS = 4
 _MIRROR_WIDTH = 0.9
 """The last picture is in a mirror, which the network errs on differently, and so wide, of what suits the drone."""
-_MEAN_SIGMA = 0.88
+_MEAN_SIGMA = 0.98
 """The error of the mean of both, as a share of what a single picture's would be."""
 _WORTH_ANOTHER_LOOK = 0.2
 _SAME_AIM, _SAME_SIZE = 0.1, 1.15

@@ -163,6 +163,9 @@ class DistanceNet(nn.Module):
         self.summary = nn.Sequential(nn.Linear(128 * 9 + 6 * self.maps + 2, 160), nn.ReLU(True))
         self.thought = nn.Sequential(nn.Linear(160, 160), nn.ReLU(True), nn.Linear(160, 160))
         self.head = nn.Linear(160, 6)
+        for last in (*(block.second[1] for block in self.more.values()), self.thought[2]):
+            nn.init.zeros_(last.weight)  # what is added to a trained network changes nothing at first
+            nn.init.zeros_(last.bias)
         self.family = nn.Linear(160, MAX_FAMILIES)
 
     def forward(self, picture: Tensor) -> tuple[Tensor, ...]:
