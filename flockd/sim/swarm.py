@@ -149,8 +149,8 @@ class _SeeingCrew:
             for i in range(count)
         ]
         self._autopilots = [SimulatedAutopilot(scenario.sensors, seed=scenario.seed, drone=i) for i in range(count)]
-        # Pilots share nothing but the networks, so their order does not matter: all think at a time, for five one after
-        # the other on two cores would leave one core idle for the last. Rendering uses all cores by itself.
+        # Pilots share nothing but the networks, so their order does not matter: each thinks as soon as its images are
+        # rendered, all at a time, for five one after the other on two cores would leave one core idle for the last.
         self._side_by_side = ThreadPoolExecutor(min(count, 2 * (os.cpu_count() or 1) + 1))
         self._outputs: list[PilotOutput] = []
 
@@ -165,10 +165,10 @@ class _SeeingCrew:
                 self._truths[i].show(shot)
             render_ms.append(1e3 * (time.perf_counter() - begin))
             state = self._autopilots[i].read(time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i])
-            steps.append((pilot, frames, state))
-        self._outputs = list(self._side_by_side.map(lambda one: one[0].step(one[1], one[2]), steps))
+            steps.append((frames, state, self._side_by_side.submit(pilot.step, frames, state)))
+        self._outputs = [thinking.result() for _, _, thinking in steps]
         truth = self._truth(step, time_s, vehicles)
-        for i, (output, (_, frames, state)) in enumerate(zip(self._outputs, steps, strict=True)):
+        for i, (output, (frames, state, _)) in enumerate(zip(self._outputs, steps, strict=True)):
             if self._telemetry is not None:
                 publish_step(self._telemetry, f"drone{i + 1}", state, output)
             if self._recorders:
