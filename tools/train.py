@@ -116,7 +116,7 @@ class DistanceTask(Task):
 
     pool_size = 8_000
     renewed_in_a_batch = 3
-    no_drone_share, masked_share = 0.12, 0.18
+    no_drone_share, masked_share = 0.25, 0.18
 
     def __init__(self, pairs: PairSet, negatives: Path, pictures: Path) -> None:
         super().__init__(DistanceNet(), 64, 2e-3)
