@@ -109,3 +109,13 @@ def test_what_cannot_be_followed_keeps_its_flow(why: str) -> None:
     else:
         first = second = np.full_like(scene.first, 90)
     assert (follow_drones(scene.flow, first, second, labels) == scene.flow).all()
+
+
+def test_a_drone_of_stripes_is_followed_across_them() -> None:
+    first = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
+    first[140:180, 180:220] = 6 * np.arange(40, dtype=np.uint8)[:, None, None]
+    labels = np.zeros((HEIGHT, WIDTH), np.uint8)
+    labels[140:180, 180:220] = 1
+    flow = follow_drones(np.zeros((HEIGHT, WIDTH, 2), np.float32), first, np.roll(first, 3, axis=0), labels)
+    assert np.median(flow[145:175, 185:215, 1]) == pytest.approx(3.0, abs=0.05)
+    assert np.isfinite(flow).all()
