@@ -212,11 +212,12 @@ def _install(system: Path, wheels: Path, install: str) -> None:
         else:
             shutil.copy(origin, source / name)
     shutil.copytree(wheels, shelf)
-    (system / "etc/pip.conf").write_text("[global]\nno-index = true\nfind-links = /root/wheels\n", encoding="utf-8")
+    pip_finds = f"[global]\nno-index = true\nfind-links = /{shelf.relative_to(system)}\n"
+    (system / "etc/pip.conf").write_text(pip_finds, encoding="utf-8")
     (system / "etc/fstab").write_text(FSTAB, encoding="utf-8")
     (system / "etc/hostname").write_text("drone\n", encoding="utf-8")
     (system / "etc/hosts").write_text("127.0.0.1 localhost drone\n", encoding="utf-8")
-    _inside(system, f"cd /root/flockd\n{install}")
+    _inside(system, f"cd /{source.relative_to(system)}\n{install}")
     stand_in = f"pip install --quiet --no-compile --target /opt/stand-in '{STAND_IN}'"
     _inside(system, f"/opt/flockd/bin/{stand_in}\nPYTHONPATH=/opt/stand-in /opt/flockd/bin/python -c '{COMPILE}'")
     shutil.copy(ROOT / "tools/device_check/drone.yaml", system / "etc/flockd/drone.yaml")
