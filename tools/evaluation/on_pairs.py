@@ -133,27 +133,34 @@ def _drones(
 ) -> None:
     """A sighting is a drone's if it lies in the drone's direction, however wrong its range is."""
     found.images += 1
-    free = list(sightings)
-    pixels = pairs["drone_pixels"][index, 0]
-    for drone in np.argsort(-pixels):
-        if pixels[drone] < MIN_PIXELS:
-            continue
-        true = R_BODY_CAMERA @ np.asarray(pairs["drone_centre"][index, 0, drone], np.float64)
-        range_m = float(np.linalg.norm(true))
-        half_angle = SIZES_M[int(pairs["drone_family"][index, drone])] / 2 / range_m
+    seen = np.flatnonzero(pairs["drone_pixels"][index, 0] >= MIN_PIXELS)
+    places = [R_BODY_CAMERA @ np.asarray(pairs["drone_centre"][index, 0, drone], np.float64) for drone in seen]
+    sighting_of = _pairings(sightings, places, [SIZES_M[int(pairs["drone_family"][index, drone])] for drone in seen])
+    for row, (drone, true) in enumerate(zip(seen, places, strict=True)):
+        range_m, best = float(np.linalg.norm(true)), sighting_of.get(row)
         left, top, right, bottom = pairs["drone_box"][index, 0, drone]
         inside = left > 1 and top > 1 and right < WIDTH - 1 and bottom < HEIGHT - 1
-        best = min(free, key=lambda s: _angle(s.position, true), default=None)
-        if best is not None and _angle(best.position, true) > half_angle:
-            best = None
         error, sigma = 0.0, 1.0
         if best is not None:
-            free.remove(best)
             distance = float(np.linalg.norm(best.position))
             error, sigma = distance / range_m - 1.0, best.range_sigma_m / distance
         whole = inside and _hidden_share(pairs, index, int(drone), depth, ids) < WHOLE_HIDES
         found.drones.append(Drone(range_m, float(right - left), bool(whole), best is not None, error, sigma))
-    found.false += len(free)
+    found.false += len(sightings) - len(sighting_of)
+
+
+def _pairings(sightings: tuple[Sighting, ...], places: list[Array], sizes_m: list[float]) -> dict[int, Sighting]:
+    """Of each drone that was found the sighting: first those that lie nearest to each other."""
+    away = sorted(
+        (_angle(sighting.position, place) / (size_m / 2 / float(np.linalg.norm(place))), drone, number)
+        for number, sighting in enumerate(sightings)
+        for drone, (place, size_m) in enumerate(zip(places, sizes_m, strict=True))
+    )
+    pairings: dict[int, int] = {}
+    for share, drone, number in away:
+        if share <= 1.0 and drone not in pairings and number not in pairings.values():
+            pairings[drone] = number
+    return {drone: sightings[number] for drone, number in pairings.items()}
 
 
 def _angle(a: Array, b: Array) -> float:
