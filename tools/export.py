@@ -100,7 +100,7 @@ def main() -> None:
         "--begun-with",
         type=Path,
         metavar="CHECKPOINT",
-        help=f"what the run was started with: the weights' mean, {BEGUN_WITH_SHARE:g} of it, is exported",
+        help=f"what the run was started with, its start.pt: the weights' mean, {BEGUN_WITH_SHARE:g} of it, is exported",
     )
     parser.add_argument("--accuracy", action="append", default=[], metavar="WHAT=FIGURE", help="measured accuracy")
     arguments = parser.parse_args()

@@ -93,11 +93,79 @@ def _quantise(file: Path, feeds: Sequence[Feeds], twin: Path) -> None:
         quant_pre_process(str(file), str(prepared), skip_symbolic_shape=True)
         nodes = onnx.load(str(prepared)).graph.node
         kept = [node.name for node in nodes if any(part in node.name for part in KEPT)]
+        entries = _entries(nodes)
+        steps = {"scale": np.array(1.0, np.float32), "zero_point": np.array(128, np.uint8)}
         quantize_static(
             str(prepared), str(twin), _Reader(feeds), quant_format=QuantFormat.QDQ,
             activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8, per_channel=True, reduce_range=True,
             op_types_to_quantize=list(IN_8_BITS), nodes_to_exclude=kept,
+            extra_options={"TensorQuantOverrides": {name: [steps] for name in entries}},
         )  # fmt: skip
+        model = onnx.load(str(twin))
+        for name in entries:
+            _enter_as_it_is(model.graph, name)
+        _spread_in_8_bits(model.graph)
+        _drop_unused(model.graph)
+        onnx.checker.check_model(model)
+        onnx.save(model, str(twin))
+
+
+def _entries(nodes: Sequence[onnx.NodeProto]) -> list[str]:
+    """What the first layers look at: an 8-bit image less 128, alone or with planes."""
+    greys = {node.output[0] for node in nodes if _is_grey(node, nodes)}
+    together = [node.output[0] for node in nodes if node.op_type == "Concat" and greys & set(node.input)]
+    return together or sorted(greys)
+
+
+def _is_grey(node: onnx.NodeProto, nodes: Sequence[onnx.NodeProto]) -> bool:
+    return node.op_type == "Sub" and any(n.op_type == "Cast" and n.output[0] == node.input[0] for n in nodes)
+
+
+def _enter_as_it_is(graph: onnx.GraphProto, name: str) -> None:
+    """An image of 8-bit numbers stays one: it needs neither be made metres of nor be brought back."""
+    made_by = {output: node for node in graph.node for output in node.output}
+    (to_8_bits,) = (n for n in graph.node if n.op_type == "QuantizeLinear" and n.input[0] == name)
+    entry, (_, scale, zero) = made_by[name], to_8_bits.input
+    begin, parts, new = list(graph.node).index(to_8_bits), [], []
+    for part in entry.input if entry.op_type == "Concat" else [name]:
+        if part in made_by and _is_grey(made_by[part], graph.node):
+            parts.append(made_by[made_by[part].input[0]].input[0])
+        else:
+            parts.append(f"{part}_8_bits")
+            new.append(onnx.helper.make_node("QuantizeLinear", [part, scale, zero], [parts[-1]]))
+    new.append(onnx.helper.make_node("Concat", parts, list(to_8_bits.output), axis=1))
+    graph.node.remove(to_8_bits)
+    for place, node in enumerate(new):
+        graph.node.insert(begin + place, node)
+
+
+def _spread_in_8_bits(graph: onnx.GraphProto) -> None:
+    """Channels that become pixels do so before they are made 32-bit numbers of: a quarter of the memory."""
+    made_by = {output: node for node in graph.node for output in node.output}
+    for spread in [node for node in graph.node if node.op_type == "DepthToSpace"]:
+        back = made_by.get(spread.input[0])
+        if back is None or back.op_type != "DequantizeLinear":
+            continue
+        place = list(graph.node).index(spread)
+        after = onnx.helper.make_node(
+            "DequantizeLinear", [f"{spread.output[0]}_8_bits", *back.input[1:]], list(spread.output)
+        )
+        spread.input[0], spread.output[0] = back.input[0], after.input[0]
+        graph.node.insert(place + 1, after)
+
+
+def _drop_unused(graph: onnx.GraphProto) -> None:
+    """What nobody reads any more, back to where it came from."""
+    told = {output.name for output in graph.output}
+    while True:
+        read = told.union(*(node.input for node in graph.node))
+        unused = [node for node in graph.node if not read & set(node.output)]
+        for node in unused:
+            graph.node.remove(node)
+        if not unused:
+            break
+    for weight in [weight for weight in graph.initializer if weight.name not in read]:
+        graph.initializer.remove(weight)
 
 
 def _images(manifest: Manifest, folder: Path, count: int) -> Iterator[Feeds]:

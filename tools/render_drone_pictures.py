@@ -39,15 +39,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--worlds", type=int, default=300)
+    parser.add_argument("--skip", type=int, default=0, help="worlds, of which there are pictures already elsewhere")
     parser.add_argument("--scenes", type=int, default=400, help="drones a world")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     os.environ["NUMBA_NUM_THREADS"] = "1"
     # From the far end of the training worlds: other places than those of whole images.
-    jobs = [
-        (arguments.out / f"{seed}.npz", seed, arguments.scenes) for seed in worlds.TRAINING[::-1][: arguments.worlds]
-    ]
+    seeds = worlds.TRAINING[::-1][arguments.skip :][: arguments.worlds]
+    jobs = [(arguments.out / f"{seed}.npz", seed, arguments.scenes) for seed in seeds]
     jobs = [job for job in jobs if not job[0].is_file()]
     begin = time.monotonic()
     with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:

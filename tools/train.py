@@ -5,6 +5,7 @@
     python tools/train.py flow       --data DATA --out RUNS/flow --minutes 40
 
 Writes OUT/checkpoint.pt, OUT/curve.csv and a picture of it every few minutes. Uses a GPU where there is one.
+With --start it goes on from another run's weights, or from a network of models/, and keeps them as OUT/start.pt.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from torch.optim.swa_utils import AveragedModel
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from tools.training.dataset import PairSet, open_pairs
+from tools.training.from_onnx import begin_with_onnx
 from tools.training.networks import MAX_DEPTH_M, DistanceNet, FlowNet, NeighboursNet
 from tools.training.pictures import PictureFiles
 from tools.training.samples import (
@@ -278,7 +280,7 @@ def main() -> None:
     parser.add_argument("--negatives", type=Path, help="what is no drone, for `distance`: file of mine_negatives.py")
     parser.add_argument("--pictures", type=Path, help="drones, for `distance`: folder of render_drone_pictures.py")
     parser.add_argument("--rate", type=float, help="learning rate to begin with")
-    parser.add_argument("--start", type=Path, help="weights to begin with: another run's checkpoint.pt")
+    parser.add_argument("--start", type=Path, help="weights to begin with: another run's checkpoint.pt, or an .onnx")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
@@ -287,10 +289,23 @@ def main() -> None:
     cv2.setNumThreads(1)
     task = _task(arguments)
     task.rate = arguments.rate or task.rate
-    if arguments.start:
-        begin_with(task.net, torch.load(arguments.start, map_location="cpu")["net"])
     arguments.out.mkdir(parents=True, exist_ok=True)
+    if arguments.start and not (arguments.out / "checkpoint.pt").is_file():
+        _start(task, arguments.start, arguments.seed)
+        torch.save({"net": task.net.state_dict()}, arguments.out / "start.pt")
     train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed)
+
+
+def _start(task: Task, weights: Path, seed: int) -> None:
+    """Give the task's network the weights of another run, or of a network that it or another one exported."""
+    if weights.suffix != ".onnx":
+        begin_with(task.net, torch.load(weights, map_location="cpu")["net"])
+        return
+    batch = _stack(task.batch_samples(np.random.default_rng(seed)), torch.device("cpu"))
+    try:
+        begin_with_onnx(task.net, weights, lambda: task.loss(batch))
+    except ValueError as error:
+        raise SystemExit(f"--start: {error}") from None
 
 
 def begin_with(net: nn.Module, weights: dict[str, Tensor]) -> None:

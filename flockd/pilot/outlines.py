@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from flockd.geometry import RigCamera, VirtualCrop
-from flockd.messages import UNCLASSED, BoolArray, Float32Array, FloatArray, Sighting, UInt8Array
+from flockd.messages import UNCLASSED, Float32Array, FloatArray, Sighting, UInt8Array
 
 _TO_THE_CORNERS = 1.5
 """Of a picture, from its middle, as a share of the way to its borders."""
@@ -59,17 +59,19 @@ class Outliner:
             masks = masks_of[sighting.label]
             if self._camera.name not in sighting.cameras or not masks:
                 continue
-            box, looked_at, said = self._said(sighting.position, masks, logit)
+            box, said = self._said(sighting.position, masks, logit)
+            if not said.size:
+                continue
             mine = said > highest[box]
-            labels[box][looked_at & (labels[box] == sighting.label)] = UNCLASSED
+            labels[labels == sighting.label] = UNCLASSED  # the pictures hold all of the drone: whose is the rest?
             labels[box][mine] = sighting.label
             highest[box][mine] = said[mine]
         return labels
 
     def _said(
         self, position: FloatArray, masks: Sequence[Mask], logit: Float32Array
-    ) -> tuple[tuple[slice, slice], BoolArray, Float32Array]:
-        """A part of the image, where in it the second stage looked, and the logit of each pixel being this drone's.
+    ) -> tuple[tuple[slice, slice], Float32Array]:
+        """A part of the image, and the logit of each of its pixels being this drone's.
 
         The pictures' mean, and what the first stage says of the pixel being any drone's, add up.
         """
@@ -77,20 +79,17 @@ class Outliner:
         widest = min(_TO_THE_CORNERS * max(mask.half_angle for mask in masks), math.pi / 2)
         rows, columns = np.nonzero(self._rays @ (position / range_m).astype(np.float32) > math.cos(widest))
         if not len(rows):
-            return (slice(0), slice(0)), np.zeros((0, 0), np.bool_), np.zeros((0, 0), np.float32)
+            return (slice(0), slice(0)), np.zeros((0, 0), np.float32)
         points = self._camera.T_body_camera.translation + range_m * self._rays[rows, columns].astype(np.float64)
         seen = np.stack([mask.crop.look_up(mask.logit, points) for mask in masks])
         told = np.isfinite(seen)
         top, left, bottom, right = rows.min(), columns.min(), rows.max() + 1, columns.max() + 1
-        looked_at = np.zeros((bottom - top, right - left), np.uint8)
-        looked_at[rows - top, columns - left] = told.any(0)
         mean = np.where(told, seen, 0.0).sum(0) / np.maximum(told.sum(0), 1)
-        said = np.full(looked_at.shape, _SURELY_NOT, np.float32)
+        said = np.full((bottom - top, right - left), _SURELY_NOT, np.float32)
         said[rows - top, columns - left] = np.where(told.any(0), mean + logit[rows, columns], _SURELY_NOT)
         size = int(right - left) * stride, int(bottom - top) * stride
         back = np.array([[1.0, 0.0, 1.0 - stride], [0.0, 1.0, 1.0 - stride]]) / stride
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         fine = cv2.warpAffine(said, back, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        where = cv2.resize(looked_at, size, interpolation=cv2.INTER_NEAREST) > 0
         box = slice(top * stride, bottom * stride), slice(left * stride, right * stride)
-        return box, np.asarray(where), np.asarray(fine, np.float32)
+        return box, np.asarray(fine, np.float32)

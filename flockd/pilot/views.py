@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -13,6 +13,7 @@ import numpy as np
 from flockd.geometry import Rig, RigCamera, ground_inverse_depth, virtual_crop
 from flockd.messages import (
     UNCLASSED,
+    BoolArray,
     Float32Array,
     FloatArray,
     Frame,
@@ -27,9 +28,11 @@ from flockd.pilot.scale import fix_by_height
 from flockd.tracking import ExpectedNeighbour
 
 _OUTLINE_PX = 5
-_FIRST_MARGIN = 1.3
-"""A picture of a drone is this much wider than its box."""
-_SURE = 0.5
+_FIRST_MARGIN = 0.95
+"""Half the first picture of a drone is so wide, of the way from its centre to its box's farthest corner."""
+_CUT_PX, _CUT_MARGIN = 2, 1.4
+"""So wide is it where the box comes so near to the image's border: the drone is larger than what is seen of it."""
+_SURE = 0.8
 """What the second look says is a drone with less than this probability is none."""
 _MARGIN = 0.68
 """Half of a picture of a drone of known size is this many times its size wide."""
@@ -44,6 +47,8 @@ _WORTH_ANOTHER_LOOK = 0.2
 _SAME_AIM, _SAME_SIZE = 0.1, 1.15
 """Two pictures show the same if one is moved by less than this share of half its width, and resized by less than this.
 """
+_REST_OFF_PX, _REST_PX = 4, 24
+"""What the first stage takes for a part of a drone and the second does not: so far from it, and so many pixels."""
 _SURE_OF_EXPECTED = 0.7
 _EXPECTED_GATE = 0.2
 """What is found where a drone was expected must be as near to that place as this share of its range, or 0.5 m."""
@@ -150,24 +155,39 @@ class Observer:
         """
         images = {name: frames.frames[name].image for name in maps}
         found, refused = self._locate(images, maps) if maps else ([], set())
-        if maps and self._perceiver.has_distance:
+        looks = bool(maps) and self._perceiver.has_distance
+        if looks:
             found += self._look_again(images, vehicle, found, expected)
-        sightings, label_of, masks_of = _merge(_without_hidden(found))
+        merged = _merge(_without_hidden(found))
+        labels = self._labels(maps, merged, refused)
+        rest = self._look_at_the_rest(images, maps, labels) if looks else []
+        if rest:
+            merged = _merge(_without_hidden(found + rest))
+            labels = self._labels(maps, merged, refused)
         views = {}
+        for name, scene in maps.items():
+            depth = self._drone_depth(scene.depth, labels[name], self._rig.cameras[name], merged.sightings)
+            views[name] = CameraView(images[name], depth, _without_outline(labels[name]))
+        return RigView(frames.time_s, vehicle, views, merged.sightings, tuple(reasons))
+
+    def _labels(
+        self, maps: Mapping[str, SceneMaps], merged: _Merged, refused: Container[Instance]
+    ) -> dict[str, UInt8Array]:
+        """Of each camera (h, w): 0 background, k the sighting with label k, 255 not to be used."""
+        labels_of = {}
         for name, scene in maps.items():
             table = np.full(256, UNCLASSED, np.uint8)
             table[0] = 0
             for instance in scene.instances:
                 otherwise = 0 if instance in refused else UNCLASSED
-                table[instance.label] = label_of.get((name, instance.label), otherwise)
+                table[instance.label] = merged.label_of.get((name, instance.label), otherwise)
             labels = table[scene.labels]
             if scene.unsure is not None:
                 labels[scene.unsure & (labels > 0)] = UNCLASSED
             if scene.logit is not None:
-                labels = self._outliners[name].draw(labels, scene.logit, sightings, masks_of)
-            depth = self._drone_depth(scene.depth, labels, self._rig.cameras[name], sightings)
-            views[name] = CameraView(images[name], depth, _without_outline(labels))
-        return RigView(frames.time_s, vehicle, views, sightings, tuple(reasons))
+                labels = self._outliners[name].draw(labels, scene.logit, merged.sightings, merged.masks_of)
+            labels_of[name] = labels
+        return labels_of
 
     def _geometry(self, camera: RigCamera, vehicle: VehicleState) -> Float32Array:
         tangents = self._tangents[camera.name]
@@ -215,6 +235,26 @@ class Observer:
         located, _ = self._look(live, images, candidates)
         return [one for one in located if one.is_drone > _SURE_OF_EXPECTED and _is_as_expected(one)]
 
+    def _look_at_the_rest(
+        self, images: Mapping[str, UInt8Array], maps: Mapping[str, SceneMaps], labels: Mapping[str, UInt8Array]
+    ) -> list[_Located]:
+        """What is found where the first stage is sure of a drone and the second does not know of one.
+
+        A drone that another hides in part, or passes close by, is often taken for a part of it.
+        """
+        live = Rig({name: self._rig.cameras[name] for name in images})
+        candidates = []
+        for name, scene in maps.items():
+            if scene.unsure is None:
+                continue
+            rest = (labels[name] == UNCLASSED) & (scene.labels > 0) & ~scene.unsure
+            if rest.any():
+                drawn = ((labels[name] > 0) & (labels[name] != UNCLASSED)).astype(np.uint8)
+                rest &= cv2.dilate(drawn, np.ones((2 * _REST_OFF_PX + 1, 2 * _REST_OFF_PX + 1), np.uint8)) == 0
+                candidates += [_Candidate((name,), *_aim(self._rig.cameras[name], blob)) for blob in _blobs(rest)]
+        located, _ = self._look(live, images, candidates)
+        return [one for one in located if one.is_drone > _SURE]
+
     def _look(
         self, live: Rig, images: Mapping[str, UInt8Array], candidates: Sequence[_Candidate]
     ) -> tuple[list[_Located], list[_Candidate]]:
@@ -239,7 +279,8 @@ class Observer:
                     continue
                 direction = _in_view(live, answer.position, look.candidate)
                 half_angle = _half_angle(answer.size_m, answer.range_m, look.half_angle)
-                further = _Look(look.candidate, direction, half_angle, answer.range_m, is_drone)
+                surely = is_drone if number > 1 else 1.0  # the first picture may be far from what suits the drone
+                further = _Look(look.candidate, direction, half_angle, answer.range_m, surely)
                 if number == 1 or (number < _MOST_LOOKS and not _shows_the_same(look, further)):
                     again.append(further)
                 elif is_drone > _SURE:  # others would not get surer
@@ -352,7 +393,7 @@ class _Look:
     range_m: float | None = None
     """Of what it should show; None: not known yet."""
     is_drone: float = 1.0
-    """The least probability that an earlier look gave."""
+    """The least probability that an earlier look gave, but for the first."""
     in_mirror: bool = False
 
 
@@ -383,6 +424,17 @@ class _Located:
     masks: tuple[Mask, ...] = ()
 
 
+def _blobs(pixels: BoolArray) -> list[Instance]:
+    """Pixels that touch each other, where there are enough."""
+    count, _, stats, centres = cv2.connectedComponentsWithStats(pixels.astype(np.uint8))
+    boxes = [(left, top, left + width, top + height) for left, top, width, height, _ in stats]
+    return [
+        Instance(0, centres[k] + 0.5, np.array(boxes[k], np.float64), float(stats[k, cv2.CC_STAT_AREA]))
+        for k in range(1, count)
+        if stats[k, cv2.CC_STAT_AREA] >= _REST_PX
+    ]
+
+
 def _fault(frame: Frame | None, camera: RigCamera) -> str | None:
     if frame is None:
         return "no frame"
@@ -400,7 +452,8 @@ def _aim(camera: RigCamera, instance: Instance) -> tuple[FloatArray, float]:
     inside = camera.camera.in_image(instance.centre[None])[0] and np.isfinite(rays[4]).all()
     centre = rays[4] if inside else rays[:4].mean(0) / np.linalg.norm(rays[:4].mean(0))
     reach = float(np.arccos(np.clip(rays[:4] @ centre, -1, 1)).max())
-    half_angle = float(np.clip(_FIRST_MARGIN * reach, *_HALF_ANGLES))
+    cut = bool((instance.box[:2] < _CUT_PX).any() or (instance.box[2:] > np.array(camera.camera.size) - _CUT_PX).any())
+    half_angle = float(np.clip((_CUT_MARGIN if cut else _FIRST_MARGIN) * reach, *_HALF_ANGLES))
     return camera.T_body_camera.rotation @ centre, half_angle
 
 
@@ -475,13 +528,18 @@ def _without_hidden(found: Sequence[_Located]) -> list[_Located]:
     return [one for one in found if not any(hides(other, one) for other in found)]
 
 
-def _merge(
-    found: Sequence[_Located],
-) -> tuple[tuple[Sighting, ...], dict[tuple[str, int], int], dict[int, list[Mask]]]:
-    """One sighting a drone: what two cameras place at the same spot is one.
+@dataclass(frozen=True, eq=False)
+class _Merged:
+    """One sighting a drone."""
 
-    Also (camera, instance) -> label, and the masks of each label.
-    """
+    sightings: tuple[Sighting, ...]
+    label_of: Mapping[tuple[str, int], int]
+    """By camera and the label of its instance."""
+    masks_of: Mapping[int, Sequence[Mask]]
+
+
+def _merge(found: Sequence[_Located]) -> _Merged:
+    """What two cameras place at the same spot is one."""
     groups: list[list[_Located]] = []
     for one in sorted(found, key=lambda item: -item.candidate.area_px):
         for group in groups:
@@ -510,7 +568,7 @@ def _merge(
         for one in group:
             if one.candidate.instance:
                 label_of[(one.candidate.cameras[0], one.candidate.instance.label)] = label
-    return tuple(sightings), label_of, masks_of
+    return _Merged(tuple(sightings), label_of, masks_of)
 
 
 def _is_same(a: _Located, b: _Located) -> bool:

@@ -14,7 +14,7 @@ from flockd.config import ScenarioConfig, load_scenario
 from flockd.data import data_path
 from flockd.geometry import rotation_angle_deg
 from flockd.messages import Float32Array, FrameSet, PilotOutput, UInt8Array, VehicleState
-from flockd.perception import Picture, RangeEstimate, SceneMaps
+from flockd.perception import Instance, Picture, RangeEstimate, SceneMaps
 from flockd.pilot import FlockPilot, views
 from flockd.sim.photographer import Photographer
 from flockd.sim.truth_perception import ROLES, TruthPerception
@@ -215,14 +215,29 @@ def test_the_picture_in_a_mirror_counts_by_how_sure_it_is(monkeypatch: pytest.Mo
         mirrors.extend(picture.in_mirror for picture in pictures)
         told = [replace(answer, relative_sigma=0.05, is_drone=0.9) for answer in answers(pictures)]
         if mirrors[-1]:
-            told[0] = replace(told[0], range_m=6.0, relative_sigma=0.1, is_drone=0.8)
+            told[0] = replace(told[0], range_m=6.0, relative_sigma=0.1, is_drone=0.85)
         return tuple(told)
 
     monkeypatch.setattr(flyer.truth, "ranges", ranges)
     (sighting,) = flyer.step().sightings
     assert mirrors == [False, False, True]
     assert np.linalg.norm(sighting.position) == pytest.approx(3.0 * 2 ** (1 / 5), rel=0.005)  # 1 of 1 + 4
-    assert sighting.drone_probability == pytest.approx(0.8)
+    assert sighting.drone_probability == pytest.approx(0.85)
+
+
+@pytest.mark.parametrize(
+    ("told", "seen"), [((0.3, 0.9, 0.9), 1), ((0.1, 0.9, 0.9), 0), ((0.9, 0.3, 0.9), 0), ((0.9, 0.9, 0.3), 0)]
+)
+def test_doubts_about_the_first_picture_of_a_drone_do_not_outlive_the_next(
+    monkeypatch: pytest.MonkeyPatch, told: tuple[float, ...], seen: int
+) -> None:
+    """Only where it is all but sure that there is none, nobody looks again; the first was not cut to this drone."""
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
+    answers, rest = flyer.truth.ranges, list(told)
+    monkeypatch.setattr(
+        flyer.truth, "ranges", lambda pictures: tuple(replace(a, is_drone=rest.pop(0)) for a in answers(pictures))
+    )
+    assert len(flyer.step().sightings) == seen
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")
@@ -260,6 +275,50 @@ def test_what_is_no_drone_belongs_to_the_background_again(
     labels = observer.view(frames, vehicle, maps, ()).cameras[name].labels
     assert set(labels[drone & ~upper]) == {sure}
     assert set(labels[upper]) == {unsure}
+
+
+def test_of_a_drone_that_the_images_border_cuts_more_is_looked_at_than_is_seen() -> None:
+    camera = next(iter(Photographer(scenario_with((0.0, 0.0, -4.0))).rig.cameras.values()))
+    width = camera.camera.size[0]
+
+    def half_angle(left: float) -> float:
+        box = np.array([left, 300.0, left + 60.0, 340.0])
+        return views._aim(camera, Instance(1, np.array([left + 30.0, 320.0]), box, 900.0))[1]
+
+    assert half_angle(0.0) > 1.3 * half_angle(10.0)
+    assert half_angle(width - 60.0) > 1.3 * half_angle(width - 70.0)
+    assert half_angle(2.0) < 1.1 * half_angle(10.0), "the first stage sees a pixel in two"
+
+
+def test_two_drones_that_the_first_stage_takes_for_one_are_two(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The far one's pixels count for the near one's, until the second stage says which of them are the near one's."""
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0), (6.0, -0.6, -4.0)))
+    frames, vehicle = flyer.look()
+    answers = flyer.truth.ranges
+
+    def ranges(pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
+        v, u = np.mgrid[0:96, 0:96] + 0.5
+        masked = []
+        for picture, answer in zip(pictures, answers(pictures), strict=True):
+            reach_px = 0.6 * answer.size_m * picture.focal_px / answer.range_m
+            logit = np.where(np.hypot(u - answer.centre[0], v - answer.centre[1]) < reach_px, 9.0, -9.0)
+            masked.append(replace(answer, mask=logit.astype(np.float32)))
+        return tuple(masked)
+
+    monkeypatch.setattr(flyer.truth, "ranges", ranges)
+    observer = views.Observer(flyer.photographer.rig, flyer.truth, height_fixes_scale=False)
+    maps, _ = observer.scenes(frames, vehicle)
+    (name,) = [name for name, scene in maps.items() if scene.instances]
+    near, far = maps[name].instances
+    pixels = maps[name].labels > 0
+    both = replace(near, box=np.concatenate([np.minimum(near.box, far.box)[:2], np.maximum(near.box, far.box)[2:]]))
+    labels = np.where(pixels, np.uint8(near.label), np.uint8(0))
+    logit = np.where(pixels, np.float32(3.0), np.float32(-3.0))[1::2, 1::2]
+    taken_for_one = {name: replace(maps[name], labels=labels, instances=(both,), unsure=~pixels, logit=logit)}
+    view = observer.view(frames, vehicle, taken_for_one, ())
+    assert sorted(np.linalg.norm(s.position) for s in view.sightings) == pytest.approx([3.01, 6.03], abs=0.1)
+    seen = view.cameras[name].labels
+    assert {*seen[maps[name].labels == near.label]} & {*seen[maps[name].labels == far.label]} <= {0, 255}
 
 
 def test_blind_cameras_still_give_a_finite_command() -> None:
@@ -302,7 +361,7 @@ def test_two_sightings_in_one_direction_are_one_drone(range_m: float, turned_deg
     aside = np.array([math.cos(turned), math.sin(turned), 0.0])
     one = views._Located(views._Candidate(("front",), ahead, 0.2), 4.0 * ahead, 0.1, size_m=0.7)
     other = views._Located(views._Candidate(("left",), aside, 0.2), range_m * aside, 0.1, size_m=0.7)
-    sightings, *_ = views._merge([one, other])
+    sightings = views._merge([one, other]).sightings
     assert len(sightings) == (1 if same else 2)
 
 

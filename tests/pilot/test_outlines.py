@@ -93,9 +93,10 @@ def test_where_the_second_stage_does_not_tell_the_labels_stay() -> None:
     assert (outliner.draw(labels, PLAIN, [sighting(1, behind)], {1: [mask_of(behind, 0.2)]}) == labels).all()
 
 
-def test_what_a_picture_does_not_show_stays_as_the_first_stage_has_it() -> None:
+def test_what_lies_beyond_a_drones_picture_is_not_known_to_be_its_own() -> None:
     labels = disc(AHEAD, 0.3).astype(np.uint8)
     drawn = Outliner(FRONT, 2).draw(labels, PLAIN, [sighting(1, AHEAD)], {1: [mask_of(AHEAD, 0.1)]})
     far: Float32Array = np.asarray(disc(AHEAD, 0.3) & ~disc(AHEAD, 0.16), np.float32)
-    assert (drawn[far > 0] == 1).all()
+    assert (drawn[far > 0] == UNCLASSED).all()
+    assert (drawn == 1).any()
     assert overlap(drawn[disc(AHEAD, 0.09)] == 1, disc(AHEAD)[disc(AHEAD, 0.09)]) > 0.95

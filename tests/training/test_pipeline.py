@@ -46,6 +46,14 @@ def test_a_network_is_trained_resumed_and_exported_by_one_command_each(
 
     run("export.py", "flow", "--checkpoint", runs / "checkpoint.pt", "--out", models)
     run("quantise.py", models / "flow.yaml", "--data", data, "--out", models)
+
+    further = tmp_path / "further"
+    run("train.py", "flow", "--data", data, "--out", further, "--minutes", "0.03", "--start", models / "flow.onnx")
+    begun = ("--checkpoint", further / "checkpoint.pt", "--begun-with", further / "start.pt")
+    run("export.py", "flow", *begun, "--out", tmp_path / "once_more")
+    said = [(folder / "flow.onnx").read_bytes() for folder in (models, tmp_path / "once_more")]
+    assert said[0] != said[1], "it learnt"
+
     for name in ("neighbours", "distance"):
         for suffix in ("yaml", "onnx"):
             (models / f"{name}.{suffix}").write_bytes((data_path("models") / f"{name}.{suffix}").read_bytes())

@@ -18,6 +18,8 @@ from torch.nn import functional as F
 Out = TypeVar("Out")
 MAX_DEPTH_M = 80.0
 """What the depth output says of the sky."""
+PLANE_STEPS = torch.tensor([100.0, 100.0, 32.0])[:, None, None]
+"""Of the geometry's planes, in a network that runs, a step of 8-bit numbers is one over this."""
 OFFSET_SCALE_PX = 16.0
 """Centre offsets leave the network in units of this many pixels of the half-size map."""
 
@@ -41,25 +43,66 @@ def _blocks(image: Tensor, size: int) -> Tensor:
     """(n, h, w, 3) uint8 -> (n, 3 size^2, h / size, w / size) in -1..1, each block of pixels in one place."""
     n, h, w, _ = image.shape
     x = image.reshape(n, h // size, size, w // size, size, 3).permute(0, 5, 2, 4, 1, 3)
-    return x.reshape(n, 3 * size * size, h // size, w // size).float() / 127.5 - 1.0
+    return (x.reshape(n, 3 * size * size, h // size, w // size).float() - 128.0) / 127.5
 
 
-def _first_layer(layer: nn.Sequential, image: Tensor, planes: Tensor, size: int) -> Tensor:
-    """``layer`` on the image's blocks and the planes.
+def _entry(image: Tensor, *planes: Tensor) -> Tensor:
+    """What the first layers of a network that runs look at: the image's 2 x 2 blocks in grey levels less 128, planes.
 
-    To run, not to train, it is one convolution on the image itself: a kernel of 3 blocks that steps by a block.
+    (n, h, w, 3) uint8 -> (n, 12 + ., h / 2, w / 2). Whole numbers from 0 to 255 less 128 are 8-bit numbers as they are:
+    see ``tools/quantise.py``.
     """
-    if layer.training:
-        return layer(torch.cat([_blocks(image, size), planes], 1))
+    n, h, w, _ = image.shape
+    blocks = image.reshape(n, h // 2, 2, w // 2, 2, 3).permute(0, 1, 3, 2, 4, 5)
+    blocks = blocks.reshape(n, h // 2, w // 2, 12).permute(0, 3, 1, 2)
+    return torch.cat([blocks.float() - 128.0, *planes], 1) if planes else blocks.float() - 128.0
+
+
+def _on_entry(layer: nn.Sequential, entry: Tensor, size: int) -> Tensor:
+    """``layer``, trained on ``_blocks`` of this size, on what ``_entry`` gives: one convolution that steps a block."""
     convolution, norm = layer[0], layer[1]
     scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)
     weight = (convolution.weight * scale[:, None, None, None]).detach()
-    ours, others = weight[:, : 3 * size * size], weight[:, 3 * size * size :]
-    kernel = ours.reshape(-1, 3, size, size, 3, 3).permute(0, 1, 4, 2, 5, 3).reshape(-1, 3, 3 * size, 3 * size)
+    step = size // 2
+    ours = _of_small_blocks(weight[:, : 3 * size * size], 3, step)
+    ours = ours.permute(0, 2, 3, 1, 4, 5).flatten(1, 3)
     bias = (norm.bias - norm.running_mean * scale).detach()
-    x = image.permute(0, 3, 1, 2).float() / 127.5 - 1.0
-    x = F.conv2d(x, kernel.clone(), bias, stride=size, padding=size)
-    return F.relu(x + F.conv2d(planes, others.clone(), padding=1))
+    kernel = ours / 127.5
+    if convolution.in_channels > 3 * size * size:
+        planes = _of_small_blocks(weight[:, 3 * size * size :], 3, step, side=1)[:, :, 0, 0]
+        planes = planes / PLANE_STEPS
+        kernel = torch.cat([kernel, planes, torch.zeros_like(planes[:, :1])], 1)
+    return F.relu(F.conv2d(entry, kernel.clone(), bias, stride=step, padding=step))
+
+
+def _of_small_blocks(weight: Tensor, channels: int, step: int, side: int = 2) -> Tensor:
+    """A kernel on large blocks, made of ``step`` x ``step`` small ones of ``side`` x ``side`` pixels, as one on these.
+
+    (o, channels (step side)^2, 3, 3) -> (o, channels, side, side, 3 step, 3 step).
+    """
+    parts = weight.reshape(-1, channels, step, side, step, side, 3, 3).permute(0, 1, 3, 5, 6, 2, 7, 4)
+    return parts.reshape(-1, channels, side, side, 3 * step, 3 * step)
+
+
+def _of_large_blocks(kernel: Tensor, step: int) -> Tensor:
+    """Back again."""
+    outputs, channels, side = kernel.shape[:3]
+    parts = kernel.reshape(outputs, channels, side, side, 3, step, 3, step).permute(0, 1, 5, 2, 7, 3, 4, 6)
+    return parts.reshape(outputs, channels * (step * side) ** 2, 3, 3)
+
+
+def first_layers_of(net: nn.Module, kernels: list[tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
+    """The weights that ``_on_entry`` made these kernels and biases of, without their normalisation."""
+    sizes = {"NeighboursNet": {"fine.0": 2, "stem.0": 4}, "DistanceNet": {"stem.0": 2}}.get(type(net).__name__, {})
+    weights: dict[str, Tensor] = {}
+    for (name, size), (kernel, bias) in zip(sizes.items(), kernels, strict=True):
+        ours = kernel[:, :12].reshape(-1, 2, 2, 3, *kernel.shape[2:]).permute(0, 3, 1, 2, 4, 5) * 127.5
+        weight = _of_large_blocks(ours, size // 2)
+        if kernel.shape[1] > 12:
+            planes = kernel[:, 12:15] * PLANE_STEPS
+            weight = torch.cat([weight, _of_large_blocks(planes[:, :, None, None], size // 2)], 1)
+        weights |= {f"{name}.weight": weight, f"{name}.bias": bias}
+    return weights
 
 
 class _Residual(nn.Module):
@@ -109,8 +152,14 @@ class NeighboursNet(nn.Module):
         known = ground > 0
         log_ground = torch.log(ground.clamp(min=1.0 / MAX_DEPTH_M))
         planes = torch.cat([geometry[:, :2], torch.where(known, log_ground + 3.0, torch.zeros_like(ground))], 1)
-        fine = _first_layer(self.fine, image, planes, 2)
-        x = _first_layer(self.stem, image, F.pixel_unshuffle(planes, 2), 4) + self.fine_down(fine)
+        if self.training:
+            fine = self.fine(torch.cat([_blocks(image, 2), planes], 1))
+            x = self.stem(torch.cat([_blocks(image, 4), F.pixel_unshuffle(planes, 2)], 1))
+        else:
+            in_steps = planes * PLANE_STEPS
+            entry = _entry(image, in_steps, in_steps[:, :1])  # sixteen channels are faster than fifteen
+            fine, x = _on_entry(self.fine, entry, 2), _on_entry(self.stem, entry, 4)
+        x = x + self.fine_down(fine)
         levels = [x]
         for down, body in zip(self.down, self.body, strict=True):
             x = body(down(x))
@@ -173,7 +222,7 @@ class DistanceNet(nn.Module):
 
         In training also a logit for each family, and log maps of the motors (n, 4, 48 * 48).
         """
-        x = self.stem(_blocks(picture, 2))
+        x = self.stem(_blocks(picture, 2)) if self.training else _on_entry(self.stem, _entry(picture), 2)
         levels = [x]
         for i, (down, body) in enumerate(zip(self.down, self.body, strict=True), start=1):
             x = body(down(x))

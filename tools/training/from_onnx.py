@@ -1,0 +1,97 @@
+"""Weights of an exported network, for training to go on where only its ONNX file is left.
+
+Export folds each batch normalisation into the convolution before it. Here the two are parted again, so that the
+network says the same as before and training can go on with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import onnx
+import torch
+from onnx import numpy_helper
+from torch import Tensor, nn
+
+from tools.training.networks import first_layers_of
+
+
+def begin_with_onnx(net: nn.Module, path: Path, run: Callable[[], object]) -> None:
+    """Give ``net`` the weights of the ONNX file that ``tools/export.py`` made of one like it.
+
+    ``run`` calls ``net`` on a batch of training samples: what the normalisations see of it becomes what they know.
+    Raises ValueError where the file is of another network.
+    """
+    own = net.state_dict()
+    norms = {name: module for name, module in net.named_modules() if isinstance(module, nn.BatchNorm2d)}
+    weights = _weights(path, net)
+    for name, value in weights.items():
+        if name not in own and not (name.endswith(".0.bias") and _norm_after(name) in norms):
+            raise ValueError(f"{path}: its {name} is not {type(net).__name__}'s")
+        if name in own and own[name].shape != value.shape:
+            raise ValueError(f"{path}: its {name} is {list(value.shape)}, not {list(own[name].shape)}")
+        if name in own:
+            own[name] = value
+    net.load_state_dict(own)
+    biases = {_norm_after(name): value for name, value in weights.items() if name not in own}
+    if missing := norms.keys() - biases.keys():
+        raise ValueError(f"{path}: nothing for {sorted(missing)[0]}; it is not {type(net).__name__}'s")
+    hooks = [norm.register_forward_pre_hook(_settled_to(biases[name])) for name, norm in norms.items()]
+    momenta = [norm.momentum for norm in norms.values()]
+    net.train()
+    for norm in norms.values():
+        norm.momentum = 0.0
+    with torch.no_grad():
+        run()
+    for hook, norm, momentum in zip(hooks, norms.values(), momenta, strict=True):
+        hook.remove()
+        norm.momentum = momentum
+
+
+def _settled_to(bias: Tensor) -> Callable[[nn.BatchNorm2d, tuple[Tensor]], None]:
+    """What makes a normalisation add ``bias`` and do nothing else, to the very batch that comes in."""
+
+    def settle(norm: nn.BatchNorm2d, inputs: tuple[Tensor]) -> None:
+        x = inputs[0].float()
+        mean, variance = x.mean((0, 2, 3)), x.var((0, 2, 3), unbiased=False)
+        norm.running_mean.copy_(mean)
+        norm.running_var.copy_(variance)
+        norm.weight.copy_(torch.sqrt(variance + norm.eps))
+        norm.bias.copy_(bias.to(mean) + mean)
+
+    return settle
+
+
+def _weights(path: Path, net: nn.Module) -> dict[str, Tensor]:
+    """Every parameter of the file, under its name in torch; a folded normalisation is its convolution's bias."""
+    graph = onnx.load(str(path)).graph
+    values = {one.name: torch.from_numpy(numpy_helper.to_array(one).copy()) for one in graph.initializer}
+    named = {name: value for name, value in values.items() if not name.startswith("onnx::")}
+    nameless: list[tuple[Tensor, Tensor]] = []
+    for node in graph.node:
+        folded = [values[name] for name in node.input[1:] if name.startswith("onnx::") and name in values]
+        if node.op_type != "Conv" or not folded:
+            continue
+        if layer := _module(node.name):
+            named |= {f"{layer}.{part}": value for part, value in zip(("weight", "bias"), folded, strict=True)}
+        else:
+            nameless.append((folded[0], folded[1]))
+    try:
+        return named | first_layers_of(net, nameless)
+    except (ValueError, RuntimeError):
+        raise ValueError(f"{path}: its first layers are not {type(net).__name__}'s") from None
+
+
+def _module(node: str) -> str:
+    """``/deep/deep.0/first/first.0/Conv`` -> ``deep.0.first.0``."""
+    parts: list[str] = []
+    for part in node.strip("/").split("/")[:-1]:
+        if parts and part.startswith(parts[-1] + "."):
+            parts.pop()
+        parts.append(part)
+    return ".".join(parts)
+
+
+def _norm_after(bias: str) -> str:
+    return bias.removesuffix("0.bias") + "1"
