@@ -122,7 +122,7 @@ def _is_grey(node: onnx.NodeProto, nodes: Sequence[onnx.NodeProto]) -> bool:
 
 
 def _enter_as_it_is(graph: onnx.GraphProto, name: str) -> None:
-    """An image of 8-bit numbers stays one: it needs neither be made metres of nor be brought back."""
+    """The image's 8-bit numbers need not become 32-bit ones and 8-bit ones again; planes beside it do once."""
     made_by = {output: node for node in graph.node for output in node.output}
     (to_8_bits,) = (n for n in graph.node if n.op_type == "QuantizeLinear" and n.input[0] == name)
     entry, (_, scale, zero) = made_by[name], to_8_bits.input
@@ -155,7 +155,7 @@ def _spread_in_8_bits(graph: onnx.GraphProto) -> None:
 
 
 def _drop_unused(graph: onnx.GraphProto) -> None:
-    """What nobody reads any more, back to where it came from."""
+    """Nodes and weights that nobody reads any more."""
     told = {output.name for output in graph.output}
     while True:
         read = told.union(*(node.input for node in graph.node))

@@ -18,7 +18,7 @@ from torch.nn import functional as F
 Out = TypeVar("Out")
 MAX_DEPTH_M = 80.0
 """What the depth output says of the sky."""
-PLANE_STEPS = torch.tensor([100.0, 100.0, 32.0])[:, None, None]
+PLANE_STEPS = torch.tensor([64.0, 64.0, 32.0])[:, None, None]
 """Of the geometry's planes, in a network that runs, a step of 8-bit numbers is one over this."""
 OFFSET_SCALE_PX = 16.0
 """Centre offsets leave the network in units of this many pixels of the half-size map."""
