@@ -47,8 +47,9 @@ _WORTH_ANOTHER_LOOK = 0.2
 _SAME_AIM, _SAME_SIZE = 0.1, 1.15
 """Two pictures show the same if one is moved by less than this share of half its width, and resized by less than this.
 """
-_REST_OFF_PX, _REST_PX = 4, 24
-"""What the first stage takes for a part of a drone and the second does not: so far from it, and so many pixels."""
+_REST_OFF_PX, _REST_PX, _MOST_RESTS = 4, 24, 6
+"""What the first stage takes for a part of a drone and the second does not: so far from it, so many pixels, and of a
+camera at most so many, the largest: an image full of ghosts must not cost the deadline."""
 _SURE_OF_EXPECTED = 0.7
 _EXPECTED_GATE = 0.2
 """What is found where a drone was expected must be as near to that place as this share of its range, or 0.5 m."""
@@ -425,14 +426,15 @@ class _Located:
 
 
 def _blobs(pixels: BoolArray) -> list[Instance]:
-    """Pixels that touch each other, where there are enough."""
+    """The largest groups of pixels that touch each other, where they are large enough."""
     count, _, stats, centres = cv2.connectedComponentsWithStats(pixels.astype(np.uint8))
-    boxes = [(left, top, left + width, top + height) for left, top, width, height, _ in stats]
-    return [
-        Instance(0, centres[k] + 0.5, np.array(boxes[k], np.float64), float(stats[k, cv2.CC_STAT_AREA]))
-        for k in range(1, count)
-        if stats[k, cv2.CC_STAT_AREA] >= _REST_PX
-    ]
+    largest = sorted(range(1, count), key=lambda k: -stats[k, cv2.CC_STAT_AREA])[:_MOST_RESTS]
+    found = []
+    for k in largest:
+        left, top, width, height, area = (float(value) for value in stats[k])
+        if area >= _REST_PX:
+            found.append(Instance(0, centres[k] + 0.5, np.array([left, top, left + width, top + height]), area))
+    return found
 
 
 def _fault(frame: Frame | None, camera: RigCamera) -> str | None:

@@ -321,6 +321,19 @@ def test_two_drones_that_the_first_stage_takes_for_one_are_two(monkeypatch: pyte
     assert {*seen[maps[name].labels == near.label]} & {*seen[maps[name].labels == far.label]} <= {0, 255}
 
 
+def test_an_image_full_of_ghosts_costs_no_more_than_a_few_looks() -> None:
+    """What the first stage is sure of in a hundred places; only the largest are looked at, and no mere specks."""
+    pixels = np.zeros((640, 480), np.bool_)
+    for k in range(100):
+        pixels[60 * (k // 10) : 60 * (k // 10) + 5 + k // 5, 45 * (k % 10) : 45 * (k % 10) + 20] = True
+    blobs = views._blobs(pixels)
+    assert [blob.area_px for blob in blobs] == [20.0 * (5 + k // 5) for k in (95, 96, 97, 98, 99, 90)]
+    assert list(blobs[0].box) == [225.0, 540.0, 245.0, 564.0]
+    speck = np.zeros((640, 480), np.bool_)
+    speck[100:103, 200:207] = True
+    assert not views._blobs(speck)
+
+
 def test_blind_cameras_still_give_a_finite_command() -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0)))
     _, state = flyer.look()
