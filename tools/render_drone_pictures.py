@@ -30,6 +30,8 @@ PICTURES_A_SCENE = 3
 PAINTED = 8
 """Drones of each family in a world, painted differently."""
 MOST_DRONES = 3
+MIN_PIXELS = 8
+"""That much of it must be seen: a drone six pixels wide is still to be told from a bird."""
 WITH_DISTRACTORS, DISTRACTOR_ALONE = 0.3, 0.1
 """Shares of the scenes: a bird or the like before or behind the drone, and in its place, where half are too far."""
 
@@ -114,13 +116,15 @@ def _scene(world: Any, place: Array, models: dict[int, list[Any]], rng: np.rando
         matrix, (right - left, bottom - top), R_ned_camera, position,
         drone_rotations=rotations, drone_positions=positions, shown=np.full(count, not alone), distractors=others,
     )  # fmt: skip
-    if np.count_nonzero(view.distractors if alone else view.ids == 1) < 40:
+    if np.count_nonzero(view.distractors if alone else view.ids == 1) < MIN_PIXELS:
         return []
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     image[top:bottom, left:right] = view.rgb
     if alone:
-        return [picture_of_no_drone(crop, image, rng) for crop in crops]
-    return [picture_of(seen, crop, image, rng) for crop in crops]
+        return [picture_of_no_drone(crop, image) for crop in crops]
+    mine = np.zeros((HEIGHT, WIDTH), np.bool_)
+    mine[top:bottom, left:right] = view.ids == 1
+    return [picture_of(seen, crop, image, mine) for crop in crops]
 
 
 def _places(position: Array, R_ned_camera: Array, focal: float, count: int, rng: np.random.Generator) -> Array:

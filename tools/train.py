@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -28,14 +30,13 @@ from torch.optim.swa_utils import AveragedModel
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from tools.training.augment import photometric
 from tools.training.dataset import PairSet, open_pairs
 from tools.training.from_onnx import begin_with_onnx
 from tools.training.networks import MAX_DEPTH_M, DistanceNet, FlowNet, NeighboursNet
 from tools.training.pictures import PictureFiles
 from tools.training.samples import (
     Sample,
-    distance_sample,
-    drone_list,
     flow_sample,
     neighbours_sample,
     no_drone_sample,
@@ -111,47 +112,39 @@ class NeighboursTask(Task):
 class DistanceTask(Task):
     """Range of the drone in the middle of a picture, and which pixels are its own.
 
-    Most drones come from the files of render_drone_pictures.py, as many as there are by now. What is no drone, and the
-    drones whose pixels are known, are cut from whole images, into two pools that are renewed a little with every batch:
-    cutting costs more than learning from it.
+    Drones come from the files of render_drone_pictures.py, as many as there are by now. Most of what is no drone is cut
+    from whole images, into a pool that is renewed a little with every batch: cutting costs more than learning from it.
     """
 
     pool_size = 8_000
     renewed_in_a_batch = 3
-    no_drone_share, masked_share = 0.25, 0.18
+    no_drone_share = 0.25
 
     def __init__(self, pairs: PairSet, negatives: Path, pictures: Path) -> None:
         super().__init__(DistanceNet(), 64, 2e-3)
         self.pairs, self.negatives = pairs, np.load(negatives)
         self.drones = PictureFiles(pictures)
-        self.whole = drone_list(pairs)
         self.no_drones: list[Sample] = []
-        self.masked: list[Sample] = []
 
     def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
         """See ``Task``."""
         self.drones.look_for_more()
-        for pool, draw in ((self.no_drones, self._no_drone), (self.masked, self._masked)):
-            while len(pool) < self.pool_size:
-                pool.append(draw(rng))
-            for _ in range(self.renewed_in_a_batch):
-                pool[int(rng.integers(self.pool_size))] = draw(rng)
+        while len(self.no_drones) < self.pool_size:
+            self.no_drones.append(self._no_drone(rng))
+        for _ in range(self.renewed_in_a_batch):
+            self.no_drones[int(rng.integers(self.pool_size))] = self._no_drone(rng)
         return super().batch_samples(rng)
 
     def sample(self, rng: np.random.Generator) -> Sample:
         """See ``Task``."""
-        kind = rng.random()
-        if kind < self.no_drone_share + self.masked_share:
-            pool = self.no_drones if kind < self.no_drone_share else self.masked
-            return pool[int(rng.integers(self.pool_size))]
-        return {**self.drones.draw(rng), **_empty_mask(known=False)}
-
-    def _masked(self, rng: np.random.Generator) -> Sample:
-        return distance_sample(self.pairs, self.whole[int(rng.integers(len(self.whole)))], rng)
+        from_pool = rng.random() < self.no_drone_share
+        drawn = self.no_drones[int(rng.integers(self.pool_size))] if from_pool else self.drones.draw(rng)
+        (picture,) = photometric([drawn["picture"]], rng)
+        return {**drawn, "picture": picture}
 
     def _no_drone(self, rng: np.random.Generator) -> Sample:
         hard = self.negatives[int(rng.integers(len(self.negatives)))] if rng.random() < 0.7 else None
-        return {**no_drone_sample(self.pairs, hard, rng), **_empty_mask(known=True)}
+        return no_drone_sample(self.pairs, hard, rng)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         """See ``Task``."""
@@ -177,25 +170,20 @@ class DistanceTask(Task):
             "other": float(right[~seen].float().mean()) if (~seen).any() else float("nan"),
         }
         exists = F.binary_cross_entropy_with_logits(out[:, 4], there)
-        mask_loss, figures["iou"] = _mask_loss(masks.float(), batch["mask"].float() / 255, batch["mask_known"], seen)
+        mask_loss, figures["iou"] = _mask_loss(masks.float(), batch["mask"].float() / 255, there)
         return (each * there).sum() / there.sum().clamp(min=1) + 0.5 * exists + mask_loss, figures
 
 
-def _empty_mask(*, known: bool) -> Sample:
-    return {"mask": np.zeros((96, 96), np.uint8), "mask_known": np.array(known, np.float32)}
-
-
-def _mask_loss(logits: Tensor, mask: Tensor, known: Tensor, seen: Tensor) -> tuple[Tensor, float]:
-    """Of (n, ., .) masks where they are known; and the mean IoU of the drones among them."""
-    bce = F.binary_cross_entropy_with_logits(logits, mask, reduction="none").mean((1, 2))
+def _mask_loss(logits: Tensor, mask: Tensor, drone: Tensor) -> tuple[Tensor, float]:
+    """Of (n, ., .) masks, ``drone`` (n,) being 0 where there is none; and the mean IoU of the others."""
+    bce = F.binary_cross_entropy_with_logits(logits, mask)
     probability = torch.sigmoid(logits)
     both, either = (probability * mask).sum((1, 2)), (probability + mask).sum((1, 2))
     dice = 1 - (2 * both + 20) / (either + 20)
-    drone = known * seen
-    loss = (2.0 * bce * known).sum() / known.sum().clamp(min=1) + 0.3 * (dice * drone).sum() / drone.sum().clamp(min=1)
+    count = drone.sum().clamp(min=1)
     guess, mine = logits > 0, mask > 0.5
     iou = (guess & mine).sum((1, 2)) / (guess | mine).sum((1, 2)).clamp(min=1)
-    return loss, float((iou * drone).sum() / drone.sum().clamp(min=1))
+    return 2.0 * bce + 0.3 * (dice * drone).sum() / count, float((iou * drone).sum() / count)
 
 
 def _flipped(batch: Batch) -> Batch:
@@ -281,6 +269,7 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path, help="drones, for `distance`: folder of render_drone_pictures.py")
     parser.add_argument("--rate", type=float, help="learning rate to begin with")
     parser.add_argument("--start", type=Path, help="weights to begin with: another run's checkpoint.pt, or an .onnx")
+    parser.add_argument("--compile", action="store_true", help="a fifth faster; needs a C++ compiler")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
@@ -293,6 +282,11 @@ def main() -> None:
     if arguments.start and not (arguments.out / "checkpoint.pt").is_file():
         _start(task, arguments.start, arguments.seed)
         torch.save({"net": task.net.state_dict()}, arguments.out / "start.pt")
+    if arguments.compile:
+        compiler = os.environ.get("CXX", "g++")
+        if shutil.which(compiler) is None:
+            raise SystemExit(f"--compile needs a C++ compiler, and there is no {compiler} here; leave --compile out")
+        task.net.compile()
     train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed)
 
 

@@ -44,7 +44,7 @@ _MIRROR_WIDTH = 0.9
 _MEAN_SIGMA = 0.98
 """The error of the mean of both, as a share of what a single picture's would be."""
 _WORTH_ANOTHER_LOOK = 0.2
-_SAME_AIM, _SAME_SIZE = 0.1, 1.15
+_SAME_AIM, _SAME_SIZE = 0.03, 1.05
 """Two pictures show the same if one is moved by less than this share of half its width, and resized by less than this.
 """
 _REST_OFF_PX, _REST_PX, _MOST_RESTS = 4, 24, 6

@@ -226,7 +226,14 @@ def test_the_picture_in_a_mirror_counts_by_how_sure_it_is(monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize(
-    ("told", "seen"), [((0.3, 0.9, 0.9), 1), ((0.1, 0.9, 0.9), 0), ((0.9, 0.3, 0.9), 0), ((0.9, 0.9, 0.3), 0)]
+    ("told", "seen"),
+    [
+        ((0.3, 0.9, 0.9), 1),
+        ((0.3, 0.85, 0.85), 1),
+        ((0.1, 0.9, 0.9), 0),
+        ((0.9, 0.75, 0.9), 0),
+        ((0.9, 0.9, 0.75), 0),
+    ],
 )
 def test_doubts_about_the_first_picture_of_a_drone_do_not_outlive_the_next(
     monkeypatch: pytest.MonkeyPatch, told: tuple[float, ...], seen: int

@@ -16,8 +16,9 @@ pytest.importorskip("torch", reason="the extra `train` is not installed")
 from flockd.cli import main
 from flockd.data import data_path
 from tools.training import worlds
-from tools.training.dataset import FOCAL_PX, HEIGHT, MAX_DRONES, WIDTH, PairSet
-from tools.training.samples import distance_sample, warped
+from tools.training.augment import UNTOUCHED, photometric
+from tools.training.dataset import FOCAL_PX, HEIGHT, WIDTH
+from tools.training.samples import DroneInView, crop_around, picture_of, warped
 
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
 
@@ -84,21 +85,24 @@ def test_a_warped_image_goes_where_its_flow_says() -> None:
 def test_the_mask_of_a_picture_is_the_drone_that_it_faces() -> None:
     """A red drone and a blue one beside it; the picture of the red one masks what is red."""
     rng = np.random.default_rng(2)
-    image, ids = np.zeros((2, HEIGHT, WIDTH, 3), np.uint8), np.zeros((2, HEIGHT, WIDTH), np.uint8)
-    for number, (colour, left) in enumerate((((255, 0, 0), 220), ((0, 0, 255), 262)), start=1):
-        part = np.s_[0, 300:340, left : left + 40]
-        image[part], ids[part] = colour, number
-    centres = np.full((1, 2, MAX_DRONES, 3), np.nan)
-    centres[0, 0, :2] = [[(left + 20 - WIDTH / 2) / FOCAL_PX * 4, 0.0, 4.0] for left in (220, 262)]
-    arrays = {
-        "image": image[None], "ids": ids[None, :, 1::2, 1::2], "focal": np.array([FOCAL_PX]), "drone_centre": centres,
-        "drone_rotation": np.broadcast_to(np.eye(3), (1, 2, MAX_DRONES, 3, 3)),
-        "drone_family": np.zeros((1, MAX_DRONES), np.int16),
-    }  # fmt: skip
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    image[300:340, 220:260], image[300:340, 262:302] = (255, 0, 0), (0, 0, 255)
+    mine = image[:, :, 0] > 0
+    seen = DroneInView(FOCAL_PX, np.array([(240 - WIDTH / 2) / FOCAL_PX * 4, 0.0, 4.0]), np.eye(3), 0)
     for _ in range(10):
-        sample = distance_sample(PairSet(arrays, 1), (0, 0, 0), rng, augment=False)
+        sample = picture_of(seen, crop_around(seen, rng), image, mine)
         red = sample["picture"][:, :, 0] > 127
         mask = sample["mask"] > 127
         assert red.sum() > 200
         assert (mask & red).sum() / (mask | red).sum() > 0.9
-        assert sample["mask_known"] == 1.0
+
+
+def test_some_images_stay_clear_and_the_others_are_spoilt_each_in_its_own_way() -> None:
+    rng = np.random.default_rng(3)
+    image = rng.integers(60, 190, (96, 96, 3), dtype=np.uint8)
+    spoilt = [photometric([image, image], rng) for _ in range(200)]
+    clear = [np.array_equal(first, image) and np.array_equal(second, image) for first, second in spoilt]
+    assert abs(np.mean(clear) - UNTOUCHED) < 0.15
+    away = [np.abs(first.astype(float) - image).mean() for first, _ in spoilt]
+    assert 3.0 < np.median([a for a, same in zip(away, clear, strict=True) if not same]) < 60.0
+    assert all(part.shape == image.shape and part.dtype == np.uint8 for pair in spoilt for part in pair)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -98,12 +97,6 @@ def ray_tangents(focal: float) -> NDArray[np.float32]:
     u = (np.arange(WIDTH // 2) * 2 + 1 - WIDTH / 2) / focal
     v = (np.arange(HEIGHT // 2) * 2 + 1 - HEIGHT / 2) / focal
     return np.stack(np.broadcast_arrays(u[None, :], v[:, None])).astype(np.float32)
-
-
-def drones_seen(pairs: PairSet, min_pixels: int) -> Iterator[tuple[int, int, int]]:
-    """(pair, image, drone) of every drone with at least so many visible pixels."""
-    for pair, image, drone in zip(*np.nonzero(pairs["drone_pixels"] >= min_pixels), strict=True):
-        yield int(pair), int(image), int(drone)
 
 
 def note(folder: Path, **facts: object) -> None:

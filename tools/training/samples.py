@@ -17,7 +17,6 @@ from tools.training.dataset import (
     R_BODY_CAMERA,
     WIDTH,
     PairSet,
-    drones_seen,
     ground_plane,
     ray_tangents,
     rig_camera,
@@ -89,31 +88,6 @@ class DroneInView:
     family: int
 
 
-def distance_sample(
-    pairs: PairSet, drone: tuple[int, int, int], rng: np.random.Generator, *, augment: bool = True
-) -> Sample:
-    """A picture of one drone, its range and which of the pixels are its own, for ``DistanceNet``."""
-    pair, k, d = drone
-    seen = DroneInView(
-        float(pairs["focal"][pair]),
-        np.asarray(pairs["drone_centre"][pair, k, d], np.float64),
-        np.asarray(pairs["drone_rotation"][pair, k, d], np.float64),
-        int(pairs["drone_family"][pair, d]),
-    )
-    crop = crop_around(seen, rng)
-    sample = picture_of(seen, crop, np.asarray(pairs["image"][pair][k]), rng, augment=augment)
-    return {**sample, "mask": _mask_of(crop, pairs["ids"][pair][k] == d + 1), "mask_known": np.array(1.0, np.float32)}
-
-
-def _mask_of(crop: VirtualCrop, mine: NDArray[Any]) -> NDArray[np.uint8]:
-    """(96, 96) how much of each of the crop's pixels is the drone's, 0-255, of every second pixel of an image."""
-    to_half = np.array([[0.5, 0.0, -0.5], [0.0, 0.5, -0.5]])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    full = cv2.warpAffine(np.uint8(255) * mine.astype(np.uint8), to_half, (WIDTH, HEIGHT), flags=flags)
-    picture, seen = crop.sample({"camera": np.repeat(full[:, :, None], 3, 2)})
-    return np.where(seen, picture[:, :, 0], np.uint8(0))
-
-
 def crop_around(drone: DroneInView, rng: np.random.Generator) -> VirtualCrop:
     """Where the second stage might look at a drone."""
     return crop_at(drone.centre, SIZES_M[drone.family], drone.focal, rng)
@@ -132,25 +106,28 @@ def crop_at(centre: NDArray[Any], size_m: float, focal: float, rng: np.random.Ge
     return virtual_crop(Rig({"camera": rig_camera(focal)}), aim / np.linalg.norm(aim), half_angle, 96)
 
 
-def picture_of(
-    drone: DroneInView, crop: VirtualCrop, image: NDArray[Any], rng: np.random.Generator, *, augment: bool = True
-) -> Sample:
-    """What ``crop`` shows of the camera's ``image``, with the truth."""
+def picture_of(drone: DroneInView, crop: VirtualCrop, image: NDArray[Any], mine: NDArray[Any]) -> Sample:
+    """What ``crop`` shows of the camera's ``image`` (h, w, 3), with the truth; ``mine`` (h, w): the drone's pixels."""
     picture, _ = crop.sample({"camera": image})
     hubs = drone.centre + HUBS[drone.family] @ drone.rotation.T
     points = np.vstack([drone.centre[None], hubs]) @ R_BODY_CAMERA.T
     place, *motors = crop.camera.project(crop.T_body_virtual.inverse().apply(points)) - 48.0
-    if augment:
-        (picture,) = photometric([picture], rng)
     log_range = np.log(np.linalg.norm(drone.centre) / crop.camera.matrix[0, 0])
     return {
         "picture": picture,
+        "mask": _mask_of(crop, mine),
         "target": np.array([log_range, *place], np.float32),
         "motors": np.asarray(motors, np.float32),
         "family": np.array(drone.family),
         "apparent": np.array(np.log(SIZES_M[drone.family]) - log_range, np.float32),
         "drone": np.array(1.0, np.float32),
     }
+
+
+def _mask_of(crop: VirtualCrop, mine: NDArray[Any]) -> NDArray[np.uint8]:
+    """(96, 96) how much of each of the crop's pixels is the drone's, 0-255."""
+    picture, seen = crop.sample({"camera": np.repeat(np.uint8(255) * mine.astype(np.uint8)[:, :, None], 3, 2)})
+    return np.where(seen, picture[:, :, 0], np.uint8(0))
 
 
 def no_drone_sample(pairs: PairSet, negative: NDArray[Any] | None, rng: np.random.Generator) -> Sample:
@@ -170,15 +147,15 @@ def no_drone_sample(pairs: PairSet, negative: NDArray[Any] | None, rng: np.rando
     aim = R_BODY_CAMERA @ np.array([*((middle - (WIDTH / 2, HEIGHT / 2)) / focal), 1.0])
     half_angle = float(np.arctan(max(half_px, 4.0) / focal))
     crop = virtual_crop(Rig({"camera": rig_camera(focal)}), aim / np.linalg.norm(aim), half_angle, 96)
-    return picture_of_no_drone(crop, np.asarray(pairs["image"][pair][k]), rng)
+    return picture_of_no_drone(crop, np.asarray(pairs["image"][pair][k]))
 
 
-def picture_of_no_drone(crop: VirtualCrop, image: NDArray[Any], rng: np.random.Generator) -> Sample:
+def picture_of_no_drone(crop: VirtualCrop, image: NDArray[Any]) -> Sample:
     """What ``crop`` shows of the camera's ``image``, where nothing is to be found."""
     picture, _ = crop.sample({"camera": image})
-    (picture,) = photometric([picture], rng)
     return {
         "picture": picture,
+        "mask": np.zeros(picture.shape[:2], np.uint8),
         "target": np.zeros(3, np.float32),
         "motors": np.zeros((4, 2), np.float32),
         "family": np.array(0),
@@ -243,11 +220,6 @@ def warped(
     flow = np.moveaxis(places - np.stack([u, v], 2), 2, 0).astype(np.float32)
     inside = (places >= 0).all(2) & (places[..., 0] <= width - 1) & (places[..., 1] <= height - 1)
     return np.asarray(second, np.uint8), flow, np.asarray(inside)
-
-
-def drone_list(pairs: PairSet, min_pixels: int = 40) -> list[tuple[int, int, int]]:
-    """Every drone worth a picture."""
-    return list(drones_seen(pairs, min_pixels))
 
 
 def _quarter(image: NDArray[Any]) -> NDArray[Any]:
