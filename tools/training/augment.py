@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
 UNTOUCHED = 0.5
-"""Share of the images that stay as they are: what is learnt from spoilt ones alone is not sharp on clear ones."""
+"""Share of the images that stay as they are, as a good camera in good light gives them."""
 
 
 def photometric(images: list[Image], rng: np.random.Generator) -> list[Image]:
