@@ -273,6 +273,9 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
+    compiler = os.environ.get("CXX", "g++")
+    if arguments.compile and shutil.which(compiler) is None:
+        raise SystemExit(f"--compile needs a C++ compiler, and there is no {compiler} here; leave --compile out")
     torch.manual_seed(arguments.seed)
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(1)
@@ -283,9 +286,6 @@ def main() -> None:
         _start(task, arguments.start, arguments.seed)
         torch.save({"net": task.net.state_dict()}, arguments.out / "start.pt")
     if arguments.compile:
-        compiler = os.environ.get("CXX", "g++")
-        if shutil.which(compiler) is None:
-            raise SystemExit(f"--compile needs a C++ compiler, and there is no {compiler} here; leave --compile out")
         task.net.compile()
     train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed)
 

@@ -184,7 +184,15 @@ def test_a_drone_that_segmentation_misses_is_seen_where_it_is_expected(
 
 
 @pytest.mark.parametrize(
-    ("wrong_by", "looks"), [((1.0,), 2), ((1.6, 1.0), 3), ((1.6, 1.3, 1.0), 4), ((1.6, 1.3, 1.6, 1.0), 4)]
+    ("wrong_by", "looks"),
+    [
+        ((1.0,), 2),
+        ((1.03, 1.0), 2),
+        ((1.08, 1.0), 3),
+        ((1.6, 1.0), 3),
+        ((1.6, 1.3, 1.0), 4),
+        ((1.6, 1.3, 1.6, 1.0), 4),
+    ],
 )
 def test_a_drone_is_looked_at_until_the_picture_shows_it_well(
     monkeypatch: pytest.MonkeyPatch, wrong_by: tuple[float, ...], looks: int

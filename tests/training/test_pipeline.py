@@ -18,6 +18,7 @@ from flockd.data import data_path
 from tools.training import worlds
 from tools.training.augment import UNTOUCHED, photometric
 from tools.training.dataset import FOCAL_PX, HEIGHT, WIDTH
+from tools.training.pictures import PictureFiles
 from tools.training.samples import DroneInView, crop_around, picture_of, warped
 
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
@@ -106,3 +107,9 @@ def test_some_images_stay_clear_and_the_others_are_spoilt_each_in_its_own_way() 
     away = [np.abs(first.astype(float) - image).mean() for first, _ in spoilt]
     assert 3.0 < np.median([a for a, same in zip(away, clear, strict=True) if not same]) < 60.0
     assert all(part.shape == image.shape and part.dtype == np.uint8 for pair in spoilt for part in pair)
+
+
+def test_pictures_from_before_they_had_masks_are_refused_by_name(tmp_path: Path) -> None:
+    np.savez(tmp_path / "1.npz", picture=np.zeros((1, 96, 96, 3), np.uint8), drone=np.ones(1, np.float32))
+    with pytest.raises(ValueError, match=r"1\.npz: its pictures have no masks; make the folder anew"):
+        PictureFiles(tmp_path)

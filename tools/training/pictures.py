@@ -37,6 +37,8 @@ class PictureFiles:
             if path not in self._files:
                 with np.load(path) as arrays:
                     self._files[path] = dict(arrays)
+                if "mask" not in self._files[path]:
+                    raise ValueError(f"{path}: its pictures have no masks; make the folder anew")
         if not self._files:
             raise FileNotFoundError(f"{self._folder}: no pictures here; make them with tools/render_drone_pictures.py")
         self._ends = np.cumsum([len(file["drone"]) for file in self._files.values()])
