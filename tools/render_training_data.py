@@ -37,13 +37,15 @@ def main() -> None:
     parser.add_argument("--split", choices=["training", "validation", "test"], default="training")
     parser.add_argument("--families", choices=["training", "unseen"], default="training")
     parser.add_argument("--worlds", type=int, default=120)
+    parser.add_argument("--skip", type=int, default=0, help="worlds of the split, which are rendered already")
     parser.add_argument("--pairs", type=int, default=30, help="pairs a world")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     arguments = parser.parse_args()
     seeds = {"training": worlds.TRAINING, "validation": worlds.VALIDATION, "test": worlds.TEST}[arguments.split]
     families = {"training": worlds.FAMILIES, "unseen": worlds.UNSEEN_FAMILIES}[arguments.families]
     os.environ["NUMBA_NUM_THREADS"] = "1"
-    jobs = [(arguments.out / f"part-{i:04d}", seeds[i], arguments.pairs, families) for i in range(arguments.worlds)]
+    wanted = range(arguments.skip, arguments.skip + arguments.worlds)
+    jobs = [(arguments.out / f"part-{i:04d}", seeds[i], arguments.pairs, families) for i in wanted]
     jobs = [job for job in jobs if not (job[0] / "made.json").is_file()]
     begin = time.monotonic()
     with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
