@@ -11,6 +11,7 @@ import numpy as np
 
 from flockd.geometry import RigCamera, VirtualCrop
 from flockd.messages import UNCLASSED, Float32Array, FloatArray, Sighting, UInt8Array
+from flockd.pilot.colours import weigh_by_colour
 
 _TO_THE_CORNERS = 1.5
 """Of a picture, from its middle, as a share of the way to its borders."""
@@ -27,6 +28,15 @@ class Mask:
     half_angle: float
 
 
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """One camera's (h, w) labels: 0 background, k the sighting with label k, 255 not to be used."""
+
+    labels: UInt8Array
+    by_networks: UInt8Array
+    """Without what colours say: a drone and another before it may be painted alike."""
+
+
 class Outliner:
     """Draws one camera's drones."""
 
@@ -41,32 +51,31 @@ class Outliner:
 
     def draw(
         self,
+        image: UInt8Array,
         labels: UInt8Array,
         logit: Float32Array,
         sightings: Sequence[Sighting],
         masks_of: Mapping[int, Sequence[Mask]],
-    ) -> UInt8Array:
-        """The camera's labels (h, w) with each sighting's pixels as both stages see them.
+    ) -> Labels:
+        """The camera's labels with each sighting's pixels as both stages and their colours say.
 
         Args:
+            image: (h, w, 3) RGB.
             labels: (h, w) as the first stage alone has them.
             logit: (h / stride, w / stride) of a pixel being any drone's, as the first stage says.
             sightings: of the whole rig.
             masks_of: the second stage's, by the sighting's label; none where it does not tell.
         """
-        labels, highest = labels.copy(), np.zeros(labels.shape, np.float32)
+        drawn, by_networks = _Canvas(labels), _Canvas(labels)
         for sighting in sightings:
             masks = masks_of[sighting.label]
             if self._camera.name not in sighting.cameras or not masks:
                 continue
             box, said = self._said(sighting.position, masks, logit)
-            if not said.size:
-                continue
-            mine = said > highest[box]
-            labels[labels == sighting.label] = UNCLASSED  # the pictures hold all of the drone: whose is the rest?
-            labels[box][mine] = sighting.label
-            highest[box][mine] = said[mine]
-        return labels
+            if said.size:
+                by_networks.paint(sighting.label, box, said)
+                drawn.paint(sighting.label, box, weigh_by_colour(said, image[box]))
+        return Labels(drawn.labels, by_networks.labels)
 
     def _said(
         self, position: FloatArray, masks: Sequence[Mask], logit: Float32Array
@@ -93,3 +102,18 @@ class Outliner:
         fine = cv2.warpAffine(said, back, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         box = slice(top * stride, bottom * stride), slice(left * stride, right * stride)
         return box, np.asarray(fine, np.float32)
+
+
+class _Canvas:
+    """Labels of an image; of the drones that claim a pixel, the surest stays on top."""
+
+    def __init__(self, labels: UInt8Array) -> None:
+        self.labels = labels.copy()
+        self._highest = np.zeros(labels.shape, np.float32)
+
+    def paint(self, label: int, box: tuple[slice, slice], said: Float32Array) -> None:
+        """A drone where its logit is above 0."""
+        mine = said > self._highest[box]
+        self.labels[self.labels == label] = UNCLASSED  # the pictures hold all of the drone: whose is the rest?
+        self.labels[box][mine] = label
+        self._highest[box][mine] = said[mine]

@@ -23,7 +23,7 @@ from flockd.messages import (
     VehicleState,
 )
 from flockd.perception import Instance, Picture, RangeEstimate, SceneMaps
-from flockd.pilot.outlines import Mask, Outliner
+from flockd.pilot.outlines import Labels, Mask, Outliner
 from flockd.pilot.scale import fix_by_height
 from flockd.tracking import ExpectedNeighbour
 
@@ -160,21 +160,26 @@ class Observer:
         if looks:
             found += self._look_again(images, vehicle, found, expected)
         merged = _merge(_without_hidden(found))
-        labels = self._labels(maps, merged, refused)
+        labels = self._labels(images, maps, merged, refused)
         rest = self._look_at_the_rest(images, maps, labels) if looks else []
         if rest:
             merged = _merge(_without_hidden(found + rest))
-            labels = self._labels(maps, merged, refused)
+            labels = self._labels(images, maps, merged, refused)
         views = {}
         for name, scene in maps.items():
-            depth = self._drone_depth(scene.depth, labels[name], self._rig.cameras[name], merged.sightings)
-            views[name] = CameraView(images[name], depth, _without_outline(labels[name]))
+            drawn = labels[name].labels
+            depth = self._drone_depth(scene.depth, drawn, self._rig.cameras[name], merged.sightings)
+            views[name] = CameraView(images[name], depth, _without_outline(drawn))
         return RigView(frames.time_s, vehicle, views, merged.sightings, tuple(reasons))
 
     def _labels(
-        self, maps: Mapping[str, SceneMaps], merged: _Merged, refused: Container[Instance]
-    ) -> dict[str, UInt8Array]:
-        """Of each camera (h, w): 0 background, k the sighting with label k, 255 not to be used."""
+        self,
+        images: Mapping[str, UInt8Array],
+        maps: Mapping[str, SceneMaps],
+        merged: _Merged,
+        refused: Container[Instance],
+    ) -> dict[str, Labels]:
+        """Of each camera."""
         labels_of = {}
         for name, scene in maps.items():
             table = np.full(256, UNCLASSED, np.uint8)
@@ -185,9 +190,10 @@ class Observer:
             labels = table[scene.labels]
             if scene.unsure is not None:
                 labels[scene.unsure & (labels > 0)] = UNCLASSED
+            drawn = Labels(labels, labels)
             if scene.logit is not None:
-                labels = self._outliners[name].draw(labels, scene.logit, merged.sightings, merged.masks_of)
-            labels_of[name] = labels
+                drawn = self._outliners[name].draw(images[name], labels, scene.logit, merged.sightings, merged.masks_of)
+            labels_of[name] = drawn
         return labels_of
 
     def _geometry(self, camera: RigCamera, vehicle: VehicleState) -> Float32Array:
@@ -237,7 +243,7 @@ class Observer:
         return [one for one in located if one.is_drone > _SURE_OF_EXPECTED and _is_as_expected(one)]
 
     def _look_at_the_rest(
-        self, images: Mapping[str, UInt8Array], maps: Mapping[str, SceneMaps], labels: Mapping[str, UInt8Array]
+        self, images: Mapping[str, UInt8Array], maps: Mapping[str, SceneMaps], labels: Mapping[str, Labels]
     ) -> list[_Located]:
         """What is found where the first stage is sure of a drone and the second does not know of one.
 
@@ -248,9 +254,10 @@ class Observer:
         for name, scene in maps.items():
             if scene.unsure is None:
                 continue
-            rest = (labels[name] == UNCLASSED) & (scene.labels > 0) & ~scene.unsure
+            known = labels[name].by_networks
+            rest = (known == UNCLASSED) & (scene.labels > 0) & ~scene.unsure
             if rest.any():
-                drawn = ((labels[name] > 0) & (labels[name] != UNCLASSED)).astype(np.uint8)
+                drawn = ((known > 0) & (known != UNCLASSED)).astype(np.uint8)
                 rest &= cv2.dilate(drawn, np.ones((2 * _REST_OFF_PX + 1, 2 * _REST_OFF_PX + 1), np.uint8)) == 0
                 candidates += [_Candidate((name,), *_aim(self._rig.cameras[name], blob)) for blob in _blobs(rest)]
         located, _ = self._look(live, images, candidates)

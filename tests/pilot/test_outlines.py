@@ -10,7 +10,7 @@ import pytest
 from flockd.config import load_scenario
 from flockd.data import data_path
 from flockd.geometry import Rig, RigCamera, build_rig, virtual_crop
-from flockd.messages import UNCLASSED, BoolArray, Float32Array, FloatArray, Sighting
+from flockd.messages import UNCLASSED, BoolArray, Float32Array, FloatArray, Sighting, UInt8Array
 from flockd.pilot.outlines import Mask, Outliner
 
 SIZE = 96
@@ -18,6 +18,7 @@ RIG: Rig = build_rig(load_scenario(data_path("config") / "paper_flight.yaml").dr
 FRONT: RigCamera = RIG.cameras["front"]
 WIDTH, HEIGHT = FRONT.camera.size
 PLAIN = np.zeros((HEIGHT // 2, WIDTH // 2), np.float32)
+GREY = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
 AHEAD = np.array([4.0, 0.3, 0.2])
 RADIUS = 0.06
 """Of a drone's disc, radians."""
@@ -28,12 +29,12 @@ def sighting(label: int, position: FloatArray, *cameras: str) -> Sighting:
 
 
 def mask_of(position: FloatArray, half_angle: float, *, radius: float = RADIUS, height: float = 5.0) -> Mask:
-    """A disc about a place: so high inside, as low outside."""
+    """A disc about a place: so high inside, a little lower than that outside, for no pixel between both to be at 0."""
     crop = virtual_crop(RIG, position, half_angle, SIZE)
     v, u = np.mgrid[:SIZE, :SIZE] + 0.5
     reach = crop.camera.focal_px * math.tan(radius)
     inside = np.hypot(u - SIZE / 2, v - SIZE / 2) < reach
-    return Mask(crop, np.where(inside, height, -height).astype(np.float32), half_angle)
+    return Mask(crop, np.where(inside, height, -1.1 * height).astype(np.float32), half_angle)
 
 
 def disc(position: FloatArray, radius: float = RADIUS) -> BoolArray:
@@ -54,7 +55,7 @@ def test_the_second_stage_draws_what_the_first_only_boxed(half_angle: float) -> 
     labels = np.zeros((HEIGHT, WIDTH), np.uint8)
     box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     labels[box] = 3
-    drawn = Outliner(FRONT, 2).draw(labels, PLAIN, [sighting(3, AHEAD)], {3: [mask_of(AHEAD, half_angle)]})
+    drawn = Outliner(FRONT, 2).draw(GREY, labels, PLAIN, [sighting(3, AHEAD)], {3: [mask_of(AHEAD, half_angle)]}).labels
     assert overlap(drawn == 3, true) > 0.95
     corners = labels.astype(bool) & ~true
     assert np.mean(drawn[corners] == UNCLASSED) > 0.9, "what one stage took for a drone is not background yet"
@@ -67,10 +68,10 @@ def test_both_stages_count_and_all_pictures() -> None:
     left[:, : u // 2] = -7.0  # outweighs 5, not 5 and 15 by their mean
     outliner, true = Outliner(FRONT, 2), disc(AHEAD)
     nothing = np.zeros((HEIGHT, WIDTH), np.uint8)
-    one = outliner.draw(nothing, left, [sighting(1, AHEAD)], {1: [mask_of(AHEAD, 0.2)]}) == 1
+    one = outliner.draw(GREY, nothing, left, [sighting(1, AHEAD)], {1: [mask_of(AHEAD, 0.2)]}).labels == 1
     assert overlap(one, true & (np.arange(WIDTH) >= u)) > 0.9
     several = [mask_of(AHEAD, 0.2), mask_of(AHEAD, 0.15, height=15.0)]
-    assert overlap(outliner.draw(nothing, left, [sighting(1, AHEAD)], {1: several}) == 1, true) > 0.9
+    assert overlap(outliner.draw(GREY, nothing, left, [sighting(1, AHEAD)], {1: several}).labels == 1, true) > 0.9
 
 
 def test_a_pixel_that_two_drones_claim_is_the_surer_ones() -> None:
@@ -78,7 +79,7 @@ def test_a_pixel_that_two_drones_claim_is_the_surer_ones() -> None:
     masks = {1: [mask_of(AHEAD, 0.2)], 2: [mask_of(beside, 0.2, height=9.0)]}
     both = [sighting(1, AHEAD), sighting(2, beside)]
     for order in (both, both[::-1]):
-        drawn = Outliner(FRONT, 2).draw(np.zeros((HEIGHT, WIDTH), np.uint8), PLAIN, order, masks)
+        drawn = Outliner(FRONT, 2).draw(GREY, np.zeros((HEIGHT, WIDTH), np.uint8), PLAIN, order, masks).labels
         assert overlap(drawn == 2, disc(beside)) > 0.9
         assert overlap(drawn == 1, disc(AHEAD) & ~disc(beside)) > 0.9
 
@@ -88,15 +89,53 @@ def test_where_the_second_stage_does_not_tell_the_labels_stay() -> None:
     labels[300:320, 200:240] = 1
     outliner, mask = Outliner(FRONT, 2), mask_of(AHEAD, 0.2)
     for seen, masks in ((sighting(1, AHEAD), []), (sighting(1, AHEAD, "left"), [mask])):
-        assert (outliner.draw(labels, PLAIN, [seen], {1: masks}) == labels).all()
+        assert (outliner.draw(GREY, labels, PLAIN, [seen], {1: masks}).labels == labels).all()
     behind = np.array([-4.0, 0.0, 0.0])
-    assert (outliner.draw(labels, PLAIN, [sighting(1, behind)], {1: [mask_of(behind, 0.2)]}) == labels).all()
+    assert (
+        outliner.draw(GREY, labels, PLAIN, [sighting(1, behind)], {1: [mask_of(behind, 0.2)]}).labels == labels
+    ).all()
 
 
 def test_what_lies_beyond_a_drones_picture_is_not_known_to_be_its_own() -> None:
     labels = disc(AHEAD, 0.3).astype(np.uint8)
-    drawn = Outliner(FRONT, 2).draw(labels, PLAIN, [sighting(1, AHEAD)], {1: [mask_of(AHEAD, 0.1)]})
+    drawn = Outliner(FRONT, 2).draw(GREY, labels, PLAIN, [sighting(1, AHEAD)], {1: [mask_of(AHEAD, 0.1)]}).labels
     far: Float32Array = np.asarray(disc(AHEAD, 0.3) & ~disc(AHEAD, 0.16), np.float32)
     assert (drawn[far > 0] == UNCLASSED).all()
     assert (drawn == 1).any()
     assert overlap(drawn[disc(AHEAD, 0.09)] == 1, disc(AHEAD)[disc(AHEAD, 0.09)]) > 0.95
+
+
+def painted(
+    *discs: tuple[BoolArray, tuple[int, int, int]], background: tuple[int, int, int] = (90, 120, 60)
+) -> UInt8Array:
+    """An image of coloured discs, each pixel a little lighter or darker than it should be."""
+    image = np.tile(np.array(background, np.float64), (HEIGHT, WIDTH, 1))
+    for where, colour in discs:
+        image[where] = colour
+    return np.clip(image + np.random.default_rng(0).normal(0, 6, image.shape), 0, 255).astype(np.uint8)
+
+
+def test_colours_mend_the_outline_that_networks_see_too_coarsely() -> None:
+    true, nothing = disc(AHEAD), np.zeros((HEIGHT, WIDTH), np.uint8)
+    aside = AHEAD + np.array([0.0, 0.05, -0.03])  # a quarter of the disc's radius
+    coarse = {1: [mask_of(aside, 0.2, height=3.0)]}
+    without = Outliner(FRONT, 2).draw(GREY, nothing, PLAIN, [sighting(1, aside)], coarse)
+    drawn = Outliner(FRONT, 2).draw(painted((true, (150, 60, 40))), nothing, PLAIN, [sighting(1, aside)], coarse)
+    assert overlap(without.labels == 1, true) < 0.8
+    assert overlap(drawn.labels == 1, true) > 0.95
+    assert (drawn.by_networks == without.labels).all()
+
+
+def test_a_camouflaged_drone_is_drawn_as_the_networks_see_it() -> None:
+    nothing, masks = np.zeros((HEIGHT, WIDTH), np.uint8), {1: [mask_of(AHEAD, 0.2, height=3.0)]}
+    drawn = Outliner(FRONT, 2).draw(painted(), nothing, PLAIN, [sighting(1, AHEAD)], masks)
+    assert overlap(drawn.labels == 1, disc(AHEAD)) > 0.9
+
+
+def test_what_both_stages_surely_deny_is_no_drones_whatever_its_colour() -> None:
+    red, far = (150, 60, 40), AHEAD + np.array([0.0, 0.7, 0.0])
+    image = painted((disc(AHEAD), red), (disc(far), red))
+    masks = {1: [mask_of(AHEAD, 0.2, height=8.0)]}
+    drawn = Outliner(FRONT, 2).draw(image, np.zeros((HEIGHT, WIDTH), np.uint8), PLAIN, [sighting(1, AHEAD)], masks)
+    assert overlap(drawn.labels == 1, disc(AHEAD)) > 0.95
+    assert not (drawn.labels[disc(far)] == 1).any()
