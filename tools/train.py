@@ -269,7 +269,7 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path, help="drones, for `distance`: folder of render_drone_pictures.py")
     parser.add_argument("--rate", type=float, help="learning rate to begin with")
     parser.add_argument("--start", type=Path, help="weights to begin with: another run's checkpoint.pt, or an .onnx")
-    parser.add_argument("--compile", action="store_true", help="a fifth faster; needs a C++ compiler")
+    parser.add_argument("--compile", action="store_true", help="`distance` a fifth faster; needs a C++ compiler")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
