@@ -13,9 +13,10 @@ import pytest
 from flockd.config import ScenarioConfig, load_scenario
 from flockd.data import data_path
 from flockd.geometry import rotation_angle_deg
-from flockd.messages import Float32Array, FrameSet, PilotOutput, UInt8Array, VehicleState
+from flockd.messages import UNCLASSED, Float32Array, FrameSet, PilotOutput, UInt8Array, VehicleState
 from flockd.perception import Instance, Picture, RangeEstimate, SceneMaps
 from flockd.pilot import FlockPilot, views
+from flockd.pilot.outlines import Labels
 from flockd.sim.photographer import Photographer
 from flockd.sim.truth_perception import ROLES, TruthPerception
 from flockd.sim.vehicles import Vehicles
@@ -334,6 +335,23 @@ def test_two_drones_that_the_first_stage_takes_for_one_are_two(monkeypatch: pyte
     assert sorted(np.linalg.norm(s.position) for s in view.sightings) == pytest.approx([3.01, 6.03], abs=0.1)
     seen = view.cameras[name].labels
     assert {*seen[maps[name].labels == near.label]} & {*seen[maps[name].labels == far.label]} <= {0, 255}
+
+
+def test_a_drone_painted_like_the_one_before_it_is_still_looked_for() -> None:
+    """Colours give its pixels to the other one; what the networks alone say does not."""
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0), (6.0, -0.6, -4.0)))
+    frames, vehicle = flyer.look()
+    observer = views.Observer(flyer.photographer.rig, flyer.truth, height_fixes_scale=False)
+    maps, _ = observer.scenes(frames, vehicle)
+    (name,) = [name for name, scene in maps.items() if scene.instances]
+    near, far = (maps[name].labels == instance.label for instance in maps[name].instances)
+    by_networks = np.where(near, 1, np.where(far, UNCLASSED, 0)).astype(np.uint8)
+    by_colour = np.where(near | far, 1, 0).astype(np.uint8)
+    images = {name: frames.frames[name].image}
+    unsure = {name: replace(maps[name], unsure=~(near | far))}
+    (found,) = observer._look_at_the_rest(images, unsure, {name: Labels(by_colour, by_networks)})
+    assert np.linalg.norm(found.position) == pytest.approx(6.03, abs=0.1)
+    assert not observer._look_at_the_rest(images, unsure, {name: Labels(by_networks, by_colour)})
 
 
 def test_an_image_full_of_ghosts_costs_no_more_than_a_few_looks() -> None:
