@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -29,16 +29,37 @@ class Mask:
 
 
 @dataclass(frozen=True, eq=False)
-class Labels:
-    """One camera's (h, w) labels: 0 background, k the sighting with label k, 255 not to be used."""
+class Claim:
+    """What the networks say of one drone's pixels."""
+
+    label: int
+    box: tuple[slice, slice]
+    """The part of the image that they tell of."""
+    logit: Float32Array
+    """Of each of its pixels being this drone's."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outlines:
+    """One camera's drones, ready to be drawn as (h, w) labels: 0 background, k the sighting with label k, 255 not to be
+    used."""
 
     labels: UInt8Array
-    by_networks: UInt8Array
-    """Without what colours say: a drone and another before it may be painted alike."""
+    """As the first stage alone has them."""
+    claims: tuple[Claim, ...] = ()
+
+    def by_networks(self) -> UInt8Array:
+        """As both stages say."""
+        return _painted(self.labels, self.claims)
+
+    def by_colours(self, image: UInt8Array) -> UInt8Array:
+        """As the colours of the image (h, w, 3) say too; a drone and another before it may be painted alike."""
+        weighed = (replace(claim, logit=weigh_by_colour(claim.logit, image[claim.box])) for claim in self.claims)
+        return _painted(self.labels, weighed)
 
 
 class Outliner:
-    """Draws one camera's drones."""
+    """Finds out which pixels of one camera are whose."""
 
     def __init__(self, camera: RigCamera, stride: int) -> None:
         """``stride``: image pixels per pixel of the first stage's map."""
@@ -49,33 +70,30 @@ class Outliner:
         rays = camera.camera.rays(np.stack([u.ravel(), v.ravel()], 1)) @ camera.T_body_camera.rotation.T
         self._rays: Float32Array = np.asarray(rays.reshape(*u.shape, 3), dtype=np.float32)
 
-    def draw(
+    def outlines(
         self,
-        image: UInt8Array,
         labels: UInt8Array,
         logit: Float32Array,
         sightings: Sequence[Sighting],
         masks_of: Mapping[int, Sequence[Mask]],
-    ) -> Labels:
-        """The camera's labels with each sighting's pixels as both stages and their colours say.
+    ) -> Outlines:
+        """What both stages say of each sighting's pixels.
 
         Args:
-            image: (h, w, 3) RGB.
             labels: (h, w) as the first stage alone has them.
             logit: (h / stride, w / stride) of a pixel being any drone's, as the first stage says.
             sightings: of the whole rig.
             masks_of: the second stage's, by the sighting's label; none where it does not tell.
         """
-        drawn, by_networks = _Canvas(labels), _Canvas(labels)
+        claims = []
         for sighting in sightings:
             masks = masks_of[sighting.label]
             if self._camera.name not in sighting.cameras or not masks:
                 continue
             box, said = self._said(sighting.position, masks, logit)
             if said.size:
-                by_networks.paint(sighting.label, box, said)
-                drawn.paint(sighting.label, box, weigh_by_colour(said, image[box]))
-        return Labels(drawn.labels, by_networks.labels)
+                claims.append(Claim(sighting.label, box, said))
+        return Outlines(labels, tuple(claims))
 
     def _said(
         self, position: FloatArray, masks: Sequence[Mask], logit: Float32Array
@@ -104,16 +122,12 @@ class Outliner:
         return box, np.asarray(fine, np.float32)
 
 
-class _Canvas:
-    """Labels of an image; of the drones that claim a pixel, the surest stays on top."""
-
-    def __init__(self, labels: UInt8Array) -> None:
-        self.labels = labels.copy()
-        self._highest = np.zeros(labels.shape, np.float32)
-
-    def paint(self, label: int, box: tuple[slice, slice], said: Float32Array) -> None:
-        """A drone where its logit is above 0."""
-        mine = said > self._highest[box]
-        self.labels[self.labels == label] = UNCLASSED  # the pictures hold all of the drone: whose is the rest?
-        self.labels[box][mine] = label
-        self._highest[box][mine] = said[mine]
+def _painted(labels: UInt8Array, claims: Iterable[Claim]) -> UInt8Array:
+    """Each drone where its logit is above 0; of those that claim a pixel, the surest."""
+    drawn, highest = labels.copy(), np.zeros(labels.shape, np.float32)
+    for claim in claims:
+        mine = claim.logit > highest[claim.box]
+        drawn[drawn == claim.label] = UNCLASSED  # the pictures hold all of the drone: whose is the rest?
+        drawn[claim.box][mine] = claim.label
+        highest[claim.box][mine] = claim.logit[mine]
+    return drawn

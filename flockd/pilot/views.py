@@ -23,7 +23,7 @@ from flockd.messages import (
     VehicleState,
 )
 from flockd.perception import Instance, Picture, RangeEstimate, SceneMaps
-from flockd.pilot.outlines import Labels, Mask, Outliner
+from flockd.pilot.outlines import Mask, Outliner, Outlines
 from flockd.pilot.scale import fix_by_height
 from flockd.tracking import ExpectedNeighbour
 
@@ -160,27 +160,23 @@ class Observer:
         if looks:
             found += self._look_again(images, vehicle, found, expected)
         merged = _merge(_without_hidden(found))
-        labels = self._labels(images, maps, merged, refused)
-        rest = self._look_at_the_rest(images, maps, labels) if looks else []
+        outlines = self._outlines(maps, merged, refused)
+        rest = self._look_at_the_rest(images, maps, outlines) if looks else []
         if rest:
             merged = _merge(_without_hidden(found + rest))
-            labels = self._labels(images, maps, merged, refused)
+            outlines = self._outlines(maps, merged, refused)
         views = {}
         for name, scene in maps.items():
-            drawn = labels[name].labels
+            drawn = outlines[name].by_colours(images[name])
             depth = self._drone_depth(scene.depth, drawn, self._rig.cameras[name], merged.sightings)
             views[name] = CameraView(images[name], depth, _without_outline(drawn))
         return RigView(frames.time_s, vehicle, views, merged.sightings, tuple(reasons))
 
-    def _labels(
-        self,
-        images: Mapping[str, UInt8Array],
-        maps: Mapping[str, SceneMaps],
-        merged: _Merged,
-        refused: Container[Instance],
-    ) -> dict[str, Labels]:
+    def _outlines(
+        self, maps: Mapping[str, SceneMaps], merged: _Merged, refused: Container[Instance]
+    ) -> dict[str, Outlines]:
         """Of each camera."""
-        labels_of = {}
+        outlines = {}
         for name, scene in maps.items():
             table = np.full(256, UNCLASSED, np.uint8)
             table[0] = 0
@@ -190,11 +186,11 @@ class Observer:
             labels = table[scene.labels]
             if scene.unsure is not None:
                 labels[scene.unsure & (labels > 0)] = UNCLASSED
-            drawn = Labels(labels, labels)
+            outlines[name] = Outlines(labels)
             if scene.logit is not None:
-                drawn = self._outliners[name].draw(images[name], labels, scene.logit, merged.sightings, merged.masks_of)
-            labels_of[name] = drawn
-        return labels_of
+                outliner = self._outliners[name]
+                outlines[name] = outliner.outlines(labels, scene.logit, merged.sightings, merged.masks_of)
+        return outlines
 
     def _geometry(self, camera: RigCamera, vehicle: VehicleState) -> Float32Array:
         tangents = self._tangents[camera.name]
@@ -243,18 +239,19 @@ class Observer:
         return [one for one in located if one.is_drone > _SURE_OF_EXPECTED and _is_as_expected(one)]
 
     def _look_at_the_rest(
-        self, images: Mapping[str, UInt8Array], maps: Mapping[str, SceneMaps], labels: Mapping[str, Labels]
+        self, images: Mapping[str, UInt8Array], maps: Mapping[str, SceneMaps], outlines: Mapping[str, Outlines]
     ) -> list[_Located]:
         """What is found where the first stage is sure of a drone and the second does not know of one.
 
-        A drone that another hides in part, or passes close by, is often taken for a part of it.
+        A drone that another hides in part, or passes close by, is often taken for a part of it. By colours it would be
+        even oftener.
         """
         live = Rig({name: self._rig.cameras[name] for name in images})
         candidates = []
         for name, scene in maps.items():
             if scene.unsure is None:
                 continue
-            known = labels[name].by_networks
+            known = outlines[name].by_networks()
             rest = (known == UNCLASSED) & (scene.labels > 0) & ~scene.unsure
             if rest.any():
                 drawn = ((known > 0) & (known != UNCLASSED)).astype(np.uint8)

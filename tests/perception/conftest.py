@@ -5,9 +5,11 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from flockd.data import data_path
+from flockd.messages import Float32Array, UInt8Array
 
 
 @pytest.fixture
@@ -16,3 +18,12 @@ def copies(tmp_path: Path) -> Path:
     folder = tmp_path / "models"
     shutil.copytree(data_path("models"), folder)
     return folder
+
+
+class Astray:
+    """A network that sees motion where there is none."""
+
+    name = "astray"
+
+    def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
+        return np.full((*first.shape[:2], 2), (40.0, 70.0), np.float32)

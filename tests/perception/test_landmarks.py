@@ -9,6 +9,7 @@ import pytest
 from flockd.messages import Float32Array, UInt8Array
 from flockd.perception import DisFlow
 from flockd.perception.landmarks import flow_of_landmarks
+from tests.perception.conftest import Astray
 
 HEIGHT, WIDTH = 360, 540
 
@@ -78,15 +79,6 @@ def test_nothing_alike_gives_no_flow() -> None:
     empty = np.full((HEIGHT, WIDTH), 90, np.uint8)
     assert flow_of_landmarks(empty, grey(pattern(2))) is None
     assert flow_of_landmarks(empty, empty) is None
-
-
-class Astray:
-    """A network that sees motion where there is none."""
-
-    name = "astray"
-
-    def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
-        return np.full((*first.shape[:2], 2), (40.0, 70.0), np.float32)
 
 
 def test_dis_finds_a_large_turn_about_the_optical_axis_although_the_network_went_astray() -> None:

@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from flockd.messages import Float32Array, UInt8Array
+from flockd.messages import UInt8Array
 from flockd.perception import DisFlow
 from flockd.perception.shift import global_shift, likeness
+from tests.perception.conftest import Astray
 
 
 def windows(right: int, down: int) -> tuple[UInt8Array, UInt8Array]:
@@ -38,15 +39,6 @@ def test_a_flow_is_likely_where_it_leads_to_the_same() -> None:
     assert likeness(first, second, right) > 0.98
     assert likeness(first, second, -right) < 0.3
     assert likeness(first, second, np.full_like(right, 2000.0)) == 0.0
-
-
-class Astray:
-    """A network that sees motion where there is none."""
-
-    name = "astray"
-
-    def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
-        return np.full((*first.shape[:2], 2), (40.0, 70.0), np.float32)
 
 
 def test_dis_finds_a_large_turn_although_the_network_went_astray() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,10 +13,10 @@ import pytest
 from flockd.config import ScenarioConfig, load_scenario
 from flockd.data import data_path
 from flockd.geometry import rotation_angle_deg
-from flockd.messages import UNCLASSED, Float32Array, FrameSet, PilotOutput, UInt8Array, VehicleState
+from flockd.messages import UNCLASSED, BoolArray, Float32Array, FrameSet, PilotOutput, UInt8Array, VehicleState
 from flockd.perception import Instance, Picture, RangeEstimate, SceneMaps
 from flockd.pilot import FlockPilot, views
-from flockd.pilot.outlines import Labels
+from flockd.pilot.outlines import Claim, Outlines
 from flockd.sim.photographer import Photographer
 from flockd.sim.truth_perception import ROLES, TruthPerception
 from flockd.sim.vehicles import Vehicles
@@ -306,22 +306,27 @@ def test_of_a_drone_that_the_images_border_cuts_more_is_looked_at_than_is_seen()
     assert half_angle(2.0) < 1.1 * half_angle(10.0), "the first stage sees a pixel in two"
 
 
-def test_two_drones_that_the_first_stage_takes_for_one_are_two(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The far one's pixels count for the near one's, until the second stage says which of them are the near one's."""
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0), (6.0, -0.6, -4.0)))
-    frames, vehicle = flyer.look()
-    answers = flyer.truth.ranges
+def with_discs(truth: TruthPerception, height: float) -> Callable[[Sequence[Picture]], tuple[RangeEstimate, ...]]:
+    """The second stage, with masks: a disc somewhat wider than the drone, so high inside and so deep outside."""
+    answers = truth.ranges
 
     def ranges(pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
         v, u = np.mgrid[0:96, 0:96] + 0.5
         masked = []
         for picture, answer in zip(pictures, answers(pictures), strict=True):
             reach_px = 0.6 * answer.size_m * picture.focal_px / answer.range_m
-            logit = np.where(np.hypot(u - answer.centre[0], v - answer.centre[1]) < reach_px, 9.0, -9.0)
-            masked.append(replace(answer, mask=logit.astype(np.float32)))
+            inside = np.hypot(u - answer.centre[0], v - answer.centre[1]) < reach_px
+            masked.append(replace(answer, mask=np.where(inside, height, -height).astype(np.float32)))
         return tuple(masked)
 
-    monkeypatch.setattr(flyer.truth, "ranges", ranges)
+    return ranges
+
+
+def test_two_drones_that_the_first_stage_takes_for_one_are_two(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The far one's pixels count for the near one's, until the second stage says which of them are the near one's."""
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0), (6.0, -0.6, -4.0)))
+    frames, vehicle = flyer.look()
+    monkeypatch.setattr(flyer.truth, "ranges", with_discs(flyer.truth, 9.0))
     observer = views.Observer(flyer.photographer.rig, flyer.truth, height_fixes_scale=False)
     maps, _ = observer.scenes(frames, vehicle)
     (name,) = [name for name, scene in maps.items() if scene.instances]
@@ -337,6 +342,30 @@ def test_two_drones_that_the_first_stage_takes_for_one_are_two(monkeypatch: pyte
     assert {*seen[maps[name].labels == near.label]} & {*seen[maps[name].labels == far.label]} <= {0, 255}
 
 
+def test_a_view_draws_drones_as_their_colours_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0)))
+    frames, vehicle = flyer.look()
+    monkeypatch.setattr(flyer.truth, "ranges", with_discs(flyer.truth, 3.0))
+    observer = views.Observer(flyer.photographer.rig, flyer.truth, height_fixes_scale=False)
+    maps, _ = observer.scenes(frames, vehicle)
+    (name,) = [name for name, scene in maps.items() if scene.instances]
+    nothing = np.zeros(maps[name].labels[1::2, 1::2].shape, np.float32)
+    maps[name] = replace(maps[name], logit=nothing)
+
+    def drawn(image: UInt8Array) -> BoolArray:
+        painted = replace(frames, frames={name: replace(frames.frames[name], image=image)})
+        view = observer.view(painted, vehicle, {name: maps[name]}, ())
+        return np.asarray(view.cameras[name].labels == view.sightings[0].label)
+
+    meadow = np.full_like(frames.frames[name].image, 90)
+    disc = drawn(meadow)
+    columns = np.nonzero(disc)[1]
+    sliver = disc & (np.arange(disc.shape[1]) > np.quantile(columns, 0.9))
+    found = drawn(np.where((disc & ~sliver)[:, :, None], np.array([200, 30, 30], np.uint8), meadow))
+    assert found[disc & ~sliver].mean() > 0.95
+    assert found[sliver].mean() < 0.05, "what has the meadow's colour is the meadow"
+
+
 def test_a_drone_painted_like_the_one_before_it_is_still_looked_for() -> None:
     """Colours give its pixels to the other one; what the networks alone say does not."""
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0), (6.0, -0.6, -4.0)))
@@ -345,13 +374,15 @@ def test_a_drone_painted_like_the_one_before_it_is_still_looked_for() -> None:
     maps, _ = observer.scenes(frames, vehicle)
     (name,) = [name for name, scene in maps.items() if scene.instances]
     near, far = (maps[name].labels == instance.label for instance in maps[name].instances)
-    by_networks = np.where(near, 1, np.where(far, UNCLASSED, 0)).astype(np.uint8)
-    by_colour = np.where(near | far, 1, 0).astype(np.uint8)
-    images = {name: frames.frames[name].image}
-    unsure = {name: replace(maps[name], unsure=~(near | far))}
-    (found,) = observer._look_at_the_rest(images, unsure, {name: Labels(by_colour, by_networks)})
+    image = np.where((near | far)[:, :, None], np.array([200, 30, 30], np.uint8), np.array([90, 120, 160], np.uint8))
+    logit = np.where(near, np.float32(3.0), np.where(far, np.float32(-3.0), np.float32(-7.0)))
+    first = np.where(near | far, np.uint8(UNCLASSED), np.uint8(0))
+    outlines = Outlines(first, (Claim(1, (slice(None), slice(None)), logit),))
+    assert (outlines.by_colours(image) == np.where(near | far, 1, 0)).mean() > 0.99
+    images, unsure = {name: image}, {name: replace(maps[name], unsure=~(near | far))}
+    (found,) = observer._look_at_the_rest(images, unsure, {name: outlines})
     assert np.linalg.norm(found.position) == pytest.approx(6.03, abs=0.1)
-    assert not observer._look_at_the_rest(images, unsure, {name: Labels(by_networks, by_colour)})
+    assert not observer._look_at_the_rest(images, unsure, {name: Outlines(outlines.by_colours(image))})
 
 
 def test_an_image_full_of_ghosts_costs_no_more_than_a_few_looks() -> None:
