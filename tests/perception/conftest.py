@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -18,6 +19,10 @@ def copies(tmp_path: Path) -> Path:
     folder = tmp_path / "models"
     shutil.copytree(data_path("models"), folder)
     return folder
+
+
+def grey(image: UInt8Array) -> UInt8Array:
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 class Astray:

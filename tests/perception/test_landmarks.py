@@ -9,7 +9,7 @@ import pytest
 from flockd.messages import Float32Array, UInt8Array
 from flockd.perception import DisFlow
 from flockd.perception.landmarks import flow_of_landmarks
-from tests.perception.conftest import Astray
+from tests.perception.conftest import Astray, grey
 
 HEIGHT, WIDTH = 360, 540
 
@@ -22,10 +22,6 @@ def pattern(seed: int, height: int = HEIGHT, width: int = WIDTH) -> UInt8Array:
         coarse = random.normal(0, 1, (height // size + 2, width // size + 2, 3)).astype(np.float32)
         spots += cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
     return np.asarray(np.clip(128 + 25 * spots, 0, 255), np.uint8)
-
-
-def grey(image: UInt8Array) -> UInt8Array:
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def moved(image: UInt8Array, motion: Float32Array) -> tuple[UInt8Array, Float32Array]:

@@ -9,7 +9,7 @@ import pytest
 from flockd.messages import UInt8Array
 from flockd.perception import DisFlow
 from flockd.perception.shift import global_shift, likeness
-from tests.perception.conftest import Astray
+from tests.perception.conftest import Astray, grey
 
 
 def windows(right: int, down: int) -> tuple[UInt8Array, UInt8Array]:
@@ -20,10 +20,6 @@ def windows(right: int, down: int) -> tuple[UInt8Array, UInt8Array]:
     first = large[top : top + 360, left : left + 540]
     second = large[top - down : top - down + 360, left - right : left - right + 540]
     return np.ascontiguousarray(first), np.ascontiguousarray(second)
-
-
-def grey(image: UInt8Array) -> UInt8Array:
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 @pytest.mark.parametrize("true", [(0, 0), (232, -40), (-248, 64), (16, 160)])
