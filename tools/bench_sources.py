@@ -19,14 +19,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from flockd.config.parameters import (
-    CameraConfig,
-    DroneConfig,
-    IntrinsicsConfig,
-    RigConfig,
-    SharedMemoryParameters,
-    SourceParameters,
-)
+from flockd.config.drone import DroneConfig
+from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.config.source import SharedMemoryParameters, SourceParameters
 from flockd.messages import Frame, UInt8Array
 from flockd.sources import FramePublisher
 from flockd.sources.assembler import Assembler

@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from flockd.autopilot.mavsdk_link import AutopilotLink
 from flockd.autopilot.stand_in import AutopilotStandIn
 from flockd.autopilot.streamer import SetpointStreamer
-from flockd.config.parameters import AutopilotParameters
+from flockd.config.autopilot import AutopilotParameters
 from flockd.data import data_path
 from flockd.messages import Setpoint
 from flockd.perception.session import OnnxModel, golden_feeds

@@ -20,7 +20,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from flockd.config import load_scenario
-from flockd.config.parameters import PerceptionConfig
+from flockd.config.perception import PerceptionConfig
 from flockd.data import data_path
 from flockd.perception import Perception, Picture
 from tools.evaluation.on_pairs import HEIGHT_SIGMAS_M, MASK_WITHIN_M, Findings, look_at_pairs

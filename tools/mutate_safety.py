@@ -152,7 +152,7 @@ def prepare(folder: Path) -> None:
     shutil.rmtree(folder / SAFETY / "__pycache__", ignore_errors=True)
     sys.dont_write_bytecode = True
     sys.path.insert(0, str(folder))
-    loaded = importlib.import_module("flockd.config.parameters").__file__
+    loaded = importlib.import_module("flockd.config.safety").__file__
     if not str(loaded).startswith(str(folder)):
         sys.exit(f"{loaded} was imported, not the copy in {folder}")
 

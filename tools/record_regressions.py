@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from flockd.cli import main as flockd
 from flockd.cli.record import models_of
 from flockd.config import DroneConfig, ScenarioConfig, load_scenario
-from flockd.config.parameters import RecordingConfig
+from flockd.config.recording import RecordingConfig
 from flockd.config.scenario import StartConfig
 from flockd.data import data_path
 from flockd.messages import Frame, FrameSet, PilotOutput, UInt8Array, VehicleState

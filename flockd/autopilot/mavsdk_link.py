@@ -28,7 +28,7 @@ from mavsdk.plugins.param import Param, ParamError
 from mavsdk.system import System
 
 from flockd.autopilot.status import AutopilotError, AutopilotStatus, Firmware, FlightMode, LandedState
-from flockd.config.parameters import AutopilotParameters
+from flockd.config.autopilot import AutopilotParameters
 from flockd.messages import FloatArray, Setpoint, VehicleState
 
 T = TypeVar("T")

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from flockd.autopilot.status import AutopilotError, AutopilotStatus
-from flockd.config.parameters import AutopilotParameters
+from flockd.config.autopilot import AutopilotParameters
 from flockd.messages import Setpoint
 
 Send = Callable[[Setpoint], None]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import yaml
 
 from flockd.calibration.intrinsics import Lens
-from flockd.config.parameters import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, MeasurementConfig, RigConfig
+from flockd.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, MeasurementConfig, RigConfig
 from flockd.geometry import RigidTransform, build_rig, euler_from_rotation
 from flockd.messages import FloatArray
 

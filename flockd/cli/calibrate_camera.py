@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from flockd.calibration.views import Collector
     from flockd.cli.pictures import Pictures
     from flockd.config import DroneConfig
-    from flockd.config.parameters import MeasurementConfig
+    from flockd.config.rig import MeasurementConfig
 
 MOST_VIEWS = 60
 ENOUGH_VIEWS, ENOUGH_SHARE = 20, 0.9
@@ -235,7 +235,7 @@ def _write_lens(
     from flockd.calibration.coverage import Plot, draw
     from flockd.calibration.fragment import intrinsics_of, rig_text
     from flockd.calibration.views import all_pixels
-    from flockd.config.parameters import CameraConfig
+    from flockd.config.rig import CameraConfig
     from flockd.recording.editing import written_whole
 
     assert collector.coverage is not None

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from flockd.calibration.extrinsics import RigFit, SharedBoard
     from flockd.cli.pictures import Pictures, PictureSet
     from flockd.config import DroneConfig
-    from flockd.config.parameters import CameraConfig
+    from flockd.config.rig import CameraConfig
     from flockd.messages import UInt8Array, VehicleState
 
 MAX_OFFSET_S = 0.3

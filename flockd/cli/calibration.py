@@ -16,7 +16,7 @@ from flockd.errors import UsageError
 if TYPE_CHECKING:
     from flockd.calibration.board import BoardSpec
     from flockd.config import DroneConfig
-    from flockd.config.parameters import MeasurementConfig
+    from flockd.config.rig import MeasurementConfig
 
 SECONDS = 120.0
 MARKER_SHARE = 0.75
@@ -94,6 +94,6 @@ def source_name(args: argparse.Namespace) -> str:
 
 def measurement(**facts: Any) -> MeasurementConfig:
     """What is known about numbers that were measured today."""
-    from flockd.config.parameters import MeasurementConfig
+    from flockd.config.rig import MeasurementConfig
 
     return MeasurementConfig(date=datetime.now(UTC).date().isoformat(), **facts)

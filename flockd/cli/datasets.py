@@ -89,7 +89,9 @@ def _check(dataset: Dataset, stride: int, depth: str) -> None:
 def _config(args: argparse.Namespace, dataset: Dataset) -> tuple[DroneConfig, list[str]]:
     """The settings to fly with, for the dataset's camera, and what was changed in them."""
     from flockd.config import DroneConfig, ScenarioConfig, load
-    from flockd.config.parameters import GeometryParameters, PerceptionConfig, RigConfig
+    from flockd.config.geometry import GeometryParameters
+    from flockd.config.perception import PerceptionConfig
+    from flockd.config.rig import RigConfig
 
     rig = RigConfig(cameras=(dataset.camera,))
     notes = []

@@ -16,7 +16,7 @@ from flockd.errors import ExitCode, ModelError, UnavailableError
 
 if TYPE_CHECKING:
     from flockd.config import DroneConfig
-    from flockd.config.parameters import Provider
+    from flockd.config.perception import Provider
     from flockd.perception import OnnxModel
 
 THREADS = 2

@@ -224,7 +224,7 @@ def _replay(
 @contextmanager
 def _recording_to(out: Path, recording: Recording, config: DroneConfig) -> Iterator[Recorder]:
     """A recorder whose file is there when all is written, and not otherwise: one file, without loss or quota."""
-    from flockd.config.parameters import RecordingConfig
+    from flockd.config.recording import RecordingConfig
     from flockd.recording import Recorder, RecordingError
     from flockd.recording.editing import written_whole
     from flockd.recording.streams import REPLAYED

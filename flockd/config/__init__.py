@@ -1,7 +1,7 @@
 """The typed configuration and its loader."""
 
+from flockd.config.drone import DroneConfig
 from flockd.config.loader import Overrides, load, load_drone, load_scenario, schema_of
-from flockd.config.parameters import DroneConfig
 from flockd.config.scenario import ScenarioConfig
 
 __all__ = ["DroneConfig", "Overrides", "ScenarioConfig", "load", "load_drone", "load_scenario", "schema_of"]

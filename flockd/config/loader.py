@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 
 from flockd.config.complaints import path_in_file, problems_of
 from flockd.config.document import Document, Place, Value, read_document
-from flockd.config.parameters import DroneConfig
+from flockd.config.drone import DroneConfig
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import ConfigError
 

@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from flockd.config.parameters import DroneConfig, NonNegative, Positive, Section, Vector3
+from flockd.config.base import NonNegative, Positive, Section, Vector3
+from flockd.config.drone import DroneConfig
 
 
 class StartConfig(Section):

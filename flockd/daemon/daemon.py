@@ -15,7 +15,7 @@ from flockd.autopilot.mavsdk_link import AutopilotLink
 from flockd.autopilot.status import AutopilotError
 from flockd.autopilot.streamer import SetpointStreamer
 from flockd.config import DroneConfig
-from flockd.config.parameters import AutopilotParameters
+from flockd.config.autopilot import AutopilotParameters
 from flockd.daemon.chronicle import Chronicle
 from flockd.daemon.computer import LoopLag, Thermometer, WallClock
 from flockd.daemon.control import FLYING, Control, Door, VehicleHistory

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from flockd.config import load_drone
-from flockd.config.parameters import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.datasets.tables import read_rows
 from flockd.errors import ConfigError, ConfigProblem
 from flockd.geometry import build_rig

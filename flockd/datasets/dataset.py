@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from flockd.config.parameters import CameraConfig
+from flockd.config.rig import CameraConfig
 from flockd.datasets.errors import DatasetError
 from flockd.datasets.images import read_depth, read_image
 from flockd.geometry import RigidTransform

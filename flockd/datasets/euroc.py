@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
-from flockd.config.parameters import CameraConfig
+from flockd.config.rig import CameraConfig
 from flockd.datasets.calibration import camera_of, read_calibration
 from flockd.datasets.dataset import Entry, FileDataset
 from flockd.datasets.errors import DatasetError

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flockd.config.parameters import DroneConfig
+from flockd.config.drone import DroneConfig
 from flockd.datasets.dataset import Dataset, DatasetFrame, Moment
 from flockd.geometry import RigCamera, RigidTransform, build_rig, rotation_angle_deg
 from flockd.messages import EgoMotion, Float32Array, Frame, FrameSet, PilotOutput, UInt8Array, VehicleState

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from flockd.config.parameters import CameraConfig
+from flockd.config.rig import CameraConfig
 from flockd.datasets.calibration import read_calibration
 from flockd.datasets.dataset import DatasetFrame, Moment
 from flockd.datasets.errors import DatasetError

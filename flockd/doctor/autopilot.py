@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator
 from flockd.autopilot.mavsdk_link import AutopilotLink
 from flockd.autopilot.status import AutopilotError, AutopilotStatus, Firmware
 from flockd.config import DroneConfig
-from flockd.config.parameters import AutopilotParameters, GateParameters
+from flockd.config.autopilot import AutopilotParameters
+from flockd.config.safety import GateParameters
 from flockd.doctor.finding import Finding, failed, failed_as_told, passed, warned
 
 HEARD_S = 10.0

@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flockd.config import DroneConfig
-from flockd.config.parameters import CameraConfig, CameraDeviceParameters, SourceParameters
+from flockd.config.rig import CameraConfig
+from flockd.config.source import CameraDeviceParameters, SourceParameters
 from flockd.doctor.finding import Finding, failed, failed_as_told, passed, warned
 from flockd.doctor.lenses import coverage, lens_problems, width_deg
 from flockd.messages import UInt8Array

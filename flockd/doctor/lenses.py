@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from flockd.config.parameters import CameraConfig, RigConfig
+from flockd.config.rig import CameraConfig, RigConfig
 from flockd.doctor.finding import Finding, failed, passed, warned
 from flockd.geometry import build_rig
 

@@ -5,7 +5,8 @@ Everything here is horizontal: north and east.
 
 from __future__ import annotations
 
-from flockd.config.parameters import DesiredVelocityParameters, FlockingParameters, WeightParameters
+from flockd.config.flocking import FlockingParameters, WeightParameters
+from flockd.config.mission import DesiredVelocityParameters
 from flockd.flocking.desired import course, desired_velocity
 from flockd.flocking.law import FlockingLaw, limit_norm
 

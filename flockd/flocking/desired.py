@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from flockd.config.parameters import DesiredVelocityParameters
+from flockd.config.mission import DesiredVelocityParameters
 from flockd.messages import FloatArray
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flockd.config.parameters import FlockingParameters, WeightParameters
+from flockd.config.flocking import FlockingParameters, WeightParameters
 from flockd.messages import BoolArray, FloatArray
 
 _MIN_DISTANCE_M = 1e-3

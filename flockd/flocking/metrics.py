@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flockd.config.parameters import FlockingParameters
+from flockd.config.flocking import FlockingParameters
 from flockd.messages import BoolArray, FloatArray
 
 

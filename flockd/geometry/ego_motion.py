@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flockd.config.parameters import GeometryParameters
+from flockd.config.geometry import GeometryParameters
 from flockd.geometry.pairs import BACKGROUND_LABEL, PointPairs
 from flockd.geometry.ransac import ransac_rigid
 from flockd.geometry.refinement import refine_ego_motion

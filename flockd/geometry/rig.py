@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flockd.config.parameters import CameraConfig, RigConfig
+from flockd.config.rig import CameraConfig, RigConfig
 from flockd.geometry.cameras import Camera, PinholeCamera, WideAngleCamera
 from flockd.geometry.rotations import rotation_from_euler
 from flockd.geometry.transform import RigidTransform

@@ -10,7 +10,8 @@ from typing import Annotated, Literal, Self
 import yaml
 from pydantic import Field, ValidationError, model_validator
 
-from flockd.config.parameters import PerceptionConfig, Positive, Provider, Section
+from flockd.config.base import Positive, Section
+from flockd.config.perception import PerceptionConfig, Provider
 from flockd.data import data_path
 from flockd.errors import ModelError
 

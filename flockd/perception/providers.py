@@ -9,7 +9,7 @@ from pathlib import Path
 
 import onnxruntime as ort
 
-from flockd.config.parameters import PerceptionConfig, Provider
+from flockd.config.perception import PerceptionConfig, Provider
 from flockd.errors import ModelError
 from flockd.perception.manifest import models_folder
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from flockd.config.parameters import PerceptionConfig
+from flockd.config.perception import PerceptionConfig
 from flockd.errors import ModelError
 from flockd.messages import BoolArray, Float32Array, FloatArray, UInt8Array
 from flockd.perception.background_flow import settle_background

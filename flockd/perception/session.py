@@ -11,7 +11,7 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from flockd.config.parameters import Provider
+from flockd.config.perception import Provider
 from flockd.errors import ModelError
 from flockd.messages import Float32Array, UInt8Array
 from flockd.perception.fitting import entering, fit, leaving

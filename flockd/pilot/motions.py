@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from flockd.config.parameters import GeometryParameters
+from flockd.config.geometry import GeometryParameters
 from flockd.geometry import (
     PointPairs,
     Rig,

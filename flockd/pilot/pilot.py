@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flockd.config.parameters import DroneConfig
+from flockd.config.drone import DroneConfig
 from flockd.flocking import FlockingLaw, course, desired_velocity
 from flockd.geometry import build_rig
 from flockd.messages import (

@@ -20,7 +20,7 @@ from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import DecodeError
 
-from flockd.config.parameters import CameraConfig, RigConfig
+from flockd.config.rig import CameraConfig, RigConfig
 from flockd.messages import FloatArray
 from flockd.recording.mcap_file import RecordingError, Stream
 

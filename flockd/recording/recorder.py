@@ -20,7 +20,8 @@ import numpy as np
 
 from flockd import __version__
 from flockd.config import DroneConfig
-from flockd.config.parameters import RecordingConfig, RigConfig
+from flockd.config.recording import RecordingConfig
+from flockd.config.rig import RigConfig
 from flockd.messages import Frame, FrameSet, PilotOutput, VehicleState
 from flockd.recording import foxglove
 from flockd.recording.codec import to_json

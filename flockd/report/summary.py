@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from flockd.config.parameters import FlockingParameters
+from flockd.config.flocking import FlockingParameters
 from flockd.flocking.metrics import connectivity, min_distance, obj1, obj2, order, safety, union
 from flockd.messages import BoolArray, FloatArray
 from flockd.sim.log import FlightLog

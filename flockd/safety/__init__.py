@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flockd.config.parameters import GateParameters, SafetyParameters
+from flockd.config.safety import GateParameters, SafetyParameters
 from flockd.safety.events import OFFBOARD, CameraHealth, Event, Inputs
 from flockd.safety.fence import outside_fence, outside_heights
 from flockd.safety.gate import (

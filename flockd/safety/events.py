@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from flockd.config.parameters import SafetyParameters
+from flockd.config.safety import SafetyParameters
 
 OFFBOARD = "offboard"
 """The flight mode in which the autopilot follows setpoints; all others are the pilot's or the autopilot's own."""

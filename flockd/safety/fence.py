@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from flockd.config.parameters import GateParameters
+from flockd.config.safety import GateParameters
 from flockd.messages import FloatArray
 
 

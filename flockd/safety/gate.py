@@ -12,7 +12,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from flockd.config.parameters import GateParameters
+from flockd.config.safety import GateParameters
 from flockd.messages import FloatArray, Setpoint, VelocityCommand
 from flockd.safety.fence import is_fenced, offsets_outside
 from flockd.safety.policy import Action

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 
-from flockd.config.parameters import SafetyParameters
+from flockd.config.safety import SafetyParameters
 from flockd.safety.events import Event
 
 

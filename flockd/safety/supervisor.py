@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from flockd.config.parameters import SafetyParameters
+from flockd.config.safety import SafetyParameters
 from flockd.safety.events import Event, Inputs, notice
 from flockd.safety.policy import ASKS, Action, Barrier, Reaction, rules
 

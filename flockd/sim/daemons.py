@@ -14,7 +14,7 @@ import yaml
 
 import flockd
 from flockd.config import DroneConfig
-from flockd.config.parameters import RecordingConfig
+from flockd.config.recording import RecordingConfig
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import ConfigError, ConfigProblem
 from flockd.sim.autopilots import Ports

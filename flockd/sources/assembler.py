@@ -7,7 +7,7 @@ from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from flockd.config.parameters import SourceParameters
+from flockd.config.source import SourceParameters
 from flockd.sources.frames import Count, RawFrame
 
 _MOST_HELD = 16

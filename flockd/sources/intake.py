@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
-from flockd.config.parameters import SourceParameters
+from flockd.config.source import SourceParameters
 from flockd.messages import Frame, FrameSet
 from flockd.sources.assembler import Assembler, RawFrameSet
 from flockd.sources.frames import CameraStatus, Count, RawFrame

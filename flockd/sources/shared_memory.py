@@ -17,7 +17,8 @@ from typing import Self
 import zenoh
 from zenoh import shm
 
-from flockd.config.parameters import DroneConfig, SourceParameters
+from flockd.config.drone import DroneConfig
+from flockd.config.source import SourceParameters
 from flockd.messages import Frame, FrameSet
 from flockd.peer import PeerError, close_peer, open_peer
 from flockd.sources.frames import CameraStatus, RawFrame

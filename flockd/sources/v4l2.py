@@ -6,7 +6,8 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 
-from flockd.config.parameters import CameraDeviceParameters, DroneConfig, SourceParameters
+from flockd.config.drone import DroneConfig
+from flockd.config.source import CameraDeviceParameters, SourceParameters
 from flockd.messages import FrameSet
 from flockd.sources.frames import CameraStatus, Count, RawFrame
 from flockd.sources.images import CorruptImageError, ImageFormat, MjpegFormat, YuyvFormat

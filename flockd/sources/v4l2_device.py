@@ -16,7 +16,7 @@ from fractions import Fraction
 from types import TracebackType
 from typing import ClassVar, Literal, Protocol, Self
 
-from flockd.config.parameters import ControlParameters
+from flockd.config.source import ControlParameters
 from flockd.errors import UnavailableError
 
 PixelFormat = Literal["mjpeg", "yuyv"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flockd.config.parameters import TrackingParameters
+from flockd.config.tracking import TrackingParameters
 from flockd.tracking.measurement import Measurement, sighting_covariance
 from flockd.tracking.tracker import Blind, ExpectedNeighbour, Tracker
 

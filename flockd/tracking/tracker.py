@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flockd.config.parameters import TrackingParameters
+from flockd.config.tracking import TrackingParameters
 from flockd.messages import BoolArray, FloatArray, Neighbour
 from flockd.tracking.measurement import Measurement
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from flockd.autopilot.mavsdk_link import AutopilotLink
 from flockd.autopilot.streamer import SetpointStreamer
-from flockd.config.parameters import AutopilotParameters
+from flockd.config.autopilot import AutopilotParameters
 from flockd.messages import Setpoint
 
 CONTROL_S = 0.05

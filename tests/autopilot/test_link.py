@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from flockd.autopilot.stand_in import TICK_S, AutopilotStandIn, Demand, MotionState
 from flockd.autopilot.status import AutopilotError, Firmware
-from flockd.config.parameters import AutopilotParameters
+from flockd.config.autopilot import AutopilotParameters
 from flockd.messages import Setpoint
 from tests.autopilot.conftest import HEARTBEAT_S, free_port
 

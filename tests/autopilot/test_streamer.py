@@ -11,7 +11,7 @@ import pytest
 
 from flockd.autopilot.status import AutopilotError, AutopilotStatus
 from flockd.autopilot.streamer import SetpointStreamer
-from flockd.config.parameters import AutopilotParameters
+from flockd.config.autopilot import AutopilotParameters
 from flockd.messages import Setpoint
 
 PERIOD_S = 0.05

@@ -19,7 +19,7 @@ from flockd.calibration.board import BoardFinder, BoardSpec
 from flockd.cli import main
 from flockd.cli.pictures import identity
 from flockd.config import DroneConfig, load_drone
-from flockd.config.parameters import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
+from flockd.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
 from flockd.messages import Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
 from flockd.recording import Recorder
 from flockd.sources import CameraStatus

@@ -16,7 +16,7 @@ from flockd.calibration.extrinsics import SharedBoard, calibrate_rig
 from flockd.calibration.fragment import extrinsics_of
 from flockd.calibration.shared import SharedCollector
 from flockd.calibration.turns import CameraTurn, Follower
-from flockd.config.parameters import MeasurementConfig
+from flockd.config.rig import MeasurementConfig
 from flockd.geometry import Camera, PinholeCamera, RigidTransform, WideAngleCamera, rotation_angle_deg
 from flockd.messages import FloatArray
 from tests.calibration import darkroom

@@ -6,7 +6,7 @@ import asyncio
 from typing import Any
 
 from flockd.config import DroneConfig
-from flockd.config.parameters import SourceParameters
+from flockd.config.source import SourceParameters
 from flockd.daemon.sight import Sight
 from flockd.messages import FrameSet, VehicleState
 from tests.recording.made_up import drone_config

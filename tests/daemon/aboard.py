@@ -18,20 +18,14 @@ import zenoh
 
 from flockd.autopilot.stand_in import AutopilotStandIn
 from flockd.config import DroneConfig
-from flockd.config.parameters import (
-    AutopilotParameters,
-    CameraConfig,
-    DesiredVelocityParameters,
-    ExtrinsicsConfig,
-    GeometryParameters,
-    IntrinsicsConfig,
-    PerceptionConfig,
-    RigConfig,
-    SafetyParameters,
-    SharedMemoryParameters,
-    SourceParameters,
-    TelemetryParameters,
-)
+from flockd.config.autopilot import AutopilotParameters
+from flockd.config.geometry import GeometryParameters
+from flockd.config.mission import DesiredVelocityParameters
+from flockd.config.perception import PerceptionConfig
+from flockd.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
+from flockd.config.safety import SafetyParameters
+from flockd.config.source import SharedMemoryParameters, SourceParameters
+from flockd.config.telemetry import TelemetryParameters
 from flockd.daemon import Daemon, Ending, ServiceManager
 from flockd.messages import Float32Array, Frame, UInt8Array
 from flockd.perception import Picture, RangeEstimate, SceneMaps

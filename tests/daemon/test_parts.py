@@ -15,7 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flockd.config.parameters import CameraConfig, DroneConfig, IntrinsicsConfig, RigConfig, SourceParameters
+from flockd.config.drone import DroneConfig
+from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.config.source import SourceParameters
 from flockd.daemon.computer import LoopLag, WallClock, hottest_zone_c
 from flockd.daemon.inspection import Eyes
 from flockd.daemon.lock import only_instance

@@ -9,7 +9,8 @@ import pytest
 from flockd.autopilot.stand_in import AutopilotStandIn
 from flockd.autopilot.status import Firmware
 from flockd.config import DroneConfig, load_drone
-from flockd.config.parameters import AutopilotParameters, GateParameters, SafetyParameters
+from flockd.config.autopilot import AutopilotParameters
+from flockd.config.safety import GateParameters, SafetyParameters
 from flockd.data import data_path
 from flockd.doctor import Check, Finding, Level, examine
 from tests.autopilot.conftest import HEARTBEAT_S, free_port

@@ -12,15 +12,8 @@ import numpy as np
 import pytest
 
 from flockd.config import DroneConfig
-from flockd.config.parameters import (
-    CameraConfig,
-    CameraDeviceParameters,
-    ControlParameters,
-    IntrinsicsConfig,
-    RigConfig,
-    SharedMemoryParameters,
-    SourceParameters,
-)
+from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.config.source import CameraDeviceParameters, ControlParameters, SharedMemoryParameters, SourceParameters
 from flockd.doctor import Finding, Level, cameras
 from flockd.doctor.cameras import check_cameras
 from flockd.messages import Frame

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from flockd.config import DroneConfig, load_drone
-from flockd.config.parameters import RecordingConfig
+from flockd.config.recording import RecordingConfig
 from flockd.data import data_path
 from flockd.doctor import Finding, Level, computer
 from flockd.doctor.computer import (

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from flockd.config import DroneConfig, load_drone
-from flockd.config.parameters import TelemetryParameters
+from flockd.config.telemetry import TelemetryParameters
 from flockd.data import data_path
 from flockd.doctor import Check, Finding, Level, examine
 from flockd.doctor.fleet import check_fleet

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from flockd.config import load_drone
-from flockd.config.parameters import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.data import data_path
 from flockd.doctor import Level
 from flockd.doctor.lenses import coverage, lens_problems, width_deg

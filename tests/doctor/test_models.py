@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from flockd.config.parameters import CameraConfig, DroneConfig, IntrinsicsConfig, PerceptionConfig, RigConfig
+from flockd.config.drone import DroneConfig
+from flockd.config.perception import PerceptionConfig
+from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.data import data_path
 from flockd.doctor import Check, Level, examine
 from flockd.doctor.models import STEPS, check_models, judge_steps, meadow, time_steps

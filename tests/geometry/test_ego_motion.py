@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flockd.config.parameters import GeometryParameters
+from flockd.config.geometry import GeometryParameters
 from flockd.geometry import (
     PointPairs,
     Rig,

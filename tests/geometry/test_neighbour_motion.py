@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from flockd.config.parameters import GeometryParameters
+from flockd.config.geometry import GeometryParameters
 from flockd.geometry import (
     PointPairs,
     RigidTransform,

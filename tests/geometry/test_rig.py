@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flockd.config import load_drone
-from flockd.config.parameters import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
+from flockd.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
 from flockd.data import data_path
 from flockd.geometry import PinholeCamera, Rig, RigCamera, RigidTransform, WideAngleCamera, build_rig
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from onnx import helper
 
-from flockd.config.parameters import PerceptionConfig
+from flockd.config.perception import PerceptionConfig
 from flockd.data import data_path
 from flockd.errors import ModelError
 from flockd.messages import Float32Array

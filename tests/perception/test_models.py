@@ -12,7 +12,7 @@ import onnxruntime as ort
 import pytest
 
 from flockd.cli import main
-from flockd.config.parameters import PerceptionConfig
+from flockd.config.perception import PerceptionConfig
 from flockd.data import data_path
 from flockd.errors import ModelError
 from flockd.messages import BoolArray, Float32Array, UInt8Array

@@ -13,7 +13,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from flockd.cli import main
-from flockd.config.parameters import PerceptionConfig
+from flockd.config.perception import PerceptionConfig
 from flockd.data import data_path
 from flockd.errors import ModelError
 from flockd.perception import OnnxModel, Perception, load_manifest

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flockd.config.parameters import CameraConfig, IntrinsicsConfig, PerceptionConfig, RigConfig
+from flockd.config.perception import PerceptionConfig
+from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.data import data_path
 from flockd.geometry import Rig, RigCamera, build_rig, ground_inverse_depth
 from flockd.messages import BoolArray, Float32Array, FloatArray, Frame, FrameSet, UInt8Array, VehicleState

@@ -12,7 +12,8 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 from flockd.config import DroneConfig
-from flockd.config.parameters import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RecordingConfig, RigConfig
+from flockd.config.recording import RecordingConfig
+from flockd.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
 from flockd.messages import (
     EgoMotion,
     Frame,

@@ -23,7 +23,7 @@ from mcap.reader import NonSeekingReader, make_reader
 from scipy.spatial.transform import Rotation
 
 from flockd.config import DroneConfig
-from flockd.config.parameters import RecordingConfig
+from flockd.config.recording import RecordingConfig
 from flockd.geometry import build_rig
 from flockd.recording import Recorder
 from flockd.recording.editing import cut

@@ -9,7 +9,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from flockd.config.parameters import CameraConfig, DroneConfig, FlockingParameters, IntrinsicsConfig, RigConfig
+from flockd.config.drone import DroneConfig
+from flockd.config.flocking import FlockingParameters
+from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.config.scenario import ScenarioConfig, SensorConfig, StartConfig, VehicleConfig
 from flockd.flocking.metrics import min_distance, obj2, pair_distances
 from flockd.sim.truth import fly_truth, step_times

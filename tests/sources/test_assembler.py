@@ -8,7 +8,7 @@ import random
 
 import pytest
 
-from flockd.config.parameters import SourceParameters
+from flockd.config.source import SourceParameters
 from flockd.sources.assembler import Assembler, RawFrameSet
 from flockd.sources.frames import RawFrame
 from flockd.sources.images import RgbFormat

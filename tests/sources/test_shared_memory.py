@@ -14,14 +14,9 @@ import pytest
 import zenoh
 
 from flockd import peer
-from flockd.config.parameters import (
-    CameraConfig,
-    DroneConfig,
-    IntrinsicsConfig,
-    RigConfig,
-    SharedMemoryParameters,
-    SourceParameters,
-)
+from flockd.config.drone import DroneConfig
+from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.config.source import SharedMemoryParameters, SourceParameters
 from flockd.errors import UnavailableError
 from flockd.messages import Frame, FrameSet
 from flockd.sources import FramePublisher, shared_memory

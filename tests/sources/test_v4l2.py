@@ -15,15 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockd.config.parameters import (
-    CameraConfig,
-    CameraDeviceParameters,
-    ControlParameters,
-    DroneConfig,
-    IntrinsicsConfig,
-    RigConfig,
-    SourceParameters,
-)
+from flockd.config.drone import DroneConfig
+from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.config.source import CameraDeviceParameters, ControlParameters, SourceParameters
 from flockd.messages import FrameSet
 from flockd.sources import CameraStatus, v4l2_device
 from flockd.sources.v4l2 import V4l2Source

@@ -8,14 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flockd.config.parameters import (
-    CameraConfig,
-    CameraDeviceParameters,
-    DroneConfig,
-    IntrinsicsConfig,
-    RigConfig,
-    SourceParameters,
-)
+from flockd.config.drone import DroneConfig
+from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.config.source import CameraDeviceParameters, SourceParameters
 from flockd.sources.v4l2 import V4l2Source
 
 RATE_HZ = 25.0

@@ -16,7 +16,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
 from google.protobuf.descriptor_pb2 import DescriptorProto
 
-from flockd.config.parameters import RecordingConfig
+from flockd.config.recording import RecordingConfig
 from flockd.recording.editing import cut, recover
 from flockd.recording.reader import Recording
 from tests.recording.made_up import record

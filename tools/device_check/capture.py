@@ -9,14 +9,9 @@ from contextlib import contextmanager
 from itertools import pairwise
 from statistics import median
 
-from flockd.config.parameters import (
-    CameraConfig,
-    CameraDeviceParameters,
-    DroneConfig,
-    IntrinsicsConfig,
-    RigConfig,
-    SourceParameters,
-)
+from flockd.config.drone import DroneConfig
+from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.config.source import CameraDeviceParameters, SourceParameters
 from flockd.sources.frames import CameraStatus, Count
 from flockd.sources.v4l2 import V4l2Source
 from flockd.sources.v4l2_device import CameraError, CapturedBuffer, PixelFormat, V4l2Device

@@ -1,0 +1,41 @@
+"""The flocking law, Eq. 38-42."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from flockd.config.base import NonNegative, Positive, Section
+
+
+class WeightParameters(Section):
+    """The influence weight W of Eq. 39 and 40."""
+
+    kind: Literal["uniform", "nearest"] = "uniform"
+    nearest: Annotated[int, Field(ge=1)] = 3
+    """With kind `nearest`: weight 1 on this many, 0 on the rest."""
+
+
+class FlockingParameters(Section):
+    """Eq. 38-42, with the paper's values."""
+
+    cohesion: NonNegative = 0.1
+    """C_f"""
+    alignment: NonNegative = 0.1
+    """C_av"""
+    separation: NonNegative = 10.0
+    """C_c"""
+    velocity: NonNegative = 1.0
+    """C_vf"""
+    observation_distance_m: Positive = 20.0
+    """D_c"""
+    desired_distance_m: Positive = 3.5
+    """D_d"""
+    separation_distance_m: Positive = 1.5
+    """D_II"""
+    weight: WeightParameters = WeightParameters()
+    own_weight: NonNegative = 1.0
+    """W_i of Eq. 42"""
+    max_speed_m_s: Positive = 3.0
+    max_acceleration_m_s2: Positive = 2.0

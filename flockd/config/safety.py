@@ -1,0 +1,107 @@
+"""The supervisor's limits, and those of the last gate before the autopilot."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from flockd.config.base import NonNegative, Positive, Section, Share
+
+
+class GateParameters(Section):
+    """The last limits on what is sent to the autopilot, whatever asks for it."""
+
+    permission_timeout_s: Annotated[float, Field(gt=0, le=0.4)] = 0.3
+    """The supervisor's permission is good for this long: what has stalled sends nothing half a second later."""
+    command_timeout_s: Positive = 1.5
+    """A command older than this is not flown; leave the pilot three of its steps."""
+    max_speed_m_s: Positive = 4.0
+    """A command that asks for more is a fault, and refused."""
+    max_acceleration_m_s2: Positive = 5.0
+    degraded_speed_m_s: Positive = 1.0
+    """Instead, while the drone is degraded: a command that asks for more is flown this fast."""
+    min_separation_m: NonNegative = 1.0
+    """Nearer than this to a neighbour, no velocity towards it."""
+    degraded_separation_m: NonNegative = 1.5
+    """Instead, while the drone is degraded."""
+    fence_radius_m: Positive | None = 100.0
+    """Around home, level; beyond it only inward velocity. null: no circle."""
+    fence_corners_m: tuple[tuple[float, float], ...] = ()
+    """A fence of any shape: its corners north and east of home, in order. With a radius too, both hold."""
+    min_height_m: float = 1.0
+    max_height_m: float = 30.0
+
+    @model_validator(mode="after")
+    def _limits_agree(self) -> Self:
+        if self.min_height_m >= self.max_height_m:
+            raise ValueError(f"min_height_m {self.min_height_m:g} is not below max_height_m; write a smaller one")
+        if self.degraded_speed_m_s > self.max_speed_m_s:
+            raise ValueError("degraded_speed_m_s is above max_speed_m_s; write a smaller one")
+        if self.degraded_separation_m < self.min_separation_m:
+            raise ValueError("degraded_separation_m is below min_separation_m; write a larger one")
+        if 0 < len(self.fence_corners_m) < 3:
+            raise ValueError("fence_corners_m has fewer than 3 corners; add the others, or delete it")
+        if len(set(self.fence_corners_m)) < len(self.fence_corners_m):
+            raise ValueError("fence_corners_m names a corner twice; delete one, the fence closes by itself")
+        return self
+
+
+AutopilotMode = Literal["hold", "return", "land"]
+
+
+class SafetyParameters(Section):
+    """When the drone slows down, hovers, hands over to the autopilot and falls silent."""
+
+    gate: GateParameters = GateParameters()
+    camera_timeout_periods: Positive = 3.0
+    """A camera without a usable frame for this many of its frame periods is lost."""
+    max_lost_cameras: Annotated[int, Field(ge=0)] = 1
+    """Fly on with the rest, degraded, while no more than this many are lost; at least one has to see."""
+    max_dropped_share: Share = 0.2
+    """Of the frames of late; above it, degraded."""
+    estimate_timeout_s: Positive = 1.5
+    """Hover when the pilot's newest output is older than this; leave it three of its steps."""
+    degraded_ego_motion_failures: Annotated[int, Field(ge=1)] = 2
+    """Steps in a row without own motion, to be degraded."""
+    max_ego_motion_failures: Annotated[int, Field(ge=1)] = 6
+    """Steps in a row without own motion, to hover."""
+    degraded_load: Positive = 1.0
+    """How long the steps take (95th percentile) over how long they may, to be degraded."""
+    max_load: Positive = 2.0
+    """The same, to hover."""
+    degraded_temperature_c: float = 85.0
+    """Of the hottest thermal zone, to be degraded."""
+    max_temperature_c: float = 95.0
+    """The same, to hover."""
+    max_loop_lag_s: Positive = 0.2
+    """Of the event loop; above it, degraded."""
+    heartbeat_timeout_s: Positive = 2.0
+    """The link to the autopilot counts as lost, and flockd falls silent for good."""
+    neighbours_timeout_s: Positive = 2.0
+    """No confirmed neighbour seen for this long: the drone is alone."""
+    alone_s: Positive | None = 10.0
+    """How long it flies on alone before it asks for Hold. null: for ever."""
+    outside_s: Positive = 3.0
+    """How long it may take to come back into the fence and the heights before it asks for Hold."""
+    on_battery_low: AutopilotMode = "hold"
+    """What is asked of the autopilot when it says that its battery is low."""
+    on_position_lost: AutopilotMode = "hold"
+    """What is asked of the autopilot when it has lost its position; it acts by itself too."""
+    hover_s: Annotated[float, Field(gt=0, le=3)] = 1.0
+    """The longest hover, before Hold is asked for."""
+    recovery_s: NonNegative = 2.0
+    """How long all has to be well before a degraded drone flies as usual again."""
+    ask_timeout_s: Annotated[float, Field(gt=0, le=5)] = 2.0
+    """How long the autopilot has to leave offboard when asked, before silence makes it."""
+
+    @model_validator(mode="after")
+    def _worse_comes_later(self) -> Self:
+        for mild, grave in (
+            ("degraded_ego_motion_failures", "max_ego_motion_failures"),
+            ("degraded_load", "max_load"),
+            ("degraded_temperature_c", "max_temperature_c"),
+        ):
+            if getattr(self, mild) > getattr(self, grave):
+                raise ValueError(f"{mild} is above {grave}; write a smaller one")
+        return self
