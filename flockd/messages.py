@@ -6,6 +6,7 @@ Pixels are (u, v) with pixel centres at +0.5. Times are seconds on a monotonic c
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
@@ -21,7 +22,7 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
 UNCLASSED = 255
-"""Label of pixels that are not to be used: too near a drone's outline to be sure of, or a drone's that is not sighted.
+"""Label of pixels that are not to be used: too near a drone's outline to be sure of, or a drone's that is not detected.
 Other labels are 0 for the background, then one value a drone."""
 
 
@@ -97,15 +98,19 @@ class NeighbourMotion:
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
-    """One drone seen in one frame set, before any tracking."""
+class Detection:
+    """One drone detected in one frame set, before tracking, in log-polar coordinates: a bearing and a log range.
 
-    position: FloatArray
-    """(3,) metres, body FRD of the frame set."""
-    range_sigma_m: float
-    """Standard deviation along the line of sight."""
-    bearing_sigma_rad: float
-    """Standard deviation across it, each way."""
+    Cameras err in these independently: in direction by an angle, in range by a share of it.
+    """
+
+    bearing: FloatArray
+    """(3,) unit vector towards the drone's centre, body FRD of the frame set."""
+    log_range: float
+    """Natural logarithm of the range in metres."""
+    covariance: FloatArray
+    """(3, 3) in body axes, of what `flockd.geometry.log_polar_residual` measures: along the bearing the variance of the
+    log range, across it that of the angle, rad^2."""
     drone_probability: float
     """Of being a drone at all."""
     size_m: float
@@ -113,7 +118,22 @@ class Sighting:
     cameras: tuple[str, ...]
     """More than one where the drone straddles an image border."""
     label: int
-    """Its value in the instance maps of this frame set, from 1 up."""
+    """Its value in the masks of this frame set, from 1 up."""
+
+    @property
+    def range_m(self) -> float:
+        """From the body's origin."""
+        return math.exp(self.log_range)
+
+    @property
+    def position(self) -> FloatArray:
+        """(3,) metres, body FRD of the frame set."""
+        return self.range_m * self.bearing
+
+    @property
+    def range_sigma_m(self) -> float:
+        """Standard deviation along the line of sight, to first order."""
+        return self.range_m * math.sqrt(float(self.bearing @ self.covariance @ self.bearing))
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,11 +189,11 @@ class PilotOutput:
     ego_motion: EgoMotion | None
     velocity: FloatArray | None
     """(3,) m/s NED: the own velocity that the law used; None before there is one."""
-    sightings: tuple[Sighting, ...]
-    sighting_tracks: tuple[int, ...]
-    """The track that each sighting went to."""
+    detections: tuple[Detection, ...]
+    detection_tracks: tuple[int, ...]
+    """The track that each detection went to."""
     neighbour_motions: Mapping[int, NeighbourMotion]
-    """By the label of the sighting."""
+    """By the label of the detection."""
     neighbours: tuple[Neighbour, ...]
     command: VelocityCommand
     reasons: tuple[str, ...] = ()

@@ -20,31 +20,55 @@ MAY_IMPORT = {
     "peer": {"errors"},
     "config": {"messages", "errors"},
     "geometry": BASE,
-    "perception": BASE,
-    "tracking": BASE,
+    "inference": BASE,
+    "perception": BASE | {"geometry", "inference", "tracking"},
+    "tracking": BASE | {"geometry"},
     "flocking": BASE,
     "safety": BASE,
-    "pilot": BASE | {"geometry", "perception", "tracking", "flocking", "safety"},
+    "pilot": BASE | {"geometry", "inference", "perception", "tracking", "flocking", "safety"},
     "sources": BASE | {"peer"},
     "autopilot": BASE,
     "telemetry": BASE | {"peer"},
     "recording": BASE | {"telemetry"},  # for the table of topics, which says what is recorded
     "calibration": BASE | {"geometry"},
-    "datasets": BASE | {"geometry", "perception", "pilot"},
+    "datasets": BASE | {"geometry", "inference", "perception", "pilot"},
     "sim": BASE
-    | {"geometry", "perception", "tracking", "flocking", "safety", "pilot", "telemetry", "recording", "report"}
+    | {
+        "geometry",
+        "inference",
+        "perception",
+        "tracking",
+        "flocking",
+        "safety",
+        "pilot",
+        "telemetry",
+        "recording",
+        "report",
+    }
     | {"sources", "autopilot"},  # real daemons are fed frames and given autopilots
     "report": BASE | {"geometry", "flocking", "pilot", "recording", "sim"},
     "view": BASE | {"geometry", "pilot", "recording"},
-    "daemon": BASE | {"perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"},
-    "doctor": BASE | {"geometry", "perception", "pilot", "sources", "autopilot", "telemetry", "daemon"},
+    "daemon": BASE | {"inference", "perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"},
+    "doctor": BASE | {"geometry", "inference", "perception", "pilot", "sources", "autopilot", "telemetry", "daemon"},
     "cli": BASE
-    | {"perception", "pilot", "telemetry", "recording", "datasets", "sim", "report", "view", "daemon", "doctor"}
+    | {
+        "inference",
+        "perception",
+        "pilot",
+        "telemetry",
+        "recording",
+        "datasets",
+        "sim",
+        "report",
+        "view",
+        "daemon",
+        "doctor",
+    }
     | {"calibration", "geometry", "sources"},
 }
 """What each folder may import of the others."""
 
-PURE = ("messages", "geometry", "perception", "tracking", "flocking", "safety", "pilot")
+PURE = ("messages", "geometry", "inference", "perception", "tracking", "flocking", "safety", "pilot")
 """No clock, no socket, no thread, no environment: what is tested is what flies."""
 IMPURE_MODULES = {
     "asyncio",
@@ -59,7 +83,7 @@ IMPURE_MODULES = {
 }
 
 NETWORK_LIBRARIES = {"onnxruntime"}
-"""Only perception runs networks."""
+"""Only inference runs networks."""
 SIMULATOR_LIBRARIES = {"numba", "matplotlib", "jinja2", "markupsafe"}
 """Of the extra `sim`: only the simulator and its reports may need them."""
 TOOL_LIBRARIES = {"torch", "onnx", "scipy", "trimesh", "embreex", "pytest"}
@@ -114,9 +138,9 @@ def test_the_pure_line_knows_no_clock_no_thread_and_no_network(folder: str) -> N
         assert "getenv" not in path.read_text(encoding="utf-8"), path
 
 
-def test_only_perception_runs_networks() -> None:
+def test_only_inference_runs_networks() -> None:
     for path in MODULES:
-        if _folder(path) != "perception":
+        if _folder(path) != "inference":
             assert not _libraries(path) & NETWORK_LIBRARIES, path
 
 

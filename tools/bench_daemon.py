@@ -27,8 +27,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from flockd.autopilot.stand_in import AutopilotStandIn
 from flockd.config import DroneConfig, load
 from flockd.data import data_path
+from flockd.inference.session import golden_image
 from flockd.messages import Frame
-from flockd.perception.session import golden_image
 from flockd.recording.reader import Recording
 from flockd.sim.daemons import Daemons
 from flockd.sources import FramePublisher

@@ -31,8 +31,8 @@ from flockd.autopilot.stand_in import AutopilotStandIn
 from flockd.autopilot.streamer import SetpointStreamer
 from flockd.config.autopilot import AutopilotParameters
 from flockd.data import data_path
+from flockd.inference.session import OnnxModel, golden_feeds
 from flockd.messages import Setpoint
-from flockd.perception.session import OnnxModel, golden_feeds
 
 P99_BAR_MS = 60.0
 WORST_BAR_MS = 500.0

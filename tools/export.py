@@ -18,8 +18,8 @@ from torch import Tensor, nn
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from flockd.perception.manifest import Manifest
-from flockd.perception.session import golden_feeds
+from flockd.inference.manifest import Manifest
+from flockd.inference.session import golden_feeds
 from tools.training.manifests import write_manifest
 from tools.training.networks import DistanceNet, FlowNet, NeighboursNet
 

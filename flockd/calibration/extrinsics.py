@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flockd.calibration.board import Detection
+from flockd.calibration.board import BoardDetection
 from flockd.calibration.errors import CalibrationError
 from flockd.calibration.least_squares import Normal, Solution, minimise
 from flockd.calibration.poses import jacobian_of_move, moved, pose_of_board
@@ -31,7 +31,7 @@ class SharedBoard:
     """The board at one time, as seen by each camera that saw it."""
 
     name: str
-    seen: Mapping[str, Detection]
+    seen: Mapping[str, BoardDetection]
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from flockd.calibration.board import Detection
+from flockd.calibration.board import BoardDetection
 from flockd.calibration.least_squares import Normal, minimise
 from flockd.geometry import Camera, RigidTransform
 from flockd.geometry.rotations import rotation_from_vector
@@ -15,7 +15,7 @@ _NEAREST_ANGLE = 0.15
 """Cosine of the largest angle from the board's middle at which a corner still helps to find a first pose."""
 
 
-def pose_of_board(camera: Camera, seen: Detection) -> RigidTransform | None:
+def pose_of_board(camera: Camera, seen: BoardDetection) -> RigidTransform | None:
     """``T_camera_board`` with the least squared error in pixels; None where the corners fit no pose at all."""
     best: tuple[float, RigidTransform] | None = None
     for start in first_poses(camera, seen):
@@ -25,7 +25,7 @@ def pose_of_board(camera: Camera, seen: Detection) -> RigidTransform | None:
     return None if best is None else best[1]
 
 
-def first_poses(camera: Camera, seen: Detection) -> list[RigidTransform]:
+def first_poses(camera: Camera, seen: BoardDetection) -> list[RigidTransform]:
     """Both poses that a flat board may have by its outline (IPPE), likelier first; none where it fits none."""
     rays = camera.rays(seen.pixels)
     usable = np.isfinite(rays).all(axis=1)
@@ -68,7 +68,7 @@ def jacobian_of_move(pose: RigidTransform, points: FloatArray) -> FloatArray:
     return derivative
 
 
-def _normal(camera: Camera, seen: Detection, pose: RigidTransform) -> Normal:
+def _normal(camera: Camera, seen: BoardDetection, pose: RigidTransform) -> Normal:
     points = pose.apply(seen.points)
     residuals = (camera.project(points) - seen.pixels).ravel()
     derivative = (camera.jacobian(points) @ jacobian_of_move(pose, seen.points)).reshape(-1, 6)

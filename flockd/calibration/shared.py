@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
-from flockd.calibration.board import BoardFinder, Detection
+from flockd.calibration.board import BoardDetection, BoardFinder
 from flockd.calibration.extrinsics import SharedBoard
 from flockd.calibration.sharpness import edge_width_px
 from flockd.calibration.views import is_still, sharp_px
@@ -17,7 +17,7 @@ class SharedCollector:
 
     def __init__(self, finder: BoardFinder) -> None:
         self._finder = finder
-        self._before: Mapping[str, tuple[Detection, int]] = {}
+        self._before: Mapping[str, tuple[BoardDetection, int]] = {}
         self.boards: list[SharedBoard] = []
 
     def offer(self, name: str, greys: Mapping[str, UInt8Array], *, moving: bool) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from flockd.calibration.board import BoardSpec, Detection
+from flockd.calibration.board import BoardDetection, BoardSpec
 from flockd.messages import FloatArray, UInt8Array
 
 _SMALLEST_SQUARE_PX = 10.0
@@ -16,7 +16,7 @@ _ALONG = np.linspace(-0.2, 0.2, 7)
 """Where along an edge its profile is taken, in squares from its middle; the average has less noise."""
 
 
-def edge_width_px(grey: UInt8Array, seen: Detection, spec: BoardSpec) -> float:
+def edge_width_px(grey: UInt8Array, seen: BoardDetection, spec: BoardSpec) -> float:
     """Pixels over which black becomes white, in the direction in which the view is blurred more.
 
     Of a perfectly sharp picture it is between 1 and 2; of one blurred with a deviation of s pixels about 2.5 s. NaN

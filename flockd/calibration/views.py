@@ -11,7 +11,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from flockd.calibration.board import BoardFinder, Detection
+from flockd.calibration.board import BoardDetection, BoardFinder
 from flockd.calibration.coverage import Coverage
 from flockd.calibration.errors import CalibrationError
 from flockd.calibration.sharpness import edge_width_px
@@ -34,7 +34,7 @@ class View:
 
     name: str
     """Of the file, or the frame's number or time."""
-    seen: Detection
+    seen: BoardDetection
     edge_px: float
     """See `sharpness.edge_width_px`."""
 
@@ -56,7 +56,7 @@ class Collector:
         """Keeps at most ``most`` views: beyond that, of two that are alike one goes."""
         self._finder, self._most, self._max_edge_px = finder, most, max_edge_px
         self._first = ""
-        self._before: Detection | None = None
+        self._before: BoardDetection | None = None
         self.size: tuple[int, int] | None = None
         """Width, height; None before the first picture."""
         self.views: list[View] = []
@@ -125,7 +125,7 @@ def sharp_px(width: int) -> float:
     return max(_SHARP_PX, _SHARP_SHARE * width)
 
 
-def is_still(before: Detection, now: Detection, width: int) -> bool:
+def is_still(before: BoardDetection, now: BoardDetection, width: int) -> bool:
     """Whether a board was held still from one frame to the next, in pictures of this width."""
     return _apart(before, now, width) < _STILL
 
@@ -135,7 +135,7 @@ def all_pixels(views: Sequence[View]) -> FloatArray:
     return np.concatenate([view.seen.pixels for view in views])
 
 
-def _apart(first: Detection, second: Detection, width: int) -> float:
+def _apart(first: BoardDetection, second: BoardDetection, width: int) -> float:
     """Mean distance of the corners that both show, as a share of the width; infinite where they show others."""
     _, a, b = np.intersect1d(first.ids, second.ids, assume_unique=True, return_indices=True)
     if len(a) < _SAME * max(len(first.ids), len(second.ids)):

@@ -17,7 +17,7 @@ from flockd.errors import ExitCode, ModelError, UnavailableError
 if TYPE_CHECKING:
     from flockd.config import DroneConfig
     from flockd.config.perception import Provider
-    from flockd.perception import OnnxModel
+    from flockd.inference import OnnxModel
 
 THREADS = 2
 RUNS = 9
@@ -91,7 +91,7 @@ def _list(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.table import Table
 
-    from flockd.perception.manifest import load_manifest
+    from flockd.inference.manifest import load_manifest
 
     models = [load_manifest(path) for path in _manifests(args.dir)]
     if args.json:
@@ -106,7 +106,7 @@ def _list(args: argparse.Namespace) -> int:
 
 
 def _verify(args: argparse.Namespace) -> int:
-    from flockd.perception.session import OnnxModel
+    from flockd.inference.session import OnnxModel
 
     faults: dict[str, str | None] = {}
     for path in _manifests(args.dir):
@@ -161,7 +161,7 @@ def _bench(args: argparse.Namespace) -> int:
 
 def _providers(text: str | None) -> Sequence[Provider]:
     from flockd.errors import UsageError
-    from flockd.perception.providers import PROVIDERS, available
+    from flockd.inference.providers import PROVIDERS, available
 
     if text is None:
         return available()
@@ -173,8 +173,8 @@ def _providers(text: str | None) -> Sequence[Provider]:
 
 
 def _timings(manifests: Sequence[Path], providers: Sequence[Provider], args: argparse.Namespace) -> Iterator[_Timing]:
-    from flockd.perception import OnnxModel
-    from flockd.perception.session import feeds_for, shapes_of
+    from flockd.inference import OnnxModel
+    from flockd.inference.session import feeds_for, shapes_of
 
     for path in manifests:
         for provider in providers:
@@ -202,7 +202,7 @@ def _times_ms(model: OnnxModel, feeds: Any, runs: int) -> list[float]:
 
 def _prepare(args: argparse.Namespace) -> int:
     from flockd.config import ScenarioConfig, load
-    from flockd.perception import manifests_of
+    from flockd.inference import manifests_of
 
     loaded = load(args.config)
     config = loaded.drone if isinstance(loaded, ScenarioConfig) else loaded
@@ -226,10 +226,10 @@ def _prepare(args: argparse.Namespace) -> int:
 
 def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
     """Runs a model on all that it will see of these cameras, keeps what that built, and opens it again as in flight."""
-    from flockd.perception import OnnxModel
-    from flockd.perception.providers import builds_engines, engines_folder
+    from flockd.inference import OnnxModel
+    from flockd.inference.providers import builds_engines, engines_folder
+    from flockd.inference.session import feeds_for, golden_feeds, shapes_of
     from flockd.perception.roles import PICTURES_AT_A_TIME
-    from flockd.perception.session import feeds_for, golden_feeds, shapes_of
 
     wanted = config.perception
     options: Any = {"threads": wanted.threads, "provider": wanted.provider, "engines": engines_folder(wanted)}
@@ -258,7 +258,7 @@ def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
 
 def _manifests(folder: Path | None) -> tuple[Path, ...]:
     from flockd.data import data_path
-    from flockd.perception.manifest import find_manifests
+    from flockd.inference.manifest import find_manifests
 
     folder = folder or data_path("models")
     manifests = find_manifests(folder)

@@ -97,7 +97,7 @@ def opened(path: Path) -> Recording:
 
 def models_of(config: DroneConfig) -> dict[str, str]:
     """SHA-256 of each model that a configuration uses, by name. Raises ModelError."""
-    from flockd.perception import load_manifest, manifests_of
+    from flockd.inference import load_manifest, manifests_of
 
     manifests = [load_manifest(path)[0] for path in sorted(manifests_of(config.perception))]
     return {manifest.name: manifest.sha256 for manifest in manifests}

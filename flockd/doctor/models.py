@@ -13,9 +13,9 @@ import numpy as np
 from flockd.config import DroneConfig
 from flockd.doctor.finding import Finding, Level, failed, failed_as_told, passed, warned
 from flockd.errors import ModelError
+from flockd.inference import OnnxModel, manifests_of
+from flockd.inference.providers import engines_folder
 from flockd.messages import Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
-from flockd.perception import OnnxModel, manifests_of
-from flockd.perception.providers import engines_folder
 from flockd.pilot import FlockPilot, Perceiver
 
 STEPS = 4

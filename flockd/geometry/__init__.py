@@ -5,6 +5,7 @@ from flockd.geometry.ego_motion import estimate_ego_motion
 from flockd.geometry.ground import ground_inverse_depth
 from flockd.geometry.neighbour_motion import estimate_neighbour_motion
 from flockd.geometry.pairs import BACKGROUND_LABEL, PointPairs, grid_pixels, label_pixels, lift_matches
+from flockd.geometry.polar import log_polar, log_polar_covariance, log_polar_residual
 from flockd.geometry.ransac import RansacResult, ransac_rigid
 from flockd.geometry.refinement import refine_ego_motion
 from flockd.geometry.rig import Rig, RigCamera, build_rig
@@ -33,6 +34,9 @@ __all__ = [
     "ground_inverse_depth",
     "label_pixels",
     "lift_matches",
+    "log_polar",
+    "log_polar_covariance",
+    "log_polar_residual",
     "ransac_rigid",
     "refine_ego_motion",
     "rotation_angle_deg",

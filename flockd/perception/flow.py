@@ -7,10 +7,10 @@ from typing import Protocol
 import cv2
 import numpy as np
 
+from flockd.inference.fitting import fit
+from flockd.inference.session import OnnxModel
 from flockd.messages import Float32Array, UInt8Array
-from flockd.perception.fitting import fit
 from flockd.perception.landmarks import flow_of_landmarks
-from flockd.perception.session import OnnxModel
 from flockd.perception.shift import flow_of_shift, likeness
 
 _EXPLAINS = 0.8

@@ -11,15 +11,15 @@ import numpy as np
 
 from flockd.config.perception import PerceptionConfig
 from flockd.errors import ModelError
+from flockd.inference.fitting import fit
+from flockd.inference.manifest import Answer, Content, Role, Unknown, manifest_path
+from flockd.inference.providers import engines_folder
+from flockd.inference.session import OnnxModel
 from flockd.messages import BoolArray, Float32Array, FloatArray, UInt8Array
 from flockd.perception.background_flow import settle_background
 from flockd.perception.drone_flow import follow_drones
-from flockd.perception.fitting import fit
 from flockd.perception.flow import DisFlow, Flow, OnnxFlow
 from flockd.perception.instances import Instance, group_instances
-from flockd.perception.manifest import Answer, Content, Role, Unknown, manifest_path
-from flockd.perception.providers import engines_folder
-from flockd.perception.session import OnnxModel
 
 _EAGER_LOGIT = -1.5
 """Where a second stage weeds out what is none, the first proposes drones from this logit up."""

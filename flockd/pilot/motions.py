@@ -100,10 +100,10 @@ def _labels_by_flow(previous: RigView, current: RigView, flows: Mapping[str, Flo
     for name, flow in flows.items():
         before, after = previous.cameras[name].labels, current.cameras[name].labels
         height, width = before.shape
-        for sighting in previous.sightings:
-            if name not in sighting.cameras:
+        for detection in previous.detections:
+            if name not in detection.cameras:
                 continue
-            pixels = label_pixels(before, sighting.label, _PIXELS_A_DRONE)
+            pixels = label_pixels(before, detection.label, _PIXELS_A_DRONE)
             if not len(pixels):
                 continue
             start = pixels.astype(np.int64)
@@ -112,7 +112,7 @@ def _labels_by_flow(previous: RigView, current: RigView, flows: Mapping[str, Flo
             landed, counts = np.unique(after[end[inside, 1], end[inside, 0]], return_counts=True)
             for label, count in zip(landed, counts, strict=True):
                 if 0 < label < UNCLASSED:
-                    key = (sighting.label, int(label))
+                    key = (detection.label, int(label))
                     votes[key] = votes.get(key, 0) + int(count)
     same: dict[int, int] = {}
     for before_label, after_label in sorted(votes, key=lambda pair: -votes[pair]):

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from flockd.geometry import RigCamera, VirtualCrop
-from flockd.messages import UNCLASSED, Float32Array, FloatArray, Sighting, UInt8Array
+from flockd.messages import UNCLASSED, Detection, Float32Array, FloatArray, UInt8Array
 from flockd.pilot.colours import weigh_by_colour
 
 _TO_THE_CORNERS = 1.5
@@ -41,8 +41,7 @@ class Claim:
 
 @dataclass(frozen=True, eq=False)
 class Outlines:
-    """One camera's drones, ready to be drawn as (h, w) labels: 0 background, k the sighting with label k, 255 not to be
-    used."""
+    """One camera's drones, to be drawn as (h, w) labels: 0 background, k the detection with label k, 255 unused."""
 
     labels: UInt8Array
     """As the first stage alone has them."""
@@ -74,25 +73,25 @@ class Outliner:
         self,
         labels: UInt8Array,
         logit: Float32Array,
-        sightings: Sequence[Sighting],
+        detections: Sequence[Detection],
         masks_of: Mapping[int, Sequence[Mask]],
     ) -> Outlines:
-        """What both stages say of each sighting's pixels.
+        """What both stages say of each detection's pixels.
 
         Args:
             labels: (h, w) as the first stage alone has them.
             logit: (h / stride, w / stride) of a pixel being any drone's, as the first stage says.
-            sightings: of the whole rig.
-            masks_of: the second stage's, by the sighting's label; none where it does not tell.
+            detections: of the whole rig.
+            masks_of: the second stage's, by the detection's label; none where it does not tell.
         """
         claims = []
-        for sighting in sightings:
-            masks = masks_of[sighting.label]
-            if self._camera.name not in sighting.cameras or not masks:
+        for detection in detections:
+            masks = masks_of[detection.label]
+            if self._camera.name not in detection.cameras or not masks:
                 continue
-            box, said = self._said(sighting.position, masks, logit)
+            box, said = self._said(detection.position, masks, logit)
             if said.size:
-                claims.append(Claim(sighting.label, box, said))
+                claims.append(Claim(detection.label, box, said))
         return Outlines(labels, tuple(claims))
 
     def _said(

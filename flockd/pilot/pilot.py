@@ -12,8 +12,10 @@ import numpy as np
 from flockd.config.drone import DroneConfig
 from flockd.flocking import FlockingLaw, course, desired_velocity
 from flockd.geometry import build_rig
+from flockd.inference import models_folder
 from flockd.messages import (
     BoolArray,
+    Detection,
     EgoMotion,
     Float32Array,
     FloatArray,
@@ -21,15 +23,14 @@ from flockd.messages import (
     Neighbour,
     NeighbourMotion,
     PilotOutput,
-    Sighting,
     VehicleState,
     VelocityCommand,
 )
-from flockd.perception import Perception, SceneMaps, models_folder
+from flockd.perception import Perception, SceneMaps
 from flockd.pilot.motions import ego_motion, neighbour_motions
 from flockd.pilot.scale import VelocityScale
 from flockd.pilot.views import Observer, Perceiver, RigView
-from flockd.tracking import Blind, ExpectedNeighbour, Measurement, Tracker, sighting_covariance
+from flockd.tracking import Blind, ExpectedNeighbour, Measurement, Tracker
 
 _OWN_DISPLACEMENT_SIGMA_M = 0.02
 _MAX_REFUSALS = 2
@@ -109,8 +110,8 @@ class FlockPilot:
             time_s=view.time_s,
             ego_motion=ego,
             velocity=velocity,
-            sightings=view.sightings,
-            sighting_tracks=tracks,
+            detections=view.detections,
+            detection_tracks=tracks,
             neighbour_motions=motions,
             neighbours=neighbours,
             command=command,
@@ -198,7 +199,7 @@ class FlockPilot:
         if previous is not None:
             self._tracker.predict(view.time_s - previous.time_s, displacement, _OWN_DISPLACEMENT_SIGMA_M)
         measurements = [
-            _measurement(s, view.vehicle.R_ned_body, previous, motions.get(s.label)) for s in view.sightings
+            _measurement(s, view.vehicle.R_ned_body, previous, motions.get(s.label)) for s in view.detections
         ]
         return self._tracker.update(view.time_s, measurements, velocity, self._blind(view))
 
@@ -238,23 +239,23 @@ def load_perception(config: DroneConfig) -> Perception:
 
 
 def _measurement(
-    sighting: Sighting, R_ned_body: FloatArray, previous: RigView | None, motion: NeighbourMotion | None
+    detection: Detection, R_ned_body: FloatArray, previous: RigView | None, motion: NeighbourMotion | None
 ) -> Measurement:
-    """A sighting in level axes, with the velocity of Eq. 36 where there is one."""
-    position = R_ned_body @ sighting.position
-    covariance = sighting_covariance(position, sighting.range_sigma_m, sighting.bearing_sigma_rad)
+    """A detection in level axes, with the velocity of Eq. 36 where there is one."""
+    position = R_ned_body @ detection.position
+    covariance = detection.range_m**2 * R_ned_body @ detection.covariance @ R_ned_body.T
     measurement = Measurement(
         position=position,
         covariance=covariance,
-        size_m=sighting.size_m,
-        drone_probability=sighting.drone_probability,
+        size_m=detection.size_m,
+        drone_probability=detection.drone_probability,
     )
     if motion is None or previous is None:
         return measurement
     return replace(
         measurement,
         velocity=previous.vehicle.R_ned_body @ motion.velocity,
-        velocity_sigma_m_s=_MOTION_CAUTION * math.sqrt(2) * sighting.range_sigma_m / motion.interval_s,
+        velocity_sigma_m_s=_MOTION_CAUTION * math.sqrt(2) * detection.range_sigma_m / motion.interval_s,
     )
 
 

@@ -10,15 +10,15 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from flockd.geometry import Rig, RigCamera, ground_inverse_depth, virtual_crop
+from flockd.geometry import Rig, RigCamera, ground_inverse_depth, log_polar, log_polar_covariance, virtual_crop
 from flockd.messages import (
     UNCLASSED,
     BoolArray,
+    Detection,
     Float32Array,
     FloatArray,
     Frame,
     FrameSet,
-    Sighting,
     UInt8Array,
     VehicleState,
 )
@@ -54,7 +54,7 @@ _SURE_OF_EXPECTED = 0.7
 _EXPECTED_GATE = 0.2
 """What is found where a drone was expected must be as near to that place as this share of its range, or 0.5 m."""
 _SAME_DRONE = 0.6
-"""Two sightings closer than this share of their size are one drone seen by two cameras."""
+"""Two detections closer than this share of their size are one drone seen by two cameras."""
 _SAME_BEARING, _SAME_RANGE = 0.4, 1.5
 """Or in directions closer than this share of their angular size, with ranges that differ by less than this factor."""
 _HIDES = 0.25
@@ -100,7 +100,7 @@ class CameraView:
     image: UInt8Array
     depth: Float32Array
     labels: UInt8Array
-    """0 background, k the sighting with label k, 255 not to be used."""
+    """0 background, k the detection with label k, 255 not to be used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ class RigView:
     time_s: float
     vehicle: VehicleState
     cameras: Mapping[str, CameraView]
-    sightings: tuple[Sighting, ...]
+    detections: tuple[Detection, ...]
     reasons: tuple[str, ...]
 
 
@@ -150,7 +150,7 @@ class Observer:
         reasons: Sequence[str],
         expected: Sequence[ExpectedNeighbour] = (),
     ) -> RigView:
-        """Sightings of the whole rig, and the maps relabelled by them.
+        """Detections of the whole rig, and the maps relabelled by them.
 
         Where a drone is ``expected`` but not segmented, the second stage looks once more.
         """
@@ -168,9 +168,9 @@ class Observer:
         views = {}
         for name, scene in maps.items():
             drawn = outlines[name].by_colours(images[name])
-            depth = self._drone_depth(scene.depth, drawn, self._rig.cameras[name], merged.sightings)
+            depth = self._drone_depth(scene.depth, drawn, self._rig.cameras[name], merged.detections)
             views[name] = CameraView(images[name], depth, _without_outline(drawn))
-        return RigView(frames.time_s, vehicle, views, merged.sightings, tuple(reasons))
+        return RigView(frames.time_s, vehicle, views, merged.detections, tuple(reasons))
 
     def _outlines(
         self, maps: Mapping[str, SceneMaps], merged: _Merged, refused: Container[Instance]
@@ -189,7 +189,7 @@ class Observer:
             outlines[name] = Outlines(labels)
             if scene.logit is not None:
                 outliner = self._outliners[name]
-                outlines[name] = outliner.outlines(labels, scene.logit, merged.sightings, merged.masks_of)
+                outlines[name] = outliner.outlines(labels, scene.logit, merged.detections, merged.masks_of)
         return outlines
 
     def _geometry(self, camera: RigCamera, vehicle: VehicleState) -> Float32Array:
@@ -356,19 +356,19 @@ class Observer:
 
     @staticmethod
     def _drone_depth(
-        depth: Float32Array, labels: UInt8Array, camera: RigCamera, sightings: Sequence[Sighting]
+        depth: Float32Array, labels: UInt8Array, camera: RigCamera, detections: Sequence[Detection]
     ) -> Float32Array:
-        """The depth map with each drone's pixels moved to its sighting's range; their relief is kept."""
+        """The depth map with each drone's pixels moved to its detection's range; their relief is kept."""
         moved = depth.copy()
-        for sighting in sightings:
-            if camera.name not in sighting.cameras:
+        for detection in detections:
+            if camera.name not in detection.cameras:
                 continue
-            mine = labels == sighting.label
-            z = float(camera.T_body_camera.inverse().apply(sighting.position[None])[0, 2])
+            mine = labels == detection.label
+            z = float(camera.T_body_camera.inverse().apply(detection.position[None])[0, 2])
             if z <= 0 or not mine.any():
                 continue
             relief = depth[mine] - np.median(depth[mine])
-            moved[mine] = z + np.clip(relief, -sighting.size_m / 2, sighting.size_m / 2)
+            moved[mine] = z + np.clip(relief, -detection.size_m / 2, detection.size_m / 2)
         return moved
 
 
@@ -536,9 +536,9 @@ def _without_hidden(found: Sequence[_Located]) -> list[_Located]:
 
 @dataclass(frozen=True, eq=False)
 class _Merged:
-    """One sighting a drone."""
+    """One detection a drone."""
 
-    sightings: tuple[Sighting, ...]
+    detections: tuple[Detection, ...]
     label_of: Mapping[tuple[str, int], int]
     """By camera and the label of its instance."""
     masks_of: Mapping[int, Sequence[Mask]]
@@ -554,16 +554,18 @@ def _merge(found: Sequence[_Located]) -> _Merged:
                 break
         else:
             groups.append([one])
-    sightings, label_of, masks_of = [], {}, {}
+    detections, label_of, masks_of = [], {}, {}
     for label, group in enumerate(groups[: UNCLASSED - 1], start=1):
         weights = np.array([one.range_sigma_m**-2 for one in group])
         position = (weights[:, None] * np.array([one.position for one in group])).sum(0) / weights.sum()
+        bearing, log_range = log_polar(position)
+        sigma_m = min(one.range_sigma_m for one in group)  # errors of two pictures of one drone are alike
         cameras = tuple(dict.fromkeys(name for one in group for name in one.candidate.cameras))
-        sightings.append(
-            Sighting(
-                position=position,
-                range_sigma_m=min(one.range_sigma_m for one in group),  # errors of two pictures of one drone are alike
-                bearing_sigma_rad=_BEARING_SIGMA_RAD,
+        detections.append(
+            Detection(
+                bearing=bearing,
+                log_range=log_range,
+                covariance=log_polar_covariance(bearing, sigma_m / math.exp(log_range), _BEARING_SIGMA_RAD),
                 drone_probability=max(one.is_drone for one in group),
                 size_m=float((weights * [one.size_m for one in group]).sum() / weights.sum()),
                 cameras=cameras,
@@ -574,7 +576,7 @@ def _merge(found: Sequence[_Located]) -> _Merged:
         for one in group:
             if one.candidate.instance:
                 label_of[(one.candidate.cameras[0], one.candidate.instance.label)] = label
-    return _Merged(tuple(sightings), label_of, masks_of)
+    return _Merged(tuple(detections), label_of, masks_of)
 
 
 def _is_same(a: _Located, b: _Located) -> bool:

@@ -81,7 +81,7 @@ def compare(drone: str, expected: Outputs, found: Outputs, tolerances: Mapping[s
 
 
 def plain(name: str) -> str:
-    """A field without what tells one neighbour or axis from the next: `sightings[1].size_m` is `sightings.size_m`."""
+    """A field without what tells one neighbour or axis from the next: `detections[1].size_m` is `detections.size_m`."""
     return re.sub(r"\[[^]]*]", "", name)
 
 

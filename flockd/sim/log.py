@@ -48,7 +48,7 @@ class FlightLog:
     """(S, N, N, 3) m NED: [s, i, j] is drone j relative to drone i by i's confirmed track of it."""
     neighbour_velocity: FloatArray
     """(S, N, N, 3) m/s NED over ground, likewise."""
-    sighting_position: FloatArray
+    detection_position: FloatArray
     """(S, N, N, 3) m NED: as `neighbour_position`, of the single frame set before tracking."""
     false_tracks: IntArray
     """(S, N) confirmed tracks that match no true drone and did not count before."""
@@ -93,7 +93,7 @@ class FlightLog:
             "own_velocity_estimate": state,
             "neighbour_position": seen,
             "neighbour_velocity": seen,
-            "sighting_position": seen,
+            "detection_position": seen,
             "false_tracks": (steps, drones),
             "truth_position": (companion, drones, 3),
             "truth_velocity": (companion, drones, 3),

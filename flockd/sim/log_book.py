@@ -24,7 +24,7 @@ class LogBook:
         self._ego_inlier_ratio = np.full((steps, n), nan)
         self._own_velocity = np.full((steps, n, 3), nan)
         self._neighbour_position, self._neighbour_velocity = (np.full((steps, n, n, 3), nan) for _ in range(2))
-        self._sighting_position = np.full((steps, n, n, 3), nan)
+        self._detection_position = np.full((steps, n, n, 3), nan)
         self._false_tracks = np.zeros((steps, n), np.int64)
         self._false_seen: list[set[int]] = [set() for _ in range(n)]
         self._tracked: list[tuple[float, ...]] = []
@@ -69,7 +69,7 @@ class LogBook:
             self._stages.setdefault(stage, []).append(ms)
 
     def _judge(self, step: int, i: int, output: PilotOutput, R_ned_body: FloatArray) -> None:
-        """Which neighbour and which sighting is which drone, and which is none."""
+        """Which neighbour and which detection is which drone, and which is none."""
         others = [j for j in range(self._position.shape[1]) if j != i]
         true = self._position[step, others] - self._position[step, i]
         confirmed = [n for n in output.neighbours if n.confirmed]
@@ -82,9 +82,9 @@ class LogBook:
         false = {n.track for k, n in enumerate(confirmed) if k not in matched} - self._false_seen[i]
         self._false_seen[i] |= false
         self._false_tracks[step, i] = len(false)
-        sighted = np.array([R_ned_body @ s.position for s in output.sightings]).reshape(-1, 3)
-        for estimate, truth in match_neighbours(sighted, true):
-            self._sighting_position[step, i, others[truth]] = sighted[estimate]
+        detected = np.array([R_ned_body @ s.position for s in output.detections]).reshape(-1, 3)
+        for estimate, truth in match_neighbours(detected, true):
+            self._detection_position[step, i, others[truth]] = detected[estimate]
 
     def log(self, meta: Mapping[str, object], companion: tuple[FloatArray, FloatArray] | None) -> FlightLog:
         """The log, with positions and velocities (S, N, 3) of the companion with exact states, if there is one."""
@@ -96,7 +96,7 @@ class LogBook:
             command_acceleration=self._command_acceleration, ego_rotation=self._ego_rotation,
             ego_translation=self._ego_translation, ego_inlier_ratio=self._ego_inlier_ratio,
             own_velocity_estimate=self._own_velocity, neighbour_position=self._neighbour_position,
-            neighbour_velocity=self._neighbour_velocity, sighting_position=self._sighting_position,
+            neighbour_velocity=self._neighbour_velocity, detection_position=self._detection_position,
             false_tracks=self._false_tracks, truth_position=truth_position, truth_velocity=truth_velocity,
             stages_ms={stage: np.array(ms) for stage, ms in self._stages.items()}, meta=meta,
             tracked=np.array(self._tracked).reshape(-1, 6),

@@ -34,7 +34,7 @@ def picture(pilot: FlockPilot, output: PilotOutput, drone: int, name: str = "") 
             depth={name: np.where(c.depth < _SKY_M, c.depth, np.float32(np.inf)) for name, c in cameras.items()},
             labels={name: np.where(c.labels == 255, np.uint8(0), c.labels) for name, c in cameras.items()},
             flow=dict(pilot.last_flows),
-            track_ids={s.label: t for s, t in zip(output.sightings, output.sighting_tracks, strict=True)},
-            ranges={s.label: float(np.linalg.norm(s.position)) for s in output.sightings},
+            track_ids={s.label: t for s, t in zip(output.detections, output.detection_tracks, strict=True)},
+            ranges={s.label: float(np.linalg.norm(s.position)) for s in output.detections},
         )
     ]

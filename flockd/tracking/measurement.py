@@ -11,14 +11,14 @@ from flockd.messages import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """One sighting in level axes that point north, east and down. Raises ValueError for numbers that are not finite."""
+    """One detection in axes that point north, east and down. Raises ValueError for numbers that are not finite."""
 
     position: FloatArray
     """(3,) metres, relative to the own drone; not zero."""
     covariance: FloatArray
     """(3, 3) m^2 of `position`."""
     size_m: float
-    """As of `Sighting.size_m`."""
+    """As of `Detection.size_m`."""
     drone_probability: float = 1.0
     """Of being a drone at all, 0 to 1."""
     velocity: FloatArray | None = None
@@ -41,7 +41,7 @@ class Measurement:
             raise ValueError(f"a velocity's sigma must be finite and positive, not {self.velocity_sigma_m_s} m/s")
 
 
-def sighting_covariance(position: FloatArray, range_sigma_m: float, bearing_sigma_rad: float) -> FloatArray:
+def detection_covariance(position: FloatArray, range_sigma_m: float, bearing_sigma_rad: float) -> FloatArray:
     """(3, 3) m^2 of a position (3,) whose range and bearing err apart: sigma_r along it, range * sigma_b across."""
     distance = float(np.linalg.norm(position))
     along = np.outer(position, position) / distance**2

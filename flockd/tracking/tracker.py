@@ -39,7 +39,7 @@ class ExpectedNeighbour:
     position: FloatArray
     """(3,) metres, NED, own drone at the origin."""
     size_m: float
-    """As of `Sighting.size_m`."""
+    """As of `Detection.size_m`."""
 
 
 @dataclass
@@ -237,7 +237,7 @@ class Tracker:
 def range_from_size(measurement: Measurement, sizes: Sequence[float]) -> tuple[FloatArray, FloatArray]:
     """A position (3,) and covariance (3, 3) whose range also draws on a drone's size being constant.
 
-    `sizes`: what the last sightings, this one included, took the size for. The mean size over this sighting's angular
+    `sizes`: what the last detections, this one included, took the size for. The mean size over this detection's angular
     size is a second range, blended with the first by their variances.
     """
     distance = float(np.linalg.norm(measurement.position))

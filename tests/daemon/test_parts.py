@@ -26,8 +26,8 @@ from flockd.daemon.service import ServiceManager
 from flockd.daemon.worker import BusyError, LateError, Worker
 from flockd.data import data_path
 from flockd.errors import UnavailableError
+from flockd.inference import OnnxModel
 from flockd.messages import VehicleState
-from flockd.perception import OnnxModel
 from flockd.sources import CameraStatus, Count
 from tests.daemon.aboard import TinyPerceiver
 

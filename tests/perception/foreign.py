@@ -13,8 +13,8 @@ import onnxruntime as ort
 import yaml
 from onnx import TensorProto, helper, numpy_helper
 
-from flockd.perception.manifest import Manifest
-from flockd.perception.session import golden_feeds
+from flockd.inference.manifest import Manifest
+from flockd.inference.session import golden_feeds
 
 SIZE = (48, 32)
 

@@ -12,9 +12,10 @@ from onnx import helper
 from flockd.config.perception import PerceptionConfig
 from flockd.data import data_path
 from flockd.errors import ModelError
+from flockd.inference import OnnxModel
+from flockd.inference.fitting import fit
 from flockd.messages import Float32Array
-from flockd.perception import OnnxFlow, OnnxModel, Perception
-from flockd.perception.fitting import fit
+from flockd.perception import OnnxFlow, Perception
 from tests.perception.foreign import SIZE, image_input, map_output, one_channel_depth, write_model
 
 WIDTH, HEIGHT = SIZE

@@ -15,8 +15,9 @@ from flockd.cli import main
 from flockd.config.perception import PerceptionConfig
 from flockd.data import data_path
 from flockd.errors import ModelError
+from flockd.inference import OnnxModel, find_manifests, load_manifest
 from flockd.messages import BoolArray, Float32Array, UInt8Array
-from flockd.perception import DisFlow, OnnxFlow, OnnxModel, Perception, Picture, find_manifests, load_manifest
+from flockd.perception import DisFlow, OnnxFlow, Perception, Picture
 from flockd.perception.background_flow import settle_background
 from flockd.perception.roles import PICTURES_AT_A_TIME
 from flockd.sim.drone_models import drone_model

@@ -10,7 +10,7 @@ import pytest
 from flockd.cli import main
 from flockd.config import load_drone
 from flockd.data import data_path
-from flockd.perception import load_manifest
+from flockd.inference import load_manifest
 from tests.perception.foreign import one_channel_depth
 
 FLOAT = ("distance", "flow", "neighbours")
@@ -49,7 +49,7 @@ def test_bench_times_each_number_of_threads_and_says_what_entered(
 
 
 def test_bench_does_not_time_one_provider_for_another(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from flockd.perception.providers import available
+    from flockd.inference.providers import available
 
     if "tensorrt" in available():
         pytest.skip("this computer has TensorRT")

@@ -16,9 +16,10 @@ from flockd.cli import main
 from flockd.config.perception import PerceptionConfig
 from flockd.data import data_path
 from flockd.errors import ModelError
-from flockd.perception import OnnxModel, Perception, load_manifest
-from flockd.perception.providers import Prepared, available
-from flockd.perception.weights import fault_of_weights
+from flockd.inference import OnnxModel, load_manifest
+from flockd.inference.providers import Prepared, available
+from flockd.inference.weights import fault_of_weights
+from flockd.perception import Perception
 from tests.perception.foreign import SIZE, image_input, map_output, write_model
 
 MODELS = data_path("models")

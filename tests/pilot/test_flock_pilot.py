@@ -103,8 +103,8 @@ def test_true_maps_give_true_motions(flyer: Flyer) -> None:
     assert np.allclose(second.neighbours[0].position, after.position[1] - after.position[0], atol=0.02)
     (motion,) = second.neighbour_motions.values()
     assert np.allclose(R_before @ motion.velocity, (after.position[1] - q_before) / STEP_S, atol=0.1)
-    (sighting,) = second.sightings
-    assert set(sighting.cameras) == {"front", "right"}
+    (detection,) = second.detections
+    assert set(detection.cameras) == {"front", "right"}
 
 
 def test_a_repeated_time_stamp_restarts_the_pair_and_says_so(flyer: Flyer) -> None:
@@ -123,7 +123,7 @@ def test_the_rest_of_the_rig_flies_on_without_one_camera() -> None:
     output = flyer.pilot.step(without_left, state)
     assert output.counts["camera left: no frame"] == 1
     assert output.ego_motion is not None
-    assert len(output.sightings) == 1
+    assert len(output.detections) == 1
 
 
 @pytest.mark.parametrize(("gone", "confirmed"), [("front", True), ("back", False)])
@@ -131,7 +131,7 @@ def test_a_neighbour_before_a_camera_that_is_gone_stays_confirmed(gone: str, con
     """It flies ahead and then is not found twice: because nobody looks there, or although somebody does."""
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
     for _ in range(3):
-        assert len(flyer.step().sightings) == 1
+        assert len(flyer.step().detections) == 1
         flyer.move()
     flyer.vehicles.position[1] += [0.0, 0.0, -60.0]  # far above, where no camera looks
     for _ in range(2):
@@ -178,9 +178,9 @@ def test_a_drone_that_segmentation_misses_is_seen_where_it_is_expected(
     if not still_there:
         flyer.vehicles.position[1] += [0.0, 40.0, 0.0]
     output = flyer.step()
-    assert len(output.sightings) == (1 if still_there else 0)
+    assert len(output.detections) == (1 if still_there else 0)
     if still_there:
-        place = flyer.vehicles.R_ned_body[0] @ output.sightings[0].position
+        place = flyer.vehicles.R_ned_body[0] @ output.detections[0].position
         assert np.allclose(place, flyer.vehicles.position[1] - flyer.vehicles.position[0], atol=0.02)
 
 
@@ -209,9 +209,9 @@ def test_a_drone_is_looked_at_until_the_picture_shows_it_well(
         return tuple(replace(answer, range_m=factor * answer.range_m) for answer in answers(pictures))
 
     monkeypatch.setattr(flyer.truth, "ranges", ranges)
-    (sighting,) = flyer.step().sightings
+    (detection,) = flyer.step().detections
     assert asked == [1] * (looks + 1)
-    assert np.linalg.norm(sighting.position) == pytest.approx(math.hypot(3.0, 0.3), rel=0.01)
+    assert np.linalg.norm(detection.position) == pytest.approx(math.hypot(3.0, 0.3), rel=0.01)
 
 
 def test_the_picture_in_a_mirror_counts_by_how_sure_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -228,10 +228,10 @@ def test_the_picture_in_a_mirror_counts_by_how_sure_it_is(monkeypatch: pytest.Mo
         return tuple(told)
 
     monkeypatch.setattr(flyer.truth, "ranges", ranges)
-    (sighting,) = flyer.step().sightings
+    (detection,) = flyer.step().detections
     assert mirrors == [False, False, True]
-    assert np.linalg.norm(sighting.position) == pytest.approx(3.0 * 2 ** (1 / 5), rel=0.005)  # 1 of 1 + 4
-    assert sighting.drone_probability == pytest.approx(0.85)
+    assert np.linalg.norm(detection.position) == pytest.approx(3.0 * 2 ** (1 / 5), rel=0.005)  # 1 of 1 + 4
+    assert detection.drone_probability == pytest.approx(0.85)
 
 
 @pytest.mark.parametrize(
@@ -253,12 +253,12 @@ def test_doubts_about_the_first_picture_of_a_drone_do_not_outlive_the_next(
     monkeypatch.setattr(
         flyer.truth, "ranges", lambda pictures: tuple(replace(a, is_drone=rest.pop(0)) for a in answers(pictures))
     )
-    assert len(flyer.step().sightings) == seen
+    assert len(flyer.step().detections) == seen
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")
 @pytest.mark.parametrize("lie", [{"range_m": math.inf}, {"range_m": math.nan}, {"relative_sigma": 0.0}])
-def test_a_mirror_that_tells_nonsense_gives_no_sighting(monkeypatch: pytest.MonkeyPatch, lie: dict[str, Any]) -> None:
+def test_a_mirror_that_tells_nonsense_gives_no_detection(monkeypatch: pytest.MonkeyPatch, lie: dict[str, Any]) -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
     answers = flyer.truth.ranges
 
@@ -269,7 +269,7 @@ def test_a_mirror_that_tells_nonsense_gives_no_sighting(monkeypatch: pytest.Monk
         )
 
     monkeypatch.setattr(flyer.truth, "ranges", ranges)
-    assert not flyer.step().sightings
+    assert not flyer.step().detections
 
 
 @pytest.mark.parametrize(("is_drone", "sure", "unsure"), [(0.05, 0, 0), (0.35, 255, 255), (0.9, 1, 255)])
@@ -337,7 +337,7 @@ def test_two_drones_that_the_first_stage_takes_for_one_are_two(monkeypatch: pyte
     logit = np.where(pixels, np.float32(3.0), np.float32(-3.0))[1::2, 1::2]
     taken_for_one = {name: replace(maps[name], labels=labels, instances=(both,), unsure=~pixels, logit=logit)}
     view = observer.view(frames, vehicle, taken_for_one, ())
-    assert sorted(np.linalg.norm(s.position) for s in view.sightings) == pytest.approx([3.01, 6.03], abs=0.1)
+    assert sorted(np.linalg.norm(s.position) for s in view.detections) == pytest.approx([3.01, 6.03], abs=0.1)
     seen = view.cameras[name].labels
     assert {*seen[maps[name].labels == near.label]} & {*seen[maps[name].labels == far.label]} <= {0, 255}
 
@@ -355,7 +355,7 @@ def test_a_view_draws_drones_as_their_colours_say(monkeypatch: pytest.MonkeyPatc
     def drawn(image: UInt8Array) -> BoolArray:
         painted = replace(frames, frames={name: replace(frames.frames[name], image=image)})
         view = observer.view(painted, vehicle, {name: maps[name]}, ())
-        return np.asarray(view.cameras[name].labels == view.sightings[0].label)
+        return np.asarray(view.cameras[name].labels == view.detections[0].label)
 
     meadow = np.full_like(frames.frames[name].image, 90)
     disc = drawn(meadow)
@@ -433,13 +433,13 @@ def test_an_impossible_ego_motion_is_refused_but_not_for_ever() -> None:
         (5.4, 8.0, False),  # beside it
     ],
 )
-def test_two_sightings_in_one_direction_are_one_drone(range_m: float, turned_deg: float, same: bool) -> None:
+def test_two_detections_in_one_direction_are_one_drone(range_m: float, turned_deg: float, same: bool) -> None:
     ahead, turned = np.array([1.0, 0.0, 0.0]), math.radians(turned_deg)
     aside = np.array([math.cos(turned), math.sin(turned), 0.0])
     one = views._Located(views._Candidate(("front",), ahead, 0.2), 4.0 * ahead, 0.1, size_m=0.7)
     other = views._Located(views._Candidate(("left",), aside, 0.2), range_m * aside, 0.1, size_m=0.7)
-    sightings = views._merge([one, other]).sightings
-    assert len(sightings) == (1 if same else 2)
+    detections = views._merge([one, other]).detections
+    assert len(detections) == (1 if same else 2)
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ import pytest
 
 from flockd.config import load_scenario
 from flockd.data import data_path
-from flockd.geometry import Rig, RigCamera, build_rig, virtual_crop
-from flockd.messages import UNCLASSED, BoolArray, Float32Array, FloatArray, Sighting, UInt8Array
+from flockd.geometry import Rig, RigCamera, build_rig, log_polar, log_polar_covariance, virtual_crop
+from flockd.messages import UNCLASSED, BoolArray, Detection, Float32Array, FloatArray, UInt8Array
 from flockd.pilot.outlines import Mask, Outliner
 
 SIZE = 96
@@ -24,8 +24,10 @@ RADIUS = 0.06
 """Of a drone's disc, radians."""
 
 
-def sighting(label: int, position: FloatArray, *cameras: str) -> Sighting:
-    return Sighting(position, 0.1, 0.004, 0.9, 0.5, cameras or ("front",), label)
+def detection(label: int, position: FloatArray, *cameras: str) -> Detection:
+    bearing, log_range = log_polar(position)
+    covariance = log_polar_covariance(bearing, 0.1 / np.exp(log_range), 0.004)
+    return Detection(bearing, log_range, covariance, 0.9, 0.5, cameras or ("front",), label)
 
 
 def mask_of(position: FloatArray, half_angle: float, *, radius: float = RADIUS, height: float = 5.0) -> Mask:
@@ -56,7 +58,7 @@ def test_the_second_stage_draws_what_the_first_only_boxed(half_angle: float) -> 
     box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     labels[box] = 3
     masks = {3: [mask_of(AHEAD, half_angle)]}
-    drawn = Outliner(FRONT, 2).outlines(labels, PLAIN, [sighting(3, AHEAD)], masks).by_networks()
+    drawn = Outliner(FRONT, 2).outlines(labels, PLAIN, [detection(3, AHEAD)], masks).by_networks()
     assert overlap(drawn == 3, true) > 0.95
     corners = labels.astype(bool) & ~true
     assert np.mean(drawn[corners] == UNCLASSED) > 0.9, "what one stage took for a drone is not background yet"
@@ -69,16 +71,16 @@ def test_both_stages_count_and_all_pictures() -> None:
     left[:, : u // 2] = -7.0  # outweighs 5, not 5 and 15 by their mean
     outliner, true = Outliner(FRONT, 2), disc(AHEAD)
     nothing = np.zeros((HEIGHT, WIDTH), np.uint8)
-    one = outliner.outlines(nothing, left, [sighting(1, AHEAD)], {1: [mask_of(AHEAD, 0.2)]}).by_networks() == 1
+    one = outliner.outlines(nothing, left, [detection(1, AHEAD)], {1: [mask_of(AHEAD, 0.2)]}).by_networks() == 1
     assert overlap(one, true & (np.arange(WIDTH) >= u)) > 0.9
     several = [mask_of(AHEAD, 0.2), mask_of(AHEAD, 0.15, height=15.0)]
-    assert overlap(outliner.outlines(nothing, left, [sighting(1, AHEAD)], {1: several}).by_networks() == 1, true) > 0.9
+    assert overlap(outliner.outlines(nothing, left, [detection(1, AHEAD)], {1: several}).by_networks() == 1, true) > 0.9
 
 
 def test_a_pixel_that_two_drones_claim_is_the_surer_ones() -> None:
     beside = AHEAD + np.array([0.0, 0.3, 0.0])  # their discs overlap
     masks = {1: [mask_of(AHEAD, 0.2)], 2: [mask_of(beside, 0.2, height=9.0)]}
-    both = [sighting(1, AHEAD), sighting(2, beside)]
+    both = [detection(1, AHEAD), detection(2, beside)]
     for order in (both, both[::-1]):
         drawn = Outliner(FRONT, 2).outlines(np.zeros((HEIGHT, WIDTH), np.uint8), PLAIN, order, masks).by_networks()
         assert overlap(drawn == 2, disc(beside)) > 0.9
@@ -89,16 +91,16 @@ def test_where_the_second_stage_does_not_tell_the_labels_stay() -> None:
     labels = np.zeros((HEIGHT, WIDTH), np.uint8)
     labels[300:320, 200:240] = 1
     outliner, mask = Outliner(FRONT, 2), mask_of(AHEAD, 0.2)
-    for seen, masks in ((sighting(1, AHEAD), []), (sighting(1, AHEAD, "left"), [mask])):
+    for seen, masks in ((detection(1, AHEAD), []), (detection(1, AHEAD, "left"), [mask])):
         assert (outliner.outlines(labels, PLAIN, [seen], {1: masks}).by_networks() == labels).all()
     behind = np.array([-4.0, 0.0, 0.0])
-    drawn = outliner.outlines(labels, PLAIN, [sighting(1, behind)], {1: [mask_of(behind, 0.2)]}).by_networks()
+    drawn = outliner.outlines(labels, PLAIN, [detection(1, behind)], {1: [mask_of(behind, 0.2)]}).by_networks()
     assert (drawn == labels).all()
 
 
 def test_what_lies_beyond_a_drones_picture_is_not_known_to_be_its_own() -> None:
     labels = disc(AHEAD, 0.3).astype(np.uint8)
-    drawn = Outliner(FRONT, 2).outlines(labels, PLAIN, [sighting(1, AHEAD)], {1: [mask_of(AHEAD, 0.1)]}).by_networks()
+    drawn = Outliner(FRONT, 2).outlines(labels, PLAIN, [detection(1, AHEAD)], {1: [mask_of(AHEAD, 0.1)]}).by_networks()
     far: Float32Array = np.asarray(disc(AHEAD, 0.3) & ~disc(AHEAD, 0.16), np.float32)
     assert (drawn[far > 0] == UNCLASSED).all()
     assert (drawn == 1).any()
@@ -119,7 +121,7 @@ def test_colours_mend_the_outline_that_networks_see_too_coarsely() -> None:
     true, nothing = disc(AHEAD), np.zeros((HEIGHT, WIDTH), np.uint8)
     aside = AHEAD + np.array([0.0, 0.05, -0.03])  # a quarter of the disc's radius
     coarse = {1: [mask_of(aside, 0.2, height=3.0)]}
-    outlines = Outliner(FRONT, 2).outlines(nothing, PLAIN, [sighting(1, aside)], coarse)
+    outlines = Outliner(FRONT, 2).outlines(nothing, PLAIN, [detection(1, aside)], coarse)
     assert overlap(outlines.by_networks() == 1, true) < 0.8
     assert overlap(outlines.by_colours(painted((true, (150, 60, 40)))) == 1, true) > 0.95
     assert (outlines.by_colours(GREY) == outlines.by_networks()).all()
@@ -127,7 +129,7 @@ def test_colours_mend_the_outline_that_networks_see_too_coarsely() -> None:
 
 def test_a_camouflaged_drone_is_drawn_as_the_networks_see_it() -> None:
     nothing, masks = np.zeros((HEIGHT, WIDTH), np.uint8), {1: [mask_of(AHEAD, 0.2, height=3.0)]}
-    outlines = Outliner(FRONT, 2).outlines(nothing, PLAIN, [sighting(1, AHEAD)], masks)
+    outlines = Outliner(FRONT, 2).outlines(nothing, PLAIN, [detection(1, AHEAD)], masks)
     assert overlap(outlines.by_colours(painted()) == 1, disc(AHEAD)) > 0.9
 
 
@@ -136,6 +138,6 @@ def test_what_both_stages_surely_deny_is_no_drones_whatever_its_colour() -> None
     image = painted((disc(AHEAD), red), (disc(far), red))
     masks = {1: [mask_of(AHEAD, 0.2, height=8.0)]}
     nothing = np.zeros((HEIGHT, WIDTH), np.uint8)
-    drawn = Outliner(FRONT, 2).outlines(nothing, PLAIN, [sighting(1, AHEAD)], masks).by_colours(image)
+    drawn = Outliner(FRONT, 2).outlines(nothing, PLAIN, [detection(1, AHEAD)], masks).by_colours(image)
     assert overlap(drawn == 1, disc(AHEAD)) > 0.95
     assert not (drawn[disc(far)] == 1).any()

@@ -27,7 +27,7 @@ def output(step: int, moved_with: FloatArray | None) -> PilotOutput:
     if moved_with is not None:
         ego = EgoMotion(np.eye(3), R_NED_BODY.T @ moved_with * STEP_S, STEP_S, 100, 90, 0.1)
     return PilotOutput(
-        time_s=STEP_S * step, ego_motion=ego, velocity=moved_with, sightings=(), sighting_tracks=(),
+        time_s=STEP_S * step, ego_motion=ego, velocity=moved_with, detections=(), detection_tracks=(),
         neighbour_motions={}, neighbours=(), command=VelocityCommand(np.zeros(2), np.zeros(2), 0.0),
         reasons=(), counts={}, stages_ms={},
     )  # fmt: skip

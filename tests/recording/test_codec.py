@@ -71,7 +71,7 @@ def test_the_schema_names_every_field_with_its_type() -> None:
     schema = json_schema(PilotOutput)
     assert schema["properties"].keys() == {part.name for part in fields(PilotOutput)}
     assert schema["properties"]["command"]["properties"]["yaw_rad"] == {"type": "number"}
-    assert schema["properties"]["sightings"]["items"]["properties"]["cameras"] == {
+    assert schema["properties"]["detections"]["items"]["properties"]["cameras"] == {
         "type": "array",
         "items": {"type": "string"},
     }

@@ -18,8 +18,8 @@ from flockd.recording.reader import Recording
 HERE = Path(__file__).parent
 FLIGHTS = ("normal", "crossing", "faults")
 # Another processor adds up in another order: a pair of points more or less moves a motion a little, and a look more or
-# less at a drone its sighting by some centimetres (0.15 m at most between two processors, tracked 0.06 m).
-TOLERANCES = ("velocity=0.02", "command=0.02", "neighbours=0.15", "sightings=0.3", "ego_motion=0.01")
+# less at a drone its detection by some centimetres (0.15 m at most between two processors, tracked 0.06 m).
+TOLERANCES = ("velocity=0.02", "command=0.02", "neighbours=0.15", "detections=0.3", "ego_motion=0.01")
 FREE = 1e9
 """Counted pairs and inliers, which that pair changes too."""
 COUNTED = ("ego_motion.inliers", "ego_motion.pairs", "neighbour_motions")
@@ -65,7 +65,7 @@ def test_a_deliberate_change_shows_where_and_by_how_much(tmp_path: Path, capsys:
     assert "in command." in told[1]
     assert "expected" in told[1]
     assert "found" in told[1]
-    assert not any(line.startswith("  sightings") for line in told)
+    assert not any(line.startswith("  detections") for line in told)
 
 
 def steps_of(flight: str) -> list[dict[str, Any]]:

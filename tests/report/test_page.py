@@ -66,7 +66,7 @@ def _flight(*, drones: int = 5, duration_s: float = 110.0, perception: str = "le
         own_velocity_estimate=velocity,
         neighbour_position=neighbours,
         neighbour_velocity=np.broadcast_to(velocity[:, None], neighbours.shape).copy(),
-        sighting_position=neighbours,
+        detection_position=neighbours,
         false_tracks=np.zeros((steps, drones), dtype=np.int64),
         truth_position=position,
         truth_velocity=velocity,

@@ -13,13 +13,14 @@ import pytest
 
 from flockd.cli import main
 from flockd.config import DroneConfig
+from flockd.geometry import log_polar, log_polar_covariance
 from flockd.messages import (
+    Detection,
     EgoMotion,
     Frame,
     FrameSet,
     Neighbour,
     PilotOutput,
-    Sighting,
     VehicleState,
     VelocityCommand,
 )
@@ -72,17 +73,18 @@ def output_of(drone: int, step: int, time_s: float) -> PilotOutput:
     )  # fmt: skip
     false = replace(known, track=9, position=np.array([-20.0, 0.0, 0.0]))
     neighbours = [known] * (step >= UNKNOWN_STEPS) + [false] * (drone == 0 and step == 5)
-    sighting = Sighting(
-        position=np.array([0.0, east_m, 0.0]), range_sigma_m=0.1, bearing_sigma_rad=0.01, drone_probability=0.9,
-        size_m=0.6, cameras=("left",), label=1,
+    bearing, log_range = log_polar(np.array([0.0, east_m, 0.0]))
+    detection = Detection(
+        bearing=bearing, log_range=log_range, covariance=log_polar_covariance(bearing, 0.1, 0.01),
+        drone_probability=0.9, size_m=0.6, cameras=("left",), label=1,
     )  # fmt: skip
     moved = EgoMotion(np.eye(3), np.array([STEP_S + LONG_M, 0.0, 0.0]), STEP_S, 100, 80, 0.1)
     return PilotOutput(
         time_s=time_s,
         ego_motion=moved if step else None,
         velocity=np.array([1.04, 0.0, 0.0]) if step else None,
-        sightings=(sighting,),
-        sighting_tracks=(7,),
+        detections=(detection,),
+        detection_tracks=(7,),
         neighbour_motions={},
         neighbours=tuple(neighbours),
         command=VelocityCommand(np.array([1.0, 0.1]), np.array([0.0, 0.2]), 0.0),

@@ -82,7 +82,7 @@ def _hand_made() -> FlightLog:
         own_velocity_estimate=velocity,
         neighbour_position=neighbour_position,
         neighbour_velocity=np.full((STEPS, DRONES, DRONES, 3), np.nan),
-        sighting_position=neighbour_position,
+        detection_position=neighbour_position,
         false_tracks=false_tracks,
         truth_position=truth_position,
         truth_velocity=truth_velocity,
@@ -226,7 +226,7 @@ def test_a_single_drone_has_no_distances() -> None:
     alone: dict[str, Any] = {}
     for name in log.__dataclass_fields__:
         value = getattr(log, name)
-        if name in ("neighbour_position", "neighbour_velocity", "sighting_position"):
+        if name in ("neighbour_position", "neighbour_velocity", "detection_position"):
             alone[name] = value[:, :1, :1]
         elif name not in ("time_s", "desired", "stages_ms", "meta"):
             alone[name] = value[:, :1]

@@ -73,7 +73,7 @@ def _output(velocity: np.ndarray | None) -> PilotOutput:
     )  # fmt: skip
     command = VelocityCommand(velocity=np.array([0.9, 0.1]), acceleration=np.array([0.2, -0.2]), yaw_rad=math.pi / 2)
     return PilotOutput(
-        time_s=12.5, ego_motion=None, velocity=velocity, sightings=(), sighting_tracks=(), neighbour_motions={},
+        time_s=12.5, ego_motion=None, velocity=velocity, detections=(), detection_tracks=(), neighbour_motions={},
         neighbours=(neighbour,), command=command,
         reasons=("no ego-motion: 12 pairs are too few",), counts={"ego": 1}, stages_ms={"flow": 14.0},
     )  # fmt: skip

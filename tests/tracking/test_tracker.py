@@ -1,4 +1,4 @@
-"""The tracker in stories: noise, dropouts, crossings, outliers, false sightings, and its own opinion of its errors."""
+"""The tracker in stories: noise, dropouts, crossings, outliers, false detections, and its own opinion of its errors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from flockd.messages import Neighbour
-from flockd.tracking import Measurement, Tracker, TrackingParameters, sighting_covariance
+from flockd.tracking import Measurement, Tracker, TrackingParameters, detection_covariance
 
 Array = NDArray[np.float64]
 STEP_S = 0.5
@@ -148,7 +148,7 @@ def test_a_track_not_confirmed_dies_at_its_first_miss() -> None:
     assert second != first  # a number is never given twice
 
 
-def test_false_sightings_of_one_frame_are_never_confirmed() -> None:
+def test_false_detections_of_one_frame_are_never_confirmed() -> None:
     tracker, now_s = _settled()
     spots = [np.array([x, y, -1.0]) for x in (-9.0, 9.0) for y in (-6.0, 0.0, 6.0)]
     for k in range(60):
@@ -331,7 +331,7 @@ def test_the_constancy_of_size_steadies_the_range() -> None:
             position = truth / distance * estimated
             if k:
                 tracker.predict(STEP_S, CRUISE * STEP_S)
-            covariance = sighting_covariance(position, 0.03 * estimated, 0.003)
+            covariance = detection_covariance(position, 0.03 * estimated, 0.003)
             tracker.update(k * STEP_S, [Measurement(position, covariance, estimated * angular_size)], CRUISE)
             if k >= 20:
                 errors_m.append(tracker.neighbours()[0].position - truth)
@@ -340,9 +340,9 @@ def test_the_constancy_of_size_steadies_the_range() -> None:
     assert rms_m[0] < 0.03 * 5.2
 
 
-def test_a_sightings_covariance_is_long_along_the_line_of_sight() -> None:
+def test_a_detections_covariance_is_long_along_the_line_of_sight() -> None:
     position = np.array([6.0, 8.0, 0.0])
-    covariance = sighting_covariance(position, 0.3, 0.01)
+    covariance = detection_covariance(position, 0.3, 0.01)
     along, across, down = np.array([0.6, 0.8, 0.0]), np.array([-0.8, 0.6, 0.0]), np.array([0.0, 0.0, 1.0])
     axes = np.stack([along, across, down])
     np.testing.assert_allclose(axes @ covariance @ axes.T, np.diag([0.09, 0.01, 0.01]), atol=1e-15)

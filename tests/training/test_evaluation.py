@@ -7,23 +7,25 @@ import pytest
 
 pytest.importorskip("torch", reason="the extra `train` is not installed")
 
-from flockd.messages import Sighting
+from flockd.geometry import log_polar, log_polar_covariance
+from flockd.messages import Detection
 from tools.evaluation.on_pairs import _pairings
 
 
-def sighting(*position: float) -> Sighting:
-    return Sighting(np.array(position), 0.1, 0.004, 0.9, 0.5, ("camera",), 1)
+def detection(*position: float) -> Detection:
+    bearing, log_range = log_polar(np.array(position))
+    return Detection(bearing, log_range, log_polar_covariance(bearing, 0.1, 0.004), 0.9, 0.5, ("camera",), 1)
 
 
-def test_a_far_drone_keeps_its_sighting_though_it_lies_within_a_near_ones_outline() -> None:
+def test_a_far_drone_keeps_its_detection_though_it_lies_within_a_near_ones_outline() -> None:
     near, far = np.array([2.0, 0.0, 0.0]), np.array([10.0, 1.0, 0.0])
-    of_far, of_near = sighting(10.5, 1.05, 0.0), sighting(2.1, -0.21, 0.0)
+    of_far, of_near = detection(10.5, 1.05, 0.0), detection(2.1, -0.21, 0.0)
     found = _pairings((of_far, of_near), [near, far], [0.5, 0.5])
     assert found[0] is of_near
     assert found[1] is of_far
 
 
-def test_one_sighting_is_not_two_drones_and_none_is_found_in_another_direction() -> None:
+def test_one_detection_is_not_two_drones_and_none_is_found_in_another_direction() -> None:
     near, far = np.array([2.0, 0.0, 0.0]), np.array([10.0, 0.1, 0.0])
-    assert list(_pairings((sighting(9.0, 0.09, 0.0),), [near, far], [0.5, 0.5])) == [1]
-    assert not _pairings((sighting(0.0, 2.0, 0.0),), [near, far], [0.5, 0.5])
+    assert list(_pairings((detection(9.0, 0.09, 0.0),), [near, far], [0.5, 0.5])) == [1]
+    assert not _pairings((detection(0.0, 2.0, 0.0),), [near, far], [0.5, 0.5])

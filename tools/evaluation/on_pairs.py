@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.geometry import Rig
-from flockd.messages import UNCLASSED, Frame, FrameSet, Sighting, VehicleState
+from flockd.messages import UNCLASSED, Detection, Frame, FrameSet, VehicleState
 from flockd.perception import DisFlow, Perception
 from flockd.pilot.views import Observer
 from flockd.sim.drone_models import drone_model
@@ -48,7 +48,7 @@ class Findings:
     def __init__(self) -> None:
         self.images = 0
         self.false = 0
-        """Sightings that are no drone's, or a drone's second one."""
+        """Detections that are no drone's, or a drone's second one."""
         self.drones: list[Drone] = []
         self.iou: list[float] = []
         self.depth: dict[str | None, list[float]] = {given: [] for given in (None, *HEIGHT_SIGMAS_M)}
@@ -100,7 +100,7 @@ def look_at_pairs(pairs: PairSet, perception: Perception, indices: Iterable[int]
         view = observer.view(frames, vehicle, maps, ())
         labels = view.cameras["camera"].labels
         _masks(((labels > 0) & (labels != UNCLASSED))[1::2, 1::2], ids, pairs, index, found)
-        _drones(view.sightings, pairs, index, depth, ids, found)
+        _drones(view.detections, pairs, index, depth, ids, found)
         flow = np.asarray(pairs["flow"][index], np.float32)
         valid = np.asarray(pairs["flow_valid"][index])
         ours = perception.flow("camera", images[0], images[1], labels)
@@ -129,15 +129,15 @@ def _masks(guess: Array, ids: Array, pairs: PairSet, index: int, found: Findings
 
 
 def _drones(
-    sightings: tuple[Sighting, ...], pairs: PairSet, index: int, depth: Array, ids: Array, found: Findings
+    detections: tuple[Detection, ...], pairs: PairSet, index: int, depth: Array, ids: Array, found: Findings
 ) -> None:
-    """A sighting is a drone's if it lies in the drone's direction, however wrong its range is."""
+    """A detection is a drone's if it lies in the drone's direction, however wrong its range is."""
     found.images += 1
     seen = np.flatnonzero(pairs["drone_pixels"][index, 0] >= MIN_PIXELS)
     places = [R_BODY_CAMERA @ np.asarray(pairs["drone_centre"][index, 0, drone], np.float64) for drone in seen]
-    sighting_of = _pairings(sightings, places, [SIZES_M[int(pairs["drone_family"][index, drone])] for drone in seen])
+    detection_of = _pairings(detections, places, [SIZES_M[int(pairs["drone_family"][index, drone])] for drone in seen])
     for row, (drone, true) in enumerate(zip(seen, places, strict=True)):
-        range_m, best = float(np.linalg.norm(true)), sighting_of.get(row)
+        range_m, best = float(np.linalg.norm(true)), detection_of.get(row)
         left, top, right, bottom = pairs["drone_box"][index, 0, drone]
         inside = left > 1 and top > 1 and right < WIDTH - 1 and bottom < HEIGHT - 1
         error, sigma = 0.0, 1.0
@@ -146,21 +146,21 @@ def _drones(
             error, sigma = distance / range_m - 1.0, best.range_sigma_m / distance
         whole = inside and _hidden_share(pairs, index, int(drone), depth, ids) < WHOLE_HIDES
         found.drones.append(Drone(range_m, float(right - left), bool(whole), best is not None, error, sigma))
-    found.false += len(sightings) - len(sighting_of)
+    found.false += len(detections) - len(detection_of)
 
 
-def _pairings(sightings: tuple[Sighting, ...], places: list[Array], sizes_m: list[float]) -> dict[int, Sighting]:
-    """Of each drone that was found the sighting: first those that lie nearest to each other."""
+def _pairings(detections: tuple[Detection, ...], places: list[Array], sizes_m: list[float]) -> dict[int, Detection]:
+    """Of each drone that was found the detection: first those that lie nearest to each other."""
     away = sorted(
-        (_angle(sighting.position, place) / (size_m / 2 / float(np.linalg.norm(place))), drone, number)
-        for number, sighting in enumerate(sightings)
+        (_angle(detection.position, place) / (size_m / 2 / float(np.linalg.norm(place))), drone, number)
+        for number, detection in enumerate(detections)
         for drone, (place, size_m) in enumerate(zip(places, sizes_m, strict=True))
     )
     pairings: dict[int, int] = {}
     for share, drone, number in away:
         if share <= 1.0 and drone not in pairings and number not in pairings.values():
             pairings[drone] = number
-    return {drone: sightings[number] for drone, number in pairings.items()}
+    return {drone: detections[number] for drone, number in pairings.items()}
 
 
 def _angle(a: Array, b: Array) -> float:

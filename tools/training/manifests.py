@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 from numpy.typing import NDArray
 
-from flockd.perception import OnnxModel
+from flockd.inference import OnnxModel
 
 
 def write_manifest(document: dict[str, Any], file: Path, golden: Mapping[str, NDArray[Any]]) -> Path:

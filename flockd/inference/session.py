@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from flockd.config.perception import Provider
 from flockd.errors import ModelError
+from flockd.inference.fitting import entering, fit, leaving
+from flockd.inference.manifest import Answer, Content, InputSpec, Manifest, OutputSpec, load_manifest
+from flockd.inference.providers import Prepared, Shapes, engine_folder, is_slow_to_build, open_session
+from flockd.inference.weights import fault_of_weights
 from flockd.messages import Float32Array, UInt8Array
-from flockd.perception.fitting import entering, fit, leaving
-from flockd.perception.manifest import Answer, Content, InputSpec, Manifest, OutputSpec, load_manifest
-from flockd.perception.providers import Prepared, Shapes, engine_folder, is_slow_to_build, open_session
-from flockd.perception.weights import fault_of_weights
 
 _GOLDEN_TOLERANCE = 0.02
 

@@ -11,7 +11,7 @@ import onnxruntime as ort
 
 from flockd.config.perception import PerceptionConfig, Provider
 from flockd.errors import ModelError
-from flockd.perception.manifest import models_folder
+from flockd.inference.manifest import models_folder
 
 PROVIDERS: dict[Provider, str] = {
     "cpu": "CPUExecutionProvider",

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flockd.inference.manifest import InputSpec, Manifest, OutputSpec
 from flockd.messages import Float32Array, UInt8Array
-from flockd.perception.manifest import InputSpec, Manifest, OutputSpec
 
 Size = tuple[int, int]
 """Width and height, pixels."""
