@@ -160,11 +160,13 @@ class VelocityCommand:
     """What the flock law asks of the autopilot; altitude is held elsewhere."""
 
     velocity: FloatArray
-    """(2,) m/s, north and east, after limits."""
+    """(2,) m/s, north and east: the law's after limits, and the trim."""
     acceleration: FloatArray
     """(2,) m/s^2, north and east: u of Eq. 38 after limits."""
     yaw_rad: float
     """Heading, clockwise from north."""
+    trim: FloatArray | None = None
+    """(2,) m/s, north and east: what of the velocity corrects the autopilot's own estimate; None: nothing."""
 
 
 @dataclass(frozen=True, eq=False)

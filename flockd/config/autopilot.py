@@ -36,5 +36,8 @@ class AutopilotParameters(Section):
     """Where the autopilot's velocity and the cameras' differ, setpoints are corrected by up to this: an autopilot flies
     by its own estimate, which GNSS alone leaves off by 0.1 to 0.3 m/s. 0: not at all. Does nothing with `own_velocity:
     autopilot`."""
+    velocity_trim_memory: Share = 0.7
+    """Share of the last correction that stays with each step: noise of single steps goes, drifts over several seconds do
+    not."""
     low_battery_share: Share = 0.2
     """The battery counts as low when the autopilot says that no more than this is left."""

@@ -6,11 +6,48 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from flockd.config.base import Positive, Section
+from flockd.config.base import NonNegative, Positive, Section, Share
 from flockd.messages import ScaleSource
 
 Provider = Literal["cpu", "cuda", "tensorrt", "openvino"]
 """What computes the networks: ONNX Runtime's execution providers."""
+
+
+class DetectionParameters(Section):
+    """How networks' outputs become detections. What belongs to a network's weights stands in its manifest instead."""
+
+    min_range_m: Positive = 0.2
+    """Nearer than this, nothing is a drone: it would touch the own one."""
+    max_range_m: Positive = 60.0
+    """Farther than this, nothing is a drone: it would be smaller than a pixel or two."""
+    crop_shift: Share = 0.03
+    """A further crop is not worth it when it would be moved by less than this share of half its width, ..."""
+    crop_resize: Annotated[float, Field(ge=1)] = 1.05
+    """... and resized by less than this factor."""
+    prediction_gate: Positive = 0.2
+    """What is found where a track was predicted lies within this share of its range of that place, or ..."""
+    prediction_gate_m: Positive = 0.5
+    """... within this distance."""
+    suppression_gate: Positive = 3.4
+    """Two detections are one when their Mahalanobis distance is less: 99 % of pairs of one drone are nearer (chi-square
+    of three degrees of freedom)."""
+    drone_extent: Share = 0.18
+    """Share of its size by which a drone's centre may be misplaced between two of its detections, as a standard
+    deviation: with the gate, two drones are never nearer to each other than 0.6 of their size."""
+    occlusion: Share = 0.25
+    """Nothing is seen of what lies behind a drone within this share of its angular size from its centre."""
+    max_residuals: Annotated[int, Field(ge=0)] = 6
+    """Residuals, of one image, that are proposed: the largest. An image full of false ones must not cost the deadline."""
+    residual_px: Annotated[int, Field(ge=1)] = 24
+    """Image pixels that a residual has at least."""
+    residual_distance_px: Annotated[int, Field(ge=0)] = 4
+    """How far it is from every drone's mask: nearer, it is the mask's own error."""
+    mask_border_px: Annotated[int, Field(ge=0)] = 5
+    """Background so near to a mask is not used: masks and depth maps are least certain there."""
+    colour_weight: NonNegative = 4.0
+    """Of a pixel's colour against the networks' logits, in a mask. 0: masks are the networks' alone."""
+    depth_map_sigma: Positive = 0.08
+    """Standard deviation of a drone's log range where the depth map alone gives it (`perception.distance: none`)."""
 
 
 class PerceptionConfig(Section):
@@ -41,6 +78,7 @@ class PerceptionConfig(Section):
     """Where `flockd models prepare` keeps what a provider has built; by default `engines` beside the manifests."""
     deadline_s: Positive = 1.0
     """In flight, a network that has not answered one call by then is stuck, and is ended."""
+    detection: DetectionParameters = DetectionParameters()
     scale: ScaleSource = "height"
     """The background's metric scale: `network` (pure RGB, as in the paper), `height` (attitude and height above ground
     from the autopilot) or `velocity` (attitude and velocity from the autopilot; the drone has to move)."""

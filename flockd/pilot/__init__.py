@@ -1,6 +1,5 @@
 """The pure line from pixels to command."""
 
-from flockd.pilot.pilot import FlockPilot
-from flockd.pilot.views import Perceiver
+from flockd.pilot.pilot import FlockPilot, StepTrace
 
-__all__ = ["FlockPilot", "Perceiver"]
+__all__ = ["FlockPilot", "StepTrace"]

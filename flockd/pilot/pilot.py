@@ -5,19 +5,17 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from flockd.config.drone import DroneConfig
 from flockd.flocking import FlockingLaw, course, desired_velocity
 from flockd.geometry import build_rig
-from flockd.inference import models_folder
 from flockd.messages import (
     BoolArray,
     Detection,
     EgoMotion,
-    Float32Array,
     FloatArray,
     FrameSet,
     Neighbour,
@@ -26,16 +24,19 @@ from flockd.messages import (
     VehicleState,
     VelocityCommand,
 )
-from flockd.perception import Perception, SceneMaps
+from flockd.perception import Networks, Observation, Perception, load_networks
+from flockd.perception.detection.detector import DetectionTrace
 from flockd.pilot.motions import ego_motion, neighbour_motions
-from flockd.pilot.scale import VelocityScale
-from flockd.pilot.views import Observer, Perceiver, RigView
+from flockd.pilot.trim import VelocityTrim
 from flockd.tracking import Blind, ExpectedNeighbour, Measurement, Tracker
 
-_OWN_DISPLACEMENT_SIGMA_M = 0.02
-_MAX_REFUSALS = 2
-_MOTION_CAUTION = 2.0
-"""Eq. 36 rests on the same ranges as the positions do: it counts for less than its own spread says."""
+
+@dataclass
+class StepTrace:
+    """What a step saw on its way, for reports and viewers: filled where a caller passes one in."""
+
+    observation: Observation | None = None
+    detection: DetectionTrace = field(default_factory=DetectionTrace)
 
 
 class FlockPilot:
@@ -44,218 +45,186 @@ class FlockPilot:
     def __init__(
         self,
         config: DroneConfig,
-        perceiver: Perceiver | None = None,
+        networks: Networks | None = None,
         stopwatch: Callable[[], float] | None = None,
     ) -> None:
-        """``perceiver`` may be shared by several pilots. ``stopwatch`` (seconds) only fills ``stages_ms``."""
+        """``networks`` may be shared by several pilots; None: those that the configuration names.
+
+        ``stopwatch`` (seconds) only fills ``stages_ms``. Raises ModelError.
+        """
         self._config = config
         self._rig = build_rig(config.rig)
-        self._perceiver = perceiver or load_perception(config)
-        self._observer = Observer(self._rig, self._perceiver, height_fixes_scale=config.perception.scale == "height")
-        self._scale = VelocityScale(self._rig) if config.perception.scale == "velocity" else None
+        self._perception = Perception(self._rig, networks or load_networks(config.perception), config.perception)
         self._tracker = Tracker(config.tracking)
         self._law = FlockingLaw(config.flocking)
+        limit_m_s, memory = 0.0, 0.0
+        if config.autopilot is not None and config.own_velocity == "vision":
+            limit_m_s, memory = config.autopilot.max_velocity_trim_m_s, config.autopilot.velocity_trim_memory
+        self._trim = VelocityTrim(limit_m_s, memory)
         self._stopwatch = stopwatch
         self._first_time_s: float | None = None
-        self._previous: RigView | None = None
+        self._last_time_s: float | None = None
         self._velocity: FloatArray | None = None
         self._refused_in_a_row = 0
-        self._flows_seen: Mapping[str, Float32Array] = {}
 
-    @property
-    def last_view(self) -> RigView | None:
-        """What the last step saw, for reports."""
-        return self._previous
-
-    @property
-    def last_flows(self) -> Mapping[str, Float32Array]:
-        """By camera, the flow into the last step's images, for reports."""
-        return self._flows_seen
-
-    def step(self, frames: FrameSet, vehicle: VehicleState) -> PilotOutput:
+    def step(self, frames: FrameSet, vehicle: VehicleState, trace: StepTrace | None = None) -> PilotOutput:
         """One step of the pure line.
 
         Args:
             frames: the newest image of every camera that has one.
             vehicle: what the own autopilot says, at the frames' time.
+            trace: filled with what was seen; changes nothing.
         """
         laps = _Laps(self._stopwatch)
-        if self._first_time_s is None:
-            self._first_time_s = frames.time_s
-        maps, reasons = self._observer.scenes(frames, vehicle)
-        laps.end("scene")
-        previous, reasons = self._pair_with(frames.time_s, reasons)
-        flows = self._flows(previous, frames, maps)
-        laps.end("flow")
-        if self._scale:
-            maps, why = self._fixed(self._scale, previous, vehicle, maps, flows)
-            reasons += why
-        view = self._observer.view(frames, vehicle, maps, reasons, self._expected(frames.time_s))
-        laps.end("distance")
-        ego, displacement = self._ego_motion(previous, view, flows, reasons)
+        trace = trace or StepTrace()
+        predictions = self._predictions(frames.time_s)
+        observation = self._perception.observe(frames, vehicle, predictions, trace.detection, laps.end)
+        trace.observation = observation
+        ego, why_no_ego = self._ego_motion(observation)
         laps.end("ego_motion")
-        motions: dict[int, NeighbourMotion] = {}
-        if ego is not None and previous is not None:
-            motions, why = neighbour_motions(self._rig, previous, view, flows, ego, self._config.geometry)
-            reasons += why
+        motions, why_no_motion = self._neighbour_motions(observation, ego)
         laps.end("neighbour_motion")
-        velocity = self._own_velocity(ego, displacement, vehicle)
-        tracks = self._track(previous, view, displacement, motions, velocity)
-        laps.end("tracking")
+        self._trim.update(vehicle, ego)
+        velocity = self._own_velocity(observation, ego)
+        tracks = self._track(observation, ego, motions, velocity)
         neighbours = self._tracker.neighbours()
-        command = self._command(view, neighbours, velocity)
+        laps.end("tracking")
+        command = self._command(observation, neighbours, velocity)
         laps.end("flocking")
-        self._previous, self._flows_seen = view, flows
+        self._last_time_s = observation.time_s
+        reasons = (*observation.reasons, *why_no_ego, *why_no_motion)
         return PilotOutput(
-            time_s=view.time_s,
+            time_s=observation.time_s,
             ego_motion=ego,
             velocity=velocity,
-            detections=view.detections,
+            detections=observation.detections,
             detection_tracks=tracks,
             neighbour_motions=motions,
             neighbours=neighbours,
             command=command,
-            reasons=tuple(reasons),
+            reasons=reasons,
             counts=Counter(reasons),
             stages_ms=laps.stages_ms,
         )
 
-    def _expected(self, time_s: float) -> tuple[ExpectedNeighbour, ...]:
-        if self._previous is None or time_s <= self._previous.time_s:
+    def _predictions(self, time_s: float) -> tuple[ExpectedNeighbour, ...]:
+        """Of the tracks, at the frames' time; none where time does not go on."""
+        if self._last_time_s is None or time_s <= self._last_time_s:
             return ()
-        return self._tracker.expect(time_s - self._previous.time_s, self._velocity)
+        return self._tracker.expect(time_s - self._last_time_s, self._velocity)
 
-    def _pair_with(self, time_s: float, reasons: list[str]) -> tuple[RigView | None, list[str]]:
-        if self._previous is not None and time_s <= self._previous.time_s:
-            return None, [*reasons, "time stamps do not increase: the pair starts anew"]
-        return self._previous, reasons
-
-    def _flows(
-        self, previous: RigView | None, frames: FrameSet, maps: Mapping[str, SceneMaps]
-    ) -> dict[str, Float32Array]:
-        if previous is None:
-            return {}
-        both = {name: previous.cameras[name] for name in maps if name in previous.cameras}
-        return {n: self._perceiver.flow(n, v.image, frames.frames[n].image, v.labels) for n, v in both.items()}
-
-    @staticmethod
-    def _fixed(
-        scale: VelocityScale,
-        previous: RigView | None,
-        vehicle: VehicleState,
-        maps: Mapping[str, SceneMaps],
-        flows: Mapping[str, Float32Array],
-    ) -> tuple[dict[str, SceneMaps], list[str]]:
-        """The maps with their scale from the autopilot's velocity."""
-        before = previous.vehicle if previous else None
-        labels = {name: view.labels for name, view in previous.cameras.items()} if previous else {}
-        return scale.fix(before, vehicle, labels, maps, flows)
-
-    def _ego_motion(
-        self, previous: RigView | None, view: RigView, flows: Mapping[str, Float32Array], reasons: list[str]
-    ) -> tuple[EgoMotion | None, FloatArray | None]:
-        """The motion in C and the displacement in NED."""
-        if previous is None:
-            return None, None
+    def _ego_motion(self, observation: Observation) -> tuple[EgoMotion | None, Sequence[str]]:
+        """The own motion in C (the body frame at the previous observation), or why there is none."""
+        if observation.previous is None:
+            return None, ()
         try:
-            ego = ego_motion(self._rig, previous, view, flows, self._config.geometry)
+            ego = ego_motion(self._rig, observation, self._config.geometry)
         except ValueError as error:
-            reasons.append(f"ego-motion: {error}")
-            return None, None
-        displacement = previous.vehicle.R_ned_body @ ego.translation
-        if not self._is_plausible(displacement, ego.interval_s):
-            reasons.append("ego-motion: no vehicle changes its velocity that fast")
-            return None, None
-        return ego, displacement
+            return None, (f"ego-motion: {error}",)
+        if not self._is_plausible(_displacement(observation, ego), ego.interval_s):
+            return None, ("ego-motion: no vehicle changes its velocity that fast",)
+        return ego, ()
 
     def _is_plausible(self, displacement: FloatArray, interval_s: float) -> bool:
-        """Whether the last velocity can have become this one; a third refusal in a row would rather doubt the last."""
+        """Whether the last velocity can have become this one; after some refusals the last one is doubted instead."""
         if self._velocity is None:
             return True
+        parameters = self._config.geometry
         change = float(np.linalg.norm(displacement / interval_s - self._velocity))
-        allowed = self._config.geometry.max_acceleration_m_s2 * interval_s * (1 + self._refused_in_a_row)
-        if change <= allowed or self._refused_in_a_row == _MAX_REFUSALS:
+        allowed = parameters.max_acceleration_m_s2 * interval_s * (1 + self._refused_in_a_row)
+        if change <= allowed or self._refused_in_a_row == parameters.max_refused_ego_motions:
             self._refused_in_a_row = 0
             return True
         self._refused_in_a_row += 1
         return False
 
-    def _own_velocity(
-        self, ego: EgoMotion | None, displacement: FloatArray | None, vehicle: VehicleState
-    ) -> FloatArray | None:
+    def _neighbour_motions(
+        self, observation: Observation, ego: EgoMotion | None
+    ) -> tuple[Mapping[int, NeighbourMotion], Sequence[str]]:
+        if ego is None:
+            return {}, ()
+        return neighbour_motions(self._rig, observation, ego, self._config.geometry)
+
+    def _own_velocity(self, observation: Observation, ego: EgoMotion | None) -> FloatArray | None:
         """(3,) NED m/s. Where vision fails, the last one that it gave."""
-        if ego is not None and displacement is not None:
-            self._velocity = displacement / ego.interval_s  # Eq. 21
-        return vehicle.velocity_ned if self._config.own_velocity == "autopilot" else self._velocity
+        if ego is not None:
+            self._velocity = _displacement(observation, ego) / ego.interval_s  # Eq. 21
+        return observation.vehicle.velocity_ned if self._config.own_velocity == "autopilot" else self._velocity
 
     def _track(
         self,
-        previous: RigView | None,
-        view: RigView,
-        displacement: FloatArray | None,
+        observation: Observation,
+        ego: EgoMotion | None,
         motions: Mapping[int, NeighbourMotion],
         velocity: FloatArray | None,
     ) -> tuple[int, ...]:
-        if previous is not None:
-            self._tracker.predict(view.time_s - previous.time_s, displacement, _OWN_DISPLACEMENT_SIGMA_M)
-        measurements = [
-            _measurement(s, view.vehicle.R_ned_body, previous, motions.get(s.label)) for s in view.detections
-        ]
-        return self._tracker.update(view.time_s, measurements, velocity, self._blind(view))
+        """The track of each detection."""
+        if observation.previous is not None:
+            displacement = None if ego is None else _displacement(observation, ego)
+            sigma_m = self._config.geometry.own_displacement_sigma_m
+            self._tracker.predict(observation.interval_s, displacement, sigma_m)
+        caution = self._config.geometry.neighbour_velocity_caution
+        measurements = [_measurement(observation, d, motions.get(d.label), caution) for d in observation.detections]
+        return self._tracker.update(observation.time_s, measurements, velocity, self._blind(observation))
 
-    def _blind(self, view: RigView) -> Blind | None:
-        """Where only cameras look that gave nothing in this step; None: they all did."""
-        gone = self._rig.cameras.keys() - view.cameras.keys()
+    def _blind(self, observation: Observation) -> Blind | None:
+        """Where only cameras point that gave nothing in this step; None: they all did."""
+        gone = self._rig.cameras.keys() - observation.cameras.keys()
         if not gone:
             return None
 
         def blind(places: FloatArray) -> BoolArray:
-            pixels = self._rig.pixels_of(places @ view.vehicle.R_ned_body)  # row by row R^T p: into the body's axes
+            pixels = self._rig.pixels_of(places @ observation.vehicle.R_ned_body)  # row by row R^T p: into the body
             shown = {name: np.isfinite(uv).all(axis=1) for name, uv in pixels.items()}
             of_gone = np.any([shown[name] for name in gone], axis=0)
-            of_others = np.any([shown[name] for name in view.cameras], axis=0)
+            of_others = np.any([shown[name] for name in observation.cameras], axis=0)
             hidden: BoolArray = of_gone & ~of_others
             return hidden
 
         return blind
 
-    def _command(self, view: RigView, neighbours: Sequence[Neighbour], velocity: FloatArray | None) -> VelocityCommand:
-        elapsed_s = view.time_s - (self._first_time_s or 0.0)
+    def _command(
+        self, observation: Observation, neighbours: Sequence[Neighbour], velocity: FloatArray | None
+    ) -> VelocityCommand:
+        if self._first_time_s is None:
+            self._first_time_s = observation.time_s
+        elapsed_s = observation.time_s - self._first_time_s
         desired = desired_velocity(self._config.desired, elapsed_s)
         seen = [n for n in neighbours if n.confirmed]
         positions = np.array([n.position[:2] for n in seen]).reshape(-1, 2)
         velocities = np.array([n.velocity[:2] for n in seen]).reshape(-1, 2)
-        own = desired if velocity is None else velocity[:2]  # before the first pair: as asked for
+        own = desired if velocity is None else velocity[:2]  # before the first pair: as desired
         command, acceleration = self._law.command(own, positions, velocities, desired, self._config.step_s)
-        R = view.vehicle.R_ned_body
+        R = observation.vehicle.R_ned_body
         heading = math.atan2(R[1, 0], R[0, 0])
         yaw = course(self._config.desired, elapsed_s) if self._config.yaw == "course" else heading
-        return VelocityCommand(command, acceleration, yaw)
+        trim = self._trim.velocity
+        return VelocityCommand(command + trim, acceleration, yaw, trim if trim.any() else None)
 
 
-def load_perception(config: DroneConfig) -> Perception:
-    """The networks that a configuration names. Raises ModelError."""
-    return Perception(config.perception, models_folder(config.perception))
+def _displacement(observation: Observation, ego: EgoMotion) -> FloatArray:
+    """(3,) metres NED that the drone went since the previous observation."""
+    before = observation.vehicle if observation.previous is None else observation.previous.vehicle
+    displacement: FloatArray = before.R_ned_body @ ego.translation
+    return displacement
 
 
 def _measurement(
-    detection: Detection, R_ned_body: FloatArray, previous: RigView | None, motion: NeighbourMotion | None
+    observation: Observation, detection: Detection, motion: NeighbourMotion | None, caution: float
 ) -> Measurement:
-    """A detection in level axes, with the velocity of Eq. 36 where there is one."""
-    position = R_ned_body @ detection.position
-    covariance = detection.range_m**2 * R_ned_body @ detection.covariance @ R_ned_body.T
-    measurement = Measurement(
-        position=position,
-        covariance=covariance,
+    """A detection in NED axes, with the velocity of Eq. 36 where there is one."""
+    R_ned_body = observation.vehicle.R_ned_body
+    velocity, sigma_m_s = None, 1.0
+    if motion is not None and observation.previous is not None:
+        velocity = observation.previous.vehicle.R_ned_body @ motion.velocity
+        sigma_m_s = caution * math.sqrt(2) * detection.range_sigma_m / motion.interval_s
+    return Measurement(
+        position=R_ned_body @ detection.position,
+        covariance=detection.range_m**2 * R_ned_body @ detection.covariance @ R_ned_body.T,
         size_m=detection.size_m,
         drone_probability=detection.drone_probability,
-    )
-    if motion is None or previous is None:
-        return measurement
-    return replace(
-        measurement,
-        velocity=previous.vehicle.R_ned_body @ motion.velocity,
-        velocity_sigma_m_s=_MOTION_CAUTION * math.sqrt(2) * detection.range_sigma_m / motion.interval_s,
+        velocity=velocity,
+        velocity_sigma_m_s=sigma_m_s,
     )
 
 
@@ -268,6 +237,7 @@ class _Laps:
         self.stages_ms: dict[str, float] = {}
 
     def end(self, stage: str) -> None:
+        """Of a stage."""
         if self._watch:
             now = self._watch()
             self.stages_ms[stage] = 1e3 * (now - self._last)

@@ -7,11 +7,7 @@ import math
 import numpy as np
 
 from flockd.flocking import limit_norm
-from flockd.messages import FloatArray, PilotOutput, VehicleState
-
-_MEMORY = 0.7
-"""Share of the old trim that stays with each step: noise of single steps goes, drifts over several seconds do not."""
-
+from flockd.messages import EgoMotion, FloatArray, VehicleState
 
 class VelocityTrim:
     """The autopilot's velocity less the one that the cameras measured, averaged over some steps and limited.
@@ -20,9 +16,9 @@ class VelocityTrim:
     with v - b, and so do neighbours with other b: a flock with equal commands drifts together. So b is added.
     """
 
-    def __init__(self, limit_m_s: float) -> None:
-        """``limit_m_s``: the trim's largest norm; 0: no trim."""
-        self._limit_m_s = limit_m_s
+    def __init__(self, limit_m_s: float, memory: float) -> None:
+        """``limit_m_s``: the trim's largest norm; 0: no trim. ``memory``: share of the last trim that each step keeps."""
+        self._limit_m_s, self._memory = limit_m_s, memory
         self._before: VehicleState | None = None
         self._mean = np.zeros(2)
 
@@ -31,13 +27,12 @@ class VelocityTrim:
         """(2,) m/s, north and east, to be added to the pilot's command."""
         return limit_norm(self._mean, self._limit_m_s)
 
-    def step(self, vehicle: VehicleState, output: PilotOutput) -> None:
-        """After each step of the pilot, with the vehicle's state that it got.
+    def update(self, vehicle: VehicleState, ego: EgoMotion | None) -> None:
+        """With the vehicle's state and the ego-motion of each step.
 
         Without ego-motion, or without a finite velocity of the autopilot at both of its ends, the trim stays as it was.
         """
         before, self._before = self._before, vehicle
-        ego = output.ego_motion
         if before is None or ego is None or before.velocity_ned is None or vehicle.velocity_ned is None:
             return
         if not math.isclose(vehicle.time_s - before.time_s, ego.interval_s, rel_tol=0.2):
@@ -46,4 +41,4 @@ class VelocityTrim:
         wrong = (believed - before.R_ned_body @ ego.velocity)[:2]
         if not np.isfinite(wrong).all():
             return  # it would never leave the mean again
-        self._mean = _MEMORY * self._mean + (1 - _MEMORY) * limit_norm(wrong, 2 * self._limit_m_s)
+        self._mean = self._memory * self._mean + (1 - self._memory) * limit_norm(wrong, 2 * self._limit_m_s)

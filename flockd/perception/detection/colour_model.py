@@ -1,4 +1,4 @@
-"""Which pixels have a drone's colours: networks see too coarsely for its outline, thin arms and propellers."""
+"""Colour models of a drone and its surroundings: networks are too coarse for its outline, thin arms and propellers."""
 
 from __future__ import annotations
 
@@ -11,15 +11,13 @@ _LEVELS = 20
 """Of red, green and blue each, that are told apart."""
 _SHADES = 0.5 * np.eye(_LEVELS) + 0.25 * (np.eye(_LEVELS, k=1) + np.eye(_LEVELS, k=-1))
 """A colour also counts, by less, for those beside it."""
-_MAYBE = -8.0
-"""Logit from which on a pixel may be the drone's at all, or lies so near to it that it shows what surrounds it."""
-_WEIGHT = 4.0
-"""Of the colours: their evidence is each pixel's own, that of the networks much the same for all about it."""
+_MIN_LOGIT = -8.0
+"""From here on a pixel may be the drone's at all, or lies so near to it that it shows what surrounds it."""
 _RARE = 0.02
-"""So many pixels of every colour are thought to be in the drone and around it before any is seen."""
+"""Prior count of pixels of every colour, in the drone and around it."""
 
 
-def weigh_by_colour(logit: Float32Array, image: UInt8Array) -> Float32Array:
+def reweight_by_colour(logit: Float32Array, image: UInt8Array, weight: float) -> Float32Array:
     """Logits of pixels being a drone's, by how much oftener their colours are the drone's than its surroundings'.
 
     Both are histograms of the same pixels, each counted by the probability that it has so far (as by the colour models
@@ -28,14 +26,16 @@ def weigh_by_colour(logit: Float32Array, image: UInt8Array) -> Float32Array:
     Args:
         logit: (h, w) as the networks say.
         image: (h, w, 3) RGB.
+        weight: of the colours. Their evidence is each pixel's own, that of the networks much the same for its
+            neighbours.
     """
-    maybe = logit > _MAYBE
-    share = 1.0 / (1.0 + np.exp(-logit[maybe].astype(np.float64)))
-    colour = (image[maybe].astype(np.int64) * _LEVELS >> 8) @ (_LEVELS**2, _LEVELS, 1)
+    possible = logit > _MIN_LOGIT
+    share = 1.0 / (1.0 + np.exp(-logit[possible].astype(np.float64)))
+    colour = (image[possible].astype(np.int64) * _LEVELS >> 8) @ (_LEVELS**2, _LEVELS, 1)
     own, other = (_frequency(colour, part) for part in (share, 1.0 - share))
-    weighed = logit.copy()
-    weighed[maybe] += _WEIGHT * np.log(own / other)
-    return weighed
+    reweighted = logit.copy()
+    reweighted[possible] += weight * np.log(own / other)
+    return reweighted
 
 
 def _frequency(colour: NDArray[np.int64], weight: FloatArray) -> FloatArray:

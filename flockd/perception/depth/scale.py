@@ -9,7 +9,7 @@ import numpy as np
 
 from flockd.geometry import Rig, RigCamera, RigidTransform, grid_pixels
 from flockd.messages import Float32Array, FloatArray, UInt8Array, VehicleState
-from flockd.perception import SceneMaps
+from flockd.perception.maps import SceneMaps
 
 _DRAWS = 200
 _MOST_PIXELS = 3000

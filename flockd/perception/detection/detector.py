@@ -1,0 +1,99 @@
+"""The detection pipeline of a frame set: propose, crop, refine, suppress, mask."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from flockd.config.perception import DetectionParameters
+from flockd.geometry import Rig
+from flockd.messages import Detection, UInt8Array, VehicleState
+from flockd.perception.detection.from_depth import candidates_from_depth
+from flockd.perception.detection.instances import Instance
+from flockd.perception.detection.masks import DroneMasks, MaskRenderer, first_stage_labels
+from flockd.perception.detection.nms import Suppressed, separate, suppress
+from flockd.perception.detection.proposals import (
+    Proposal,
+    propose_instances,
+    propose_predictions,
+    propose_residuals,
+)
+from flockd.perception.detection.refinement import Candidate, Cascade, Thresholds
+from flockd.perception.detection.roi import CropRules
+from flockd.perception.maps import SceneMaps
+from flockd.perception.networks import Networks
+from flockd.tracking import ExpectedNeighbour
+
+
+@dataclass
+class DetectionTrace:
+    """What the detector went through, for reports and measurements: filled where a caller passes one in."""
+
+    proposals: list[Proposal] = field(default_factory=list)
+    candidates: list[Candidate] = field(default_factory=list)
+
+
+class Detector:
+    """Finds drones in the images of a rig."""
+
+    def __init__(self, rig: Rig, networks: Networks, parameters: DetectionParameters) -> None:
+        self._rig, self._networks, self._parameters = rig, networks, parameters
+        self._rules = CropRules()
+        self._cascade = Cascade(networks, self._rules, Thresholds(), parameters)
+        self._renderers = {name: MaskRenderer(c, networks.map_stride) for name, c in rig.cameras.items()}
+
+    def detect(
+        self,
+        images: Mapping[str, UInt8Array],
+        scenes: Mapping[str, SceneMaps],
+        vehicle: VehicleState,
+        predictions: Sequence[ExpectedNeighbour],
+        trace: DetectionTrace,
+    ) -> tuple[tuple[Detection, ...], dict[str, UInt8Array]]:
+        """The drones in view, and each camera's mask (h, w) of their labels.
+
+        Args:
+            images: (h, w, 3) by camera; not empty.
+            scenes: what the first stage says of each, with depth in metres.
+            vehicle: for the attitude.
+            predictions: of tracks, where the second stage searches too.
+            trace: filled.
+        """
+        rig = Rig({name: self._rig.cameras[name] for name in images})
+        proposals = propose_instances(rig, scenes, self._rules)
+        trace.proposals += proposals
+        if not self._networks.has_distance:
+            trace.candidates += candidates_from_depth(rig, scenes, proposals, self._parameters)
+            return self._masked(suppress(trace.candidates, self._parameters), images, scenes, ())
+        candidates, rejected = self._cascade.refine(rig, images, proposals)
+        predicted = propose_predictions(rig, vehicle, predictions, [c.bearing for c in candidates], self._rules)
+        candidates += self._cascade.refine(rig, images, predicted)[0]
+        none = {proposal.instance for proposal in rejected if proposal.instance}
+        masks = {n: m.by_networks() for n, m in self._masks(separate(candidates), scenes, none).items()}
+        residuals = propose_residuals(rig, scenes, masks, self._rules, self._parameters)
+        candidates += self._cascade.refine(rig, images, residuals)[0]
+        trace.proposals += predicted + residuals
+        trace.candidates += candidates
+        return self._masked(suppress(candidates, self._parameters), images, scenes, none)
+
+    def _masked(
+        self,
+        found: Suppressed,
+        images: Mapping[str, UInt8Array],
+        scenes: Mapping[str, SceneMaps],
+        rejected: Container[Instance],
+    ) -> tuple[tuple[Detection, ...], dict[str, UInt8Array]]:
+        masks = self._masks(found, scenes, rejected)
+        weight = self._parameters.colour_weight
+        return found.detections, {name: mask.by_colours(images[name], weight) for name, mask in masks.items()}
+
+    def _masks(
+        self, found: Suppressed, scenes: Mapping[str, SceneMaps], rejected: Container[Instance]
+    ) -> dict[str, DroneMasks]:
+        masks = {}
+        for name, scene in scenes.items():
+            labels = first_stage_labels(scene, found.labels_of(name), rejected)
+            masks[name] = DroneMasks(labels)
+            if scene.logit is not None:
+                masks[name] = self._renderers[name].render(labels, scene.logit, found.detections, found.masks_of)
+        return masks

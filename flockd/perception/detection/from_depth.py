@@ -1,0 +1,51 @@
+"""Detection without a second stage: a drone's place by the depth map alone (Eq. 37)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from flockd.config.perception import DetectionParameters
+from flockd.geometry import Rig, RigCamera, log_polar
+from flockd.perception.detection.instances import Instance
+from flockd.perception.detection.proposals import Proposal
+from flockd.perception.detection.refinement import Candidate
+from flockd.perception.detection.roi import angle_between
+from flockd.perception.maps import SceneMaps
+
+_MAX_RADIUS_M = 0.6
+"""Pixels whose depth is farther from the median are not the drone's: it is at most 1.2 m wide."""
+_MIN_ANGLE = 1e-3
+
+
+def candidates_from_depth(
+    rig: Rig, scenes: Mapping[str, SceneMaps], proposals: Sequence[Proposal], parameters: DetectionParameters
+) -> list[Candidate]:
+    """One a proposal of the first stage: the centre of the bounding box of its points."""
+    found = []
+    for proposal in proposals:
+        camera = rig.cameras[proposal.cameras[0]]
+        if proposal.instance is not None:
+            found.append(_candidate(camera, scenes[camera.name], proposal, proposal.instance, parameters))
+    return [one for one in found if one is not None]
+
+
+def _candidate(
+    camera: RigCamera, scene: SceneMaps, proposal: Proposal, instance: Instance, parameters: DetectionParameters
+) -> Candidate | None:
+    rows, columns = np.nonzero(scene.labels == instance.label)
+    pixels = np.asarray(np.stack([columns, rows], 1) + 0.5, np.float64)
+    points = camera.camera.unproject(pixels, np.asarray(scene.depth[rows, columns], np.float64))
+    distance = np.linalg.norm(points, axis=1)
+    kept = np.abs(distance - np.median(distance)) < _MAX_RADIUS_M
+    if not kept.any():
+        return None
+    centre = (points[kept].min(0) + points[kept].max(0)) / 2
+    bearing, log_range = log_polar(camera.T_body_camera.apply(centre[None])[0])
+    left, top, right, _ = instance.box
+    rays = camera.camera.rays(np.array([[left, top], [right, top]]))
+    width = max(angle_between(rays[0], rays[1]), _MIN_ANGLE)
+    sigma = parameters.depth_map_sigma
+    return Candidate(proposal, bearing, log_range, sigma, sigma * width, math.exp(log_range) * width)

@@ -1,0 +1,253 @@
+"""The networks' side of perception: flow of a pair of images, depth and drones of one, range of the drone in a crop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from flockd.config.perception import PerceptionConfig
+from flockd.errors import ModelError
+from flockd.geometry import RigCamera
+from flockd.inference.fitting import fit
+from flockd.inference.manifest import Answer, Content, Role, Unknown, manifest_path
+from flockd.inference.providers import engines_folder
+from flockd.inference.session import OnnxModel
+from flockd.messages import Float32Array, Frame, UInt8Array
+from flockd.perception.background_flow import settle_background
+from flockd.perception.detection.instances import group_instances
+from flockd.perception.drone_flow import follow_drones
+from flockd.perception.flow import DisFlow, Flow, OnnxFlow
+from flockd.perception.maps import Crop, OpenDepth, RangeEstimate, SceneMaps
+
+_PROPOSAL_LOGIT = -1.5
+_MASK_LOGIT = 0.4
+CROPS_PER_RUN = 24
+"""Crops in one run of the distance network, so that an image full of false proposals does not take more memory."""
+_MIN_DEPTH_M, _MAX_DEPTH_M = 1e-3, 1e3
+"""Where a reciprocal is taken: beyond lies the sky."""
+_MIN_RAY_Z = 0.1
+"""Of a unit ray, for its tangents to stay finite: 84 degrees off the optical axis."""
+
+
+class Networks(Protocol):
+    """What perception asks of networks: `OnnxNetworks`, or exact ones that a simulator puts in their place."""
+
+    crop_size: int
+    """Width and height of the second stage's crops, pixels."""
+    map_stride: int
+    """Image pixels per pixel of the first stage's maps."""
+
+    @property
+    def has_distance(self) -> bool:
+        """Whether there is a second stage for a drone's range."""
+        ...
+
+    def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
+        """(h, w, 2) pixels from the first image to the second.
+
+        ``labels`` (h, w) of the first image: one value a drone, 0 and 255 none.
+        """
+        ...
+
+    def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
+        """Depth and drones of one image.
+
+        ``ground`` (h / map_stride, w / map_stride) is the inverse depth (1/m) of flat ground, where attitude and height
+        are to fix the scale.
+        """
+        ...
+
+    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+        """Range and centre of the drone in the middle of each crop."""
+        ...
+
+
+class OnnxNetworks:
+    """The networks that a configuration names. Stateless: may serve several pilots."""
+
+    crop_size = 96
+    map_stride = 2
+
+    def __init__(self, config: PerceptionConfig, models_dir: Path) -> None:
+        """Raises ModelError."""
+        self._models: dict[str, OnnxModel] = {}
+        self._dir = models_dir
+        self._config = config
+        cv2.setNumThreads(config.threads)
+        self._flow = self._build_flow(config)
+        self._depth = self._model(config.depth, "depth")
+        self._segmentation = self._model(config.segmentation, "segmentation")
+        self._unknown = self._what_is_unknown(config)
+        self._distance = None if config.distance == "none" else self._model(config.distance, "distance")
+
+    @property
+    def has_distance(self) -> bool:
+        """Whether there is a second stage."""
+        return self._distance is not None
+
+    def terminate(self) -> None:
+        """Ends every run of a network that is under way; whoever called it gets an error."""
+        for model in self._models.values():
+            model.terminate()
+
+    def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
+        """See `Networks`. The flow of each drone is found by itself."""
+        before, after = first.image, second.image
+        flow = self._flow.flow(before, after)
+        if self._config.flow_refinement == "quick_dis":
+            flow = settle_background(flow, before, after, labels)
+        return follow_drones(flow, before, after, labels)
+
+    def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
+        """See `Networks`."""
+        height, width = frame.image.shape[:2]
+        planes = geometry_planes(camera, ground, self.map_stride)
+        maps = self._run(self._depth, frame.image, planes)
+        depth = np.asarray(
+            cv2.resize(maps["depth"][0], (width, height), interpolation=cv2.INTER_NEAREST), dtype=np.float32
+        )
+        if self._segmentation is not self._depth:
+            maps = self._run(self._segmentation, frame.image, planes)
+        logit = self._at_map_stride(maps["drone"], (width, height))[0]
+        offset = self._at_map_stride(maps["offset"], (width, height))
+        # A second stage weeds out false proposals, so that the first may propose more.
+        proposal, certain = (_PROPOSAL_LOGIT, _MASK_LOGIT) if self.has_distance else (0.0, 0.0)
+        labels, instances = group_instances(logit - np.float32(proposal), offset, scale=self.map_stride)
+        labels = np.asarray(cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
+        low = cv2.resize((logit < certain).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+        scene = SceneMaps(np.full_like(depth, np.nan), labels, instances, uncertain=low & (labels > 0), logit=logit)
+        return self._with_depth(scene, depth, camera)
+
+    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+        """See `Networks`."""
+        if self._distance is None:
+            raise ValueError("this configuration has no distance model")
+        if not crops:
+            return ()
+        images = [np.ascontiguousarray(c.image[:, ::-1]) if c.mirrored else c.image for c in crops]
+        batches = [images[i : i + CROPS_PER_RUN] for i in range(0, len(images), CROPS_PER_RUN)]
+        outputs = [self._distance.answer({"picture": batch}) for batch in batches]
+        rows = np.concatenate([output["range"] for output in outputs])
+        masks: Sequence[Float32Array | None] = [None] * len(crops)
+        if "mask" in outputs[0]:
+            masks = list(np.concatenate([output["mask"][:, 0] for output in outputs]))
+        return tuple(
+            self._estimate(row, crop, mask) for row, crop, mask in zip(rows, crops, masks, strict=True)
+        )
+
+    def _estimate(self, row: Float32Array, crop: Crop, mask: Float32Array | None) -> RangeEstimate:
+        """The output's columns, with a mirror image's turned back."""
+        log_range_per_focal, right, down, log_sigma, drone_logit, log_apparent_size = (float(value) for value in row)
+        if crop.mirrored:
+            right = -right
+            mask = None if mask is None else np.ascontiguousarray(mask[:, ::-1])
+        return RangeEstimate(
+            log_range=log_range_per_focal + float(np.log(crop.view.camera.focal_px)),
+            log_range_sigma=float(np.exp(log_sigma)),
+            centre=np.array([self.crop_size / 2 + right, self.crop_size / 2 + down]),
+            size_m=float(np.exp(log_range_per_focal + log_apparent_size)),
+            drone_probability=float(1.0 / (1.0 + np.exp(-drone_logit))),
+            mask=mask,
+        )
+
+    def _run(self, model: OnnxModel, image: UInt8Array, planes: Float32Array) -> dict[Answer, Float32Array]:
+        """One model's maps (c, h, w) that show all of an image, at the model's resolution."""
+        fitting = fit(model.manifest, (image.shape[1], image.shape[0]))
+        contents: dict[Content, Sequence[UInt8Array] | Float32Array] = {"image": [fitting.enter(image)]}
+        if "geometry" in model.manifest.contents:
+            contents["geometry"] = fitting.enter_planes(planes, self.map_stride)[None]
+        return {name: fitting.inside(map_)[0] for name, map_ in model.answer(contents).items()}
+
+    def _at_map_stride(self, maps: Float32Array, image: tuple[int, int]) -> Float32Array:
+        """(c, h, w) at the resolution that drones are told apart in; two channels are pixels of the map."""
+        width, height = image[0] // self.map_stride, image[1] // self.map_stride
+        if maps.shape[1:] == (height, width):
+            return maps
+        resized = np.stack([cv2.resize(plane, (width, height), interpolation=cv2.INTER_LINEAR) for plane in maps])
+        if len(maps) == 2:
+            resized *= np.array([width / maps.shape[2], height / maps.shape[1]], np.float32)[:, None, None]
+        return np.asarray(resized, dtype=np.float32)
+
+    def _with_depth(self, scene: SceneMaps, depth: Float32Array, camera: RigCamera) -> SceneMaps:
+        """With metres where the depth network knows them, else with what it leaves open."""
+        meaning = self._depth.manifest.answers["depth"].depth
+        is_inverse = meaning.quantity == "inverse_depth"
+        if meaning.focal_px:
+            size = (depth.shape[1], depth.shape[0])
+            longer = fit(self._depth.manifest, size).scale[0] * camera.camera.focal_px / meaning.focal_px
+            depth = depth / longer if is_inverse else depth * longer
+        if self._unknown == "nothing":
+            metres = 1.0 / np.maximum(depth, 1.0 / _MAX_DEPTH_M) if is_inverse else depth
+            return replace(scene, depth=np.asarray(metres, np.float32))
+        inverse = depth if is_inverse else 1.0 / np.maximum(depth, _MIN_DEPTH_M)
+        return replace(
+            scene, open=OpenDepth(np.asarray(inverse, np.float32), shift=self._unknown == "scale_and_shift")
+        )
+
+    def _what_is_unknown(self, config: PerceptionConfig) -> Unknown:
+        """What of the depth is left for the autopilot's height or velocity to fix. Raises ModelError."""
+        manifest = self._depth.manifest
+        unknown = manifest.answers["depth"].depth.unknown
+        if config.scale == "network" and unknown != "nothing":
+            raise ModelError(
+                f"perception.scale: depth model {config.depth!r} knows no metres, so `network` cannot give the scale; "
+                "write height or velocity, or choose a metric model"
+            )
+        takes_ground = "geometry" in manifest.contents
+        if unknown == "nothing" and (config.scale == "velocity" or (config.scale == "height" and not takes_ground)):
+            return "scale"
+        return unknown
+
+    def _build_flow(self, config: PerceptionConfig) -> Flow:
+        if config.flow == "dis":
+            return DisFlow()
+        network = OnnxFlow(self._model(config.flow, "flow"))
+        if config.flow_refinement == "none":
+            return network
+        return DisFlow(network, config.flow_refinement_scale, quick=config.flow_refinement == "quick_dis")
+
+    def _model(self, name: str, role: Role) -> OnnxModel:
+        path = manifest_path(self._dir, name)
+        key = str(path)
+        if key not in self._models:
+            if not path.is_file():
+                raise ModelError(
+                    f"perception.{role}: there is no model {name!r} ({path} is missing); "
+                    f"choose one of {', '.join(sorted(p.stem for p in self._dir.glob('*.yaml'))) or 'none at hand'}"
+                )
+            self._models[key] = OnnxModel(
+                path,
+                threads=self._config.threads,
+                provider=self._config.provider,
+                engines=engines_folder(self._config),
+            )
+        model = self._models[key]
+        if role not in model.manifest.roles:
+            raise ModelError(
+                f"perception.{role}: model {name!r} fills {', '.join(model.manifest.roles)} and not {role}; "
+                "choose another"
+            )
+        return model
+
+
+def geometry_planes(camera: RigCamera, ground: Float32Array | None, stride: int) -> Float32Array:
+    """(3, h / stride, w / stride): tangents of the rays right and down, and the inverse depth of flat ground, else 0."""
+    tangents = _ray_tangents(camera, stride)
+    flat = np.zeros(tangents.shape[1:], np.float32) if ground is None else ground
+    return np.concatenate([tangents, flat[None]])
+
+
+@lru_cache(maxsize=32)
+def _ray_tangents(camera: RigCamera, stride: int) -> Float32Array:
+    """(2, h / stride, w / stride) of the block centres' rays, right and down of the optical axis."""
+    width, height = camera.camera.size
+    u, v = np.meshgrid(np.arange(stride / 2, width, stride), np.arange(stride / 2, height, stride))
+    rays = camera.camera.rays(np.stack([u.ravel(), v.ravel()], 1))
+    tangents = rays[:, :2] / np.maximum(rays[:, 2:], _MIN_RAY_Z)
+    return np.ascontiguousarray(tangents.T.reshape(2, *u.shape), dtype=np.float32)

@@ -1,0 +1,136 @@
+"""Perception: a frame set in, an observation out; images to maps, flow, metric depth, detections and masks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+from flockd.config.perception import PerceptionConfig
+from flockd.geometry import Rig, ground_inverse_depth
+from flockd.inference import models_folder
+from flockd.messages import Float32Array, Frame, FrameSet, VehicleState
+from flockd.perception.detection.detector import DetectionTrace, Detector
+from flockd.perception.detection.masks import depth_of_drones, without_borders
+from flockd.perception.maps import SceneMaps
+from flockd.perception.networks import Networks, OnnxNetworks
+from flockd.perception.observation import CameraObservation, Observation
+from flockd.perception.depth import VelocityScale, fix_by_height
+from flockd.tracking import ExpectedNeighbour
+
+Reasons = list[str]
+
+
+class Perception:
+    """One drone's perception. Remembers the last observation; the networks may serve several drones."""
+
+    def __init__(self, rig: Rig, networks: Networks, config: PerceptionConfig) -> None:
+        self._rig, self._networks, self._config = rig, networks, config
+        self._detector = Detector(rig, networks, config.detection)
+        self._velocity_scale = VelocityScale(rig) if config.scale == "velocity" else None
+        self._last: Observation | None = None
+
+    def observe(
+        self,
+        frames: FrameSet,
+        vehicle: VehicleState,
+        predictions: Sequence[ExpectedNeighbour] = (),
+        trace: DetectionTrace | None = None,
+        lap: Callable[[str], None] = lambda stage: None,
+    ) -> Observation:
+        """What the newest frame set shows.
+
+        Args:
+            frames: the newest image of every camera that has one.
+            vehicle: what the own autopilot says, at the frames' time.
+            predictions: where tracks should be; the detector searches there too.
+            trace: filled with what the detector went through, where a caller wants to see it.
+            lap: called at the end of each stage with its name, to time it.
+        """
+        usable, unusable = self._usable(frames)
+        scenes, failed = self._scenes(usable, vehicle)
+        lap("scene")
+        previous, restarted = self._pair(frames)
+        flows = self._flows(previous, {name: usable[name] for name in scenes})
+        lap("flow")
+        scenes, unscaled = self._scaled(previous, vehicle, scenes, flows)
+        images = {name: usable[name].image for name in scenes}
+        detections, masks = self._detector.detect(images, scenes, vehicle, predictions, trace or DetectionTrace())
+        cameras = {}
+        for name, scene in scenes.items():
+            depth = depth_of_drones(scene.depth, masks[name], self._rig.cameras[name], detections)
+            labels = without_borders(masks[name], self._config.detection.mask_border_px)
+            cameras[name] = CameraObservation(images[name], depth, labels, flows.get(name))
+        reasons = (*unusable, *failed, *restarted, *unscaled)
+        self._last = Observation(frames.time_s, vehicle, cameras, detections, previous, reasons)
+        lap("detection")
+        return self._last
+
+    def _usable(self, frames: FrameSet) -> tuple[dict[str, Frame], Reasons]:
+        """The frames of the rig's cameras that have the right size."""
+        usable, reasons = {}, []
+        for name, camera in self._rig.cameras.items():
+            width, height = camera.camera.size
+            frame = frames.frames.get(name)
+            if frame is None:
+                reasons.append(f"camera {name}: no frame")
+            elif frame.image.shape != (height, width, 3):
+                found = f"{frame.image.shape[1]}x{frame.image.shape[0]}"
+                reasons.append(f"camera {name}: its image is {found} and not {width}x{height}")
+            else:
+                usable[name] = frame
+        return usable, reasons
+
+    def _scenes(self, frames: Mapping[str, Frame], vehicle: VehicleState) -> tuple[dict[str, SceneMaps], Reasons]:
+        """The networks' maps of every camera, with the scale that the height gives where it is to give it."""
+        scenes, reasons = {}, []
+        for name, frame in frames.items():
+            camera = self._rig.cameras[name]
+            try:
+                ground = None
+                if self._config.scale == "height":
+                    stride = self._networks.map_stride
+                    ground = ground_inverse_depth(camera, vehicle.R_ned_body, vehicle.height_m, stride=stride)
+                scene = self._networks.scene(frame, camera, ground)
+                scenes[name] = scene if ground is None else fix_by_height(scene, ground)
+            except (FloatingPointError, ValueError) as error:  # an output that is not finite; a height below the ground
+                reasons.append(f"camera {name}: {error}")
+        return scenes, reasons
+
+    def _pair(self, frames: FrameSet) -> tuple[Observation | None, Reasons]:
+        """The observation before, unless time runs backwards."""
+        if self._last is None:
+            return None, []
+        if frames.time_s <= self._last.time_s:
+            return None, ["time stamps do not increase: the pair starts anew"]
+        return replace(self._last, previous=None), []
+
+    def _flows(self, previous: Observation | None, frames: Mapping[str, Frame]) -> dict[str, Float32Array]:
+        """By camera, from the image before to this one."""
+        if previous is None:
+            return {}
+        flows = {}
+        for name, frame in frames.items():
+            before = previous.cameras.get(name)
+            if before is not None:
+                first = Frame(name, before.image, previous.time_s, 0)
+                flows[name] = self._networks.flow(first, frame, before.labels)
+        return flows
+
+    def _scaled(
+        self,
+        previous: Observation | None,
+        vehicle: VehicleState,
+        scenes: dict[str, SceneMaps],
+        flows: Mapping[str, Float32Array],
+    ) -> tuple[dict[str, SceneMaps], Reasons]:
+        """The maps with the scale that the autopilot's velocity gives where it is to give it."""
+        if self._velocity_scale is None:
+            return scenes, []
+        before = previous.vehicle if previous else None
+        labels = {name: camera.labels for name, camera in previous.cameras.items()} if previous else {}
+        return self._velocity_scale.fix(before, vehicle, labels, scenes, flows)
+
+
+def load_networks(config: PerceptionConfig) -> OnnxNetworks:
+    """The networks that a configuration names. Raises ModelError."""
+    return OnnxNetworks(config, models_folder(config))
