@@ -209,7 +209,7 @@ def test_no_drone_is_told_the_truth() -> None:
     for path in MODULES:
         if _folder(path) not in {"sim", "recording", "report", "view"}:
             assert "flockd.recording.truth" not in _imports(path), path
-    assert list(inspect.signature(FlockPilot.step).parameters) == ["self", "frames", "vehicle"]
+    assert list(inspect.signature(FlockPilot.step).parameters) == ["self", "frames", "vehicle", "trace"]
 
 
 def test_the_doctor_sees_of_the_daemon_what_everybody_sees() -> None:

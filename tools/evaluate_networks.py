@@ -22,17 +22,19 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from flockd.config import load_scenario
 from flockd.config.perception import PerceptionConfig
 from flockd.data import data_path
-from flockd.perception import Perception, Picture
+from flockd.geometry import PinholeCamera, RigidTransform
+from flockd.messages import Frame
+from flockd.perception import Crop, Networks, OnnxNetworks
 from tools.evaluation.on_pairs import HEIGHT_SIGMAS_M, MASK_WITHIN_M, Findings, look_at_pairs
 from tools.evaluation.on_rigs import ego_motion_errors
 from tools.training import worlds
-from tools.training.dataset import HEIGHT, WIDTH, PairSet, open_pairs
+from tools.training.dataset import WIDTH, PairSet, open_pairs, rig_camera
 
 RANGES_M = ((1.5, 5.0), (5.0, 10.0), (10.0, 20.0))
 RIG_WORLDS, RIG_STEPS = 12, 4
 IMAGES_TIMED = 60
-PICTURES_OF_A_DRONE = (1, 1, 1)
-"""As many as it takes one after another, mostly: see ``flockd.pilot.views``."""
+CROPS_OF_A_DRONE = (1, 1, 1)
+"""As many as it takes one after another, mostly: see ``flockd.perception.detection.refinement``."""
 
 WITH: dict[str | None, str] = {
     None: "RGB alone",
@@ -115,7 +117,7 @@ def main() -> None:
     if arguments.float:
         roles = ("flow", "depth", "segmentation", "distance")
         config = config.model_copy(update={role: getattr(config, role).removesuffix("_int8") for role in roles})
-    perception = Perception(config, arguments.models)
+    perception = OnnxNetworks(config, arguments.models)
 
     def findings(folder: Path) -> Findings:
         pairs = open_pairs(folder)
@@ -190,7 +192,7 @@ def _distances(found: Findings, note: str) -> Iterator[Row]:
                 yield Row(f"distance{note}, {what}, {name}", 100 * float(figure(errors)), "%", len(errors))
 
 
-def rows_of_rigs(perception: Perception, count: int) -> Iterator[Row]:
+def rows_of_rigs(perception: Networks, count: int) -> Iterator[Row]:
     """The own motion, from the four cameras of the paper's drone."""
     drone = load_scenario(data_path("config") / "paper_flight.yaml").drone
     errors = ego_motion_errors(drone, perception, worlds.TEST[1000 : 1000 + count], RIG_STEPS)
@@ -200,18 +202,19 @@ def rows_of_rigs(perception: Perception, count: int) -> Iterator[Row]:
         yield Row(f"own motion over 0.5 m, {name}, estimated", 100 * len(known) / len(errors[given]), "%", len(known))
 
 
-def rows_of_cost(perception: Perception, pairs: PairSet, threads: int) -> Iterator[Row]:
+def rows_of_cost(perception: Networks, pairs: PairSet, threads: int) -> Iterator[Row]:
     """Time of an image with up to four drones; the pictures of them are cut beforehand."""
-    geometry = np.zeros((3, HEIGHT // perception.map_scale, WIDTH // perception.map_scale), np.float32)
-    side = perception.picture_size
+    camera = rig_camera(WIDTH / 2)
+    side = perception.crop_size
     times = []
     for pair in range(min(pairs.count, IMAGES_TIMED)):
         image = np.asarray(pairs["image"][pair][0])
-        picture = Picture(np.ascontiguousarray(image[:side, :side]), 60.0, np.eye(3), np.zeros(3))
+        pinhole = PinholeCamera(np.array([[60.0, 0, side / 2], [0, 60.0, side / 2], [0, 0, 1.0]]), (side, side))
+        crop = Crop(np.ascontiguousarray(image[:side, :side]), pinhole, RigidTransform(np.eye(3), np.zeros(3)))
         begin = time.perf_counter()
-        perception.scene("camera", image, geometry)
-        for pictures in PICTURES_OF_A_DRONE:
-            perception.ranges([picture] * 4 * pictures)
+        perception.scene(Frame("camera", image, 0.0, 0), camera, None)
+        for crops in CROPS_OF_A_DRONE:
+            perception.ranges([crop] * 4 * crops)
         times.append(time.perf_counter() - begin)
     name = f"depth, masks and four drones' distances of an image, {threads} threads"
     yield Row(name, 1e3 * float(np.median(times)), "ms", len(times))

@@ -119,12 +119,12 @@ def _config(args: argparse.Namespace, dataset: Dataset) -> tuple[DroneConfig, li
 
 def _fly(dataset: Dataset, config: DroneConfig, stride: int, *, recorded_depth: bool) -> list[Pair]:
     from flockd.datasets.motion import fly_pairs
-    from flockd.pilot.pilot import load_perception
+    from flockd.perception import load_networks
 
     pairs: list[Pair] = []
     with ExitStack() as stack:
         tell = stack.enter_context(progress("replaying", "pairs"))
-        learned = load_perception(config)
+        learned = load_networks(config.perception)
         for pair in fly_pairs(dataset, config, learned, stride=stride, recorded_depth=recorded_depth):
             pairs.append(pair)
             tell(len(pairs), len(dataset) - stride)

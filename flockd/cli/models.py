@@ -229,7 +229,7 @@ def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
     from flockd.inference import OnnxModel
     from flockd.inference.providers import builds_engines, engines_folder
     from flockd.inference.session import feeds_for, golden_feeds, shapes_of
-    from flockd.perception.roles import PICTURES_AT_A_TIME
+    from flockd.perception.networks import CROPS_PER_RUN
 
     wanted = config.perception
     options: Any = {"threads": wanted.threads, "provider": wanted.provider, "engines": engines_folder(wanted)}
@@ -239,7 +239,7 @@ def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
         sizes = sorted({camera.size_px for camera in config.rig.cameras})
         feeds = [
             golden_feeds(model.manifest),
-            *(feeds_for(model.manifest, size, pictures) for size in sizes for pictures in (1, PICTURES_AT_A_TIME)),
+            *(feeds_for(model.manifest, size, pictures) for size in sizes for pictures in (1, CROPS_PER_RUN)),
         ]
         for each in feeds:
             model.run(each)

@@ -53,12 +53,12 @@ async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceMa
     from flockd.cli.record import models_of
     from flockd.config import load_drone
     from flockd.daemon import Daemon, clock_at
-    from flockd.pilot.pilot import load_perception
+    from flockd.perception import load_networks
 
     daemon = Daemon(
         config,
         str(args.config),
-        load_networks=lambda: load_perception(config),
+        load_networks=lambda: load_networks(config.perception),
         models=models_of(config),
         recordings=args.record,
         service=service,

@@ -37,7 +37,6 @@ class AutopilotParameters(Section):
     by its own estimate, which GNSS alone leaves off by 0.1 to 0.3 m/s. 0: not at all. Does nothing with `own_velocity:
     autopilot`."""
     velocity_trim_memory: Share = 0.7
-    """Share of the last correction that stays with each step: noise of single steps goes, drifts over several seconds do
-    not."""
+    """Share of the last correction that each step keeps: noise of single steps goes, slow drifts stay."""
     low_battery_share: Share = 0.2
     """The battery counts as low when the autopilot says that no more than this is left."""

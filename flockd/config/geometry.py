@@ -32,7 +32,7 @@ class GeometryParameters(Section):
     min_drone_pairs: Annotated[int, Field(ge=3)] = 12
     """With fewer point pairs a neighbour's motion is not estimated."""
     neighbour_velocity_caution: Positive = 2.0
-    """Factor on the standard deviation of a neighbour's velocity by Eq. 36: it rests on the same ranges as the positions
-    do, and so is not independent of them."""
+    """Factor on the standard deviation of a neighbour's velocity by Eq. 36: it rests on the same ranges as the
+    positions do, and so is not independent of them."""
     refine: bool = True
     """Polish the ego-motion by its reprojection error after Algorithm 1."""

@@ -37,7 +37,7 @@ class DetectionParameters(Section):
     occlusion: Share = 0.25
     """Nothing is seen of what lies behind a drone within this share of its angular size from its centre."""
     max_residuals: Annotated[int, Field(ge=0)] = 6
-    """Residuals, of one image, that are proposed: the largest. An image full of false ones must not cost the deadline."""
+    """Residuals of one image that are proposed, the largest: one full of false ones must not cost the deadline."""
     residual_px: Annotated[int, Field(ge=1)] = 24
     """Image pixels that a residual has at least."""
     residual_distance_px: Annotated[int, Field(ge=0)] = 4

@@ -20,7 +20,6 @@ from flockd.daemon.inspection import Asked, Inspector, position_from_home
 from flockd.daemon.requests import Requests, Wish
 from flockd.daemon.sight import Sight
 from flockd.messages import FloatArray, Setpoint, VehicleState, VelocityCommand
-from flockd.pilot.trim import VelocityTrim
 from flockd.safety import (
     Action,
     Decision,
@@ -120,7 +119,6 @@ class Control:
         inspector: Inspector,
         requests: Requests,
         history: VehicleHistory,
-        trim: VelocityTrim,
         asked: Asked,
         on_tick: Callable[[Decision, Decision], None],
         clock: Callable[[], float],
@@ -129,7 +127,7 @@ class Control:
         assert config.autopilot is not None
         self._autopilot = config.autopilot
         self._link, self._streamer, self._door, self._sight = link, streamer, door, sight
-        self._inspector, self._requests, self._history, self._trim = inspector, requests, history, trim
+        self._inspector, self._requests, self._history = inspector, requests, history
         self._asked, self._on_tick, self._clock = asked, on_tick, clock
         self._supervisor = Supervisor(config.safety)
         self._enough_looks = max(2, config.tracking.confirm_hits)
@@ -199,7 +197,7 @@ class Control:
         look = self._sight.newest
         if look is None or look.flight != self._flight or look.number < self._enough_looks:
             return np.zeros(2), self._yaw_rad, now
-        return look.output.command.velocity + self._trim.velocity, look.output.command.yaw_rad, look.time_s
+        return look.output.command.velocity, look.output.command.yaw_rad, look.time_s
 
     def _around(self, now: float, status: AutopilotStatus, vehicle: VehicleState | None) -> Surroundings:
         known = vehicle is not None and vehicle.velocity_ned is not None

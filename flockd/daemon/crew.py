@@ -13,7 +13,6 @@ from flockd.daemon.control import Control
 from flockd.daemon.networks import WatchedNetworks
 from flockd.daemon.requests import Requests, TakeOff
 from flockd.daemon.sight import Sight
-from flockd.pilot.trim import VelocityTrim
 from flockd.sources import FrameSource
 from flockd.telemetry.publisher import ZenohTelemetry
 
@@ -34,7 +33,6 @@ class Crew:
     telemetry: ZenohTelemetry
     lag: LoopLag
     thermometer: Thermometer
-    trim: VelocityTrim
     wall_clock: WallClock
     dead_tasks: dict[str, str]
     """Why each task that has ended did, by name."""

@@ -21,7 +21,7 @@ from flockd.daemon.computer import LoopLag, Thermometer, WallClock
 from flockd.daemon.control import FLYING, Control, Door, VehicleHistory
 from flockd.daemon.crew import Crew
 from flockd.daemon.inspection import Asked, Inspector
-from flockd.daemon.networks import Networks, WatchedNetworks
+from flockd.daemon.networks import InterruptibleNetworks, WatchedNetworks
 from flockd.daemon.preview import preview
 from flockd.daemon.reports import tell_for_ever, tell_service
 from flockd.daemon.requests import Requests, TakeOff
@@ -29,8 +29,6 @@ from flockd.daemon.service import ServiceManager
 from flockd.daemon.sight import Sight
 from flockd.daemon.worker import BusyError, LateError, Worker
 from flockd.errors import ConfigError, ConfigProblem, FlockdError
-from flockd.messages import FrameSet, PilotOutput, VehicleState
-from flockd.pilot.trim import VelocityTrim
 from flockd.safety import Decision, Event, Gate, State
 from flockd.sources import open_source
 from flockd.telemetry.publisher import ZenohTelemetry
@@ -65,7 +63,7 @@ class Daemon:
         config: DroneConfig,
         file: str,
         *,
-        load_networks: Callable[[], Networks],
+        load_networks: Callable[[], InterruptibleNetworks],
         models: Mapping[str, str],
         recordings: Path | None,
         service: ServiceManager,
@@ -159,25 +157,19 @@ class Daemon:
         streamer.start()
         stack.callback(streamer.close)
         history, lag, thermometer = VehicleHistory(), LoopLag(clock), Thermometer()
-        trim = VelocityTrim(self._autopilot.max_velocity_trim_m_s if config.own_velocity == "vision" else 0.0)
-
-        def on_step(frames: FrameSet, vehicle: VehicleState, output: PilotOutput) -> None:
-            trim.step(vehicle, output)
-            chronicle.step(frames, vehicle, output)
-
-        sight = Sight(config, self._source, networks, history.at, on_step, chronicle.event, clock)
+        sight = Sight(config, self._source, networks, history.at, chronicle.step, chronicle.event, clock)
         stack.push_async_callback(_patiently, closing, sight.leave)
         dead: dict[str, str] = {}
         inspector = Inspector(config, self._source, sight, networks, gate, lag, thermometer, dead, clock)
         requests = Requests(link, chronicle.event)
         control = Control(
-            config, link, streamer, door, sight, inspector, requests, history, trim, self._asked, self._on_tick, clock
+            config, link, streamer, door, sight, inspector, requests, history, self._asked, self._on_tick, clock
         )  # fmt: skip
         take_off = TakeOff(link, streamer, self._asked, lambda: control.decision, chronicle.event)
         crew = Crew(
             link=link, streamer=streamer, source=self._source, sight=sight, networks=networks, control=control,
             requests=requests, take_off=take_off, chronicle=chronicle, telemetry=telemetry, lag=lag,
-            thermometer=thermometer, trim=trim, wall_clock=WallClock(chronicle.event, time.monotonic), dead_tasks=dead,
+            thermometer=thermometer, wall_clock=WallClock(chronicle.event, time.monotonic), dead_tasks=dead,
         )  # fmt: skip
         taker = self._taker(asyncio.get_running_loop(), chronicle)
         telemetry.announce(config.name, self._about(), taker, functools.partial(_picture, sight))

@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from flockd.daemon.worker import Worker
-from flockd.messages import Float32Array, UInt8Array
-from flockd.perception import Picture, RangeEstimate, SceneMaps
-from flockd.pilot import Perceiver
+from flockd.geometry import RigCamera
+from flockd.messages import Float32Array, Frame, UInt8Array
+from flockd.perception import Crop, Networks, RangeEstimate, SceneMaps
 
 TERMINATE_S = 0.5
 """How long a run may take to end when told to; ONNX Runtime takes a few milliseconds."""
@@ -17,8 +17,8 @@ MAX_ABANDONED = 2
 """Workers given up in a row, before only a new process can help."""
 
 
-class Networks(Perceiver, Protocol):
-    """A perceiver that can be interrupted."""
+class InterruptibleNetworks(Networks, Protocol):
+    """Networks whose runs can be ended."""
 
     def terminate(self) -> None:
         """Ends every call under way, from any thread."""
@@ -29,11 +29,11 @@ class NetworkStuckError(Exception):
 
 
 class WatchedNetworks:
-    """A `Perceiver` in front of another; one thread calls it, the counts are for any thread."""
+    """`Networks` in front of others; one thread calls it, the counts are for any thread."""
 
-    def __init__(self, networks: Networks, deadline_s: float) -> None:
-        self.picture_size = networks.picture_size
-        self.map_scale = networks.map_scale
+    def __init__(self, networks: InterruptibleNetworks, deadline_s: float) -> None:
+        self.crop_size = networks.crop_size
+        self.map_stride = networks.map_stride
         self._networks = networks
         self._deadline_s = deadline_s
         self._worker = Worker("networks")
@@ -53,22 +53,22 @@ class WatchedNetworks:
 
     @property
     def has_distance(self) -> bool:
-        """See `Perceiver`, and so for the next three."""
+        """See `Networks`, and so for the next three."""
         return self._networks.has_distance
 
-    def flow(self, camera: str, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
+    def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
         """Raises NetworkStuckError; so do the next two."""
-        answer: Float32Array = self._call(self._networks.flow, camera, first, second, labels)
+        answer: Float32Array = self._call(self._networks.flow, first, second, labels)
         return answer
 
-    def scene(self, camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:
+    def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
         """Depth and drones of one image."""
-        answer: SceneMaps = self._call(self._networks.scene, camera, image, geometry)
+        answer: SceneMaps = self._call(self._networks.scene, frame, camera, ground)
         return answer
 
-    def ranges(self, pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
-        """Range and centre of the drone in the middle of each picture."""
-        answer: tuple[RangeEstimate, ...] = self._call(self._networks.ranges, pictures)
+    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+        """Range and centre of the drone in the middle of each crop."""
+        answer: tuple[RangeEstimate, ...] = self._call(self._networks.ranges, crops)
         return answer
 
     def leave(self) -> None:

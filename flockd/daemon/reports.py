@@ -70,11 +70,18 @@ def _flight_message(crew: Crew, now: float) -> FlightMessage:
         heartbeat_age_s=status.heartbeat_age_s,
         battery_share=status.battery_share,
         height_m=None if vehicle is None else vehicle.height_m,
-        velocity_trim=[float(v) for v in crew.trim.velocity],
+        velocity_trim=_velocity_trim(crew),
         silence=stream.silence,
         setpoints_sent=stream.sent,
         setpoints_missed=stream.missed,
     )
+
+
+def _velocity_trim(crew: Crew) -> list[float]:
+    """(2,) m/s, north and east, of the newest command."""
+    newest = crew.sight.newest
+    trim = None if newest is None else newest.output.command.trim
+    return [0.0, 0.0] if trim is None else [float(v) for v in trim]
 
 
 def _computer_message(crew: Crew, now: float) -> ComputerMessage:

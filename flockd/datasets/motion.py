@@ -12,8 +12,8 @@ from flockd.config.drone import DroneConfig
 from flockd.datasets.dataset import Dataset, DatasetFrame, Moment
 from flockd.geometry import RigCamera, RigidTransform, build_rig, rotation_angle_deg
 from flockd.messages import EgoMotion, Float32Array, Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
-from flockd.perception import Picture, RangeEstimate, SceneMaps
-from flockd.pilot import FlockPilot, Perceiver
+from flockd.perception import Crop, Networks, RangeEstimate, SceneMaps
+from flockd.pilot import FlockPilot
 
 _FLAT_DEVIATION = 1.0
 """Grey levels of standard deviation under which an image shows nothing: matched with anything, it would stand still."""
@@ -54,9 +54,9 @@ def size_of(motion: RigidTransform) -> tuple[float, float]:
 class RecordedDepth:
     """Stands before the learned perception and answers depth as it was recorded."""
 
-    def __init__(self, learned: Perceiver) -> None:
-        self.picture_size = learned.picture_size
-        self.map_scale = learned.map_scale
+    def __init__(self, learned: Networks) -> None:
+        self.crop_size = learned.crop_size
+        self.map_stride = learned.map_stride
         self._learned = learned
         self._depth: Float32Array | None = None
 
@@ -69,22 +69,22 @@ class RecordedDepth:
         """The depth of the next step's image; None: what is learned."""
         self._depth = depth
 
-    def flow(self, camera: str, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
+    def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
         """The learned flow."""
-        return self._learned.flow(camera, first, second, labels)
+        return self._learned.flow(first, second, labels)
 
-    def scene(self, camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:
+    def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
         """The learned drones, and the recorded depth."""
-        scene = self._learned.scene(camera, image, geometry)
+        scene = self._learned.scene(frame, camera, ground)
         return scene if self._depth is None else replace(scene, depth=self._depth, open=None)
 
-    def ranges(self, pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
+    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         """The learned ranges."""
-        return self._learned.ranges(pictures)
+        return self._learned.ranges(crops)
 
 
 def fly_pairs(
-    dataset: Dataset, config: DroneConfig, learned: Perceiver, *, stride: int, recorded_depth: bool
+    dataset: Dataset, config: DroneConfig, learned: Networks, *, stride: int, recorded_depth: bool
 ) -> Iterator[Pair]:
     """Each frame i with frame i + ``stride``, in order, as a pilot with this configuration sees them.
 

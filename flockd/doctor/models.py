@@ -16,7 +16,8 @@ from flockd.errors import ModelError
 from flockd.inference import OnnxModel, manifests_of
 from flockd.inference.providers import engines_folder
 from flockd.messages import Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
-from flockd.pilot import FlockPilot, Perceiver
+from flockd.perception import Networks
+from flockd.pilot import FlockPilot
 
 STEPS = 4
 """The first finds no images before it, and warms up."""
@@ -51,9 +52,9 @@ def _each(config: DroneConfig) -> Iterator[Finding]:
         yield passed(about, f"hash and golden answer are right, {size_mb:.1f} MB, run by {model.provider}")
 
 
-def time_steps(config: DroneConfig, perceiver: Perceiver | None = None) -> list[tuple[float, PilotOutput]]:
+def time_steps(config: DroneConfig, networks: Networks | None = None) -> list[tuple[float, PilotOutput]]:
     """Whole steps of the pilot over an empty meadow, at the size of the cameras: seconds, and what it found."""
-    pilot = FlockPilot(config, perceiver, stopwatch=time.perf_counter)
+    pilot = FlockPilot(config, networks, stopwatch=time.perf_counter)
     timed = []
     for number in range(STEPS):
         time_s = number * config.step_s

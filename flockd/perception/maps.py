@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from flockd.geometry import VirtualCrop
+from flockd.geometry import PinholeCamera, RigidTransform
 from flockd.messages import BoolArray, Float32Array, FloatArray, UInt8Array
 from flockd.perception.detection.instances import Instance
 
@@ -42,8 +42,8 @@ class Crop:
 
     image: UInt8Array
     """(size, size, 3) RGB"""
-    view: VirtualCrop
-    """The virtual camera: its intrinsics and its pose in the body."""
+    camera: PinholeCamera
+    T_body_camera: RigidTransform
     mirrored: bool = False
     """Whether the network is to be given the mirror image, on which it errs differently. The estimate is as if not."""
 

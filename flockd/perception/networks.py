@@ -137,9 +137,7 @@ class OnnxNetworks:
         masks: Sequence[Float32Array | None] = [None] * len(crops)
         if "mask" in outputs[0]:
             masks = list(np.concatenate([output["mask"][:, 0] for output in outputs]))
-        return tuple(
-            self._estimate(row, crop, mask) for row, crop, mask in zip(rows, crops, masks, strict=True)
-        )
+        return tuple(self._estimate(row, crop, mask) for row, crop, mask in zip(rows, crops, masks, strict=True))
 
     def _estimate(self, row: Float32Array, crop: Crop, mask: Float32Array | None) -> RangeEstimate:
         """The output's columns, with a mirror image's turned back."""
@@ -148,7 +146,7 @@ class OnnxNetworks:
             right = -right
             mask = None if mask is None else np.ascontiguousarray(mask[:, ::-1])
         return RangeEstimate(
-            log_range=log_range_per_focal + float(np.log(crop.view.camera.focal_px)),
+            log_range=log_range_per_focal + float(np.log(crop.camera.focal_px)),
             log_range_sigma=float(np.exp(log_sigma)),
             centre=np.array([self.crop_size / 2 + right, self.crop_size / 2 + down]),
             size_m=float(np.exp(log_range_per_focal + log_apparent_size)),
@@ -186,9 +184,7 @@ class OnnxNetworks:
             metres = 1.0 / np.maximum(depth, 1.0 / _MAX_DEPTH_M) if is_inverse else depth
             return replace(scene, depth=np.asarray(metres, np.float32))
         inverse = depth if is_inverse else 1.0 / np.maximum(depth, _MIN_DEPTH_M)
-        return replace(
-            scene, open=OpenDepth(np.asarray(inverse, np.float32), shift=self._unknown == "scale_and_shift")
-        )
+        return replace(scene, open=OpenDepth(np.asarray(inverse, np.float32), shift=self._unknown == "scale_and_shift"))
 
     def _what_is_unknown(self, config: PerceptionConfig) -> Unknown:
         """What of the depth is left for the autopilot's height or velocity to fix. Raises ModelError."""
@@ -237,7 +233,7 @@ class OnnxNetworks:
 
 
 def geometry_planes(camera: RigCamera, ground: Float32Array | None, stride: int) -> Float32Array:
-    """(3, h / stride, w / stride): tangents of the rays right and down, and the inverse depth of flat ground, else 0."""
+    """(3, h / stride, w / stride): tangents of the rays right and down, inverse depth of flat ground (0: none)."""
     tangents = _ray_tangents(camera, stride)
     flat = np.zeros(tangents.shape[1:], np.float32) if ground is None else ground
     return np.concatenate([tangents, flat[None]])

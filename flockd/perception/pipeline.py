@@ -9,12 +9,12 @@ from flockd.config.perception import PerceptionConfig
 from flockd.geometry import Rig, ground_inverse_depth
 from flockd.inference import models_folder
 from flockd.messages import Float32Array, Frame, FrameSet, VehicleState
+from flockd.perception.depth import VelocityScale, fix_by_height
 from flockd.perception.detection.detector import DetectionTrace, Detector
 from flockd.perception.detection.masks import depth_of_drones, without_borders
 from flockd.perception.maps import SceneMaps
 from flockd.perception.networks import Networks, OnnxNetworks
 from flockd.perception.observation import CameraObservation, Observation
-from flockd.perception.depth import VelocityScale, fix_by_height
 from flockd.tracking import ExpectedNeighbour
 
 Reasons = list[str]

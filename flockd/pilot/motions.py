@@ -58,14 +58,11 @@ def neighbour_motions(
     return motions, reasons
 
 
-def neighbour_pairs(
-    rig: Rig, observation: Observation, parameters: GeometryParameters
-) -> dict[int, PointPairs | None]:
+def neighbour_pairs(rig: Rig, observation: Observation, parameters: GeometryParameters) -> dict[int, PointPairs | None]:
     """What belongs to each neighbour before and now, by its current label."""
     same = _labels_by_flow(rig, observation, parameters.max_drone_pixels)
     table = np.full(256, UNCLASSED, np.uint8)
-    for before, after in same.items():
-        table[before] = after
+    table[list(same.keys())] = list(same.values())
     pairs: dict[int, list[PointPairs]] = {after: [] for after in same.values()}
     for camera, before, after, flow in _seen_twice(rig, observation):
         relabelled = table[before.labels]
@@ -73,7 +70,8 @@ def neighbour_pairs(
             pixels = label_pixels(relabelled, label, parameters.max_drone_pixels)
             if len(pixels):
                 lifted = lift_matches(
-                    camera, pixels, flow, before.depth, after.depth, relabelled, after.labels, max_depth_m=parameters.max_depth_m,
+                    camera, pixels, flow, before.depth, after.depth, relabelled, after.labels,
+                    max_depth_m=parameters.max_depth_m,
                 )  # fmt: skip
                 found.append(lifted)
     return {label: PointPairs.concatenate(found) if found else None for label, found in pairs.items()}

@@ -9,6 +9,7 @@ import numpy as np
 from flockd.flocking import limit_norm
 from flockd.messages import EgoMotion, FloatArray, VehicleState
 
+
 class VelocityTrim:
     """The autopilot's velocity less the one that the cameras measured, averaged over some steps and limited.
 
@@ -17,7 +18,7 @@ class VelocityTrim:
     """
 
     def __init__(self, limit_m_s: float, memory: float) -> None:
-        """``limit_m_s``: the trim's largest norm; 0: no trim. ``memory``: share of the last trim that each step keeps."""
+        """``limit_m_s``: its largest norm; 0: no trim. ``memory``: share of the last trim that each step keeps."""
         self._limit_m_s, self._memory = limit_m_s, memory
         self._before: VehicleState | None = None
         self._mean = np.zeros(2)

@@ -12,7 +12,7 @@ import numpy as np
 
 from flockd.flocking import desired_velocity
 from flockd.messages import FloatArray, PilotOutput
-from flockd.pilot import FlockPilot
+from flockd.pilot import FlockPilot, StepTrace
 from flockd.recording import RecordingError
 from flockd.recording.codec import from_json, to_json
 from flockd.recording.reader import Recording, head_of
@@ -76,9 +76,10 @@ def filmstrip(
     pictured = pictured_steps(steps)
     frames: list[FilmstripFrame] = []
     for index, step in enumerate(recording.steps()):
-        output = pilot.step(step.frames, step.vehicle)
+        trace = StepTrace()
+        output = pilot.step(step.frames, step.vehicle, trace)
         if index in pictured:
-            seen = picture(pilot, output, names.index(recording.drone), "" if log.has_truth else recording.drone)
+            seen = picture(trace, output, names.index(recording.drone), "" if log.has_truth else recording.drone)
             frames += (replace(one, time_s=one.time_s - log.meta["clock_at_start_s"]) for one in seen)
         progress(index + 1, steps)
     return tuple(frames)

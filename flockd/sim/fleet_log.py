@@ -15,8 +15,8 @@ from flockd.config.scenario import ScenarioConfig
 from flockd.flocking import desired_velocity
 from flockd.flocking.metrics import order, union
 from flockd.messages import FloatArray, PilotOutput
-from flockd.pilot import FlockPilot
-from flockd.pilot.pilot import load_perception
+from flockd.perception import load_networks
+from flockd.pilot import FlockPilot, StepTrace
 from flockd.recording.codec import from_json
 from flockd.recording.mcap_file import Entry, read_records
 from flockd.recording.reader import Recording
@@ -149,13 +149,14 @@ def filmstrip(recordings: Path, flown: Flown) -> tuple[FilmstripFrame, ...]:
     if path is None:
         return ()
     recording = Recording(path)
-    perception = load_perception(recording.config)
+    perception = load_networks(recording.config.perception)
     times = [time_s for _, time_s in recording.contents.steps]
     strip: list[FilmstripFrame] = []
     for index in sorted(pictured_steps(len(times))):
         pilot = FlockPilot(recording.config, perception)
         for step in recording.steps(times[max(index - 1, 0)], times[index]):
-            output = pilot.step(step.frames, step.vehicle)
+            trace = StepTrace()
+            output = pilot.step(step.frames, step.vehicle, trace)
         begin_s = flown.shootings[0].time_s
-        strip += [replace(frame, time_s=frame.time_s - begin_s) for frame in picture(pilot, output, _FILMSTRIP_DRONE)]
+        strip += [replace(frame, time_s=frame.time_s - begin_s) for frame in picture(trace, output, _FILMSTRIP_DRONE)]
     return tuple(strip)

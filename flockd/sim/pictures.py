@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flockd.messages import PilotOutput
-from flockd.pilot import FlockPilot
+from flockd.pilot import StepTrace
 from flockd.report.filmstrip import FilmstripFrame
 
 _MOMENTS = 6
@@ -18,9 +18,9 @@ def pictured_steps(steps: int) -> set[int]:
     return set(np.linspace(1, steps - 1, _MOMENTS).astype(int).tolist())
 
 
-def picture(pilot: FlockPilot, output: PilotOutput, drone: int, name: str = "") -> list[FilmstripFrame]:
+def picture(trace: StepTrace, output: PilotOutput, drone: int, name: str = "") -> list[FilmstripFrame]:
     """What a pilot worked with in the step that gave ``output``; nothing before its first."""
-    view = pilot.last_view
+    view = trace.observation
     if view is None:
         return []
     cameras = view.cameras
@@ -33,7 +33,7 @@ def picture(pilot: FlockPilot, output: PilotOutput, drone: int, name: str = "") 
             images={name: c.image for name, c in cameras.items()},
             depth={name: np.where(c.depth < _SKY_M, c.depth, np.float32(np.inf)) for name, c in cameras.items()},
             labels={name: np.where(c.labels == 255, np.uint8(0), c.labels) for name, c in cameras.items()},
-            flow=dict(pilot.last_flows),
+            flow=view.flows,
             track_ids={s.label: t for s, t in zip(output.detections, output.detection_tracks, strict=True)},
             ranges={s.label: float(np.linalg.norm(s.position)) for s in output.detections},
         )

@@ -15,9 +15,8 @@ from flockd.config.scenario import ScenarioConfig
 from flockd.errors import UsageError
 from flockd.flocking import FlockingLaw, course, desired_velocity
 from flockd.messages import FloatArray, PilotOutput
-from flockd.perception import Perception
-from flockd.pilot import FlockPilot
-from flockd.pilot.pilot import load_perception
+from flockd.perception import load_networks
+from flockd.pilot import FlockPilot, StepTrace
 from flockd.recording import Recorder
 from flockd.recording.truth import TrueDrone, Truth
 from flockd.report.filmstrip import FilmstripFrame
@@ -142,7 +141,7 @@ class _SeeingCrew:
         self._telemetry, self._recorders = telemetry, recorders
         self._photographer = Photographer(scenario)
         count = len(scenario.vehicles)
-        learned: Perception = load_perception(scenario.drone)
+        learned = load_networks(scenario.drone.perception)
         self._truths = [TruthPerception(learned, swap, self._photographer.rig) for _ in range(count)] if swap else []
         self._pilots = [
             FlockPilot(scenario.drone, self._truths[i] if swap else learned, stopwatch=time.perf_counter)
@@ -152,12 +151,14 @@ class _SeeingCrew:
         # Pilots share nothing but the networks, so their order does not matter: each thinks as soon as its images are
         # rendered, all at a time, for five one after the other on two cores would leave one core idle for the last.
         self._side_by_side = ThreadPoolExecutor(min(count, 2 * (os.cpu_count() or 1) + 1))
+        self._traces = [StepTrace() for _ in range(count)]
         self._outputs: list[PilotOutput] = []
 
     def decide(self, step: int, time_s: float, vehicles: Vehicles, book: LogBook) -> tuple[FloatArray, FloatArray]:
         """Velocity setpoints (n, 2) and headings (n,)."""
         steps = []
         render_ms = []
+        self._traces = [StepTrace() for _ in self._pilots]
         for i, pilot in enumerate(self._pilots):
             begin = time.perf_counter()
             frames, shot = self._photographer.photograph(i, step, time_s, vehicles)
@@ -165,7 +166,7 @@ class _SeeingCrew:
                 self._truths[i].show(shot)
             render_ms.append(1e3 * (time.perf_counter() - begin))
             state = self._autopilots[i].read(time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i])
-            steps.append((frames, state, self._side_by_side.submit(pilot.step, frames, state)))
+            steps.append((frames, state, self._side_by_side.submit(pilot.step, frames, state, self._traces[i])))
         self._outputs = [thinking.result() for _, _, thinking in steps]
         truth = self._truth(step, time_s, vehicles)
         for i, (output, (frames, state, _)) in enumerate(zip(self._outputs, steps, strict=True)):
@@ -195,4 +196,4 @@ class _SeeingCrew:
 
     def picture(self) -> list[FilmstripFrame]:
         """What the chosen drone's pilot worked with in the last step."""
-        return picture(self._pilots[_FILMSTRIP_DRONE], self._outputs[_FILMSTRIP_DRONE], _FILMSTRIP_DRONE)
+        return picture(self._traces[_FILMSTRIP_DRONE], self._outputs[_FILMSTRIP_DRONE], _FILMSTRIP_DRONE)

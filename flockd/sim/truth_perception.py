@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flockd.geometry import Rig
-from flockd.messages import Float32Array, FloatArray, UInt8Array
-from flockd.perception import Instance, Picture, RangeEstimate, SceneMaps
-from flockd.pilot import Perceiver
+from flockd.geometry import Rig, RigCamera
+from flockd.messages import Float32Array, FloatArray, Frame, UInt8Array
+from flockd.perception import Crop, Instance, Networks, RangeEstimate, SceneMaps
 from flockd.sim.renderer import View, true_flow
 
 ROLES = ("flow", "depth", "segmentation", "distance")
@@ -42,9 +41,9 @@ class TruthPerception:
     It is told with `show` what the cameras are about to see; the pilot knows nothing of it.
     """
 
-    def __init__(self, learned: Perceiver, swap: frozenset[str], rig: Rig) -> None:
-        self.picture_size = learned.picture_size
-        self.map_scale = learned.map_scale
+    def __init__(self, learned: Networks, swap: frozenset[str], rig: Rig) -> None:
+        self.crop_size = learned.crop_size
+        self.map_stride = learned.map_stride
         self._learned, self._swap, self._rig = learned, swap, rig
         self._now: Shot | None = None
         self._before: Shot | None = None
@@ -58,11 +57,11 @@ class TruthPerception:
         """What the next step's frames truly hold."""
         self._before, self._now = self._now, shot
 
-    def flow(self, camera: str, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
+    def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
         """The true or the learned flow."""
         if "flow" not in self._swap:
-            return self._learned.flow(camera, first, second, labels)
-        before, now = _known(self._before), _known(self._now)
+            return self._learned.flow(first, second, labels)
+        before, now, camera = _known(self._before), _known(self._now), second.camera
         flow, _ = true_flow(
             before.views[camera], now.views[camera], _matrix(self._rig, camera),
             R_ned_camera=(before.R_ned_cameras[camera], now.R_ned_cameras[camera]),
@@ -72,10 +71,10 @@ class TruthPerception:
         )  # fmt: skip
         return flow
 
-    def scene(self, camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:
+    def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
         """Depth and drones, each true or learned."""
         now = _known(self._now)
-        view = now.views[camera]
+        view = now.views[frame.camera]
         true = SceneMaps(
             depth=np.where(np.isfinite(view.depth), view.depth, np.float32(_SKY_M)),
             labels=view.ids,
@@ -83,45 +82,46 @@ class TruthPerception:
         )
         if {"depth", "segmentation"} <= self._swap:
             return true
-        learned = self._learned.scene(camera, image, geometry)
+        learned = self._learned.scene(frame, camera, ground)
         depth = true.depth if "depth" in self._swap else learned.depth
         drones = true if "segmentation" in self._swap else learned
         return replace(drones, depth=depth, open=None if "depth" in self._swap else learned.open)
 
-    def ranges(self, pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
-        """The true range of the drone nearest to each picture's middle, or the learned one."""
+    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+        """The true range of the drone nearest to each crop's middle, or the learned one."""
         if "distance" not in self._swap:
-            return self._learned.ranges(pictures)
-        return tuple(self._range(picture, _known(self._now)) for picture in pictures)
+            return self._learned.ranges(crops)
+        return tuple(self._range(crop, _known(self._now)) for crop in crops)
 
-    def _instances(self, camera: str, now: Shot) -> list[Instance]:
-        ids = now.views[camera].ids
+    def _instances(self, camera: RigCamera, now: Shot) -> list[Instance]:
+        name = camera.name
+        ids = now.views[name].ids
         found = []
         for drone in now.shown:
             rows, columns = np.nonzero(ids == drone + 1)
             if rows.size < _MIN_PIXELS:
                 continue
-            point = now.R_ned_cameras[camera].T @ (now.drone_positions[drone] - now.positions[camera])
-            centre = self._rig.cameras[camera].camera.project(point[None])[0]
+            point = now.R_ned_cameras[name].T @ (now.drone_positions[drone] - now.positions[name])
+            centre = camera.camera.project(point[None])[0]
             if not np.isfinite(centre).all():
                 centre = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
             box = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], np.float64)
             found.append(Instance(drone + 1, centre, box, float(rows.size)))
         return sorted(found, key=lambda one: -one.area_px)
 
-    def _range(self, picture: Picture, now: Shot) -> RangeEstimate:
-        size = self.picture_size
+    def _range(self, crop: Crop, now: Shot) -> RangeEstimate:
+        size = self.crop_size
         visible = [d for d in now.shown if any((view.ids == d + 1).sum() >= _MIN_PIXELS for view in now.views.values())]
         if not visible:
-            return RangeEstimate(1.0, 1.0, np.full(2, size / 2), _SIZE_M, is_drone=0.0)
+            return RangeEstimate(0.0, 1.0, np.full(2, size / 2), _SIZE_M, drone_probability=0.0)
         in_body = (now.drone_positions[visible] - now.position) @ now.R_ned_body
-        in_picture = (in_body - picture.position) @ picture.R_body_camera
-        ranges = np.linalg.norm(in_picture, axis=1)
-        point = in_picture[np.argmax(in_picture[:, 2] / ranges)]
-        range_m = float(np.linalg.norm(point))
-        centre = size / 2 + picture.focal_px * point[:2] / max(point[2], 1e-3)
+        in_view = crop.T_body_camera.inverse().apply(in_body)
+        ranges = np.linalg.norm(in_view, axis=1)
+        point = in_view[np.argmax(in_view[:, 2] / ranges)]
+        log_range = float(np.log(np.linalg.norm(point)))
+        centre = size / 2 + crop.camera.focal_px * point[:2] / max(point[2], 1e-3)
         inside = bool(((centre > 0) & (centre < size)).all())
-        return RangeEstimate(range_m, 0.001, np.clip(centre, -size, 2 * size), _SIZE_M, is_drone=float(inside))
+        return RangeEstimate(log_range, 0.001, np.clip(centre, -size, 2 * size), _SIZE_M, float(inside))
 
 
 def _known(shot: Shot | None) -> Shot:

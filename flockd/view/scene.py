@@ -10,9 +10,9 @@ import numpy as np
 
 from flockd.geometry import PointPairs, Rig, build_rig
 from flockd.messages import EgoMotion, Float32Array, FloatArray, PilotOutput, UInt8Array
-from flockd.pilot import FlockPilot
+from flockd.perception import Observation
+from flockd.pilot import FlockPilot, StepTrace
 from flockd.pilot.motions import background_pairs, neighbour_pairs
-from flockd.pilot.views import RigView
 from flockd.recording.codec import Json, from_json, to_json
 from flockd.recording.mcap_file import Entry, read_records
 from flockd.recording.own_path import OwnPath
@@ -81,7 +81,7 @@ class Scenes:
 
     def moments(self, start_s: float, end_s: float) -> Iterator[Moment]:
         """Those within this time of the recording's clock. Raises RecordingError where it is spoilt."""
-        path, before, last = OwnPath(), None, None
+        path, last = OwnPath(), None
         for step in self._recording.steps(start_s, end_s):
             output = None if step.output is None else from_json(PilotOutput, step.output)
             velocity = None if output is None else output.velocity
@@ -89,7 +89,7 @@ class Scenes:
             place = Place(position, step.vehicle.R_ned_body)
             maps = None
             if self._pilot is not None:
-                maps, before = self._look(self._pilot, step, before, (last, place))
+                maps = self._maps(self._pilot, step, (last, place))
             yield Moment(
                 number=step.number,
                 time_s=step.frames.time_s,
@@ -102,39 +102,35 @@ class Scenes:
             )
             last = place
 
-    def _look(
-        self, pilot: FlockPilot, step: RecordedStep, before: RigView | None, places: tuple[Place | None, Place]
-    ) -> tuple[Maps | None, RigView | None]:
-        output = pilot.step(step.frames, step.vehicle)
+    def _maps(self, pilot: FlockPilot, step: RecordedStep, places: tuple[Place | None, Place]) -> Maps | None:
+        trace = StepTrace()
+        output = pilot.step(step.frames, step.vehicle, trace)
         if step.output is not None:
             self.compared += 1
             self.equal += _without_times(to_json(output)) == _without_times(step.output)
-        view = pilot.last_view
-        if view is None:
-            return None, None
-        pairs = {} if before is None else self._pairs(before, view, pilot, output.ego_motion, places)
-        cameras = view.cameras
-        return Maps({n: c.labels for n, c in cameras.items()}, {n: c.depth for n, c in cameras.items()}, pairs), view
+        if trace.observation is None:
+            return None
+        pairs = self._pairs(trace.observation, output.ego_motion, places)
+        cameras = trace.observation.cameras
+        return Maps({n: c.labels for n, c in cameras.items()}, {n: c.depth for n, c in cameras.items()}, pairs)
 
     def _pairs(
         self,
-        before: RigView,
-        view: RigView,
-        pilot: FlockPilot,
+        observation: Observation,
         ego: EgoMotion | None,
         places: tuple[Place | None, Place],
     ) -> dict[str, FloatArray]:
         """Nothing where no camera has both frames."""
         last, here = places
-        flows, parameters = pilot.last_flows, self._recording.config.geometry
-        if last is None or not flows:
+        parameters = self._recording.config.geometry
+        if last is None or observation.previous is None or not observation.flows:
             return {}
-        still = background_pairs(self.rig, before, view, flows, parameters)
+        still = background_pairs(self.rig, observation, parameters)
         kept = np.zeros(len(still), dtype=np.bool_)
         if ego is not None:
             off = still.previous - (still.current @ ego.rotation.T + ego.translation)  # Eq. 7
             kept = np.linalg.norm(off, axis=1) <= ego.threshold_m
-        drones = neighbour_pairs(self.rig, before, view, flows, parameters)
+        drones = neighbour_pairs(self.rig, observation, parameters)
         found = {"still": still.select(kept), "rejected": still.select(~kept)}
         found |= {f"drone {label}": pairs for label, pairs in drones.items() if pairs is not None}
         return {kind: _segments(pairs, last, here) for kind, pairs in found.items()}

@@ -10,7 +10,7 @@ import pytest
 from flockd.config import Overrides, load_drone, load_scenario, schema_of
 from flockd.config.document import core_scalar
 from flockd.errors import ConfigError, ConfigProblem, ModelError
-from flockd.pilot.pilot import load_perception
+from flockd.perception import load_networks
 
 CONFIG = Path(__file__).parents[2] / "config"
 
@@ -284,15 +284,15 @@ def test_models_that_are_not_there_are_told_with_where_they_were_looked_for(tmp_
     (tmp_path / "models").mkdir()
     (tmp_path / "drone.yaml").write_text(_with("perception: {models_dir: modles}"), encoding="utf-8")
     with pytest.raises(ModelError, match=rf"^perception\.models_dir: {tmp_path}/modles is no folder; name the one "):
-        load_perception(load_drone(tmp_path / "drone.yaml"))
+        load_networks(load_drone(tmp_path / "drone.yaml").perception)
     (tmp_path / "drone.yaml").write_text(_with("perception: {models_dir: models}"), encoding="utf-8")
     with pytest.raises(
         ModelError, match=rf"^perception\.flow: there is no model 'flow_int8' \({tmp_path}/models/flow_int8\.yaml "
     ):
-        load_perception(load_drone(tmp_path / "drone.yaml"))
+        load_networks(load_drone(tmp_path / "drone.yaml").perception)
     (tmp_path / "drone.yaml").write_text(_with("perception: {flow: my/flow.yaml}"), encoding="utf-8")
     with pytest.raises(ModelError, match=rf"\({tmp_path}/my/flow\.yaml is missing\)"):
-        load_perception(load_drone(tmp_path / "drone.yaml"))
+        load_networks(load_drone(tmp_path / "drone.yaml").perception)
 
 
 def test_a_wrong_override_is_told_as_such() -> None:

@@ -27,8 +27,9 @@ from flockd.config.safety import SafetyParameters
 from flockd.config.source import SharedMemoryParameters, SourceParameters
 from flockd.config.telemetry import TelemetryParameters
 from flockd.daemon import Daemon, Ending, ServiceManager
+from flockd.geometry import RigCamera
 from flockd.messages import Float32Array, Frame, UInt8Array
-from flockd.perception import Picture, RangeEstimate, SceneMaps
+from flockd.perception import Crop, RangeEstimate, SceneMaps
 from flockd.sources import FramePublisher
 from flockd.telemetry.watcher import FleetWatcher, Heard
 from tests.autopilot.flight import until
@@ -46,8 +47,8 @@ PATIENT = SafetyParameters(degraded_load=50.0, max_load=100.0, max_loop_lag_s=2.
 class TinyPerceiver:
     """Not networks: says that all stands still before a tilted wall, and sees no drone. A test may spoil it."""
 
-    picture_size = 96
-    map_scale = 2
+    crop_size = 96
+    map_stride = 2
     has_distance = True
 
     def __init__(self) -> None:
@@ -63,20 +64,21 @@ class TinyPerceiver:
         if self.ends_when_told:
             self.hangs.clear()
 
-    def flow(self, camera: str, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
+    def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
         if self.astray > 0:
             self.astray -= 1
             raise FloatingPointError("model tiny: output flow is not finite")
         while self.hangs.is_set():
             time.sleep(0.01)
-        return np.zeros((*first.shape[:2], 2), np.float32)
+        return np.zeros((*first.image.shape[:2], 2), np.float32)
 
-    def scene(self, camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:
-        rows, columns = np.mgrid[0 : image.shape[0], 0 : image.shape[1]]
+    def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
+        height, width = frame.image.shape[:2]
+        rows, columns = np.mgrid[0:height, 0:width]
         depth = (5.0 + 0.02 * rows + 0.01 * columns).astype(np.float32)
-        return SceneMaps(depth, np.zeros(image.shape[:2], np.uint8), ())
+        return SceneMaps(depth, np.zeros((height, width), np.uint8), ())
 
-    def ranges(self, pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
+    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         return ()
 
 

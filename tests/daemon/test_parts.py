@@ -27,11 +27,12 @@ from flockd.daemon.worker import BusyError, LateError, Worker
 from flockd.data import data_path
 from flockd.errors import UnavailableError
 from flockd.inference import OnnxModel
-from flockd.messages import VehicleState
+from flockd.messages import Frame, VehicleState
 from flockd.sources import CameraStatus, Count
 from tests.daemon.aboard import TinyPerceiver
 
 IMAGE = np.zeros((48, 64, 3), np.uint8)
+FRAME = Frame("front", IMAGE, 0.0, 0)
 NO_DRONES = np.zeros((48, 64), np.uint8)
 
 
@@ -63,24 +64,24 @@ def _raises_timeout() -> None:
 def test_a_stuck_network_is_ended_then_abandoned_then_hopeless() -> None:
     tiny = TinyPerceiver()
     networks = WatchedNetworks(tiny, deadline_s=0.05)
-    networks.flow("front", IMAGE, IMAGE, NO_DRONES)
+    networks.flow(FRAME, FRAME, NO_DRONES)
     assert (networks.stuck, networks.hopeless) == (False, False)
 
     tiny.hangs.set()
     with pytest.raises(NetworkStuckError, match=r"did not answer within 0\.05 s"):
-        networks.flow("front", IMAGE, IMAGE, NO_DRONES)
+        networks.flow(FRAME, FRAME, NO_DRONES)
     assert (networks.stuck, networks.ended, tiny.told_to_end, networks.hopeless) == (True, 1, 1, False)
-    networks.flow("front", IMAGE, IMAGE, NO_DRONES)
+    networks.flow(FRAME, FRAME, NO_DRONES)
     assert not networks.stuck, "it answers again"
 
     tiny.ends_when_told = False
     tiny.hangs.set()
     for hopeless in (False, True):
         with pytest.raises(NetworkStuckError):
-            networks.flow("front", IMAGE, IMAGE, NO_DRONES)
+            networks.flow(FRAME, FRAME, NO_DRONES)
         assert networks.hopeless is hopeless
     tiny.hangs.clear()
-    networks.flow("front", IMAGE, IMAGE, NO_DRONES)
+    networks.flow(FRAME, FRAME, NO_DRONES)
     assert not networks.hopeless, "a worker of its own answers"
 
 
@@ -107,7 +108,7 @@ def test_a_network_gone_astray_is_counted() -> None:
     tiny.astray = 1
     networks = WatchedNetworks(tiny, deadline_s=5.0)
     with pytest.raises(FloatingPointError):
-        networks.flow("front", IMAGE, IMAGE, NO_DRONES)
+        networks.flow(FRAME, FRAME, NO_DRONES)
     assert (networks.faults, networks.stuck) == (1, False)
 
 

@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flockd.messages import Float32Array, FloatArray, UInt8Array
-from flockd.perception import DisFlow, Picture, RangeEstimate, SceneMaps
+from flockd.geometry import RigCamera
+from flockd.messages import Float32Array, FloatArray, Frame, UInt8Array
+from flockd.perception import Crop, DisFlow, RangeEstimate, SceneMaps
 from flockd.sim.renderer import Renderer
 from flockd.sim.world import World
 
@@ -60,22 +61,22 @@ def film() -> Film:
 class Onlooker:
     """In the place of the networks: OpenCV's flow, no drones, and the film's depth in its order."""
 
-    picture_size = 96
-    map_scale = 2
+    crop_size = 96
+    map_stride = 2
     has_distance = True
 
     def __init__(self, depth: Sequence[FloatArray]) -> None:
         self._flow = DisFlow()
         self._depth: Iterator[FloatArray] = iter(depth)
 
-    def flow(self, camera: str, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
-        return self._flow.flow(first, second)
+    def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
+        return self._flow.flow(first.image, second.image)
 
-    def scene(self, camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:
+    def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
         depth = np.minimum(next(self._depth), 1000.0).astype(np.float32)
-        return SceneMaps(depth, np.zeros(image.shape[:2], np.uint8), ())
+        return SceneMaps(depth, np.zeros(frame.image.shape[:2], np.uint8), ())
 
-    def ranges(self, pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
+    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         return ()
 
 

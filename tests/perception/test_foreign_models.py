@@ -14,26 +14,24 @@ from flockd.data import data_path
 from flockd.errors import ModelError
 from flockd.inference import OnnxModel
 from flockd.inference.fitting import fit
-from flockd.messages import Float32Array
-from flockd.perception import OnnxFlow, Perception
+from flockd.messages import Frame
+from flockd.perception import OnnxFlow, OnnxNetworks
+from tests.perception.cameras import camera_of
 from tests.perception.foreign import SIZE, image_input, map_output, one_channel_depth, write_model
 
 WIDTH, HEIGHT = SIZE
 
 
-def perception_with(depth: Path, **config: Any) -> Perception:
-    return Perception(PerceptionConfig(flow="dis", depth=str(depth), distance="none", **config), data_path("models"))
+def perception_with(depth: Path, **config: Any) -> OnnxNetworks:
+    return OnnxNetworks(PerceptionConfig(flow="dis", depth=str(depth), distance="none", **config), data_path("models"))
 
 
 def plain(colour: tuple[int, int, int], size: tuple[int, int] = SIZE) -> np.ndarray:
     return np.full((size[1], size[0], 3), colour, np.uint8)
 
 
-def geometry_of(focal_px: float, size: tuple[int, int]) -> Float32Array:
-    """The rays of a camera with this focal length."""
-    u, v = np.meshgrid(np.arange(1, size[0], 2), np.arange(1, size[1], 2))
-    tangents = np.stack([(u - size[0] / 2) / focal_px, (v - size[1] / 2) / focal_px, np.zeros(u.shape)])
-    return tangents.astype(np.float32)
+def front(image: np.ndarray) -> Frame:
+    return Frame("front", image, 0.0, 0)
 
 
 @pytest.mark.parametrize(
@@ -49,7 +47,7 @@ def test_an_image_enters_in_the_order_range_and_normalisation_of_the_manifest(
 ) -> None:
     imagenet = {"mean": [0.485, 0.456, 0.406], "deviation": [0.229, 0.224, 0.225]}
     path = one_channel_depth(tmp_path, channel=channel, output={}, colour=colour, **imagenet)
-    seen = perception_with(path, scale="network").scene("front", plain((200, 100, 50)), geometry_of(40.0, SIZE))
+    seen = perception_with(path, scale="network").scene(front(plain((200, 100, 50))), camera_of(40.0, SIZE), None)
     np.testing.assert_allclose(seen.depth, expected, rtol=1e-5)
 
 
@@ -90,7 +88,7 @@ def test_what_lies_right_in_the_image_lies_right_in_the_map_although_its_input_w
     path = one_channel_depth(tmp_path, output={})
     image = plain((0, 0, 0), (64, 64))  # half as wide again is black border in an input of 48 x 32
     image[:, 32:] = 255
-    seen = perception_with(path, scale="network").scene("front", image, geometry_of(40.0, (64, 64)))
+    seen = perception_with(path, scale="network").scene(front(image), camera_of(40.0, (64, 64)), None)
     assert seen.depth.shape == (64, 64)
     np.testing.assert_allclose(seen.depth[:, :30], 0.0, atol=1e-6)
     np.testing.assert_allclose(seen.depth[:, 34:], 1.0, atol=1e-6)
@@ -98,14 +96,14 @@ def test_what_lies_right_in_the_image_lies_right_in_the_map_although_its_input_w
 
 def test_inverse_depth_in_a_unit_of_its_own_becomes_metres(tmp_path: Path) -> None:
     path = one_channel_depth(tmp_path, output={"factor": 0.5, "depth": {"quantity": "inverse_depth"}})
-    seen = perception_with(path, scale="network").scene("front", plain((51, 0, 0)), geometry_of(40.0, SIZE))
+    seen = perception_with(path, scale="network").scene(front(plain((51, 0, 0))), camera_of(40.0, SIZE), None)
     np.testing.assert_allclose(seen.depth, 10.0, rtol=1e-5)  # 0.2 of brightness is 0.1 1/m
 
 
 def test_depth_for_one_focal_length_is_scaled_to_the_cameras(tmp_path: Path) -> None:
     path = one_channel_depth(tmp_path, output={"depth": {"focal_px": 100.0}})
     size = (96, 64)  # enters at half its size, so that 300 px become 150 px
-    seen = perception_with(path, scale="network").scene("front", plain((255, 0, 0), size), geometry_of(300.0, size))
+    seen = perception_with(path, scale="network").scene(front(plain((255, 0, 0), size)), camera_of(300.0, size), None)
     np.testing.assert_allclose(seen.depth, 1.5, rtol=1e-3)
 
 
@@ -115,7 +113,7 @@ def test_a_relative_network_is_refused_where_nothing_fixes_its_scale(tmp_path: P
     with pytest.raises(ModelError, match=r"perception\.scale: .* knows no metres, .* write height or velocity"):
         perception_with(path, scale="network")
     for scale in ("height", "velocity"):
-        seen = perception_with(path, scale=scale).scene("front", plain((51, 0, 0)), geometry_of(40.0, SIZE))
+        seen = perception_with(path, scale=scale).scene(front(plain((51, 0, 0))), camera_of(40.0, SIZE), None)
         assert np.isnan(seen.depth).all()
         assert seen.open is not None
         assert seen.open.shift
@@ -125,7 +123,7 @@ def test_a_relative_network_is_refused_where_nothing_fixes_its_scale(tmp_path: P
 def test_a_metric_network_leaves_its_scale_to_the_autopilot_where_that_is_asked_for(tmp_path: Path) -> None:
     path = one_channel_depth(tmp_path, output={})
     for scale in ("height", "velocity"):  # it takes no ground as an input, so height has to align what it says
-        seen = perception_with(path, scale=scale).scene("front", plain((51, 0, 0)), geometry_of(40.0, SIZE))
+        seen = perception_with(path, scale=scale).scene(front(plain((51, 0, 0))), camera_of(40.0, SIZE), None)
         assert seen.open is not None
         assert not seen.open.shift
         np.testing.assert_allclose(seen.open.inverse, 5.0, rtol=1e-5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,14 @@ from flockd.config.perception import PerceptionConfig
 from flockd.data import data_path
 from flockd.errors import ModelError
 from flockd.inference import OnnxModel, find_manifests, load_manifest
-from flockd.messages import BoolArray, Float32Array, UInt8Array
-from flockd.perception import DisFlow, OnnxFlow, Perception, Picture
+from flockd.messages import BoolArray, Float32Array, Frame, UInt8Array
+from flockd.perception import DisFlow, OnnxFlow, OnnxNetworks
 from flockd.perception.background_flow import settle_background
-from flockd.perception.roles import PICTURES_AT_A_TIME
+from flockd.perception.networks import CROPS_PER_RUN
 from flockd.sim.drone_models import drone_model
 from flockd.sim.renderer import Renderer
 from flockd.sim.world import World
+from tests.perception.cameras import camera_of, crop_of
 
 MODELS = data_path("models")
 NAMES = ["distance", "distance_int8", "flow", "flow_int8", "neighbours", "neighbours_int8"]
@@ -108,14 +110,14 @@ def test_the_simulator_refuses_a_flipped_bit_in_one_sentence(
 
 def test_a_model_in_the_wrong_role_is_refused() -> None:
     with pytest.raises(ModelError, match=r"perception\.flow: model 'distance' fills distance and not flow"):
-        Perception(PerceptionConfig(flow="distance"), MODELS)
+        OnnxNetworks(PerceptionConfig(flow="distance"), MODELS)
 
 
 def test_a_model_that_is_not_there_is_refused_with_those_that_are() -> None:
     with pytest.raises(
         ModelError, match=r"perception\.flow: there is no model 'raft'.*distance_int8, flow, flow_int8, neighbours"
     ):
-        Perception(PerceptionConfig(flow="raft"), MODELS)
+        OnnxNetworks(PerceptionConfig(flow="raft"), MODELS)
 
 
 def shifted_pictures(shift: tuple[int, int], size: tuple[int, int]) -> tuple[UInt8Array, UInt8Array]:
@@ -179,17 +181,17 @@ def test_the_twins_in_8_bits_say_what_the_float_networks_say() -> None:
     image = np.ascontiguousarray(view.rgb)
     roles = {"flow": "flow", "depth": "neighbours", "segmentation": "neighbours", "distance": "distance"}
     twins = PerceptionConfig.model_validate({role: f"{name}_int8" for role, name in roles.items()})
-    ours, theirs = (Perception(config, MODELS) for config in (twins, PerceptionConfig.model_validate(roles)))
-    no_ground = np.zeros((3, 160, 160), np.float32)
-    our, their = (perception.scene("camera", image, no_ground) for perception in (ours, theirs))
+    ours, theirs = (OnnxNetworks(config, MODELS) for config in (twins, PerceptionConfig.model_validate(roles)))
+    camera, frame = camera_of(222.0, (320, 320)), Frame("camera", image, 0.0, 0)
+    our, their = (networks.scene(frame, camera, None) for networks in (ours, theirs))
     assert np.median(np.abs(our.depth / their.depth - 1)[their.depth < 50]) < 0.03
     both, any_ = ((f(our.labels > 0, their.labels > 0)).sum() for f in (np.logical_and, np.logical_or))
     assert both / any_ > 0.8
     windows = [image[v - 48 : v + 48, u - 48 : u + 48] for u, v in ((86, 130), (234, 190))]
-    pictures = [Picture(np.ascontiguousarray(window), 222.0, np.eye(3), np.zeros(3)) for window in windows]
+    pictures = [crop_of(window, 222.0) for window in windows]
     for mine, other in zip(ours.ranges(pictures), theirs.ranges(pictures), strict=True):
-        assert other.is_drone > 0.5
-        assert mine.range_m == pytest.approx(other.range_m, rel=0.05)
+        assert other.drone_probability > 0.5
+        assert mine.log_range == pytest.approx(other.log_range, abs=0.05)
         np.testing.assert_allclose(mine.centre, other.centre, atol=1.5)
 
 
@@ -201,32 +203,32 @@ def test_what_a_mirror_shows_is_told_as_if_there_were_none() -> None:
         drone_positions=np.array([[1.5, -0.1, -4.1]]),
     )  # fmt: skip
     image = np.ascontiguousarray(view.rgb)
-    direct, mirrored = (Picture(image, 100.0, np.eye(3), np.zeros(3), in_mirror=m) for m in (False, True))
-    shown_so = Picture(np.ascontiguousarray(image[:, ::-1]), 100.0, np.eye(3), np.zeros(3))
-    one, other, raw = Perception(PerceptionConfig(), MODELS).ranges([direct, mirrored, shown_so])
-    assert other.range_m != pytest.approx(one.range_m, rel=1e-4), "the network errs on both apart"
-    assert other.range_m == pytest.approx(raw.range_m, rel=1e-3)
+    direct, mirrored = (crop_of(image, 100.0, mirrored=m) for m in (False, True))
+    shown_so = crop_of(image[:, ::-1], 100.0)
+    one, other, raw = OnnxNetworks(PerceptionConfig(), MODELS).ranges([direct, mirrored, shown_so])
+    assert other.log_range != pytest.approx(one.log_range, abs=1e-4), "the network errs on both apart"
+    assert other.log_range == pytest.approx(raw.log_range, abs=1e-3)
     np.testing.assert_allclose(other.centre, [96 - raw.centre[0], raw.centre[1]], atol=0.05)
     for told in (one, other):
         assert told.centre[0] == pytest.approx(48 - 100 / 15, abs=3.0)
-        assert told.range_m == pytest.approx(1.5, rel=0.25)
+        assert math.exp(told.log_range) == pytest.approx(1.5, rel=0.25)
 
 
 def test_many_pictures_go_in_batches_no_larger_than_what_is_prepared(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     images = rng.integers(0, 256, (31, 96, 96, 3), dtype=np.uint8)
-    pictures = [Picture(image, 100.0, np.eye(3), np.zeros(3)) for image in images]
-    perception, answer, batches = Perception(PerceptionConfig(), MODELS), OnnxModel.answer, []
+    pictures = [crop_of(image, 100.0) for image in images]
+    perception, answer, batches = OnnxNetworks(PerceptionConfig(), MODELS), OnnxModel.answer, []
 
     def noted(model: OnnxModel, contents: dict[Any, Any]) -> dict[Any, Float32Array]:
         batches.append(len(contents["picture"]))
         return answer(model, contents)
 
     monkeypatch.setattr(OnnxModel, "answer", noted)
-    ranges = [estimate.range_m for estimate in perception.ranges(pictures)]
-    assert max(batches) == PICTURES_AT_A_TIME
+    ranges = [estimate.log_range for estimate in perception.ranges(pictures)]
+    assert max(batches) == CROPS_PER_RUN
     assert sum(batches) == 31
-    np.testing.assert_allclose(ranges, [perception.ranges([picture])[0].range_m for picture in pictures], rtol=1e-3)
+    np.testing.assert_allclose(ranges, [perception.ranges([picture])[0].log_range for picture in pictures], atol=1e-3)
 
 
 def test_the_network_of_flow_is_sharpened_by_dis_unless_told_otherwise() -> None:
@@ -239,7 +241,9 @@ def test_the_network_of_flow_is_sharpened_by_dis_unless_told_otherwise() -> None
     ):
         config = PerceptionConfig.model_validate({"flow_refinement": refinement})
         no_drones = np.zeros(first.shape[:2], np.uint8)
-        found = Perception(config, MODELS).flow("camera", first, second, no_drones)
+        found = OnnxNetworks(config, MODELS).flow(
+            Frame("camera", first, 0.0, 0), Frame("camera", second, 0.5, 1), no_drones
+        )
         flow = expected.flow(first, second)
         settled = settle_background(flow, first, second, no_drones) if refinement == "quick_dis" else flow
         np.testing.assert_allclose(found, settled, atol=1e-4)
@@ -252,10 +256,8 @@ def test_the_second_stage_tells_which_pixels_are_the_drones_in_a_mirror_too() ->
         drone_rotations=np.stack([cv2.Rodrigues(np.array([0.2, -0.4, 0.3]))[0]]), shown=[True],
         drone_positions=np.array([[1.5, 0.0, -4.0]]),
     )  # fmt: skip
-    pictures = [
-        Picture(np.ascontiguousarray(view.rgb), 200.0, np.eye(3), np.zeros(3), in_mirror=m) for m in (False, True)
-    ]
-    for told in Perception(PerceptionConfig(), MODELS).ranges(pictures):
+    pictures = [crop_of(view.rgb, 200.0, mirrored=m) for m in (False, True)]
+    for told in OnnxNetworks(PerceptionConfig(), MODELS).ranges(pictures):
         assert told.mask is not None
         assert told.mask.shape == (96, 96)
         drone, said = view.ids > 0, told.mask > 0

@@ -19,7 +19,7 @@ from flockd.errors import ModelError
 from flockd.inference import OnnxModel, load_manifest
 from flockd.inference.providers import Prepared, available
 from flockd.inference.weights import fault_of_weights
-from flockd.perception import Perception
+from flockd.perception import OnnxNetworks
 from tests.perception.foreign import SIZE, image_input, map_output, write_model
 
 MODELS = data_path("models")
@@ -163,7 +163,7 @@ def test_a_provider_that_is_not_there_is_refused_and_nothing_takes_its_place() -
         ModelError,
         match=r"perception\.provider: this ONNX Runtime has no CUDAE.*; install onnxruntime-gpu in its place, or",
     ):
-        Perception(PerceptionConfig(provider="cuda", flow="flow"), MODELS)
+        OnnxNetworks(PerceptionConfig(provider="cuda", flow="flow"), MODELS)
 
 
 @pytest.mark.parametrize("provider", ["cuda", "tensorrt", "openvino"])
@@ -171,7 +171,7 @@ def test_a_network_in_8_bits_is_for_the_cpu_alone(provider: str) -> None:
     """A GPU would run it slower than the float one and without a word, OpenVINO with other answers."""
     config = PerceptionConfig.model_validate({"provider": provider})
     with pytest.raises(ModelError, match=rf"flow_int8 is made for cpu, not for {provider}; name another"):
-        Perception(config, MODELS)
+        OnnxNetworks(config, MODELS)
 
 
 @pytest.mark.skipif("cuda" in available(), reason="this computer can compute with CUDA")

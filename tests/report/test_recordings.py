@@ -24,7 +24,8 @@ from flockd.messages import (
     VehicleState,
     VelocityCommand,
 )
-from flockd.pilot.views import CameraView, RigView
+from flockd.perception import CameraObservation, Observation
+from flockd.pilot import StepTrace
 from flockd.recording import Recorder, RecordingError
 from flockd.recording.editing import cut
 from flockd.recording.reader import Recording
@@ -285,20 +286,18 @@ class Looking:
     """A pilot that only looks."""
 
     config: DroneConfig
-    last_view: RigView | None = None
 
-    @property
-    def last_flows(self) -> dict[str, np.ndarray]:
-        return {}
-
-    def step(self, frames: FrameSet, vehicle: VehicleState) -> PilotOutput:
+    def step(self, frames: FrameSet, vehicle: VehicleState, trace: StepTrace) -> PilotOutput:
         cameras = {
-            name: CameraView(
-                frame.image, np.full((HEIGHT, WIDTH), 3.0, np.float32), np.zeros((HEIGHT, WIDTH), np.uint8)
+            name: CameraObservation(
+                frame.image,
+                np.full((HEIGHT, WIDTH), 3.0, np.float32),
+                np.zeros((HEIGHT, WIDTH), np.uint8),
+                None,
             )
             for name, frame in frames.frames.items()
         }
-        self.last_view = RigView(frames.time_s, vehicle, cameras, (), ())
+        trace.observation = Observation(frames.time_s, vehicle, cameras, (), None)
         return output_of(0, frames.frames["front"].sequence, frames.time_s)
 
 

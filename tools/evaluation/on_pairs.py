@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flockd.config.perception import PerceptionConfig
 from flockd.geometry import Rig
-from flockd.messages import UNCLASSED, Detection, Frame, FrameSet, VehicleState
-from flockd.perception import DisFlow, Perception
-from flockd.pilot.views import Observer
+from flockd.messages import UNCLASSED, Detection, Frame, FrameSet, ScaleSource, VehicleState
+from flockd.perception import DisFlow, Networks, Perception
 from flockd.sim.drone_models import drone_model
 from tools.training.dataset import HEIGHT, R_BODY_CAMERA, WIDTH, PairSet, rig_camera
 from tools.training.samples import SIZES_M
@@ -75,7 +75,7 @@ class Findings:
         return np.concatenate(self.flow[name, on_drones])
 
 
-def look_at_pairs(pairs: PairSet, perception: Perception, indices: Iterable[int]) -> Findings:
+def look_at_pairs(pairs: PairSet, networks: Networks, indices: Iterable[int]) -> Findings:
     """The second stage and all, on each pair's first image; the flow on both. The autopilot's height errs.
 
     Drones are what they are with a barometer.
@@ -90,20 +90,19 @@ def look_at_pairs(pairs: PairSet, perception: Perception, indices: Iterable[int]
         frames = FrameSet(0.0, {"camera": Frame("camera", images[0], 0.0, 0)})
         depth, ids = np.asarray(pairs["depth"][index][0], np.float32), np.asarray(pairs["ids"][index][0])
         for given in (None, "range finder", "barometer"):
-            observer = Observer(rig, perception, height_fixes_scale=given is not None)
+            scale: ScaleSource = "network" if given is None else "height"
             measured_m = height + HEIGHT_SIGMAS_M.get(given or "", 0.0) * wrong
             vehicle = VehicleState(0.0, R_ned_camera @ R_BODY_CAMERA.T, measured_m)
-            maps, _ = observer.scenes(frames, vehicle)
-            off = _depth_errors(maps["camera"].depth[1::2, 1::2], depth, ids)
+            view = Perception(rig, networks, PerceptionConfig(scale=scale)).observe(frames, vehicle)
+            off = _depth_errors(view.cameras["camera"].depth[1::2, 1::2], depth, ids)
             found.depth[given].append(float(off.mean()) if off.size else 0.0)
             found.depth_pixels[given].append(off[::16])
-        view = observer.view(frames, vehicle, maps, ())
         labels = view.cameras["camera"].labels
         _masks(((labels > 0) & (labels != UNCLASSED))[1::2, 1::2], ids, pairs, index, found)
         _drones(view.detections, pairs, index, depth, ids, found)
         flow = np.asarray(pairs["flow"][index], np.float32)
         valid = np.asarray(pairs["flow_valid"][index])
-        ours = perception.flow("camera", images[0], images[1], labels)
+        ours = networks.flow(*(Frame("camera", image, 0.5 * k, k) for k, image in enumerate(images[:2])), labels)
         for name, guess in (("network", ours), ("dis", dis.flow(images[0], images[1]))):
             error = np.linalg.norm(np.moveaxis(guess[1::2, 1::2], 2, 0) - flow, axis=0)
             for on_drones in (False, True):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from flockd.config import DroneConfig
 from flockd.geometry import Rig, build_rig
 from flockd.messages import Frame, FrameSet, VehicleState
-from flockd.perception import Perception
+from flockd.perception import Networks
 from flockd.pilot import FlockPilot
 from flockd.sim.renderer import Renderer
 from flockd.sim.world import World
@@ -28,7 +28,7 @@ NOISE = 2.0
 
 
 def ego_motion_errors(
-    config: DroneConfig, perception: Perception, seeds: Sequence[int], steps_a_world: int
+    config: DroneConfig, perception: Networks, seeds: Sequence[int], steps_a_world: int
 ) -> dict[str | None, list[float]]:
     """Translation errors in metres of single steps, by what measured the height (None: the network alone fixes the
     scale); NaN where there was no estimate.

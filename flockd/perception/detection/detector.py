@@ -53,12 +53,14 @@ class Detector:
         """The drones in view, and each camera's mask (h, w) of their labels.
 
         Args:
-            images: (h, w, 3) by camera; not empty.
+            images: (h, w, 3) by camera.
             scenes: what the first stage says of each, with depth in metres.
             vehicle: for the attitude.
             predictions: of tracks, where the second stage searches too.
             trace: filled.
         """
+        if not images:
+            return (), {}
         rig = Rig({name: self._rig.cameras[name] for name in images})
         proposals = propose_instances(rig, scenes, self._rules)
         trace.proposals += proposals

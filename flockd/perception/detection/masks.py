@@ -137,9 +137,7 @@ def _draw(labels: UInt8Array, drones: Iterable[DroneLogits]) -> UInt8Array:
     return drawn
 
 
-def first_stage_labels(
-    scene: SceneMaps, label_of: Mapping[int, int], rejected: Container[Instance]
-) -> UInt8Array:
+def first_stage_labels(scene: SceneMaps, label_of: Mapping[int, int], rejected: Container[Instance]) -> UInt8Array:
     """(h, w) the first stage's instances with their detections' labels.
 
     Background where the second stage rejects them, `UNCLASSED` where it is not certain of them.

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from flockd.config.perception import DetectionParameters
-from flockd.geometry import Rig, log_polar
+from flockd.geometry import Rig, VirtualCrop, log_polar
 from flockd.messages import FloatArray, UInt8Array
 from flockd.perception.detection.masks import CropMask
 from flockd.perception.detection.proposals import Proposal
@@ -131,26 +131,24 @@ class Cascade:
                 candidates.append(candidate)
         return candidates, rejected
 
-    def _candidates(
-        self, rig: Rig, images: Mapping[str, UInt8Array], stages: Sequence[_Stage]
-    ) -> list[Candidate]:
+    def _candidates(self, rig: Rig, images: Mapping[str, UInt8Array], stages: Sequence[_Stage]) -> list[Candidate]:
         """What the network says of each crop, in the body."""
         if not stages:
             return []
-        crops = take_crops(rig, images, [stage.roi for stage in stages], self._network.crop_size)
+        crops, views = take_crops(rig, images, [stage.roi for stage in stages], self._network.crop_size)
         return [
-            self._candidate(stage, crop, estimate)
-            for stage, crop, estimate in zip(stages, crops, self._network.ranges(crops), strict=True)
+            self._candidate(stage, view, estimate)
+            for stage, view, estimate in zip(stages, views, self._network.ranges(crops), strict=True)
         ]
 
-    def _candidate(self, stage: _Stage, crop: Crop, estimate: RangeEstimate) -> Candidate:
+    def _candidate(self, stage: _Stage, view: VirtualCrop, estimate: RangeEstimate) -> Candidate:
         """The camera sits beside the body's origin, so that bearing and range change a little."""
-        ray = crop.view.camera.rays(estimate.centre[None])[0]
+        ray = view.camera.rays(estimate.centre[None])[0]
         bearing, log_range = ray, estimate.log_range
         if math.isfinite(log_range) and log_range < math.log(2 * self._parameters.max_range_m):
-            place = crop.view.T_body_virtual.apply(math.exp(log_range) * ray[None])[0]
+            place = view.T_body_virtual.apply(math.exp(log_range) * ray[None])[0]
             bearing, log_range = log_polar(place)
-        masks = () if estimate.mask is None else (CropMask(crop.view, estimate.mask, stage.roi.half_angle),)
+        masks = () if estimate.mask is None else (CropMask(view, estimate.mask, stage.roi.half_angle),)
         return Candidate(
             stage.proposal, bearing, log_range, estimate.log_range_sigma, self._thresholds.bearing_sigma_rad,
             estimate.size_m, estimate.drone_probability, masks,

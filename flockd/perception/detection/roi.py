@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flockd.geometry import Rig, RigCamera, virtual_crop
+from flockd.geometry import Rig, RigCamera, VirtualCrop, virtual_crop
 from flockd.messages import FloatArray, UInt8Array
 from flockd.perception.detection.instances import Instance
 from flockd.perception.maps import Crop
@@ -84,13 +84,17 @@ def roi_of_instance(camera: RigCamera, instance: Instance, rules: CropRules) -> 
     return Roi(camera.T_body_camera.rotation @ centre, half_angle)
 
 
-def take_crops(rig: Rig, images: Mapping[str, UInt8Array], rois: Sequence[Roi], size_px: int) -> list[Crop]:
-    """One crop a region, drawn from whichever cameras of the rig see there."""
-    crops = []
+def take_crops(
+    rig: Rig, images: Mapping[str, UInt8Array], rois: Sequence[Roi], size_px: int
+) -> tuple[list[Crop], list[VirtualCrop]]:
+    """One crop a region, drawn from whichever cameras of the rig see there, and the virtual cameras."""
+    crops, views = [], []
     for roi in rois:
         view = virtual_crop(rig, roi.direction, roi.half_angle, size_px)
-        crops.append(Crop(view.sample(images, range_m=roi.range_m)[0], view, roi.mirrored))
-    return crops
+        image, _ = view.sample(images, range_m=roi.range_m)
+        crops.append(Crop(image, view.camera, view.T_body_virtual, roi.mirrored))
+        views.append(view)
+    return crops, views
 
 
 def angle_between(a: FloatArray, b: FloatArray) -> float:

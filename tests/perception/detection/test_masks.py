@@ -1,4 +1,4 @@
-"""Pixels belong to whom both stages say."""
+"""Pixels belong to the drone that both stages say."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flockd.config import load_scenario
 from flockd.data import data_path
 from flockd.geometry import Rig, RigCamera, build_rig, log_polar, log_polar_covariance, virtual_crop
 from flockd.messages import UNCLASSED, BoolArray, Detection, Float32Array, FloatArray, UInt8Array
-from flockd.pilot.outlines import Mask, Outliner
+from flockd.perception.detection.masks import CropMask, MaskRenderer
 
 SIZE = 96
 RIG: Rig = build_rig(load_scenario(data_path("config") / "paper_flight.yaml").drone.rig)
@@ -22,6 +22,7 @@ GREY = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
 AHEAD = np.array([4.0, 0.3, 0.2])
 RADIUS = 0.06
 """Of a drone's disc, radians."""
+COLOUR_WEIGHT = 4.0
 
 
 def detection(label: int, position: FloatArray, *cameras: str) -> Detection:
@@ -30,13 +31,13 @@ def detection(label: int, position: FloatArray, *cameras: str) -> Detection:
     return Detection(bearing, log_range, covariance, 0.9, 0.5, cameras or ("front",), label)
 
 
-def mask_of(position: FloatArray, half_angle: float, *, radius: float = RADIUS, height: float = 5.0) -> Mask:
+def mask_of(position: FloatArray, half_angle: float, *, radius: float = RADIUS, height: float = 5.0) -> CropMask:
     """A disc about a place: so high inside, a little lower than that outside, for no pixel between both to be at 0."""
     crop = virtual_crop(RIG, position, half_angle, SIZE)
     v, u = np.mgrid[:SIZE, :SIZE] + 0.5
     reach = crop.camera.focal_px * math.tan(radius)
     inside = np.hypot(u - SIZE / 2, v - SIZE / 2) < reach
-    return Mask(crop, np.where(inside, height, -1.1 * height).astype(np.float32), half_angle)
+    return CropMask(crop, np.where(inside, height, -1.1 * height).astype(np.float32), half_angle)
 
 
 def disc(position: FloatArray, radius: float = RADIUS) -> BoolArray:
@@ -58,7 +59,7 @@ def test_the_second_stage_draws_what_the_first_only_boxed(half_angle: float) -> 
     box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     labels[box] = 3
     masks = {3: [mask_of(AHEAD, half_angle)]}
-    drawn = Outliner(FRONT, 2).outlines(labels, PLAIN, [detection(3, AHEAD)], masks).by_networks()
+    drawn = MaskRenderer(FRONT, 2).render(labels, PLAIN, [detection(3, AHEAD)], masks).by_networks()
     assert overlap(drawn == 3, true) > 0.95
     corners = labels.astype(bool) & ~true
     assert np.mean(drawn[corners] == UNCLASSED) > 0.9, "what one stage took for a drone is not background yet"
@@ -69,12 +70,12 @@ def test_both_stages_count_and_all_pictures() -> None:
     left = np.zeros((HEIGHT // 2, WIDTH // 2), np.float32)
     u = int(np.nonzero(disc(AHEAD))[1].mean())
     left[:, : u // 2] = -7.0  # outweighs 5, not 5 and 15 by their mean
-    outliner, true = Outliner(FRONT, 2), disc(AHEAD)
+    renderer, true = MaskRenderer(FRONT, 2), disc(AHEAD)
     nothing = np.zeros((HEIGHT, WIDTH), np.uint8)
-    one = outliner.outlines(nothing, left, [detection(1, AHEAD)], {1: [mask_of(AHEAD, 0.2)]}).by_networks() == 1
+    one = renderer.render(nothing, left, [detection(1, AHEAD)], {1: [mask_of(AHEAD, 0.2)]}).by_networks() == 1
     assert overlap(one, true & (np.arange(WIDTH) >= u)) > 0.9
     several = [mask_of(AHEAD, 0.2), mask_of(AHEAD, 0.15, height=15.0)]
-    assert overlap(outliner.outlines(nothing, left, [detection(1, AHEAD)], {1: several}).by_networks() == 1, true) > 0.9
+    assert overlap(renderer.render(nothing, left, [detection(1, AHEAD)], {1: several}).by_networks() == 1, true) > 0.9
 
 
 def test_a_pixel_that_two_drones_claim_is_the_surer_ones() -> None:
@@ -82,7 +83,7 @@ def test_a_pixel_that_two_drones_claim_is_the_surer_ones() -> None:
     masks = {1: [mask_of(AHEAD, 0.2)], 2: [mask_of(beside, 0.2, height=9.0)]}
     both = [detection(1, AHEAD), detection(2, beside)]
     for order in (both, both[::-1]):
-        drawn = Outliner(FRONT, 2).outlines(np.zeros((HEIGHT, WIDTH), np.uint8), PLAIN, order, masks).by_networks()
+        drawn = MaskRenderer(FRONT, 2).render(np.zeros((HEIGHT, WIDTH), np.uint8), PLAIN, order, masks).by_networks()
         assert overlap(drawn == 2, disc(beside)) > 0.9
         assert overlap(drawn == 1, disc(AHEAD) & ~disc(beside)) > 0.9
 
@@ -90,17 +91,19 @@ def test_a_pixel_that_two_drones_claim_is_the_surer_ones() -> None:
 def test_where_the_second_stage_does_not_tell_the_labels_stay() -> None:
     labels = np.zeros((HEIGHT, WIDTH), np.uint8)
     labels[300:320, 200:240] = 1
-    outliner, mask = Outliner(FRONT, 2), mask_of(AHEAD, 0.2)
+    renderer, mask = MaskRenderer(FRONT, 2), mask_of(AHEAD, 0.2)
     for seen, masks in ((detection(1, AHEAD), []), (detection(1, AHEAD, "left"), [mask])):
-        assert (outliner.outlines(labels, PLAIN, [seen], {1: masks}).by_networks() == labels).all()
+        assert (renderer.render(labels, PLAIN, [seen], {1: masks}).by_networks() == labels).all()
     behind = np.array([-4.0, 0.0, 0.0])
-    drawn = outliner.outlines(labels, PLAIN, [detection(1, behind)], {1: [mask_of(behind, 0.2)]}).by_networks()
+    drawn = renderer.render(labels, PLAIN, [detection(1, behind)], {1: [mask_of(behind, 0.2)]}).by_networks()
     assert (drawn == labels).all()
 
 
-def test_what_lies_beyond_a_drones_picture_is_not_known_to_be_its_own() -> None:
+def test_what_lies_beyond_a_drones_crop_is_not_known_to_be_its_own() -> None:
     labels = disc(AHEAD, 0.3).astype(np.uint8)
-    drawn = Outliner(FRONT, 2).outlines(labels, PLAIN, [detection(1, AHEAD)], {1: [mask_of(AHEAD, 0.1)]}).by_networks()
+    drawn = (
+        MaskRenderer(FRONT, 2).render(labels, PLAIN, [detection(1, AHEAD)], {1: [mask_of(AHEAD, 0.1)]}).by_networks()
+    )
     far: Float32Array = np.asarray(disc(AHEAD, 0.3) & ~disc(AHEAD, 0.16), np.float32)
     assert (drawn[far > 0] == UNCLASSED).all()
     assert (drawn == 1).any()
@@ -121,16 +124,16 @@ def test_colours_mend_the_outline_that_networks_see_too_coarsely() -> None:
     true, nothing = disc(AHEAD), np.zeros((HEIGHT, WIDTH), np.uint8)
     aside = AHEAD + np.array([0.0, 0.05, -0.03])  # a quarter of the disc's radius
     coarse = {1: [mask_of(aside, 0.2, height=3.0)]}
-    outlines = Outliner(FRONT, 2).outlines(nothing, PLAIN, [detection(1, aside)], coarse)
-    assert overlap(outlines.by_networks() == 1, true) < 0.8
-    assert overlap(outlines.by_colours(painted((true, (150, 60, 40)))) == 1, true) > 0.95
-    assert (outlines.by_colours(GREY) == outlines.by_networks()).all()
+    masks_drawn = MaskRenderer(FRONT, 2).render(nothing, PLAIN, [detection(1, aside)], coarse)
+    assert overlap(masks_drawn.by_networks() == 1, true) < 0.8
+    assert overlap(masks_drawn.by_colours(painted((true, (150, 60, 40))), COLOUR_WEIGHT) == 1, true) > 0.95
+    assert (masks_drawn.by_colours(GREY, COLOUR_WEIGHT) == masks_drawn.by_networks()).all()
 
 
 def test_a_camouflaged_drone_is_drawn_as_the_networks_see_it() -> None:
     nothing, masks = np.zeros((HEIGHT, WIDTH), np.uint8), {1: [mask_of(AHEAD, 0.2, height=3.0)]}
-    outlines = Outliner(FRONT, 2).outlines(nothing, PLAIN, [detection(1, AHEAD)], masks)
-    assert overlap(outlines.by_colours(painted()) == 1, disc(AHEAD)) > 0.9
+    masks_drawn = MaskRenderer(FRONT, 2).render(nothing, PLAIN, [detection(1, AHEAD)], masks)
+    assert overlap(masks_drawn.by_colours(painted(), COLOUR_WEIGHT) == 1, disc(AHEAD)) > 0.9
 
 
 def test_what_both_stages_surely_deny_is_no_drones_whatever_its_colour() -> None:
@@ -138,6 +141,7 @@ def test_what_both_stages_surely_deny_is_no_drones_whatever_its_colour() -> None
     image = painted((disc(AHEAD), red), (disc(far), red))
     masks = {1: [mask_of(AHEAD, 0.2, height=8.0)]}
     nothing = np.zeros((HEIGHT, WIDTH), np.uint8)
-    drawn = Outliner(FRONT, 2).outlines(nothing, PLAIN, [detection(1, AHEAD)], masks).by_colours(image)
+    rendered = MaskRenderer(FRONT, 2).render(nothing, PLAIN, [detection(1, AHEAD)], masks)
+    drawn = rendered.by_colours(image, COLOUR_WEIGHT)
     assert overlap(drawn == 1, disc(AHEAD)) > 0.95
     assert not (drawn[disc(far)] == 1).any()

@@ -12,9 +12,8 @@ from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.data import data_path
 from flockd.geometry import Rig, RigCamera, build_rig, ground_inverse_depth
 from flockd.messages import BoolArray, Float32Array, FloatArray, Frame, FrameSet, UInt8Array, VehicleState
-from flockd.perception import Instance, OpenDepth, Perception, SceneMaps
-from flockd.pilot.scale import VelocityScale, fix_by_height
-from flockd.pilot.views import Observer
+from flockd.perception import Instance, OnnxNetworks, OpenDepth, Perception, SceneMaps
+from flockd.perception.depth import VelocityScale, fix_by_height
 from tests.perception.foreign import SIZE, one_channel_depth
 
 WIDTH, HEIGHT = 160, 120
@@ -156,9 +155,8 @@ def test_a_foreign_relative_network_sees_metres_by_height(tmp_path: Path) -> Non
     image = np.repeat(grey[:, :, None], 3, axis=2)
     path = one_channel_depth(tmp_path, output={"depth": {"quantity": "inverse_depth", "unknown": "scale_and_shift"}})
     config = PerceptionConfig(flow="dis", depth=str(path), distance="none", scale="height")
-    observer = Observer(rig, Perception(config, data_path("models")), height_fixes_scale=True)
-    frames = FrameSet(0.0, {"front": Frame("front", image, 0.0, 0)})
-    maps, reasons = observer.scenes(frames, vehicle)
-    assert reasons == []
+    perception = Perception(rig, OnnxNetworks(config, data_path("models")), config)
+    observation = perception.observe(FrameSet(0.0, {"front": Frame("front", image, 0.0, 0)}), vehicle)
+    assert observation.reasons == ()
     rows = slice(SIZE[1] * 3 // 4, None)
-    np.testing.assert_allclose(maps["front"].depth[rows], 1.0 / inverse[rows], rtol=0.05)
+    np.testing.assert_allclose(observation.cameras["front"].depth[rows], 1.0 / inverse[rows], rtol=0.05)
