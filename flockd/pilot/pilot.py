@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -30,7 +29,7 @@ from flockd.perception import Perception, SceneMaps
 from flockd.pilot.motions import ego_motion, neighbour_motions
 from flockd.pilot.scale import VelocityScale
 from flockd.pilot.views import Observer, Perceiver, RigView
-from flockd.tracking import Blind, ExpectedNeighbour, Measurement, Tracker
+from flockd.tracking import Blind, Measurement, Prediction, Tracker
 
 _OWN_DISPLACEMENT_SIGMA_M = 0.02
 _MAX_REFUSALS = 2
@@ -120,10 +119,10 @@ class FlockPilot:
             stages_ms=laps.stages_ms,
         )
 
-    def _expected(self, time_s: float) -> tuple[ExpectedNeighbour, ...]:
+    def _expected(self, time_s: float) -> tuple[Prediction, ...]:
         if self._previous is None or time_s <= self._previous.time_s:
             return ()
-        return self._tracker.expect(time_s - self._previous.time_s, self._velocity)
+        return self._tracker.predictions(time_s - self._previous.time_s, self._velocity)
 
     def _pair_with(self, time_s: float, reasons: list[str]) -> tuple[RigView | None, list[str]]:
         if self._previous is not None and time_s <= self._previous.time_s:
@@ -242,18 +241,11 @@ def _measurement(
     detection: Detection, R_ned_body: FloatArray, previous: RigView | None, motion: NeighbourMotion | None
 ) -> Measurement:
     """A detection in level axes, with the velocity of Eq. 36 where there is one."""
-    position = R_ned_body @ detection.position
-    covariance = detection.range_m**2 * R_ned_body @ detection.covariance @ R_ned_body.T
-    measurement = Measurement(
-        position=position,
-        covariance=covariance,
-        size_m=detection.size_m,
-        drone_probability=detection.drone_probability,
-    )
     if motion is None or previous is None:
-        return measurement
-    return replace(
-        measurement,
+        return Measurement.of(detection, R_ned_body)
+    return Measurement.of(
+        detection,
+        R_ned_body,
         velocity=previous.vehicle.R_ned_body @ motion.velocity,
         velocity_sigma_m_s=_MOTION_CAUTION * math.sqrt(2) * detection.range_sigma_m / motion.interval_s,
     )

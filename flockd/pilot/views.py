@@ -25,7 +25,7 @@ from flockd.messages import (
 from flockd.perception import Instance, Picture, RangeEstimate, SceneMaps
 from flockd.pilot.outlines import Mask, Outliner, Outlines
 from flockd.pilot.scale import fix_by_height
-from flockd.tracking import ExpectedNeighbour
+from flockd.tracking import Prediction
 
 _OUTLINE_PX = 5
 _FIRST_MARGIN = 0.95
@@ -148,7 +148,7 @@ class Observer:
         vehicle: VehicleState,
         maps: Mapping[str, SceneMaps],
         reasons: Sequence[str],
-        expected: Sequence[ExpectedNeighbour] = (),
+        expected: Sequence[Prediction] = (),
     ) -> RigView:
         """Detections of the whole rig, and the maps relabelled by them.
 
@@ -221,7 +221,7 @@ class Observer:
         images: Mapping[str, UInt8Array],
         vehicle: VehicleState,
         found: Sequence[_Located],
-        expected: Sequence[ExpectedNeighbour],
+        expected: Sequence[Prediction],
     ) -> list[_Located]:
         """What the second stage finds where a drone is expected and none was segmented."""
         live = Rig({name: self._rig.cameras[name] for name in images})
