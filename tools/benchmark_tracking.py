@@ -116,7 +116,9 @@ def _detections(rng: np.random.Generator, scenario: Scenario, truth: Array, tree
     bearings = truth / ranges[:, None]
     found = []
     for index, position in enumerate(truth):
-        near = (ranges < ranges[index]) & (np.arccos(np.clip(bearings @ bearings[index], -1, 1)) < scenario.occluded_rad)
+        near = (ranges < ranges[index]) & (
+            np.arccos(np.clip(bearings @ bearings[index], -1, 1)) < scenario.occluded_rad
+        )
         if near.any() or rng.random() < scenario.misses:
             continue
         sigma = 0.08 if rng.random() < 0.1 else 0.02
@@ -188,7 +190,9 @@ def main() -> None:
     print("| scenario | recall | false tracks a minute | false a step | position RMS m | switches a minute |")
     print("|---|---|---|---|---|---|")
     for scenario in SCENARIOS:
-        print(f"| {scenario.name} | {score(scenario, flights, lambda: Tracker(TrackingParameters()), measurement).row()} |")
+        print(
+            f"| {scenario.name} | {score(scenario, flights, lambda: Tracker(TrackingParameters()), measurement).row()} |"
+        )
 
 
 if __name__ == "__main__":

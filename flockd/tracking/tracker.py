@@ -14,7 +14,6 @@ from flockd.tracking.association import assign
 from flockd.tracking.filter import Innovation, State
 from flockd.tracking.measurement import Measurement
 
-STRICT = True
 Blind = Callable[[FloatArray], BoolArray]
 """Of positions (n, 3), metres NED from the own drone: which (n,) no camera could show at this time."""
 
@@ -164,13 +163,13 @@ class Tracker:
 
     def _confirm(self, track: _Track) -> None:
         needed = self.parameters.keep_probability if track.confirmed else self.parameters.confirm_probability
-        track.confirmed = track.hits >= self.parameters.confirm_hits and track.existence * track.drone_probability > needed
+        track.confirmed = (
+            track.hits >= self.parameters.confirm_hits and track.existence * track.drone_probability > needed
+        )
         track.was_confirmed |= track.confirmed
 
     def _is_kept(self, track: _Track) -> bool:
         unseen_s = self._time_s - track.last_seen_s
-        if not track.was_confirmed and unseen_s > 0.0 and STRICT:
-            return False
         return unseen_s <= self.parameters.max_unseen_s and track.existence >= self.parameters.drop_probability
 
 
