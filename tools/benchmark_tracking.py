@@ -1,7 +1,7 @@
 """The tracker on synthetic neighbours: recall, false tracks, position error and identity switches.
 
 Five neighbours on crossing paths around a drone that flies the paper's circle; detections with noise of heavier tails
-than they say, misses, occlusion, clutter, and one thing on the ground that the network half takes for a drone.
+than they say, misses, occlusion, clutter, and one tree that the network takes for a drone with a probability of 0.7.
 
     python -m tools.benchmark_tracking --flights 20
 """
@@ -190,9 +190,8 @@ def main() -> None:
     print("| scenario | recall | false tracks a minute | false a step | position RMS m | switches a minute |")
     print("|---|---|---|---|---|---|")
     for scenario in SCENARIOS:
-        print(
-            f"| {scenario.name} | {score(scenario, flights, lambda: Tracker(TrackingParameters()), measurement).row()} |"
-        )
+        found = score(scenario, flights, lambda: Tracker(TrackingParameters()), measurement)
+        print(f"| {scenario.name} | {found.row()} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -28,14 +28,16 @@ class TrackingParameters(Section):
     model are nearer (chi-square with 3 degrees of freedom)."""
 
     gate_sigma: Positive = 6.0
-    """Association gate: the largest Mahalanobis distance of a detection from a track, in standard deviations."""
+    """Association gate: the largest Mahalanobis distance of a detection from a track, in standard deviations. Wider
+    than a Gaussian needs, as range errors have heavier tails: a detection left out begins a second track of its drone."""
 
     detection_probability: Probability = 0.7
     """P_D: of a neighbour that the cameras can show being detected in one frame set. The shipped networks detect 93 %
-    of drones at least 12 px wide and 34 % of those of 6 to 12 px (README)."""
+    of drones at least 12 px wide and 34 % of those of 6 to 12 px (README), and misses come in runs. At 0.7 a track
+    stays confirmed through three frame sets in a row without a detection."""
     clutter_density: Positive = 0.01
     """False detections in one frame set, per steradian and unit of log range. The shipped networks give 18 in 500
-    images (README), each of about 1.5 sr and 0.5 to 20 m, thus 0.0065."""
+    images (README), each of about 1.5 sr and 0.5 to 20 m, thus 0.0065; rounded up."""
     survival_time_s: Positive = 60.0
     """Mean time that a neighbour stays within sight: existence probability decays with this time constant."""
     birth_probability: Probability = 0.5
@@ -43,7 +45,8 @@ class TrackingParameters(Section):
     evidence_interval_s: Positive = 0.5
     """Frame sets nearer to each other in time are not independent evidence of existence: they count in proportion."""
     drone_probability_memory_s: Positive = 5.0
-    """Time constant of the average of a track's drone probabilities, by which its existence probability is multiplied."""
+    """Time constant of the average of the network's drone probabilities over a track; its existence probability is
+    multiplied by it."""
     confirm_hits: Annotated[int, Field(ge=1)] = 3
     """No track is confirmed with fewer detections."""
     confirm_probability: Probability = 0.925

@@ -12,7 +12,7 @@ from flockd.messages import FloatArray
 from flockd.tracking.measurement import Measurement
 
 _LINEARISATIONS = 3
-"""Of the iterated update; Bell & Cathey 1993. Each halves the digits still wrong, as Gauss-Newton does."""
+"""Of the iterated update (B. Bell, F. Cathey, IEEE Transactions on Automatic Control 38(2), 1993)."""
 MIN_RANGE_M = 0.01
 """A predicted position nearer than this has no bearing."""
 
