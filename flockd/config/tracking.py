@@ -29,7 +29,7 @@ class TrackingParameters(Section):
 
     gate_sigma: Positive = 6.0
     """Association gate: the largest Mahalanobis distance of a detection from a track, in standard deviations. Wider
-    than a Gaussian needs, as range errors have heavier tails: a detection left out begins a second track of its drone."""
+    than a Gaussian needs, as range errors have heavier tails: a detection left out begins a second track."""
 
     detection_probability: Probability = 0.7
     """P_D: of a neighbour that the cameras can show being detected in one frame set. The shipped networks detect 93 %

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,7 +65,7 @@ class Innovation:
     @property
     def log_likelihood(self) -> float:
         """Logarithm of the Gaussian density, per steradian and unit of log range."""
-        return -0.5 * (self.squared_distance + self.log_determinant + 3 * np.log(2 * np.pi))
+        return -0.5 * (self.squared_distance + self.log_determinant + 3 * math.log(2 * math.pi))
 
 
 def initial(measurement: Measurement, own_velocity: FloatArray | None, parameters: TrackingParameters) -> State:
