@@ -153,6 +153,8 @@ class Neighbour:
     """Since last seen; 0 when seen in the newest frame set."""
     hits: int
     confirmed: bool
+    existence_probability: float = 1.0
+    """Of being a drone that is still there; 1 in recordings from before it was estimated."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -86,7 +86,7 @@ NETWORK_LIBRARIES = {"onnxruntime"}
 """Only inference runs networks."""
 SIMULATOR_LIBRARIES = {"numba", "matplotlib", "jinja2", "markupsafe"}
 """Of the extra `sim`: only the simulator and its reports may need them."""
-TOOL_LIBRARIES = {"torch", "onnx", "scipy", "trimesh", "embreex", "pytest"}
+TOOL_LIBRARIES = {"torch", "onnx", "trimesh", "embreex", "pytest"}
 """For training and tests: nothing in the package may need them."""
 
 

@@ -24,10 +24,8 @@ class DetectionParameters(Section):
     """A further crop is not worth it when it would be moved by less than this share of half its width, ..."""
     crop_resize: Annotated[float, Field(ge=1)] = 1.05
     """... and resized by less than this factor."""
-    prediction_gate: Positive = 0.2
-    """What is found where a track was predicted lies within this share of its range of that place, or ..."""
-    prediction_gate_m: Positive = 0.5
-    """... within this distance."""
+    prediction_gate: Positive = 4.0
+    """What is found where a track was predicted lies within this Mahalanobis distance of it, in standard deviations."""
     suppression_gate: Positive = 3.4
     """Two detections are one when their Mahalanobis distance is less: 99 % of pairs of one drone are nearer (chi-square
     of three degrees of freedom)."""

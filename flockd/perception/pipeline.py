@@ -15,7 +15,7 @@ from flockd.perception.detection.masks import depth_of_drones, without_borders
 from flockd.perception.maps import SceneMaps
 from flockd.perception.networks import Networks, OnnxNetworks
 from flockd.perception.observation import CameraObservation, Observation
-from flockd.tracking import ExpectedNeighbour
+from flockd.tracking import Prediction
 
 Reasons = list[str]
 
@@ -33,7 +33,7 @@ class Perception:
         self,
         frames: FrameSet,
         vehicle: VehicleState,
-        predictions: Sequence[ExpectedNeighbour] = (),
+        predictions: Sequence[Prediction] = (),
         trace: DetectionTrace | None = None,
         lap: Callable[[str], None] = lambda stage: None,
     ) -> Observation:

@@ -28,7 +28,7 @@ from flockd.perception import Networks, Observation, Perception, load_networks
 from flockd.perception.detection.detector import DetectionTrace
 from flockd.pilot.motions import ego_motion, neighbour_motions
 from flockd.pilot.trim import VelocityTrim
-from flockd.tracking import Blind, ExpectedNeighbour, Measurement, Tracker
+from flockd.tracking import Blind, Measurement, Prediction, Tracker
 
 
 @dataclass
@@ -107,11 +107,11 @@ class FlockPilot:
             stages_ms=laps.stages_ms,
         )
 
-    def _predictions(self, time_s: float) -> tuple[ExpectedNeighbour, ...]:
+    def _predictions(self, time_s: float) -> tuple[Prediction, ...]:
         """Of the tracks, at the frames' time; none where time does not go on."""
         if self._last_time_s is None or time_s <= self._last_time_s:
             return ()
-        return self._tracker.expect(time_s - self._last_time_s, self._velocity)
+        return self._tracker.predictions(time_s - self._last_time_s, self._velocity)
 
     def _ego_motion(self, observation: Observation) -> tuple[EgoMotion | None, Sequence[str]]:
         """The own motion in C (the body frame at the previous observation), or why there is none."""
@@ -218,14 +218,7 @@ def _measurement(
     if motion is not None and observation.previous is not None:
         velocity = observation.previous.vehicle.R_ned_body @ motion.velocity
         sigma_m_s = caution * math.sqrt(2) * detection.range_sigma_m / motion.interval_s
-    return Measurement(
-        position=R_ned_body @ detection.position,
-        covariance=detection.range_m**2 * R_ned_body @ detection.covariance @ R_ned_body.T,
-        size_m=detection.size_m,
-        drone_probability=detection.drone_probability,
-        velocity=velocity,
-        velocity_sigma_m_s=sigma_m_s,
-    )
+    return Measurement.of(detection, R_ned_body, velocity, sigma_m_s)
 
 
 class _Laps:

@@ -22,7 +22,7 @@ from flockd.perception.detection.refinement import Candidate, Cascade, Threshold
 from flockd.perception.detection.roi import CropRules
 from flockd.perception.maps import SceneMaps
 from flockd.perception.networks import Networks
-from flockd.tracking import ExpectedNeighbour
+from flockd.tracking import Prediction
 
 
 @dataclass
@@ -47,7 +47,7 @@ class Detector:
         images: Mapping[str, UInt8Array],
         scenes: Mapping[str, SceneMaps],
         vehicle: VehicleState,
-        predictions: Sequence[ExpectedNeighbour],
+        predictions: Sequence[Prediction],
         trace: DetectionTrace,
     ) -> tuple[tuple[Detection, ...], dict[str, UInt8Array]]:
         """The drones in view, and each camera's mask (h, w) of their labels.

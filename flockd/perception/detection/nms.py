@@ -10,7 +10,7 @@ import numpy as np
 
 from flockd.config.perception import DetectionParameters
 from flockd.geometry import log_polar_covariance, log_polar_residual
-from flockd.messages import UNCLASSED, Detection, FloatArray
+from flockd.messages import UNCLASSED, Detection
 from flockd.perception.detection.masks import CropMask
 from flockd.perception.detection.refinement import Candidate
 from flockd.perception.detection.roi import angle_between
@@ -89,7 +89,7 @@ def are_one_drone(one: Candidate, other: Candidate, parameters: DetectionParamet
     """
     residual = log_polar_residual(other.bearing, other.log_range, one.bearing, one.log_range)
     extent = parameters.drone_extent * max(one.size_m, other.size_m) / min(one.range_m, other.range_m)
-    spread = covariance_of(one) + covariance_of(other) + extent**2 * np.eye(3)
+    spread = one.covariance + other.covariance + extent**2 * np.eye(3)
     return float(residual @ np.linalg.solve(spread, residual)) < parameters.suppression_gate**2
 
 
@@ -112,8 +112,3 @@ def fuse(group: Sequence[Candidate], label: int) -> Detection:
         cameras=tuple(dict.fromkeys(name for one in group for name in one.proposal.cameras)),
         label=label,
     )
-
-
-def covariance_of(candidate: Candidate) -> FloatArray:
-    """(3, 3) as of `Detection.covariance`."""
-    return log_polar_covariance(candidate.bearing, candidate.log_range_sigma, candidate.bearing_sigma_rad)

@@ -5,6 +5,7 @@ A proposal costs a few crops of the second stage, which decides.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -12,12 +13,23 @@ import cv2
 import numpy as np
 
 from flockd.config.perception import DetectionParameters
-from flockd.geometry import Rig
+from flockd.geometry import Rig, log_polar
 from flockd.messages import UNCLASSED, BoolArray, FloatArray, UInt8Array, VehicleState
 from flockd.perception.detection.instances import Instance
 from flockd.perception.detection.roi import CropRules, Roi, angle_between, roi_of_instance
 from flockd.perception.maps import SceneMaps
-from flockd.tracking import ExpectedNeighbour
+from flockd.tracking import Prediction
+
+
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """Where a track should be, in log-polar coordinates of the body."""
+
+    bearing: FloatArray
+    """(3,) unit vector."""
+    log_range: float
+    covariance: FloatArray
+    """(3, 3) as of `Detection.covariance`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +41,8 @@ class Proposal:
     roi: Roi
     instance: Instance | None = None
     """Of the first stage; None where it comes from a prediction."""
-    predicted: FloatArray | None = None
-    """(3,) metres in the body, where a track is predicted; None elsewhere."""
+    predicted: Predicted | None = None
+    """Where it comes from a track; None elsewhere."""
 
     @property
     def area_px(self) -> float:
@@ -50,7 +62,7 @@ def propose_instances(rig: Rig, scenes: Mapping[str, SceneMaps], rules: CropRule
 def propose_predictions(
     rig: Rig,
     vehicle: VehicleState,
-    predictions: Iterable[ExpectedNeighbour],
+    predictions: Iterable[Prediction],
     detected: Sequence[FloatArray],
     rules: CropRules,
 ) -> list[Proposal]:
@@ -65,13 +77,16 @@ def propose_predictions(
     """
     proposals = []
     for prediction in predictions:
-        place = vehicle.R_ned_body.T @ prediction.position
-        range_m = float(np.linalg.norm(place))
-        roi = Roi(place / range_m, rules.half_angle(prediction.size_m, range_m))
+        R_body_ned = vehicle.R_ned_body.T
+        place = R_body_ned @ prediction.position
+        bearing, log_range = log_polar(place)
+        range_m = math.exp(log_range)
+        covariance = R_body_ned @ prediction.covariance @ R_body_ned.T / range_m**2
+        roi = Roi(bearing, rules.half_angle(prediction.size_m, range_m))
         cameras = tuple(name for name, pixel in rig.pixels_of(place[None]).items() if np.isfinite(pixel).all())
         found = any(angle_between(roi.direction, bearing) < roi.half_angle for bearing in detected)
         if cameras and not found:
-            proposals.append(Proposal(cameras, roi, predicted=place))
+            proposals.append(Proposal(cameras, roi, predicted=Predicted(bearing, log_range, covariance)))
     return proposals
 
 

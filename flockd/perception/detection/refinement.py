@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from flockd.config.perception import DetectionParameters
-from flockd.geometry import Rig, VirtualCrop, log_polar
+from flockd.geometry import Rig, VirtualCrop, log_polar, log_polar_covariance, log_polar_residual
 from flockd.messages import FloatArray, UInt8Array
 from flockd.perception.detection.masks import CropMask
 from flockd.perception.detection.proposals import Proposal
@@ -58,6 +58,11 @@ class Candidate:
     def position(self) -> FloatArray:
         """(3,) metres in the body."""
         return self.range_m * self.bearing
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(3, 3) as of `Detection.covariance`."""
+        return log_polar_covariance(self.bearing, self.log_range_sigma, self.bearing_sigma_rad)
 
 
 class RangeNetwork(Protocol):
@@ -195,13 +200,14 @@ class Cascade:
         return self._thresholds.drone if proposal.predicted is None else self._thresholds.predicted_drone
 
     def _is_as_predicted(self, candidate: Candidate) -> bool:
-        place = candidate.proposal.predicted
-        if place is None:
+        """Within a Mahalanobis distance of the track that it was proposed for."""
+        track = candidate.proposal.predicted
+        if track is None:
             return True
-        gate_m = max(
-            self._parameters.prediction_gate * float(np.linalg.norm(place)), self._parameters.prediction_gate_m
-        )
-        return float(np.linalg.norm(candidate.position - place)) < gate_m
+        residual = log_polar_residual(candidate.bearing, candidate.log_range, track.bearing, track.log_range)
+        extent = self._parameters.drone_extent * candidate.size_m / candidate.range_m
+        spread = track.covariance + candidate.covariance + extent**2 * np.eye(3)
+        return float(residual @ np.linalg.solve(spread, residual)) < self._parameters.prediction_gate**2
 
 
 def mean_candidate(one: Candidate, other: Candidate) -> Candidate:
