@@ -41,7 +41,7 @@ def pytest_runtest_makereport(
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """A starved run is noted; a skip that is not permitted becomes a failure."""
     report = yield
-    if call.excinfo is not None and call.excinfo.errisinstance(starvation.Starved):
+    if call.excinfo is not None and call.excinfo.errisinstance(starvation.StarvedError):
         item.stash[STARVED] = True
     if report.skipped and not hasattr(report, "wasxfail"):
         _fail_unless_permitted(report)

@@ -1,7 +1,7 @@
 """The only tests that may skip, why, and how to run them. `tests/conftest.py` fails every other skip.
 
-What a plain `make test` installs or any Linux computer has is no reason to skip. An entry is for hardware, data or rights
-that a build machine need not have.
+What `make test` installs is no reason to skip. An entry is for hardware, data, system tools or rights that a build
+machine need not have.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ class PermittedSkip:
 PERMITTED = (
     PermittedSkip("tests/sitl/*", "FLOCKD_PX4 names no", "build PX4 SITL and name its build folder in FLOCKD_PX4"),
     PermittedSkip(
-        "tests/datasets/*", "FLOCKD_DATA does not name", "name a folder that holds hololens/ (real images) in FLOCKD_DATA"
+        "tests/datasets/*",
+        "FLOCKD_DATA does not name",
+        "name in FLOCKD_DATA a folder that holds hololens/",
     ),
     PermittedSkip(
         "tests/sources/*", "no virtual camera", "`modprobe vivid`, on a kernel that was built with CONFIG_VIDEO_VIVID"
@@ -42,7 +44,9 @@ PERMITTED = (
     PermittedSkip("tests/d*", "systemd-analyze is not here", "install systemd (tests of units in daemon and doctor)"),
     PermittedSkip("tests/telemetry/*", "openssl is not here", "install the openssl command"),
     PermittedSkip(
-        "tests/training/*", "this processor has 16-bit", "run on a processor without bfloat16 instructions (AVX512-BF16)"
+        "tests/training/*",
+        "this processor has 16-bit",
+        "run on a processor without bfloat16 instructions",
     ),
     PermittedSkip("tests/training/*", "its instructions are not known", "run on Linux on an x86 processor"),
 )

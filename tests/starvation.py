@@ -1,7 +1,8 @@
 """Runs a test whose drone flies in real time, and tells a computer that stopped it from a drone that failed.
 
-Setpoints 0.5 s apart end a flight, as they should. A computer that does not run this process for so long proves nothing
-about the daemon: such a run counts as starved. `tests/conftest.py` runs the test again, and fails it if every run starves.
+Setpoints 0.5 s apart end a flight, as they should. A computer that does not run this process for so long proves
+nothing about the daemon: such a run counts as starved. `tests/conftest.py` runs the test again, and the test fails if
+every run is starved.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ PAUSE_S = 5.0
 _PERIOD_S = 0.02
 
 
-class Starved(AssertionError):
+class StarvedError(AssertionError):
     """A test failed while the computer did not run it."""
 
 
@@ -54,11 +55,11 @@ class Starvation:
 
 
 def tell(story: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    """Runs the coroutine. Raises Starved where it fails while the computer stopped this process for too long."""
+    """Runs the coroutine. Raises StarvedError where it fails while the computer stopped this process for too long."""
     with Starvation() as starvation:
         try:
             asyncio.run(story())
         except Exception as error:
             if starvation.longest_s > BEARABLE_S:
-                raise Starved(f"the computer stopped this process for {starvation.longest_s:.1f} s") from error
+                raise StarvedError(f"the computer stopped this process for {starvation.longest_s:.1f} s") from error
             raise

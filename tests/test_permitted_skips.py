@@ -12,9 +12,7 @@ from tests.permitted_skips import PERMITTED, permitted
 WAYS = {
     "call": "import pytest\ndef test_it(): pytest.skip('no reason')\n",
     "mark": "import pytest\n@pytest.mark.skipif(True, reason='no reason')\ndef test_it(): pass\n",
-    "fixture": (
-        "import pytest\n@pytest.fixture\ndef absent(): pytest.skip('no reason')\ndef test_it(absent): pass\n"
-    ),
+    "fixture": ("import pytest\n@pytest.fixture\ndef absent(): pytest.skip('no reason')\ndef test_it(absent): pass\n"),
     "module": "import pytest\npytest.skip('no reason', allow_module_level=True)\ndef test_it(): pass\n",
     "import": "import pytest\npytest.importorskip('not_there_at_all', reason='no reason')\ndef test_it(): pass\n",
 }

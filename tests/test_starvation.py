@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.inner_pytest import pytest_with_our_hooks
-from tests.starvation import BEARABLE_S, Starvation, Starved, tell
+from tests.starvation import BEARABLE_S, Starvation, StarvedError, tell
 
 WATCHES = """
 import time
@@ -62,7 +62,7 @@ def test_a_story_that_fails_while_it_cannot_run_was_starved(monkeypatch: pytest.
         raise AssertionError("it never came")
 
     monkeypatch.setattr(Starvation, "_watch", stopped)
-    with pytest.raises(Starved, match=r"stopped this process for 3\.0 s") as raised:
+    with pytest.raises(StarvedError, match=r"stopped this process for 3\.0 s") as raised:
         tell(story)
     assert str(raised.value.__cause__) == "it never came"
 
@@ -91,8 +91,8 @@ def test_it():
 @pytest.mark.parametrize(
     ("failing", "error", "runs", "closing"),
     [
-        (2, "starvation.Starved('no time')", 3, "1 passed"),
-        (9, "starvation.Starved('no time')", 3, "1 failed"),
+        (2, "starvation.StarvedError('no time')", 3, "1 passed"),
+        (9, "starvation.StarvedError('no time')", 3, "1 failed"),
         (9, "AssertionError('wrong')", 1, "1 failed"),
     ],
 )

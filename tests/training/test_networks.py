@@ -6,9 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("torch", reason="the extra `train` is not installed")
-
 import torch
 
 from tools.train import is_faster_in_16_bits
