@@ -11,17 +11,6 @@ ROOT = Path(__file__).parents[1]
 
 def pytest_with_our_hooks(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
     """The tests of a folder; ids are relative to it."""
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-c",
-        "/dev/null",
-        "--rootdir",
-        str(folder),
-        "-p",
-        "tests.conftest",
-    ]
-    command += [*options, str(folder)]
+    isolated = ["-c", "/dev/null", "--rootdir", str(folder), "-p", "tests.conftest"]
+    command = [sys.executable, "-m", "pytest", "-q", *isolated, *options, str(folder)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=120)
