@@ -1,29 +1,39 @@
-# make demo   fly the paper's flight in the simulator and write its report
-# make test   lint, types and tests
-# Both make their own virtual environment in .venv first; PYTHON names the interpreter to make it with.
+# `make` prints the targets. Each makes its own virtual environment in .venv first; PYTHON names the interpreter for it.
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-all clean
+.DEFAULT_GOAL := help
+.PHONY: help demo lint test test-all mutate mutate-all references clean
 
-demo: $(VENV)/sim.installed
+help: ## print this list
+	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
+
+demo: $(VENV)/sim.installed ## fly the paper's flight in the simulator and write its report
 	$(BIN)/flockd sim
 
-test: lint
-	$(BIN)/python -m pytest -n 2 -m "not slow"
-
-test-all: lint
-	$(BIN)/python -m pytest -n 2
-
-.PHONY: lint
-lint: $(VENV)/test.installed
+lint: $(VENV)/test.installed ## ruff and mypy
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-clean:
+test: lint ## lint and all tests but the slow ones, on two cores in under 10 minutes
+	$(BIN)/python -m pytest -n 2 -m "not slow"
+
+test-all: lint ## lint and all tests, those too that take minutes each
+	$(BIN)/python -m pytest -n 2
+
+mutate: $(VENV)/test.installed ## try the safety layer's tests on a sample of its mutants, in about a minute
+	$(BIN)/python -m tools.mutate_safety --sample 60
+
+mutate-all: $(VENV)/test.installed ## try them on every mutant, in about a quarter of an hour
+	$(BIN)/python -m tools.mutate_safety
+
+references: $(VENV)/test.installed ## write what the recorded flights of tests/replay are expected to give again
+	$(BIN)/python -m tools.record_regressions --only references
+
+clean: ## delete the virtual environment and what was built
 	rm -rf $(VENV) build dist *.egg-info
 
 # The extra of this name, installed; again only when what it installs has changed.

@@ -8,17 +8,22 @@
 
 Pictures are a quarter of the real size and JPEG, so that a recording is well under a megabyte. After a change that is
 meant to change outputs (new networks, say), `--only references` writes the expectations again from the same recordings.
+They are made with the networks in 32-bit floats, in place of those in 8 bits that the recordings were flown with: with
+and without VNNI instructions, processors compute the latter differently.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import yaml
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
@@ -31,6 +36,7 @@ from flockd.data import data_path
 from flockd.messages import Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
 from flockd.pilot import FlockPilot
 from flockd.recording import Recorder
+from flockd.recording.reader import Recording
 from flockd.recording.truth import Truth
 from flockd.sim.swarm import fly
 
@@ -65,9 +71,23 @@ def main() -> None:
         recording, reference = arguments.out / f"{name}.mcap", arguments.out / f"{name}.expected"
         if arguments.only is None:
             record(recording, *make())
-        if flockd(["replay", str(recording), "--reference", str(reference), "--update-reference"]):
-            raise SystemExit(f"{recording}: could not be replayed")
+        with tempfile.TemporaryDirectory() as folder:
+            config = with_float_networks(recording, Path(folder) / "drone.yaml")
+            update = ["--config", str(config), "--reference", str(reference), "--update-reference"]
+            if flockd(["replay", str(recording), *update]):
+                raise SystemExit(f"{recording}: could not be replayed")
         print(f"{recording}: {recording.stat().st_size / 1e6:.2f} MB, {reference.stat().st_size / 1e3:.0f} kB expected")
+
+
+def with_float_networks(recording: Path, target: Path) -> Path:
+    """Writes the recording's configuration to the target, each 8-bit network replaced by the one it was made from."""
+    document = json.loads(Recording(recording).config.model_dump_json())
+    document["perception"] = {
+        key: value.removesuffix("_int8") if isinstance(value, str) else value
+        for key, value in document["perception"].items()
+    }
+    target.write_text(yaml.safe_dump(document), encoding="utf-8")
+    return target
 
 
 def flown(starts: Starts, *, seed: int) -> tuple[DroneConfig, list[Step]]:

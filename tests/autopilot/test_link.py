@@ -12,17 +12,13 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from flockd.autopilot.mavsdk_link import SETPOINT_TYPE_MASK, AutopilotLink
 from flockd.autopilot.stand_in import TICK_S, AutopilotStandIn, Demand, MotionState
 from flockd.autopilot.status import AutopilotError, Firmware
 from flockd.config.autopilot import AutopilotParameters
 from flockd.messages import Setpoint
 from tests.autopilot.conftest import HEARTBEAT_S, free_port
-
-try:
-    from flockd.autopilot.mavsdk_link import SETPOINT_TYPE_MASK, AutopilotLink
-    from tests.autopilot.flight import flying, north, until
-except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
-    pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
+from tests.autopilot.flight import flying, north, until
 
 
 def _parameters(port: int, system_id: int | None = None) -> AutopilotParameters:

@@ -16,11 +16,7 @@ import pytest
 
 from flockd.autopilot.stand_in import AutopilotStandIn
 from tests.autopilot.conftest import HEARTBEAT_S
-
-try:
-    from tests.autopilot.flight import Flight, flying, until
-except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
-    pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
+from tests.autopilot.flight import Flight, flying, until
 
 STOPS_WITHIN_S = 0.5
 FAILSAFE_WITHIN_S = 2.5

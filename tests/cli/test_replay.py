@@ -16,7 +16,6 @@ import yaml
 from flockd.cli import main
 from flockd.config import Overrides, ScenarioConfig, load_scenario
 from flockd.data import data_path
-from flockd.errors import ModelError
 from flockd.messages import FrameSet, PilotOutput, VehicleState
 from flockd.recording import Recorder
 from flockd.recording.reader import Recording
@@ -253,10 +252,7 @@ def flight(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
             return fly(flown, recorders=recorders).log
 
     folder = tmp_path_factory.mktemp("flight")
-    try:
-        return Flight(fly_recorded, folder, fly_recorded(folder, []))
-    except (ModelError, IndexError) as error:
-        pytest.skip(f"the networks in models/ do not fit the code: {error}")
+    return Flight(fly_recorded, folder, fly_recorded(folder, []))
 
 
 def test_a_replay_of_a_simulated_flight_equals_it_bit_for_bit(flight: Flight, capsys: Capture) -> None:

@@ -19,11 +19,7 @@ from flockd.autopilot.stand_in import AutopilotStandIn
 from flockd.cli import main
 from flockd.data import data_path
 from tests.autopilot.conftest import HEARTBEAT_S, free_port
-
-try:
-    from tests.daemon.aboard import Cameras, config_for, free_endpoint
-except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
-    pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
+from tests.daemon.aboard import Cameras, config_for, free_endpoint
 
 RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
 ROOT = Path(__file__).parents[2]

@@ -12,19 +12,15 @@ import pytest
 
 from flockd.autopilot.stand_in import AutopilotStandIn
 from flockd.config import DroneConfig
+from flockd.daemon import DaemonError, Ending
 from flockd.errors import ConfigError, ConfigProblem
+from flockd.pilot import FlockPilot
+from flockd.recording.codec import to_json
+from flockd.recording.reader import Recording
 from tests.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
-
-try:
-    from flockd.daemon import DaemonError, Ending
-    from flockd.pilot import FlockPilot
-    from flockd.recording.codec import to_json
-    from flockd.recording.reader import Recording
-    from tests.autopilot.flight import until
-    from tests.daemon.aboard import CAMERAS, SECONDS_TO_FAIL, SPEED_M_S, STEP_S, TinyPerceiver, aboard
-    from tests.starvation import tell
-except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
-    pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
+from tests.autopilot.flight import until
+from tests.daemon.aboard import CAMERAS, SECONDS_TO_FAIL, SPEED_M_S, STEP_S, TinyPerceiver, aboard
+from tests.starvation import tell
 
 
 def test_from_the_ground_into_the_air_and_back_into_the_pilots_hands(tmp_path: Path) -> None:

@@ -13,16 +13,12 @@ import pytest
 
 from flockd.config import load_drone
 from flockd.daemon import clock_at, event_loop_at
+from flockd.daemon.networks import WatchedNetworks
 from flockd.daemon.sight import Sight
 from flockd.errors import ConfigError
 from flockd.messages import Frame, FrameSet, VehicleState
 from flockd.sources import CameraStatus
-
-try:
-    from flockd.daemon.networks import WatchedNetworks
-    from tests.daemon.aboard import STEP_S, TinyPerceiver, config_for
-except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
-    pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
+from tests.daemon.aboard import STEP_S, TinyPerceiver, config_for
 
 
 def test_sleeps_and_timeouts_count_in_simulated_seconds() -> None:

@@ -6,21 +6,16 @@ from typing import Any
 
 import pytest
 
+from flockd.autopilot.mavsdk_link import AutopilotLink
 from flockd.autopilot.stand_in import AutopilotStandIn
 from flockd.autopilot.status import Firmware
 from flockd.config import DroneConfig, load_drone
 from flockd.config.autopilot import AutopilotParameters
 from flockd.config.safety import GateParameters, SafetyParameters
 from flockd.data import data_path
-from flockd.doctor import Check, Finding, Level, examine
+from flockd.doctor import Check, Finding, Level, autopilot, examine
+from flockd.doctor.autopilot import JUDGES, check_autopilot, judge_firmware
 from tests.autopilot.conftest import HEARTBEAT_S, free_port
-
-try:
-    from flockd.autopilot.mavsdk_link import AutopilotLink
-    from flockd.doctor import autopilot
-    from flockd.doctor.autopilot import JUDGES, check_autopilot, judge_firmware
-except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
-    pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
 
 GOOD: dict[str, float | int] = {
     "COM_OF_LOSS_T": 1.0,

@@ -10,19 +10,14 @@ import pytest
 
 from flockd.config import DroneConfig, load_drone
 from flockd.config.telemetry import TelemetryParameters
+from flockd.daemon import only_instance
 from flockd.data import data_path
-from flockd.doctor import Check, Finding, Level, examine
+from flockd.doctor import Check, Finding, Level, examine, service
 from flockd.doctor.fleet import check_fleet
+from flockd.doctor.service import check_instance, check_unit, judge_exposure
 from flockd.telemetry.publisher import ZenohTelemetry
 from flockd.telemetry.topics import AboutMessage, AnswerMessage
-
-try:
-    from flockd.daemon import only_instance
-    from flockd.doctor import service
-    from flockd.doctor.service import check_instance, check_unit, judge_exposure
-    from tests.daemon.aboard import free_endpoint
-except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
-    pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
+from tests.daemon.aboard import free_endpoint
 
 QUADROTOR = load_drone(data_path("config") / "quadrotor.yaml")
 needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not here")

@@ -15,11 +15,7 @@ from flockd.data import data_path
 from flockd.doctor import Check, Level, examine
 from flockd.doctor.models import STEPS, check_models, judge_steps, meadow, time_steps
 from flockd.messages import PilotOutput
-
-try:
-    from tests.daemon.aboard import TinyPerceiver
-except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
-    pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
+from tests.daemon.aboard import TinyPerceiver
 
 LENS = IntrinsicsConfig(fx=32.0, fy=32.0, cx=32.0, cy=24.0)
 TINY = DroneConfig(rig=RigConfig(cameras=(CameraConfig(name="front", size_px=(64, 48), intrinsics=LENS),)))

@@ -221,7 +221,8 @@ def test_tables_and_pictures_hold_what_was_flown(tmp_path: Path) -> None:
 
 
 def test_tables_as_parquet(tmp_path: Path) -> None:
-    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
+    from pyarrow import parquet
+
     outputs = record(tmp_path / "drone1.mcap", steps=3)
     export_tables(Recording(tmp_path / "drone1.mcap"), tmp_path, "parquet")
     table = parquet.read_table(tmp_path / "output.parquet").to_pydict()

@@ -17,15 +17,9 @@ import pytest
 from flockd.autopilot.stand_in import AutopilotStandIn
 from flockd.cli import main
 from flockd.data import data_path
-from tests.autopilot.conftest import free_port
-
-try:
-    import mavsdk.mavsdk  # noqa: F401 - only to see whether it loads
-except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
-    pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
-
 from flockd.sim.ground_station import GroundStation, home_deg
 from flockd.sim.log import FlightLog
+from tests.autopilot.conftest import free_port
 
 SECONDS_TO_START = 120.0
 PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
-
-pytest.importorskip("torch", reason="the extra `train` is not installed")
 
 from flockd.geometry import log_polar, log_polar_covariance
 from flockd.messages import Detection

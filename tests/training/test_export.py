@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import pytest
-
-pytest.importorskip("torch", reason="the extra `train` is not installed")
-
 import torch
 
 from tools.export import draw_back

@@ -9,11 +9,8 @@ from typing import Any
 import numpy as np
 import onnxruntime as ort
 import pytest
-from numpy.typing import NDArray
-
-pytest.importorskip("torch", reason="the extra `train` is not installed")
-
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from flockd.data import data_path

@@ -6,9 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("torch", reason="the extra `train` is not installed")
-
 import torch
 
 from tools.train import is_faster_in_16_bits
@@ -20,7 +17,7 @@ CPU = Path("/proc/cpuinfo")
 @pytest.mark.skipif(not CPU.is_file() or "flags" not in CPU.read_text(), reason="its instructions are not known")
 def test_a_processor_without_instructions_for_16_bit_numbers_trains_on_32() -> None:
     if {"avx512_bf16", "amx_bf16", "avx_ne_convert"} & set(CPU.read_text().split()):
-        pytest.skip("this one has some")
+        pytest.skip("this processor has 16-bit instructions")
     assert not is_faster_in_16_bits(torch.device("cpu"))
 
 

@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("torch", reason="the extra `train` is not installed")
-
 from tools.training.pictures import PictureFiles
 
 
@@ -17,7 +15,7 @@ def test_a_family_of_few_pictures_is_drawn_as_often_as_one_of_many(tmp_path: Pat
         values = np.arange(len(families), dtype=np.float32)
         np.savez(
             tmp_path / f"{name}.npz", family=families, drone=np.full(len(families), drones), apparent=values,
-            target=np.zeros((len(families), 3)),
+            target=np.zeros((len(families), 3)), mask=np.zeros((len(families), 1, 1)),
         )  # fmt: skip
     files, rng = PictureFiles(tmp_path), np.random.default_rng(0)
     drawn = [files.draw(rng) for _ in range(3000)]
@@ -36,7 +34,8 @@ def test_pictures_like_the_last_look_at_a_drone_are_drawn_more_often_than_others
     target[:80, 1], target[80:90, 2] = 20.0, -9.0
     values = np.full(100, np.log(70.0))
     values[90] = np.log(120.0)
-    np.savez(tmp_path / "a.npz", family=np.zeros(100), drone=np.ones(100), apparent=values, target=target)
+    masks = np.zeros((100, 1, 1))
+    np.savez(tmp_path / "a.npz", family=np.zeros(100), drone=np.ones(100), apparent=values, target=target, mask=masks)
     files, rng = PictureFiles(tmp_path), np.random.default_rng(0)
     drawn = [files.draw(rng) for _ in range(3000)]
     like_it = [np.abs(sample["target"]).max() == 0.0 and sample["apparent"] < np.log(100.0) for sample in drawn]

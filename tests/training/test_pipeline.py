@@ -11,8 +11,6 @@ import cv2
 import numpy as np
 import pytest
 
-pytest.importorskip("torch", reason="the extra `train` is not installed")
-
 from flockd.cli import main
 from flockd.data import data_path
 from tools.training import worlds

@@ -5,13 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import onnx
 import onnxruntime as ort
 import pytest
 from numpy.typing import NDArray
-
-pytest.importorskip("torch", reason="the extra `train` is not installed")
-
-import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from flockd.data import data_path

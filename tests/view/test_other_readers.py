@@ -93,7 +93,6 @@ def test_foxglove_knows_its_schemas_again(files: list[Path]) -> None:
 
 
 def rerun_says(*arguments: str, home: Path) -> str:
-    pytest.importorskip("rerun_cli", reason="rerun-sdk is not installed: pip install 'flockd[view]'")
     environment = {**os.environ, "CI": "1", "HOME": str(home)}
     command = [sys.executable, "-m", "rerun_cli", "mcap", *arguments]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -111,7 +110,6 @@ def test_reruns_own_check_finds_nothing(files: list[Path], tmp_path: Path) -> No
 
 
 def test_reruns_loader_shows_images_cameras_places_and_log(files: list[Path], tmp_path: Path) -> None:
-    pytest.importorskip("rerun", reason="rerun-sdk is not installed: pip install 'flockd[view]'")
     from rerun.chunk import RrdReader
 
     path = next(path for path in files if path.name == "one.mcap")

@@ -60,12 +60,6 @@ def test_without_rerun_it_says_what_to_install(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.fixture
-def rerun() -> None:
-    pytest.importorskip("rerun", reason="rerun-sdk is not installed: pip install 'flockd[view]'")
-
-
-@pytest.mark.usefixtures("rerun")
 def test_without_a_screen_it_offers_a_file(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
@@ -74,7 +68,6 @@ def test_without_a_screen_it_offers_a_file(monkeypatch: pytest.MonkeyPatch, caps
     assert err == "there is no screen here to open Rerun on; write a file for it with --save FILE.rrd\n"
 
 
-@pytest.mark.usefixtures("rerun")
 @pytest.mark.parametrize("content", [None, b"not a recording", b"\x89MCAP0\r\n"])
 def test_what_cannot_be_read_leaves_nothing(content: bytes | None, tmp_path: Path, capsys: Capture) -> None:
     bad = tmp_path / "bad.mcap"
@@ -87,7 +80,6 @@ def test_what_cannot_be_read_leaves_nothing(content: bytes | None, tmp_path: Pat
     assert set(tmp_path.iterdir()) == before
 
 
-@pytest.mark.usefixtures("rerun")
 def test_a_spoilt_recording_leaves_nothing_half_written(tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "drone1.mcap"
     record(path)
@@ -112,7 +104,6 @@ def steps() -> list[RecordedStep]:
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
     """Three steps with the shipped networks."""
-    pytest.importorskip("rerun", reason="rerun-sdk is not installed: pip install 'flockd[view]'")
     path = tmp_path_factory.mktemp("view") / "normal.rrd"
     assert main(["view", str(NORMAL), "--start", str(START_S), "--end", str(END_S), "--save", str(path)]) == 0
     return shown_in(path)
@@ -177,7 +168,6 @@ def test_commands_and_curves_are_the_recorded_ones(shown: Shown, steps: list[Rec
 
 
 def test_as_recorded_nothing_is_computed(tmp_path: Path, capsys: Capture) -> None:
-    pytest.importorskip("rerun", reason="rerun-sdk is not installed: pip install 'flockd[view]'")
     path = tmp_path / "drone1.mcap"
     record(path, steps=3)
     out, err = told(capsys, 0, path, "--as-recorded", "--save", tmp_path / "x.rrd", "--json")
@@ -193,7 +183,6 @@ def test_as_recorded_nothing_is_computed(tmp_path: Path, capsys: Capture) -> Non
 # -------------------------------------------------------------------------------------------------- nothing goes out
 
 
-@pytest.mark.usefixtures("rerun")
 def test_the_viewer_is_started_deaf_and_dumb(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """It listens to this computer alone, and what it would ask the web goes where nobody answers."""
     from flockd.view import rerun_file
@@ -213,7 +202,6 @@ def test_the_viewer_is_started_deaf_and_dumb(monkeypatch: pytest.MonkeyPatch, tm
     assert {environment[name] for name in ("HTTP_PROXY", "https_proxy", "ALL_PROXY")} == {"http://127.0.0.1:9"}
 
 
-@pytest.mark.usefixtures("rerun")
 def test_no_statistics_are_collected(tmp_path: Path) -> None:
     """Where Rerun collects them, it opens a file for them in its user's folder: with us there is none."""
     from flockd.view.rerun_file import viewer_environment

@@ -1,0 +1,60 @@
+"""The only tests that may skip, why, and how to run them. `tests/conftest.py` fails every other skip.
+
+What `make test` installs is no reason to skip. An entry is for hardware, data, system tools or rights that a build
+machine need not have.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+
+@dataclass(frozen=True)
+class PermittedSkip:
+    """Tests that may skip for one reason."""
+
+    tests: str
+    """Shell pattern of their ids, such as `tests/daemon/*`."""
+    reason: str
+    """Contained in what the test gives as its reason."""
+    to_run: str
+    """What a person has to do for them to run."""
+
+
+PERMITTED = (
+    PermittedSkip("tests/sitl/*", "FLOCKD_PX4 names no", "build PX4 SITL and name its build folder in FLOCKD_PX4"),
+    PermittedSkip(
+        "tests/datasets/*",
+        "FLOCKD_DATA does not name",
+        "name in FLOCKD_DATA a folder that holds hololens/",
+    ),
+    PermittedSkip(
+        "tests/sources/*", "no virtual camera", "`modprobe vivid`, on a kernel that was built with CONFIG_VIDEO_VIVID"
+    ),
+    PermittedSkip(
+        "tests/perception/*", "this computer can compute with CUDA", "install onnxruntime in place of onnxruntime-gpu"
+    ),
+    PermittedSkip(
+        "tests/perception/*", "this computer has TensorRT", "install onnxruntime in place of onnxruntime-gpu"
+    ),
+    PermittedSkip(
+        "tests/recording/*", "a small file system cannot be mounted", "run as root, where `mount -t tmpfs` is allowed"
+    ),
+    PermittedSkip("tests/d*", "systemd-analyze is not here", "install systemd (tests of units in daemon and doctor)"),
+    PermittedSkip("tests/telemetry/*", "openssl is not here", "install the openssl command"),
+    PermittedSkip(
+        "tests/training/*",
+        "this processor has 16-bit",
+        "run on a processor without bfloat16 instructions",
+    ),
+    PermittedSkip("tests/training/*", "its instructions are not known", "run on Linux on an x86 processor"),
+)
+
+
+def permitted(test: str, reason: str) -> PermittedSkip | None:
+    """The entry that lets this test skip for this reason."""
+    for entry in PERMITTED:
+        if fnmatchcase(test, entry.tests) and entry.reason in reason:
+            return entry
+    return None
