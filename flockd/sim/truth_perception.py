@@ -13,8 +13,6 @@ from flockd.perception import Instance, Picture, RangeEstimate, SceneMaps
 from flockd.pilot import Perceiver
 from flockd.sim.renderer import View, true_flow
 
-ROLES = ("flow", "depth", "segmentation", "distance")
-"""What can be swapped."""
 _SKY_M = 1000.0
 _MIN_PIXELS = 10
 _SIZE_M = 0.6

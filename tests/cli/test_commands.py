@@ -10,9 +10,7 @@ from pathlib import Path
 import pytest
 
 from flockd.cli import main
-from flockd.cli.sim import ROLES
 from flockd.errors import ModelError
-from flockd.sim import truth_perception
 
 ROOT = Path(__file__).parents[2]
 PAPER_FLIGHT = (ROOT / "config" / "paper_flight.yaml").read_text(encoding="utf-8")
@@ -109,10 +107,6 @@ def test_a_slip_on_the_command_line_is_a_usage_error(
     error = _usage_error(capsys, *arguments)
     assert error.startswith(told)
     assert error.count("\n") == 1
-
-
-def test_the_roles_to_swap_are_those_that_can_be() -> None:
-    assert truth_perception.ROLES == ROLES
 
 
 @pytest.mark.parametrize(

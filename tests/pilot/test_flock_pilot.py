@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockd.choices import ROLES
 from flockd.config import ScenarioConfig, load_scenario
 from flockd.data import data_path
 from flockd.geometry import rotation_angle_deg
@@ -18,7 +19,7 @@ from flockd.perception import Instance, Picture, RangeEstimate, SceneMaps
 from flockd.pilot import FlockPilot, views
 from flockd.pilot.outlines import Claim, Outlines
 from flockd.sim.photographer import Photographer
-from flockd.sim.truth_perception import ROLES, TruthPerception
+from flockd.sim.truth_perception import TruthPerception
 from flockd.sim.vehicles import Vehicles
 
 STEP_S = 0.5
