@@ -218,7 +218,8 @@ def _schema_at(root: Schema, path: KeyPath) -> Schema:
     for part in path:
         schema = _with_parts(root, schema)
         if isinstance(part, str):
-            schema = schema.get("properties", {}).get(part, {})
+            others = schema.get("additionalProperties")
+            schema = schema.get("properties", {}).get(part, others if isinstance(others, dict) else {})
         else:
             prefix = schema.get("prefixItems", ())
             schema = prefix[part] if part < len(prefix) else schema.get("items", {})

@@ -9,10 +9,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from flockd.choices import Role
 from flockd.config.perception import PerceptionConfig
 from flockd.errors import ModelError
 from flockd.inference.fitting import fit
-from flockd.inference.manifest import Answer, Content, Role, Unknown, manifest_path
+from flockd.inference.manifest import Unknown
+from flockd.inference.manifest_file import manifest_path
 from flockd.inference.providers import engines_folder
 from flockd.inference.session import OnnxModel
 from flockd.messages import BoolArray, Float32Array, FloatArray, UInt8Array
@@ -20,6 +22,7 @@ from flockd.perception.background_flow import settle_background
 from flockd.perception.drone_flow import follow_drones
 from flockd.perception.flow import DisFlow, Flow, OnnxFlow
 from flockd.perception.instances import Instance, group_instances
+from flockd.perception.requirements import check_roles
 
 _EAGER_LOGIT = -1.5
 """Where a second stage weeds out what is none, the first proposes drones from this logit up."""
@@ -154,7 +157,7 @@ class Perception:
             return ()
         shown = [np.ascontiguousarray(p.image[:, ::-1]) if p.in_mirror else p.image for p in pictures]
         answers = [
-            self._distance.answer({"picture": shown[i : i + PICTURES_AT_A_TIME]})
+            self._distance.infer({"crop": shown[i : i + PICTURES_AT_A_TIME]})
             for i in range(0, len(shown), PICTURES_AT_A_TIME)
         ]
         out = np.concatenate([answer["range"] for answer in answers])
@@ -178,13 +181,13 @@ class Perception:
             for row, picture, mask in zip(out, pictures, masks, strict=True)
         )
 
-    def _look(self, model: OnnxModel, image: UInt8Array, geometry: Float32Array) -> dict[Answer, Float32Array]:
+    def _look(self, model: OnnxModel, image: UInt8Array, geometry: Float32Array) -> dict[str, Float32Array]:
         """What one model says of an image: maps (c, h, w) that show all of it, at the model's resolution."""
         fitting = fit(model.manifest, (image.shape[1], image.shape[0]))
-        contents: dict[Content, Sequence[UInt8Array] | Float32Array] = {"image": [fitting.enter(image)]}
+        contents: dict[str, Sequence[UInt8Array] | Float32Array] = {"image": [fitting.enter(image)]}
         if "geometry" in model.manifest.contents:
             contents["geometry"] = fitting.enter_planes(geometry, self.map_scale)[None]
-        return {name: fitting.inside(map_)[0] for name, map_ in model.answer(contents).items()}
+        return {name: fitting.inside(map_)[0] for name, map_ in model.infer(contents).items()}
 
     def _at_map_scale(self, maps: Float32Array, image: tuple[int, int]) -> Float32Array:
         """(c, h, w) at the resolution that drones are told apart in; two channels are pixels of the map."""
@@ -200,7 +203,7 @@ class Perception:
         self, depth: Float32Array, labels: UInt8Array, instances: tuple[Instance, ...], geometry: Float32Array
     ) -> SceneMaps:
         """With metres of what the depth network says, or with what it leaves open."""
-        meaning = self._depth.manifest.answers["depth"].depth
+        meaning = self._depth.manifest.results["depth"].depth
         is_inverse = meaning.quantity == "inverse_depth"
         if meaning.focal_px:
             size = (depth.shape[1], depth.shape[0])
@@ -216,7 +219,7 @@ class Perception:
     def _what_is_unknown(self, config: PerceptionConfig) -> Unknown:
         """What of the depth is left for the autopilot's height or velocity to fix. Raises ModelError."""
         manifest = self._depth.manifest
-        unknown = manifest.answers["depth"].depth.unknown
+        unknown = manifest.results["depth"].depth.unknown
         if config.scale == "network" and unknown != "nothing":
             raise ModelError(
                 f"perception.scale: depth model {config.depth!r} knows no metres, so `network` cannot give the scale; "
@@ -249,6 +252,7 @@ class Perception:
                 threads=self._config.threads,
                 provider=self._config.provider,
                 engines=engines_folder(self._config),
+                check=check_roles,
             )
         model = self._models[key]
         if role not in model.manifest.roles:
@@ -259,7 +263,7 @@ class Perception:
         return model
 
 
-def _masks(answers: Sequence[Mapping[Answer, Float32Array]]) -> Float32Array:
+def _masks(answers: Sequence[Mapping[str, Float32Array]]) -> Float32Array:
     return np.concatenate([answer["mask"][:, 0] for answer in answers])
 
 

@@ -15,7 +15,7 @@ from flockd.messages import BoolArray, Float32Array, FloatArray, Frame, FrameSet
 from flockd.perception import Instance, OpenDepth, Perception, SceneMaps
 from flockd.pilot.scale import VelocityScale, fix_by_height
 from flockd.pilot.views import Observer
-from tests.perception.foreign import SIZE, one_channel_depth
+from tests.inference.foreign import SIZE, one_channel_depth
 
 WIDTH, HEIGHT = 160, 120
 FACTOR, SHIFT = 2.5, 0.03
