@@ -41,7 +41,7 @@ def line_of(path: Path, start: str) -> int:
 def crop_regressor(folder: Path, **keys: Any) -> Path:
     """Takes crops of 24 x 24 and gives two numbers of each: their mean brightness, and one less that."""
     document: dict[str, Any] = {"crop": CROP, "golden_size": [24, 24], **keys}
-    weights = {"axis": np.array([1], np.int64), "ends": np.array([0, 1], np.float32)}
+    weights: dict[str, np.ndarray] = {"axis": np.array([1], np.int64), "ends": np.array([0, 1], np.float32)}
     nodes = [
         helper.make_node("ReduceMean", ["patch"], ["mean"], axes=[1, 2, 3], keepdims=0),
         helper.make_node("Unsqueeze", ["mean", "axis"], ["column"]),
