@@ -265,7 +265,7 @@ def test_verifying_a_damaged_model_fails_the_check(tmp_path: Path, capsys: pytes
     assert main(["models", "verify", "--json", "--dir", str(tmp_path)]) == 1
     (told,) = json.loads(capsys.readouterr().out)
     assert (told["model"], told["ok"]) == ("flow", False)
-    assert told["fault"].startswith(f"{tmp_path / 'flow.yaml'}: ")
+    assert told["fault"].startswith(f"{tmp_path / 'flow.yaml'}:1: accuracy: is missing; add it with a section")
     assert main(["models", "list", "--dir", str(tmp_path)]) == 78
 
 
