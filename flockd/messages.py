@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -206,7 +205,3 @@ class PilotOutput:
     """Estimates refused in this step, by reason."""
     stages_ms: Mapping[str, float] = field(default_factory=dict)
     """Time each stage took, as measured by the caller's clock; empty without one."""
-
-
-ScaleSource = Literal["network", "height", "velocity"]
-OwnVelocitySource = Literal["vision", "autopilot"]

@@ -10,15 +10,16 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "flockd"
 
-BASE = {"messages", "config", "errors", "data"}
-"""Under everything: the nouns, the typed configuration, the error types, and where the shipped files are."""
+BASE = {"choices", "messages", "config", "errors", "data"}
+"""Under everything: choices, nouns, the typed configuration, the error types, and where the shipped files are."""
 
 MAY_IMPORT = {
+    "choices": set(),
     "messages": set(),
     "errors": set(),
     "data": {"errors"},
     "peer": {"errors"},
-    "config": {"messages", "errors"},
+    "config": {"choices", "messages", "errors"},
     "geometry": BASE,
     "inference": BASE,
     "perception": BASE | {"geometry", "inference", "tracking"},
@@ -68,7 +69,7 @@ MAY_IMPORT = {
 }
 """What each folder may import of the others."""
 
-PURE = ("messages", "geometry", "inference", "perception", "tracking", "flocking", "safety", "pilot")
+PURE = ("choices", "messages", "geometry", "inference", "perception", "tracking", "flocking", "safety", "pilot")
 """No clock, no socket, no thread, no environment: what is tested is what flies."""
 IMPURE_MODULES = {
     "asyncio",

@@ -1,6 +1,6 @@
 """Measure what one daemon takes: seconds until it is ready, memory, processor; with shipped models and four cameras.
 
-python tools/bench_daemon.py [--seconds 20] [--recording DRONE.mcap] [--json]
+python -m tools.bench_daemon [--seconds 20] [--recording DRONE.mcap] [--json]
 
 A real `flockd run` with the configuration of PX4 SITL, beside an autopilot stand-in in Hold: pictures of 640x480 from
 shared memory (a recording's, or plain ones without drones), 2 sets a second, and a recording; in the environment that
@@ -22,12 +22,10 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
 from flockd.autopilot.stand_in import AutopilotStandIn
 from flockd.config import DroneConfig, load
 from flockd.data import data_path
-from flockd.inference.session import golden_image
+from flockd.inference.feeds import golden_image
 from flockd.messages import Frame
 from flockd.recording.reader import Recording
 from flockd.sim.daemons import Daemons

@@ -1,6 +1,6 @@
 """Measure what it takes to get camera frames into the pilot: decoding, putting sets together, shared memory.
 
-python tools/bench_sources.py [--size 640 480] [--cameras 4] [--json]
+python -m tools.bench_sources [--size 640 480] [--cameras 4] [--json]
 """
 
 from __future__ import annotations
@@ -12,12 +12,9 @@ import sys
 import time
 from collections.abc import Callable
 from multiprocessing.synchronize import Event
-from pathlib import Path
 
 import cv2
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from flockd.config.drone import DroneConfig
 from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig

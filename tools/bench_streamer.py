@@ -1,6 +1,6 @@
 """Measure how regularly setpoints leave while the networks keep every core busy, and print one table.
 
-python tools/bench_streamer.py [--seconds 20] [--json]
+python -m tools.bench_streamer [--seconds 20] [--json]
 
 A child process streams through MAVSDK to an autopilot stand-in in this one, first idle, then with the shipped networks
 and geometry running without a pause. The times are those at which the kernel handed the packets over. `timer` is a bare
@@ -20,18 +20,16 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from flockd.autopilot.mavsdk_link import AutopilotLink
 from flockd.autopilot.stand_in import AutopilotStandIn
 from flockd.autopilot.streamer import SetpointStreamer
 from flockd.config.autopilot import AutopilotParameters
 from flockd.data import data_path
-from flockd.inference.session import OnnxModel, golden_feeds
+from flockd.inference import OnnxModel
+from flockd.inference.feeds import golden_feeds
 from flockd.messages import Setpoint
 
 P99_BAR_MS = 60.0
@@ -84,7 +82,7 @@ def measure(load: str, seconds: float) -> tuple[Row, Row]:
 
 def child(port: int, load: str, seconds: float) -> subprocess.Popen[bytes]:
     """This program again, in another process."""
-    command = [sys.executable, __file__, "--seconds", str(seconds), "--child", str(port), load]
+    command = [sys.executable, "-m", "tools.bench_streamer", "--seconds", str(seconds), "--child", str(port), load]
     return subprocess.Popen(command, stdout=subprocess.PIPE)
 
 

@@ -1,23 +1,20 @@
 """Measure the shipped networks on rendered worlds that they never saw, and print one table.
 
-python tools/render_training_data.py DATA/test   --split test --worlds 25 --pairs 12
-python tools/render_training_data.py DATA/unseen --split test --worlds 25 --pairs 12 --families unseen
-python tools/evaluate_networks.py --data DATA/test --unseen DATA/unseen [--json]
+python -m tools.render_training_data DATA/test   --split test --worlds 25 --pairs 12
+python -m tools.render_training_data DATA/unseen --split test --worlds 25 --pairs 12 --families unseen
+python -m tools.evaluate_networks --data DATA/test --unseen DATA/unseen [--json]
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from flockd.config import load_scenario
 from flockd.config.perception import PerceptionConfig
@@ -205,7 +202,7 @@ def rows_of_rigs(perception: Networks, count: int) -> Iterator[Row]:
 def rows_of_cost(perception: Networks, pairs: PairSet, threads: int) -> Iterator[Row]:
     """Time of an image with up to four drones; the pictures of them are cut beforehand."""
     camera = rig_camera(WIDTH / 2)
-    side = perception.crop_size
+    side = perception.second_stage.crop_size if perception.second_stage else 0
     times = []
     for pair in range(min(pairs.count, IMAGES_TIMED)):
         image = np.asarray(pairs["image"][pair][0])

@@ -1,12 +1,11 @@
 """Export a trained network to ONNX, check it against torch, and write its manifest.
 
-python tools/export.py neighbours --checkpoint RUNS/neighbours/checkpoint.pt --out models
+python -m tools.export neighbours --checkpoint RUNS/neighbours/checkpoint.pt --out models
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,25 +15,32 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
+from flockd.inference.feeds import golden_feeds
 from flockd.inference.manifest import Manifest
-from flockd.inference.session import golden_feeds
 from tools.training.manifests import write_manifest
 from tools.training.networks import DistanceNet, FlowNet, NeighboursNet
 
 ALLOWED_DIFFERENCE = 2e-3
 """Between ONNX Runtime and torch, as a share of the output's largest value."""
 BEGUN_WITH_SHARE = 0.35
-DATA = "Rendered by tools/render_training_data.py from seeded worlds; no foreign data."
+DATA = "Rendered by tools.render_training_data from seeded worlds; no foreign data."
 
 IMAGE = {"shape": [1, "h", "w", 3], "dtype": "uint8", "meaning": "RGB image", "unit": "grey levels 0-255"}
+COLUMNS = {
+    "range": (
+        *("log_range_per_focal", "right_px", "down_px", "log_relative_sigma"),
+        *("drone_logit", "log_apparent_size"),
+    )
+}
+"""Of an output (n, k), in the order in which the network writes them."""
 NETWORKS: dict[str, dict[str, Any]] = {
     "neighbours": {
         "net": NeighboursNet,
         "roles": ["depth", "segmentation"],
         "description": "U-Net: metric depth, drone mask and centre offsets of one image",
         "size_multiple": 32,
+        "map_stride": 2,
+        "thresholds": {"proposal_logit": -1.5, "mask_logit": 0.4, "proposal_logit_alone": 0.0},
         "golden_size": [480, 640],
         "inputs": {
             "image": IMAGE,
@@ -43,6 +49,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
                 "dtype": "float32",
                 "meaning": "ray tangents right and down; inverse depth of flat ground, 0 where unknown",
                 "unit": "1, 1, 1/m",
+                "kind": "planes",
             },
         },
         "outputs": {
@@ -54,10 +61,28 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "distance": {
         "net": DistanceNet,
         "roles": ["distance"],
-        "description": "Range of the drone in the middle of a picture, its centre, the uncertainty, and its pixels",
+        "description": "Range of the drone in the middle of a crop, its centre, the uncertainty, and its pixels",
         "size_multiple": 1,
         "golden_size": [96, 96],
-        "inputs": {"picture": {**IMAGE, "shape": ["n", 96, 96, 3]}},
+        "crop": {
+            "fill": 0.68,
+            "first_margin": 0.95,
+            "cut_margin": 1.4,
+            "mirror_scale": 0.9,
+            "min_half_angle_deg": 1.0,
+            "max_half_angle_deg": 35.0,
+            "max_resize": 1.7,
+            "max_crops": 4,
+        },
+        "thresholds": {
+            "drone_probability": 0.8,
+            "expected_drone_probability": 0.7,
+            "another_crop_probability": 0.2,
+            "bearing_sigma_rad": 0.004,
+            "min_relative_sigma": 0.005,
+            "mean_sigma_factor": 0.98,
+        },
+        "inputs": {"picture": {**IMAGE, "shape": ["n", 96, 96, 3], "carries": "crop"}},
         "outputs": {
             "range": (
                 ["n", 6],
@@ -142,6 +167,9 @@ def _manifest(name: str, spec: dict[str, Any], accuracy: dict[str, str], state: 
         key: {"shape": s, "dtype": "float32", "meaning": m, "unit": u, "golden_mean": 0.0, "golden_deviation": 0.0}
         for key, (s, m, u) in spec["outputs"].items()
     }
+    for key, columns in COLUMNS.items():
+        if key in outputs:
+            outputs[key]["columns"] = list(columns)
     kept = {k: v for k, v in spec.items() if k not in ("net", "outputs")}
     document = {
         "name": name,
@@ -150,7 +178,7 @@ def _manifest(name: str, spec: dict[str, Any], accuracy: dict[str, str], state: 
         "licence": "Apache-2.0",
         "data": DATA,
         "accuracy": accuracy,
-        "command": f"tools/train.py {name} ({state['spent'] / 60:.0f} minutes, {state['step']} steps), tools/export.py",
+        "command": f"tools.train {name} ({state['spent'] / 60:.0f} minutes, {state['step']} steps), tools.export",
         **kept,
         "outputs": outputs,
     }

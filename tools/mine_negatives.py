@@ -1,24 +1,19 @@
 """Find what the segmentation network wrongly takes for drones: the distance network learns to say no to it.
 
-python tools/mine_negatives.py --data DATA/training --model RUNS/models/neighbours.yaml --out DATA/negatives.npy
+python -m tools.mine_negatives --data DATA/training --model RUNS/models/neighbours.yaml --out DATA/negatives.npy
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
 from flockd.inference import OnnxModel
 from flockd.perception import group_instances
+from flockd.perception.requirements import check_roles
 from tools.training.dataset import ground_plane, open_pairs, ray_tangents
-
-EAGER_LOGIT = -1.5
-"""Pixels above this count, so that near misses are found too."""
 
 
 def main() -> None:
@@ -30,7 +25,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
     pairs = open_pairs(arguments.data)
-    model = OnnxModel(arguments.model, threads=arguments.threads)
+    model = OnnxModel(arguments.model, threads=arguments.threads, check=check_roles)
     found = []
     for pair in range(pairs.count):
         focal = float(pairs["focal"][pair])
@@ -38,7 +33,8 @@ def main() -> None:
         planes = np.concatenate([ray_tangents(focal), ground[None]])
         out = model.run({"image": np.asarray(pairs["image"][pair][0])[None], "geometry": planes[None]})
         ids = np.asarray(pairs["ids"][pair][0])
-        labels, instances = group_instances(out["drone"][0, 0] - EAGER_LOGIT, out["offset"][0], scale=2)
+        logit = out["drone"][0, 0] - np.float32(model.manifest.threshold("proposal_logit"))
+        labels, instances = group_instances(logit, out["offset"][0], scale=model.manifest.map_stride or 1)
         for instance in instances:
             if (ids[labels == instance.label] > 0).mean() < 0.05:
                 left, top, right, bottom = instance.box

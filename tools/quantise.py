@@ -1,13 +1,12 @@
 """Make the 8-bit twin of a network: half the time on a CPU. The range of its numbers is learnt from rendered images.
 
-python tools/quantise.py models/neighbours.yaml --data DATA/training --out models
-python tools/quantise.py models/distance.yaml --data DATA/pictures --out models
+python -m tools.quantise models/neighbours.yaml --data DATA/training --out models
+python -m tools.quantise models/distance.yaml --data DATA/pictures --out models
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -20,11 +19,9 @@ from numpy.typing import NDArray
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
+from flockd.inference import Manifest, load_manifest
+from flockd.inference.feeds import golden_feeds
 from flockd.inference.fitting import fit
-from flockd.inference.manifest import Manifest, load_manifest
-from flockd.inference.session import golden_feeds
 from tools.training.dataset import HEIGHT, WIDTH, ground_plane, open_pairs, ray_tangents
 from tools.training.manifests import write_manifest
 
@@ -45,13 +42,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("manifest", type=Path, help="of the float network")
     parser.add_argument(
-        "--data", type=Path, required=True, help="folder of render_training_data.py, or render_drone_pictures.py"
+        "--data", type=Path, required=True, help="folder of tools.render_training_data, or tools.render_drone_pictures"
     )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--accuracy", action="append", default=[], metavar="WHAT=FIGURE", help="measured accuracy")
     arguments = parser.parse_args()
     manifest, file = load_manifest(arguments.manifest)
-    draw = _pictures if "picture" in manifest.contents else _images
+    draw = _images if manifest.crop is None else _crops
     feeds = list(draw(manifest, arguments.data, IMAGES + COMPARED))
     name = f"{manifest.name}_int8"
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -69,7 +66,7 @@ def main() -> None:
         "description": f"{manifest.description}; in 8-bit numbers",
         "providers": ["cpu"],
         "accuracy": accuracy,
-        "command": f"{manifest.command}, tools/quantise.py",
+        "command": f"{manifest.command}, tools.quantise",
     }
     names = list(manifest.outputs)
     golden = ort.InferenceSession(str(twin), providers=["CPUExecutionProvider"]).run(names, golden_feeds(manifest))
@@ -182,13 +179,13 @@ def _images(manifest: Manifest, folder: Path, count: int) -> Iterator[Feeds]:
         yield {name: contents[spec.carries or name][None] for name, spec in manifest.inputs.items()}
 
 
-def _pictures(manifest: Manifest, folder: Path, count: int) -> Iterator[Feeds]:
-    """Inputs of sixteen pictures each."""
+def _crops(manifest: Manifest, folder: Path, count: int) -> Iterator[Feeds]:
+    """Inputs of sixteen crops each."""
     (name,) = manifest.inputs
     rng = np.random.Generator(np.random.PCG64(0))
     files = sorted(folder.glob("*.npz"))[:count]
     if not files:
-        raise SystemExit(f"{folder}: no pictures here; make them with tools/render_drone_pictures.py")
+        raise SystemExit(f"{folder}: no pictures here; make them with `python -m tools.render_drone_pictures`")
     for index in range(count):
         with np.load(files[index % len(files)]) as arrays:
             yield {name: rng.choice(arrays["picture"], 16)}

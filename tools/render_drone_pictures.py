@@ -1,6 +1,6 @@
 """Render pictures of single drones as the distance network is shown them: many more than whole images would give.
 
-    python tools/render_drone_pictures.py OUT --worlds 300 --scenes 300
+    python -m tools.render_drone_pictures OUT --worlds 300 --scenes 300
 
 Only the window of the camera's image that the pictures look at is drawn. Every drone stands in another place. One file
 a world, which `train.py distance --pictures OUT` takes up as they appear.
@@ -11,15 +11,12 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import os
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from tools.training import worlds
 from tools.training.dataset import FOCAL_PX, HEIGHT, R_BODY_CAMERA, WIDTH

@@ -1,6 +1,6 @@
 """Render training pairs: two camera images a fraction of a second apart, with depth, drones and flow as truth.
 
-python tools/render_training_data.py OUT --worlds 120 --pairs 30 --split training
+python -m tools.render_training_data OUT --worlds 120 --pairs 30 --split training
 
 A third of the scenes have birds and the like in them. With ``--families unseen`` the drones are of the families that
 no network is trained on.
@@ -11,15 +11,12 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import os
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from tools.training import worlds
 from tools.training.dataset import FOCAL_PX, HEIGHT, MAX_DRONES, R_BODY_CAMERA, WIDTH, create_part, note

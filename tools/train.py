@@ -1,8 +1,8 @@
 """Train one network on rendered pairs; resumes from its last checkpoint.
 
-    python tools/train.py neighbours --data DATA --out RUNS/neighbours --minutes 40
-    python tools/train.py distance   --data DATA --out RUNS/distance --minutes 90 --pictures P --negatives N.npy
-    python tools/train.py flow       --data DATA --out RUNS/flow --minutes 40
+    python -m tools.train neighbours --data DATA --out RUNS/neighbours --minutes 40
+    python -m tools.train distance   --data DATA --out RUNS/distance --minutes 90 --pictures P --negatives N.npy
+    python -m tools.train flow       --data DATA --out RUNS/flow --minutes 40
 
 Writes OUT/checkpoint.pt, OUT/curve.csv and a picture of it every few minutes. Uses a GPU where there is one.
 With --start it goes on from another run's weights, or from a network of models/, and keeps them as OUT/start.pt.
@@ -14,7 +14,6 @@ import argparse
 import math
 import os
 import shutil
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -27,8 +26,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.optim.swa_utils import AveragedModel
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from tools.training.augment import photometric
 from tools.training.dataset import PairSet, open_pairs

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -13,11 +12,10 @@ from flockd.calibration.errors import CalibrationError
 from flockd.calibration.least_squares import Normal, Solution, minimise
 from flockd.calibration.poses import first_poses, jacobian_of_move, moved
 from flockd.calibration.views import View
+from flockd.choices import LensModel
 from flockd.geometry import Camera, PinholeCamera, RigidTransform, WideAngleCamera
 from flockd.messages import FloatArray
 
-Model = Literal["pinhole", "wide_angle"]
-MODELS: tuple[Model, ...] = ("pinhole", "wide_angle")
 MIN_VIEWS = 6
 _COEFFICIENTS = {"pinhole": 5, "wide_angle": 4}
 _FIRST_FOCALS = {
@@ -41,7 +39,7 @@ _LEAST_TILT_DEG = 10.0
 class Lens:
     """A calibrated camera, and how well the views agree on it."""
 
-    model: Model
+    model: LensModel
     camera: Camera
     sigma: FloatArray
     """Standard deviations of fx, fy, cx, cy and the distortion, from the residuals: what noise alone leaves open."""
@@ -92,7 +90,7 @@ class Lens:
         return float(angles[0] + angles[1]), float(angles[2] + angles[3])
 
 
-def calibrate(views: Sequence[View], size: tuple[int, int], model: Model) -> Lens:
+def calibrate(views: Sequence[View], size: tuple[int, int], model: LensModel) -> Lens:
     """The camera of this model with the least squared residual.
 
     Raises CalibrationError for too few views, and for views from which the camera cannot be known: all square to it,
@@ -134,7 +132,7 @@ def tilt_deg(pose: RigidTransform) -> float:
     return math.degrees(math.acos(min(abs(float(pose.rotation[2, 2])), 1.0)))
 
 
-def rough_tilts_deg(views: Sequence[View], size: tuple[int, int], model: Model) -> list[float]:
+def rough_tilts_deg(views: Sequence[View], size: tuple[int, int], model: LensModel) -> list[float]:
     """Tilts of the board before its camera is calibrated: good enough for advice."""
     if len(views) < 2:
         return [0.0] * len(views)
@@ -166,7 +164,7 @@ class _State:
     poses: tuple[RigidTransform, ...]
 
 
-def _begin(views: Sequence[View], size: tuple[int, int], model: Model) -> _State:
+def _begin(views: Sequence[View], size: tuple[int, int], model: LensModel) -> _State:
     """The best of a few plain lenses, with the board's pose in each view."""
     best: tuple[float, Camera, list[tuple[float, RigidTransform | None]]] | None = None
     for focal in _FIRST_FOCALS[model]:
@@ -256,7 +254,7 @@ def _camera_like(camera: Camera, numbers: FloatArray) -> Camera:
     return _camera("pinhole" if isinstance(camera, PinholeCamera) else "wide_angle", camera.size, numbers)
 
 
-def _camera(model: Model, size: tuple[int, int], numbers: FloatArray) -> Camera:
+def _camera(model: LensModel, size: tuple[int, int], numbers: FloatArray) -> Camera:
     fx, fy, cx, cy, *distortion = (float(number) for number in numbers)
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     kind = PinholeCamera if model == "pinhole" else WideAngleCamera
@@ -266,7 +264,7 @@ def _camera(model: Model, size: tuple[int, int], numbers: FloatArray) -> Camera:
 def _with_zero_distortion(camera: Camera) -> Camera:
     """The same lens, with coefficients to be fitted."""
     numbers = _numbers(camera)
-    model: Model = "pinhole" if isinstance(camera, PinholeCamera) else "wide_angle"
+    model: LensModel = "pinhole" if isinstance(camera, PinholeCamera) else "wide_angle"
     return _camera(model, camera.size, np.concatenate([numbers, np.zeros(_COEFFICIENTS[model])]))
 
 

@@ -7,8 +7,9 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
+from flockd.choices import LENS_MODELS, PixelFormat
 from flockd.cli.calibration import (
     add_shared,
     board_of,
@@ -53,7 +54,7 @@ def add(commands: Commands) -> None:
     help_of_source = "a folder of images, a video, a recording or a /dev/video; by default --config's own camera, live"
     parser.add_argument("source", metavar="SOURCE", nargs="?", help=help_of_source)
     parser.add_argument("--camera", metavar="NAME", help="the camera's name in the rig")
-    parser.add_argument("--model", choices=("pinhole", "wide_angle"), help="default: whichever leaves less residual")
+    parser.add_argument("--model", choices=LENS_MODELS, help="default: whichever leaves less residual")
     parser.add_argument(
         "--views", metavar="N", type=positive_count, default=MOST_VIEWS, help="use N views at most (60)"
     )
@@ -61,7 +62,9 @@ def add(commands: Commands) -> None:
     parser.add_argument("--serial", metavar="TEXT", help="what identifies the camera, where it cannot be asked")
     parser.add_argument("--picture", metavar="FILE", type=Path, help="draw the coverage and the residuals (.png)")
     parser.add_argument("--size", metavar="WxH", type=pair, default=(640, 480), help="of a /dev/video (640x480)")
-    parser.add_argument("--pixel-format", choices=("mjpeg", "yuyv"), default="mjpeg", help="of a /dev/video (mjpeg)")
+    parser.add_argument(
+        "--pixel-format", choices=get_args(PixelFormat), default="mjpeg", help="of a /dev/video (mjpeg)"
+    )
     parser.add_argument("--print-board", metavar="FILE", type=Path, help="write the board to print (.pdf, .png)")
     add_shared(parser, "the drone, for its camera's device and serial")
     parser.set_defaults(run=_camera)
@@ -204,7 +207,7 @@ def _is_enough(collector: Collector) -> bool:
 def _lenses(args: argparse.Namespace, collector: Collector) -> list[Lens]:
     """Of the model that was asked for, or of both as far as they fit."""
     from flockd.calibration.errors import CalibrationError
-    from flockd.calibration.intrinsics import MODELS, calibrate
+    from flockd.calibration.intrinsics import calibrate
 
     counts = collector.counts()
     if collector.size is None:
@@ -216,7 +219,7 @@ def _lenses(args: argparse.Namespace, collector: Collector) -> list[Lens]:
             "--squares and --dictionary, and that it fills a good part of the picture"
         )
     found, faults = [], []
-    for model in (args.model,) if args.model else MODELS:
+    for model in (args.model,) if args.model else LENS_MODELS:
         try:
             found.append(calibrate(collector.views, collector.size, model))
         except CalibrationError as error:

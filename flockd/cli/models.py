@@ -1,4 +1,4 @@
-"""`flockd models`: which networks are at hand, whether they are whole, how fast they are, and their engines."""
+"""`flockd models`: which networks there are, whether they are intact, how fast they are, and their engines."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from flockd.choices import PROVIDERS, Provider
 from flockd.cli.output import progress, say, say_json
 from flockd.cli.parser import Commands, Parser, add_commands, positive_count
 from flockd.errors import ExitCode, ModelError, UnavailableError
 
 if TYPE_CHECKING:
     from flockd.config import DroneConfig
-    from flockd.config.perception import Provider
     from flockd.inference import OnnxModel
 
 THREADS = 2
 RUNS = 9
-"""The median of so many is told, after one that nobody counts."""
+"""Timed after one run that is not counted."""
 
 
 def add(commands: Commands) -> None:
@@ -39,7 +39,7 @@ def _add_list(commands: Commands) -> None:
 
 def _add_verify(commands: Commands) -> None:
     examples = ("flockd models verify", "flockd models verify --json")
-    description = "Check each model file against its manifest: hash, weights, inputs, outputs, and a known answer."
+    description = "Check each model file against its manifest: hash, weights, inputs, outputs, and golden output."
     _add_options(commands("verify", description, examples), _verify)
 
 
@@ -51,7 +51,7 @@ def _add_bench(commands: Commands) -> None:
     )
     description = "Time each model, for each provider and number of threads: milliseconds a run, the median."
     parser = _add_options(commands("bench", description, examples), _bench)
-    parser.add_argument("--provider", metavar="NAME,...", help="cpu, cuda, tensorrt, openvino (default: all there are)")
+    parser.add_argument("--provider", metavar="NAME,...", help=f"{', '.join(PROVIDERS)} (default: all there are)")
     parser.add_argument("--threads", metavar="N,...", type=_counts, default=(1, 2), help="on the CPU (default: 1,2)")
     parser.add_argument("--size", metavar="WxH", type=_size, default=(640, 480), help="of the image (default: 640x480)")
     parser.add_argument("--runs", metavar="N", type=positive_count, default=RUNS, help=f"to time (default: {RUNS})")
@@ -91,9 +91,10 @@ def _list(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.table import Table
 
-    from flockd.inference.manifest import load_manifest
+    from flockd.inference import load_manifest
+    from flockd.perception.requirements import check_roles
 
-    models = [load_manifest(path) for path in _manifests(args.dir)]
+    models = [load_manifest(path, check_roles) for path in _manifests(args.dir)]
     if args.json:
         say_json([model.model_dump(mode="json") for model, _ in models])
         return ExitCode.DONE
@@ -106,12 +107,14 @@ def _list(args: argparse.Namespace) -> int:
 
 
 def _verify(args: argparse.Namespace) -> int:
-    from flockd.inference.session import OnnxModel
+    from flockd.doctor.deadline import GOLDEN_S, within
+    from flockd.inference import OnnxModel
+    from flockd.perception.requirements import check_roles
 
     faults: dict[str, str | None] = {}
     for path in _manifests(args.dir):
         try:
-            OnnxModel(path, threads=THREADS)
+            OnnxModel(path, threads=THREADS, check=check_roles, deadline=within(GOLDEN_S))
         except ModelError as error:
             faults[path.stem] = str(error)
         else:
@@ -153,34 +156,35 @@ def _bench(args: argparse.Namespace) -> int:
     else:
         table = Table("model", "provider", "threads", "ms, median", "least", "input", box=None, pad_edge=False)
         for t in timings:
-            told = [f"{t.median_ms:.1f}", f"{t.least_ms:.1f}", t.input] if t.fault is None else ["-", "-", t.fault]
-            table.add_row(t.model, t.provider, str(t.threads), *told)
+            cells = [f"{t.median_ms:.1f}", f"{t.least_ms:.1f}", t.input] if t.fault is None else ["-", "-", t.fault]
+            table.add_row(t.model, t.provider, str(t.threads), *cells)
         Console(markup=False, highlight=False).print(table)
     return ExitCode.CHECK_FAILED if any(timing.fault for timing in timings) else ExitCode.DONE
 
 
 def _providers(text: str | None) -> Sequence[Provider]:
     from flockd.errors import UsageError
-    from flockd.inference.providers import PROVIDERS, available
+    from flockd.inference.providers import available
 
     if text is None:
         return available()
     named = [provider for provider in PROVIDERS if provider in text.split(",")]
-    strangers = sorted(set(text.split(",")) - set(PROVIDERS))
-    if strangers:
-        raise UsageError(f"--provider: {strangers[0]!r} is none of {', '.join(PROVIDERS)}; choose of these")
+    unknown = sorted(set(text.split(",")) - set(PROVIDERS))
+    if unknown:
+        raise UsageError(f"--provider: {unknown[0]!r} is none of {', '.join(PROVIDERS)}; choose of these")
     return named
 
 
 def _timings(manifests: Sequence[Path], providers: Sequence[Provider], args: argparse.Namespace) -> Iterator[_Timing]:
     from flockd.inference import OnnxModel
-    from flockd.inference.session import feeds_for, shapes_of
+    from flockd.inference.feeds import feeds_for, shapes_of
+    from flockd.perception.requirements import check_roles
 
     for path in manifests:
         for provider in providers:
             for threads in args.threads:
                 try:
-                    model = OnnxModel(path, threads=threads, provider=provider, preparing=True)
+                    model = OnnxModel(path, threads=threads, provider=provider, preparing=True, check=check_roles)
                 except ModelError as error:
                     yield _Timing(path.stem, provider, threads, "", None, None, str(error))
                     continue
@@ -192,12 +196,12 @@ def _timings(manifests: Sequence[Path], providers: Sequence[Provider], args: arg
 
 def _times_ms(model: OnnxModel, feeds: Any, runs: int) -> list[float]:
     model.run(feeds)
-    taken = []
+    times = []
     for _ in range(runs):
         begun_s = time.perf_counter()
         model.run(feeds)
-        taken.append(1e3 * (time.perf_counter() - begun_s))
-    return taken
+        times.append(1e3 * (time.perf_counter() - begun_s))
+    return times
 
 
 def _prepare(args: argparse.Namespace) -> int:
@@ -207,15 +211,15 @@ def _prepare(args: argparse.Namespace) -> int:
     loaded = load(args.config)
     config = loaded.drone if isinstance(loaded, ScenarioConfig) else loaded
     paths = manifests_of(config.perception)
-    told = []
+    prepared = []
     with progress("preparing", "models") as tell:
         for path in paths:
-            told.append(_prepare_one(path, config))
-            tell(len(told), len(paths))
+            prepared.append(_prepare_one(path, config))
+            tell(len(prepared), len(paths))
     if args.json:
-        say_json(told)
+        say_json(prepared)
         return ExitCode.DONE
-    for one in told:
+    for one in prepared:
         start = f"starts in {one['start_s']:.2f} s"
         if one["engines"] is None:
             say(f"{one['model']}: nothing to prepare for {config.perception.provider}; {start}")
@@ -225,21 +229,27 @@ def _prepare(args: argparse.Namespace) -> int:
 
 
 def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
-    """Runs a model on all that it will see of these cameras, keeps what that built, and opens it again as in flight."""
+    """Runs a model on every shape of input that these cameras give it, keeps the engines, and opens it as in flight."""
     from flockd.inference import OnnxModel
+    from flockd.inference.feeds import feeds_for, golden_feeds, shapes_of
     from flockd.inference.providers import builds_engines, engines_folder
-    from flockd.inference.session import feeds_for, golden_feeds, shapes_of
     from flockd.perception.networks import CROPS_PER_RUN
+    from flockd.perception.requirements import check_roles
 
     wanted = config.perception
-    options: Any = {"threads": wanted.threads, "provider": wanted.provider, "engines": engines_folder(wanted)}
+    options: Any = {
+        "threads": wanted.threads,
+        "provider": wanted.provider,
+        "engines": engines_folder(wanted),
+        "check": check_roles,
+    }
     begun_s = time.perf_counter()
     if builds_engines(wanted.provider):
         model = OnnxModel(path, **options, preparing=True)
         sizes = sorted({camera.size_px for camera in config.rig.cameras})
         feeds = [
             golden_feeds(model.manifest),
-            *(feeds_for(model.manifest, size, pictures) for size in sizes for pictures in (1, CROPS_PER_RUN)),
+            *(feeds_for(model.manifest, size, batch) for size in sizes for batch in (1, CROPS_PER_RUN)),
         ]
         for each in feeds:
             model.run(each)
@@ -258,7 +268,7 @@ def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
 
 def _manifests(folder: Path | None) -> tuple[Path, ...]:
     from flockd.data import data_path
-    from flockd.inference.manifest import find_manifests
+    from flockd.inference import find_manifests
 
     folder = folder or data_path("models")
     manifests = find_manifests(folder)

@@ -6,8 +6,9 @@ import argparse
 import re
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
+from flockd.choices import ROLES, AutopilotKind, ScaleSource, SimulatedPerception
 from flockd.cli import fleet
 from flockd.cli.flights import prepare, save, tell, write_findings
 from flockd.cli.output import complain, progress
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 
 SCENARIO = "paper_flight.yaml"
 RECORDINGS = "recordings"
-ROLES = ("flow", "depth", "segmentation", "distance")
 OPTIONS = {
     "duration": "duration_s",
     "seed": "seed",
@@ -45,13 +45,13 @@ def add(commands: Commands) -> None:
     parser.add_argument("scenario", nargs="?", metavar="SCENARIO", type=Path, help="by default the paper's flight")
     parser.add_argument(
         "--perception",
-        choices=("learned", "truth"),
+        choices=get_args(SimulatedPerception),
         default="learned",
         help="fly by sight, or on everybody's exact state without looking (default: learned)",
     )
     parser.add_argument(
         "--autopilot",
-        choices=("standin", "px4"),
+        choices=get_args(AutopilotKind),
         help="fly with a real `flockd run` a drone, and this autopilot (default: with the simulator's own pilots); "
         "`px4` needs FLOCKD_PX4, the SITL build folder of PX4",
     )
@@ -62,9 +62,7 @@ def add(commands: Commands) -> None:
         help=f"with --autopilot: how fast simulated time passes (default: {fleet.DEFAULT_SPEED_FACTOR})",
     )
     parser.add_argument("--flow", metavar="NAME", help="the model for optical flow, or `dis`")
-    parser.add_argument(
-        "--scale", choices=("network", "height", "velocity"), help="where the background's scale comes from"
-    )
+    parser.add_argument("--scale", choices=get_args(ScaleSource), help="where the background's scale comes from")
     parser.add_argument("--drones", metavar="N", type=positive_count, help="size of the flock")
     parser.add_argument("--duration", metavar="S", type=positive_number, help="seconds to fly")
     parser.add_argument("--seed", metavar="N", type=seed, help="of the world and of all noise")

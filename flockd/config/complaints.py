@@ -176,7 +176,7 @@ def _wanted(root: Schema, schema: Schema, unit: str) -> str:
             return "a list of at least 1 entry" if schema.get("minItems") else "a list"
         case _:
             keys = schema.get("required") or schema.get("properties", {})  # what must be there, or else what may
-            return f"a section with {', '.join(sorted(keys))}"
+            return f"a section with {', '.join(sorted(keys))}" if keys else "a section"
 
 
 def _wanted_number(schema: Schema, unit: str) -> str:
@@ -218,7 +218,8 @@ def _schema_at(root: Schema, path: KeyPath) -> Schema:
     for part in path:
         schema = _with_parts(root, schema)
         if isinstance(part, str):
-            schema = schema.get("properties", {}).get(part, {})
+            others = schema.get("additionalProperties")
+            schema = schema.get("properties", {}).get(part, others if isinstance(others, dict) else {})
         else:
             prefix = schema.get("prefixItems", ())
             schema = prefix[part] if part < len(prefix) else schema.get("items", {})

@@ -50,16 +50,16 @@ class Document:
     """Paths whose value is not known because of a problem already listed."""
 
 
-def read_document(path: Path) -> Document:
-    """The values of one YAML file.
+def read_document(path: Path, what: str = "configuration") -> Document:
+    """The values of one YAML file; ``what`` it is, for the messages.
 
     Raises ConfigError with one problem when nothing can be read from it (missing, not text, not YAML, not a mapping);
     lesser faults are listed in the document's `problems`.
     """
-    text = _read_text(path)
+    text = _read_text(path, what)
     document = Document(str(path))
     try:
-        _Builder(document, text).build()
+        _Builder(document, text, what).build()
     except yaml.MarkedYAMLError as error:
         raise ConfigError([_syntax_problem(str(path), text, error)]) from error
     except yaml.reader.ReaderError as error:
@@ -75,7 +75,7 @@ def key_text(path: KeyPath) -> str:
     return text.removeprefix(".")
 
 
-def _read_text(path: Path) -> str:
+def _read_text(path: Path, what: str) -> str:
     def fault(message: str, line: int = 0) -> ConfigError:
         return ConfigError([ConfigProblem(str(path), line, "", message)])
 
@@ -83,7 +83,7 @@ def _read_text(path: Path) -> str:
         if path.is_dir():
             raise fault("is a folder; name the YAML file in it")
         if path.exists() and not path.is_file():
-            raise fault("is not an ordinary file; copy the configuration to one")
+            raise fault(f"is not an ordinary file; copy the {what} to one")
         with path.open("rb") as stream:
             raw = stream.read(MAX_BYTES + 1)
     except FileNotFoundError as error:
@@ -93,7 +93,7 @@ def _read_text(path: Path) -> str:
     except ValueError as error:
         raise fault(f"is not a path ({error}); check it") from error
     if len(raw) > MAX_BYTES:
-        raise fault(f"is larger than {MAX_BYTES // 1024} KiB, which no configuration is; check the path")
+        raise fault(f"is larger than {MAX_BYTES // 1024} KiB, which no {what} is; check the path")
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -104,17 +104,17 @@ def _read_text(path: Path) -> str:
 class _Builder:
     """Walks the parser's events once; depth is bounded, so no input can exhaust the stack."""
 
-    def __init__(self, document: Document, text: str) -> None:
-        self._document = document
+    def __init__(self, document: Document, text: str, what: str) -> None:
+        self._document, self._what = document, what
         self._events: Iterator[yaml.Event] = yaml.parse(text, Loader=yaml.SafeLoader)
 
     def build(self) -> None:
         """Fills the document."""
         if isinstance(self._next_of(yaml.DocumentStartEvent, yaml.StreamEndEvent), yaml.StreamEndEvent):
-            raise self._fatal(0, "is empty; write the configuration into it")
+            raise self._fatal(0, f"is empty; write the {self._what} into it")
         top = next(self._events)
         if isinstance(top, yaml.ScalarEvent) and not top.value:
-            raise self._fatal(0, "is empty; write the configuration into it")
+            raise self._fatal(0, f"is empty; write the {self._what} into it")
         if not isinstance(top, yaml.MappingStartEvent):
             kind = "a list" if isinstance(top, yaml.SequenceStartEvent) else "a single value"
             raise self._fatal(_line(top), f"is {kind} at its top level; write keys with values, such as `seed: 0`")

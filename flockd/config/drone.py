@@ -10,6 +10,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from flockd.choices import OwnVelocitySource
 from flockd.config.autopilot import AutopilotParameters
 from flockd.config.base import Positive, Section
 from flockd.config.flocking import FlockingParameters
@@ -22,7 +23,6 @@ from flockd.config.safety import SafetyParameters
 from flockd.config.source import SourceParameters
 from flockd.config.telemetry import TelemetryParameters
 from flockd.config.tracking import TrackingParameters
-from flockd.messages import OwnVelocitySource
 
 
 class DroneConfig(Section):

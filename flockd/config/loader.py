@@ -9,13 +9,13 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from flockd.choices import ROLES
 from flockd.config.complaints import path_in_file, problems_of
 from flockd.config.document import Document, Place, Value, read_document
 from flockd.config.drone import DroneConfig
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import ConfigError
 
-ROLES = ("flow", "depth", "segmentation", "distance")
 PATHS = {("perception", key) for key in ("models_dir", "engines_dir", *ROLES)} | {("telemetry", "zenoh_config")}
 """Keys of a drone whose values are paths; of a model's role only where it ends in `.yaml`, else it is a name."""
 OVERRIDE = "override"

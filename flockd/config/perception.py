@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field
 
+from flockd.choices import ROLES, FlowRefinement, Provider, Role, ScaleSource
 from flockd.config.base import NonNegative, Positive, Section, Share
-from flockd.messages import ScaleSource
 
-Provider = Literal["cpu", "cuda", "tensorrt", "openvino"]
-"""What computes the networks: ONNX Runtime's execution providers."""
+DIS, NO_MODEL = "dis", "none"
+"""What stands where else a model's name does: OpenCV's DIS flow, and no second stage."""
 
 
 class DetectionParameters(Section):
@@ -56,7 +56,7 @@ class PerceptionConfig(Section):
 
     flow: str = "flow_int8"
     """`dis` is OpenCV's DIS flow instead of a network."""
-    flow_refinement: Literal["dis", "quick_dis", "none"] = "quick_dis"
+    flow_refinement: FlowRefinement = "quick_dis"
     """A network's flow finds what moved far; DIS then makes it exact. `quick_dis` is for flight: 12 ms an image, where
     `dis` takes 34, and where the images show nothing, what is around tells the flow. With a sensor's depth, on images
     that are blurred and moved far, `dis` is worth its time, and every pixel keeps its own flow.
@@ -66,7 +66,7 @@ class PerceptionConfig(Section):
     depth: str = "neighbours_int8"
     segmentation: str = "neighbours_int8"
     distance: str = "distance_int8"
-    """Second stage: a drone's range from its picture alone. `none`: the depth map decides."""
+    """Second stage: a drone's range from its crop alone. `none`: the depth map decides."""
     models_dir: str | None = None
     """Folder of the manifests; by default the one that comes with flockd."""
     threads: Annotated[int, Field(ge=1, le=64)] = 2
@@ -75,8 +75,13 @@ class PerceptionConfig(Section):
     engines_dir: str | None = None
     """Where `flockd models prepare` keeps what a provider has built; by default `engines` beside the manifests."""
     deadline_s: Positive = 1.0
-    """In flight, a network that has not answered one call by then is stuck, and is ended."""
+    """In flight, a network that has not finished one call by then is stuck, and is ended."""
     detection: DetectionParameters = DetectionParameters()
     scale: ScaleSource = "height"
     """The background's metric scale: `network` (pure RGB, as in the paper), `height` (attitude and height above ground
     from the autopilot) or `velocity` (attitude and velocity from the autopilot; the drone has to move)."""
+
+    @property
+    def networks(self) -> dict[Role, str]:
+        """The model's name, or its manifest's path, of each role that a network fills."""
+        return {role: name for role in ROLES if (name := getattr(self, role)) not in {DIS, NO_MODEL}}

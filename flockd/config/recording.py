@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
+from flockd.choices import ImageFormat
 from flockd.config.base import Positive, Section
 
 
 class RecordingConfig(Section):
     """How a flight is written down, where it is."""
 
-    images: Literal["png", "jpeg"] = "png"
+    images: ImageFormat = "png"
     """`png` loses nothing: only then does a replay equal the flight."""
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 90
     queue_mb: Positive = 64.0

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
+from flockd.choices import LensModel
 from flockd.config.base import NonNegative, Positive, Section, Vector3
 
 
@@ -28,7 +29,7 @@ class MeasurementConfig(Section):
 class IntrinsicsConfig(Section):
     """A camera's projection, in pixels; pixel centres at +0.5."""
 
-    model: Literal["pinhole", "wide_angle"] = "pinhole"
+    model: LensModel = "pinhole"
     fx: Positive
     fy: Positive
     cx: Positive

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
+from flockd.choices import AutopilotMode
 from flockd.config.base import NonNegative, Positive, Section, Share
 
 
@@ -45,9 +46,6 @@ class GateParameters(Section):
         if len(set(self.fence_corners_m)) < len(self.fence_corners_m):
             raise ValueError("fence_corners_m names a corner twice; delete one, the fence closes by itself")
         return self
-
-
-AutopilotMode = Literal["hold", "return", "land"]
 
 
 class SafetyParameters(Section):

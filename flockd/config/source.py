@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from flockd.choices import PixelFormat
 from flockd.config.base import Positive, Section
 
 
@@ -24,7 +25,7 @@ class CameraDeviceParameters(Section):
     name: Annotated[str, Field(pattern=r"^[a-z0-9_-]+$")]
     """The camera's name in the rig."""
     device: Annotated[str, Field(pattern=r"^/dev/")]
-    pixel_format: Literal["mjpeg", "yuyv"] = "mjpeg"
+    pixel_format: PixelFormat = "mjpeg"
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 30.0
     controls: tuple[ControlParameters, ...] = ()
     """Set in this order whenever the camera is opened; what is not named here stays as it was."""

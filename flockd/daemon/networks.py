@@ -32,7 +32,7 @@ class WatchedNetworks:
     """`Networks` in front of others; one thread calls it, the counts are for any thread."""
 
     def __init__(self, networks: InterruptibleNetworks, deadline_s: float) -> None:
-        self.crop_size = networks.crop_size
+        self.second_stage = networks.second_stage
         self.map_stride = networks.map_stride
         self._networks = networks
         self._deadline_s = deadline_s
@@ -50,11 +50,6 @@ class WatchedNetworks:
     def hopeless(self) -> bool:
         """Only a new process can help."""
         return self._abandoned >= MAX_ABANDONED
-
-    @property
-    def has_distance(self) -> bool:
-        """See `Networks`, and so for the next three."""
-        return self._networks.has_distance
 
     def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
         """Raises NetworkStuckError; so do the next two."""

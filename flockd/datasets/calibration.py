@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from pydantic import ValidationError
 
+from flockd.choices import LensModel
 from flockd.config import load_drone
 from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.datasets.tables import read_rows
@@ -45,7 +45,7 @@ def camera_of(
     size: tuple[int, int],
     intrinsics: Sequence[float],
     distortion: Sequence[float] = (),
-    model: Literal["pinhole", "wide_angle"] = "pinhole",
+    model: LensModel = "pinhole",
 ) -> CameraConfig:
     """From fx, fy, cx, cy with pixel centres at whole numbers. Raises ConfigError, which names ``file``."""
     fx, fy, cx, cy = (float(value) for value in intrinsics)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import yaml
 
+from flockd.choices import LensModel
 from flockd.config.rig import CameraConfig
 from flockd.datasets.calibration import camera_of, read_calibration
 from flockd.datasets.dataset import Entry, FileDataset
@@ -19,7 +20,7 @@ from flockd.datasets.tables import read_lines, read_rows
 from flockd.errors import ConfigError, ConfigProblem
 from flockd.geometry import RigidTransform
 
-_MODELS: Mapping[str, Literal["pinhole", "wide_angle"]] = {
+_MODELS: Mapping[str, LensModel] = {
     "radial-tangential": "pinhole",
     "equidistant": "wide_angle",
 }

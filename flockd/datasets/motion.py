@@ -55,15 +55,10 @@ class RecordedDepth:
     """Stands before the learned perception and answers depth as it was recorded."""
 
     def __init__(self, learned: Networks) -> None:
-        self.crop_size = learned.crop_size
+        self.second_stage = learned.second_stage
         self.map_stride = learned.map_stride
         self._learned = learned
         self._depth: Float32Array | None = None
-
-    @property
-    def has_distance(self) -> bool:
-        """As the learned perception."""
-        return self._learned.has_distance
 
     def show(self, depth: Float32Array | None) -> None:
         """The depth of the next step's image; None: what is learned."""

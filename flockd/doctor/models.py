@@ -1,4 +1,4 @@
-"""Models: whole, with the right answer, run by the right provider, and fast enough for the step."""
+"""Models: intact, with the golden output, run by the right provider, and fast enough for the step."""
 
 from __future__ import annotations
 
@@ -11,18 +11,20 @@ import cv2
 import numpy as np
 
 from flockd.config import DroneConfig
+from flockd.doctor.deadline import GOLDEN_S, within
 from flockd.doctor.finding import Finding, Level, failed, failed_as_told, passed, warned
 from flockd.errors import ModelError
 from flockd.inference import OnnxModel, manifests_of
 from flockd.inference.providers import engines_folder
 from flockd.messages import Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
 from flockd.perception import Networks
+from flockd.perception.requirements import check_roles
 from flockd.pilot import FlockPilot
 
 STEPS = 4
-"""The first finds no images before it, and warms up."""
+"""How many are timed. The first has no images before it, and warms up."""
 FULL = 0.8
-"""Of the step that thinking may take, before it is told: a neighbour or two more take their time too."""
+"""Share of `safety.degraded_load` above which a step is a warning: each further neighbour takes time too."""
 HEIGHT_M = 5.0
 PASSING_PX = 4
 SKY = (170, 190, 215)
@@ -31,11 +33,11 @@ GRASS = (80, 130)
 
 def check_models(config: DroneConfig) -> Iterator[Finding]:
     """Each model of the configuration, and then how long a step takes with all of them."""
-    whole = True
+    intact = True
     for finding in _each(config):
-        whole = whole and finding.level is not Level.FAILURE
+        intact = intact and finding.level is not Level.FAILURE
         yield finding
-    if whole:
+    if intact:
         yield judge_steps(config, time_steps(config))
 
 
@@ -44,16 +46,23 @@ def _each(config: DroneConfig) -> Iterator[Finding]:
     for path in manifests_of(wanted):
         about = f"model {path.stem}"
         try:
-            model = OnnxModel(path, threads=wanted.threads, provider=wanted.provider, engines=engines_folder(wanted))
+            model = OnnxModel(
+                path,
+                threads=wanted.threads,
+                provider=wanted.provider,
+                engines=engines_folder(wanted),
+                check=check_roles,
+                deadline=within(GOLDEN_S),
+            )
         except ModelError as error:
             yield failed_as_told(about, str(error))
             continue
         size_mb = path.with_name(model.manifest.file).stat().st_size / 1e6
-        yield passed(about, f"hash and golden answer are right, {size_mb:.1f} MB, run by {model.provider}")
+        yield passed(about, f"hash and golden output are right, {size_mb:.1f} MB, run by {model.provider}")
 
 
 def time_steps(config: DroneConfig, networks: Networks | None = None) -> list[tuple[float, PilotOutput]]:
-    """Whole steps of the pilot over an empty meadow, at the size of the cameras: seconds, and what it found."""
+    """Steps of the pilot over an empty meadow, at the size of the cameras: seconds, and the output."""
     pilot = FlockPilot(config, networks, stopwatch=time.perf_counter)
     timed = []
     for number in range(STEPS):
@@ -70,15 +79,15 @@ def time_steps(config: DroneConfig, networks: Networks | None = None) -> list[tu
 
 
 def meadow(size: tuple[int, int], number: int) -> UInt8Array:
-    """Sky above grass that passes by from picture to picture, (height, width, 3) RGB."""
+    """Sky above grass that moves sideways from image to image, (height, width, 3) RGB."""
     width, height = size
-    picture = np.empty((height, width, 3), np.uint8)
-    picture[: height // 2] = SKY
+    image = np.empty((height, width, 3), np.uint8)
+    image[: height // 2] = SKY
     wide = width + STEPS * PASSING_PX
     grass = np.random.default_rng(0).integers(*GRASS, (height // 4, wide // 2, 3), dtype=np.uint8)
     grass = np.asarray(cv2.resize(grass, (wide, height - height // 2)), np.uint8)
-    picture[height // 2 :] = grass[:, number * PASSING_PX :][:, :width]
-    return picture
+    image[height // 2 :] = grass[:, number * PASSING_PX :][:, :width]
+    return image
 
 
 def judge_steps(config: DroneConfig, timed: list[tuple[float, PilotOutput]]) -> Finding:
@@ -92,12 +101,12 @@ def judge_steps(config: DroneConfig, timed: list[tuple[float, PilotOutput]]) -> 
         f"{'threads' if threads > 1 else 'thread'} and {count} {'cameras' if count > 1 else 'camera'} ({longest})"
     )
     load = took_s / config.step_s
-    mend = "give perception.threads more cores, raise step_s, take smaller images, or `perception.flow: dis`"
+    fix = "give perception.threads more cores, raise step_s, take smaller images, or `perception.flow: dis`"
     busy, cores = os.getloadavg()[0], os.cpu_count() or 1
     if busy > cores:
-        mend = f"stop other programs first (a load of {busy:.0f} on {cores} cores), and {mend}"
+        fix = f"stop other programs first (a load of {busy:.0f} on {cores} cores), and {fix}"
     if load > config.safety.degraded_load:
-        return failed("step", f"{measured}: above safety.degraded_load, so it would always fly slowly", mend)
+        return failed("step", f"{measured}: above safety.degraded_load, so it would always fly slowly", fix)
     if load > FULL * config.safety.degraded_load:
-        return warned("step", f"{measured}: little is left for what else the computer does", mend)
+        return warned("step", f"{measured}: little is left for what else the computer does", fix)
     return passed("step", measured)

@@ -1,4 +1,4 @@
-"""From a camera's image to what a model takes, and from the model's maps back to the image."""
+"""Pre- and post-processing: from an image to what a model takes, and from the model's maps back to the image."""
 
 from __future__ import annotations
 
@@ -85,9 +85,9 @@ def entering(spec: InputSpec, images: Sequence[UInt8Array]) -> NDArray[Any]:
     return np.ascontiguousarray(batch, dtype=spec.dtype)
 
 
-def leaving(spec: OutputSpec, answer: NDArray[Any]) -> Float32Array:
-    """An output in its unit; a map as (n, c, h, w)."""
-    values = np.asarray(answer, dtype=np.float32)
+def leaving(spec: OutputSpec, output: NDArray[Any]) -> Float32Array:
+    """An output in its unit, float32; a map as (n, c, h, w)."""
+    values = np.asarray(output, dtype=np.float32)
     if values.ndim == 3:
         values = values[:, None]
     elif values.ndim == 4 and spec.layout == "nhwc":

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import onnxruntime as ort
 
-from flockd.config.perception import PerceptionConfig, Provider
+from flockd.choices import Provider
+from flockd.config.perception import PerceptionConfig
 from flockd.errors import ModelError
-from flockd.inference.manifest import models_folder
+from flockd.inference.manifest_file import ManifestFile, models_folder
 
-PROVIDERS: dict[Provider, str] = {
+EXECUTION_PROVIDERS: dict[Provider, str] = {
     "cpu": "CPUExecutionProvider",
     "cuda": "CUDAExecutionProvider",
     "tensorrt": "TensorrtExecutionProvider",
@@ -45,17 +46,15 @@ def engine_folder(engines: Path | None, provider: Provider, name: str, sha256: s
 def available() -> tuple[Provider, ...]:
     """What the ONNX Runtime that is installed can compute with."""
     found = ort.get_available_providers()
-    return tuple(provider for provider, name in PROVIDERS.items() if name in found)
+    return tuple(provider for provider, name in EXECUTION_PROVIDERS.items() if name in found)
 
 
-def open_session(
-    file: Path, manifest: Path, *, threads: int, provider: Provider, folder: Path | None
-) -> ort.InferenceSession:
+def open_session(file: ManifestFile, *, threads: int, provider: Provider, folder: Path | None) -> ort.InferenceSession:
     """A session that runs on the provider that was asked for, with its engines in ``folder``.
 
     Raises ModelError where that cannot be: never another provider in its place.
     """
-    wanted = PROVIDERS[provider]
+    wanted = EXECUTION_PROVIDERS[provider]
     if provider not in available():
         raise ModelError(
             f"perception.provider: this ONNX Runtime has no {wanted}; install {_PACKAGES[provider]} in its place, or "
@@ -69,15 +68,16 @@ def open_session(
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         session = ort.InferenceSession(
-            str(file), options, providers=_providers(provider, threads, folder), enable_fallback=0
+            str(file.model), options, providers=_providers(provider, threads, folder), enable_fallback=0
         )
     except Exception as error:  # noqa: BLE001 - ONNX Runtime's own exception types are private
         reason = str(error).splitlines()[0]
         if provider == "cpu":
-            raise ModelError(f"{manifest}: file: {file} cannot be loaded ({reason}); restore it") from None
-        raise ModelError(
-            f"{manifest}: file: {file} cannot be loaded by {wanted} ({reason}); mend what it says, or write "
-            "perception.provider: cpu"
+            raise file.error(("file",), f"{file.model} cannot be loaded ({reason}); restore it") from None
+        raise file.error(
+            ("file",),
+            f"{file.model} cannot be loaded by {wanted} ({reason}); fix what it says, or write "
+            "perception.provider: cpu",
         ) from None
     # Where a provider's libraries do not load, ONNX Runtime only warns and takes the CPU.
     found = session.get_providers()
@@ -91,7 +91,8 @@ def open_session(
 
 def _providers(provider: Provider, threads: int, folder: Path | None) -> list[tuple[str, dict[str, str]]]:
     """Providers with their options, the first one first."""
-    cuda = (PROVIDERS["cuda"], {"cudnn_conv_algo_search": "HEURISTIC"})  # the default tries all, at each new shape
+    # By default, CUDA tries all algorithms at each new shape.
+    cuda = (EXECUTION_PROVIDERS["cuda"], {"cudnn_conv_algo_search": "HEURISTIC"})
     options: dict[str, str] = {}
     if provider == "tensorrt":
         if folder is not None:
@@ -101,14 +102,15 @@ def _providers(provider: Provider, threads: int, folder: Path | None) -> list[tu
                 "trt_timing_cache_enable": "1",
                 "trt_timing_cache_path": str(folder),
             }
-        return [(PROVIDERS["tensorrt"], options), cuda]  # what TensorRT has no layer for runs beside it on the GPU
+        # What TensorRT has no layer for runs beside it on the GPU.
+        return [(EXECUTION_PROVIDERS["tensorrt"], options), cuda]
     if provider == "cuda":
         return [cuda]
     if provider == "openvino":
         options = {"device_type": "CPU", "num_of_threads": str(threads)}
         if folder is not None:
             options["cache_dir"] = str(folder)
-    return [(PROVIDERS[provider], options)]
+    return [(EXECUTION_PROVIDERS[provider], options)]
 
 
 @dataclass(frozen=True)

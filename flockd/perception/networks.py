@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -11,22 +11,24 @@ from typing import Protocol
 import cv2
 import numpy as np
 
+from flockd.choices import Role
 from flockd.config.perception import PerceptionConfig
 from flockd.errors import ModelError
 from flockd.geometry import RigCamera
 from flockd.inference.fitting import fit
-from flockd.inference.manifest import Answer, Content, Role, Unknown, manifest_path
+from flockd.inference.manifest import Unknown
+from flockd.inference.manifest_file import manifest_path
 from flockd.inference.providers import engines_folder
 from flockd.inference.session import OnnxModel
 from flockd.messages import Float32Array, Frame, UInt8Array
 from flockd.perception.background_flow import settle_background
 from flockd.perception.detection.instances import group_instances
+from flockd.perception.detection.second_stage import SecondStage
 from flockd.perception.drone_flow import follow_drones
 from flockd.perception.flow import DisFlow, Flow, OnnxFlow
 from flockd.perception.maps import Crop, OpenDepth, RangeEstimate, SceneMaps
+from flockd.perception.requirements import check_roles
 
-_PROPOSAL_LOGIT = -1.5
-_MASK_LOGIT = 0.4
 CROPS_PER_RUN = 24
 """Crops in one run of the distance network, so that an image full of false proposals does not take more memory."""
 _MIN_DEPTH_M, _MAX_DEPTH_M = 1e-3, 1e3
@@ -38,15 +40,10 @@ _MIN_RAY_Z = 0.1
 class Networks(Protocol):
     """What perception asks of networks: `OnnxNetworks`, or exact ones that a simulator puts in their place."""
 
-    crop_size: int
-    """Width and height of the second stage's crops, pixels."""
     map_stride: int
     """Image pixels per pixel of the first stage's maps."""
-
-    @property
-    def has_distance(self) -> bool:
-        """Whether there is a second stage for a drone's range."""
-        ...
+    second_stage: SecondStage | None
+    """How the crops are cut that `ranges` takes; None: there is no second stage."""
 
     def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
         """(h, w, 2) pixels from the first image to the second.
@@ -71,9 +68,6 @@ class Networks(Protocol):
 class OnnxNetworks:
     """The networks that a configuration names. Stateless: may serve several pilots."""
 
-    crop_size = 96
-    map_stride = 2
-
     def __init__(self, config: PerceptionConfig, models_dir: Path) -> None:
         """Raises ModelError."""
         self._models: dict[str, OnnxModel] = {}
@@ -85,11 +79,8 @@ class OnnxNetworks:
         self._segmentation = self._model(config.segmentation, "segmentation")
         self._unknown = self._what_is_unknown(config)
         self._distance = None if config.distance == "none" else self._model(config.distance, "distance")
-
-    @property
-    def has_distance(self) -> bool:
-        """Whether there is a second stage."""
-        return self._distance is not None
+        self.map_stride = self._segmentation.manifest.map_stride or 1
+        self.second_stage = None if self._distance is None else SecondStage.of(self._distance.manifest)
 
     def terminate(self) -> None:
         """Ends every run of a network that is under way; whoever called it gets an error."""
@@ -117,7 +108,11 @@ class OnnxNetworks:
         logit = self._at_map_stride(maps["drone"], (width, height))[0]
         offset = self._at_map_stride(maps["offset"], (width, height))
         # A second stage weeds out false proposals, so that the first may propose more.
-        proposal, certain = (_PROPOSAL_LOGIT, _MASK_LOGIT) if self.has_distance else (0.0, 0.0)
+        threshold = self._segmentation.manifest.threshold
+        alone = threshold("proposal_logit_alone")
+        proposal, certain = alone, alone
+        if self._distance is not None:
+            proposal, certain = threshold("proposal_logit"), threshold("mask_logit")
         labels, instances = group_instances(logit - np.float32(proposal), offset, scale=self.map_stride)
         labels = np.asarray(cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
         low = cv2.resize((logit < certain).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
@@ -126,41 +121,26 @@ class OnnxNetworks:
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         """See `Networks`."""
-        if self._distance is None:
+        if self._distance is None or self.second_stage is None:
             raise ValueError("this configuration has no distance model")
         if not crops:
             return ()
         images = [np.ascontiguousarray(c.image[:, ::-1]) if c.mirrored else c.image for c in crops]
         batches = [images[i : i + CROPS_PER_RUN] for i in range(0, len(images), CROPS_PER_RUN)]
-        outputs = [self._distance.answer({"picture": batch}) for batch in batches]
-        rows = np.concatenate([output["range"] for output in outputs])
+        outputs = [self._distance.infer({"crop": batch}) for batch in batches]
+        columns = self._distance.manifest.results["range"].by_column(np.concatenate([o["range"] for o in outputs]))
         masks: Sequence[Float32Array | None] = [None] * len(crops)
         if "mask" in outputs[0]:
             masks = list(np.concatenate([output["mask"][:, 0] for output in outputs]))
         return tuple(self._estimate(row, crop, mask) for row, crop, mask in zip(rows, crops, masks, strict=True))
 
-    def _estimate(self, row: Float32Array, crop: Crop, mask: Float32Array | None) -> RangeEstimate:
-        """The output's columns, with a mirror image's turned back."""
-        log_range_per_focal, right, down, log_sigma, drone_logit, log_apparent_size = (float(value) for value in row)
-        if crop.mirrored:
-            right = -right
-            mask = None if mask is None else np.ascontiguousarray(mask[:, ::-1])
-        return RangeEstimate(
-            log_range=log_range_per_focal + float(np.log(crop.camera.focal_px)),
-            log_range_sigma=float(np.exp(log_sigma)),
-            centre=np.array([self.crop_size / 2 + right, self.crop_size / 2 + down]),
-            size_m=float(np.exp(log_range_per_focal + log_apparent_size)),
-            drone_probability=float(1.0 / (1.0 + np.exp(-drone_logit))),
-            mask=mask,
-        )
-
-    def _run(self, model: OnnxModel, image: UInt8Array, planes: Float32Array) -> dict[Answer, Float32Array]:
+    def _run(self, model: OnnxModel, image: UInt8Array, planes: Float32Array) -> dict[str, Float32Array]:
         """One model's maps (c, h, w) that show all of an image, at the model's resolution."""
         fitting = fit(model.manifest, (image.shape[1], image.shape[0]))
-        contents: dict[Content, Sequence[UInt8Array] | Float32Array] = {"image": [fitting.enter(image)]}
+        contents: dict[str, Sequence[UInt8Array] | Float32Array] = {"image": [fitting.enter(image)]}
         if "geometry" in model.manifest.contents:
             contents["geometry"] = fitting.enter_planes(planes, self.map_stride)[None]
-        return {name: fitting.inside(map_)[0] for name, map_ in model.answer(contents).items()}
+        return {name: fitting.inside(map_)[0] for name, map_ in model.infer(contents).items()}
 
     def _at_map_stride(self, maps: Float32Array, image: tuple[int, int]) -> Float32Array:
         """(c, h, w) at the resolution that drones are told apart in; two channels are pixels of the map."""
@@ -174,7 +154,7 @@ class OnnxNetworks:
 
     def _with_depth(self, scene: SceneMaps, depth: Float32Array, camera: RigCamera) -> SceneMaps:
         """With metres where the depth network knows them, else with what it leaves open."""
-        meaning = self._depth.manifest.answers["depth"].depth
+        meaning = self._depth.manifest.results["depth"].depth
         is_inverse = meaning.quantity == "inverse_depth"
         if meaning.focal_px:
             size = (depth.shape[1], depth.shape[0])
@@ -189,7 +169,7 @@ class OnnxNetworks:
     def _what_is_unknown(self, config: PerceptionConfig) -> Unknown:
         """What of the depth is left for the autopilot's height or velocity to fix. Raises ModelError."""
         manifest = self._depth.manifest
-        unknown = manifest.answers["depth"].depth.unknown
+        unknown = manifest.results["depth"].depth.unknown
         if config.scale == "network" and unknown != "nothing":
             raise ModelError(
                 f"perception.scale: depth model {config.depth!r} knows no metres, so `network` cannot give the scale; "
@@ -222,6 +202,7 @@ class OnnxNetworks:
                 threads=self._config.threads,
                 provider=self._config.provider,
                 engines=engines_folder(self._config),
+                check=check_roles,
             )
         model = self._models[key]
         if role not in model.manifest.roles:
@@ -230,6 +211,22 @@ class OnnxNetworks:
                 "choose another"
             )
         return model
+
+
+def _estimate(columns: Mapping[str, float], crop: Crop, mask: Float32Array | None, size: int) -> RangeEstimate:
+    """Of one crop's output, with a mirror image's turned back."""
+    right = columns["right_px"]
+    if crop.mirrored:
+        right = -right
+        mask = None if mask is None else np.ascontiguousarray(mask[:, ::-1])
+    return RangeEstimate(
+        log_range=columns["log_range_per_focal"] + float(np.log(crop.camera.focal_px)),
+        log_range_sigma=float(np.exp(columns["log_relative_sigma"])),
+        centre=np.array([size / 2 + right, size / 2 + columns["down_px"]]),
+        size_m=float(np.exp(columns["log_range_per_focal"] + columns["log_apparent_size"])),
+        drone_probability=float(1.0 / (1.0 + np.exp(-columns["drone_logit"]))),
+        mask=mask,
+    )
 
 
 def geometry_planes(camera: RigCamera, ground: Float32Array | None, stride: int) -> Float32Array:

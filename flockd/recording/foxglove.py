@@ -20,6 +20,7 @@ from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import DecodeError
 
+from flockd.choices import ImageFormat
 from flockd.config.rig import CameraConfig, RigConfig
 from flockd.messages import FloatArray
 from flockd.recording.mcap_file import RecordingError, Stream
@@ -32,7 +33,7 @@ _CENTRE_PX = 0.5
 """Pixel centres lie at whole numbers in Foxglove, as in OpenCV, and half a pixel farther here."""
 
 
-def image(time_ns: int, camera: str, data: bytes, kind: Literal["png", "jpeg"]) -> bytes:
+def image(time_ns: int, camera: str, data: bytes, kind: ImageFormat) -> bytes:
     """A CompressedImage."""
     message = CompressedImage(frame_id=camera, data=data, format=kind)
     message.timestamp.FromNanoseconds(time_ns)

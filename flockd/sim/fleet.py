@@ -10,10 +10,10 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
+from flockd.choices import AutopilotKind
 from flockd.config import DroneConfig
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import UnavailableError
@@ -26,7 +26,6 @@ from flockd.sim.processes import Program
 from flockd.sim.swarm import Flight
 from flockd.sources import clock_at
 
-AutopilotKind = Literal["standin", "px4"]
 Progress = Callable[[int, int], None]
 
 AUTOPILOT_START_S, DAEMON_START_S = 90.0, 180.0

@@ -7,10 +7,10 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
+from flockd.choices import ROLES, SimulatedPerception
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import UsageError
 from flockd.flocking import FlockingLaw, course, desired_velocity
@@ -25,7 +25,7 @@ from flockd.sim.log_book import LogBook
 from flockd.sim.photographer import Photographer
 from flockd.sim.pictures import picture, pictured_steps
 from flockd.sim.truth import fly_truth, step_times
-from flockd.sim.truth_perception import ROLES, TruthPerception
+from flockd.sim.truth_perception import TruthPerception
 from flockd.sim.vehicles import SimulatedAutopilot, Vehicles
 from flockd.telemetry import TelemetrySink, publish_step
 
@@ -43,7 +43,7 @@ class Flight:
 def fly(
     scenario: ScenarioConfig,
     *,
-    perception: Literal["learned", "truth"] = "learned",
+    perception: SimulatedPerception = "learned",
     swap: frozenset[str] = frozenset(),
     telemetry: TelemetrySink | None = None,
     recorders: Sequence[Recorder] = (),

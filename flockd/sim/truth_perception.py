@@ -12,8 +12,6 @@ from flockd.messages import Float32Array, FloatArray, Frame, UInt8Array
 from flockd.perception import Crop, Instance, Networks, RangeEstimate, SceneMaps
 from flockd.sim.renderer import View, true_flow
 
-ROLES = ("flow", "depth", "segmentation", "distance")
-"""What can be swapped."""
 _SKY_M = 1000.0
 _MIN_PIXELS = 10
 _SIZE_M = 0.6
@@ -42,16 +40,11 @@ class TruthPerception:
     """
 
     def __init__(self, learned: Networks, swap: frozenset[str], rig: Rig) -> None:
-        self.crop_size = learned.crop_size
+        self.second_stage = learned.second_stage
         self.map_stride = learned.map_stride
         self._learned, self._swap, self._rig = learned, swap, rig
         self._now: Shot | None = None
         self._before: Shot | None = None
-
-    @property
-    def has_distance(self) -> bool:
-        """There is a second stage, learned or true."""
-        return "distance" in self._swap or self._learned.has_distance
 
     def show(self, shot: Shot) -> None:
         """What the next step's frames truly hold."""
@@ -110,7 +103,7 @@ class TruthPerception:
         return sorted(found, key=lambda one: -one.area_px)
 
     def _range(self, crop: Crop, now: Shot) -> RangeEstimate:
-        size = self.crop_size
+        size = crop.camera.size[0]
         visible = [d for d in now.shown if any((view.ids == d + 1).sum() >= _MIN_PIXELS for view in now.views.values())]
         if not visible:
             return RangeEstimate(0.0, 1.0, np.full(2, size / 2), _SIZE_M, drone_probability=0.0)

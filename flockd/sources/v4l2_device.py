@@ -16,10 +16,10 @@ from fractions import Fraction
 from types import TracebackType
 from typing import ClassVar, Literal, Protocol, Self
 
+from flockd.choices import PixelFormat
 from flockd.config.source import ControlParameters
 from flockd.errors import UnavailableError
 
-PixelFormat = Literal["mjpeg", "yuyv"]
 Clock = Literal["monotonic", "copied", "unknown"]
 
 _CAPTURE = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE

@@ -120,7 +120,7 @@ def test_a_changed_model_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
     values["perception"]["models_dir"] = str(models)
     config.write_text(yaml.safe_dump(values), encoding="utf-8")
     assert main(["run", "--config", str(config)]) == 78
-    assert "flow_int8.yaml: sha256: " in capsys.readouterr().err
+    assert "flow_int8.yaml:5: sha256: " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,7 @@ from flockd.perception import Crop, RangeEstimate, SceneMaps
 from flockd.sources import FramePublisher
 from flockd.telemetry.watcher import FleetWatcher, Heard
 from tests.autopilot.flight import until
+from tests.perception.shipped import SECOND_STAGE
 
 WIDTH, HEIGHT = 64, 48
 CAMERAS = ("front", "back")
@@ -47,9 +48,8 @@ PATIENT = SafetyParameters(degraded_load=50.0, max_load=100.0, max_loop_lag_s=2.
 class TinyPerceiver:
     """Not networks: says that all stands still before a tilted wall, and sees no drone. A test may spoil it."""
 
-    crop_size = 96
     map_stride = 2
-    has_distance = True
+    second_stage = SECOND_STAGE
 
     def __init__(self) -> None:
         self.astray = 0

@@ -15,6 +15,7 @@ from flockd.messages import Float32Array, FloatArray, Frame, UInt8Array
 from flockd.perception import Crop, DisFlow, RangeEstimate, SceneMaps
 from flockd.sim.renderer import Renderer
 from flockd.sim.world import World
+from tests.perception.shipped import SECOND_STAGE
 
 WIDTH, HEIGHT = 320, 240
 FOCAL = 200.0
@@ -61,9 +62,8 @@ def film() -> Film:
 class Onlooker:
     """In the place of the networks: OpenCV's flow, no drones, and the film's depth in its order."""
 
-    crop_size = 96
     map_stride = 2
-    has_distance = True
+    second_stage = SECOND_STAGE
 
     def __init__(self, depth: Sequence[FloatArray]) -> None:
         self._flow = DisFlow()

@@ -40,7 +40,7 @@ def test_a_flipped_bit_is_a_failure_of_that_model_alone(copies: Path) -> None:
     flow, neighbours, distance = check_models(_with(models_dir=str(copies)))
     for finding, name in ((flow, "flow_int8"), (neighbours, "neighbours_int8")):
         assert (finding.level, finding.about) == (Level.PASS, f"model {name}")
-        assert "hash and golden answer are right" in finding.measured
+        assert "hash and golden output are right" in finding.measured
         assert "run by CPUExecutionProvider" in finding.measured
     assert (distance.level, distance.about) == (Level.FAILURE, "model distance_int8")
     assert "was changed or damaged" in distance.measured

@@ -1,4 +1,4 @@
-"""Models of others: whatever they take and say, their manifest tells how."""
+"""Models of other people: their manifest says what they take and what their outputs mean."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from onnx import helper
 
 from flockd.config.perception import PerceptionConfig
 from flockd.data import data_path
@@ -16,8 +15,8 @@ from flockd.inference import OnnxModel
 from flockd.inference.fitting import fit
 from flockd.messages import Frame
 from flockd.perception import OnnxFlow, OnnxNetworks
+from tests.inference.foreign import SIZE, constant_flow, one_channel_depth
 from tests.perception.cameras import camera_of
-from tests.perception.foreign import SIZE, image_input, map_output, one_channel_depth, write_model
 
 WIDTH, HEIGHT = SIZE
 
@@ -49,24 +48,6 @@ def test_an_image_enters_in_the_order_range_and_normalisation_of_the_manifest(
     path = one_channel_depth(tmp_path, channel=channel, output={}, colour=colour, **imagenet)
     seen = perception_with(path, scale="network").scene(front(plain((200, 100, 50))), camera_of(40.0, SIZE), None)
     np.testing.assert_allclose(seen.depth, expected, rtol=1e-5)
-
-
-def constant_flow(folder: Path, flow: tuple[float, float], size: tuple[int | str, int | str] = SIZE) -> Path:
-    """A flow network in NHWC, in grey, that says the same whatever it sees, and says it in NHWC."""
-    width, height = size
-    spec = image_input(shape=[1, height, width, 1], layout="nhwc", colour="grey", white=255.0)
-    nodes = [
-        helper.make_node("Sub", ["a", "b"], ["difference"]),
-        helper.make_node("Mul", ["difference", "zeros"], ["nothing"]),
-        helper.make_node("Add", ["nothing", "always"], ["motion"]),
-    ]
-    weights = {"zeros": np.zeros(2, np.float32), "always": np.array(flow, np.float32)}
-    return write_model(
-        folder, "someones_flow", "flow", nodes,
-        inputs={"a": {**spec, "carries": "first"}, "b": {**spec, "carries": "second"}},
-        outputs={"motion": map_output([1, height, width, 2], gives="flow", layout="nhwc")},
-        weights=weights,
-    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -127,61 +108,3 @@ def test_a_metric_network_leaves_its_scale_to_the_autopilot_where_that_is_asked_
         assert seen.open is not None
         assert not seen.open.shift
         np.testing.assert_allclose(seen.open.inverse, 5.0, rtol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("changes", "complaint"),
-    [
-        ({"carries": "second"}, r"inputs: the role depth needs one that carries 'image'"),
-        ({"colour": "grey"}, r"inputs: image: shape: a grey image in nchw has 1 where 3 is written"),
-        ({"mean": [0.5]}, r"inputs: image: mean: has 1 numbers for 3 channels"),
-        ({"layout": "whcn"}, r"inputs\.rgb\.layout: Input should be 'nhwc' or 'nchw'"),
-        ({"shape": [1, 3, 32]}, r"inputs: image: shape: an image has 4 axes \(nchw\), and not 3"),
-        (
-            {"shape": [1, 3, 32, 64]},
-            r"inputs\.rgb\.shape: the manifest says \[1, 3, 32, 64\] but the model file \[1, 3, 3",
-        ),
-        (
-            {"shape": ["n", 3, 32, 48]},
-            r"inputs\.rgb\.shape: the manifest says \[n, 3, 32, 48\] but the model file \[1, ",
-        ),
-        ({"dtype": "float16"}, r"inputs\.rgb\.dtype: the manifest says float16 but the model file float32"),
-    ],
-)
-def test_a_manifest_that_does_not_fit_is_refused_in_one_sentence(
-    tmp_path: Path, changes: dict[str, Any], complaint: str
-) -> None:
-    import yaml
-
-    path = one_channel_depth(tmp_path, output={})
-    document = yaml.safe_load(path.read_text())
-    document["inputs"]["rgb"] |= changes
-    path.write_text(yaml.safe_dump(document))
-    with pytest.raises(ModelError, match=complaint) as refused:
-        OnnxModel(path, threads=1)
-    assert str(refused.value).startswith(f"{path}: ")
-    assert "\n" not in str(refused.value)
-
-
-def test_sizes_that_the_file_leaves_free_the_manifest_may_fix(tmp_path: Path) -> None:
-    import yaml
-
-    path = constant_flow(tmp_path, (1.0, 1.0), ("w", "h"))
-    document = yaml.safe_load(path.read_text())
-    for name in ("a", "b"):
-        document["inputs"][name]["shape"] = [1, HEIGHT, WIDTH, 1]
-    path.write_text(yaml.safe_dump(document))
-    assert OnnxModel(path, threads=1).manifest.fixed_size == SIZE
-
-
-def test_an_output_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    import yaml
-
-    path = constant_flow(tmp_path, (3.0, -2.0))
-    document = yaml.safe_load(path.read_text())
-    document["outputs"] = {"moved": document["outputs"]["motion"]}
-    path.write_text(yaml.safe_dump(document))
-    with pytest.raises(
-        ModelError, match=r"outputs: the manifest names \['moved'\] but the model file has \['motion'\]"
-    ):
-        OnnxModel(path, threads=1)

@@ -9,7 +9,7 @@ import pytest
 from flockd.messages import Float32Array, UInt8Array
 from flockd.perception import DisFlow
 from flockd.perception.landmarks import flow_of_landmarks
-from tests.perception.conftest import Astray, grey
+from tests.perception.conftest import WrongFlow, grey
 
 HEIGHT, WIDTH = 360, 540
 
@@ -80,4 +80,4 @@ def test_nothing_alike_gives_no_flow() -> None:
 def test_dis_finds_a_large_turn_about_the_optical_axis_although_the_network_went_astray() -> None:
     first = pattern(1)
     second, true = moved(first, turn(25, 1.3, 60, -30))
-    assert np.median(errors(DisFlow(Astray()).flow(first, second), true)) < 2.0  # as near as DIS gets at such a zoom
+    assert np.median(errors(DisFlow(WrongFlow()).flow(first, second), true)) < 2.0  # as near as DIS gets at such a zoom

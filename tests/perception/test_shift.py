@@ -9,7 +9,7 @@ import pytest
 from flockd.messages import UInt8Array
 from flockd.perception import DisFlow
 from flockd.perception.shift import global_shift, likeness
-from tests.perception.conftest import Astray, grey
+from tests.perception.conftest import WrongFlow, grey
 
 
 def windows(right: int, down: int) -> tuple[UInt8Array, UInt8Array]:
@@ -39,6 +39,6 @@ def test_a_flow_is_likely_where_it_leads_to_the_same() -> None:
 
 def test_dis_finds_a_large_turn_although_the_network_went_astray() -> None:
     first, second = windows(-240, 30)
-    flow = DisFlow(Astray()).flow(first, second)
+    flow = DisFlow(WrongFlow()).flow(first, second)
     inside = np.s_[20:-60, 270:-20]
     assert np.abs(np.median(flow[inside], axis=(0, 1)) - [-240.0, 30.0]).max() < 0.2

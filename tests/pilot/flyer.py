@@ -15,6 +15,7 @@ from flockd.pilot import FlockPilot
 from flockd.sim.photographer import Photographer
 from flockd.sim.truth_perception import ROLES, TruthPerception
 from flockd.sim.vehicles import Vehicles
+from tests.perception.shipped import SECOND_STAGE
 
 STEP_S = 0.5
 CRUISE = np.array([[1.0, 0.0], [0.8, 0.2]])
@@ -24,9 +25,8 @@ TURNED = np.array([0.2, 0.0])
 class NoNetworks:
     """A fake: every role is answered by the truth before it comes here."""
 
-    crop_size = 96
     map_stride = 2
-    has_distance = True
+    second_stage = SECOND_STAGE
 
     def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
         raise AssertionError("asked for a learned flow")

@@ -43,5 +43,5 @@ def test_pictures_like_the_last_look_at_a_drone_are_drawn_more_often_than_others
 
 
 def test_a_folder_without_pictures_says_how_to_make_them(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"make them with tools/render_drone_pictures\.py"):
+    with pytest.raises(FileNotFoundError, match=r"make them with `python -m tools\.render_drone_pictures`"):
         PictureFiles(tmp_path)

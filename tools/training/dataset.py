@@ -51,7 +51,7 @@ def open_pairs(folder: Path) -> PairSet:
     """The pairs of every part in ``folder``, opened read-only."""
     parts = sorted(folder.glob("part-*"))
     if not parts:
-        raise FileNotFoundError(f"{folder}: no rendered pairs here; make them with tools/render_training_data.py")
+        raise FileNotFoundError(f"{folder}: no rendered pairs; make them with `python -m tools.render_training_data`")
     opened = {name: [np.load(part / f"{name}.npy", mmap_mode="r") for part in parts] for name in ARRAYS}
     big = {"image", "depth", "ids", "flow", "flow_valid"}
     arrays = {n: (_Chained(a) if n in big else np.concatenate([np.asarray(x) for x in a])) for n, a in opened.items()}

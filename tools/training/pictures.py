@@ -40,7 +40,9 @@ class PictureFiles:
                 if "mask" not in self._files[path]:
                     raise ValueError(f"{path}: its pictures have no masks; make the folder anew")
         if not self._files:
-            raise FileNotFoundError(f"{self._folder}: no pictures here; make them with tools/render_drone_pictures.py")
+            raise FileNotFoundError(
+                f"{self._folder}: no pictures here; make them with `python -m tools.render_drone_pictures`"
+            )
         self._ends = np.cumsum([len(file["drone"]) for file in self._files.values()])
         family = np.concatenate([np.where(file["drone"] > 0.5, file["family"], -1) for file in self._files.values()])
         aimed = np.concatenate([_aimed(file) for file in self._files.values()])

@@ -18,8 +18,7 @@ from flockd.perception.detection.proposals import (
     propose_predictions,
     propose_residuals,
 )
-from flockd.perception.detection.refinement import Candidate, Cascade, Thresholds
-from flockd.perception.detection.roi import CropRules
+from flockd.perception.detection.refinement import Candidate, Cascade
 from flockd.perception.maps import SceneMaps
 from flockd.perception.networks import Networks
 from flockd.tracking import Prediction
@@ -38,8 +37,8 @@ class Detector:
 
     def __init__(self, rig: Rig, networks: Networks, parameters: DetectionParameters) -> None:
         self._rig, self._networks, self._parameters = rig, networks, parameters
-        self._rules = CropRules()
-        self._cascade = Cascade(networks, self._rules, Thresholds(), parameters)
+        stage = networks.second_stage
+        self._refining = None if stage is None else (stage.rules, Cascade(networks, stage, parameters))
         self._renderers = {name: MaskRenderer(c, networks.map_stride) for name, c in rig.cameras.items()}
 
     def detect(
@@ -62,19 +61,19 @@ class Detector:
         if not images:
             return (), {}
         rig = Rig({name: self._rig.cameras[name] for name in images})
-        proposals = propose_instances(rig, scenes, self._rules)
-        trace.proposals += proposals
-        if not self._networks.has_distance:
-            trace.candidates += candidates_from_depth(rig, scenes, proposals, self._parameters)
+        if self._refining is None:
+            trace.candidates += candidates_from_depth(rig, scenes, self._parameters)
             return self._masked(suppress(trace.candidates, self._parameters), images, scenes, ())
-        candidates, rejected = self._cascade.refine(rig, images, proposals)
-        predicted = propose_predictions(rig, vehicle, predictions, [c.bearing for c in candidates], self._rules)
-        candidates += self._cascade.refine(rig, images, predicted)[0]
+        rules, cascade = self._refining
+        proposals = propose_instances(rig, scenes, rules)
+        candidates, rejected = cascade.refine(rig, images, proposals)
+        predicted = propose_predictions(rig, vehicle, predictions, [c.bearing for c in candidates], rules)
+        candidates += cascade.refine(rig, images, predicted)[0]
         none = {proposal.instance for proposal in rejected if proposal.instance}
         masks = {n: m.by_networks() for n, m in self._masks(separate(candidates), scenes, none).items()}
-        residuals = propose_residuals(rig, scenes, masks, self._rules, self._parameters)
-        candidates += self._cascade.refine(rig, images, residuals)[0]
-        trace.proposals += predicted + residuals
+        residuals = propose_residuals(rig, scenes, masks, rules, self._parameters)
+        candidates += cascade.refine(rig, images, residuals)[0]
+        trace.proposals += [*proposals, *predicted, *residuals]
         trace.candidates += candidates
         return self._masked(suppress(candidates, self._parameters), images, scenes, none)
 

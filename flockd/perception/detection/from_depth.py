@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from flockd.geometry import Rig, RigCamera, log_polar
 from flockd.perception.detection.instances import Instance
 from flockd.perception.detection.proposals import Proposal
 from flockd.perception.detection.refinement import Candidate
-from flockd.perception.detection.roi import angle_between
+from flockd.perception.detection.roi import Roi, angle_between
 from flockd.perception.maps import SceneMaps
 
 _MAX_RADIUS_M = 0.6
@@ -21,19 +21,17 @@ _MIN_ANGLE = 1e-3
 
 
 def candidates_from_depth(
-    rig: Rig, scenes: Mapping[str, SceneMaps], proposals: Sequence[Proposal], parameters: DetectionParameters
+    rig: Rig, scenes: Mapping[str, SceneMaps], parameters: DetectionParameters
 ) -> list[Candidate]:
-    """One a proposal of the first stage: the centre of the bounding box of its points."""
+    """One an instance of the first stage: the centre of the bounding box of its points."""
     found = []
-    for proposal in proposals:
-        camera = rig.cameras[proposal.cameras[0]]
-        if proposal.instance is not None:
-            found.append(_candidate(camera, scenes[camera.name], proposal, proposal.instance, parameters))
+    for name, scene in scenes.items():
+        found += [_candidate(rig.cameras[name], scene, instance, parameters) for instance in scene.instances]
     return [one for one in found if one is not None]
 
 
 def _candidate(
-    camera: RigCamera, scene: SceneMaps, proposal: Proposal, instance: Instance, parameters: DetectionParameters
+    camera: RigCamera, scene: SceneMaps, instance: Instance, parameters: DetectionParameters
 ) -> Candidate | None:
     rows, columns = np.nonzero(scene.labels == instance.label)
     pixels = np.asarray(np.stack([columns, rows], 1) + 0.5, np.float64)
@@ -47,5 +45,6 @@ def _candidate(
     left, top, right, _ = instance.box
     rays = camera.camera.rays(np.array([[left, top], [right, top]]))
     width = max(angle_between(rays[0], rays[1]), _MIN_ANGLE)
+    proposal = Proposal((camera.name,), Roi(bearing, width / 2), instance)
     sigma = parameters.depth_map_sigma
     return Candidate(proposal, bearing, log_range, sigma, sigma * width, math.exp(log_range) * width)

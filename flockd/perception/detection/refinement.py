@@ -14,24 +14,9 @@ from flockd.geometry import Rig, VirtualCrop, log_polar, log_polar_covariance, l
 from flockd.messages import FloatArray, UInt8Array
 from flockd.perception.detection.masks import CropMask
 from flockd.perception.detection.proposals import Proposal
-from flockd.perception.detection.roi import CropRules, Roi, take_crops
+from flockd.perception.detection.roi import Roi, take_crops
+from flockd.perception.detection.second_stage import SecondStage
 from flockd.perception.maps import Crop, RangeEstimate
-
-
-@dataclass(frozen=True)
-class Thresholds:
-    """Decisions on what a network of the second stage says. They belong to its weights."""
-
-    drone: float = 0.8
-    """Least drone probability of a detection."""
-    predicted_drone: float = 0.7
-    """The same where a track was predicted."""
-    another_crop: float = 0.2
-    """With no more than this, a proposal is rejected without another crop."""
-    mean_sigma: float = 0.98
-    """Error of the mean of a crop and its mirrored one, as a share of what a single crop's would be."""
-    min_log_range_sigma: float = 0.005
-    bearing_sigma_rad: float = 0.004
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +53,6 @@ class Candidate:
 class RangeNetwork(Protocol):
     """Of `flockd.perception.networks.Networks`, what refinement needs."""
 
-    crop_size: int
-
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         """Range and centre of the drone in the middle of each crop."""
         ...
@@ -88,11 +71,9 @@ class _Stage:
 class Cascade:
     """Refines proposals with the network of the second stage."""
 
-    def __init__(
-        self, network: RangeNetwork, rules: CropRules, thresholds: Thresholds, parameters: DetectionParameters
-    ) -> None:
-        self._network = network
-        self._rules, self._thresholds, self._parameters = rules, thresholds, parameters
+    def __init__(self, network: RangeNetwork, second_stage: SecondStage, parameters: DetectionParameters) -> None:
+        self._network, self._crop_size = network, second_stage.crop_size
+        self._rules, self._thresholds, self._parameters = second_stage.rules, second_stage.thresholds, parameters
 
     def refine(
         self, rig: Rig, images: Mapping[str, UInt8Array], proposals: Sequence[Proposal]
@@ -140,7 +121,7 @@ class Cascade:
         """What the network says of each crop, in the body."""
         if not stages:
             return []
-        crops, views = take_crops(rig, images, [stage.roi for stage in stages], self._network.crop_size)
+        crops, views = take_crops(rig, images, [stage.roi for stage in stages], self._crop_size)
         return [
             self._candidate(stage, view, estimate)
             for stage, view, estimate in zip(stages, views, self._network.ranges(crops), strict=True)

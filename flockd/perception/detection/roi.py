@@ -19,21 +19,21 @@ _BORDER_PX = 2
 
 @dataclass(frozen=True)
 class CropRules:
-    """How crops are to be cut for a network of the second stage: as those that it was trained on."""
+    """How crops are to be cut for a network of the second stage, as its manifest says: as those that it was trained on."""
 
-    fill: float = 0.68
+    fill: float
     """Half of the crop's width over the drone's size, both as seen from the camera."""
-    first_margin: float = 0.95
+    first_margin: float
     """Half of the first crop's width over the way from a box's centre to its farthest corner."""
-    cut_margin: float = 1.4
+    cut_margin: float
     """The same where the image's border cuts the box: the drone is larger than what is seen of it."""
-    mirror_scale: float = 0.9
+    mirror_scale: float
     """Width of the mirrored crop over what suits the drone."""
-    min_half_angle: float = math.radians(1.0)
-    max_half_angle: float = math.radians(35.0)
-    max_resize: float = 1.7
+    min_half_angle: float
+    max_half_angle: float
+    max_resize: float
     """A further crop is at most this many times as wide as the last one, and at least as much narrower."""
-    max_crops: int = 4
+    max_crops: int
     """Of one proposal, before the mirrored one."""
 
     def half_angle(self, size_m: float, range_m: float, before: float | None = None) -> float:

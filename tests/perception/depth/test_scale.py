@@ -14,7 +14,7 @@ from flockd.geometry import Rig, RigCamera, build_rig, ground_inverse_depth
 from flockd.messages import BoolArray, Float32Array, FloatArray, Frame, FrameSet, UInt8Array, VehicleState
 from flockd.perception import Instance, OnnxNetworks, OpenDepth, Perception, SceneMaps
 from flockd.perception.depth import VelocityScale, fix_by_height
-from tests.perception.foreign import SIZE, one_channel_depth
+from tests.inference.foreign import SIZE, one_channel_depth
 
 WIDTH, HEIGHT = 160, 120
 FACTOR, SHIFT = 2.5, 0.03

@@ -14,8 +14,8 @@ from flockd.perception import Crop, Instance, RangeEstimate, SceneMaps
 from flockd.perception.detection.detector import DetectionTrace, Detector
 from flockd.perception.detection.masks import DroneLogits, DroneMasks, first_stage_labels, without_borders
 from flockd.perception.detection.proposals import largest_blobs, propose_residuals
-from flockd.perception.detection.roi import CropRules
 from flockd.sim.truth_perception import TruthPerception
+from tests.perception.shipped import SECOND_STAGE
 from tests.pilot.flyer import Flyer, scenario_with
 
 PARAMETERS = DetectionParameters()
@@ -124,10 +124,10 @@ def test_a_drone_painted_like_the_one_before_it_is_still_proposed() -> None:
     by_colours = masks.by_colours(image, COLOUR_WEIGHT)
     assert (by_colours == np.where(near | far, 1, 0)).mean() > 0.99
     scenes = {scene.camera: replace(scene.maps, uncertain=~(near | far))}
-    (proposal,) = propose_residuals(rig, scenes, {scene.camera: masks.by_networks()}, CropRules(), PARAMETERS)
+    (proposal,) = propose_residuals(rig, scenes, {scene.camera: masks.by_networks()}, SECOND_STAGE.rules, PARAMETERS)
     place = flyer.vehicles.R_ned_body[0].T @ (flyer.vehicles.position[2] - flyer.vehicles.position[0])
     assert proposal.roi.direction @ place / np.linalg.norm(place) > np.cos(0.02)
-    assert not propose_residuals(rig, scenes, {scene.camera: by_colours}, CropRules(), PARAMETERS)
+    assert not propose_residuals(rig, scenes, {scene.camera: by_colours}, SECOND_STAGE.rules, PARAMETERS)
 
 
 def test_an_image_full_of_false_ones_gives_only_the_largest_residuals() -> None:

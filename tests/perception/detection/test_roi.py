@@ -9,10 +9,11 @@ import pytest
 
 from flockd.geometry import Rig
 from flockd.perception import Instance
-from flockd.perception.detection.roi import CropRules, Roi, angle_between, roi_of_instance, take_crops
+from flockd.perception.detection.roi import Roi, angle_between, roi_of_instance, take_crops
 from tests.perception.cameras import camera_of
+from tests.perception.shipped import SECOND_STAGE
 
-RULES = CropRules()
+RULES = SECOND_STAGE.rules
 CAMERA = camera_of(320.0, (640, 480))
 
 

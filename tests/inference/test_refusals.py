@@ -1,4 +1,4 @@
-"""What must never fly: damaged models, weights that are no numbers, another provider than the one asked for."""
+"""What must never run: damaged models, weights that are no numbers, another provider than the one asked for."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from flockd.inference import OnnxModel, load_manifest
 from flockd.inference.providers import Prepared, available
 from flockd.inference.weights import fault_of_weights
 from flockd.perception import OnnxNetworks
-from tests.perception.foreign import SIZE, image_input, map_output, write_model
+from flockd.perception.requirements import check_roles
+from tests.inference.foreign import SIZE, image_input, map_output, write_model
 
 MODELS = data_path("models")
 ROOT = Path(__file__).parents[2]
@@ -77,7 +78,7 @@ def put_in_a_nan(manifest: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "told"),
+    ("damage", "expected"),
     [
         (flip_a_bit, "sha256: "),
         (truncate, "sha256: "),
@@ -88,10 +89,10 @@ def put_in_a_nan(manifest: Path) -> None:
         (put_in_a_nan, "holds NaN; restore the model or train it again"),
     ],
 )
-def test_a_start_with_a_spoilt_model_ends_with_one_sentence(
-    spoil: Callable[[Path], None], told: str, copies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_start_with_a_damaged_model_ends_with_one_sentence(
+    damage: Callable[[Path], None], expected: str, copies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    spoil(copies / "neighbours_int8.yaml")
+    damage(copies / "neighbours_int8.yaml")
     drone = tmp_path / "drone.yaml"
     drone.write_text(
         (ROOT / "config" / "px4_sitl.yaml")
@@ -111,10 +112,10 @@ def test_a_start_with_a_spoilt_model_ends_with_one_sentence(
     sentences = capsys.readouterr().err.splitlines()
     assert [line for line in sentences if "perception.scale" not in line] == [sentences[-1]]
     assert sentences[-1].startswith(str(copies / "neighbours_int8.yaml"))
-    assert told in sentences[-1]
+    assert expected in sentences[-1]
 
 
-def test_a_nan_that_no_answer_shows_is_found_too() -> None:
+def test_a_nan_that_no_output_shows_is_found_too() -> None:
     """ReLU may make a number of it."""
     weights = np.array([1.0, np.nan, 2.0], np.float32)
     half = np.array([1.0, np.nan], np.float16)
@@ -168,7 +169,7 @@ def test_a_provider_that_is_not_there_is_refused_and_nothing_takes_its_place() -
 
 @pytest.mark.parametrize("provider", ["cuda", "tensorrt", "openvino"])
 def test_a_network_in_8_bits_is_for_the_cpu_alone(provider: str) -> None:
-    """A GPU would run it slower than the float one and without a word, OpenVINO with other answers."""
+    """A GPU would run it slower than the float one and without a warning, OpenVINO with other outputs."""
     config = PerceptionConfig.model_validate({"provider": provider})
     with pytest.raises(ModelError, match=rf"flow_int8 is made for cpu, not for {provider}; name another"):
         OnnxNetworks(config, MODELS)
@@ -179,14 +180,15 @@ def test_a_provider_that_onnx_runtime_silently_replaces_is_an_error(monkeypatch:
     """As on a computer with onnxruntime-gpu and no driver: it is listed, and does not start."""
     listed = ["CUDAExecutionProvider", "CPUExecutionProvider"]
     monkeypatch.setattr(ort, "get_available_providers", lambda: listed)
-    told = r"CUDAExecutionProvider does not start here, and .* took CPUExecutionProvider"
-    with pytest.warns(UserWarning, match="not in available"), pytest.raises(ModelError, match=told):
+    expected = r"CUDAExecutionProvider does not start here, and .* took CPUExecutionProvider"
+    with pytest.warns(UserWarning, match="not in available"), pytest.raises(ModelError, match=expected):
         OnnxModel(MODELS / "flow.yaml", threads=1, provider="cuda")
 
 
 def test_tensorrt_never_builds_in_flight(tmp_path: Path) -> None:
     with pytest.raises(
-        ModelError, match=r"flow\.yaml: is not prepared for tensorrt, .* run `flockd models prepare` first"
+        ModelError,
+        match=r"flow\.yaml:4: file: flow\.onnx is not prepared for tensorrt, .*; run `flockd models prepare`",
     ):
         OnnxModel(MODELS / "flow.yaml", threads=1, provider="tensorrt", engines=tmp_path)
 
@@ -204,7 +206,7 @@ def test_what_was_prepared_covers_what_lies_between(tmp_path: Path) -> None:
     assert Prepared.load(tmp_path / "elsewhere") is None
 
 
-def test_a_provider_that_cannot_run_a_model_is_told_in_one_sentence(tmp_path: Path) -> None:
+def test_a_provider_that_cannot_run_a_model_is_an_error_of_one_sentence(tmp_path: Path) -> None:
     """It loads, and fails with the golden input."""
     width, height = SIZE
     weights = {"shape": np.array([1, 3, height, width + 1], np.int64)}
@@ -214,16 +216,16 @@ def test_a_provider_that_cannot_run_a_model_is_told_in_one_sentence(tmp_path: Pa
         outputs={"flow": map_output([1, "c", height, "w"])},
         weights=weights, golden=False,
     )  # fmt: skip
-    with pytest.raises(ModelError, match=r"broken\.yaml: CPUExecutionProvider cannot run broken\.onnx \(.*; choose"):
+    with pytest.raises(ModelError, match=r"broken\.yaml:4: file: CPUExecutionProvider cannot run broken\.onnx \(.*;"):
         OnnxModel(path, threads=1)
 
 
-def test_a_mask_of_another_size_than_its_picture_is_refused(tmp_path: Path) -> None:
+def test_a_mask_of_another_size_than_its_crop_is_refused(tmp_path: Path) -> None:
     for suffix in ("yaml", "onnx"):
         (tmp_path / f"distance.{suffix}").write_bytes((MODELS / f"distance.{suffix}").read_bytes())
     manifest = tmp_path / "distance.yaml"
     inputs, outputs = manifest.read_text(encoding="utf-8").split("outputs:")
     before, mask = outputs.split("  mask:")
     manifest.write_text(f"{inputs}outputs:{before}  mask:{mask.replace('- 96', '- 48')}", encoding="utf-8")
-    with pytest.raises(ModelError, match="mask: shape: has to be as high and wide as the picture"):
-        load_manifest(manifest)
+    with pytest.raises(ModelError, match=r"outputs\.mask\.shape: has to be as high and wide as the crop"):
+        load_manifest(manifest, check_roles)

@@ -1,4 +1,4 @@
-"""Tiny models as others might export them, with their manifests."""
+"""Tiny models as other people might export them, with their manifests."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import onnxruntime as ort
 import yaml
 from onnx import TensorProto, helper, numpy_helper
 
+from flockd.inference.feeds import golden_feeds
 from flockd.inference.manifest import Manifest
-from flockd.inference.session import golden_feeds
 
 SIZE = (48, 32)
 
@@ -43,7 +43,7 @@ def write_model(
     golden: bool = True,
     **keys: Any,
 ) -> Path:
-    """Writes model and manifest; ``golden=False`` leaves the golden answer 0. Returns the manifest's path."""
+    """Writes model and manifest; ``golden=False`` leaves the golden output 0. Returns the manifest's path."""
 
     def info(tensor: str, spec: dict[str, Any]) -> onnx.ValueInfoProto:
         kinds = {"float32": TensorProto.FLOAT, "float16": TensorProto.FLOAT16, "uint8": TensorProto.UINT8}
@@ -79,12 +79,18 @@ def write_model(
         for key, value in zip(outputs, session.run(list(outputs), feeds), strict=True):
             document["outputs"][key] |= {"golden_mean": float(value.mean()), "golden_deviation": float(value.std())}
     path = folder / f"{name}.yaml"
-    path.write_text(yaml.safe_dump(document, sort_keys=False))
+    write_manifest(path, document)
     return path
 
 
+def write_manifest(path: Path, document: dict[str, Any]) -> None:
+    """Without anchors: lists that two keys share are written twice."""
+    dumper = type("Dumper", (yaml.SafeDumper,), {"ignore_aliases": lambda self, data: True})
+    path.write_text(yaml.dump(document, Dumper=dumper, sort_keys=False))
+
+
 def one_channel_depth(folder: Path, *, channel: int = 0, output: dict[str, Any], **changes: Any) -> Path:
-    """A depth network that says what one channel of its image holds."""
+    """A depth network whose output is one channel of its image."""
     width, height = SIZE
     weights = {"which": np.array([channel], np.int64), "axis": np.array([1], np.int64)}
     nodes = [
@@ -95,5 +101,23 @@ def one_channel_depth(folder: Path, *, channel: int = 0, output: dict[str, Any],
         folder, "someones_depth", "depth", nodes,
         inputs={"rgb": image_input(carries="image", **changes)},
         outputs={"disparity": map_output([1, height, width], gives="depth", **output)},
+        weights=weights,
+    )  # fmt: skip
+
+
+def constant_flow(folder: Path, flow: tuple[float, float], size: tuple[int | str, int | str] = SIZE) -> Path:
+    """A flow network in NHWC, in grey, whose output, in NHWC too, is the same for all images."""
+    width, height = size
+    spec = image_input(shape=[1, height, width, 1], layout="nhwc", colour="grey", white=255.0)
+    nodes = [
+        helper.make_node("Sub", ["a", "b"], ["difference"]),
+        helper.make_node("Mul", ["difference", "zeros"], ["nothing"]),
+        helper.make_node("Add", ["nothing", "always"], ["motion"]),
+    ]
+    weights = {"zeros": np.zeros(2, np.float32), "always": np.array(flow, np.float32)}
+    return write_model(
+        folder, "someones_flow", "flow", nodes,
+        inputs={"a": {**spec, "carries": "first"}, "b": {**spec, "carries": "second"}},
+        outputs={"motion": map_output([1, height, width, 2], gives="flow", layout="nhwc")},
         weights=weights,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""`flockd models`: what a person sees of the networks before they fly."""
+"""`flockd models`: the networks, listed, verified, timed and prepared."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from flockd.cli import main
 from flockd.config import load_drone
 from flockd.data import data_path
 from flockd.inference import load_manifest
-from tests.perception.foreign import one_channel_depth
+from tests.inference.foreign import one_channel_depth
 
 FLOAT = ("distance", "flow", "neighbours")
 
 
-def test_the_list_tells_hash_and_licence(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_list_shows_hash_and_licence(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["models", "list", "--json"]) == 0
     listed = {model["name"]: model for model in json.loads(capsys.readouterr().out)}
     assert sorted(listed) == sorted([*FLOAT, *(f"{name}_int8" for name in FLOAT)])
@@ -24,14 +24,14 @@ def test_the_list_tells_hash_and_licence(capsys: pytest.CaptureFixture[str]) -> 
     assert listed["flow"]["sha256"] == load_manifest(data_path("models") / "flow.yaml")[0].sha256
 
 
-def test_verify_tells_which_model_is_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verify_names_the_damaged_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = one_channel_depth(tmp_path, output={})
     assert main(["models", "verify", "--dir", str(tmp_path)]) == 0
     path.with_suffix(".onnx").write_bytes(b"")
     assert main(["models", "verify", "--dir", str(tmp_path), "--json"]) == 1
-    (told,) = json.loads(capsys.readouterr().out.partition("\n")[2])
-    assert told["model"] == "someones_depth"
-    assert "sha256" in told["fault"]
+    (verified,) = json.loads(capsys.readouterr().out.partition("\n")[2])
+    assert verified["model"] == "someones_depth"
+    assert "sha256" in verified["fault"]
 
 
 def test_bench_times_each_number_of_threads_and_says_what_entered(
@@ -67,7 +67,7 @@ def test_on_the_cpu_there_is_nothing_to_prepare(tmp_path: Path, capsys: pytest.C
     drone.write_text(text.replace("perception:\n", f"perception:\n  engines_dir: {tmp_path / 'engines'}\n"))
     assert load_drone(drone).perception.provider == "cpu"
     assert main(["models", "prepare", "--config", str(drone), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert [one["model"] for one in told] == ["flow_int8", "neighbours_int8", "distance_int8"]
-    assert all(one["engines"] is None and one["start_s"] > 0 for one in told)
+    prepared = json.loads(capsys.readouterr().out)
+    assert [one["model"] for one in prepared] == ["flow_int8", "neighbours_int8", "distance_int8"]
+    assert all(one["engines"] is None and one["start_s"] > 0 for one in prepared)
     assert not (tmp_path / "engines").exists()

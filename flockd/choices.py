@@ -1,0 +1,44 @@
+"""Every closed choice of the configuration and the command line, spelled once; imports nothing heavy.
+
+Where a choice is needed at run time, ``typing.get_args`` lists it.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+Role = Literal["flow", "depth", "segmentation", "distance"]
+"""What a network is used for: optical flow of two images, depth of one, drones in one, range of the drone in a crop."""
+ROLES: tuple[Role, ...] = get_args(Role)
+
+Provider = Literal["cpu", "cuda", "tensorrt", "openvino"]
+"""What computes the networks: ONNX Runtime's execution providers."""
+PROVIDERS: tuple[Provider, ...] = get_args(Provider)
+
+FlowRefinement = Literal["dis", "quick_dis", "none"]
+"""What sharpens a network's flow."""
+
+ScaleSource = Literal["network", "height", "velocity"]
+"""Where the metric scale of the background comes from."""
+
+OwnVelocitySource = Literal["vision", "autopilot"]
+"""Whose estimate of its own velocity a drone flies by."""
+
+LensModel = Literal["pinhole", "wide_angle"]
+"""A camera's projection: with OpenCV's radial-tangential distortion, or equidistant (Kannala-Brandt)."""
+LENS_MODELS: tuple[LensModel, ...] = get_args(LensModel)
+
+PixelFormat = Literal["mjpeg", "yuyv"]
+"""What a V4L2 camera delivers."""
+
+ImageFormat = Literal["png", "jpeg"]
+"""How the images of a recording are compressed."""
+
+AutopilotMode = Literal["hold", "return", "land"]
+"""What flockd may ask the autopilot to do instead of following it."""
+
+SimulatedPerception = Literal["learned", "truth"]
+"""Whether a simulated drone flies by its networks or by the simulator's state."""
+
+AutopilotKind = Literal["standin", "px4"]
+"""Which autopilot a simulated fleet flies with."""

@@ -1,0 +1,64 @@
+"""What a network of the second stage asks for: how its crops are cut, and how its outputs are judged."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from flockd.errors import ModelError
+from flockd.inference import Manifest
+from flockd.perception.detection.roi import CropRules
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Decisions on what the network says. They belong to its weights, and stand in its manifest."""
+
+    drone: float
+    """Least drone probability of a detection."""
+    predicted_drone: float
+    """The same where a track was predicted."""
+    another_crop: float
+    """With no more than this, a proposal is rejected without another crop."""
+    mean_sigma: float
+    """Error of the mean of a crop and its mirrored one, as a share of what a single crop's would be."""
+    min_log_range_sigma: float
+    bearing_sigma_rad: float
+
+
+@dataclass(frozen=True)
+class SecondStage:
+    """A network's interface."""
+
+    crop_size: int
+    """Width and height of its crops, pixels."""
+    rules: CropRules
+    thresholds: Thresholds
+
+    @classmethod
+    def of(cls, manifest: Manifest) -> SecondStage:
+        """Raises ModelError where the manifest does not say how crops are cut or outputs are judged."""
+        crop = manifest.crop
+        if crop is None:
+            raise ModelError(f"model {manifest.name} takes no crops; choose one whose manifest has a section `crop`")
+        return cls(
+            crop_size=manifest.crop_size_px,
+            rules=CropRules(
+                fill=crop.fill,
+                first_margin=crop.first_margin,
+                cut_margin=crop.cut_margin,
+                mirror_scale=crop.mirror_scale,
+                min_half_angle=math.radians(crop.min_half_angle_deg),
+                max_half_angle=math.radians(crop.max_half_angle_deg),
+                max_resize=crop.max_resize,
+                max_crops=crop.max_crops,
+            ),
+            thresholds=Thresholds(
+                drone=manifest.threshold("drone_probability"),
+                predicted_drone=manifest.threshold("expected_drone_probability"),
+                another_crop=manifest.threshold("another_crop_probability"),
+                mean_sigma=manifest.threshold("mean_sigma_factor"),
+                min_log_range_sigma=manifest.threshold("min_relative_sigma"),
+                bearing_sigma_rad=manifest.threshold("bearing_sigma_rad"),
+            ),
+        )
