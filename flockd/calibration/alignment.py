@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
 from flockd.calibration.errors import CalibrationError
-from flockd.calibration.least_squares import Normal, Solution, minimise
-from flockd.calibration.turns import CameraTurn, best_rotation
+from flockd.calibration.turns import CameraTurn
+from flockd.geometry.rigid_fit import fit_rotation
+from flockd.geometry.robust.kernels import Tukey
+from flockd.geometry.robust.reweighting import reweighted, robust_rotation
+from flockd.geometry.robust.solver import LevenbergMarquardt, NormalEquations, Problem, Solution
 from flockd.geometry.rotations import rotation_from_vector
 from flockd.messages import BoolArray, FloatArray
 
@@ -91,14 +94,14 @@ def align(turns: Sequence[CameraTurn], attitudes: Attitudes, max_offset_s: float
     Raises CalibrationError where there are too few turns, where both contradict each other, and where the vehicle
     turned too little, or about one axis only, to tell.
     """
-    each = _Problem.of(turns, attitudes, max_offset_s)
+    each = _Turns.of(turns, attitudes, max_offset_s)
     offset_s, weights = each.scan(max_offset_s)
-    state, weights, _ = _fit(
-        each, _State(best_rotation(each.vehicle(offset_s), each.camera, weights), offset_s), weights
-    )
+    start = _State(fit_rotation(each.camera, each.vehicle(offset_s), weights), offset_s)
+    solution, weights = _fit(each, start, weights)
     chains = _chained([turn for turn, weight in zip(each.turns, weights, strict=True) if weight > _FITS])
-    problem = _Problem.of(chains, attitudes, max_offset_s)
-    state, weights, solution = _fit(problem, state, np.ones(len(problem.turns)))
+    problem = _Turns.of(chains, attitudes, max_offset_s)
+    solution, weights = _fit(problem, solution.state, np.ones(len(problem.turns)))
+    state = solution.state
     left = problem.residuals(state)
     good = weights > _FITS
     rms = float(np.sqrt((left[good] ** 2).sum(axis=1).mean()))
@@ -124,13 +127,18 @@ def align(turns: Sequence[CameraTurn], attitudes: Attitudes, max_offset_s: float
     return found
 
 
-def _fit(problem: _Problem, state: _State, weights: FloatArray) -> tuple[_State, FloatArray, Solution[_State]]:
-    for _ in range(_ROUNDS):
-        solution = minimise(state, partial(problem.normal, weights=weights), _move)
-        state, before, weights = solution.state, weights, _weights(problem.residuals(solution.state))
-        if float(np.abs(weights - before).max()) < _SETTLED:
-            break
-    return state, weights, solution
+def _fit(turns: _Turns, start: _State, weights: FloatArray) -> tuple[Solution[_State], FloatArray]:
+    """From a start and weights (n,): the last fit, and the weights of what it leaves over."""
+    return reweighted(
+        lambda weights, before: LevenbergMarquardt().minimise(
+            _Alignment(turns, weights), before.state if before else start
+        ),
+        lambda solution: np.linalg.norm(turns.residuals(solution.state), axis=1),
+        _tukey,
+        weights,
+        rounds=_ROUNDS,
+        settled=_SETTLED,
+    )
 
 
 def _chained(turns: Sequence[CameraTurn]) -> list[CameraTurn]:
@@ -150,7 +158,7 @@ def _chained(turns: Sequence[CameraTurn]) -> list[CameraTurn]:
     return found
 
 
-def _check_known(found: Alignment, problem: _Problem, at_limit: bool) -> None:
+def _check_known(found: Alignment, problem: _Turns, at_limit: bool) -> None:
     if not found.sigma_deg < _SIGMA_DEG:
         spread = np.abs(problem.vehicle(found.time_offset_s)).mean(axis=0)
         most = _AXES[int(np.argmax(spread))]
@@ -173,7 +181,7 @@ class _State:
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class _Turns:
     turns: Sequence[CameraTurn]
     attitudes: Attitudes
     starts_s: FloatArray
@@ -182,7 +190,7 @@ class _Problem:
     """(n, 3) rotation vectors of the camera's turns, in its axes."""
 
     @classmethod
-    def of(cls, turns: Sequence[CameraTurn], attitudes: Attitudes, max_offset_s: float) -> _Problem:
+    def of(cls, turns: Sequence[CameraTurn], attitudes: Attitudes, max_offset_s: float) -> _Turns:
         """Of those turns that attitudes are known for, whatever the offset."""
         starts, ends = (np.array([getattr(turn, name) for turn in turns]) for name in ("start_s", "end_s"))
         known = np.ones(len(turns), np.bool_)
@@ -209,11 +217,9 @@ class _Problem:
         """The offset that leaves least, whatever the rotation, and the weights (n,) of the turns there."""
         best = (math.inf, 0.0, np.ones(len(self.camera)))
         for offset_s in np.arange(-max_offset_s, max_offset_s + _SCAN_S / 2, _SCAN_S):
-            vehicle, weights = self.vehicle(float(offset_s)), np.ones(len(self.camera))
-            for _ in range(3):
-                left = vehicle - self.camera @ best_rotation(vehicle, self.camera, weights).T
-                weights = _weights(left)
-            cost = float(np.median(np.linalg.norm(left, axis=1)))
+            vehicle = self.vehicle(float(offset_s))
+            _, left, weights = robust_rotation(self.camera, vehicle, _tukey, rounds=3)
+            cost = float(np.median(left))
             if cost < best[0]:
                 best = (cost, float(offset_s), weights)
         return best[1], best[2]
@@ -222,31 +228,34 @@ class _Problem:
         """(n, 3) radians."""
         return self.vehicle(state.offset_s) - self.camera @ state.rotation.T
 
-    def normal(self, state: _State, weights: FloatArray) -> Normal:
-        scale = np.sqrt(weights)[:, None]
-        left = (self.residuals(state) * scale).ravel()
-        turned = self.camera @ state.rotation.T
-        derivative = np.zeros((len(turned), 3, 4))
+
+@dataclass(frozen=True, eq=False)
+class _Alignment(Problem[_State]):
+    """Four parameters: the camera's rotation vector in the body, and the offset in seconds."""
+
+    turns: _Turns
+    weights: FloatArray
+
+    def linearise(self, state: _State) -> NormalEquations:
+        turned = self.turns.camera @ state.rotation.T
+        jacobian = np.zeros((len(turned), 3, 4))
         x, y, z = turned.T
-        derivative[:, 0, 1], derivative[:, 0, 2] = -z, y
-        derivative[:, 1, 0], derivative[:, 1, 2] = z, -x
-        derivative[:, 2, 0], derivative[:, 2, 1] = -y, x
-        later, sooner = self.vehicle(state.offset_s + _TIME_STEP_S), self.vehicle(state.offset_s - _TIME_STEP_S)
-        derivative[:, :, 3] = (later - sooner) / (2 * _TIME_STEP_S)
-        J = (derivative * scale[:, :, None]).reshape(-1, 4)
-        return Normal(float(left @ left), J.T @ left, J.T @ J)
+        jacobian[:, 0, 1], jacobian[:, 0, 2] = -z, y
+        jacobian[:, 1, 0], jacobian[:, 1, 2] = z, -x
+        jacobian[:, 2, 0], jacobian[:, 2, 1] = -y, x
+        later = self.turns.vehicle(state.offset_s + _TIME_STEP_S)
+        sooner = self.turns.vehicle(state.offset_s - _TIME_STEP_S)
+        jacobian[:, :, 3] = (later - sooner) / (2 * _TIME_STEP_S)
+        residuals = self.turns.residuals(state).ravel()
+        return NormalEquations.of(residuals, jacobian.reshape(-1, 4), np.repeat(self.weights, 3))
+
+    def move(self, state: _State, step: FloatArray) -> _State:
+        return _State(rotation_from_vector(step[:3]) @ state.rotation, state.offset_s + float(step[3]))
 
 
-def _move(state: _State, step: FloatArray) -> _State:
-    return _State(rotation_from_vector(step[:3]) @ state.rotation, state.offset_s + float(step[3]))
-
-
-def _weights(left: FloatArray) -> FloatArray:
-    """Tukey's: what is far off counts nothing."""
-    size = np.linalg.norm(left, axis=1)
-    scale = 6.0 * max(float(np.median(size)), 1e-9)
-    weights: FloatArray = np.maximum(1.0 - (size / scale) ** 2, 0.0) ** 2
-    return weights
+def _tukey(left: FloatArray) -> Tukey:
+    """For residuals (n,): what is far off counts nothing."""
+    return Tukey(6.0 * max(float(np.median(left)), 1e-9))
 
 
 def _logs(rotations: FloatArray) -> FloatArray:

@@ -10,10 +10,10 @@ from typing import Literal
 import numpy as np
 
 from flockd.calibration.errors import CalibrationError
-from flockd.calibration.least_squares import Normal, Solution, minimise
 from flockd.calibration.poses import first_poses, jacobian_of_move, moved
 from flockd.calibration.views import View
 from flockd.geometry import Camera, PinholeCamera, RigidTransform, WideAngleCamera
+from flockd.geometry.robust.solver import LevenbergMarquardt, NormalEquations, Problem
 from flockd.messages import FloatArray
 
 Model = Literal["pinhole", "wide_angle"]
@@ -106,7 +106,7 @@ def calibrate(views: Sequence[View], size: tuple[int, int], model: Model) -> Len
     dropped: list[tuple[View, float]] = []
     kept = list(views)
     for _ in range(_MOST_ROUNDS):
-        solution = _fit(kept, state)
+        solution = LevenbergMarquardt().minimise(_LensProblem(kept), state)
         state = solution.state
         rms = np.array([_rms(_residuals(state.camera, *one)) for one in zip(kept, state.poses, strict=True)])
         limit = max(_OUTLIER * float(np.median(rms)), float(np.median(rms)) + _OUTLIER_PX)
@@ -123,7 +123,7 @@ def calibrate(views: Sequence[View], size: tuple[int, int], model: Model) -> Len
                 "stays as it is, and the board's own numbers of squares"
             )
     corners = sum(len(view.seen.ids) for view in kept)
-    sigma = solution.sigma(2 * corners, len(solution.normal.gradient))[: 4 + _COEFFICIENTS[model]]
+    sigma = solution.sigma(2 * corners, len(solution.equations.gradient))[: 4 + _COEFFICIENTS[model]]
     lens = Lens(model, state.camera, sigma, tuple(kept), state.poses, tuple(dropped))
     _check_known(lens)
     return lens
@@ -189,47 +189,44 @@ def _first_pose(camera: Camera, view: View) -> tuple[float, RigidTransform | Non
     return min(finite, key=lambda one: one[0]) if finite else (math.inf, None)
 
 
-def _fit(views: Sequence[View], state: _State) -> Solution[_State]:
-    return minimise(state, lambda now: _normal(views, now), _move)
-
-
-def _normal(views: Sequence[View], state: _State) -> Normal:
+@dataclass(frozen=True, eq=False)
+class _LensProblem(Problem[_State]):
     """Blocks: the lens, then six for each view."""
-    lens = len(_numbers(state.camera))
-    size = lens + 6 * len(views)
-    gradient, hessian, cost = np.zeros(size), np.zeros((size, size)), 0.0
-    points = np.concatenate([pose.apply(view.seen.points) for view, pose in zip(views, state.poses, strict=True)])
-    seen = np.concatenate([view.seen.pixels for view in views])
-    residuals = state.camera.project(points) - seen
-    by_point, by_lens = state.camera.jacobian(points), _jacobian_of_lens(state.camera, points)
-    if not (np.isfinite(residuals).all() and np.isfinite(by_point).all() and np.isfinite(by_lens).all()):
-        return Normal(math.inf, gradient, np.eye(size))
-    start = 0
-    for index, (view, pose) in enumerate(zip(views, state.poses, strict=True)):
-        part = slice(start, start + len(view.seen.ids))
-        start = part.stop
-        r = residuals[part].ravel()
-        A = by_lens[part].reshape(-1, lens)
-        B = (by_point[part] @ jacobian_of_move(pose, view.seen.points)).reshape(-1, 6)
-        own = slice(lens + 6 * index, lens + 6 * index + 6)
-        cost += float(r @ r)
-        gradient[:lens] += A.T @ r
-        gradient[own] = B.T @ r
-        hessian[:lens, :lens] += A.T @ A
-        hessian[:lens, own] = A.T @ B
-        hessian[own, :lens] = hessian[:lens, own].T
-        hessian[own, own] = B.T @ B
-    return Normal(cost, gradient, hessian)
 
+    views: Sequence[View]
 
-def _move(state: _State, step: FloatArray) -> _State:
-    numbers = _numbers(state.camera)
-    changed = numbers + step[: len(numbers)]
-    # A focal length that shrinks to nothing or turns its sign is no camera; the step is refused by its cost.
-    changed[:2] = np.maximum(changed[:2], 0.2 * numbers[:2])
-    steps = step[len(numbers) :].reshape(-1, 6)
-    poses = tuple(moved(pose, own) for pose, own in zip(state.poses, steps, strict=True))
-    return _State(_camera_like(state.camera, changed), poses)
+    def linearise(self, state: _State) -> NormalEquations:
+        lens = len(_numbers(state.camera))
+        size = lens + 6 * len(self.views)
+        gradient, hessian, cost = np.zeros(size), np.zeros((size, size)), 0.0
+        pairs = list(zip(self.views, state.poses, strict=True))
+        points = np.concatenate([pose.apply(view.seen.points) for view, pose in pairs])
+        residuals = state.camera.project(points) - np.concatenate([view.seen.pixels for view in self.views])
+        by_point, by_lens = state.camera.jacobian(points), _jacobian_of_lens(state.camera, points)
+        if not (np.isfinite(residuals).all() and np.isfinite(by_point).all() and np.isfinite(by_lens).all()):
+            return NormalEquations.unsolvable(size)
+        start = 0
+        for index, (view, pose) in enumerate(pairs):
+            part = slice(start, start + len(view.seen.ids))
+            start = part.stop
+            by_pose = by_point[part] @ jacobian_of_move(pose, view.seen.points)
+            block = NormalEquations.of(
+                residuals[part].ravel(), np.concatenate([by_lens[part], by_pose], axis=2).reshape(-1, lens + 6)
+            )
+            own = np.r_[:lens, lens + 6 * index : lens + 6 * index + 6]
+            cost += block.cost
+            gradient[own] += block.gradient
+            hessian[np.ix_(own, own)] += block.hessian
+        return NormalEquations(cost, gradient, hessian)
+
+    def move(self, state: _State, step: FloatArray) -> _State:
+        numbers = _numbers(state.camera)
+        changed = numbers + step[: len(numbers)]
+        # A focal length that shrinks to nothing or turns its sign is no camera; the step is refused by its cost.
+        changed[:2] = np.maximum(changed[:2], 0.2 * numbers[:2])
+        steps = step[len(numbers) :].reshape(-1, 6)
+        poses = tuple(moved(pose, own) for pose, own in zip(state.poses, steps, strict=True))
+        return _State(_camera_like(state.camera, changed), poses)
 
 
 def _jacobian_of_lens(camera: Camera, points: FloatArray) -> FloatArray:

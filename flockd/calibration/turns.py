@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
 
 from flockd.geometry import Camera
+from flockd.geometry.robust.kernels import Cauchy
+from flockd.geometry.robust.reweighting import robust_rotation
+from flockd.geometry.robust.solver import GaussNewton, NormalEquations, Problem
 from flockd.geometry.rotations import rotation_from_vector
 from flockd.messages import BoolArray, Float32Array, FloatArray, UInt8Array
 
@@ -21,7 +24,8 @@ _APART = 1 / 60
 _WINDOW_PX, _LEVELS = (21, 21), 4
 _THERE_AND_BACK_PX = 0.5
 _LEAST_POINTS = 40
-_ROUNDS, _STEPS = 6, 12
+_ROUNDS = 6
+_OPTIMIZER = GaussNewton(max_steps=12, tolerance=1e-8)
 _FEW_PX = 0.35
 """Where a turn alone leaves no more than this, by the median, the camera's own shift does not show."""
 _AHEAD, _ESSENTIAL_ANGLE = 0.3, 0.003
@@ -115,7 +119,7 @@ def _followed(
 
 
 def _turn(before: FloatArray, after: FloatArray, focal_px: float) -> Turn | str:
-    rotation, left = _pure_turn(before, after)
+    rotation, left, _ = robust_rotation(after, before, _cauchy, rounds=_ROUNDS)
     if np.median(left) * focal_px > _FEW_PX:
         starts = [rotation, *_essential_turn(before, after, rotation)]
         rotation, left = min(
@@ -144,52 +148,76 @@ def _essential_turn(before: FloatArray, after: FloatArray, near: FloatArray) -> 
     return [max(rotations, key=lambda rotation: float(np.trace(near.T @ rotation)))]
 
 
-def _pure_turn(before: FloatArray, after: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The best rotation of directions (n, 3) where only far things are seen, and the angles (n,) it leaves."""
-    weights = np.ones(len(before))
-    for _ in range(_ROUNDS):
-        rotation = best_rotation(before, after, weights)
-        left = np.linalg.norm(before - after @ rotation.T, axis=1)
-        weights = _weights(left)
-    return rotation, left
-
-
-def best_rotation(to: FloatArray, vectors: FloatArray, weights: FloatArray) -> FloatArray:
-    """(3, 3) R with least ``sum w |to - R vectors|^2`` (Wahba's problem, by Kabsch)."""
-    u, _, vt = np.linalg.svd((to * weights[:, None]).T @ vectors)
-    rotation: FloatArray = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return rotation
-
-
-def _turn_beside_a_shift(before: FloatArray, after: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The rotation for which both directions and one shift lie in a plane, at whatever distance each point is.
+@dataclass(frozen=True, eq=False)
+class _Epipolar:
+    """Directions seen from two places, one turned by ``rotation``: all planes of a pair share the camera's shift.
 
     The shift drops out: it is the least eigenvector of the planes' normals (Kneip and Lynen 2013).
     """
-    rotation, weights = start, np.ones(len(before))
-    left = weights
-    for _ in range(_STEPS):
-        turned = after @ rotation.T
-        normals = np.cross(before, turned)
-        shift = np.linalg.eigh((normals * weights[:, None]).T @ normals)[1][:, 0]
-        # How far the point lies off its epipolar plane, as an angle.
-        off = normals @ shift / np.maximum(np.linalg.norm(np.cross(before, shift), axis=1), 0.05)
-        left = np.abs(off)
-        weights = _weights(left)
+
+    before: FloatArray
+    """(n, 3)"""
+    after: FloatArray
+    """(n, 3)"""
+    rotation: FloatArray
+    weights: FloatArray
+    """(n,) that the shift is found with."""
+
+    @cached_property
+    def turned(self) -> FloatArray:
+        """(n, 3) ``after`` in the first camera's axes."""
+        return self.after @ self.rotation.T
+
+    @cached_property
+    def normals(self) -> FloatArray:
+        """(n, 3) of the planes of both directions."""
+        return np.cross(self.before, self.turned)
+
+    @cached_property
+    def shift(self) -> FloatArray:
+        """(3,) unit vector along which the camera moved."""
+        least: FloatArray = np.linalg.eigh((self.normals * self.weights[:, None]).T @ self.normals)[1][:, 0]
+        return least
+
+    @cached_property
+    def sines(self) -> FloatArray:
+        """(n,) of the angle between direction and shift; where they are near no plane is well known."""
+        return np.maximum(np.linalg.norm(np.cross(self.before, self.shift), axis=1), 0.05)
+
+    @cached_property
+    def residuals(self) -> FloatArray:
+        """(n,) how far each point lies off its epipolar plane, as an angle."""
+        off: FloatArray = self.normals @ self.shift / self.sines
+        return off
+
+
+class _TurnBesideAShift(Problem[_Epipolar]):
+    """Five parameters: the rotation vector, and the shift's two, which follow the turn and are found anew each time."""
+
+    def linearise(self, state: _Epipolar) -> NormalEquations:
         # d (before x R after) . shift / d turn, with R' = exp(turn) R: before x (turn x turned) . shift
-        slope = np.cross(turned, np.cross(shift, before))
-        slope /= np.maximum(np.linalg.norm(np.cross(before, shift), axis=1), 0.05)[:, None]
-        # The shift follows the turn: only what it cannot take up counts.
-        along, across = _tangents(shift)
-        by_shift = np.stack([normals @ along, normals @ across], axis=1)
-        by_shift /= np.maximum(np.linalg.norm(np.cross(before, shift), axis=1), 0.05)[:, None]
-        J = np.concatenate([slope, by_shift], axis=1)
-        H = (J * weights[:, None]).T @ J
-        step = -np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(5), (J * weights[:, None]).T @ off)
-        rotation = rotation_from_vector(step[:3]) @ rotation
-        if float(np.linalg.norm(step[:3])) < 1e-8:
-            break
-    return rotation, left
+        by_turn = np.cross(state.turned, np.cross(state.shift, state.before))
+        along, across = _tangents(state.shift)
+        by_shift = np.stack([state.normals @ along, state.normals @ across], axis=1)
+        jacobian = np.concatenate([by_turn, by_shift], axis=1) / state.sines[:, None]
+        weights = _cauchy(state.residuals).weight(state.residuals**2)
+        equations = NormalEquations.of(state.residuals, jacobian, weights)
+        return equations.damped(np.full(5, 1e-9 * np.trace(equations.hessian)))
+
+    def move(self, state: _Epipolar, step: FloatArray) -> _Epipolar:
+        weights = _cauchy(state.residuals).weight(state.residuals**2)
+        return replace(state, rotation=rotation_from_vector(step[:3]) @ state.rotation, weights=weights)
+
+    def step_size(self, step: FloatArray) -> float:
+        """Radians."""
+        return float(np.linalg.norm(step[:3]))
+
+
+def _turn_beside_a_shift(before: FloatArray, after: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The rotation for which both directions and one shift lie in a plane, at whatever distance each point is."""
+    state = _Epipolar(before, after, start, np.ones(len(before)))
+    found = _OPTIMIZER.minimise(_TurnBesideAShift(), state).state
+    return found.rotation, np.abs(found.residuals)
 
 
 def _tangents(unit: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -199,8 +227,6 @@ def _tangents(unit: FloatArray) -> tuple[FloatArray, FloatArray]:
     return along, np.cross(unit, along)
 
 
-def _weights(left: FloatArray) -> FloatArray:
-    """Cauchy's, with the scale of the median."""
-    scale = max(2.0 * float(np.median(np.abs(left))), math.radians(0.005))
-    weights: FloatArray = 1.0 / (1.0 + (left / scale) ** 2)
-    return weights
+def _cauchy(left: FloatArray) -> Cauchy:
+    """For residuals (n,): two median deviations are 1.35 standard deviations, stricter than Gaussian errors ask for."""
+    return Cauchy(max(2.0 * float(np.median(np.abs(left))), math.radians(0.005)))

@@ -16,9 +16,7 @@ from flockd.inference.manifest import Answer, Content, Role, Unknown, manifest_p
 from flockd.inference.providers import engines_folder
 from flockd.inference.session import OnnxModel
 from flockd.messages import BoolArray, Float32Array, FloatArray, UInt8Array
-from flockd.perception.background_flow import settle_background
-from flockd.perception.drone_flow import follow_drones
-from flockd.perception.flow import DisFlow, Flow, OnnxFlow
+from flockd.perception.flow import DisFlow, Flow, OnnxFlow, background_flow, object_flow
 from flockd.perception.instances import Instance, group_instances
 
 _EAGER_LOGIT = -1.5
@@ -50,7 +48,7 @@ class SceneMaps:
     """(h, w) 0 for background, then one value a drone."""
     instances: tuple[Instance, ...]
     open: OpenDepth | None = None
-    """What is there instead of metres, for `flockd.pilot.scale` to fix."""
+    """What is there instead of metres, for `flockd.perception.depth` to fix."""
     unsure: BoolArray | None = None
     """(h, w) which pixels of the drones may just as well be background; None: no such."""
     logit: Float32Array | None = None
@@ -124,8 +122,8 @@ class Perception:
         """
         flow = self._flow.flow(first, second)
         if self._config.flow_refinement == "quick_dis":
-            flow = settle_background(flow, first, second, labels)
-        return follow_drones(flow, first, second, labels)
+            flow = background_flow(flow, first, second, labels)
+        return object_flow(flow, first, second, labels)
 
     def scene(self, camera: str, image: UInt8Array, geometry: Float32Array) -> SceneMaps:
         """Depth and drones of one image.

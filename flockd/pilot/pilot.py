@@ -27,8 +27,8 @@ from flockd.messages import (
     VelocityCommand,
 )
 from flockd.perception import Perception, SceneMaps
+from flockd.perception.depth import VelocityScale
 from flockd.pilot.motions import ego_motion, neighbour_motions
-from flockd.pilot.scale import VelocityScale
 from flockd.pilot.views import Observer, Perceiver, RigView
 from flockd.tracking import Blind, ExpectedNeighbour, Measurement, Tracker
 

@@ -23,8 +23,8 @@ from flockd.messages import (
     VehicleState,
 )
 from flockd.perception import Instance, Picture, RangeEstimate, SceneMaps
+from flockd.perception.depth import fix_by_height
 from flockd.pilot.outlines import Mask, Outliner, Outlines
-from flockd.pilot.scale import fix_by_height
 from flockd.tracking import ExpectedNeighbour
 
 _OUTLINE_PX = 5

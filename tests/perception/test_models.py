@@ -18,7 +18,7 @@ from flockd.errors import ModelError
 from flockd.inference import OnnxModel, find_manifests, load_manifest
 from flockd.messages import BoolArray, Float32Array, UInt8Array
 from flockd.perception import DisFlow, OnnxFlow, Perception, Picture
-from flockd.perception.background_flow import settle_background
+from flockd.perception.flow import background_flow
 from flockd.perception.roles import PICTURES_AT_A_TIME
 from flockd.sim.drone_models import drone_model
 from flockd.sim.renderer import Renderer
@@ -241,7 +241,7 @@ def test_the_network_of_flow_is_sharpened_by_dis_unless_told_otherwise() -> None
         no_drones = np.zeros(first.shape[:2], np.uint8)
         found = Perception(config, MODELS).flow("camera", first, second, no_drones)
         flow = expected.flow(first, second)
-        settled = settle_background(flow, first, second, no_drones) if refinement == "quick_dis" else flow
+        settled = background_flow(flow, first, second, no_drones) if refinement == "quick_dis" else flow
         np.testing.assert_allclose(found, settled, atol=1e-4)
 
 

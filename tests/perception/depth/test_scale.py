@@ -13,7 +13,7 @@ from flockd.data import data_path
 from flockd.geometry import Rig, RigCamera, build_rig, ground_inverse_depth
 from flockd.messages import BoolArray, Float32Array, FloatArray, Frame, FrameSet, UInt8Array, VehicleState
 from flockd.perception import Instance, OpenDepth, Perception, SceneMaps
-from flockd.pilot.scale import VelocityScale, fix_by_height
+from flockd.perception.depth import VelocityScale, fix_by_height
 from flockd.pilot.views import Observer
 from tests.perception.foreign import SIZE, one_channel_depth
 
