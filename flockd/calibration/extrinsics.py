@@ -5,21 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 
 from flockd.calibration.board import BoardDetection
 from flockd.calibration.errors import CalibrationError
 from flockd.calibration.poses import jacobian_of_move, moved, pose_of_board
+from flockd.calibration.rejection import OutlierRejection, root_mean_square
 from flockd.geometry import Camera, RigidTransform, rotation_angle_deg
 from flockd.geometry.robust.solver import LevenbergMarquardt, NormalEquations, Problem, Solution
 from flockd.messages import FloatArray
 
 MIN_SHARED = 3
 """Boards that two neighbours have to see together."""
-_OUTLIER, _OUTLIER_PX = 2.5, 0.2
-_MOST_DROPPED = 1 / 3
-_MOST_ROUNDS = 5
+_REJECTION = OutlierRejection(margin_px=0.2)
 _SIGMA_DEG, _SIGMA_M = 0.5, 0.02
 """A camera whose place the boards leave more uncertain than this is not known."""
 _METRES_A_DEGREE = 0.01
@@ -82,18 +82,18 @@ def calibrate_rig(
     state = _begin(names, kept, poses, reference, T_body_reference)
     given, dropped = len(kept), list[tuple[str, float]]()
     fixed = names.index(reference)
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_REJECTION.max_rounds):
         problem = _RigProblem(tuple(cameras.values()), names, kept, fixed)
         solution = LevenbergMarquardt().minimise(problem, state)
         state = solution.state
-        rms = np.array([_rms(np.concatenate(list(one.values()))) for one in problem.residuals(state)])
-        limit = max(_OUTLIER * float(np.median(rms)), float(np.median(rms)) + _OUTLIER_PX)
-        if (rms <= limit).all():
+        rms = np.array([root_mean_square(np.concatenate(list(one.values()))) for one in problem.residuals(state)])
+        fits = _REJECTION.inliers(rms)
+        if fits.all():
             break
-        dropped += [(board.name, float(value)) for board, value in zip(kept, rms, strict=True) if value > limit]
-        state = _State(state.mounts, tuple(p for p, value in zip(state.boards, rms, strict=True) if value <= limit))
-        kept = [board for board, value in zip(kept, rms, strict=True) if value <= limit]
-        if len(dropped) > _MOST_DROPPED * given:
+        dropped += [(kept[index].name, float(rms[index])) for index in np.flatnonzero(~fits)]
+        state = _State(state.mounts, tuple(compress(state.boards, fits)))
+        kept = list(compress(kept, fits))
+        if len(dropped) > _REJECTION.max_dropped * given:
             raise CalibrationError(
                 f"{len(dropped)} of {given} boards contradict the others; hold the board still, let every camera take "
                 "its picture at the same time, and check the cameras' intrinsics"
@@ -220,7 +220,7 @@ def _told(
             T_body_camera=solution.state.mounts[index],
             sigma_deg=math.degrees(float(sigma[index, :3].max())),
             sigma_m=float(sigma[index, 3:].max()),
-            rms_px=_rms(np.concatenate(own)) if own else 0.0,
+            rms_px=root_mean_square(np.concatenate(own)) if own else 0.0,
             boards=len(own),
         )
         if not (mounting.sigma_deg < _SIGMA_DEG and mounting.sigma_m < _SIGMA_M):
@@ -229,8 +229,6 @@ def _told(
                 f"{100 * mounting.sigma_m:.2g} cm; show the board nearer, tilted, and in more places that both see"
             )
         mountings[name] = mounting
-    return RigFit(reference, mountings, _rms(np.concatenate([r for one in residuals for r in one.values()])), dropped)
-
-
-def _rms(residuals: FloatArray) -> float:
-    return float(np.sqrt((residuals**2).sum(axis=1).mean()))
+    return RigFit(
+        reference, mountings, root_mean_square(np.concatenate([r for one in residuals for r in one.values()])), dropped
+    )

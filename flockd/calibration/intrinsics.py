@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import Literal
 
 import numpy as np
 
 from flockd.calibration.errors import CalibrationError
 from flockd.calibration.poses import first_poses, jacobian_of_move, moved
+from flockd.calibration.rejection import OutlierRejection, root_mean_square
 from flockd.calibration.views import View
 from flockd.geometry import Camera, PinholeCamera, RigidTransform, WideAngleCamera
 from flockd.geometry.robust.solver import LevenbergMarquardt, NormalEquations, Problem
@@ -25,10 +27,7 @@ _FIRST_FOCALS = {
     "wide_angle": 1.0 / np.radians(np.linspace(60.0, 240.0, 9)),
 }
 """Focal lengths to begin with, in widths of the picture."""
-_OUTLIER, _OUTLIER_PX = 2.5, 0.1
-"""A view is dropped whose residual is more than this times the median's, and this much above it."""
-_MOST_DROPPED = 1 / 3
-_MOST_ROUNDS = 5
+_REJECTION = OutlierRejection(margin_px=0.1)
 _COEFFICIENT_STEP = 1e-6
 _FOCAL_SIGMA = 0.01
 """A focal length that the views leave more uncertain than this is not known."""
@@ -59,12 +58,12 @@ class Lens:
     @property
     def rms_px(self) -> float:
         """Root of the mean squared distance of all corners."""
-        return _rms(np.concatenate(self.residuals()))
+        return root_mean_square(np.concatenate(self.residuals()))
 
     @property
     def rms_of_views_px(self) -> tuple[float, ...]:
         """The same for each view."""
-        return tuple(_rms(residuals) for residuals in self.residuals())
+        return tuple(root_mean_square(residuals) for residuals in self.residuals())
 
     @property
     def max_px(self) -> float:
@@ -105,19 +104,19 @@ def calibrate(views: Sequence[View], size: tuple[int, int], model: Model) -> Len
     state = _begin(views, size, model)
     dropped: list[tuple[View, float]] = []
     kept = list(views)
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_REJECTION.max_rounds):
         solution = LevenbergMarquardt().minimise(_LensProblem(kept), state)
         state = solution.state
-        rms = np.array([_rms(_residuals(state.camera, *one)) for one in zip(kept, state.poses, strict=True)])
-        limit = max(_OUTLIER * float(np.median(rms)), float(np.median(rms)) + _OUTLIER_PX)
-        if (rms <= limit).all():
-            break
-        dropped += [(view, float(value)) for view, value in zip(kept, rms, strict=True) if value > limit]
-        state = _State(
-            state.camera, tuple(pose for pose, value in zip(state.poses, rms, strict=True) if value <= limit)
+        rms = np.array(
+            [root_mean_square(_residuals(state.camera, *one)) for one in zip(kept, state.poses, strict=True)]
         )
-        kept = [view for view, value in zip(kept, rms, strict=True) if value <= limit]
-        if len(dropped) > _MOST_DROPPED * len(views) or len(kept) < MIN_VIEWS:
+        fits = _REJECTION.inliers(rms)
+        if fits.all():
+            break
+        dropped += [(kept[index], float(rms[index])) for index in np.flatnonzero(~fits)]
+        state = _State(state.camera, tuple(compress(state.poses, fits)))
+        kept = list(compress(kept, fits))
+        if len(dropped) > _REJECTION.max_dropped * len(views) or len(kept) < MIN_VIEWS:
             raise CalibrationError(
                 f"{len(dropped)} of {len(views)} views contradict the others; use a flat, rigid board, focus that "
                 "stays as it is, and the board's own numbers of squares"
@@ -184,7 +183,7 @@ def _begin(views: Sequence[View], size: tuple[int, int], model: Model) -> _State
 
 def _first_pose(camera: Camera, view: View) -> tuple[float, RigidTransform | None]:
     """The board's likelier pose, after its residual; none, after infinity, where it fits none."""
-    found = [(_rms(_residuals(camera, view, pose)), pose) for pose in first_poses(camera, view.seen)]
+    found = [(root_mean_square(_residuals(camera, view, pose)), pose) for pose in first_poses(camera, view.seen)]
     finite = [one for one in found if math.isfinite(one[0])]
     return min(finite, key=lambda one: one[0]) if finite else (math.inf, None)
 
@@ -269,7 +268,3 @@ def _with_zero_distortion(camera: Camera) -> Camera:
 
 def _residuals(camera: Camera, view: View, pose: RigidTransform) -> FloatArray:
     return view.seen.pixels - camera.project(pose.apply(view.seen.points))
-
-
-def _rms(residuals: FloatArray) -> float:
-    return float(np.sqrt((residuals**2).sum(axis=1).mean()))

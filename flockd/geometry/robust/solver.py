@@ -54,8 +54,7 @@ class NormalEquations:
 
     def step(self) -> FloatArray:
         """(n,)"""
-        step: FloatArray = np.linalg.solve(self.hessian, -self.gradient)
-        return step
+        return np.asarray(np.linalg.solve(self.hessian, -self.gradient), np.float64)
 
 
 class Problem(ABC, Generic[State]):
@@ -125,13 +124,23 @@ class GaussNewton:
                 equations = problem.linearise(state)
             if not equations.solvable:
                 break
-            if math.isfinite(self.max_condition) and not np.linalg.cond(equations.hessian) < self.max_condition:
+            step = self._step(equations)
+            if step is None:
                 return Solution(state, NormalEquations.unsolvable(len(equations.gradient)), converged=False)
-            step = problem.limited(equations.step())
+            step = problem.limited(step)
             state = problem.move(state, step)
             if number >= self.min_steps and problem.step_size(step) < self.tolerance:
                 return Solution(state, equations, converged=True)
         return Solution(state, equations, converged=False)
+
+    def _step(self, equations: NormalEquations) -> FloatArray | None:
+        """(n,) or None where the hessian is singular."""
+        if math.isfinite(self.max_condition) and not np.linalg.cond(equations.hessian) < self.max_condition:
+            return None
+        try:
+            return equations.step()
+        except np.linalg.LinAlgError:
+            return None
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The flow of each drone by itself: that of a whole image loses what is small and moves otherwise than its background."""
+"""The flow of each drone by itself: that of a whole image loses what is small and moves against its background."""
 
 from __future__ import annotations
 
