@@ -217,8 +217,8 @@ class _Epipolar:
     @cached_property
     def sines(self) -> FloatArray:
         """(n,) of the angle between direction and shift; where they are near no plane is well known."""
-        turned: FloatArray = self.after @ self.rotation.T
-        return turned
+        sines: FloatArray = np.maximum(np.linalg.norm(np.cross(self.before, self.shift), axis=1), 0.05)
+        return sines
 
     @cached_property
     def residuals(self) -> FloatArray:
