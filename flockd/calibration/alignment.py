@@ -5,31 +5,46 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
 from flockd.calibration.errors import CalibrationError
-from flockd.calibration.least_squares import Normal, Solution, minimise
-from flockd.calibration.turns import CameraTurn, best_rotation
+from flockd.calibration.turns import CameraTurn
+from flockd.geometry.rigid_fit import fit_rotation
+from flockd.geometry.robust.kernels import Tukey
+from flockd.geometry.robust.reweighting import reweighted, robust_rotation
+from flockd.geometry.robust.solver import LevenbergMarquardt, NormalEquations, Problem, Solution
 from flockd.geometry.rotations import rotation_from_vector
 from flockd.messages import BoolArray, FloatArray
 
 MIN_TURNS = 30
-_SCAN_S = 0.01
-_ROUNDS, _SETTLED = 8, 1e-3
-"""Fits with new weights, until no weight changes by more."""
-_CHAIN_S, _HALF = 0.4, 0.5
-_FITS = 0.2
-"""Weight above which a turn counts as one that fits."""
-_TIME_STEP_S = 1e-3
-_SIGMA_DEG, _SIGMA_S = 0.5, 0.01
-"""What is more uncertain than this is not known."""
-_MOST_RMS_SHARE = 0.3
-"""Of the turns themselves: more left over than this, and both have nothing to do with each other."""
-_LONGEST_GAP = 3.0
-"""Attitudes farther apart than this times their median are not interpolated between."""
 _AXES = ("rolled", "pitched", "yawed")
+
+
+@dataclass(frozen=True)
+class AlignmentParameters:
+    """How turns are compared, and what is believed."""
+
+    scan_step_s: float = 0.01
+    """Between offsets that are tried as starts."""
+    max_rounds: int = 8
+    weight_tolerance: float = 1e-3
+    """Fits with new weights end where no weight changes by more."""
+    chain_s: float = 0.4
+    """Turns are compared over about this long."""
+    inlier_weight: float = 0.2
+    """Weight above which a turn counts as one that fits."""
+    difference_step_s: float = 1e-3
+    """Of the derivative by the offset."""
+    max_sigma_deg: float = 0.5
+    max_sigma_s: float = 0.01
+    """What is more uncertain than this is not known."""
+    max_residual: float = 0.3
+    """Share of the turns themselves: more left over than this, and both have nothing to do with each other."""
+
+
+DEFAULTS = AlignmentParameters()
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +53,8 @@ class Attitudes:
 
     times_s: FloatArray
     rotations: FloatArray
+    max_gap: float = 3.0
+    """Attitudes farther apart than this times their median are not interpolated between."""
 
     @cached_property
     def _bends(self) -> FloatArray:
@@ -66,7 +83,7 @@ class Attitudes:
         near += square * ((a**3 - a) * self._bends[index] + (b**3 - b) * self._bends[index + 1])
         u, _, vt = np.linalg.svd(near)
         inside = (times_s >= self.times_s[0]) & (times_s <= self.times_s[-1])
-        inside &= span <= _LONGEST_GAP * float(np.median(steps))
+        inside &= span <= self.max_gap * float(np.median(steps))
         return u @ vt, inside
 
 
@@ -85,25 +102,30 @@ class Alignment:
     turns: int
 
 
-def align(turns: Sequence[CameraTurn], attitudes: Attitudes, max_offset_s: float) -> Alignment:
+def align(
+    turns: Sequence[CameraTurn], attitudes: Attitudes, max_offset_s: float, parameters: AlignmentParameters = DEFAULTS
+) -> Alignment:
     """The rotation and the offset for which the camera's turns are the vehicle's.
 
     Raises CalibrationError where there are too few turns, where both contradict each other, and where the vehicle
     turned too little, or about one axis only, to tell.
     """
-    each = _Problem.of(turns, attitudes, max_offset_s)
-    offset_s, weights = each.scan(max_offset_s)
-    state, weights, _ = _fit(
-        each, _State(best_rotation(each.vehicle(offset_s), each.camera, weights), offset_s), weights
+    each = _Turns.of(turns, attitudes, max_offset_s)
+    offset_s, weights = each.scan(max_offset_s, parameters)
+    start = _State(fit_rotation(each.camera, each.vehicle(offset_s), weights), offset_s)
+    solution, weights = _fit(each, start, weights, parameters)
+    chains = _chained(
+        [turn for turn, weight in zip(each.turns, weights, strict=True) if weight > parameters.inlier_weight],
+        parameters.chain_s,
     )
-    chains = _chained([turn for turn, weight in zip(each.turns, weights, strict=True) if weight > _FITS])
-    problem = _Problem.of(chains, attitudes, max_offset_s)
-    state, weights, solution = _fit(problem, state, np.ones(len(problem.turns)))
+    problem = _Turns.of(chains, attitudes, max_offset_s)
+    solution, weights = _fit(problem, solution.state, np.ones(len(problem.turns)), parameters)
+    state = solution.state
     left = problem.residuals(state)
-    good = weights > _FITS
+    good = weights > parameters.inlier_weight
     rms = float(np.sqrt((left[good] ** 2).sum(axis=1).mean()))
     size = float(np.sqrt((problem.vehicle(state.offset_s)[good] ** 2).sum(axis=1).mean()))
-    if rms > _MOST_RMS_SHARE * size:
+    if rms > parameters.max_residual * size:
         raise CalibrationError(
             f"the camera's turns and the vehicle's have nothing to do with each other: {math.degrees(rms):.2f} of "
             f"{math.degrees(size):.2f} degrees are left over; turn the drone faster, before something that stands still"
@@ -120,21 +142,28 @@ def align(turns: Sequence[CameraTurn], attitudes: Attitudes, max_offset_s: float
         rms_deg=math.degrees(rms),
         turns=int(good.sum()),
     )
-    _check_known(found, problem, abs(state.offset_s) >= max_offset_s)
+    _check_known(found, problem, abs(state.offset_s) >= max_offset_s, parameters)
     return found
 
 
-def _fit(problem: _Problem, state: _State, weights: FloatArray) -> tuple[_State, FloatArray, Solution[_State]]:
-    for _ in range(_ROUNDS):
-        solution = minimise(state, partial(problem.normal, weights=weights), _move)
-        state, before, weights = solution.state, weights, _weights(problem.residuals(solution.state))
-        if float(np.abs(weights - before).max()) < _SETTLED:
-            break
-    return state, weights, solution
+def _fit(
+    turns: _Turns, start: _State, weights: FloatArray, parameters: AlignmentParameters
+) -> tuple[Solution[_State], FloatArray]:
+    """From a start and weights (n,): the last fit, and the weights of what it leaves over."""
+    return reweighted(
+        lambda weights, before: LevenbergMarquardt().minimise(
+            _Alignment(turns, weights, parameters.difference_step_s), before.state if before else start
+        ),
+        lambda solution: np.linalg.norm(turns.residuals(solution.state), axis=1),
+        _tukey,
+        weights,
+        rounds=parameters.max_rounds,
+        settled=parameters.weight_tolerance,
+    )
 
 
-def _chained(turns: Sequence[CameraTurn]) -> list[CameraTurn]:
-    """From each turn on, as many as take `_CHAIN_S` together, as one.
+def _chained(turns: Sequence[CameraTurn], chain_s: float) -> list[CameraTurn]:
+    """From each turn on, as many as take nearest to ``chain_s`` together, as one.
 
     The noise of a short turn is as large as that of a long one; and where attitudes are interpolated it is smaller,
     which would draw short turns there, whatever the offset.
@@ -143,15 +172,15 @@ def _chained(turns: Sequence[CameraTurn]) -> list[CameraTurn]:
     for first, turn in enumerate(turns):
         rotation, end_s = turn.rotation, turn.end_s
         for after in turns[first + 1 :]:
-            if after.start_s != end_s or end_s - turn.start_s > _CHAIN_S - _HALF * (after.end_s - after.start_s):
+            if after.start_s != end_s or end_s - turn.start_s > chain_s - 0.5 * (after.end_s - after.start_s):
                 break
             rotation, end_s = rotation @ after.rotation, after.end_s
         found.append(CameraTurn(turn.start_s, end_s, rotation))
     return found
 
 
-def _check_known(found: Alignment, problem: _Problem, at_limit: bool) -> None:
-    if not found.sigma_deg < _SIGMA_DEG:
+def _check_known(found: Alignment, problem: _Turns, at_limit: bool, parameters: AlignmentParameters) -> None:
+    if not found.sigma_deg < parameters.max_sigma_deg:
         spread = np.abs(problem.vehicle(found.time_offset_s)).mean(axis=0)
         most = _AXES[int(np.argmax(spread))]
         others = " and ".join(axis.removesuffix("ed") for axis in _AXES if axis != most)
@@ -159,7 +188,7 @@ def _check_known(found: Alignment, problem: _Problem, at_limit: bool) -> None:
             f"the camera's turn in the body is known to {found.sigma_deg:.1f} degrees only, as the drone mostly {most};"
             f" {others} it as much, and for longer"
         )
-    if not found.sigma_s < _SIGMA_S or at_limit:
+    if not found.sigma_s < parameters.max_sigma_s or at_limit:
         raise CalibrationError(
             f"the time offset is known to {1000 * found.sigma_s:.0f} ms only, as the drone turned too evenly or the "
             "offset is larger than was looked for; turn it back and forth, or raise --max-offset"
@@ -173,7 +202,7 @@ class _State:
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class _Turns:
     turns: Sequence[CameraTurn]
     attitudes: Attitudes
     starts_s: FloatArray
@@ -182,7 +211,7 @@ class _Problem:
     """(n, 3) rotation vectors of the camera's turns, in its axes."""
 
     @classmethod
-    def of(cls, turns: Sequence[CameraTurn], attitudes: Attitudes, max_offset_s: float) -> _Problem:
+    def of(cls, turns: Sequence[CameraTurn], attitudes: Attitudes, max_offset_s: float) -> _Turns:
         """Of those turns that attitudes are known for, whatever the offset."""
         starts, ends = (np.array([getattr(turn, name) for turn in turns]) for name in ("start_s", "end_s"))
         known = np.ones(len(turns), np.bool_)
@@ -205,15 +234,13 @@ class _Problem:
         second, _ = self.attitudes.at(self.ends_s + offset_s)
         return _logs(np.swapaxes(first, 1, 2) @ second)
 
-    def scan(self, max_offset_s: float) -> tuple[float, FloatArray]:
+    def scan(self, max_offset_s: float, parameters: AlignmentParameters) -> tuple[float, FloatArray]:
         """The offset that leaves least, whatever the rotation, and the weights (n,) of the turns there."""
         best = (math.inf, 0.0, np.ones(len(self.camera)))
-        for offset_s in np.arange(-max_offset_s, max_offset_s + _SCAN_S / 2, _SCAN_S):
-            vehicle, weights = self.vehicle(float(offset_s)), np.ones(len(self.camera))
-            for _ in range(3):
-                left = vehicle - self.camera @ best_rotation(vehicle, self.camera, weights).T
-                weights = _weights(left)
-            cost = float(np.median(np.linalg.norm(left, axis=1)))
+        for offset_s in np.arange(-max_offset_s, max_offset_s + parameters.scan_step_s / 2, parameters.scan_step_s):
+            vehicle = self.vehicle(float(offset_s))
+            _, left, weights = robust_rotation(self.camera, vehicle, _tukey, rounds=3)
+            cost = float(np.median(left))
             if cost < best[0]:
                 best = (cost, float(offset_s), weights)
         return best[1], best[2]
@@ -222,31 +249,35 @@ class _Problem:
         """(n, 3) radians."""
         return self.vehicle(state.offset_s) - self.camera @ state.rotation.T
 
-    def normal(self, state: _State, weights: FloatArray) -> Normal:
-        scale = np.sqrt(weights)[:, None]
-        left = (self.residuals(state) * scale).ravel()
-        turned = self.camera @ state.rotation.T
-        derivative = np.zeros((len(turned), 3, 4))
+
+@dataclass(frozen=True, eq=False)
+class _Alignment(Problem[_State]):
+    """Four parameters: the camera's rotation vector in the body, and the offset in seconds."""
+
+    turns: _Turns
+    weights: FloatArray
+    difference_step_s: float
+
+    def linearise(self, state: _State) -> NormalEquations:
+        turned = self.turns.camera @ state.rotation.T
+        jacobian = np.zeros((len(turned), 3, 4))
         x, y, z = turned.T
-        derivative[:, 0, 1], derivative[:, 0, 2] = -z, y
-        derivative[:, 1, 0], derivative[:, 1, 2] = z, -x
-        derivative[:, 2, 0], derivative[:, 2, 1] = -y, x
-        later, sooner = self.vehicle(state.offset_s + _TIME_STEP_S), self.vehicle(state.offset_s - _TIME_STEP_S)
-        derivative[:, :, 3] = (later - sooner) / (2 * _TIME_STEP_S)
-        J = (derivative * scale[:, :, None]).reshape(-1, 4)
-        return Normal(float(left @ left), J.T @ left, J.T @ J)
+        jacobian[:, 0, 1], jacobian[:, 0, 2] = -z, y
+        jacobian[:, 1, 0], jacobian[:, 1, 2] = z, -x
+        jacobian[:, 2, 0], jacobian[:, 2, 1] = -y, x
+        step_s = self.difference_step_s
+        later, sooner = (self.turns.vehicle(state.offset_s + sign * step_s) for sign in (1.0, -1.0))
+        jacobian[:, :, 3] = (later - sooner) / (2 * step_s)
+        residuals = self.turns.residuals(state).ravel()
+        return NormalEquations.of(residuals, jacobian.reshape(-1, 4), np.repeat(self.weights, 3))
+
+    def move(self, state: _State, step: FloatArray) -> _State:
+        return _State(rotation_from_vector(step[:3]) @ state.rotation, state.offset_s + float(step[3]))
 
 
-def _move(state: _State, step: FloatArray) -> _State:
-    return _State(rotation_from_vector(step[:3]) @ state.rotation, state.offset_s + float(step[3]))
-
-
-def _weights(left: FloatArray) -> FloatArray:
-    """Tukey's: what is far off counts nothing."""
-    size = np.linalg.norm(left, axis=1)
-    scale = 6.0 * max(float(np.median(size)), 1e-9)
-    weights: FloatArray = np.maximum(1.0 - (size / scale) ** 2, 0.0) ** 2
-    return weights
+def _tukey(left: FloatArray) -> Tukey:
+    """For residuals (n,): what is far off counts nothing."""
+    return Tukey(6.0 * max(float(np.median(left)), 1e-9))
 
 
 def _logs(rotations: FloatArray) -> FloatArray:

@@ -5,21 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 
 from flockd.calibration.board import BoardDetection
 from flockd.calibration.errors import CalibrationError
-from flockd.calibration.least_squares import Normal, Solution, minimise
 from flockd.calibration.poses import jacobian_of_move, moved, pose_of_board
+from flockd.calibration.rejection import OutlierRejection, root_mean_square
 from flockd.geometry import Camera, RigidTransform, rotation_angle_deg
+from flockd.geometry.robust.solver import LevenbergMarquardt, NormalEquations, Problem, Solution
 from flockd.messages import FloatArray
 
 MIN_SHARED = 3
 """Boards that two neighbours have to see together."""
-_OUTLIER, _OUTLIER_PX = 2.5, 0.2
-_MOST_DROPPED = 1 / 3
-_MOST_ROUNDS = 5
+_REJECTION = OutlierRejection(margin_px=0.2)
 _SIGMA_DEG, _SIGMA_M = 0.5, 0.02
 """A camera whose place the boards leave more uncertain than this is not known."""
 _METRES_A_DEGREE = 0.01
@@ -82,18 +82,18 @@ def calibrate_rig(
     state = _begin(names, kept, poses, reference, T_body_reference)
     given, dropped = len(kept), list[tuple[str, float]]()
     fixed = names.index(reference)
-    for _ in range(_MOST_ROUNDS):
-        problem = _Problem(tuple(cameras.values()), names, kept, fixed)
-        solution = minimise(state, problem.normal, problem.move)
+    for _ in range(_REJECTION.max_rounds):
+        problem = _RigProblem(tuple(cameras.values()), names, kept, fixed)
+        solution = LevenbergMarquardt().minimise(problem, state)
         state = solution.state
-        rms = np.array([_rms(np.concatenate(list(one.values()))) for one in problem.residuals(state)])
-        limit = max(_OUTLIER * float(np.median(rms)), float(np.median(rms)) + _OUTLIER_PX)
-        if (rms <= limit).all():
+        rms = np.array([root_mean_square(np.concatenate(list(one.values()))) for one in problem.residuals(state)])
+        fits = _REJECTION.inliers(rms)
+        if fits.all():
             break
-        dropped += [(board.name, float(value)) for board, value in zip(kept, rms, strict=True) if value > limit]
-        state = _State(state.mounts, tuple(p for p, value in zip(state.boards, rms, strict=True) if value <= limit))
-        kept = [board for board, value in zip(kept, rms, strict=True) if value <= limit]
-        if len(dropped) > _MOST_DROPPED * given:
+        dropped += [(kept[index].name, float(rms[index])) for index in np.flatnonzero(~fits)]
+        state = _State(state.mounts, tuple(compress(state.boards, fits)))
+        kept = list(compress(kept, fits))
+        if len(dropped) > _REJECTION.max_dropped * given:
             raise CalibrationError(
                 f"{len(dropped)} of {given} boards contradict the others; hold the board still, let every camera take "
                 "its picture at the same time, and check the cameras' intrinsics"
@@ -149,7 +149,7 @@ def _middle(transforms: Sequence[RigidTransform]) -> RigidTransform:
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class _RigProblem(Problem[_State]):
     """Blocks of six: the cameras but the reference, then the boards."""
 
     cameras: tuple[Camera, ...]
@@ -157,24 +157,20 @@ class _Problem:
     boards: Sequence[SharedBoard]
     fixed: int
 
-    def normal(self, state: _State) -> Normal:
+    def linearise(self, state: _State) -> NormalEquations:
         size = 6 * (len(state.mounts) + len(state.boards))
         gradient, hessian, cost = np.zeros(size), np.zeros((size, size)), 0.0
-        for board, camera, r, by_camera, by_board in self._terms(state):
-            if not (np.isfinite(r).all() and np.isfinite(by_camera).all()):
-                return Normal(math.inf, gradient[6:], np.eye(size - 6))
-            own = slice(6 * (len(state.mounts) + board), 6 * (len(state.mounts) + board + 1))
-            mount = slice(6 * camera, 6 * camera + 6)
-            cost += float(r @ r)
-            gradient[mount] += by_camera.T @ r
-            gradient[own] += by_board.T @ r
-            hessian[mount, mount] += by_camera.T @ by_camera
-            hessian[own, own] += by_board.T @ by_board
-            cross = by_camera.T @ by_board
-            hessian[mount, own] += cross
-            hessian[own, mount] += cross.T
+        for board, camera, residuals, jacobian in self._terms(state):
+            block = NormalEquations.of(residuals, jacobian)
+            if not block.solvable:
+                return NormalEquations.unsolvable(size - 6)
+            start = 6 * (len(state.mounts) + board)
+            own = np.r_[6 * camera : 6 * camera + 6, start : start + 6]
+            cost += block.cost
+            gradient[own] += block.gradient
+            hessian[np.ix_(own, own)] += block.hessian
         free = np.delete(np.arange(size), slice(6 * self.fixed, 6 * self.fixed + 6))
-        return Normal(cost, gradient[free], hessian[np.ix_(free, free)])
+        return NormalEquations(cost, gradient[free], hessian[np.ix_(free, free)])
 
     def move(self, state: _State, step: FloatArray) -> _State:
         free = [one for index, one in enumerate((*state.mounts, *state.boards)) if index != self.fixed]
@@ -185,12 +181,12 @@ class _Problem:
     def residuals(self, state: _State) -> list[dict[str, FloatArray]]:
         """For each board and each camera that saw it (n, 2) pixels, seen less predicted."""
         found: list[dict[str, FloatArray]] = [{} for _ in self.boards]
-        for board, camera, r, _, _ in self._terms(state):
+        for board, camera, r, _ in self._terms(state):
             found[board][self.names[camera]] = -r.reshape(-1, 2)
         return found
 
-    def _terms(self, state: _State) -> Iterator[tuple[int, int, FloatArray, FloatArray, FloatArray]]:
-        """Board, camera, residuals (2 n,), and their derivatives (2 n, 6) by the camera's mounting and the board."""
+    def _terms(self, state: _State) -> Iterator[tuple[int, int, FloatArray, FloatArray]]:
+        """Board, camera, residuals (2 n,), and their derivatives (2 n, 12) by the camera's mounting and the board."""
         for index, (board, T_body_board) in enumerate(zip(self.boards, state.boards, strict=True)):
             for name, seen in board.seen.items():
                 camera = self.names.index(name)
@@ -202,25 +198,20 @@ class _Problem:
                 # A camera that turns about its own place moves what it sees the other way.
                 by_mount = -jacobian_of_move(RigidTransform.identity(), in_body - mount.translation)
                 by_board = jacobian_of_move(T_body_board, seen.points)
-                yield (
-                    index,
-                    camera,
-                    residuals.ravel(),
-                    (by_body @ by_mount).reshape(-1, 6),
-                    (by_body @ by_board).reshape(-1, 6),
-                )
+                jacobian = by_body @ np.concatenate([by_mount, by_board], axis=2)
+                yield index, camera, residuals.ravel(), jacobian.reshape(-1, 12)
 
 
 def _told(
     names: Sequence[str],
-    problem: _Problem,
+    problem: _RigProblem,
     solution: Solution[_State],
     reference: str,
     dropped: tuple[tuple[str, float], ...],
 ) -> RigFit:
     residuals = problem.residuals(solution.state)
     numbers = sum(r.size for one in residuals for r in one.values())
-    sigma = solution.sigma(numbers, len(solution.normal.gradient)).reshape(-1, 6)
+    sigma = solution.sigma(numbers, len(solution.equations.gradient)).reshape(-1, 6)
     sigma = np.insert(sigma, problem.fixed, 0.0, axis=0)
     mountings = {}
     for index, name in enumerate(names):
@@ -229,7 +220,7 @@ def _told(
             T_body_camera=solution.state.mounts[index],
             sigma_deg=math.degrees(float(sigma[index, :3].max())),
             sigma_m=float(sigma[index, 3:].max()),
-            rms_px=_rms(np.concatenate(own)) if own else 0.0,
+            rms_px=root_mean_square(np.concatenate(own)) if own else 0.0,
             boards=len(own),
         )
         if not (mounting.sigma_deg < _SIGMA_DEG and mounting.sigma_m < _SIGMA_M):
@@ -238,8 +229,6 @@ def _told(
                 f"{100 * mounting.sigma_m:.2g} cm; show the board nearer, tilted, and in more places that both see"
             )
         mountings[name] = mounting
-    return RigFit(reference, mountings, _rms(np.concatenate([r for one in residuals for r in one.values()])), dropped)
-
-
-def _rms(residuals: FloatArray) -> float:
-    return float(np.sqrt((residuals**2).sum(axis=1).mean()))
+    return RigFit(
+        reference, mountings, root_mean_square(np.concatenate([r for one in residuals for r in one.values()])), dropped
+    )

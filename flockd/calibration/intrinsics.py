@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 
 from flockd.calibration.errors import CalibrationError
-from flockd.calibration.least_squares import Normal, Solution, minimise
 from flockd.calibration.poses import first_poses, jacobian_of_move, moved
+from flockd.calibration.rejection import OutlierRejection, root_mean_square
 from flockd.calibration.views import View
 from flockd.choices import LensModel
 from flockd.geometry import Camera, PinholeCamera, RigidTransform, WideAngleCamera
+from flockd.geometry.robust.solver import LevenbergMarquardt, NormalEquations, Problem
 from flockd.messages import FloatArray
 
 MIN_VIEWS = 6
@@ -23,10 +25,7 @@ _FIRST_FOCALS = {
     "wide_angle": 1.0 / np.radians(np.linspace(60.0, 240.0, 9)),
 }
 """Focal lengths to begin with, in widths of the picture."""
-_OUTLIER, _OUTLIER_PX = 2.5, 0.1
-"""A view is dropped whose residual is more than this times the median's, and this much above it."""
-_MOST_DROPPED = 1 / 3
-_MOST_ROUNDS = 5
+_REJECTION = OutlierRejection(margin_px=0.1)
 _COEFFICIENT_STEP = 1e-6
 _FOCAL_SIGMA = 0.01
 """A focal length that the views leave more uncertain than this is not known."""
@@ -57,12 +56,12 @@ class Lens:
     @property
     def rms_px(self) -> float:
         """Root of the mean squared distance of all corners."""
-        return _rms(np.concatenate(self.residuals()))
+        return root_mean_square(np.concatenate(self.residuals()))
 
     @property
     def rms_of_views_px(self) -> tuple[float, ...]:
         """The same for each view."""
-        return tuple(_rms(residuals) for residuals in self.residuals())
+        return tuple(root_mean_square(residuals) for residuals in self.residuals())
 
     @property
     def max_px(self) -> float:
@@ -103,25 +102,25 @@ def calibrate(views: Sequence[View], size: tuple[int, int], model: LensModel) ->
     state = _begin(views, size, model)
     dropped: list[tuple[View, float]] = []
     kept = list(views)
-    for _ in range(_MOST_ROUNDS):
-        solution = _fit(kept, state)
+    for _ in range(_REJECTION.max_rounds):
+        solution = LevenbergMarquardt().minimise(_LensProblem(kept), state)
         state = solution.state
-        rms = np.array([_rms(_residuals(state.camera, *one)) for one in zip(kept, state.poses, strict=True)])
-        limit = max(_OUTLIER * float(np.median(rms)), float(np.median(rms)) + _OUTLIER_PX)
-        if (rms <= limit).all():
-            break
-        dropped += [(view, float(value)) for view, value in zip(kept, rms, strict=True) if value > limit]
-        state = _State(
-            state.camera, tuple(pose for pose, value in zip(state.poses, rms, strict=True) if value <= limit)
+        rms = np.array(
+            [root_mean_square(_residuals(state.camera, *one)) for one in zip(kept, state.poses, strict=True)]
         )
-        kept = [view for view, value in zip(kept, rms, strict=True) if value <= limit]
-        if len(dropped) > _MOST_DROPPED * len(views) or len(kept) < MIN_VIEWS:
+        fits = _REJECTION.inliers(rms)
+        if fits.all():
+            break
+        dropped += [(kept[index], float(rms[index])) for index in np.flatnonzero(~fits)]
+        state = _State(state.camera, tuple(compress(state.poses, fits)))
+        kept = list(compress(kept, fits))
+        if len(dropped) > _REJECTION.max_dropped * len(views) or len(kept) < MIN_VIEWS:
             raise CalibrationError(
                 f"{len(dropped)} of {len(views)} views contradict the others; use a flat, rigid board, focus that "
                 "stays as it is, and the board's own numbers of squares"
             )
     corners = sum(len(view.seen.ids) for view in kept)
-    sigma = solution.sigma(2 * corners, len(solution.normal.gradient))[: 4 + _COEFFICIENTS[model]]
+    sigma = solution.sigma(2 * corners, len(solution.equations.gradient))[: 4 + _COEFFICIENTS[model]]
     lens = Lens(model, state.camera, sigma, tuple(kept), state.poses, tuple(dropped))
     _check_known(lens)
     return lens
@@ -182,52 +181,49 @@ def _begin(views: Sequence[View], size: tuple[int, int], model: LensModel) -> _S
 
 def _first_pose(camera: Camera, view: View) -> tuple[float, RigidTransform | None]:
     """The board's likelier pose, after its residual; none, after infinity, where it fits none."""
-    found = [(_rms(_residuals(camera, view, pose)), pose) for pose in first_poses(camera, view.seen)]
+    found = [(root_mean_square(_residuals(camera, view, pose)), pose) for pose in first_poses(camera, view.seen)]
     finite = [one for one in found if math.isfinite(one[0])]
     return min(finite, key=lambda one: one[0]) if finite else (math.inf, None)
 
 
-def _fit(views: Sequence[View], state: _State) -> Solution[_State]:
-    return minimise(state, lambda now: _normal(views, now), _move)
-
-
-def _normal(views: Sequence[View], state: _State) -> Normal:
+@dataclass(frozen=True, eq=False)
+class _LensProblem(Problem[_State]):
     """Blocks: the lens, then six for each view."""
-    lens = len(_numbers(state.camera))
-    size = lens + 6 * len(views)
-    gradient, hessian, cost = np.zeros(size), np.zeros((size, size)), 0.0
-    points = np.concatenate([pose.apply(view.seen.points) for view, pose in zip(views, state.poses, strict=True)])
-    seen = np.concatenate([view.seen.pixels for view in views])
-    residuals = state.camera.project(points) - seen
-    by_point, by_lens = state.camera.jacobian(points), _jacobian_of_lens(state.camera, points)
-    if not (np.isfinite(residuals).all() and np.isfinite(by_point).all() and np.isfinite(by_lens).all()):
-        return Normal(math.inf, gradient, np.eye(size))
-    start = 0
-    for index, (view, pose) in enumerate(zip(views, state.poses, strict=True)):
-        part = slice(start, start + len(view.seen.ids))
-        start = part.stop
-        r = residuals[part].ravel()
-        A = by_lens[part].reshape(-1, lens)
-        B = (by_point[part] @ jacobian_of_move(pose, view.seen.points)).reshape(-1, 6)
-        own = slice(lens + 6 * index, lens + 6 * index + 6)
-        cost += float(r @ r)
-        gradient[:lens] += A.T @ r
-        gradient[own] = B.T @ r
-        hessian[:lens, :lens] += A.T @ A
-        hessian[:lens, own] = A.T @ B
-        hessian[own, :lens] = hessian[:lens, own].T
-        hessian[own, own] = B.T @ B
-    return Normal(cost, gradient, hessian)
 
+    views: Sequence[View]
 
-def _move(state: _State, step: FloatArray) -> _State:
-    numbers = _numbers(state.camera)
-    changed = numbers + step[: len(numbers)]
-    # A focal length that shrinks to nothing or turns its sign is no camera; the step is refused by its cost.
-    changed[:2] = np.maximum(changed[:2], 0.2 * numbers[:2])
-    steps = step[len(numbers) :].reshape(-1, 6)
-    poses = tuple(moved(pose, own) for pose, own in zip(state.poses, steps, strict=True))
-    return _State(_camera_like(state.camera, changed), poses)
+    def linearise(self, state: _State) -> NormalEquations:
+        lens = len(_numbers(state.camera))
+        size = lens + 6 * len(self.views)
+        gradient, hessian, cost = np.zeros(size), np.zeros((size, size)), 0.0
+        pairs = list(zip(self.views, state.poses, strict=True))
+        points = np.concatenate([pose.apply(view.seen.points) for view, pose in pairs])
+        residuals = state.camera.project(points) - np.concatenate([view.seen.pixels for view in self.views])
+        by_point, by_lens = state.camera.jacobian(points), _jacobian_of_lens(state.camera, points)
+        if not (np.isfinite(residuals).all() and np.isfinite(by_point).all() and np.isfinite(by_lens).all()):
+            return NormalEquations.unsolvable(size)
+        start = 0
+        for index, (view, pose) in enumerate(pairs):
+            part = slice(start, start + len(view.seen.ids))
+            start = part.stop
+            by_pose = by_point[part] @ jacobian_of_move(pose, view.seen.points)
+            block = NormalEquations.of(
+                residuals[part].ravel(), np.concatenate([by_lens[part], by_pose], axis=2).reshape(-1, lens + 6)
+            )
+            own = np.r_[:lens, lens + 6 * index : lens + 6 * index + 6]
+            cost += block.cost
+            gradient[own] += block.gradient
+            hessian[np.ix_(own, own)] += block.hessian
+        return NormalEquations(cost, gradient, hessian)
+
+    def move(self, state: _State, step: FloatArray) -> _State:
+        numbers = _numbers(state.camera)
+        changed = numbers + step[: len(numbers)]
+        # A focal length that shrinks to nothing or turns its sign is no camera; the step is refused by its cost.
+        changed[:2] = np.maximum(changed[:2], 0.2 * numbers[:2])
+        steps = step[len(numbers) :].reshape(-1, 6)
+        poses = tuple(moved(pose, own) for pose, own in zip(state.poses, steps, strict=True))
+        return _State(_camera_like(state.camera, changed), poses)
 
 
 def _jacobian_of_lens(camera: Camera, points: FloatArray) -> FloatArray:
@@ -270,7 +266,3 @@ def _with_zero_distortion(camera: Camera) -> Camera:
 
 def _residuals(camera: Camera, view: View, pose: RigidTransform) -> FloatArray:
     return view.seen.pixels - camera.project(pose.apply(view.seen.points))
-
-
-def _rms(residuals: FloatArray) -> float:
-    return float(np.sqrt((residuals**2).sum(axis=1).mean()))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
 from flockd.calibration.board import BoardDetection
-from flockd.calibration.least_squares import Normal, minimise
 from flockd.geometry import Camera, RigidTransform
+from flockd.geometry.robust.solver import LevenbergMarquardt, NormalEquations, Problem
 from flockd.geometry.rotations import rotation_from_vector
 from flockd.messages import FloatArray
 
@@ -19,9 +21,9 @@ def pose_of_board(camera: Camera, seen: BoardDetection) -> RigidTransform | None
     """``T_camera_board`` with the least squared error in pixels; None where the corners fit no pose at all."""
     best: tuple[float, RigidTransform] | None = None
     for start in first_poses(camera, seen):
-        found = minimise(start, lambda pose: _normal(camera, seen, pose), moved)
-        if np.isfinite(found.normal.cost) and (best is None or found.normal.cost < best[0]):
-            best = found.normal.cost, found.state
+        found = LevenbergMarquardt().minimise(_PoseProblem(camera, seen), start)
+        if found.equations.solvable and (best is None or found.equations.cost < best[0]):
+            best = found.equations.cost, found.state
     return None if best is None else best[1]
 
 
@@ -68,19 +70,19 @@ def jacobian_of_move(pose: RigidTransform, points: FloatArray) -> FloatArray:
     return derivative
 
 
-def _normal(camera: Camera, seen: BoardDetection, pose: RigidTransform) -> Normal:
-    points = pose.apply(seen.points)
-    residuals = (camera.project(points) - seen.pixels).ravel()
-    derivative = (camera.jacobian(points) @ jacobian_of_move(pose, seen.points)).reshape(-1, 6)
-    return normal_of(residuals, derivative)
+@dataclass(frozen=True, eq=False)
+class _PoseProblem(Problem[RigidTransform]):
+    camera: Camera
+    seen: BoardDetection
 
+    def linearise(self, state: RigidTransform) -> NormalEquations:
+        points = state.apply(self.seen.points)
+        residuals = (self.camera.project(points) - self.seen.pixels).ravel()
+        jacobian = (self.camera.jacobian(points) @ jacobian_of_move(state, self.seen.points)).reshape(-1, 6)
+        return NormalEquations.of(residuals, jacobian)
 
-def normal_of(residuals: FloatArray, derivative: FloatArray) -> Normal:
-    """The normal equations of residuals (m,) and their derivative (m, n); without a solution where either is NaN."""
-    cost = float(residuals @ residuals)
-    if not (np.isfinite(cost) and np.isfinite(derivative).all()):
-        return Normal(np.inf, np.zeros(derivative.shape[1]), np.eye(derivative.shape[1]))
-    return Normal(cost, derivative.T @ residuals, derivative.T @ derivative)
+    def move(self, state: RigidTransform, step: FloatArray) -> RigidTransform:
+        return moved(state, step)
 
 
 def _turn_to_axis(direction: FloatArray) -> FloatArray:

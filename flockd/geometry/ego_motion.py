@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from flockd.config.geometry import GeometryParameters
 from flockd.geometry.pairs import BACKGROUND_LABEL, PointPairs
-from flockd.geometry.ransac import ransac_rigid
 from flockd.geometry.refinement import refine_ego_motion
 from flockd.geometry.rig import Rig
+from flockd.geometry.robust.ransac import ransac_rigid
 from flockd.geometry.transform import RigidTransform
 from flockd.messages import EgoMotion
 
-_EXPLAINED_PX = 3.0
-_MIN_EXPLAINED = 0.08
-"""Of the matches so near to where a motion moves them. On real images true motions explain 15 % and more; those that
-Algorithm 1 finds in nothing but false matches, because within metres there are always some that agree, under 6 %."""
-_KEPT = 0.9
-"""A polish that loses more of the explained matches than the rest has followed the false ones."""
+
+@dataclass(frozen=True)
+class EgoMotionAcceptance:
+    """Which motions are believed, by the matches that they explain."""
+
+    explained_px: float = 3.0
+    """A match is explained that is so near to where the motion moves it."""
+    min_explained: float = 0.08
+    """Of all matches. On real images true motions explain 15 % and more; those that Algorithm 1 finds in nothing but
+    false matches, because within metres there are always some that agree, under 6 %."""
+    min_kept: float = 0.9
+    """Of the explained matches: a refinement that loses more has followed the false ones."""
+
+
+ACCEPTANCE = EgoMotionAcceptance()
 
 
 def estimate_ego_motion(
@@ -43,13 +54,14 @@ def estimate_ego_motion(
     motion = found.transform
     explained = _explained(background, rig, motion)
     if parameters.refine:
-        polished = refine_ego_motion(background, rig, motion, agreeing=found.inliers, seed=seed)
-        still = _explained(background, rig, polished) if polished else 0.0
-        if polished and still >= _KEPT * explained:
-            motion, explained = polished, still
-    if explained < _MIN_EXPLAINED:
+        refined = refine_ego_motion(background, rig, motion, agreeing=found.inliers, seed=seed)
+        still = _explained(background, rig, refined) if refined else 0.0
+        if refined and still >= ACCEPTANCE.min_kept * explained:
+            motion, explained = refined, still
+    if explained < ACCEPTANCE.min_explained:
         raise ValueError(
-            f"the best motion explains only {explained:.1%} of {len(background)} matches within {_EXPLAINED_PX:g} px"
+            f"the best motion explains only {explained:.1%} of {len(background)} matches within "
+            f"{ACCEPTANCE.explained_px:g} px"
         )
     return EgoMotion(
         rotation=motion.rotation,
@@ -70,5 +82,5 @@ def _explained(pairs: PointPairs, rig: Rig, motion: RigidTransform) -> float:
         mount = camera.T_body_camera
         pixels = camera.camera.project((moved[mine] - mount.translation) @ mount.rotation)
         distances = np.linalg.norm(pixels - pairs.pixels_current[mine], axis=1)
-        near += int(np.count_nonzero(distances < _EXPLAINED_PX))  # behind a camera it is NaN, and not near
+        near += int(np.count_nonzero(distances < ACCEPTANCE.explained_px))  # behind a camera it is NaN, and not near
     return near / len(pairs)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from flockd.config.geometry import GeometryParameters
 from flockd.geometry.pairs import PointPairs
-from flockd.geometry.ransac import ransac_rigid
+from flockd.geometry.robust.ransac import ransac_rigid
 from flockd.geometry.transform import RigidTransform
 from flockd.messages import EgoMotion, NeighbourMotion
 

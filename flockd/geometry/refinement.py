@@ -1,35 +1,55 @@
-"""The ego-motion polished by its reprojection error: metric scale from the depths, accuracy from the flow."""
+"""The ego-motion refined by its reprojection error: metric scale from the depths, accuracy from the flow."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from flockd.geometry.pairs import PointPairs
 from flockd.geometry.rig import Rig, RigCamera
+from flockd.geometry.robust.kernels import Cauchy
+from flockd.geometry.robust.solver import GaussNewton, NormalEquations, Problem
 from flockd.geometry.rotations import rotation_from_vector
 from flockd.geometry.transform import RigidTransform
 from flockd.messages import BoolArray, FloatArray
 
-_MAX_PAIRS = 2500
-_FLOW_SIGMA_PX = 0.3
-_DEPTH_SIGMA = 0.05
-"""Relative error of depth. Only its ratio to the flow's error matters: the common size is found from the residuals."""
-_CAUCHY = 1.2
-"""Cauchy's scale in standard deviations. Half of the 2.385 that Gaussian errors ask for: the depth of a whole object
-is wrong together, and the stricter scale halved the error where that is 15 %, for 5 % where all errors are Gaussian."""
-_RAYLEIGH_MEDIAN = 1.1774
-_MAX_STEPS = 20
-_SCALED_STEPS = 4
-_CONVERGED = 1e-4
-"""A step under this many radians and metres."""
-_UNSEEN_PX = 1e3
-"""Residual of a point that a motion moves out of the lens's reach."""
+
+@dataclass(frozen=True)
+class RefinementParameters:
+    """How the ego-motion is refined."""
+
+    max_pairs: int = 2500
+    """Drawn of more: each costs two residuals a step."""
+    flow_sigma_px: float = 0.3
+    depth_sigma: float = 0.05
+    """Relative error of depth. Only its ratio to the flow's error matters: their common size is found from the
+    residuals."""
+    cauchy_sigmas: float = 1.2
+    """Cauchy's scale in standard deviations. Half of the 2.385 that Gaussian errors ask for: the depth of a whole
+    object is wrong together, and the stricter scale halved the error where that is 15 %, for 5 % where all errors are
+    Gaussian."""
+    unseen_px: float = 1e3
+    """Residual of a point that a motion moves out of the lens's reach."""
+    rough: GaussNewton = field(default=GaussNewton(max_steps=3, tolerance=0.0, max_condition=1e12))
+    """While the motion is still rough, so are the size of the residuals and the direction of the parallax: they are
+    found anew at each step."""
+    fine: GaussNewton = field(default=GaussNewton(max_steps=17, tolerance=1e-4, min_steps=2, max_condition=1e12))
+    """Then they stay; until a step is under so many radians and metres."""
+
+
+DEFAULTS = RefinementParameters()
 
 
 def refine_ego_motion(
-    pairs: PointPairs, rig: Rig, initial: RigidTransform, *, agreeing: BoolArray | None = None, seed: int = 0
+    pairs: PointPairs,
+    rig: Rig,
+    initial: RigidTransform,
+    *,
+    agreeing: BoolArray | None = None,
+    seed: int = 0,
+    parameters: RefinementParameters = DEFAULTS,
 ) -> RigidTransform | None:
     """The motion near ``initial`` (F to C) that best reprojects the pairs, or None where there is no better one.
 
@@ -47,38 +67,25 @@ def refine_ego_motion(
     if strangers:
         raise ValueError(f"pairs of camera {sorted(strangers)[0]!r}, which is not in the rig")
     agreeing = np.ones(len(pairs), np.bool_) if agreeing is None else agreeing
-    if len(pairs) > _MAX_PAIRS:
-        drawn = np.sort(np.random.default_rng(seed).choice(len(pairs), _MAX_PAIRS, replace=False))
+    if len(pairs) > parameters.max_pairs:
+        drawn = np.sort(np.random.default_rng(seed).choice(len(pairs), parameters.max_pairs, replace=False))
         pairs, agreeing = pairs.select(drawn), agreeing[drawn]
     mine = {name: pairs.camera_names == name for name in rig.cameras}
     views = [_View(rig.cameras[name], pairs.select(which)) for name, which in mine.items() if which.any()]
-    # As `_linearise` puts them: camera by camera, there and back.
+    # As `_Reprojection` puts them: camera by camera, there and back.
     typical = np.concatenate([np.tile(agreeing[which], 2) for which in mine.values()])
     if not typical.any():
         return None
-    motion = initial
-    for iteration in range(_MAX_STEPS):
-        residuals, jacobians, parallax = _linearise(views, motion)
-        if iteration == 0:
-            at_first = residuals
-        if iteration < _SCALED_STEPS:
-            # While the motion is still rough, so are the size of the residuals and the direction of the parallax.
-            whitening = _whitening(parallax)
-            scale = _CAUCHY * _sigma(_times(whitening[typical], residuals[typical]))
-        white = _times(whitening, residuals)
-        weights = 1.0 / (1.0 + (white**2).sum(axis=1) / scale**2)
-        J = whitening @ jacobians
-        weighted = (J * weights[:, None, None]).reshape(-1, 6)
-        normal = weighted.T @ J.reshape(-1, 6)
-        if not np.linalg.cond(normal) < 1e12:
-            return None
-        step = -np.linalg.solve(normal, weighted.T @ white.ravel())
-        motion = RigidTransform(rotation_from_vector(step[:3]), step[3:]) @ motion
-        if iteration >= _SCALED_STEPS and np.abs(step).max() < _CONVERGED:
-            at_last, _, _ = _linearise(views, motion)
-            before, after = (_cost(residuals, whitening, scale) for residuals in (at_first, at_last))
-            return motion if after < before else None
-    return None
+    start = _Reprojection(views, initial, parameters.unseen_px)
+    rough = parameters.rough.minimise(_Refinement(parameters, typical), start)
+    if not rough.equations.solvable:
+        return None
+    weighting = _Weighting.learned(rough.state, typical, parameters)
+    fine = parameters.fine.minimise(_Refinement(parameters, typical, weighting), rough.state)
+    if not fine.converged:
+        return None
+    before, after = (weighting.loss(state) for state in (start, fine.state))
+    return fine.state.motion if after < before else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,53 +103,104 @@ class _View:
         return self.camera.camera.project(points_camera), derivative
 
 
-def _linearise(views: list[_View], motion: RigidTransform) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Residuals (m, 2) in pixels, their derivatives (m, 2, 6) by a left increment (rotation, translation), and the
-    derivatives (m, 2) by the logarithm of each point's depth: its parallax."""
-    residuals, jacobians, parallaxes = [], [], []
-    back = motion.inverse()
-    for view in views:
+@dataclass(frozen=True, eq=False)
+class _Linearisation:
+    residuals: FloatArray
+    """(m, 2) pixels"""
+    jacobians: FloatArray
+    """(m, 2, 6) by a left increment (rotation, translation) of the motion"""
+    parallaxes: FloatArray
+    """(m, 2) derivatives by the logarithm of each point's depth"""
+
+
+@dataclass(frozen=True, eq=False)
+class _Reprojection:
+    """All pairs, reprojected both ways by one motion."""
+
+    views: list[_View]
+    motion: RigidTransform
+    unseen_px: float
+
+    @cached_property
+    def linearised(self) -> _Linearisation:
+        parts = [part for view in self.views for part in self._both_ways(view)]
+        residuals, jacobians, parallaxes = (np.concatenate(part) for part in zip(*parts, strict=True))
+        unseen = ~np.isfinite(residuals[:, 0])
+        residuals[unseen], jacobians[unseen], parallaxes[unseen] = self.unseen_px, 0.0, 0.0
+        return _Linearisation(residuals, jacobians, parallaxes)
+
+    def _both_ways(self, view: _View) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
         pairs, centre = view.pairs, view.camera.T_body_camera.translation
+        back = self.motion.inverse()
 
         # From t+1 to t: X = T P_F, and an increment (w, v) moves X by w x X + v.
-        moved = motion.apply(pairs.current)
+        moved = self.motion.apply(pairs.current)
         pixels, by_point = view.reproject(moved)
-        residuals.append(pixels - pairs.pixels_previous)
-        jacobians.append(np.concatenate([np.cross(moved[:, None], by_point), by_point], axis=2))
-        parallaxes.append(_times(by_point @ motion.rotation, pairs.current - centre))
+        jacobian = np.concatenate([np.cross(moved[:, None], by_point), by_point], axis=2)
+        parallax = _times(by_point @ self.motion.rotation, pairs.current - centre)
+        backward = (pixels - pairs.pixels_previous, jacobian, parallax)
 
         # From t to t+1: Y = T^-1 P_C, and the increment moves Y by -R'(w x P_C + v).
         pixels, by_point = view.reproject(back.apply(pairs.previous))
-        residuals.append(pixels - pairs.pixels_current)
         by_point = by_point @ back.rotation
-        jacobians.append(-np.concatenate([np.cross(pairs.previous[:, None], by_point), by_point], axis=2))
-        parallaxes.append(_times(by_point, pairs.previous - centre))
-    residual, jacobian, parallax = (np.concatenate(parts) for parts in (residuals, jacobians, parallaxes))
-    unseen = ~np.isfinite(residual[:, 0])
-    residual[unseen], jacobian[unseen], parallax[unseen] = _UNSEEN_PX, 0.0, 0.0
-    return residual, jacobian, parallax
+        jacobian = -np.concatenate([np.cross(pairs.previous[:, None], by_point), by_point], axis=2)
+        parallax = _times(by_point, pairs.previous - centre)
+        return [backward, (pixels - pairs.pixels_current, jacobian, parallax)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Weighting:
+    """What a residual counts."""
+
+    whitening: FloatArray
+    """(m, 2, 2) inverse square roots of the residuals' covariances ``flow^2 I + depth^2 p p'``, p the parallax"""
+    kernel: Cauchy
+    """of whitened residuals"""
+
+    @classmethod
+    def learned(cls, state: _Reprojection, typical: BoolArray, parameters: RefinementParameters) -> _Weighting:
+        """From the parallax of all residuals, and the size of the ``typical`` (m,) ones."""
+        parallaxes, flow_px = state.linearised.parallaxes, parameters.flow_sigma_px
+        length = np.linalg.norm(parallaxes, axis=1)
+        direction = parallaxes / np.maximum(length, 1e-12)[:, None]
+        discount = 1.0 - flow_px / np.hypot(flow_px, parameters.depth_sigma * length)
+        along = direction[:, :, None] * direction[:, None, :]
+        whitening = (np.eye(2) - discount[:, None, None] * along) / flow_px
+        size = np.linalg.norm(_times(whitening[typical], state.linearised.residuals[typical]), axis=1)
+        # Outliers under a half do not move the median, which for a Rayleigh distribution is sqrt(2 ln 2) sigma.
+        sigma = max(float(np.median(size)) / np.sqrt(2.0 * np.log(2.0)), 1e-3)
+        return cls(whitening, Cauchy(parameters.cauchy_sigmas * sigma))
+
+    def whitened(self, state: _Reprojection) -> FloatArray:
+        """(m, 2)"""
+        return _times(self.whitening, state.linearised.residuals)
+
+    def loss(self, state: _Reprojection) -> float:
+        """The robust cost of a motion."""
+        return float(self.kernel.loss((self.whitened(state) ** 2).sum(axis=1)).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class _Refinement(Problem[_Reprojection]):
+    """Six parameters: rotation vector and translation that the motion is multiplied by from the left."""
+
+    parameters: RefinementParameters
+    typical: BoolArray
+    weighting: _Weighting | None = None
+    """None: learned anew at each state."""
+
+    def linearise(self, state: _Reprojection) -> NormalEquations:
+        weighting = self.weighting or _Weighting.learned(state, self.typical, self.parameters)
+        white = weighting.whitened(state)
+        weights = weighting.kernel.weight((white**2).sum(axis=1))
+        J = weighting.whitening @ state.linearised.jacobians
+        return NormalEquations.of(white.ravel(), J.reshape(-1, 6), np.repeat(weights, 2))
+
+    def move(self, state: _Reprojection, step: FloatArray) -> _Reprojection:
+        increment = RigidTransform(rotation_from_vector(step[:3]), step[3:])
+        return _Reprojection(state.views, increment @ state.motion, state.unseen_px)
 
 
 def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
     product: FloatArray = (matrices @ vectors[:, :, None])[:, :, 0]
     return product
-
-
-def _whitening(parallax: FloatArray) -> FloatArray:
-    """(m, 2, 2) inverse square roots of the residuals' covariances ``flow^2 I + depth^2 p p'``."""
-    length = np.linalg.norm(parallax, axis=1)
-    direction = parallax / np.maximum(length, 1e-12)[:, None]
-    discount = 1.0 - _FLOW_SIGMA_PX / np.hypot(_FLOW_SIGMA_PX, _DEPTH_SIGMA * length)
-    along = direction[:, :, None] * direction[:, None, :]
-    whitening: FloatArray = (np.eye(2) - discount[:, None, None] * along) / _FLOW_SIGMA_PX
-    return whitening
-
-
-def _sigma(white: FloatArray) -> float:
-    """Standard deviation of whitened residuals, each axis, from their median: outliers under a half do not matter."""
-    return max(float(np.median(np.linalg.norm(white, axis=1))) / _RAYLEIGH_MEDIAN, 1e-3)
-
-
-def _cost(residuals: FloatArray, whitening: FloatArray, scale: float) -> float:
-    white = _times(whitening, residuals)
-    return float(np.log1p((white**2).sum(axis=1) / scale**2).sum())

@@ -52,13 +52,24 @@ def kabsch(source: FloatArray, target: FloatArray, weights: FloatArray) -> tuple
     target_mean = weights @ target  # Eq. 19
     centred_source = source - source_mean[:, None]
     centred_target = target - target_mean[:, None]
-    covariance = (centred_target * weights[:, None]).transpose(0, 2, 1) @ centred_source
-    u, _, vt = np.linalg.svd(covariance)  # Eq. 20
-    # Without the sign the best orthogonal matrix may be a reflection, for flat or noisy points.
-    u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
-    rotations = u @ vt
+    rotations = _rotations((centred_target * weights[:, None]).transpose(0, 2, 1) @ centred_source)
     translations = target_mean - np.einsum("bij,bj->bi", rotations, source_mean)
     return rotations, translations
+
+
+def fit_rotation(source: FloatArray, target: FloatArray, weights: FloatArray) -> FloatArray:
+    """(3, 3) R with the least ``sum w |target - R source|^2`` of vectors (n, 3) and weights (n,): Wahba's problem."""
+    rotation: FloatArray = _rotations(((target * weights[:, None]).T @ source)[None])[0]
+    return rotation
+
+
+def _rotations(covariances: FloatArray) -> FloatArray:
+    """(b, 3, 3) the rotations R with the largest trace of ``R^T covariance``, of covariances (b, 3, 3)."""
+    u, _, vt = np.linalg.svd(covariances)  # Eq. 20
+    # Without the sign the best orthogonal matrix may be a reflection, for flat or noisy points.
+    u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
+    rotations: FloatArray = u @ vt
+    return rotations
 
 
 def _require_spread(name: str, points: FloatArray, weights: FloatArray) -> None:

@@ -21,11 +21,9 @@ from flockd.inference.manifest_file import manifest_path
 from flockd.inference.providers import engines_folder
 from flockd.inference.session import OnnxModel
 from flockd.messages import Float32Array, Frame, UInt8Array
-from flockd.perception.background_flow import settle_background
 from flockd.perception.detection.instances import group_instances
 from flockd.perception.detection.second_stage import SecondStage
-from flockd.perception.drone_flow import follow_drones
-from flockd.perception.flow import DisFlow, Flow, OnnxFlow
+from flockd.perception.flow import DisFlow, Flow, OnnxFlow, background_flow, object_flow
 from flockd.perception.maps import Crop, OpenDepth, RangeEstimate, SceneMaps
 from flockd.perception.requirements import check_roles
 
@@ -92,8 +90,8 @@ class OnnxNetworks:
         before, after = first.image, second.image
         flow = self._flow.flow(before, after)
         if self._config.flow_refinement == "quick_dis":
-            flow = settle_background(flow, before, after, labels)
-        return follow_drones(flow, before, after, labels)
+            flow = background_flow(flow, before, after, labels)
+        return object_flow(flow, before, after, labels)
 
     def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
         """See `Networks`."""
@@ -132,7 +130,11 @@ class OnnxNetworks:
         masks: Sequence[Float32Array | None] = [None] * len(crops)
         if "mask" in outputs[0]:
             masks = list(np.concatenate([output["mask"][:, 0] for output in outputs]))
-        return tuple(self._estimate(row, crop, mask) for row, crop, mask in zip(rows, crops, masks, strict=True))
+        size = self.second_stage.crop_size
+        return tuple(
+            _estimate({name: float(column[k]) for name, column in columns.items()}, crop, masks[k], size)
+            for k, crop in enumerate(crops)
+        )
 
     def _run(self, model: OnnxModel, image: UInt8Array, planes: Float32Array) -> dict[str, Float32Array]:
         """One model's maps (c, h, w) that show all of an image, at the model's resolution."""

@@ -19,7 +19,7 @@ from flockd.errors import ModelError
 from flockd.inference import OnnxModel, find_manifests, load_manifest
 from flockd.messages import BoolArray, Float32Array, Frame, UInt8Array
 from flockd.perception import DisFlow, OnnxFlow, OnnxNetworks
-from flockd.perception.background_flow import settle_background
+from flockd.perception.flow import background_flow
 from flockd.perception.networks import CROPS_PER_RUN
 from flockd.sim.drone_models import drone_model
 from flockd.sim.renderer import Renderer
@@ -245,7 +245,7 @@ def test_the_network_of_flow_is_sharpened_by_dis_unless_told_otherwise() -> None
             Frame("camera", first, 0.0, 0), Frame("camera", second, 0.5, 1), no_drones
         )
         flow = expected.flow(first, second)
-        settled = settle_background(flow, first, second, no_drones) if refinement == "quick_dis" else flow
+        settled = background_flow(flow, first, second, no_drones) if refinement == "quick_dis" else flow
         np.testing.assert_allclose(found, settled, atol=1e-4)
 
 

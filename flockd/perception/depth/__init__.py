@@ -1,5 +1,7 @@
-"""Metric scale of depth: by the height above ground, or by the autopilot's velocity."""
+"""The metric scale of depth that a network leaves open, fixed by the autopilot's height or by its velocity."""
 
-from flockd.perception.depth.scale import VelocityScale, fix_by_height
+from flockd.perception.depth.by_height import fix_by_height
+from flockd.perception.depth.by_velocity import VelocityScale
+from flockd.perception.depth.scale import Scale
 
-__all__ = ["VelocityScale", "fix_by_height"]
+__all__ = ["Scale", "VelocityScale", "fix_by_height"]

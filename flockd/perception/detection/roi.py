@@ -19,7 +19,7 @@ _BORDER_PX = 2
 
 @dataclass(frozen=True)
 class CropRules:
-    """How crops are to be cut for a network of the second stage, as its manifest says: as those that it was trained on."""
+    """How crops are to be cut for a network, as its manifest says: as those that it was trained on."""
 
     fill: float
     """Half of the crop's width over the drone's size, both as seen from the camera."""

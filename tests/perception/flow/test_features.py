@@ -8,7 +8,7 @@ import pytest
 
 from flockd.messages import Float32Array, UInt8Array
 from flockd.perception import DisFlow
-from flockd.perception.landmarks import flow_of_landmarks
+from flockd.perception.flow.features import feature_flow
 from tests.perception.conftest import WrongFlow, grey
 
 HEIGHT, WIDTH = 360, 540
@@ -52,7 +52,7 @@ def errors(flow: Float32Array, true: Float32Array) -> Float32Array:
 def test_landmarks_tell_a_turn_with_a_zoom(motion: Float32Array) -> None:
     first = pattern(1)
     second, true = moved(first, motion)
-    found = flow_of_landmarks(grey(first), grey(second))
+    found = feature_flow(grey(first), grey(second))
     assert found is not None
     off = errors(found, true)
     assert np.median(off) < 2.0
@@ -64,17 +64,17 @@ def test_what_stands_before_the_plane_moves_its_own_way() -> None:
     first, second = behind.copy(), np.roll(behind, (0, -60), axis=(0, 1))
     first[120:240, 300:460] = before
     second[120:240, 170:330] = before  # 130 px to the left, where all else goes 60
-    found = flow_of_landmarks(grey(first), grey(second))
+    found = feature_flow(grey(first), grey(second))
     assert found is not None
     assert np.abs(np.median(found[150:210, 340:420], axis=(0, 1)) - [-130.0, 0.0]).max() < 6.0
     assert np.abs(np.median(found[:, 80:200], axis=(0, 1)) - [-60.0, 0.0]).max() < 3.0
 
 
 def test_nothing_alike_gives_no_flow() -> None:
-    assert flow_of_landmarks(grey(pattern(1)), grey(pattern(2))) is None
+    assert feature_flow(grey(pattern(1)), grey(pattern(2))) is None
     empty = np.full((HEIGHT, WIDTH), 90, np.uint8)
-    assert flow_of_landmarks(empty, grey(pattern(2))) is None
-    assert flow_of_landmarks(empty, empty) is None
+    assert feature_flow(empty, grey(pattern(2))) is None
+    assert feature_flow(empty, empty) is None
 
 
 def test_dis_finds_a_large_turn_about_the_optical_axis_although_the_network_went_astray() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from flockd.messages import UInt8Array
 from flockd.perception import DisFlow
-from flockd.perception.shift import global_shift, likeness
+from flockd.perception.flow.cross_correlation import flow_correlation, global_translation
 from tests.perception.conftest import WrongFlow, grey
 
 
@@ -25,16 +25,16 @@ def windows(right: int, down: int) -> tuple[UInt8Array, UInt8Array]:
 @pytest.mark.parametrize("true", [(0, 0), (232, -40), (-248, 64), (16, 160)])
 def test_the_shift_of_a_whole_image_is_found_to_a_small_pixel(true: tuple[int, int]) -> None:
     first, second = windows(*true)
-    found = global_shift(grey(first), grey(second))
+    found = global_translation(grey(first), grey(second))
     assert np.abs(np.array(found) - true).max() <= 8.0
 
 
 def test_a_flow_is_likely_where_it_leads_to_the_same() -> None:
     first, second = (grey(image) for image in windows(64, -32))
     right = np.full((360, 540, 2), (64.0, -32.0), np.float32)
-    assert likeness(first, second, right) > 0.98
-    assert likeness(first, second, -right) < 0.3
-    assert likeness(first, second, np.full_like(right, 2000.0)) == 0.0
+    assert flow_correlation(first, second, right) > 0.98
+    assert flow_correlation(first, second, -right) < 0.3
+    assert flow_correlation(first, second, np.full_like(right, 2000.0)) == 0.0
 
 
 def test_dis_finds_a_large_turn_although_the_network_went_astray() -> None:

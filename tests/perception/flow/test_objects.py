@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flockd.messages import UNCLASSED, Float32Array, FloatArray, UInt8Array
-from flockd.perception.drone_flow import follow_drones
+from flockd.perception.flow import object_flow
 
 HEIGHT, WIDTH = 320, 400
 BEHIND = (3.0, -2.0)
@@ -64,7 +64,7 @@ def test_a_drone_is_followed_far_from_where_its_background_went(
     shift: tuple[float, float], turn_deg: float, zoom: float
 ) -> None:
     scene = Scene(motion(shift, turn_deg, zoom, (200, 160)))
-    found = follow_drones(scene.flow, scene.first, scene.second, scene.mask)
+    found = object_flow(scene.flow, scene.first, scene.second, scene.mask)
     assert np.median(scene.off(found)) < 0.15
     assert np.quantile(scene.off(found), 0.9) < 0.5
     assert (found[scene.mask == 0] == scene.flow[scene.mask == 0]).all(), "the background is not its business"
@@ -73,12 +73,12 @@ def test_a_drone_is_followed_far_from_where_its_background_went(
 def test_a_drone_that_has_grown_brighter_is_followed_too() -> None:
     scene = Scene(motion((25.0, -14.0), 4.0, 1.05, (200, 160)))
     brighter = np.clip(scene.second * 1.15 + 12.0, 0, 255).astype(np.uint8)
-    assert np.median(scene.off(follow_drones(scene.flow, scene.first, brighter, scene.mask))) < 0.2
+    assert np.median(scene.off(object_flow(scene.flow, scene.first, brighter, scene.mask))) < 0.2
 
 
 def test_a_drone_that_half_leaves_the_image_is_followed() -> None:
     scene = Scene(motion((-36.0, 0.0), 0.0, 1.0, (40, 160)), (40, 160))
-    found = follow_drones(scene.flow, scene.first, scene.second, scene.mask)
+    found = object_flow(scene.flow, scene.first, scene.second, scene.mask)
     stays = scene.true[:, 0] + np.nonzero(scene.mask)[1] > 2
     assert np.median(scene.off(found)[stays]) < 0.6
 
@@ -90,7 +90,7 @@ def test_two_drones_are_told_apart() -> None:
     first = np.where(far.mask[..., None] > 0, far.first, near.first)
     changed = (far.second != Scene(np.array([[1.0, 0.0, 1e4], [0.0, 1.0, 0.0]]), (290, 150)).second).any(2)
     second = np.where(changed[..., None], far.second, near.second)
-    found = follow_drones(near.flow, first, second, labels)
+    found = object_flow(near.flow, first, second, labels)
     assert np.median(near.off(found)) < 0.15
     assert np.median(far.off(found)) < 0.15
 
@@ -108,7 +108,7 @@ def test_what_cannot_be_followed_keeps_its_flow(why: str) -> None:
         labels = scene.mask * np.uint8(UNCLASSED)
     else:
         first = second = np.full_like(scene.first, 90)
-    assert (follow_drones(scene.flow, first, second, labels) == scene.flow).all()
+    assert (object_flow(scene.flow, first, second, labels) == scene.flow).all()
 
 
 def test_a_drone_of_stripes_is_followed_across_them() -> None:
@@ -116,6 +116,6 @@ def test_a_drone_of_stripes_is_followed_across_them() -> None:
     first[140:180, 180:220] = 6 * np.arange(40, dtype=np.uint8)[:, None, None]
     labels = np.zeros((HEIGHT, WIDTH), np.uint8)
     labels[140:180, 180:220] = 1
-    flow = follow_drones(np.zeros((HEIGHT, WIDTH, 2), np.float32), first, np.roll(first, 3, axis=0), labels)
+    flow = object_flow(np.zeros((HEIGHT, WIDTH, 2), np.float32), first, np.roll(first, 3, axis=0), labels)
     assert np.median(flow[145:175, 185:215, 1]) == pytest.approx(3.0, abs=0.05)
     assert np.isfinite(flow).all()
