@@ -23,11 +23,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from flockd.flight_log.log import FlightLog
 from flockd.flocking.metrics import pair_distances
 from flockd.messages import BoolArray, FloatArray
-from flockd.report.paper import TABLE_2
-from flockd.report.summary import EXACT_STATES, estimation_errors, objective_sums
-from flockd.sim.log import FlightLog
+from flockd.report.paper_results import TABLE_2
+from flockd.report.summary import estimation_errors, objective_sums
 
 FEW: Final = 8
 """Up to this many drones are told apart by colour."""
@@ -100,7 +100,7 @@ def drone_name(number: int) -> str:
 
 def companion(log: FlightLog) -> tuple[FloatArray, FloatArray] | None:
     """Positions and velocities of the flight with exact states; None without one, and beside a flight that is one."""
-    if not len(log.truth_position) or log.meta["perception"] == EXACT_STATES:
+    if not len(log.truth_position) or not log.metadata.by_sight:
         return None
     return log.truth_position, log.truth_velocity
 
@@ -256,7 +256,7 @@ _CURVES_OF_PAIRS: Final = ("distance, m", "Σ obj2")
 
 def _flight_title(log: FlightLog) -> str:
     """What the flight steered by."""
-    return "With exact states" if log.meta["perception"] == EXACT_STATES else "By sight"
+    return "By sight" if log.metadata.by_sight else "With exact states"
 
 
 _DESIRED: Final[dict[str, Any]] = {"color": INK, "linestyle": (0, (4, 3)), "linewidth": 1.0}
@@ -283,7 +283,7 @@ def _flight_column(axes: Mapping[str, Axes], log: FlightLog, position: FloatArra
 
     if "distance, m" in axes:
         distance = axes["distance, m"]
-        separation_m = log.meta["separation_distance_m"]
+        separation_m = log.metadata.separation_distance_m
         _distance_lines(distance, time_s, position)
         distance.axhline(separation_m, **_REFERENCE)
         distance.annotate(
@@ -408,7 +408,7 @@ def _tracked_lines(axes: Axes, log: FlightLog) -> None:
 def error_curves(log: FlightLog) -> Figure | None:
     """Errors of the estimated own motion and of the distance to the tracked neighbours; None without any estimate."""
     errors = estimation_errors(log)
-    if log.meta["perception"] == EXACT_STATES or not any(np.isfinite(values).any() for values in errors.values()):
+    if not log.metadata.by_sight or not any(np.isfinite(values).any() for values in errors.values()):
         return None
     drones = log.position.shape[1]
     with rc_context(STYLE):
@@ -458,7 +458,7 @@ def _paper_maxima(axes: Axes, log: FlightLog, column: str) -> None:
 
 def _windows(log: FlightLog) -> tuple[BoolArray, BoolArray]:
     """(S,) each: the steps on the circle, and those after it."""
-    circling = log.time_s < log.meta["circle_until_s"]
+    circling = log.time_s < log.metadata.circle_until_s
     return circling, ~circling
 
 
@@ -469,7 +469,7 @@ def _circle_ends(log: FlightLog) -> bool:
 
 def _mark_circle(axes: Axes, log: FlightLog) -> None:
     if _circle_ends(log):
-        axes.axvline(log.meta["circle_until_s"], color=MUTED, linewidth=0.8)
+        axes.axvline(log.metadata.circle_until_s, color=MUTED, linewidth=0.8)
 
 
 def _error_lines(axes: Axes, time_s: FloatArray, values: FloatArray) -> None:

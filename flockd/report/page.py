@@ -15,12 +15,13 @@ from markupsafe import Markup
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from flockd.flight_log.key_frames import KeyFrame, load_key_frames
+from flockd.flight_log.log import FlightLog
+from flockd.flight_log.metadata import EXACT_STATES
 from flockd.messages import UInt8Array
 from flockd.report import figures
-from flockd.report.filmstrip import FilmstripFrame, filmstrip_figure, load_filmstrip
-from flockd.report.paper import TABLE_2, TABLE_3
-from flockd.report.summary import EXACT_STATES
-from flockd.sim.log import FlightLog
+from flockd.report.filmstrip import filmstrip_figure
+from flockd.report.paper_results import TABLE_2, TABLE_3
 
 
 def write_report(directory: Path) -> Path:
@@ -35,7 +36,7 @@ def write_report(directory: Path) -> Path:
     log = FlightLog.load(directory / "flight.npz")
     summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
     strip = directory / "filmstrip.npz"
-    frames = load_filmstrip(strip) if strip.is_file() else ()
+    frames = load_key_frames(strip) if strip.is_file() else ()
 
     folder = directory / "figures"
     folder.mkdir(exist_ok=True)
@@ -91,7 +92,7 @@ def _embed(figure: Figure, folder: Path, name: str, description: str) -> Markup:
     return Markup(element)  # drawn here, from numbers
 
 
-def _plate(frame: FilmstripFrame, number: int, folder: Path) -> dict[str, Any]:
+def _plate(frame: KeyFrame, number: int, folder: Path) -> dict[str, Any]:
     """The filmstrip's figure as a PNG file and, for the page, as WebP: a photograph, a sixth of the size."""
     canvas = FigureCanvasAgg(filmstrip_figure(frame))
     canvas.draw()  # type: ignore[no-untyped-call]

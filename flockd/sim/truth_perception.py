@@ -22,8 +22,8 @@ _SIZE_M = 0.6
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
-    """What one drone's cameras truly saw, and where everything was."""
+class RenderTruth:
+    """The truth behind one rendered frame set of one drone: ids, depth and poses."""
 
     views: Mapping[str, View]
     R_ned_cameras: Mapping[str, FloatArray]
@@ -37,26 +37,26 @@ class Shot:
 
 
 class TruthPerception:
-    """Stands before the learned perception and answers the swapped roles itself. One for each drone.
+    """Takes the swapped roles from the renderer's truth and all others from the learned perception. One for each drone.
 
-    It is told with `show` what the cameras are about to see; the pilot knows nothing of it.
+    Call `show` with the truth behind the next frame set before the pilot's step.
     """
 
     def __init__(self, learned: Perceiver, swap: frozenset[str], rig: Rig) -> None:
         self.picture_size = learned.picture_size
         self.map_scale = learned.map_scale
         self._learned, self._swap, self._rig = learned, swap, rig
-        self._now: Shot | None = None
-        self._before: Shot | None = None
+        self._now: RenderTruth | None = None
+        self._before: RenderTruth | None = None
 
     @property
     def has_distance(self) -> bool:
         """There is a second stage, learned or true."""
         return "distance" in self._swap or self._learned.has_distance
 
-    def show(self, shot: Shot) -> None:
-        """What the next step's frames truly hold."""
-        self._before, self._now = self._now, shot
+    def show(self, truth: RenderTruth) -> None:
+        """Sets the truth behind the next step's frames."""
+        self._before, self._now = self._now, truth
 
     def flow(self, camera: str, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
         """The true or the learned flow."""
@@ -94,7 +94,7 @@ class TruthPerception:
             return self._learned.ranges(pictures)
         return tuple(self._range(picture, _known(self._now)) for picture in pictures)
 
-    def _instances(self, camera: str, now: Shot) -> list[Instance]:
+    def _instances(self, camera: str, now: RenderTruth) -> list[Instance]:
         ids = now.views[camera].ids
         found = []
         for drone in now.shown:
@@ -109,7 +109,7 @@ class TruthPerception:
             found.append(Instance(drone + 1, centre, box, float(rows.size)))
         return sorted(found, key=lambda one: -one.area_px)
 
-    def _range(self, picture: Picture, now: Shot) -> RangeEstimate:
+    def _range(self, picture: Picture, now: RenderTruth) -> RangeEstimate:
         size = self.picture_size
         visible = [d for d in now.shown if any((view.ids == d + 1).sum() >= _MIN_PIXELS for view in now.views.values())]
         if not visible:
@@ -124,10 +124,10 @@ class TruthPerception:
         return RangeEstimate(range_m, 0.001, np.clip(centre, -size, 2 * size), _SIZE_M, is_drone=float(inside))
 
 
-def _known(shot: Shot | None) -> Shot:
-    if shot is None:
-        raise RuntimeError("the truth was asked before it was shown")
-    return shot
+def _known(truth: RenderTruth | None) -> RenderTruth:
+    if truth is None:
+        raise RuntimeError("the truth of a frame set was needed before `show` was called with it")
+    return truth
 
 
 def _matrix(rig: Rig, camera: str) -> FloatArray:

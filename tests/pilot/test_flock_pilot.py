@@ -17,7 +17,7 @@ from flockd.messages import UNCLASSED, BoolArray, Float32Array, FrameSet, PilotO
 from flockd.perception import Instance, Picture, RangeEstimate, SceneMaps
 from flockd.pilot import FlockPilot, views
 from flockd.pilot.outlines import Claim, Outlines
-from flockd.sim.photographer import Photographer
+from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.truth_perception import ROLES, TruthPerception
 from flockd.sim.vehicles import Vehicles
 
@@ -55,15 +55,15 @@ class Flyer:
 
     def __init__(self, scenario: ScenarioConfig) -> None:
         self.scenario = scenario
-        self.photographer = Photographer(scenario)
-        self.truth = TruthPerception(NoNetworks(), frozenset(ROLES), self.photographer.rig)
+        self.camera_simulator = CameraSimulator(scenario)
+        self.truth = TruthPerception(NoNetworks(), frozenset(ROLES), self.camera_simulator.rig)
         self.pilot = FlockPilot(scenario.drone, self.truth)
         self.vehicles = Vehicles(scenario.vehicles, scenario.vehicle)
         self.time_s = 100.0
         self.steps = 0
 
     def look(self) -> tuple[FrameSet, VehicleState]:
-        frames, shot = self.photographer.photograph(0, self.steps, self.time_s, self.vehicles)
+        frames, shot = self.camera_simulator.capture(0, self.steps, self.time_s, self.vehicles)
         self.truth.show(shot)
         v = self.vehicles
         return frames, VehicleState(self.time_s, v.R_ned_body[0], -float(v.position[0, 2]), v.velocity[0])
@@ -282,7 +282,7 @@ def test_what_is_no_drone_belongs_to_the_background_again(
     monkeypatch.setattr(
         flyer.truth, "ranges", lambda pictures: tuple(replace(a, is_drone=is_drone) for a in answers(pictures))
     )
-    observer = views.Observer(flyer.photographer.rig, flyer.truth, height_fixes_scale=False)
+    observer = views.Observer(flyer.camera_simulator.rig, flyer.truth, height_fixes_scale=False)
     maps, _ = observer.scenes(frames, vehicle)
     (name,) = [name for name, scene in maps.items() if scene.instances]
     drone = maps[name].labels > 0
@@ -294,7 +294,7 @@ def test_what_is_no_drone_belongs_to_the_background_again(
 
 
 def test_of_a_drone_that_the_images_border_cuts_more_is_looked_at_than_is_seen() -> None:
-    camera = next(iter(Photographer(scenario_with((0.0, 0.0, -4.0))).rig.cameras.values()))
+    camera = next(iter(CameraSimulator(scenario_with((0.0, 0.0, -4.0))).rig.cameras.values()))
     width = camera.camera.size[0]
 
     def half_angle(left: float) -> float:
@@ -327,7 +327,7 @@ def test_two_drones_that_the_first_stage_takes_for_one_are_two(monkeypatch: pyte
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0), (6.0, -0.6, -4.0)))
     frames, vehicle = flyer.look()
     monkeypatch.setattr(flyer.truth, "ranges", with_discs(flyer.truth, 9.0))
-    observer = views.Observer(flyer.photographer.rig, flyer.truth, height_fixes_scale=False)
+    observer = views.Observer(flyer.camera_simulator.rig, flyer.truth, height_fixes_scale=False)
     maps, _ = observer.scenes(frames, vehicle)
     (name,) = [name for name, scene in maps.items() if scene.instances]
     near, far = maps[name].instances
@@ -346,7 +346,7 @@ def test_a_view_draws_drones_as_their_colours_say(monkeypatch: pytest.MonkeyPatc
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0)))
     frames, vehicle = flyer.look()
     monkeypatch.setattr(flyer.truth, "ranges", with_discs(flyer.truth, 3.0))
-    observer = views.Observer(flyer.photographer.rig, flyer.truth, height_fixes_scale=False)
+    observer = views.Observer(flyer.camera_simulator.rig, flyer.truth, height_fixes_scale=False)
     maps, _ = observer.scenes(frames, vehicle)
     (name,) = [name for name, scene in maps.items() if scene.instances]
     nothing = np.zeros(maps[name].labels[1::2, 1::2].shape, np.float32)
@@ -370,7 +370,7 @@ def test_a_drone_painted_like_the_one_before_it_is_still_looked_for() -> None:
     """Colours give its pixels to the other one; what the networks alone say does not."""
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0), (6.0, -0.6, -4.0)))
     frames, vehicle = flyer.look()
-    observer = views.Observer(flyer.photographer.rig, flyer.truth, height_fixes_scale=False)
+    observer = views.Observer(flyer.camera_simulator.rig, flyer.truth, height_fixes_scale=False)
     maps, _ = observer.scenes(frames, vehicle)
     (name,) = [name for name, scene in maps.items() if scene.instances]
     near, far = (maps[name].labels == instance.label for instance in maps[name].instances)

@@ -24,8 +24,8 @@ try:
 except Exception as error:  # noqa: BLE001 - whatever keeps the native library from loading
     pytest.skip(f"MAVSDK's native library does not load: {error}", allow_module_level=True)
 
+from flockd.flight_log.log import FlightLog
 from flockd.sim.ground_station import GroundStation, home_deg
-from flockd.sim.log import FlightLog
 
 SECONDS_TO_START = 120.0
 PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
