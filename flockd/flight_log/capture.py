@@ -19,9 +19,12 @@ def key_frame_steps(steps: int) -> set[int]:
 
 
 def capture(pilot: FlockPilot, output: PilotOutput, drone: int, name: str = "") -> list[KeyFrame]:
-    """What a pilot worked with in the step that gave ``output``; empty before its first step."""
+    """What a pilot worked with in the step that gave ``output``.
+
+    Empty before its first step, and where no camera had a usable image, as of a drone that touched the ground.
+    """
     view = pilot.last_view
-    if view is None:
+    if view is None or not view.cameras:
         return []
     cameras = view.cameras
     return [

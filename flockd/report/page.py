@@ -36,7 +36,7 @@ def write_report(directory: Path) -> Path:
     log = FlightLog.load(directory / "flight.npz")
     summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
     strip = directory / "filmstrip.npz"
-    frames = load_key_frames(strip) if strip.is_file() else ()
+    frames = [frame for frame in load_key_frames(strip) if frame.cameras] if strip.is_file() else []
 
     folder = directory / "figures"
     folder.mkdir(exist_ok=True)

@@ -379,6 +379,18 @@ def test_formation_edges_have_nobody_between() -> None:
 # ------------------------------------------------------------------------------------------------------ the filmstrip
 
 
+def test_a_key_frame_without_cameras_is_left_out(tmp_path: Path) -> None:
+    """As flights kept them in which a drone touched the ground: the report has all the others."""
+    grounded = KeyFrame(
+        time_s=2.0, drone=0, cameras=(), images={}, depth={}, labels={}, flow={}, track_ids={}, ranges={}
+    )
+    page = _report(tmp_path, _flight(duration_s=20.0), grounded, _moment())
+    assert len(load_key_frames(tmp_path / "filmstrip.npz")) == 2
+    assert "drone 1 at 3.0 s" in page
+    assert "at 2.0 s" not in page
+    assert sorted(path.name for path in (tmp_path / "figures").glob("filmstrip*")) == ["filmstrip_1.png"]
+
+
 def test_a_filmstrip_survives_its_file(tmp_path: Path) -> None:
     moment = _moment()
     save_key_frames(tmp_path / "filmstrip.npz", [moment, _moment(time_s=9.5)])
