@@ -45,7 +45,7 @@ def flight_log(recordings: Sequence[Recording], progress: Progress = lambda done
     """The log of one flight that one or several of its drones recorded.
 
     Several are put together by their truth, as each drone has a clock of its own. Raises RecordingError where they are
-    not of one flight, or spoilt. `progress` is told how many of how many steps are read.
+    not of one flight, or damaged. `progress` is called with (steps read, steps in all).
     """
     names, steps = _read(recordings, progress)
     began_s = recordings[0].pilot_began_s

@@ -17,7 +17,7 @@ _STAGE_PREFIX = "stage "
 
 @dataclass(frozen=True, eq=False)
 class FlightLog:
-    """S steps of N drones; NaN where there was no estimate, and where nobody knows the truth.
+    """S steps of N drones; NaN where there was no estimate, and where the truth is not known.
 
     A drone that was not recorded in a step has no command in it. Raises ValueError for shapes that do not fit together.
     """
@@ -72,6 +72,16 @@ class FlightLog:
     def recorded(self) -> BoolArray:
         """(S, N): which drones' steps are in it."""
         return np.asarray(np.isfinite(self.command_velocity).all(axis=2))
+
+    @property
+    def companion(self) -> tuple[FloatArray, FloatArray] | None:
+        """Positions and velocities (S, N, 3) of the companion with exact states.
+
+        None without one, and of a flight that flew on exact states itself.
+        """
+        if not len(self.truth_position) or not self.metadata.by_sight:
+            return None
+        return self.truth_position, self.truth_velocity
 
     def __post_init__(self) -> None:
         steps, drones = self.position.shape[:2]

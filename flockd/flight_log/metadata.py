@@ -74,7 +74,7 @@ class FlightMetadata(BaseModel):
     observation_distance_m: float
     separation_distance_m: float
     seed: int | None = None
-    """Of the scenario; None where a recording does not tell it."""
+    """Of the scenario; None where a recording does not hold it."""
     wall_s: float | None = None
     """How long the simulation took; None of a recording."""
     autopilot: str | None = None

@@ -1,4 +1,4 @@
-"""What only a simulator knows: recorded beside a flight, to judge it by. Nothing that flies reads it."""
+"""True states from a simulator: recorded beside a flight, to evaluate it. Nothing that flies reads it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class TrueDrone:
     R_ned_body: Matrix3
     """(3, 3)"""
     exact_position: Vector3 | None = None
-    """(3,) where it would be, had everybody known everybody's exact state from the start; None in such a flight."""
+    """(3,) m NED in the companion flight, in which all drones had all exact states; None in such a flight."""
     exact_velocity: Vector3 | None = None
     """(3,) likewise."""
 

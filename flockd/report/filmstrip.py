@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from flockd.flight_log.key_frames import KeyFrame
 from flockd.messages import BoolArray, FloatArray
-from flockd.report.figures import FEW, STYLE, colour_of
+from flockd.report.style import FEW, STYLE, colour_of
 
 RIG_ORDER = ("left", "front", "right", "back")
 """Reading order of the cameras: a turn to the right. Cameras of other names follow in their own order."""
@@ -89,9 +89,9 @@ def _rig_place(camera: str) -> int:
     return RIG_ORDER.index(camera) if camera in RIG_ORDER else len(RIG_ORDER)
 
 
-def _show(axes: Axes, picture: NDArray[np.generic], **style: object) -> None:
-    height, width = picture.shape[:2]
-    axes.imshow(picture, extent=(0, width, height, 0), **style)  # type: ignore[arg-type]  # pixel centres at +0.5
+def _show(axes: Axes, image: NDArray[np.generic], **style: object) -> None:
+    height, width = image.shape[:2]
+    axes.imshow(image, extent=(0, width, height, 0), **style)  # type: ignore[arg-type]  # pixel centres at +0.5
     axes.set(xlim=(0, width), ylim=(height, 0))
 
 
@@ -133,7 +133,7 @@ _Box = tuple[float, float, float, float]
 
 
 def _name(axes: Axes, mask: BoolArray, caption: str, taken: Sequence[_Box]) -> _Box:
-    """Written as near to the drone as there is room, within the picture and clear of the names already there."""
+    """Written as near to the drone as there is room, within the image and clear of the names already there."""
     height, width = mask.shape
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     half, line = 0.018 * width * len(caption), 0.034 * height
@@ -159,7 +159,7 @@ def _draw_depth(axes: Axes, depth: NDArray[np.float32]) -> None:
 
 
 _ARROWS_ACROSS = 14
-"""The flow is drawn once in each of this many cells across the picture, and once for each drone."""
+"""The flow is drawn once in each of this many cells across the image, and once for each drone."""
 
 
 def _typical_flow(frame: KeyFrame) -> float:

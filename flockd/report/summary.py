@@ -1,4 +1,4 @@
-"""The figures of one flight: the paper's Tables 2 and 3, the flock, the neighbours seen and the time it took."""
+"""The figures of one flight: the paper's Tables 2 and 3, the flock, the tracked neighbours and the timings."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def summarise(log: FlightLog) -> Json:
     steps; order, union and connectivity are horizontal means over the last 10 s, with the law's observation distance as
     interaction distance. `neighbours`: the share of all drones within 10 m, at all steps, of which there was a
     confirmed track, and new false tracks; of drones and steps that were recorded. A flight whose perception is "truth"
-    saw nothing: its `neighbours` are null and it is itself Table 3's "truth". Of a recording without truth
-    (`has_truth`) all of these are null. `own_account` is what the recorded drones themselves knew. `autopilot` names
-    what real daemons flew, and `fleet` tells how they did; both are null where the simulator flew the pilots itself.
+    has no perception: its `neighbours` are null and it is itself Table 3's "truth". Of a recording without truth
+    (`has_truth`) all of these are null. `own_account` needs no truth: the recorded drones' own estimates. `autopilot`
+    names what real daemons flew, and `fleet` holds their figures; null where the simulator ran the pilots.
     """
     metadata, value = log.metadata, log.metadata.model_dump()
     return {
@@ -100,11 +100,11 @@ def objective_sums(log: FlightLog, position: FloatArray, velocity: FloatArray) -
 
 
 def _table_2(log: FlightLog) -> Json:
-    looked = np.full(len(log.time_s), log.metadata.by_sight)
+    by_sight = np.full(len(log.time_s), log.metadata.by_sight)
     circling = np.asarray(log.time_s < log.metadata.circle_until_s)
     errors = estimation_errors(log)
     return {
-        window: {column: _spread(np.abs(values[steps & looked])) for column, values in errors.items()}
+        window: {column: _spread(np.abs(values[steps & by_sight])) for column, values in errors.items()}
         for window, steps in (("before", circling), ("after", ~circling))
     }
 
@@ -190,11 +190,11 @@ def _neighbours(log: FlightLog) -> Json:
 
 def _own_account(log: FlightLog) -> Json:
     """How often the own motion was estimated, from the second step on, and how many neighbours were tracked at once."""
-    looked = log.recorded & log.metadata.by_sight
+    estimating = log.recorded & log.metadata.by_sight
     _, counts = np.unique(log.tracked[:, :2], axis=0, return_counts=True)
     return {
-        "own_motion_ratio": _mean(np.isfinite(log.ego_inlier_ratio)[1:][looked[1:]]),
-        "most_neighbours_tracked": int(counts.max(initial=0)) if looked.any() and len(log.tracked) else None,
+        "own_motion_ratio": _mean(np.isfinite(log.ego_inlier_ratio)[1:][estimating[1:]]),
+        "most_neighbours_tracked": int(counts.max(initial=0)) if estimating.any() and len(log.tracked) else None,
     }
 
 

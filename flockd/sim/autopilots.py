@@ -54,7 +54,7 @@ class Ports:
 
 
 class Autopilots(Protocol):
-    """One autopilot a vehicle, on the ground below its start until somebody brings it up."""
+    """One autopilot a vehicle, on the ground below its start until it is commanded to take off."""
 
     name: str
     """For the report."""

@@ -1,6 +1,6 @@
 """Quadrotor meshes: families of one shape and one size each, painted from a seed.
 
-A family's size is its own, so a picture tells the family and with it the size: the only scale that one image has.
+A family's size is its own, so an image shows the family and with it the size: the only scale that one image has.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ def fly_exact_states(scenario: ScenarioConfig) -> tuple[FloatArray, FloatArray, 
     """Times (S,) s, positions (S, N, 3) m and velocities (S, N, 3) m/s in NED, as each step begins.
 
     The paper's "UAV flocking based on ground truth cluster state": each vehicle gets what the flocking law commands on
-    everybody's true position and velocity.
+    the true positions and velocities of all.
     """
     times = step_times(scenario)
     drone = scenario.drone

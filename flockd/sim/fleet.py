@@ -113,11 +113,11 @@ class _Fleet:
         self._autopilots.start()
         self._needed = self._autopilots.programs()
         self._wait_for(
-            self._station.heard,
+            self._station.is_connected,
             AUTOPILOT_START_S * self._speed_factor,
-            lambda i: f"{self._autopilots.name} {i + 1} said nothing for {AUTOPILOT_START_S:g} s",
+            lambda i: f"{self._autopilots.name} {i + 1} sent nothing for {AUTOPILOT_START_S:g} s",
         )
-        self._station.ask_for_news()
+        self._station.request_messages()
         self._server.start()
         self._daemons.start()
         self._needed = (*self._autopilots.programs(), *self._daemons.programs())
@@ -184,9 +184,9 @@ class _Fleet:
             if program.name in run.handed_over:
                 continue
             if program.ended is not None:
-                why = f"its daemon ended with exit code {program.ended} ({program.last_words()})"
+                why = f"its daemon ended with exit code {program.ended} ({program.last_output()})"
             elif autopilots and autopilots[i].ended is not None:
-                why = f"its autopilot ended with exit code {autopilots[i].ended} ({autopilots[i].last_words()})"
+                why = f"its autopilot ended with exit code {autopilots[i].ended} ({autopilots[i].last_output()})"
             elif not self._station.mode_is(i, "OFFBOARD"):
                 why = f"it left offboard ({self._last_messages(i)})"
             else:
@@ -207,9 +207,9 @@ class _Fleet:
 
     def _last_messages(self, i: int) -> str:
         """The last messages of a drone's daemon and autopilot."""
-        messages = [f"flockd: {self._daemons.status(i) or self._daemons.programs()[i].last_words()}"]
-        if self._station.last_words(i):
-            messages.append(f"autopilot: {self._station.last_words(i)}")
+        messages = [f"flockd: {self._daemons.status(i) or self._daemons.programs()[i].last_output()}"]
+        if self._station.last_text(i):
+            messages.append(f"autopilot: {self._station.last_text(i)}")
         return "; ".join(messages)
 
     def _request(
@@ -241,7 +241,7 @@ class _Fleet:
         self._server.frames()
         for program in self._needed:
             if program.ended is not None:
-                raise UnavailableError(f"{program.name} ended with exit code {program.ended} ({program.last_words()})")
+                raise UnavailableError(f"{program.name} ended with exit code {program.ended} ({program.last_output()})")
         time.sleep(POLL_S)
 
     def _cpu_s(self) -> dict[str, float]:

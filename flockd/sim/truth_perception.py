@@ -89,7 +89,7 @@ class TruthPerception:
         return replace(drones, depth=depth, open=None if "depth" in self._swap else learned.open)
 
     def ranges(self, pictures: Sequence[Picture]) -> tuple[RangeEstimate, ...]:
-        """The true range of the drone nearest to each picture's middle, or the learned one."""
+        """The true range of the drone nearest to each crop's middle, or the learned one."""
         if "distance" not in self._swap:
             return self._learned.ranges(pictures)
         return tuple(self._range(picture, _known(self._now)) for picture in pictures)

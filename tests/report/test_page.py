@@ -17,10 +17,11 @@ from scipy.spatial import Delaunay
 from flockd.flight_log.key_frames import KeyFrame, load_key_frames, save_key_frames
 from flockd.flight_log.log import FlightLog
 from flockd.flight_log.metadata import FlightMetadata
-from flockd.report.figures import error_curves, flight_curves, gabriel_edges, trajectories
+from flockd.report.curves import error_curves, flight_curves
 from flockd.report.filmstrip import filmstrip_figure
 from flockd.report.page import write_report
 from flockd.report.summary import summarise, write_summary
+from flockd.report.trajectories import gabriel_edges, trajectories
 
 Array = NDArray[np.float64]
 RADIUS_M = 2.1
@@ -257,7 +258,7 @@ def test_a_flight_with_exact_states_says_what_it_lacks(tmp_path: Path) -> None:
     page = _Page(_report(tmp_path, _flight(perception="truth")))
     assert "Five drones flew 110 s with exact states and stayed one flock" in page.text
     assert "there is no estimate to compare with the truth" in page.text
-    assert "No camera pictures were kept of this flight." in page.text
+    assert "No camera images were kept of this flight." in page.text
     assert "No stage of this flight was timed." in page.text
     assert "it stands alone" in page.text
     assert not [row for row in page.rows if row and row[0][0] in ("maximum", "By sight")]

@@ -252,16 +252,16 @@ def test_without_truth_nothing_is_made_up(alone: Path, capsys: Capture) -> None:
     for sentence in (
         "One drone flew 6 s by sight",
         "kestrel, begun 20",
-        "The recording holds no truth, so all of this is the drone’s own account.",
+        "The recording holds no truth, so all of this is the drone’s own estimate.",
         "The recording holds no truth, so the true path is not known.",
         "The recording holds no truth, so nothing can be said of the paper&#8217;s deviations",
         "The recording holds no truth to compare the estimates with.",
         "The recording holds no truth of the flock.",
-        "The recording holds no truth of who was there to be seen.",
+        "The recording holds no truth of the neighbours.",
         "scene",
     ):
         assert sentence in text, sentence
-    for claim in ("One drone is no flock", "nobody to be seen", "Nothing was estimated", "stayed one flock", "nan"):
+    for claim in ("One drone is no flock", "There were no neighbours", "Nothing was estimated", "stayed one flock", "nan"):
         assert claim not in text.partition("<svg")[0], claim
     assert {path.name for path in (folder / "figures").iterdir()} == {"account.png"}
 

@@ -171,7 +171,7 @@ def test_the_ground_station_knows_where_everybody_truly_is() -> None:
         ) as stand_in,
     ):
         until_s = time.monotonic() + 10.0
-        while not (station.heard(0) and station.is_armed(0)):
+        while not (station.is_connected(0) and station.is_armed(0)):
             assert time.monotonic() < until_s
             time.sleep(0.01)
         poses = station.poses()

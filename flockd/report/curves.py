@@ -1,228 +1,27 @@
-"""The report's line figures: paths and formation, the curves of the paper's Fig. 6 and 7, the errors of its Fig. 5.
+"""The report's curves over time: those of the paper's Fig. 6 and 7, and the errors of its Fig. 5.
 
-Each function takes a flight log and returns a matplotlib figure in the light palette; :func:`save_png` and
-:func:`inline_svg` turn it into what the report ships. Up to `FEW` drones have a line and a colour each; more are shown
-as the band they fill.
+Each function takes a flight log and returns a matplotlib figure in the light palette.
 """
 
 from __future__ import annotations
 
-import io
-import re
 from collections.abc import Mapping
 from itertools import combinations
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from matplotlib import colormaps, rc_context
+from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from flockd.flight_log.log import FlightLog
-from flockd.flocking.metrics import pair_distances
 from flockd.messages import BoolArray, FloatArray
 from flockd.report.paper_results import TABLE_2
+from flockd.report.style import BAND, FEW, INK, MUTED, STYLE, colour_of, drone_name
 from flockd.report.summary import estimation_errors, objective_sums
-
-FEW: Final = 8
-"""Up to this many drones are told apart by colour."""
-
-NAMED: Final = 12
-"""Up to this many have their number and their distances written into the formation."""
-
-INK: Final = "#1b2430"
-MUTED: Final = "#667382"
-GRID: Final = "#dde3ea"
-PAPER: Final = "#ffffff"
-
-# Okabe and Ito's colours, which colour-blind readers can tell apart; yellow darkened and black made grey, so that all
-# eight can be seen on white and on near-black.
-_DRONES: Final = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#a39400", "#808890")
-
-_ON_COLOUR: Final = "#fffffe"
-"""White in either scheme, so not the paper's."""
-
-STYLE: Final[dict[Any, Any]] = {
-    "font.family": ["DejaVu Sans"],
-    "font.size": 9.0,
-    "text.color": INK,
-    "axes.labelcolor": INK,
-    "axes.labelsize": 9.0,
-    "axes.titlesize": 10.0,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.edgecolor": MUTED,
-    "axes.linewidth": 0.7,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": GRID,
-    "grid.linewidth": 0.7,
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "xtick.labelsize": 8.5,
-    "ytick.labelsize": 8.5,
-    "xtick.major.width": 0.7,
-    "ytick.major.width": 0.7,
-    "lines.linewidth": 1.3,
-    "lines.solid_capstyle": "round",
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    "figure.facecolor": PAPER,
-    "figure.dpi": 150.0,
-    "svg.fonttype": "none",
-    "svg.image_inline": True,
-}
-
-
-def colour_of(number: int, count: int) -> str:
-    """The colour of drone `number` (from 0) in a flock of `count`."""
-    if count <= FEW:
-        return _DRONES[number % FEW]
-    return to_hex(colormaps["viridis"](0.2 + 0.65 * number / (count - 1)))
-
-
-def drone_name(number: int) -> str:
-    """Drones count from 0 in the log and from 1 in the report, as in the paper."""
-    return f"drone {number + 1}"
-
-
-# --------------------------------------------------------------------------------------------------- paths, formation
-
-
-def companion(log: FlightLog) -> tuple[FloatArray, FloatArray] | None:
-    """Positions and velocities of the flight with exact states; None without one, and beside a flight that is one."""
-    if not len(log.truth_position) or not log.metadata.by_sight:
-        return None
-    return log.truth_position, log.truth_velocity
-
-
-def trajectories(log: FlightLog) -> Figure:
-    """All true paths seen from above, north up, with the formation at the start and at the end."""
-    drones = log.position.shape[1]
-    exact = companion(log)
-    with rc_context(STYLE):
-        figure = Figure(figsize=(11.0, 7.4), layout="constrained")
-        paths, *formations = figure.subplot_mosaic(
-            [["paths", "start"], ["paths", "end"]] if drones > 1 else [["paths"]],
-            width_ratios=(1.9, 1.0) if drones > 1 else (1.0,),
-        ).values()
-        if exact:
-            for number in range(drones):
-                _plan(paths, exact[0][:, number], **_COMPANION)
-        for number in range(drones):
-            colour = colour_of(number, drones)
-            track = log.position[:, number]
-            _plan(paths, track, color=colour, linewidth=1.4 if drones <= FEW else 0.8)
-            _plan(paths, track[:1], color=colour, marker="o", markersize=5, markerfacecolor=PAPER, zorder=4)
-            _plan(paths, track[-1:], color=colour, marker="o", markersize=6, markeredgecolor=PAPER, zorder=5)
-        paths.set_aspect("equal", adjustable="datalim")
-        paths.set(xlabel="east, m", ylabel="north, m", title="Paths")
-        paths.legend(handles=_path_handles(drones, exact=exact is not None), loc="best")
-
-        reach = 1.15 * max(np.abs(_centred(log.position[step])).max() for step in (0, -1)) + 1.2
-        for axes, step, name in zip(formations, (0, -1), ("start", "end"), strict=False):
-            axes.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="east of the middle, m", ylabel="north, m")
-            axes.set_aspect("equal")
-            axes.set_title(f"Formation at the {name}, t = {log.time_s[step]:g} s")
-            for ticks in (axes.xaxis, axes.yaxis):
-                ticks.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
-            _formation(axes, log.position[step], log.velocity[step])
-        if exact and formations:
-            ideal = _centred(exact[0][-1])
-            ring: dict[str, Any] = {
-                "color": MUTED,
-                "markerfacecolor": "none",
-                "markersize": 11 if drones <= NAMED else 7,
-            }
-            formations[-1].plot(ideal[:, 1], ideal[:, 0], "o", **ring)
-    return figure
-
-
-_COMPANION: Final[dict[str, Any]] = {"color": MUTED, "linestyle": (0, (3, 2)), "linewidth": 0.9, "alpha": 0.8}
-
-
-def _plan(axes: Axes, track: FloatArray, **style: object) -> None:
-    axes.plot(track[:, 1], track[:, 0], **style)  # type: ignore[arg-type]
-
-
-def _path_handles(drones: int, *, exact: bool) -> list[Line2D]:
-    handles = []
-    if drones <= FEW:
-        handles += [Line2D([], [], color=colour_of(i, drones), label=drone_name(i)) for i in range(drones)]
-    else:
-        handles += [
-            Line2D([], [], color=colour_of(0, drones), label="drone 1"),
-            Line2D([], [], color=colour_of(drones // 2, drones), label="…"),
-            Line2D([], [], color=colour_of(drones - 1, drones), label=f"drone {drones}"),
-        ]
-    handles.append(Line2D([], [], color=MUTED, marker="o", markerfacecolor=PAPER, linestyle="", label="start"))
-    handles.append(Line2D([], [], color=MUTED, marker="o", linestyle="", label="end"))
-    if exact:
-        handles.append(Line2D([], [], label="with exact states", **_COMPANION))
-    return handles
-
-
-def _centred(position: FloatArray) -> FloatArray:
-    """(n, 2) north and east from the flock's middle."""
-    plan: FloatArray = position[:, :2] - position[:, :2].mean(axis=0)
-    return plan
-
-
-def _formation(axes: Axes, position: FloatArray, velocity: FloatArray) -> None:
-    """The flock from above around its middle, with the distances between those that have nobody between them."""
-    plan = _centred(position)
-    drones = len(plan)
-    for i, j in np.argwhere(np.triu(gabriel_edges(plan))):
-        axes.plot(plan[[i, j], 1], plan[[i, j], 0], color=MUTED, linewidth=0.9, zorder=1)
-        if drones <= NAMED:
-            _length(axes, plan[i], plan[j])
-    colours = [colour_of(number, drones) for number in range(drones)]
-    axes.quiver(
-        plan[:, 1], plan[:, 0], velocity[:, 1], velocity[:, 0],
-        color=colours, angles="xy", scale_units="xy", scale=1.0, width=0.006 if drones <= NAMED else 0.003, zorder=2,
-    )  # fmt: skip
-    axes.scatter(plan[:, 1], plan[:, 0], s=90 if drones <= NAMED else 22, c=colours, zorder=3)
-    if drones <= NAMED:
-        for number in range(drones):
-            axes.text(
-                plan[number, 1], plan[number, 0], str(number + 1),
-                color=_ON_COLOUR, ha="center", va="center_baseline", fontsize=7.5, fontweight="bold", zorder=4,
-            )  # fmt: skip
-
-
-def _length(axes: Axes, one: FloatArray, other: FloatArray) -> None:
-    """The length of a side written on it, or beside it where the two drones' marks leave no room."""
-    metres = float(np.linalg.norm(other - one))
-    north, east = (one + other) / 2
-    short = metres < 0.15 * np.ptp(axes.get_ylim())
-    if short:
-        away = np.array([one[1] - other[1], other[0] - one[0]]) / max(metres, 1e-9)
-        away *= 1 if away @ (north, east) > 0 else -1  # outwards from the flock's middle
-        north, east = (north, east) + 0.09 * np.ptp(axes.get_ylim()) * away
-    axes.text(
-        east, north, f"{metres:.2f}", ha="center", va="center", fontsize=8,
-        bbox={"facecolor": PAPER, "edgecolor": "none", "pad": 1.0},
-    )  # fmt: skip
-
-
-def gabriel_edges(plan: FloatArray) -> BoolArray:
-    """(n, n): pairs whose diameter circle holds nobody else; the sides of a pentagon, not its diagonals."""
-    squared = pair_distances(plan) ** 2
-    # k is inside the circle over i and j where the angle at k is obtuse: |ik|^2 + |jk|^2 < |ij|^2.
-    inside = squared[:, None, :] + squared[None, :, :] < squared[:, :, None] - 1e-9
-    return np.asarray(~inside.any(axis=2) & ~np.eye(len(plan), dtype=bool))
-
-
-# ------------------------------------------------------------------------------------------- curves of Fig. 6 and 7
 
 
 def flight_curves(log: FlightLog) -> Figure:
@@ -231,7 +30,7 @@ def flight_curves(log: FlightLog) -> Figure:
     One drone has no distances and no shape.
     """
     flights = [(_flight_title(log), log.position, log.velocity)]
-    exact = companion(log)
+    exact = log.companion
     if exact:
         flights.append(("With exact states", *exact))
     drones = log.position.shape[1]
@@ -255,7 +54,7 @@ _CURVES_OF_PAIRS: Final = ("distance, m", "Σ obj2")
 
 
 def _flight_title(log: FlightLog) -> str:
-    """What the flight steered by."""
+    """Which states the drones flew by."""
     return "By sight" if log.metadata.by_sight else "With exact states"
 
 
@@ -321,21 +120,18 @@ def _flock_lines(axes: Axes, time_s: FloatArray, values: FloatArray) -> None:
         return
     some = np.isfinite(values).any(axis=1)
     low, tenth, middle, ninetieth, high = np.nanpercentile(values[some], (0, 10, 50, 90, 100), axis=1)
-    axes.fill_between(time_s[some], low, high, color=_BAND, alpha=0.18, linewidth=0)
-    axes.fill_between(time_s[some], tenth, ninetieth, color=_BAND, alpha=0.35, linewidth=0)
-    axes.plot(time_s[some], middle, color=_BAND)
-
-
-_BAND: Final = _DRONES[0]
+    axes.fill_between(time_s[some], low, high, color=BAND, alpha=0.18, linewidth=0)
+    axes.fill_between(time_s[some], tenth, ninetieth, color=BAND, alpha=0.35, linewidth=0)
+    axes.plot(time_s[some], middle, color=BAND)
 
 
 def _flock_handles(drones: int) -> list[Line2D | Patch]:
     if drones <= FEW:
         return [Line2D([], [], color=colour_of(i, drones), label=drone_name(i)) for i in range(drones)]
     return [
-        Line2D([], [], color=_BAND, label="median drone"),
-        Patch(color=_BAND, alpha=0.5, linewidth=0, label="10th to 90th percentile"),
-        Patch(color=_BAND, alpha=0.18, linewidth=0, label="all drones"),
+        Line2D([], [], color=BAND, label="median drone"),
+        Patch(color=BAND, alpha=0.5, linewidth=0, label="10th to 90th percentile"),
+        Patch(color=BAND, alpha=0.18, linewidth=0, label="all drones"),
     ]
 
 
@@ -350,7 +146,7 @@ def _legend(figure: Figure, log: FlightLog, *more: Line2D) -> None:
 
 
 def account_curves(log: FlightLog) -> Figure:
-    """What one recorded drone itself knew and wanted: speed, course, and the distances of the neighbours it tracked."""
+    """Estimates and commands of one recorded drone: speed, course, and the distances of the neighbours it tracked."""
     time_s = log.time_s
     own, command = log.own_velocity_estimate[:, 0, :2], log.command_velocity[:, 0]
     drawn = (
@@ -480,42 +276,3 @@ def _error_lines(axes: Axes, time_s: FloatArray, values: FloatArray) -> None:
             time_s, values[:, number], color=colour_of(number, drones),
             linewidth=0.9 if values.ndim == 2 else 0.7, alpha=0.9 if values.ndim == 2 else 0.6,
         )  # fmt: skip
-
-
-# ------------------------------------------------------------------------------------------------------------ output
-
-# What the page's style sheet turns with the reader's light or dark scheme.
-_THEMED: Final = {
-    INK: "var(--ink)",
-    MUTED: "var(--muted)",
-    GRID: "var(--grid)",
-    PAPER: "var(--paper)",
-    _BAND: "var(--blue)",
-}
-
-
-def save_png(figure: Figure, path: Path) -> None:
-    """Write the figure in the light palette at its own resolution."""
-    figure.savefig(path, format="png")
-
-
-def inline_svg(figure: Figure, name: str, description: str) -> str:
-    """The figure as an `<svg>` element for a page that sets --ink, --muted, --grid, --paper, --blue and --sans.
-
-    `name` keeps its ids apart from those of other figures in the same page; `description` is for readers who hear it.
-    """
-    buffer = io.StringIO()
-    with rc_context({**STYLE, "svg.hashsalt": name}):
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    text = buffer.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    used = set(re.findall(r'(?:href="#|url\(#)([^")]+)', text))
-    text = re.sub(r' id="([^"]*)"', lambda found: found[0] if found[1] in used else "", text)
-    text = re.sub(r' width="[\d.]+pt" height="[\d.]+pt"', "", text, count=1)
-    text = re.sub(r' xmlns(:xlink)?="[^"]*"', "", text)
-    text = text.replace("xlink:href=", "href=").replace("<svg", f'<svg role="img" aria-label="{description}"', 1)
-    text = re.sub(r"font: ((?:bold )?[\d.]+px) [^;\"]*", r"font: \1 var(--sans)", text)
-    for colour, variable in _THEMED.items():
-        text = text.replace(colour, variable)
-    return re.sub(r"\n\s*", "\n", text).strip()
