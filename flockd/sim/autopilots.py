@@ -73,8 +73,8 @@ class Autopilots(Protocol):
         """Those that are programs of their own."""
 
 
-class StandIns:
-    """Autopilot stand-ins that fly the simulator's own vehicles."""
+class SimulatedAutopilots:
+    """The autopilots that `flockd.autopilot` simulates, on the simulator's own vehicle model."""
 
     name = "stand-in"
 

@@ -18,7 +18,7 @@ from flockd.config import DroneConfig
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import UnavailableError
 from flockd.flight_log.fleet import FleetRun, fleet_key_frames, fleet_log
-from flockd.sim.autopilots import Autopilots, Px4s, StandIns
+from flockd.sim.autopilots import Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.daemons import Daemons, fleet_configs
 from flockd.sim.exact_states import exact_states_at
 from flockd.sim.frame_server import FrameServer
@@ -159,7 +159,7 @@ class _Fleet:
         run.cores = {kind: (after - cpu_s[kind]) / run.wall_s for kind, after in self._cpu_s().items()}
         run.clock_rates = [rate for i in self._all if (rate := _rate(booted[i], self._station.uptime_s(i))) is not None]
         version = self._station.version(0)
-        stand_in = self._autopilots.name == StandIns.name
+        stand_in = self._autopilots.name == SimulatedAutopilots.name
         run.autopilot = self._autopilots.name if stand_in or version is None else f"{self._autopilots.name} {version}"
         run.frames = tuple(s for s in self._server.frames() if run.began_s <= s.time_s < run.ended_s)
         return run
@@ -267,7 +267,7 @@ def _autopilots(
 ) -> Autopilots:
     if kind == "px4":
         return Px4s(scenario, speed_factor, environment, folder)
-    return StandIns(scenario, speed_factor)
+    return SimulatedAutopilots(scenario, speed_factor)
 
 
 @contextmanager

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from flockd.messages import BoolArray, Float32Array, FloatArray, IntArray, UInt8Array
 from flockd.sim import _raster, textures
+from flockd.sim.airframe import DroneModel, machine_texels
 from flockd.sim.distractors import Distractor, Placed
-from flockd.sim.drone_models import DroneModel, machine_texels
 from flockd.sim.mesh import face_normals
 from flockd.sim.sky import SKY_BITS
 from flockd.sim.world import GROUND_MAP_BITS, World

@@ -261,7 +261,13 @@ def test_without_truth_nothing_is_made_up(alone: Path, capsys: Capture) -> None:
         "scene",
     ):
         assert sentence in text, sentence
-    for claim in ("One drone is no flock", "There were no neighbours", "Nothing was estimated", "stayed one flock", "nan"):
+    for claim in (
+        "One drone is no flock",
+        "There were no neighbours",
+        "Nothing was estimated",
+        "stayed one flock",
+        "nan",
+    ):
         assert claim not in text.partition("<svg")[0], claim
     assert {path.name for path in (folder / "figures").iterdir()} == {"account.png"}
 
