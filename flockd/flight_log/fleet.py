@@ -110,9 +110,7 @@ def fleet_log(
         perception="learned",
         wall_s=run.wall_s,
         autopilot=run.autopilot,
-        fleet=_metadata(
-            run, times, drone.flocking.observation_distance_m, speed_factor, processed, longest_s, spanning
-        ),
+        fleet=_metadata(run, times, drone.flocking, speed_factor, processed, longest_s, spanning),
     )
     return builder.build(metadata, companion)
 
