@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from flockd.flight_log.log import FlightLog
-from flockd.flight_log.matching import match_neighbours
 from flockd.flight_log.metadata import FlightMetadata
+from flockd.flight_log.truth_matching import match_neighbours
 from flockd.messages import BoolArray, FloatArray, PilotOutput
 
 

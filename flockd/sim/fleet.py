@@ -17,7 +17,7 @@ import numpy as np
 from flockd.config import DroneConfig
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import UnavailableError
-from flockd.flight_log.fleet import FleetRun, fleet_key_frames, fleet_log
+from flockd.flight_log.fleet_log import FleetRun, fleet_key_frames, fleet_log
 from flockd.sim.autopilots import Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.daemons import Daemons, fleet_configs
 from flockd.sim.exact_states import exact_states_at

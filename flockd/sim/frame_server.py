@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Self
 
 from flockd.config.scenario import ScenarioConfig
-from flockd.flight_log.fleet import FleetFrame
+from flockd.flight_log.fleet_log import FleetFrame
 from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.ground_station import Poses
 from flockd.sources import FramePublisher

@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 
 from flockd.flight_log.log import FlightLog
-from flockd.flight_log.matching import match_neighbours
 from flockd.flight_log.metadata import FlightMetadata
+from flockd.flight_log.truth_matching import match_neighbours
 from flockd.report.paper_results import TABLE_2, TABLE_3
 from flockd.report.summary import summarise, write_summary
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from flockd.config import load_scenario
 from flockd.data import data_path
-from flockd.flight_log.fleet import FleetFrame, FleetRun, fleet_log
+from flockd.flight_log.fleet_log import FleetFrame, FleetRun, fleet_log
 from tests.recording.made_up import drone_config, record
 
 
