@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,18 @@ UInt8Array = NDArray[np.uint8]
 UInt16Array = NDArray[np.uint16]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Of an array in a message, in its annotation: recordings are checked against it."""
+
+    sizes: tuple[int, ...]
+
+
+Vector2 = Annotated[FloatArray, Shape((2,))]
+Vector3 = Annotated[FloatArray, Shape((3,))]
+Matrix3 = Annotated[FloatArray, Shape((3, 3))]
 
 UNCLASSED = 255
 """Label of pixels that are not to be used: too near a drone's outline to be sure of, or a drone's that is not detected.
@@ -49,11 +62,11 @@ class VehicleState:
     """What the drone's own autopilot says of itself. Nothing in here comes from another drone."""
 
     time_s: float
-    R_ned_body: FloatArray
+    R_ned_body: Matrix3
     """(3, 3) attitude."""
     height_m: float
     """Height above ground from the barometer, metres, up positive."""
-    velocity_ned: FloatArray | None = None
+    velocity_ned: Vector3 | None = None
     """(3,) m/s, the autopilot's own estimate, where it has one."""
 
 
@@ -64,9 +77,9 @@ class EgoMotion:
     C is the body frame at the interval's start, F at its end.
     """
 
-    rotation: FloatArray
+    rotation: Matrix3
     """(3, 3)"""
-    translation: FloatArray
+    translation: Vector3
     """(3,) metres, in C."""
     interval_s: float
     pairs: int
@@ -84,13 +97,13 @@ class EgoMotion:
 class NeighbourMotion:
     """A neighbour's own motion over one interval, in C, free of the drone's own (Eq. 31-36)."""
 
-    rotation: FloatArray
-    translation: FloatArray
+    rotation: Matrix3
+    translation: Vector3
     """(3,) metres in C (Eq. 35)."""
-    velocity: FloatArray
+    velocity: Vector3
     """(3,) m/s in C (Eq. 36)."""
     interval_s: float
-    centre: FloatArray
+    centre: Vector3
     """(3,) metres in F: centre of the inliers' bounding box (Eq. 37)."""
     pairs: int
     inliers: int
@@ -103,11 +116,11 @@ class Detection:
     Cameras err in these independently: in direction by an angle, in range by a share of it.
     """
 
-    bearing: FloatArray
+    bearing: Vector3
     """(3,) unit vector towards the drone's centre, body FRD of the frame set."""
     log_range: float
     """Natural logarithm of the range in metres."""
-    covariance: FloatArray
+    covariance: Matrix3
     """(3, 3) in body axes, of what `flockd.geometry.log_polar_residual` measures: along the bearing the variance of the
     log range, across it that of the angle, rad^2."""
     drone_probability: float
@@ -140,9 +153,9 @@ class Neighbour:
     """A tracked drone, in level axes that point north, east and down, relative to the own drone."""
 
     track: int
-    position: FloatArray
+    position: Vector3
     """(3,) metres, NED, own drone at the origin, at the output's time."""
-    velocity: FloatArray
+    velocity: Vector3
     """(3,) m/s, NED, over ground."""
     position_sigma_m: float
     velocity_sigma_m_s: float
@@ -160,9 +173,9 @@ class Neighbour:
 class VelocityCommand:
     """What the flock law asks of the autopilot; altitude is held elsewhere."""
 
-    velocity: FloatArray
+    velocity: Vector2
     """(2,) m/s, north and east: the law's after limits, and the trim."""
-    acceleration: FloatArray
+    acceleration: Vector2
     """(2,) m/s^2, north and east: u of Eq. 38 after limits."""
     yaw_rad: float
     """Heading, clockwise from north."""
@@ -176,7 +189,7 @@ class Setpoint:
 
     time_s: float
     """When it was decided."""
-    velocity: FloatArray
+    velocity: Vector2
     """(2,) m/s, north and east."""
     height_m: float
     """As in `VehicleState`, up positive."""
@@ -190,7 +203,7 @@ class PilotOutput:
 
     time_s: float
     ego_motion: EgoMotion | None
-    velocity: FloatArray | None
+    velocity: Vector3 | None
     """(3,) m/s NED: the own velocity that the law used; None before there is one."""
     detections: tuple[Detection, ...]
     detection_tracks: tuple[int, ...]

@@ -30,7 +30,8 @@ MAY_IMPORT = {
     "sources": BASE | {"peer"},
     "autopilot": BASE,
     "telemetry": BASE | {"peer"},
-    "recording": BASE | {"telemetry"},  # for the table of topics, which says what is recorded
+    "recording": BASE | {"geometry", "telemetry"},  # telemetry for the table of topics, which says what is recorded
+    "flight_log": BASE | {"flocking", "pilot", "recording"},
     "calibration": BASE | {"geometry"},
     "datasets": BASE | {"geometry", "inference", "perception", "pilot"},
     "sim": BASE
@@ -44,10 +45,10 @@ MAY_IMPORT = {
         "pilot",
         "telemetry",
         "recording",
-        "report",
+        "flight_log",
     }
     | {"sources", "autopilot"},  # real daemons are fed frames and given autopilots
-    "report": BASE | {"geometry", "flocking", "pilot", "recording", "sim"},
+    "report": BASE | {"flocking", "flight_log"},
     "view": BASE | {"geometry", "pilot", "recording"},
     "daemon": BASE | {"inference", "perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"},
     "doctor": BASE | {"geometry", "inference", "perception", "pilot", "sources", "autopilot", "telemetry", "daemon"},
@@ -58,6 +59,7 @@ MAY_IMPORT = {
         "pilot",
         "telemetry",
         "recording",
+        "flight_log",
         "datasets",
         "sim",
         "report",
@@ -203,12 +205,21 @@ def test_one_file_opens_and_closes_sessions() -> None:
         assert "session.close" not in text, path
 
 
+def test_reports_and_flight_logs_know_no_simulator() -> None:
+    """A report of a recording needs no simulator: all three meet in the flight log."""
+    assert {"report", "sim"}.isdisjoint(MAY_IMPORT["flight_log"])
+    assert "sim" not in MAY_IMPORT["report"]
+    for path in (path for path in MODULES if _folder(path) in {"report", "flight_log"}):
+        assert "sim" not in _imported_folders(path), path
+        assert _folder(path) == "report" or "report" not in _imported_folders(path), path
+
+
 def test_no_drone_is_told_the_truth() -> None:
     """A simulator records where everybody truly is, for those who look at recordings; a pilot gets its own senses."""
     from flockd.pilot import FlockPilot
 
     for path in MODULES:
-        if _folder(path) not in {"sim", "recording", "report", "view"}:
+        if _folder(path) not in {"sim", "recording", "flight_log", "view"}:
             assert "flockd.recording.truth" not in _imports(path), path
     assert list(inspect.signature(FlockPilot.step).parameters) == ["self", "frames", "vehicle", "trace"]
 

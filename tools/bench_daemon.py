@@ -69,7 +69,7 @@ def measure(seconds: float, recording: Path | None) -> dict[str, float]:
             program = daemons.programs()[0]
             while not daemons.is_ready(0):
                 if program.ended is not None or time.monotonic() - begin > PATIENCE_S:
-                    raise SystemExit(f"the daemon did not become ready: {program.last_words()}")
+                    raise SystemExit(f"the daemon did not become ready: {program.last_output()}")
                 pictures.show()
             ready_s, cpu_s = time.monotonic() - begin, program.cpu_s()
             resident = {}

@@ -3,10 +3,10 @@
     python tools/record_regressions.py [--out tests/replay] [--only references]
 
 - ``normal``: three drones on their way.
-- ``crossing``: five drones fly through one another's pictures, 1 to 4 m away.
-- ``faults``: a camera lost, a black picture, a torn one, a time stamp twice, one that goes back, a second of nothing.
+- ``crossing``: five drones fly through one another's images, 1 to 4 m away.
+- ``faults``: a camera lost, a black image, a torn one, a time stamp twice, one that goes back, a second of nothing.
 
-Pictures are a quarter of the real size and JPEG, so that a recording is well under a megabyte. After a change that is
+Images are a quarter of the real size and JPEG, so that a recording is well under a megabyte. After a change that is
 meant to change outputs (new networks, say), `--only references` writes the expectations again from the same recordings.
 They are made with the networks in 32-bit floats, in place of those in 8 bits that the recordings were flown with: with
 and without VNNI instructions, processors compute the latter differently.

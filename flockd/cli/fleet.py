@@ -60,7 +60,7 @@ def fly(args: argparse.Namespace, scenario: ScenarioConfig, directory: Path) -> 
             environment=os.environ,
             progress=tell_progress,
         )
-    save(directory, flight.log, flight.filmstrip)
+    save(directory, flight.log, flight.key_frames)
     summary = write_findings(directory, flight.log)
     code = tell(directory, summary, as_json=args.json)
     fleet = summary["fleet"]

@@ -10,8 +10,8 @@ from flockd.cli.output import say, say_json
 from flockd.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.report.filmstrip import FilmstripFrame
-    from flockd.sim.log import FlightLog
+    from flockd.flight_log.key_frames import KeyFrame
+    from flockd.flight_log.log import FlightLog
 
 LOG_NAME = "flight.npz"
 FILMSTRIP_NAME = "filmstrip.npz"
@@ -36,14 +36,14 @@ def check(directory: Path) -> None:
         raise UsageError(f"{directory}: holds other files than a flight's; name a new or empty folder with --out")
 
 
-def save(directory: Path, log: FlightLog, filmstrip: Sequence[FilmstripFrame]) -> None:
+def save(directory: Path, log: FlightLog, filmstrip: Sequence[KeyFrame]) -> None:
     """Writes the flight's log, and its pictures if there are any, over those of an earlier flight."""
-    from flockd.report.filmstrip import save_filmstrip
+    from flockd.flight_log.key_frames import save_key_frames
 
     log.save(directory / LOG_NAME)
     (directory / FILMSTRIP_NAME).unlink(missing_ok=True)
     if filmstrip:
-        save_filmstrip(directory / FILMSTRIP_NAME, filmstrip)
+        save_key_frames(directory / FILMSTRIP_NAME, filmstrip)
 
 
 def write_findings(directory: Path, log: FlightLog) -> dict[str, Any]:

@@ -124,6 +124,8 @@ def _info(args: argparse.Namespace) -> int:
         say(f"{name:12}{facts[name]}")
     for name, sha256 in facts["models"].items():
         say(f"{'model':12}{name} {sha256[:12]}")
+    for note in facts["migrations"]:
+        say(f"{'migration':12}{note}")
     for gap in facts["gaps"]:
         say(f"{'gap':12}steps {gap['first_step']} to {gap['last_step']} are missing")
     for damage in facts["damages"]:
@@ -148,6 +150,7 @@ def _facts(recording: Recording) -> dict[str, Any]:
         "duration_s": recording.duration_s,
         "lost": contents.lost,
         "models": dict(contents.models),
+        "migrations": list(recording.migrations),
         "gaps": [{"first_step": first, "last_step": last} for first, last in contents.gaps],
         "damages": [
             {"file": str(path), "byte": damage.offset, "reason": damage.reason} for path, damage in contents.damages

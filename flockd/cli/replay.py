@@ -167,6 +167,9 @@ def faults(recording: Recording) -> Iterator[str]:
 def changes(recording: Recording, config: DroneConfig, start_s: float) -> Iterator[str]:
     """What may keep a replay from this time on, with these settings, from being the flight."""
     contents = recording.contents
+    if recording.migrations and config is recording.config:
+        changed = "; ".join(recording.migrations)
+        yield f"{recording.path}: was recorded by version {contents.flight.get('version')}: {changed}"
     first_step = next(number for number, time_s in contents.steps if time_s >= start_s)
     if first_step > 0:
         yield f"the replay begins with step {first_step}: the pilot remembers nothing before it, nor the time it flew"

@@ -17,8 +17,8 @@ from flockd.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from flockd.report.filmstrip import FilmstripFrame
-    from flockd.sim.log import FlightLog
+    from flockd.flight_log.key_frames import KeyFrame
+    from flockd.flight_log.log import FlightLog
 
 SUFFIX = ".report"
 """Of the folder beside a recording that its report goes to."""
@@ -67,7 +67,7 @@ def _again(args: argparse.Namespace) -> int:
     for option in ("out", "without_pictures"):
         if getattr(args, option):
             raise UsageError(f"--{option.replace('_', '-')} is for recordings, and {args.flight} has a flight's log")
-    from flockd.sim.log import FlightLog
+    from flockd.flight_log.log import FlightLog
 
     path = args.flight / LOG_NAME
     try:
@@ -81,7 +81,7 @@ def _recordings(path: Path) -> tuple[Path, ...]:
     """The recording that was named, or all in the folder that was."""
     if not path.is_dir():
         return (path,)
-    from flockd.report.from_recording import recordings_in
+    from flockd.flight_log.from_recordings import recordings_in
 
     found = recordings_in(path)
     if not found:
@@ -89,8 +89,8 @@ def _recordings(path: Path) -> tuple[Path, ...]:
     return found
 
 
-def _flight(paths: Sequence[Path], *, pictured: bool) -> tuple[FlightLog, tuple[FilmstripFrame, ...]]:
-    from flockd.report.from_recording import filmstrip, flight_log
+def _flight(paths: Sequence[Path], *, pictured: bool) -> tuple[FlightLog, tuple[KeyFrame, ...]]:
+    from flockd.flight_log.from_recordings import flight_log, key_frames
 
     recordings = [opened(path) for path in paths]
     for recording in recordings:
@@ -100,8 +100,8 @@ def _flight(paths: Sequence[Path], *, pictured: bool) -> tuple[FlightLog, tuple[
         log = flight_log(recordings, tell_progress)
     if not pictured:
         return log, ()
-    first = min(recordings, key=lambda recording: log.meta["names"].index(recording.drone))
+    first = min(recordings, key=lambda recording: (log.metadata.names or []).index(recording.drone))
     for change in changes(first, first.config, first.start_s):
         complain(change)
     with progress("computing the pictures again", "steps") as tell_progress:
-        return log, filmstrip(first, log, tell_progress)
+        return log, key_frames(first, log, tell_progress)

@@ -114,7 +114,7 @@ def _run(args: argparse.Namespace) -> int:
             recorders=_recorders(scenario, args.swap, directory / RECORDINGS, stack) if args.record else (),
             progress=tell_progress,
         )
-    save(directory, flight.log, flight.filmstrip)
+    save(directory, flight.log, flight.key_frames)
     return tell(directory, write_findings(directory, flight.log), as_json=args.json)
 
 

@@ -1,4 +1,4 @@
-"""Recording: what a drone saw, knew and decided, in files that replay and viewers read."""
+"""Recording: inputs and outputs of a drone's pilot, in MCAP files that replay and viewers read."""
 
 from flockd.recording.mcap_file import RecordingError
 from flockd.recording.recorder import Recorder

@@ -74,14 +74,14 @@ def compare(drone: str, expected: Outputs, found: Outputs, tolerances: Mapping[s
             if _same(a, b, _tolerance(name, tolerances)):
                 continue
             result.first = result.first or Difference(step, time_s, drone, name, a, b)
-            told = result.fields.setdefault(plain(name), FieldDifference())
-            told.steps.add(step)
-            told.largest = _larger(told.largest, a, b)
+            differing = result.fields.setdefault(plain(name), FieldDifference())
+            differing.steps.add(step)
+            differing.largest = _larger(differing.largest, a, b)
     return result
 
 
 def plain(name: str) -> str:
-    """A field without what tells one neighbour or axis from the next: `detections[1].size_m` is `detections.size_m`."""
+    """A field without its indices and keys: `detections[1].size_m` is `detections.size_m`."""
     return re.sub(r"\[[^]]*]", "", name)
 
 
@@ -102,15 +102,15 @@ def load_reference(path: Path) -> Outputs:
         head, *steps = (json.loads(line) for line in lines)
         outputs = {int(line["step"]): dict(line["output"]) for line in steps}
         if any(not isinstance(output["time_s"], float) for output in outputs.values()):
-            raise ValueError("a step has no time")  # noqa: TRY301 - told below
+            raise ValueError("a step has no time")  # noqa: TRY301 - wrapped below
         if len(outputs) != head["steps"]:
-            raise RecordingError(f"{path}: is cut off after {len(outputs)} of {head['steps']} steps; {_MEND}")
+            raise RecordingError(f"{path}: is cut off after {len(outputs)} of {head['steps']} steps; {_WHAT_TO_DO}")
     except (ValueError, KeyError, TypeError) as error:
-        raise RecordingError(f"{path}: is no reference of outputs ({error}); {_MEND}") from error
+        raise RecordingError(f"{path}: is no reference of outputs ({error}); {_WHAT_TO_DO}") from error
     return outputs
 
 
-_MEND = "restore it, or write it again with --update-reference"
+_WHAT_TO_DO = "restore it, or write it again with --update-reference"
 
 
 def _flat(value: Json, name: str = "") -> Iterator[tuple[str, Json]]:

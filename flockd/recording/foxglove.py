@@ -1,4 +1,4 @@
-"""The one place that knows Foxglove's well-known schemas (protobuf): what its app and Rerun show with nothing added.
+"""The one adapter to Foxglove's well-known schemas (protobuf): what its app and Rerun show with nothing added.
 
 Places are in the drone's own axes: `local` points north, east and down from where the recording began, `body` is FRD,
 and each camera's frame carries the camera's name and is RDF.
@@ -41,7 +41,7 @@ def image(time_ns: int, camera: str, data: bytes, kind: ImageFormat) -> bytes:
 
 
 def image_data(message: bytes) -> tuple[bytes, str]:
-    """The compressed picture in a CompressedImage, and its format. Raises RecordingError."""
+    """The compressed image in a CompressedImage, and its format. Raises RecordingError."""
     decoded = CompressedImage()
     try:
         decoded.ParseFromString(message)
@@ -174,7 +174,7 @@ def _stream(topic: str, message: Any) -> Stream:
 
 @cache
 def image_stream(camera: str) -> Stream:
-    """Where a camera's pictures go."""
+    """The stream of a camera's images."""
     return _stream(f"/camera/{camera}/image", CompressedImage)
 
 

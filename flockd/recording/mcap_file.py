@@ -1,4 +1,4 @@
-"""The one place that knows the MCAP format: writes it in small chunks, and reads whatever of a file is whole."""
+"""The one adapter to the MCAP format: writes it in small chunks, and reads whatever of a file is whole."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class Damage:
     offset: int
     reason: str
     at_end: bool
-    """The file just stops: its writer was killed. Otherwise something within it is spoilt."""
+    """The file just stops: its writer was killed. Otherwise something within it is damaged."""
 
 
 class McapFile:
@@ -175,8 +175,8 @@ class McapFile:
 def read_records(path: Path) -> Iterator[Record | Damage]:
     """All records in the order in which they were written, and what could not be read.
 
-    A damaged chunk is told and left out; where the file stops before its end, that is told last. Raises RecordingError
-    for what is no MCAP file, and OSError.
+    A damaged chunk is yielded as `Damage`; where the file stops before its end, that comes last. Raises RecordingError
+    for what is not an MCAP file, and OSError.
     """
     with path.open("rb") as file:
         if file.read(len(_MAGIC)) != _MAGIC:

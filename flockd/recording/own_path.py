@@ -1,4 +1,4 @@
-"""The own path as a drone knows it, for viewers: what its velocity adds up to."""
+"""The own path by dead reckoning, for viewers: the integral of the estimated velocity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reads a recording: finished, or cut off by a kill, but never one that is not ours or not enough to be played."""
+"""Reads a recording: finished, or cut off by a kill. Refuses other MCAP files and what is too damaged to replay."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from flockd.messages import Frame, FrameSet, UInt8Array, VehicleState
 from flockd.recording import foxglove
 from flockd.recording.codec import from_json
 from flockd.recording.mcap_file import Damage, Entry, Inclosure, Note, Record, RecordingError, read_records
+from flockd.recording.migration import Migrated, migrate_configuration, migrate_output
 from flockd.recording.streams import (
     CONFIGURATION,
     END_NOTE,
@@ -34,20 +35,21 @@ from flockd.recording.streams import (
 )
 from flockd.recording.truth import Truth
 
-_MEND = "`flockd record recover` makes a recording without it"
+_WHAT_TO_DO = "`flockd record recover` makes a recording without it"
 _IMAGE_SUFFIX, _CALIBRATION_SUFFIX = "/image", "/calibration"
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedStep:
-    """What went into one step of the pilot, and what came out."""
+    """Inputs and output of one step of the pilot."""
 
     number: int
     """Counted from 0 at the flight's first step."""
     frames: FrameSet
     vehicle: VehicleState
     output: Mapping[str, Any] | None
-    """A `PilotOutput` as JSON, every number exact; None where the recording ends before it."""
+    """A `PilotOutput` as JSON, every number exact; None where the recording ends before it. Of an earlier version: as
+    `migrate_output` converts it."""
     truth: Truth | None
     """Of a simulated flight."""
 
@@ -103,12 +105,15 @@ class Recording:
     def __init__(self, path: Path, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
         """Opens the file and those that go on where it ends.
 
-        Raises RecordingError for what is no recording of ours, or not whole enough to be played, and OSError.
-        `progress` is told how many of how many bytes are checked.
+        Raises RecordingError for what is not a recording of flockd, or too damaged to replay, and OSError.
+        `progress` is called with (bytes checked, bytes in all).
         """
         self.path = path
         self.contents = _survey(path, progress)
-        self.config = _config(path, self.contents.configuration)
+        migrated = _migrated(path, self.contents.configuration)
+        self.config = _config(path, migrated)
+        self.migrations: tuple[str, ...] = migrated.notes
+        """What was changed in a configuration of an earlier version, each in one sentence."""
 
     @property
     def drone(self) -> str:
@@ -127,7 +132,7 @@ class Recording:
 
     @property
     def has_truth(self) -> bool:
-        """Whether a simulator recorded where everybody truly was."""
+        """Whether a simulator recorded the true states of all drones."""
         return TRUTH.topic in self.contents.streams
 
     @property
@@ -140,7 +145,7 @@ class Recording:
     def steps(self, start_s: float = -np.inf, end_s: float = np.inf) -> Iterator[RecordedStep]:
         """The steps at these times (of the recording's clock) in the order in which they were flown.
 
-        Raises RecordingError where an image or a message is spoilt.
+        Raises RecordingError where an image or a message is damaged.
         """
         number, messages = -1, dict[str, bytes]()
         for path in self.contents.paths:
@@ -164,23 +169,23 @@ class Recording:
             if not start_s <= listed.time_s <= end_s:
                 return
             vehicle: VehicleState = from_json(VehicleState, json.loads(messages[VEHICLE.topic]))
-            output = json.loads(messages[OUTPUT.topic]) if OUTPUT.topic in messages else None
+            output = migrate_output(json.loads(messages[OUTPUT.topic])) if OUTPUT.topic in messages else None
             truth = from_json(Truth, json.loads(messages[TRUTH.topic])) if TRUTH.topic in messages else None
             frames = {}
             for entry in listed.frames:
-                image = _picture(messages[foxglove.image_stream(entry.camera).topic])
+                image = _image(messages[foxglove.image_stream(entry.camera).topic])
                 frames[entry.camera] = Frame(entry.camera, image, entry.time_s, entry.sequence)
         except KeyError as error:
-            raise RecordingError(f"{self.path}: step {number} lost its message {error}; {_MEND}") from error
+            raise RecordingError(f"{self.path}: step {number} lost its message {error}; {_WHAT_TO_DO}") from error
         except (ValueError, RecordingError) as error:
-            raise RecordingError(f"{self.path}: step {number} cannot be read ({error}); {_MEND}") from error
+            raise RecordingError(f"{self.path}: step {number} cannot be read ({error}); {_WHAT_TO_DO}") from error
         yield RecordedStep(number, FrameSet(listed.time_s, frames), vehicle, output, truth)
 
 
 def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
     """What every file begins with: the flight, its models and its configuration.
 
-    Raises RecordingError where the file is not ours or ends before all three, and OSError.
+    Raises RecordingError where the file is not a recording of flockd or ends before all three, and OSError.
     """
     flight, models, configuration = None, None, None
     for record in read_records(path):
@@ -202,7 +207,7 @@ def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
                 known = f"format {flight.facts.get('format')!r}, and this flockd reads {FORMAT!r}"
                 raise RecordingError(f"{path}: is of {known}; use the flockd that wrote it")
             return flight, models, configuration
-    raise RecordingError(f"{path}: is an MCAP file, but no recording of flockd; name one that flockd wrote")
+    raise RecordingError(f"{path}: is an MCAP file, but not a recording of flockd; name one that flockd wrote")
 
 
 def check(path: Path) -> None:
@@ -238,7 +243,7 @@ def _all_parts(first: Path, flight: Note) -> Iterator[Path]:
         number += 1
         try:
             head = head_of(path)[0]
-        except RecordingError:  # killed in the moment in which it was begun, or another flight's remains
+        except RecordingError:  # killed in the moment in which it was begun, or left over from another flight
             return
         if head.facts.get("recording") != flight.facts.get("recording"):
             return
@@ -268,9 +273,17 @@ def _time_of(path: Path, data: bytes) -> float:
         raise RecordingError(f"{path}: holds a frame set without a time; use another copy") from error
 
 
-def _config(path: Path, text: bytes) -> DroneConfig:
+def _migrated(path: Path, text: bytes) -> Migrated:
     try:
-        return DroneConfig.model_validate_json(text)
+        return migrate_configuration(json.loads(text))
+    except ValueError as error:
+        raise RecordingError(f"{path}: the configuration in it is not JSON ({error}); use another copy") from error
+
+
+def _config(path: Path, migrated: Migrated) -> DroneConfig:
+    try:
+        # Strict checks allow in JSON what they refuse in Python values, such as a list for a tuple.
+        return DroneConfig.model_validate_json(json.dumps(migrated.document))
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "the whole"
@@ -281,7 +294,7 @@ def _config(path: Path, text: bytes) -> DroneConfig:
 
 
 def is_image(topic: str) -> bool:
-    """Whether this stream holds a camera's pictures."""
+    """Whether this stream holds a camera's images."""
     return topic.endswith(_IMAGE_SUFFIX)
 
 
@@ -295,7 +308,7 @@ def makes_steps(topic: str) -> bool:
     return topic in {FRAMES.topic, VEHICLE.topic, OUTPUT.topic, TRUTH.topic} or is_image(topic)
 
 
-def _picture(message: bytes) -> UInt8Array:
+def _image(message: bytes) -> UInt8Array:
     data, kind = foxglove.image_data(message)
     bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
     if bgr is None:

@@ -85,7 +85,7 @@ class Recorder:
     """Writes `PATH`, and when that is full `PATH` with a number before its suffix, each file complete in itself.
 
     `step` and `publish` return at once, whatever the disk does. What does not fit into the queue is dropped, counted
-    and told once; a disk that fails or is full ends the recording and nothing else. Times are those of the messages.
+    and reported once; a disk that fails or is full ends the recording alone. Times are those of the messages.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Recorder:
             settings: how to record; by default the configuration's own.
             models: SHA-256 of each model in use, by name.
             facts: more to be known of the flight, such as what of it was not learned.
-            on_event: told, from the recorder's thread or the caller's, what went wrong, in one sentence.
+            on_event: called, from the recorder's thread or the caller's, with what went wrong, in one sentence.
         """
         self._settings = settings or config.recording
         self._drone = drone
@@ -167,7 +167,7 @@ class Recorder:
             self._lock.wait_for(lambda: self._held_bytes == 0 or self._failure is not None)
 
     def close(self, timeout_s: float = 30.0) -> None:
-        """Writes what is left and ends the file. A disk that takes longer than this loses the rest, which is told."""
+        """Writes what is left and ends the file. What is not written by then is lost, and reported."""
         if self._closed:
             return
         self._closed = True
@@ -175,7 +175,7 @@ class Recorder:
         self._thread.join(timeout_s)
         if self._thread.is_alive():
             self._on_event(
-                f"recording {self._parts.path}: the disk was too slow to end it; `flockd record recover` mends it"
+                f"recording {self._parts.path}: the disk was too slow to end it; `flockd record recover` repairs it"
             )
 
     def __enter__(self) -> Self:
@@ -222,7 +222,7 @@ class Recorder:
         with self._lock:
             self._failure = sentence
             self._held_bytes = 0
-            while not self._queue.empty():  # nobody will take these any more
+            while not self._queue.empty():  # the thread that takes these has failed
                 self._lost += isinstance(self._queue.get(), _Step | _Message)
             self._lock.notify_all()
         self._parts.abandon()
@@ -232,7 +232,7 @@ class Recorder:
         self._parts.begin()
         flushed_s = time.monotonic()
         closing = unflushed = False
-        while not (closing and self._queue.empty()):  # what is told while closing belongs into the file too
+        while not (closing and self._queue.empty()):  # events of closing belong into the file too
             try:
                 item = self._queue.get(timeout=FLUSH_EVERY_S)
             except queue.Empty:
@@ -269,13 +269,13 @@ class Recorder:
         for reason in step.output.reasons:
             self._parts.write(_log_entry(step.frames.time_s, "WARNING", reason))
         early, self._early = self._early, []
-        for item in early:  # told before there was a time
+        for item in early:  # from before there was a time
             self._write_message(item)
 
     def _write_message(self, item: _Message) -> None:
         if item.topic not in TABLE:
             return
-        stamp = item.message.get("time_s", self._time_s)  # without one: what this recorder tells of itself
+        stamp = item.message.get("time_s", self._time_s)  # without one: the recorder's own events
         if not isinstance(stamp, int | float):
             self._early.append(item)
             return
@@ -414,7 +414,7 @@ def _step_entries(
     for camera, frame in step.frames.frames.items():
         data = _compressed(frame, settings)
         if data is None:
-            tell(f"recording: an image of camera {camera} is no picture and is left out")
+            tell(f"recording: an image of camera {camera} has no pixels or not three channels and is left out")
             continue
         kept.append(FrameEntry(camera, frame.time_s, frame.sequence))
         stamp = nanoseconds(frame.time_s)

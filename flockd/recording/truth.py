@@ -1,10 +1,10 @@
-"""What only a simulator knows: recorded beside a flight, to judge it by. Nothing that flies reads it."""
+"""True states from a simulator: recorded beside a flight, to evaluate it. Nothing that flies reads it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from flockd.messages import FloatArray
+from flockd.messages import Matrix3, Vector3
 
 
 @dataclass(frozen=True, eq=False)
@@ -12,15 +12,15 @@ class TrueDrone:
     """Where one drone of the flock truly was."""
 
     name: str
-    position: FloatArray
+    position: Vector3
     """(3,) m NED, from the world's origin."""
-    velocity: FloatArray
+    velocity: Vector3
     """(3,) m/s NED."""
-    R_ned_body: FloatArray
+    R_ned_body: Matrix3
     """(3, 3)"""
-    exact_position: FloatArray | None = None
-    """(3,) where it would be, had everybody known everybody's exact state from the start; None in such a flight."""
-    exact_velocity: FloatArray | None = None
+    exact_position: Vector3 | None = None
+    """(3,) m NED in the companion flight, in which all drones had all exact states; None in such a flight."""
+    exact_velocity: Vector3 | None = None
     """(3,) likewise."""
 
 

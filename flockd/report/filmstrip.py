@@ -1,16 +1,8 @@
-"""A few moments of one drone's flight as pictures: what it saw, how far, and how it moved.
-
-The flight loop collects a :class:`FilmstripFrame` at chosen steps and saves them with :func:`save_filmstrip`; the
-report draws each with :func:`filmstrip_figure`.
-"""
+"""Figures of a flight's key frames: what one drone's cameras saw, with detections, depth and optical flow."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TypeVar
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -21,183 +13,15 @@ from matplotlib.colors import LogNorm, hsv_to_rgb, to_rgb
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from flockd.messages import BoolArray, FloatArray, UInt8Array
-from flockd.report.figures import FEW, STYLE, colour_of, drone_name
-
-_Pixel = TypeVar("_Pixel", bound=np.generic)
+from flockd.flight_log.key_frames import KeyFrame
+from flockd.messages import BoolArray, FloatArray
+from flockd.report.style import FEW, STYLE, colour_of
 
 RIG_ORDER = ("left", "front", "right", "back")
 """Reading order of the cameras: a turn to the right. Cameras of other names follow in their own order."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class FilmstripFrame:
-    """What one drone's pilot worked with at one step. A camera without a map is absent from that mapping."""
-
-    time_s: float
-    drone: int
-    """From 0 up."""
-    cameras: tuple[str, ...]
-    images: Mapping[str, UInt8Array]
-    """(h, w, 3) RGB, at ``time_s``."""
-    depth: Mapping[str, NDArray[np.float32]]
-    """(h, w) metres along the optical axis; inf is sky."""
-    labels: Mapping[str, UInt8Array]
-    """(h, w) instances, 0 is background; one label means the same drone in all cameras."""
-    flow: Mapping[str, NDArray[np.float32]]
-    """(h, w, 2) camera pixels from the previous image to this one; NaN where there is none."""
-    track_ids: Mapping[int, int]
-    """Label to the track it belongs to."""
-    ranges: Mapping[int, float]
-    """Label to its distance from the drone in metres."""
-    shrink: int = 1
-    """How many camera pixels, each way, one pixel of these pictures stands for."""
-    name: str = ""
-    """Of the drone, where it has another than its number."""
-
-    @property
-    def title(self) -> str:
-        """Whose picture it is."""
-        return self.name or drone_name(self.drone)
-
-    def __post_init__(self) -> None:
-        for camera in self.cameras:
-            if camera not in self.images:
-                raise ValueError(f"filmstrip frame at {self.time_s:g} s: camera {camera!r} has no image")
-            size = self.images[camera].shape[:2]
-            for name, maps in self._maps():
-                if camera in maps and maps[camera].shape[:2] != size:
-                    raise ValueError(
-                        f"filmstrip frame at {self.time_s:g} s, camera {camera!r}: {name} is {maps[camera].shape[:2]},"
-                        f" the image {size}"
-                    )
-
-    def _maps(self) -> Iterator[tuple[str, Mapping[str, NDArray[np.generic]]]]:
-        yield from (
-            ("the depth", self.depth),
-            ("the labels", self.labels),
-            ("the flow", self.flow),
-        )
-
-
-# ----------------------------------------------------------------------------------------------------------- storage
-# Every picture is stored encoded: images as JPEG, labels as PNG, depth as 16-bit PNG, flow as 16-bit PNG with a
-# channel for where it is known. That is a tenth of what compressed arrays take.
-
-_STORED_SHRINK = 2
-_DEPTH_UNIT_M = 0.01
-_DEPTH_SKY = 65535
-_FLOW_UNIT_PX = 1 / 8
-_FLOW_ZERO = 32768
-
-
-def save_filmstrip(path: Path, frames: Sequence[FilmstripFrame]) -> None:
-    """Write the frames at half size; some 0.4 MB for each frame of four 480x640 cameras."""
-    arrays: dict[str, NDArray[np.generic]] = {}
-    index = []
-    for number, frame in enumerate(frames):
-        index.append(
-            {
-                "time_s": frame.time_s,
-                "drone": frame.drone,
-                "cameras": list(frame.cameras),
-                "track_ids": {str(label): int(track) for label, track in frame.track_ids.items()},
-                "ranges": {str(label): float(metres) for label, metres in frame.ranges.items()},
-                "shrink": frame.shrink * _STORED_SHRINK,
-                "name": frame.name,
-            }
-        )
-        for camera in frame.cameras:
-            arrays[f"{number}/{camera}/image"] = _encode_image(frame.images[camera])
-            if camera in frame.depth:
-                arrays[f"{number}/{camera}/depth"] = _encode_depth(frame.depth[camera])
-            if camera in frame.labels:
-                arrays[f"{number}/{camera}/labels"] = _png(_thin(frame.labels[camera]))
-            if camera in frame.flow:
-                arrays[f"{number}/{camera}/flow"] = _encode_flow(frame.flow[camera])
-    np.savez(path, index=np.frombuffer(json.dumps(index).encode(), np.uint8), **arrays)  # type: ignore[arg-type]
-
-
-def load_filmstrip(path: Path) -> tuple[FilmstripFrame, ...]:
-    """Read what :func:`save_filmstrip` wrote: depth to 1 cm up to 655 m, flow to 1/8 px."""
-    with np.load(path, allow_pickle=False) as stored:
-        pictures = {name: stored[name] for name in stored.files}
-    frames = []
-    for number, entry in enumerate(json.loads(pictures["index"].tobytes())):
-        kinds: dict[str, dict[str, NDArray[np.uint8]]] = {}
-        for camera in entry["cameras"]:
-            for kind in ("image", "depth", "labels", "flow"):
-                encoded = pictures.get(f"{number}/{camera}/{kind}")
-                if encoded is not None:
-                    kinds.setdefault(kind, {})[camera] = encoded
-        frames.append(
-            FilmstripFrame(
-                time_s=entry["time_s"],
-                drone=entry["drone"],
-                cameras=tuple(entry["cameras"]),
-                images={camera: _decode_image(data) for camera, data in kinds.get("image", {}).items()},
-                depth={camera: _decode_depth(data) for camera, data in kinds.get("depth", {}).items()},
-                labels={
-                    camera: np.asarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED), np.uint8)
-                    for camera, data in kinds.get("labels", {}).items()
-                },
-                flow={camera: _decode_flow(data) for camera, data in kinds.get("flow", {}).items()},
-                track_ids={int(label): track for label, track in entry["track_ids"].items()},
-                ranges={int(label): metres for label, metres in entry["ranges"].items()},
-                shrink=entry["shrink"],
-                name=entry.get("name", ""),
-            )
-        )
-    return tuple(frames)
-
-
-def _thin(picture: NDArray[_Pixel]) -> NDArray[_Pixel]:
-    """Every second pixel: means across a silhouette would invent depths and labels."""
-    return np.ascontiguousarray(picture[::_STORED_SHRINK, ::_STORED_SHRINK])
-
-
-def _png(picture: NDArray[np.uint8] | NDArray[np.uint16]) -> UInt8Array:
-    return np.asarray(cv2.imencode(".png", picture)[1], np.uint8)
-
-
-def _encode_image(image: UInt8Array) -> UInt8Array:
-    height, width = _thin(image).shape[:2]
-    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1], np.uint8)
-
-
-def _decode_image(data: UInt8Array) -> UInt8Array:
-    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)[..., ::-1]
-
-
-def _encode_depth(depth: NDArray[np.float32]) -> UInt8Array:
-    metres = _thin(depth)
-    known = np.isfinite(metres)
-    units = np.clip(np.where(known, metres, 0.0) / _DEPTH_UNIT_M, 0, _DEPTH_SKY - 1)
-    return _png(np.where(known, np.round(units), _DEPTH_SKY).astype(np.uint16))
-
-
-def _decode_depth(data: UInt8Array) -> NDArray[np.float32]:
-    units = np.asarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED))
-    return np.where(units == _DEPTH_SKY, np.inf, units * _DEPTH_UNIT_M).astype(np.float32)
-
-
-def _encode_flow(flow: NDArray[np.float32]) -> UInt8Array:
-    pixels = _thin(flow).astype(np.float64)
-    valid = np.isfinite(pixels).all(axis=2, keepdims=True)
-    units = np.where(valid, pixels, 0.0) / _FLOW_UNIT_PX + _FLOW_ZERO
-    coded = np.concatenate([np.clip(np.round(units), 0, 65535), valid], axis=2)
-    return _png(coded.astype(np.uint16))
-
-
-def _decode_flow(data: UInt8Array) -> NDArray[np.float32]:
-    coded = np.asarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED)).astype(np.float32)
-    flow = (coded[..., :2] - _FLOW_ZERO) * np.float32(_FLOW_UNIT_PX)
-    return np.where(coded[..., 2:] == 0, np.float32(np.nan), flow)
-
-
-# ----------------------------------------------------------------------------------------------------------- drawing
-# A plate as dark as film in light and in dark surroundings, so the pictures keep their look in both.
+# A plate as dark as film under either scheme of the page, so that the images appear alike in both.
 
 _PLATE = "#14181f"
 _INK = "#e8ecf1"
@@ -212,7 +36,7 @@ _WIDTH = 8.6
 _LEFT, _RIGHT, _TOP, _BOTTOM, _GAP = 0.3, 0.78, 0.62, 0.14, 0.05
 
 
-def filmstrip_figure(frame: FilmstripFrame) -> Figure:
+def filmstrip_figure(frame: KeyFrame) -> Figure:
     """One moment: a row of camera images with the drones found in them, a row of depth, a row of flow."""
     cameras = sorted(frame.cameras, key=_rig_place)
     cell_w = min((_WIDTH - _LEFT - _RIGHT - _GAP * (len(cameras) - 1)) / len(cameras), 3.2)
@@ -265,13 +89,13 @@ def _rig_place(camera: str) -> int:
     return RIG_ORDER.index(camera) if camera in RIG_ORDER else len(RIG_ORDER)
 
 
-def _show(axes: Axes, picture: NDArray[np.generic], **style: object) -> None:
-    height, width = picture.shape[:2]
-    axes.imshow(picture, extent=(0, width, height, 0), **style)  # type: ignore[arg-type]  # pixel centres at +0.5
+def _show(axes: Axes, image: NDArray[np.generic], **style: object) -> None:
+    height, width = image.shape[:2]
+    axes.imshow(image, extent=(0, width, height, 0), **style)  # type: ignore[arg-type]  # pixel centres at +0.5
     axes.set(xlim=(0, width), ylim=(height, 0))
 
 
-def _draw_seen(axes: Axes, frame: FilmstripFrame, camera: str) -> None:
+def _draw_seen(axes: Axes, frame: KeyFrame, camera: str) -> None:
     image = frame.images[camera]
     labels = frame.labels.get(camera, np.zeros(image.shape[:2], np.uint8))
     tinted = image.astype(np.float32)
@@ -286,11 +110,11 @@ def _draw_seen(axes: Axes, frame: FilmstripFrame, camera: str) -> None:
         taken.append(_name(axes, labels == label, _caption(frame, label), taken))
 
 
-def _track_colour(frame: FilmstripFrame, label: int) -> str:
+def _track_colour(frame: KeyFrame, label: int) -> str:
     return colour_of(frame.track_ids[label], FEW) if label in frame.track_ids else "#ffffff"
 
 
-def _caption(frame: FilmstripFrame, label: int) -> str:
+def _caption(frame: KeyFrame, label: int) -> str:
     track = f"#{frame.track_ids[label]}" if label in frame.track_ids else "new"
     return f"{track}  {frame.ranges[label]:.2f} m" if label in frame.ranges else track
 
@@ -309,7 +133,7 @@ _Box = tuple[float, float, float, float]
 
 
 def _name(axes: Axes, mask: BoolArray, caption: str, taken: Sequence[_Box]) -> _Box:
-    """Written as near to the drone as there is room, within the picture and clear of the names already there."""
+    """Written as near to the drone as there is room, within the image and clear of the names already there."""
     height, width = mask.shape
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     half, line = 0.018 * width * len(caption), 0.034 * height
@@ -335,10 +159,10 @@ def _draw_depth(axes: Axes, depth: NDArray[np.float32]) -> None:
 
 
 _ARROWS_ACROSS = 14
-"""The flow is drawn once in each of this many cells across the picture, and once for each drone."""
+"""The flow is drawn once in each of this many cells across the image, and once for each drone."""
 
 
-def _typical_flow(frame: FilmstripFrame) -> float:
+def _typical_flow(frame: KeyFrame) -> float:
     """The 95th percentile of the flow's length over all cameras, camera pixels; 0 without flow."""
     lengths = [np.linalg.norm(flow[::4, ::4], axis=2).ravel() for flow in frame.flow.values()]
     known = np.concatenate(lengths) if lengths else np.zeros(0)
@@ -352,7 +176,7 @@ def _direction_colours(u: NDArray[np.floating], v: NDArray[np.floating]) -> NDAr
     return hsv_to_rgb(np.stack([hue, np.full_like(hue, 0.62), np.ones_like(hue)], axis=-1))
 
 
-def _draw_flow(axes: Axes, frame: FilmstripFrame, camera: str, p95_px: float) -> None:
+def _draw_flow(axes: Axes, frame: KeyFrame, camera: str, p95_px: float) -> None:
     flow = frame.flow[camera]
     grey = cv2.cvtColor(np.ascontiguousarray(frame.images[camera]), cv2.COLOR_RGB2GRAY)
     _show(axes, grey, cmap="gray", vmin=0, vmax=560, interpolation="bilinear")

@@ -1,4 +1,4 @@
-"""The figures of one flight: the paper's Tables 2 and 3, the flock, the neighbours seen and the time it took."""
+"""The figures of one flight: the paper's Tables 2 and 3, the flock, the tracked neighbours and the timings."""
 
 from __future__ import annotations
 
@@ -9,18 +9,15 @@ from typing import Any
 import numpy as np
 
 from flockd.config.flocking import FlockingParameters
+from flockd.flight_log.log import FlightLog
 from flockd.flocking.metrics import connectivity, min_distance, obj1, obj2, order, safety, union
 from flockd.messages import BoolArray, FloatArray
-from flockd.sim.log import FlightLog
 
 TAIL_S = 10.0
 """The end of a flight, over which the flock counts as converged."""
 CONVERGENCE_BAND = {"obj1": 0.05, "obj2": 0.2}
 """How near to its tail mean a sum must stay to have converged."""
 RECALL_RANGE_M = 10.0
-
-EXACT_STATES = "truth"
-"""What `meta["perception"]` says of a flight in which nobody looked: every drone was told the others' true states."""
 
 Json = dict[str, Any]
 
@@ -34,20 +31,15 @@ def summarise(log: FlightLog) -> Json:
     steps; order, union and connectivity are horizontal means over the last 10 s, with the law's observation distance as
     interaction distance. `neighbours`: the share of all drones within 10 m, at all steps, of which there was a
     confirmed track, and new false tracks; of drones and steps that were recorded. A flight whose perception is "truth"
-    saw nothing: its `neighbours` are null and it is itself Table 3's "truth". Of a recording without truth
-    (`has_truth`) all of these are null. `own_account` is what the recorded drones themselves knew. `autopilot` names
-    what real daemons flew, and `fleet` tells how they did; both are null where the simulator flew the pilots itself.
+    has no perception: its `neighbours` are null and it is itself Table 3's "truth". Of a recording without truth
+    (`has_truth`) all of these are null. `own_account` needs no truth: the recorded drones' own estimates. `autopilot`
+    names what real daemons flew, and `fleet` holds their figures; null where the simulator ran the pilots.
     """
-    meta = log.meta
+    metadata, value = log.metadata, log.metadata.model_dump()
     return {
-        **{key: meta[key] for key in ("scenario", "perception", "flow", "scale", "drones", "duration_s", "step_s")},
-        **{key: meta[key] for key in ("seed", "wall_s", "circle_until_s")},
-        "recorded": meta.get("recorded"),
-        "began": meta.get("began"),
-        "autopilot": meta.get("autopilot"),
-        "fleet": meta.get("fleet"),
+        **{key: value[key] for key in _FROM_METADATA},
         "has_truth": log.has_truth,
-        "realtime_factor": meta["duration_s"] / meta["wall_s"] if meta["wall_s"] else None,
+        "realtime_factor": metadata.duration_s / metadata.wall_s if metadata.wall_s else None,
         "table2": _table_2(log),
         "table3": _table_3(log),
         "flock": _flock(log),
@@ -59,6 +51,12 @@ def summarise(log: FlightLog) -> Json:
             if len(samples)
         },
     }
+
+
+_FROM_METADATA = (
+    "scenario", "perception", "flow", "scale", "drones", "duration_s", "step_s", "seed", "wall_s", "circle_until_s",
+    "recorded", "began", "autopilot", "fleet",
+)  # fmt: skip
 
 
 def write_summary(summary: Json, path: Path) -> None:
@@ -92,7 +90,7 @@ def estimation_errors(log: FlightLog) -> dict[str, FloatArray]:
 def objective_sums(log: FlightLog, position: FloatArray, velocity: FloatArray) -> dict[str, FloatArray]:
     """The sums of obj1 and obj2 over the flock at each step, (S,), of true states (S, N, 3) on the log's time base."""
     parameters = _flocking(log)
-    circling = log.time_s < log.meta["circle_until_s"]
+    circling = log.time_s < log.metadata.circle_until_s
     plan, speed = position[..., :2], velocity[..., :2]
     steps = range(len(plan))
     return {
@@ -102,11 +100,11 @@ def objective_sums(log: FlightLog, position: FloatArray, velocity: FloatArray) -
 
 
 def _table_2(log: FlightLog) -> Json:
-    looked = np.full(len(log.time_s), _is_by_sight(log))
-    circling = np.asarray(log.time_s < log.meta["circle_until_s"])
+    by_sight = np.full(len(log.time_s), log.metadata.by_sight)
+    circling = np.asarray(log.time_s < log.metadata.circle_until_s)
     errors = estimation_errors(log)
     return {
-        window: {column: _spread(np.abs(values[steps & looked])) for column, values in errors.items()}
+        window: {column: _spread(np.abs(values[steps & by_sight])) for column, values in errors.items()}
         for window, steps in (("before", circling), ("after", ~circling))
     }
 
@@ -126,8 +124,8 @@ def _spread(values: FloatArray) -> Json:
 def _table_3(log: FlightLog) -> Json:
     totals: dict[str, dict[str, FloatArray]] = {}
     if _is_settled(log):
-        totals["vision" if _is_by_sight(log) else "truth"] = objective_sums(log, log.position, log.velocity)
-        if _is_by_sight(log) and len(log.truth_position):
+        totals["vision" if log.metadata.by_sight else "truth"] = objective_sums(log, log.position, log.velocity)
+        if log.metadata.by_sight and len(log.truth_position):
             totals["truth"] = objective_sums(log, log.truth_position, log.truth_velocity)
     return {
         row: {name: _convergence(log, name, totals.get(row), totals.get("truth")) for name in CONVERGENCE_BAND}
@@ -165,7 +163,7 @@ def _flock(log: FlightLog) -> Json:
     steps = range(len(log.time_s))
     nearest = np.array([min_distance(log.position[s]) for s in steps])
     tail = np.flatnonzero(_tail(log))
-    reach_m = log.meta["observation_distance_m"]
+    reach_m = log.metadata.observation_distance_m
     return {
         "min_distance_m": _finite(nearest.min(initial=np.inf)),
         "min_distance_after_10s_m": _finite(nearest[log.time_s >= 10.0].min(initial=np.inf)),
@@ -177,13 +175,13 @@ def _flock(log: FlightLog) -> Json:
 
 
 def _neighbours(log: FlightLog) -> Json:
-    if not (_is_by_sight(log) and log.has_truth):
+    if not (log.metadata.by_sight and log.has_truth):
         return {"recall_within_10m": None, "false_per_drone_minute": None}
     drones = log.position.shape[1]
     distances = np.linalg.norm(_relative_positions(log), axis=-1)
     near = (distances <= RECALL_RANGE_M) & ~np.eye(drones, dtype=bool) & log.recorded[..., None]
     seen = np.asarray(np.isfinite(log.neighbour_position).all(axis=-1))
-    drone_minutes = log.recorded.sum() * log.meta["step_s"] / 60
+    drone_minutes = log.recorded.sum() * log.metadata.step_s / 60
     return {
         "recall_within_10m": _mean(seen[near]),
         "false_per_drone_minute": float(log.false_tracks.sum() / drone_minutes),
@@ -192,11 +190,11 @@ def _neighbours(log: FlightLog) -> Json:
 
 def _own_account(log: FlightLog) -> Json:
     """How often the own motion was estimated, from the second step on, and how many neighbours were tracked at once."""
-    looked = log.recorded & _is_by_sight(log)
+    estimating = log.recorded & log.metadata.by_sight
     _, counts = np.unique(log.tracked[:, :2], axis=0, return_counts=True)
     return {
-        "own_motion_ratio": _mean(np.isfinite(log.ego_inlier_ratio)[1:][looked[1:]]),
-        "most_neighbours_tracked": int(counts.max(initial=0)) if looked.any() and len(log.tracked) else None,
+        "own_motion_ratio": _mean(np.isfinite(log.ego_inlier_ratio)[1:][estimating[1:]]),
+        "most_neighbours_tracked": int(counts.max(initial=0)) if estimating.any() and len(log.tracked) else None,
     }
 
 
@@ -205,26 +203,22 @@ def _relative_positions(log: FlightLog) -> FloatArray:
     return np.asarray(log.position[:, None] - log.position[:, :, None], dtype=float)
 
 
-def _is_by_sight(log: FlightLog) -> bool:
-    return bool(log.meta["perception"] != EXACT_STATES)
-
-
 def _is_settled(log: FlightLog) -> bool:
     """Whether the whole tail follows the circle's end, where Eq. 44 changes its branch."""
     tail = _tail(log)
-    return log.has_truth and not tail.all() and bool(np.all(log.time_s[tail] >= log.meta["circle_until_s"]))
+    return log.has_truth and not tail.all() and bool(np.all(log.time_s[tail] >= log.metadata.circle_until_s))
 
 
 def _tail(log: FlightLog) -> BoolArray:
     """The steps of the last 10 s; all of a shorter flight."""
-    begin_s = log.time_s[-1] + log.meta["step_s"] - TAIL_S
+    begin_s = log.time_s[-1] + log.metadata.step_s - TAIL_S
     return np.asarray(log.time_s > begin_s - 1e-6, dtype=bool)  # the step that begins just then belongs to it
 
 
 def _flocking(log: FlightLog) -> FlockingParameters:
     """With the distances that Eq. 45 takes."""
     return FlockingParameters(
-        observation_distance_m=log.meta["observation_distance_m"], desired_distance_m=log.meta["desired_distance_m"]
+        observation_distance_m=log.metadata.observation_distance_m, desired_distance_m=log.metadata.desired_distance_m
     )
 
 

@@ -54,7 +54,7 @@ class Ports:
 
 
 class Autopilots(Protocol):
-    """One autopilot a vehicle, on the ground below its start until somebody brings it up."""
+    """One autopilot a vehicle, on the ground below its start until it is commanded to take off."""
 
     name: str
     """For the report."""
@@ -73,8 +73,8 @@ class Autopilots(Protocol):
         """Those that are programs of their own."""
 
 
-class StandIns:
-    """Autopilot stand-ins that fly the simulator's own vehicles."""
+class SimulatedAutopilots:
+    """The autopilots that `flockd.autopilot` simulates, on the simulator's own vehicle model."""
 
     name = "stand-in"
 

@@ -124,7 +124,7 @@ class Daemons:
         return self._listeners[number].listen().status
 
     def is_ready(self, number: int) -> bool:
-        """Its networks are loaded, its autopilot is heard and it sees."""
+        """Its networks are loaded, its autopilot is connected and frames arrive."""
         return self._listeners[number].listen().ready
 
     def end(self) -> dict[str, int]:
@@ -134,7 +134,7 @@ class Daemons:
 
 
 class _Listener:
-    """What a service manager hears of one daemon."""
+    """The notifications of one daemon, as for a service manager."""
 
     def __init__(self, base: Path) -> None:
         self.path = base.with_suffix(".notify")

@@ -1,201 +1,32 @@
 """Quadrotor meshes: families of one shape and one size each, painted from a seed.
 
-A family's size is its own, so a picture tells the family and with it the size: the only scale that one image has.
+A family's size is its own, so an image shows the family and with it the size: the only scale that one image has.
 """
 
 from __future__ import annotations
 
-import functools
 import math
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.random import Generator
-from numpy.typing import NDArray
 
-from flockd.messages import Float32Array, FloatArray
-from flockd.sim import textures
-from flockd.sim.mesh import Mesh
-from flockd.sim.textures import PackedArray
-
-
-@dataclass(frozen=True, eq=False)
-class DroneModel:
-    """One drone's mesh, body FRD, metres, origin at the centre of its bounding box."""
-
-    family: int
-    seed: int
-    vertices: Float32Array
-    """(n, 3)"""
-    triangles: NDArray[np.int32]
-    """(m, 3)"""
-    colours: Float32Array
-    """(m, 3) linear albedo."""
-    texture: NDArray[np.int32]
-    """(m,) number of the machine texture."""
-    uv: FloatArray
-    """(m, 2, 4) texture coordinates in tiles from body (x, y, z, 1)."""
-    hubs: FloatArray
-    """(4, 3) tops of the motors: front right, rear right, rear left, front left (plus frame: front, right, rear, left).
-    """
-    extent: FloatArray
-    """(2, 3) least and greatest corner, propellers at any angle; a family's own."""
-    size_m: float
-    """Widest horizontal distance, propeller tip to tip."""
-
-
-@functools.cache
-def machine_texels() -> PackedArray:
-    """The packed pyramids of the machine textures, one after another; the same for all worlds."""
-    rng = np.random.default_rng(7)
-    return np.concatenate([textures.pack_pyramid(textures.speckle(rng)) for _ in range(MACHINE_TEXTURES)])
-
-
-MACHINE_TEXTURES = 3
+from flockd.messages import FloatArray
+from flockd.sim.airframe import Airframe, DroneModel, outline, oval
 
 
 def drone_model(family: int, seed: int) -> DroneModel:
     """The mesh of a family (0 to ``FAMILIES`` - 1), colours and propeller angles from ``seed``."""
     if not 0 <= family < FAMILIES:
         raise ValueError(f"family must be from 0 to {FAMILIES - 1}, not {family}")
-    craft = _Craft(np.random.default_rng([family, seed]))
+    craft = Airframe(np.random.default_rng([family, seed]))
     _BUILDERS[family](craft)
     return craft.model(family, seed)
-
-
-class _Craft:
-    """A drone as it is put together, nose along +x, z down, in its builder's own origin."""
-
-    def __init__(self, rng: Generator) -> None:
-        self.rng = rng
-        self.mesh = Mesh()
-        self.hubs: list[FloatArray] = []
-        self.radii: list[float] = []
-        base = float(rng.choice([rng.uniform(0.02, 0.06), rng.uniform(0.12, 0.3), rng.uniform(0.5, 0.75)]))
-        self.body = np.clip(base * rng.uniform(0.85, 1.15, 3), 0.01, 0.8)
-        if rng.random() < 0.3:
-            self.body = _vivid(rng) * 0.8
-        self.frame = np.full(3, rng.uniform(0.015, 0.07)) if rng.random() < 0.7 else np.full(3, rng.uniform(0.3, 0.7))
-        self.front, self.rear = _vivid(rng), _vivid(rng)
-        self.metal = np.full(3, rng.uniform(0.05, 0.5))
-        # Slow or fast: two blades, or the disc they blur into.
-        self.disc = bool(rng.random() < 0.5)
-        self.prop = np.full(3, rng.uniform(0.03, 0.5)) if rng.random() < 0.7 else _vivid(rng) * 0.7
-        self.skin = rng.integers(0, MACHINE_TEXTURES, 2)
-
-    def box(
-        self,
-        centre: tuple[float, float, float],
-        half: tuple[float, float, float],
-        colour: FloatArray,
-        heading: float = 0.0,
-    ) -> None:
-        self.mesh.box(np.array(centre), half, heading, int(self.skin[0]), colour, (0.3, 0.3))
-
-    def rod(
-        self,
-        a: tuple[float, float, float],
-        b: tuple[float, float, float],
-        radius: float,
-        colours: list[FloatArray],
-        sides: int = 6,
-    ) -> None:
-        """A tube in equal lengths of the given colours."""
-        self.mesh.frustum(
-            np.array(a), np.array(b), (radius, radius), sides, int(self.skin[1]), np.array(colours), (0.2, 0.2)
-        )
-
-    def beam(
-        self,
-        a: tuple[float, float, float],
-        b: tuple[float, float, float],
-        half: tuple[float, float],
-        colours: list[FloatArray],
-    ) -> None:
-        """A level box beam in equal lengths of the given colours; half width and half height."""
-        start, end = np.array(a), np.array(b)
-        step = (end - start) / len(colours)
-        heading = math.atan2(step[1], step[0])
-        for k, colour in enumerate(colours):
-            middle = start + step * (k + 0.5)
-            self.box(
-                (middle[0], middle[1], middle[2]),
-                (float(np.hypot(step[0], step[1])) / 2, half[0], half[1]),
-                colour,
-                heading,
-            )
-
-    def loft(self, rings: list[FloatArray], colours: list[FloatArray]) -> None:
-        """A closed skin over rings (n, 3), the first on top, each clockwise seen from above; see ``Mesh.loft``."""
-        self.mesh.loft(rings, int(self.skin[0]), np.array(colours), (0.3, 0.3))
-
-    def ball(self, centre: tuple[float, float, float], radius: float, colour: FloatArray) -> None:
-        slope = np.radians([-70, -35, 0, 35, 70])
-        rings = [_oval(r, r, z) + centre for r, z in zip(radius * np.cos(slope), radius * np.sin(slope), strict=True)]
-        self.loft(rings, [colour] * (len(rings) - 1))
-
-    def rotor(self, x: float, y: float, z: float, radius: float, motor: tuple[float, float], *, accent: bool) -> None:
-        """A motor standing on (x, y, z), with its propeller. ``motor``: radius and height."""
-        top = z - motor[1]
-        self.rod(
-            (x, y, z),
-            (x, y, top),
-            motor[0],
-            [self.metal, (self.front if x > 0 else self.rear) if accent else self.metal],
-            8,
-        )
-        hub = np.array([x, y, top])
-        self.hubs.append(hub)
-        self.radii.append(radius)
-        angle = self.rng.uniform(0, math.pi)
-        lift = np.array([0, 0, 0.004 + 0.01 * radius])
-        if self.disc:
-            self.mesh.frustum(
-                hub - lift, hub - lift - [0, 0, 0.004], (radius, radius), 16, int(self.skin[1]), self.prop, (0.25, 0.25)
-            )
-        else:
-            width = 0.075 * radius + 0.004
-            half = math.sqrt(radius**2 - width**2)
-            self.mesh.box(hub - lift, (half, width, 0.002), angle, int(self.skin[1]), self.prop, (0.25, 0.25))
-
-    def model(self, family: int, seed: int) -> DroneModel:
-        vertices = np.vstack(self.mesh.vertices)
-        hubs = np.array(self.hubs)
-        reach = np.array(self.radii)[:, None] * np.array([1.0, 1.0, 0.0])
-        low = np.minimum(vertices.min(0), (hubs - reach).min(0))
-        high = np.maximum(vertices.max(0), (hubs + reach).max(0))
-        # The rotor disc's own thickness is there whichever way the propeller is drawn.
-        low[2] = min(low[2], float((hubs[:, 2] - 0.008 - 0.01 * np.array(self.radii)).min()))
-        centre = (low + high) / 2
-        apart = np.linalg.norm(hubs[:, None, :2] - hubs[None, :, :2], axis=-1)
-        uv = np.concatenate(self.mesh.uv)
-        uv[:, :, 3] += uv[:, :, :3] @ centre + self.rng.uniform(0, 1, 2)
-        return DroneModel(
-            family=family,
-            seed=seed,
-            vertices=(vertices - centre).astype(np.float32),
-            triangles=np.vstack(self.mesh.triangles).astype(np.int32),
-            colours=np.concatenate(self.mesh.tint).astype(np.float32),
-            texture=np.concatenate(self.mesh.texture).astype(np.int32),
-            uv=uv,
-            hubs=hubs - centre,
-            extent=np.stack([low, high]) - centre,
-            size_m=float((apart + np.add.outer(self.radii, self.radii)).max()),
-        )
-
-
-def _vivid(rng: Generator) -> FloatArray:
-    """A strong colour of any hue."""
-    hue = rng.uniform(0, 2 * math.pi)
-    rgb = 0.5 + 0.5 * np.cos(hue + np.array([0.0, -2.1, 2.1]))
-    return np.asarray(np.clip(rgb * rng.uniform(0.3, 0.8) + rng.uniform(0.0, 0.1), 0.02, 0.85))
 
 
 def _corners(x: float, y: float) -> list[tuple[float, float]]:
     return [(x, y), (-x, y), (-x, -y), (x, -y)]
 
 
-def _thin_x(c: _Craft) -> None:
+def _thin_x(c: Airframe) -> None:
     """The common X on thin tubes: 450 mm between opposite motors."""
     for x, y in _corners(0.16, 0.16):
         accent = c.front if x > 0 else c.rear
@@ -213,7 +44,7 @@ def _thin_x(c: _Craft) -> None:
             c.rod((x, y * 0.6, 0.005), (x, y, 0.1), 0.004, [c.frame])
 
 
-def _thick_pod(c: _Craft) -> None:
+def _thick_pod(c: Airframe) -> None:
     """A stout body on short arms, a camera pod under the nose."""
     c.box((0, 0, 0), (0.1, 0.06, 0.04), c.body)
     c.box((0, 0, -0.05), (0.075, 0.045, 0.014), c.body * 0.8)
@@ -230,7 +61,7 @@ def _thick_pod(c: _Craft) -> None:
         c.rod((x, y, 0.0), (x, y, 0.085), 0.009, [c.body, accent])
 
 
-def _folding(c: _Craft) -> None:
+def _folding(c: Airframe) -> None:
     """A sleek camera drone: front arms swept forward and high, rear arms low."""
     c.box((0.0, 0, 0), (0.11, 0.038, 0.026), c.body)
     c.box((-0.015, 0, -0.032), (0.08, 0.032, 0.01), c.body * 1.1)
@@ -253,7 +84,7 @@ def _folding(c: _Craft) -> None:
             c.rod((0.125, 0.145 * y, -0.005), (0.125, 0.145 * y, 0.055), 0.007, [c.body, accent])
 
 
-def _racer(c: _Craft) -> None:
+def _racer(c: Airframe) -> None:
     """A small racing frame: flat plates, a canopy, a tilted camera."""
     c.box((0, 0, 0), (0.055, 0.02, 0.0025), c.frame)
     c.box((0, 0, -0.024), (0.05, 0.018, 0.0015), c.frame)
@@ -269,7 +100,7 @@ def _racer(c: _Craft) -> None:
         c.rotor(x, y, -0.002, 0.0635, (0.0125, 0.018), accent=True)
 
 
-def _h_frame(c: _Craft) -> None:
+def _h_frame(c: Airframe) -> None:
     """Two long booms joined by crossbars, payload slung between."""
     for y in (-0.2, 0.2):
         c.beam((-0.22, y, 0), (0.22, y, 0), (0.013, 0.013), [c.rear, c.frame, c.body, c.frame, c.front])
@@ -285,7 +116,7 @@ def _h_frame(c: _Craft) -> None:
         c.rod((x * 0.6, y, 0), (x * 0.7, y, 0.13), 0.007, [c.frame, c.front if x > 0 else c.rear])
 
 
-def _plus(c: _Craft) -> None:
+def _plus(c: Airframe) -> None:
     """Arms ahead, astern and abeam."""
     c.rod((0, 0, -0.035), (0, 0, 0.02), 0.075, [c.body], 12)
     c.rod((0, 0, -0.06), (0, 0, -0.035), 0.05, [c.body * 0.75], 12)
@@ -298,7 +129,7 @@ def _plus(c: _Craft) -> None:
         c.rod((0.45 * x, 0.45 * y, 0.01), (0.55 * x, 0.55 * y, 0.12), 0.006, [c.frame])
 
 
-def _ducted(c: _Craft) -> None:
+def _ducted(c: Airframe) -> None:
     """Four ducts around a small body."""
     c.box((0, 0, -0.004), (0.075, 0.03, 0.018), c.body)
     c.box((0.0, 0, -0.03), (0.045, 0.024, 0.01), c.body * 0.8)
@@ -313,7 +144,14 @@ def _ducted(c: _Craft) -> None:
 
 
 def _ring(
-    c: _Craft, x: float, y: float, inner: float, outer: float, half_height: float, first: FloatArray, second: FloatArray
+    c: Airframe,
+    x: float,
+    y: float,
+    inner: float,
+    outer: float,
+    half_height: float,
+    first: FloatArray,
+    second: FloatArray,
 ) -> None:
     """A short tube with a wall, every third segment in the first colour."""
     sides = 12
@@ -331,7 +169,7 @@ def _ring(
     c.mesh.add(vertices, np.array(faces), int(c.skin[0]), np.array(tint), (0.3, 0.3))
 
 
-def _long_legs(c: _Craft) -> None:
+def _long_legs(c: Airframe) -> None:
     """A big carbon plate frame on tall skids, with a gimballed camera."""
     c.box((0, 0, 0.012), (0.1, 0.09, 0.003), c.frame)
     c.box((0, 0, -0.02), (0.09, 0.08, 0.003), c.frame)
@@ -355,22 +193,10 @@ def _long_legs(c: _Craft) -> None:
             c.rod((x, 0.06 * y, 0.01), (1.4 * x, 0.17 * y, 0.26), 0.008, [c.frame, c.body])
 
 
-def _oval(along: float, across: float, z: float) -> FloatArray:
-    """Ring of 12 points on an ellipse of these half widths."""
-    angle = np.arange(12) * math.pi / 6
-    return np.column_stack([along * np.cos(angle), across * np.sin(angle), np.full(12, z)])
-
-
-def _outline(right: list[tuple[float, float]], z: float, scale: float = 1.0) -> FloatArray:
-    """Ring through the points of the right half, nose to tail, and their mirror images."""
-    points = np.array(right + [(x, -y) for x, y in reversed(right)])
-    return np.column_stack([points * scale, np.full(len(points), z)])
-
-
-def _bumper(c: _Craft) -> None:
+def _bumper(c: Airframe) -> None:
     """A palm-sized toy: an egg of a body within two rails around all rotors."""
     c.loft(
-        [_oval(a, b, z) for a, b, z in ((0.02, 0.015, -0.034), (0.042, 0.03, -0.024), (0.055, 0.036, -0.006),
+        [oval(a, b, z) for a, b, z in ((0.02, 0.015, -0.034), (0.042, 0.03, -0.024), (0.055, 0.036, -0.006),
                                         (0.045, 0.03, 0.01), (0.02, 0.014, 0.016))],
         [c.body, c.body * 0.8, c.rear, c.frame],
     )  # fmt: skip
@@ -393,10 +219,10 @@ def _bumper(c: _Craft) -> None:
         c.rotor(x, y, 0.0, 0.0423, (0.007, 0.016), accent=False)
 
 
-def _dome(c: _Craft) -> None:
+def _dome(c: Airframe) -> None:
     """A light-show drone: a domed body with a lamp under it, on stilts."""
     c.loft(
-        [_oval(r, r, z) for r, z in ((0.02, -0.088), (0.05, -0.078), (0.072, -0.055), (0.08, -0.02), (0.08, 0.004),
+        [oval(r, r, z) for r, z in ((0.02, -0.088), (0.05, -0.078), (0.072, -0.055), (0.08, -0.02), (0.08, 0.004),
                                      (0.055, 0.018))],
         [c.body, c.body, c.body * 0.8, c.rear, c.frame],
     )  # fmt: skip
@@ -410,11 +236,11 @@ def _dome(c: _Craft) -> None:
         c.rod((0.4 * x, 0.4 * y, 0.01), (0.62 * x, 0.62 * y, 0.11), 0.0045, [c.frame, accent])
 
 
-def _dead_cat(c: _Craft) -> None:
+def _dead_cat(c: Airframe) -> None:
     """Two long narrow decks, the front arms bent wide and back to clear the camera's view."""
     deck = [(0.2, 0.025), (0.1, 0.045), (-0.14, 0.032), (-0.17, 0.02)]
-    c.loft([_outline(deck, 0.0), _outline(deck, 0.005)], [c.frame])
-    c.loft([_outline(deck, -0.036, 0.92), _outline(deck, -0.032, 0.92)], [c.body])
+    c.loft([outline(deck, 0.0), outline(deck, 0.005)], [c.frame])
+    c.loft([outline(deck, -0.036, 0.92), outline(deck, -0.032, 0.92)], [c.body])
     for x, y in _corners(0.12, 0.028):
         c.rod((x, y, 0), (x, y, -0.033), 0.005, [c.metal])
     c.box((-0.06, 0, -0.056), (0.075, 0.024, 0.02), c.rear)
@@ -432,11 +258,11 @@ def _dead_cat(c: _Craft) -> None:
         c.rotor(x, y, 0.004, 0.1215, (0.0165, 0.026), accent=True)
 
 
-def _courier(c: _Craft) -> None:
+def _courier(c: Airframe) -> None:
     """A delivery van of a drone: a big box of a body, a parcel hung under it."""
     side = [(0.16, 0.085), (-0.16, 0.085)]
     c.loft(
-        [_outline(side, z, scale) for z, scale in ((-0.1, 0.75), (-0.07, 1.0), (0.01, 1.0), (0.03, 0.85))],
+        [outline(side, z, scale) for z, scale in ((-0.1, 0.75), (-0.07, 1.0), (0.01, 1.0), (0.03, 0.85))],
         [c.body * 0.85, c.body, c.frame],
     )
     c.box((0.16, 0, -0.035), (0.006, 0.06, 0.022), c.front)
@@ -458,11 +284,11 @@ def _courier(c: _Craft) -> None:
         c.rod((-0.21, y, 0.2), (0.21, y, 0.2), 0.008, [c.rear, c.frame, c.front])
 
 
-def _dragonfly(c: _Craft) -> None:
+def _dragonfly(c: Airframe) -> None:
     """A slender body with a tail and two big eyes, short arms ahead and long ones astern."""
     half = [(0.11, 0.01), (0.09, 0.027), (0.02, 0.024), (-0.06, 0.012), (-0.17, 0.006)]
     c.loft(
-        [_outline(half, z, scale) for z, scale in ((-0.026, 0.6), (-0.014, 1.0), (0.008, 1.0), (0.018, 0.7))],
+        [outline(half, z, scale) for z, scale in ((-0.026, 0.6), (-0.014, 1.0), (0.008, 1.0), (0.018, 0.7))],
         [c.body, c.body * 0.8, c.frame],
     )
     for y in (-0.02, 0.02):
@@ -478,11 +304,11 @@ def _dragonfly(c: _Craft) -> None:
         c.rotor(x, y, z, 0.0636, (0.0105, 0.018), accent=True)
 
 
-def _wide_nose(c: _Craft) -> None:
+def _wide_nose(c: Airframe) -> None:
     """A manta of a camera drone: wide ahead, a finned tail, a ball of a camera in a fork under the nose."""
     half = [(0.155, 0.05), (0.125, 0.112), (0.05, 0.118), (-0.16, 0.03)]
     c.loft(
-        [_outline(half, z, scale) for z, scale in ((-0.052, 0.65), (-0.032, 0.97), (0.004, 1.0), (0.022, 0.8))],
+        [outline(half, z, scale) for z, scale in ((-0.052, 0.65), (-0.032, 0.97), (0.004, 1.0), (0.022, 0.8))],
         [c.body, c.body, c.body * 0.7],
     )
     c.box((0.146, 0, -0.012), (0.008, 0.045, 0.01), c.front)

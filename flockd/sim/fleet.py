@@ -1,4 +1,4 @@
-"""Flies a scenario with real daemons: autopilots, `flockd run` processes, a film crew that feeds their cameras."""
+"""Flies a scenario with real daemons: autopilots, `flockd run` processes, and a server of their camera frames."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from flockd.choices import AutopilotKind
 from flockd.config import DroneConfig
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import UnavailableError
-from flockd.sim.autopilots import Autopilots, Px4s, StandIns
+from flockd.flight_log.fleet_log import FleetRun, fleet_key_frames, fleet_log
+from flockd.sim.autopilots import Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.daemons import Daemons, fleet_configs
-from flockd.sim.film_crew import FilmCrew
-from flockd.sim.fleet_log import Flown, filmstrip, flight_log
+from flockd.sim.exact_states import exact_states_at
+from flockd.sim.frame_server import FrameServer
 from flockd.sim.ground_station import GroundStation
 from flockd.sim.processes import Program
 from flockd.sim.swarm import Flight
@@ -32,8 +33,8 @@ AUTOPILOT_START_S, DAEMON_START_S = 90.0, 180.0
 """Real seconds; a computer that loads networks for five drones takes its time."""
 ARM_S, CLIMB_S, READY_S, OFFBOARD_S, LAND_S = 60.0, 60.0, 60.0, 10.0, 60.0
 """Simulated seconds for each step of bringing a fleet up and down."""
-LOOK_S = 0.05
-ASK_AGAIN_S = 1.0
+POLL_S = 0.05
+REQUEST_AGAIN_S = 1.0
 ON_GROUND_M, AT_HEIGHT_M = 0.5, 1.0
 
 
@@ -55,140 +56,141 @@ def fly_fleet(
         sitl: the configuration whose source, autopilot, safety and telemetry the daemons have.
         kind: of the autopilots.
         speed_factor: how fast simulated time passes.
-        logs: a folder for what all programs write and fly with, over what an earlier fleet's did.
+        logs: a folder for the logs and configurations of all programs; those of an earlier fleet are overwritten.
         recordings: a folder for the daemons' recordings; None: they are deleted.
         environment: this process's own.
-        progress: told (simulated seconds done, seconds in all).
+        progress: called with (simulated seconds done, seconds in all).
 
     Raises UnavailableError when a program does not come up or a drone not into the air, in time.
     """
-    scenario = _at_rest(scenario)
+    scenario = _at_standstill(scenario)
     clock = clock_at(speed_factor)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="flockd-")))
         stack.enter_context(_kept(folder, logs))
-        films = recordings or folder / "recordings"
-        films.mkdir(parents=True, exist_ok=True)
+        recorded = recordings or folder / "recordings"
+        recorded.mkdir(parents=True, exist_ok=True)
         autopilots = stack.enter_context(_autopilots(scenario, kind, speed_factor, environment, folder))
         ports, endpoint = autopilots.ports, _free_endpoint()
         configs = fleet_configs(scenario, sitl, ports=ports, endpoint=endpoint, speed_factor=speed_factor)
         names = [config.name for config in configs]
         assert configs[0].source is not None
         station = stack.enter_context(GroundStation([port.truth for port in ports], clock))
-        crew = stack.enter_context(
-            FilmCrew(
+        server = stack.enter_context(
+            FrameServer(
                 scenario, names, endpoint=endpoint, rate_hz=configs[0].source.shared_memory.rate_hz,
                 poses=station.poses, clock=clock, speed_factor=speed_factor,
             )
         )  # fmt: skip
-        daemons = stack.enter_context(Daemons(configs, folder=folder, recordings=films, environment=environment))
-        fleet = _Fleet(scenario, speed_factor, clock, autopilots, station, crew, daemons)
+        daemons = stack.enter_context(Daemons(configs, folder=folder, recordings=recorded, environment=environment))
+        fleet = _Fleet(scenario, speed_factor, clock, autopilots, station, server, daemons)
         fleet.come_up()
         fleet.take_off()
-        flown = fleet.fly(progress)
-        fleet.land(flown)
-        return Flight(flight_log(scenario, configs, flown, films, speed_factor), filmstrip(films, flown))
+        run = fleet.fly(progress)
+        fleet.land(run)
+        times = np.array([frame.time_s - run.frames[0].time_s for frame in run.frames])
+        companion = exact_states_at(times, scenario)
+        log = fleet_log(scenario, configs, run, recorded, speed_factor, companion)
+        return Flight(log, fleet_key_frames(recorded, run))
 
 
 class _Fleet:
-    """Brings a fleet up, lets it fly, and lands it: the hands of five pilots and their stopwatch."""
+    """Starts a fleet, flies and lands it, as its ground pilots would."""
 
     def __init__(
         self, scenario: ScenarioConfig, speed_factor: float, clock: Callable[[], float], autopilots: Autopilots,
-        station: GroundStation, crew: FilmCrew, daemons: Daemons,
+        station: GroundStation, server: FrameServer, daemons: Daemons,
     ) -> None:  # fmt: skip
         self._scenario, self._speed_factor, self._clock = scenario, speed_factor, clock
-        self._autopilots, self._station, self._crew, self._daemons = autopilots, station, crew, daemons
+        self._autopilots, self._station, self._server, self._daemons = autopilots, station, server, daemons
         self._all = range(len(scenario.vehicles))
         self._needed: Sequence[Program] = ()
-        """What has to run now."""
+        """Programs that have to run now; `_poll` raises when one has ended."""
 
     def come_up(self) -> None:
-        """All programs start, and see and hear each other."""
+        """Starts all programs and waits until they are connected."""
         self._autopilots.start()
         self._needed = self._autopilots.programs()
         self._wait_for(
-            self._station.heard,
+            self._station.is_connected,
             AUTOPILOT_START_S * self._speed_factor,
-            lambda i: f"{self._autopilots.name} {i + 1} said nothing for {AUTOPILOT_START_S:g} s",
+            lambda i: f"{self._autopilots.name} {i + 1} sent nothing for {AUTOPILOT_START_S:g} s",
         )
-        self._station.ask_for_news()
-        self._crew.start()
+        self._station.request_messages()
+        self._server.start()
         self._daemons.start()
         self._needed = (*self._autopilots.programs(), *self._daemons.programs())
         self._wait_for(
             self._daemons.is_ready,
             DAEMON_START_S * self._speed_factor,
-            lambda i: f"the daemon of drone{i + 1} was not ready after {DAEMON_START_S:g} s ({self._said(i)})",
+            lambda i: f"the daemon of drone{i + 1} was not ready after {DAEMON_START_S:g} s ({self._last_messages(i)})",
         )
 
     def take_off(self) -> None:
-        """As pilots do: arm, climb to the drone's own height, and give it to flockd when that is ready."""
+        """Arms, climbs to the drone's own height, and selects offboard when flockd is ready."""
         station = self._station
-        self._ask(station.is_armed, station.arm, ARM_S, "could not be armed")
-        self._ask(self._is_up, self._ask_to_climb, CLIMB_S, "did not reach its height")
+        self._request(station.is_armed, station.arm, ARM_S, "could not be armed")
+        self._request(self._is_up, self._request_climb, CLIMB_S, "did not reach its height")
         self._wait_for(
             lambda i: self._daemons.status(i).startswith("ready") and station.mode_is(i, "LOITER"),
             READY_S,
-            lambda i: f"flockd was not ready to fly drone{i + 1} after {READY_S:g} s ({self._said(i)})",
+            lambda i: f"flockd was not ready to fly drone{i + 1} after {READY_S:g} s ({self._last_messages(i)})",
         )
-        self._ask(
+        self._request(
             lambda i: station.mode_is(i, "OFFBOARD"),
             lambda i: station.select(i, "OFFBOARD"),
             OFFBOARD_S,
             "did not go into offboard",
         )
 
-    def fly(self, progress: Progress) -> Flown:
-        """Watches until the time is over."""
-        flown = Flown(self._clock())
+    def fly(self, progress: Progress) -> FleetRun:
+        """Monitors the flight until its time is over."""
+        run = FleetRun(self._clock())
         wall_s, cpu_s, booted = time.monotonic(), self._cpu_s(), [self._station.uptime_s(i) for i in self._all]
         total_s = self._scenario.duration_s
-        while (flying_s := self._clock() - flown.began_s) < total_s:
+        while (flying_s := self._clock() - run.began_s) < total_s:
             progress(int(flying_s), int(total_s))
-            self._notice(flown, flying_s)
-            self._crew.shootings()
-            time.sleep(LOOK_S)
+            self._note_handovers(run, flying_s)
+            self._server.frames()
+            time.sleep(POLL_S)
         progress(int(total_s), int(total_s))
-        flown.ended_s, flown.wall_s = self._clock(), time.monotonic() - wall_s
-        flown.cores = {kind: (after - cpu_s[kind]) / flown.wall_s for kind, after in self._cpu_s().items()}
-        flown.clock_rates = [
-            rate for i in self._all if (rate := _rate(booted[i], self._station.uptime_s(i))) is not None
-        ]
+        run.ended_s, run.wall_s = self._clock(), time.monotonic() - wall_s
+        run.cores = {kind: (after - cpu_s[kind]) / run.wall_s for kind, after in self._cpu_s().items()}
+        run.clock_rates = [rate for i in self._all if (rate := _rate(booted[i], self._station.uptime_s(i))) is not None]
         version = self._station.version(0)
-        stand_in = self._autopilots.name == StandIns.name
-        flown.autopilot = self._autopilots.name if stand_in or version is None else f"{self._autopilots.name} {version}"
-        flown.shootings = tuple(s for s in self._crew.shootings() if flown.began_s <= s.time_s < flown.ended_s)
-        return flown
+        stand_in = self._autopilots.name == SimulatedAutopilots.name
+        run.autopilot = self._autopilots.name if stand_in or version is None else f"{self._autopilots.name} {version}"
+        run.frames = tuple(s for s in self._server.frames() if run.began_s <= s.time_s < run.ended_s)
+        return run
 
-    def land(self, flown: Flown) -> None:
-        """The daemons end, which leaves the drones in Hold, and the pilots land them."""
-        flown.notes += self._crew.notes()
+    def land(self, run: FleetRun) -> None:
+        """Ends the daemons, which leaves the drones in Hold, and lands them."""
+        run.notes += self._server.notes()
         self._needed = self._autopilots.programs()
-        flown.exit_codes = self._daemons.end()
+        run.exit_codes = self._daemons.end()
         try:
-            self._ask(
+            self._request(
                 lambda i: not self._station.is_armed(i), lambda i: self._station.select(i, "LAND"), LAND_S,
                 "did not land",
             )  # fmt: skip
         except UnavailableError as error:  # the flight is over, and worth its report
-            flown.notes.append(str(error))
+            run.notes.append(str(error))
 
-    def _notice(self, flown: Flown, flying_s: float) -> None:
-        """A drone that is not in offboard any more, or of which a program has ended."""
+    def _note_handovers(self, run: FleetRun, flying_s: float) -> None:
+        """Notes a drone that is not in offboard any more, or of which a program has ended."""
         autopilots = self._autopilots.programs()
         for i, program in zip(self._all, self._daemons.programs(), strict=True):
-            if program.name in flown.handed_over:
+            if program.name in run.handed_over:
                 continue
             if program.ended is not None:
-                why = f"its daemon ended with exit code {program.ended} ({program.last_words()})"
+                why = f"its daemon ended with exit code {program.ended} ({program.last_output()})"
             elif autopilots and autopilots[i].ended is not None:
-                why = f"its autopilot ended with exit code {autopilots[i].ended} ({autopilots[i].last_words()})"
+                why = f"its autopilot ended with exit code {autopilots[i].ended} ({autopilots[i].last_output()})"
             elif not self._station.mode_is(i, "OFFBOARD"):
-                why = f"it left offboard ({self._said(i)})"
+                why = f"it left offboard ({self._last_messages(i)})"
             else:
                 continue
-            flown.handed_over[program.name] = f"after {flying_s:.1f} s {why}"
+            run.handed_over[program.name] = f"after {flying_s:.1f} s {why}"
 
     def _height_m(self, i: int) -> float:
         return -float(self._station.poses().position[i, 2])
@@ -197,45 +199,49 @@ class _Fleet:
         error_m = self._height_m(i) + self._scenario.vehicles[i].position_m[2]
         return abs(error_m) < AT_HEIGHT_M and self._station.mode_is(i, "LOITER")
 
-    def _ask_to_climb(self, i: int) -> None:
+    def _request_climb(self, i: int) -> None:
         """Once it has left the ground, another take-off would lead higher."""
         if self._height_m(i) < ON_GROUND_M:
             self._station.select(i, "TAKEOFF")
 
-    def _said(self, i: int) -> str:
-        """What was said last, by whom it concerns."""
-        words = [f"flockd: {self._daemons.status(i) or self._daemons.programs()[i].last_words()}"]
-        if self._station.last_words(i):
-            words.append(f"autopilot: {self._station.last_words(i)}")
-        return "; ".join(words)
+    def _last_messages(self, i: int) -> str:
+        """The last messages of a drone's daemon and autopilot."""
+        messages = [f"flockd: {self._daemons.status(i) or self._daemons.programs()[i].last_output()}"]
+        if self._station.last_text(i):
+            messages.append(f"autopilot: {self._station.last_text(i)}")
+        return "; ".join(messages)
 
-    def _ask(self, done: Callable[[int], bool], ask: Callable[[int], None], patience_s: float, otherwise: str) -> None:
-        """Asks all at a time, and those who have not done it again and again."""
-        until_s, asked_s = self._clock() + patience_s, -np.inf
-        while (open_ones := [i for i in self._all if not done(i)]) and self._clock() < until_s:
-            if self._clock() - asked_s >= ASK_AGAIN_S:
-                asked_s = self._clock()
-                for i in open_ones:
-                    ask(i)
-            self._look()
-        if open_ones:
-            first = open_ones[0]
-            raise UnavailableError(f"drone{first + 1} {otherwise} within {patience_s:g} s ({self._said(first)})")
+    def _request(
+        self, done: Callable[[int], bool], request: Callable[[int], None], timeout_s: float, otherwise: str
+    ) -> None:
+        """Sends a request to all drones, and again to those that have not complied; raises after the timeout."""
+        until_s, sent_s = self._clock() + timeout_s, -np.inf
+        while (pending := [i for i in self._all if not done(i)]) and self._clock() < until_s:
+            if self._clock() - sent_s >= REQUEST_AGAIN_S:
+                sent_s = self._clock()
+                for i in pending:
+                    request(i)
+            self._poll()
+        if pending:
+            first = pending[0]
+            raise UnavailableError(
+                f"drone{first + 1} {otherwise} within {timeout_s:g} s ({self._last_messages(first)})"
+            )
 
-    def _wait_for(self, done: Callable[[int], bool], patience_s: float, otherwise: Callable[[int], str]) -> None:
-        until_s = self._clock() + patience_s
-        while open_ones := [i for i in self._all if not done(i)]:
+    def _wait_for(self, done: Callable[[int], bool], timeout_s: float, otherwise: Callable[[int], str]) -> None:
+        until_s = self._clock() + timeout_s
+        while pending := [i for i in self._all if not done(i)]:
             if self._clock() >= until_s:
-                raise UnavailableError(f"{otherwise(open_ones[0])}; see its log")
-            self._look()
+                raise UnavailableError(f"{otherwise(pending[0])}; see its log")
+            self._poll()
 
-    def _look(self) -> None:
-        """Waits a moment. Raises when something has ended that the flight needs."""
-        self._crew.shootings()
+    def _poll(self) -> None:
+        """Waits for `POLL_S`. Raises UnavailableError when a program that the flight needs has ended."""
+        self._server.frames()
         for program in self._needed:
             if program.ended is not None:
-                raise UnavailableError(f"{program.name} ended with exit code {program.ended} ({program.last_words()})")
-        time.sleep(LOOK_S)
+                raise UnavailableError(f"{program.name} ended with exit code {program.ended} ({program.last_output()})")
+        time.sleep(POLL_S)
 
     def _cpu_s(self) -> dict[str, float]:
         def used(programs: Sequence[Program]) -> float:
@@ -249,8 +255,8 @@ class _Fleet:
         }
 
 
-def _at_rest(scenario: ScenarioConfig) -> ScenarioConfig:
-    """Autopilots begin in Hold."""
+def _at_standstill(scenario: ScenarioConfig) -> ScenarioConfig:
+    """With all drones hovering at the start, as autopilots begin in Hold."""
     vehicles = tuple(vehicle.model_copy(update={"velocity_m_s": (0.0, 0.0)}) for vehicle in scenario.vehicles)
     return scenario.model_copy(update={"vehicles": vehicles})
 
@@ -260,12 +266,12 @@ def _autopilots(
 ) -> Autopilots:
     if kind == "px4":
         return Px4s(scenario, speed_factor, environment, folder)
-    return StandIns(scenario, speed_factor)
+    return SimulatedAutopilots(scenario, speed_factor)
 
 
 @contextmanager
 def _kept(folder: Path, logs: Path) -> Iterator[None]:
-    """What the programs wrote and flew with is there afterwards, whatever happens."""
+    """Copies the programs' logs and configurations to ``logs`` at the end, also after an error."""
     try:
         yield
     finally:

@@ -1,6 +1,7 @@
-"""What stands on the ground beside a fleet of simulated autopilots: a pilot's ground station, and the truth.
+"""A ground station for a fleet of simulated autopilots, which also receives their true poses.
 
-Both come over the link on which PX4 in software tells a simulator its true pose; the stand-in tells it the same way.
+Poses come over the MAVLink stream on which PX4 SITL sends its true state to a simulator; `flockd.autopilot`'s simulated
+autopilot sends the same.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ Mode = Literal["LOITER", "TAKEOFF", "LAND", "OFFBOARD"]
 
 SYSTEM_ID = 255
 HEARTBEAT_S = 1.0
-LOOK_S = 0.05
+POLL_S = 0.05
 MODE_HZ = 20.0
 MAX_FORWARD_S = 0.2
-"""A pose older than this is not carried on."""
+"""A pose is extrapolated by no more than this."""
 REFERENCE_DEG = (1.0, 1.0)
 """The origin of the world. PX4 keeps its home as float32, whose steps are a centimetre here, and 0.4 m in Europe."""
-_HEARD = {
+_RECEIVED = {
     name: int(getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
     for name in (
         "HEARTBEAT",
@@ -71,7 +72,7 @@ class _Pose:
 
 @dataclass
 class _Vehicle:
-    """One autopilot, as heard last."""
+    """One autopilot, by its last messages."""
 
     number: int
     socket: socket.socket
@@ -91,7 +92,7 @@ class _Vehicle:
 
 
 class GroundStation:
-    """Hears the truth of all vehicles on ``ports`` and commands them, between ``__enter__`` and ``__exit__``.
+    """Receives the true poses of all vehicles on ``ports`` and commands them, between ``__enter__`` and ``__exit__``.
 
     Times are on ``clock``. Vehicles are counted from 0, and vehicle i has the MAV_SYS_ID i + 1.
     """
@@ -119,26 +120,26 @@ class GroundStation:
         for vehicle in self._vehicles:
             vehicle.socket.close()
 
-    def heard(self, number: int) -> bool:
-        """It has said where it is, and in which mode."""
+    def is_connected(self, number: int) -> bool:
+        """Its pose and its mode have been received."""
         vehicle = self._vehicles[number]
         return vehicle.pose is not None and vehicle.mode is not None
 
-    def ask_for_news(self) -> None:
-        """Lets all tell their mode as it changes, their time, and their version."""
+    def request_messages(self) -> None:
+        """Requests mode, system time and version from all autopilots."""
         for vehicle in self._vehicles:
-            self._command(vehicle, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, _HEARD["CURRENT_MODE"], 1e6 / MODE_HZ)
-            self._command(vehicle, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, _HEARD["SYSTEM_TIME"], 1e6)
-            self._command(vehicle, mavlink.MAV_CMD_REQUEST_MESSAGE, _HEARD["AUTOPILOT_VERSION"])
+            self._command(vehicle, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, _RECEIVED["CURRENT_MODE"], 1e6 / MODE_HZ)
+            self._command(vehicle, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, _RECEIVED["SYSTEM_TIME"], 1e6)
+            self._command(vehicle, mavlink.MAV_CMD_REQUEST_MESSAGE, _RECEIVED["AUTOPILOT_VERSION"])
 
     def poses(self) -> Poses:
-        """Of all as of now, carried on from what was heard last."""
+        """Of all as of now, extrapolated from the last messages."""
         now = self._clock()
         with self._lock:
-            heard = [vehicle.pose for vehicle in self._vehicles]
-        assert all(pose is not None for pose in heard), "wait until all are heard"
-        carried = [_carried_on(pose, now) for pose in heard if pose is not None]
-        return Poses(*(np.array([getattr(pose, name) for pose in carried]) for name in Poses.__annotations__))
+            received = [vehicle.pose for vehicle in self._vehicles]
+        assert all(pose is not None for pose in received), "wait until all are connected"
+        extrapolated = [_extrapolated(pose, now) for pose in received if pose is not None]
+        return Poses(*(np.array([getattr(pose, name) for pose in extrapolated]) for name in Poses.__annotations__))
 
     def mode_is(self, number: int, mode: Mode) -> bool:
         """It flies in this mode."""
@@ -149,8 +150,8 @@ class GroundStation:
         """Its motors run."""
         return self._vehicles[number].armed
 
-    def last_words(self, number: int) -> str:
-        """What it told people last; empty if it never did."""
+    def last_text(self, number: int) -> str:
+        """Its last STATUSTEXT; empty if there was none."""
         return self._vehicles[number].text
 
     def version(self, number: int) -> str | None:
@@ -162,11 +163,11 @@ class GroundStation:
         return self._vehicles[number].booted_s
 
     def arm(self, number: int) -> None:
-        """Asks for the motors; `is_armed` tells."""
+        """Sends the request to arm; see `is_armed`."""
         self._command(self._vehicles[number], mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
 
     def select(self, number: int, mode: Mode) -> None:
-        """Asks for a mode; `mode_is` tells."""
+        """Sends the request for a mode; see `mode_is`."""
         _, main, sub = mavutil.px4_map[mode]
         self._command(self._vehicles[number], mavlink.MAV_CMD_DO_SET_MODE, 1, main, sub)
 
@@ -179,7 +180,7 @@ class GroundStation:
         by_socket = {vehicle.socket: vehicle for vehicle in self._vehicles}
         due_s = time.monotonic()
         while not self._closing.is_set():
-            for ready in select.select(list(by_socket), [], [], LOOK_S)[0]:
+            for ready in select.select(list(by_socket), [], [], POLL_S)[0]:
                 self._receive(by_socket[ready])
             if time.monotonic() >= due_s:
                 due_s = time.monotonic() + HEARTBEAT_S
@@ -197,7 +198,7 @@ class GroundStation:
             for packet in _packets(data):
                 for message in vehicle.mav.parse_buffer(packet) or ():
                     if message.get_srcSystem() == vehicle.number + 1:
-                        _note(vehicle, message, now)
+                        _update(vehicle, message, now)
 
 
 def home_deg(position: FloatArray) -> tuple[float, float]:
@@ -206,7 +207,7 @@ def home_deg(position: FloatArray) -> tuple[float, float]:
     return REFERENCE_DEG[0] + float(position[0]) / north_m, REFERENCE_DEG[1] + float(position[1]) / east_m
 
 
-def _note(vehicle: _Vehicle, message: Any, now: float) -> None:
+def _update(vehicle: _Vehicle, message: Any, now: float) -> None:
     match message.get_type():
         case "HIL_STATE_QUATERNION":
             vehicle.pose = _pose(message, now)
@@ -238,7 +239,7 @@ def _pose(message: Any, now: float) -> _Pose:
     )
 
 
-def _carried_on(pose: _Pose, now: float) -> _Pose:
+def _extrapolated(pose: _Pose, now: float) -> _Pose:
     """Where it is now if neither velocity nor turn has changed."""
     elapsed_s = min(max(now - pose.time_s, 0.0), MAX_FORWARD_S)
     return _Pose(
@@ -259,11 +260,11 @@ def _rotation(quaternion: Sequence[float]) -> FloatArray:
 
 
 def _packets(data: bytes) -> Iterator[bytes]:
-    """The MAVLink 2 packets of a datagram that say what is listened to; the others cost too much to decode."""
+    """The MAVLink 2 packets of a datagram with messages that are used; the others cost too much to decode."""
     begin = 0
     while begin + 12 <= len(data) and data[begin] == mavlink.PROTOCOL_MARKER_V2:
         end = begin + 12 + data[begin + 1] + (13 if data[begin + 2] & 1 else 0)
-        if int.from_bytes(data[begin + 7 : begin + 10], "little") in _HEARD.values():
+        if int.from_bytes(data[begin + 7 : begin + 10], "little") in _RECEIVED.values():
             yield data[begin:end]
         begin = end
 

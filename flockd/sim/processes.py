@@ -14,9 +14,9 @@ from types import TracebackType
 from typing import IO, Self
 
 END_S = 30.0
-"""To end when told to, before it is killed."""
+"""To end after SIGTERM, before it is killed."""
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_LAST_WORDS_BYTES = 4000
+_LAST_LINE_BYTES = 4000
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +33,10 @@ class Program:
         """Its exit code; None while it runs."""
         return self.process.poll()
 
-    def last_words(self) -> str:
+    def last_output(self) -> str:
         """The last line of its log."""
         with self.log.open("rb") as file:
-            file.seek(max(0, self.log.stat().st_size - _LAST_WORDS_BYTES))
+            file.seek(max(0, self.log.stat().st_size - _LAST_LINE_BYTES))
             lines = file.read().decode(errors="replace").split("\n")
         return next((line.strip() for line in reversed(lines) if line.strip()), "nothing")
 

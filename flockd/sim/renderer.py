@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 from flockd.messages import BoolArray, Float32Array, FloatArray, IntArray, UInt8Array
 from flockd.sim import _raster, textures
+from flockd.sim.airframe import DroneModel, machine_texels
 from flockd.sim.distractors import Distractor, Placed
-from flockd.sim.drone_models import DroneModel, machine_texels
 from flockd.sim.mesh import face_normals
 from flockd.sim.sky import SKY_BITS
 from flockd.sim.world import GROUND_MAP_BITS, World
 
 Indices = NDArray[np.int32]
 _DISTRACTOR = 255
-"""Id while an image is drawn; afterwards distractors are nobody."""
+"""Id of distractors while an image is drawn; afterwards they count as background."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +207,7 @@ def _fill(rows: Indices, planes: FloatArray, width: int, height: int) -> tuple[I
 
 @contextmanager
 def _threads_worth(samples: int) -> Iterator[None]:
-    """One thread for a small picture: waiting for a second one would cost more than it brings."""
+    """One thread for a small image: waiting for a second one would cost more than it saves."""
     threads = numba.get_num_threads()
     numba.set_num_threads(threads if samples > 100_000 else 1)
     try:

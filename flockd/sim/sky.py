@@ -1,4 +1,4 @@
-"""Sun, skylight, haze, the sky's picture, and the camera's tone curve."""
+"""Sun, skylight, haze, the sky's image, and the camera's tone curve."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The swarm loop: render what each drone sees, let its pilot decide, let the vehicles fly; in lockstep."""
+"""The swarm loop in lockstep: render each drone's frames, step its pilot, step the vehicles."""
 
 from __future__ import annotations
 
@@ -13,31 +13,32 @@ import numpy as np
 from flockd.choices import ROLES, SimulatedPerception
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import UsageError
+from flockd.flight_log.builder import FlightLogBuilder
+from flockd.flight_log.capture import capture, key_frame_steps
+from flockd.flight_log.key_frames import KeyFrame
+from flockd.flight_log.log import FlightLog
+from flockd.flight_log.metadata import FlightMetadata
 from flockd.flocking import FlockingLaw, course, desired_velocity
 from flockd.messages import FloatArray, PilotOutput
 from flockd.perception import load_networks
 from flockd.pilot import FlockPilot, StepTrace
 from flockd.recording import Recorder
 from flockd.recording.truth import TrueDrone, Truth
-from flockd.report.filmstrip import FilmstripFrame
-from flockd.sim.log import FlightLog
-from flockd.sim.log_book import LogBook
-from flockd.sim.photographer import Photographer
-from flockd.sim.pictures import picture, pictured_steps
-from flockd.sim.truth import fly_truth, step_times
+from flockd.sim.camera_simulator import CameraSimulator
+from flockd.sim.exact_states import fly_exact_states, step_times
 from flockd.sim.truth_perception import TruthPerception
 from flockd.sim.vehicles import SimulatedAutopilot, Vehicles
 from flockd.telemetry import TelemetrySink, publish_step
 
-_FILMSTRIP_DRONE = 0
+_KEY_FRAME_DRONE = 0
 
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """A finished flight: its log, and a few moments of one drone as pictures."""
+    """A finished flight: its log, and key frames of one drone."""
 
     log: FlightLog
-    filmstrip: tuple[FilmstripFrame, ...]
+    key_frames: tuple[KeyFrame, ...]
 
 
 def fly(
@@ -54,59 +55,58 @@ def fly(
     Args:
         scenario: what to fly.
         perception: `learned` flies from rendered images; `truth` from exact relative states.
-        swap: roles of perception that are answered by the truth instead of a network.
+        swap: roles of perception that take the truth instead of a network's estimate.
         telemetry: where every drone's output is published; nothing comes back from there.
         recorders: one a drone, or none; nothing comes back from there either.
-        progress: told (steps done, steps in all).
+        progress: called with (steps done, steps in all).
     """
     unknown = swap - set(ROLES)
     if unknown:
         raise UsageError(f"there is no role {sorted(unknown)[0]!r} to swap for truth; choose from {', '.join(ROLES)}")
     begin = time.perf_counter()
     times = step_times(scenario)
-    book = LogBook(times, len(scenario.vehicles))
-    companion = fly_truth(scenario)[1:]
-    crew = (
-        _ExactCrew(scenario) if perception == "truth" else _SeeingCrew(scenario, swap, telemetry, recorders, companion)
+    builder = FlightLogBuilder(times, len(scenario.vehicles))
+    companion = fly_exact_states(scenario)[1:]
+    pilots = (
+        _ExactStatePilots(scenario)
+        if perception == "truth"
+        else _VisionPilots(scenario, swap, telemetry, recorders, companion)
     )
     yaw = course(scenario.drone.desired, 0.0)
     vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=yaw, seed=scenario.seed)
-    pictured = pictured_steps(len(times))
-    filmstrip = []
+    chosen = key_frame_steps(len(times))
+    key_frames: list[KeyFrame] = []
     for step, time_s in enumerate(times):
-        book.truth(step, vehicles.position, vehicles.velocity, vehicles.R_ned_body)
-        book.desired(step, desired_velocity(scenario.drone.desired, float(time_s)))
-        velocity, yaws = crew.decide(step, float(time_s), vehicles, book)
-        if step in pictured:
-            filmstrip += crew.picture()
+        builder.add_truth(step, vehicles.position, vehicles.velocity, vehicles.R_ned_body)
+        builder.add_desired(step, desired_velocity(scenario.drone.desired, float(time_s)))
+        velocity, yaws = pilots.step(step, float(time_s), vehicles, builder)
+        if step in chosen:
+            key_frames += pilots.key_frames()
         vehicles.step(velocity, yaws, scenario.drone.step_s)
         progress(step + 1, len(times))
-    meta = {
-        "scenario": scenario.scenario,
-        "drones": len(scenario.vehicles),
-        "duration_s": scenario.duration_s,
-        "step_s": scenario.drone.step_s,
-        "seed": scenario.seed,
-        "circle_until_s": scenario.drone.desired.circle_until_s,
-        "desired_distance_m": scenario.drone.flocking.desired_distance_m,
-        "observation_distance_m": scenario.drone.flocking.observation_distance_m,
-        "separation_distance_m": scenario.drone.flocking.separation_distance_m,
-        "perception": perception if not swap else f"learned, true {', '.join(sorted(swap))}",
-        "flow": "none" if perception == "truth" else "truth" if "flow" in swap else scenario.drone.perception.flow,
-        "scale": scenario.drone.perception.scale,
-        "wall_s": time.perf_counter() - begin,
-    }
-    return Flight(book.log(meta, companion), tuple(filmstrip))
+    metadata = FlightMetadata.of_configuration(
+        scenario.drone,
+        scenario=scenario.scenario,
+        drones=len(scenario.vehicles),
+        duration_s=scenario.duration_s,
+        seed=scenario.seed,
+        perception=perception if not swap else f"learned, true {', '.join(sorted(swap))}",
+        flow="none" if perception == "truth" else "truth" if "flow" in swap else scenario.drone.perception.flow,
+        wall_s=time.perf_counter() - begin,
+    )
+    return Flight(builder.build(metadata, companion), tuple(key_frames))
 
 
-class _ExactCrew:
-    """Pilots that know everybody's exact state."""
+class _ExactStatePilots:
+    """The flocking law on the exact states of all drones."""
 
     def __init__(self, scenario: ScenarioConfig) -> None:
         self._config = scenario.drone
         self._law = FlockingLaw(scenario.drone.flocking)
 
-    def decide(self, step: int, time_s: float, vehicles: Vehicles, book: LogBook) -> tuple[FloatArray, FloatArray]:
+    def step(
+        self, step: int, time_s: float, vehicles: Vehicles, builder: FlightLogBuilder
+    ) -> tuple[FloatArray, FloatArray]:
         """Velocity setpoints (n, 2) and headings (n,)."""
         positions, velocities = vehicles.position, vehicles.velocity
         count = len(positions)
@@ -118,15 +118,15 @@ class _ExactCrew:
             commands[i], acceleration = self._law.command(
                 velocities[i, :2], relative[:, :2], velocities[others, :2], desired, self._config.step_s
             )
-            book.exact(step, i, others, relative, velocities, commands[i], acceleration)
+            builder.add_exact_states(step, i, others, relative, velocities, commands[i], acceleration)
         return commands, np.full(count, course(self._config.desired, time_s))
 
-    def picture(self) -> list[FilmstripFrame]:
-        """Nothing was seen."""
+    def key_frames(self) -> list[KeyFrame]:
+        """None, as there are no images."""
         return []
 
 
-class _SeeingCrew:
+class _VisionPilots:
     """One pilot a drone, each given only its own images and its own autopilot's readings."""
 
     def __init__(
@@ -139,35 +139,37 @@ class _SeeingCrew:
     ) -> None:
         self._companion = companion
         self._telemetry, self._recorders = telemetry, recorders
-        self._photographer = Photographer(scenario)
+        self._cameras = CameraSimulator(scenario)
         count = len(scenario.vehicles)
         learned = load_networks(scenario.drone.perception)
-        self._truths = [TruthPerception(learned, swap, self._photographer.rig) for _ in range(count)] if swap else []
+        self._truths = [TruthPerception(learned, swap, self._cameras.rig) for _ in range(count)] if swap else []
         self._pilots = [
             FlockPilot(scenario.drone, self._truths[i] if swap else learned, stopwatch=time.perf_counter)
             for i in range(count)
         ]
         self._autopilots = [SimulatedAutopilot(scenario.sensors, seed=scenario.seed, drone=i) for i in range(count)]
-        # Pilots share nothing but the networks, so their order does not matter: each thinks as soon as its images are
+        # Pilots share nothing but the networks, so their order does not matter: each steps as soon as its images are
         # rendered, all at a time, for five one after the other on two cores would leave one core idle for the last.
-        self._side_by_side = ThreadPoolExecutor(min(count, 2 * (os.cpu_count() or 1) + 1))
+        self._executor = ThreadPoolExecutor(min(count, 2 * (os.cpu_count() or 1) + 1))
         self._traces = [StepTrace() for _ in range(count)]
         self._outputs: list[PilotOutput] = []
 
-    def decide(self, step: int, time_s: float, vehicles: Vehicles, book: LogBook) -> tuple[FloatArray, FloatArray]:
+    def step(
+        self, step: int, time_s: float, vehicles: Vehicles, builder: FlightLogBuilder
+    ) -> tuple[FloatArray, FloatArray]:
         """Velocity setpoints (n, 2) and headings (n,)."""
         steps = []
         render_ms = []
         self._traces = [StepTrace() for _ in self._pilots]
         for i, pilot in enumerate(self._pilots):
             begin = time.perf_counter()
-            frames, shot = self._photographer.photograph(i, step, time_s, vehicles)
+            frames, render_truth = self._cameras.capture(i, step, time_s, vehicles)
             if self._truths:
-                self._truths[i].show(shot)
+                self._truths[i].show(render_truth)
             render_ms.append(1e3 * (time.perf_counter() - begin))
             state = self._autopilots[i].read(time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i])
-            steps.append((frames, state, self._side_by_side.submit(pilot.step, frames, state, self._traces[i])))
-        self._outputs = [thinking.result() for _, _, thinking in steps]
+            steps.append((frames, state, self._executor.submit(pilot.step, frames, state, self._traces[i])))
+        self._outputs = [future.result() for _, _, future in steps]
         truth = self._truth(step, time_s, vehicles)
         for i, (output, (frames, state, _)) in enumerate(zip(self._outputs, steps, strict=True)):
             if self._telemetry is not None:
@@ -175,12 +177,12 @@ class _SeeingCrew:
             if self._recorders:
                 self._recorders[i].drain()  # simulated time stands still, so nothing need ever be dropped
                 self._recorders[i].step(frames, state, output, truth)
-            book.seen(step, i, output, state.R_ned_body, {"render": render_ms[i], **output.stages_ms})
+            builder.add_output(step, i, output, state.R_ned_body, {"render": render_ms[i], **output.stages_ms})
         commands = [output.command for output in self._outputs]
         return np.array([c.velocity for c in commands]), np.array([c.yaw_rad for c in commands])
 
     def _truth(self, step: int, time_s: float, vehicles: Vehicles) -> Truth:
-        """For recordings only: no pilot is told."""
+        """For recordings only: no pilot gets it."""
         drones = (
             TrueDrone(
                 name=f"drone{i + 1}",
@@ -194,6 +196,6 @@ class _SeeingCrew:
         )
         return Truth(time_s, tuple(drones))
 
-    def picture(self) -> list[FilmstripFrame]:
+    def key_frames(self) -> list[KeyFrame]:
         """What the chosen drone's pilot worked with in the last step."""
-        return picture(self._traces[_FILMSTRIP_DRONE], self._outputs[_FILMSTRIP_DRONE], _FILMSTRIP_DRONE)
+        return capture(self._traces[_KEY_FRAME_DRONE], self._outputs[_KEY_FRAME_DRONE], _KEY_FRAME_DRONE)

@@ -19,8 +19,8 @@ _SIZE_M = 0.6
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
-    """What one drone's cameras truly saw, and where everything was."""
+class RenderTruth:
+    """The truth behind one rendered frame set of one drone: ids, depth and poses."""
 
     views: Mapping[str, View]
     R_ned_cameras: Mapping[str, FloatArray]
@@ -34,21 +34,21 @@ class Shot:
 
 
 class TruthPerception:
-    """Stands before the learned perception and answers the swapped roles itself. One for each drone.
+    """Takes the swapped roles from the renderer's truth and all others from the learned perception. One for each drone.
 
-    It is told with `show` what the cameras are about to see; the pilot knows nothing of it.
+    Call `show` with the truth behind the next frame set before the pilot's step.
     """
 
     def __init__(self, learned: Networks, swap: frozenset[str], rig: Rig) -> None:
         self.second_stage = learned.second_stage
         self.map_stride = learned.map_stride
         self._learned, self._swap, self._rig = learned, swap, rig
-        self._now: Shot | None = None
-        self._before: Shot | None = None
+        self._now: RenderTruth | None = None
+        self._before: RenderTruth | None = None
 
-    def show(self, shot: Shot) -> None:
-        """What the next step's frames truly hold."""
-        self._before, self._now = self._now, shot
+    def show(self, truth: RenderTruth) -> None:
+        """Sets the truth behind the next step's frames."""
+        self._before, self._now = self._now, truth
 
     def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
         """The true or the learned flow."""
@@ -86,7 +86,7 @@ class TruthPerception:
             return self._learned.ranges(crops)
         return tuple(self._range(crop, _known(self._now)) for crop in crops)
 
-    def _instances(self, camera: RigCamera, now: Shot) -> list[Instance]:
+    def _instances(self, camera: RigCamera, now: RenderTruth) -> list[Instance]:
         name = camera.name
         ids = now.views[name].ids
         found = []
@@ -102,7 +102,7 @@ class TruthPerception:
             found.append(Instance(drone + 1, centre, box, float(rows.size)))
         return sorted(found, key=lambda one: -one.area_px)
 
-    def _range(self, crop: Crop, now: Shot) -> RangeEstimate:
+    def _range(self, crop: Crop, now: RenderTruth) -> RangeEstimate:
         size = crop.camera.size[0]
         visible = [d for d in now.shown if any((view.ids == d + 1).sum() >= _MIN_PIXELS for view in now.views.values())]
         if not visible:
@@ -117,10 +117,10 @@ class TruthPerception:
         return RangeEstimate(log_range, 0.001, np.clip(centre, -size, 2 * size), _SIZE_M, float(inside))
 
 
-def _known(shot: Shot | None) -> Shot:
-    if shot is None:
-        raise RuntimeError("the truth was asked before it was shown")
-    return shot
+def _known(truth: RenderTruth | None) -> RenderTruth:
+    if truth is None:
+        raise RuntimeError("the truth of a frame set was needed before `show` was called with it")
+    return truth
 
 
 def _matrix(rig: Rig, camera: str) -> FloatArray:

@@ -22,7 +22,7 @@ _VELOCITY_ERROR_TIME_S = 10.0
 class Vehicles:
     """All vehicles of a flight.
 
-    Horizontal velocity answers a setpoint as a first-order lag of limited acceleration; altitude is held; the attitude
+    Horizontal velocity follows a setpoint as a first-order lag of limited acceleration; altitude is held; the attitude
     is the one whose thrust gives that acceleration. The arrays are replaced by `step`, never changed in place:
     `position` (n, 3) m and `velocity` (n, 3) m/s in NED, `R_ned_body` (n, 3, 3).
     """

@@ -1,1 +1,1 @@
-"""A recording to be looked at in Rerun: what was recorded, and what the networks make of it."""
+"""A recording for Rerun: what was recorded, and the maps that its networks give."""

@@ -1,7 +1,7 @@
-"""The one place that knows Rerun: writes what there is to see to a file, and opens its viewer on one.
+"""The one adapter to Rerun: writes a recording's scenes to a file, and opens its viewer on one.
 
 Neither does anything beyond this computer: the viewer listens on the loopback interface alone, its usage statistics are
-off, and what it would ask the web for (whether it is the newest) ends at a port where nobody answers.
+off, and what it would ask the web for (whether it is the newest) ends at a closed port.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class RerunFile:
     """Writes one `.rrd` file. Raises OSError where that cannot be."""
 
     def __init__(self, path: Path, drone: str, rig: Rig) -> None:
-        path.open("wb").close()  # Rerun's own writer would tell of a failure only in its log
+        path.open("wb").close()  # Rerun's own writer reports a failure only in its log
         self._rig = rig
         self._track: list[list[float]] = []
         self._recording = rr.RecordingStream("flockd", recording_id=f"flockd-{drone}")
@@ -83,7 +83,7 @@ class RerunFile:
             self._show_output(moment.output, moment)
 
     def say(self, time_s: float, text: str) -> None:
-        """Adds something that was told in words."""
+        """Adds a text event."""
         self._recording.reset_time()
         self._recording.set_time(_TIMELINE, duration=time_s)
         self._log("log", rr.TextLog(text, level="INFO"))
@@ -105,7 +105,7 @@ class RerunFile:
         self.close()
 
     def _mount(self, camera: RigCamera) -> None:
-        """Where a camera sits; a wide-angle one has no picture plane in 3D, and lens distortion is left as it is."""
+        """Where a camera sits; a wide-angle one has no image plane in 3D, and lens distortion is left as it is."""
         entity, T = f"{_BODY}/{camera.name}", camera.T_body_camera
         self._log(entity, rr.Transform3D(translation=T.translation, mat3x3=T.rotation), static=True)
         if isinstance(camera.camera, PinholeCamera):
@@ -124,10 +124,10 @@ class RerunFile:
         for name, labels in maps.labels.items():
             self._log(f"{_BODY}/{name}/labels", rr.SegmentationImage(labels, opacity=0.6, draw_order=1.0))
         for name, depth in maps.depth.items():
-            picture = rr.EncodedDepthImage(
+            depth_image = rr.EncodedDepthImage(
                 _depth_png(depth), media_type="image/png", meter=_DEPTH_UNITS_A_METRE, depth_range=(0.0, 2000.0)
             )
-            self._log(f"{_BODY}/{name}/depth", picture)
+            self._log(f"{_BODY}/{name}/depth", depth_image)
         for kind in ("still", "rejected"):
             lines = maps.pairs.get(kind, np.zeros((0, 2, 3)))
             colour = _STILL if kind == "still" else _REJECTED

@@ -1,4 +1,4 @@
-"""What there is to see of each step of a recording, as plain values in north, east and down."""
+"""Each step of a recording for viewers, as plain values in north, east and down."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MAX_PAIRS = 800
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Where the drone was on its own path: as it knew it."""
+    """The drone's pose on its own path, by dead reckoning."""
 
     position: FloatArray
     """(3,) m NED from where the path began."""
@@ -67,7 +67,7 @@ class Moment:
 
 
 class Scenes:
-    """A recording's moments in order, flown again for their maps or as they are."""
+    """A recording's moments in order, replayed for their maps or as they are."""
 
     def __init__(self, recording: Recording, *, fly_again: bool) -> None:
         """Raises ModelError where the networks that the recording flew with are not here."""
@@ -80,7 +80,7 @@ class Scenes:
         """Those of them that came out as recorded."""
 
     def moments(self, start_s: float, end_s: float) -> Iterator[Moment]:
-        """Those within this time of the recording's clock. Raises RecordingError where it is spoilt."""
+        """Those within this time of the recording's clock. Raises RecordingError where it is damaged."""
         path, last = OwnPath(), None
         for step in self._recording.steps(start_s, end_s):
             output = None if step.output is None else from_json(PilotOutput, step.output)
@@ -137,7 +137,7 @@ class Scenes:
 
 
 def texts(recording: Recording, start_s: float, end_s: float) -> Iterator[tuple[float, str]]:
-    """What was told in words, with the time of the recording's clock."""
+    """Events in words, with the time of the recording's clock."""
     for path in recording.contents.paths:
         for record in read_records(path):
             if isinstance(record, Entry) and record.stream.topic == TABLE["events"].topic:
@@ -153,7 +153,7 @@ def _segments(pairs: PointPairs, last: Place, here: Place) -> FloatArray:
 
 
 def _true_neighbours(step: RecordedStep, own: str, position: FloatArray) -> dict[str, FloatArray]:
-    """Moved so that the own drone is where it believes to be."""
+    """Moved so that the own drone is at its estimated position."""
     drones = () if step.truth is None else step.truth.drones
     true_own = next((drone.position for drone in drones if drone.name == own), None)
     if true_own is None:

@@ -16,11 +16,11 @@ import yaml
 from flockd.cli import main
 from flockd.config import Overrides, ScenarioConfig, load_scenario
 from flockd.data import data_path
+from flockd.flight_log.from_recordings import flight_log, recordings_in
+from flockd.flight_log.log import FlightLog
 from flockd.messages import FrameSet, PilotOutput, VehicleState
 from flockd.recording import Recorder
 from flockd.recording.reader import Recording
-from flockd.report.from_recording import flight_log, recordings_in
-from flockd.sim.log import FlightLog
 from flockd.sim.start import with_drones
 from tests.recording.made_up import MODELS, MadeUpPilot, drone_config, record
 
@@ -272,10 +272,10 @@ def test_the_recordings_make_the_flights_own_log(flight: Flight) -> None:
     """What the drones recorded is all that the report needs: to the last bit, with the truth and its companion."""
     again = flight_log([Recording(path) for path in recordings_in(flight.folder)])
     for part in fields(FlightLog):
-        if part.name not in ("stages_ms", "meta"):
+        if part.name not in ("stages_ms", "metadata"):
             assert getattr(again, part.name).tobytes() == getattr(flight.log, part.name).tobytes(), part.name
     facts = ("drones", "duration_s", "step_s", "perception", "flow", "scale", "circle_until_s", "desired_distance_m")
-    assert {name: again.meta[name] for name in facts} == {name: flight.log.meta[name] for name in facts}
+    assert again.metadata.model_dump(include=set(facts)) == flight.log.metadata.model_dump(include=set(facts))
 
 
 @pytest.mark.parametrize("flight", ["dis"], indirect=True)
@@ -289,5 +289,5 @@ def test_a_flight_over_a_full_disk_is_the_same_flight(flight: Flight, tmp_path: 
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert sorted(event.split(":")[0] for event in told) == [f"recording {tmp_path / drone}.mcap" for drone in DRONES]
     for part in fields(FlightLog):
-        if part.name not in ("stages_ms", "meta"):
+        if part.name not in ("stages_ms", "metadata"):
             assert getattr(again, part.name).tobytes() == getattr(flight.log, part.name).tobytes(), part.name

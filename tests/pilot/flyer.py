@@ -6,14 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from flockd.choices import ROLES
 from flockd.config import ScenarioConfig, load_scenario
 from flockd.data import data_path
 from flockd.geometry import RigCamera
 from flockd.messages import Float32Array, Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
 from flockd.perception import Crop, Perception, RangeEstimate, SceneMaps
 from flockd.pilot import FlockPilot
-from flockd.sim.photographer import Photographer
-from flockd.sim.truth_perception import ROLES, TruthPerception
+from flockd.sim.camera_simulator import CameraSimulator
+from flockd.sim.truth_perception import TruthPerception
 from flockd.sim.vehicles import Vehicles
 from tests.perception.shipped import SECOND_STAGE
 
@@ -50,8 +51,8 @@ class Flyer:
 
     def __init__(self, scenario: ScenarioConfig) -> None:
         self.scenario = scenario
-        self.photographer = Photographer(scenario)
-        self.truth = TruthPerception(NoNetworks(), frozenset(ROLES), self.photographer.rig)
+        self.cameras = CameraSimulator(scenario)
+        self.truth = TruthPerception(NoNetworks(), frozenset(ROLES), self.cameras.rig)
         self.pilot = FlockPilot(scenario.drone, self.truth)
         self.vehicles = Vehicles(scenario.vehicles, scenario.vehicle)
         self.time_s = 100.0
@@ -60,11 +61,11 @@ class Flyer:
     def perception(self) -> Perception:
         """A fresh one."""
         config = self.scenario.drone.perception.model_copy(update={"scale": "network"})
-        return Perception(self.photographer.rig, self.truth, config)
+        return Perception(self.cameras.rig, self.truth, config)
 
     def take_frames(self) -> tuple[FrameSet, VehicleState]:
-        frames, shot = self.photographer.photograph(0, self.steps, self.time_s, self.vehicles)
-        self.truth.show(shot)
+        frames, truth = self.cameras.capture(0, self.steps, self.time_s, self.vehicles)
+        self.truth.show(truth)
         v = self.vehicles
         return frames, VehicleState(self.time_s, v.R_ned_body[0], -float(v.position[0, 2]), v.velocity[0])
 

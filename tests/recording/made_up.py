@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import is_dataclass, replace
 from pathlib import Path
 from types import UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -66,15 +66,17 @@ class MadeUpPilot:
         )
 
 
-def filled(kind: Any, number: float, name: str = "") -> Any:
+def filled(kind: Any, number: float) -> Any:
     """A message of this type with something in every field, whatever fields it has."""
     origin, parts = get_origin(kind), get_args(kind)
     if is_dataclass(kind) and isinstance(kind, type):
-        return kind(**{field: filled(hint, number, field) for field, hint in get_type_hints(kind).items()})
-    if origin is np.ndarray:
-        return np.full((3, 3) if name == "rotation" else 3, number)
+        return kind(
+            **{field: filled(hint, number) for field, hint in get_type_hints(kind, include_extras=True).items()}
+        )
+    if origin is Annotated:
+        return np.full(parts[1].sizes, number)
     if origin in (Union, UnionType, tuple):
-        inner = filled(parts[0], number, name)
+        inner = filled(parts[0], number)
         return (inner,) if origin is tuple else inner
     if origin is not None:
         return {filled(parts[0], number): filled(parts[1], number)}

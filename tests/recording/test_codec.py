@@ -13,6 +13,8 @@ import pytest
 
 from flockd.messages import PilotOutput, VehicleState
 from flockd.recording.codec import from_json, json_schema, to_json
+from flockd.recording.streams import StepFrames
+from flockd.recording.truth import Truth
 from tests.recording.made_up import MadeUpPilot, drone_config, inputs
 
 
@@ -76,3 +78,29 @@ def test_the_schema_names_every_field_with_its_type() -> None:
         "items": {"type": "string"},
     }
     assert "ego_motion" not in schema["required"]
+
+
+def test_an_array_of_another_shape_is_refused() -> None:
+    """Nine numbers are a matrix only where a matrix belongs, and nothing else is."""
+    good = to_json(next(inputs(1))[1])
+    for name, numbers, sentence in (
+        ("R_ned_body", [1.0] * 8, "R_ned_body of VehicleState: 8 numbers, where an array of 3 x 3 has 9"),
+        ("velocity_ned", [1.0] * 9, "velocity_ned of VehicleState: 9 numbers, where an array of 3 has 3"),
+        ("velocity_ned", [], "velocity_ned of VehicleState: 0 numbers, where an array of 3 has 3"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            from_json(VehicleState, {**good, name: numbers})
+    assert from_json(VehicleState, good).R_ned_body.shape == (3, 3)
+
+
+def test_the_schema_says_the_shape_of_arrays() -> None:
+    properties = json_schema(VehicleState)["properties"]
+    assert properties["velocity_ned"] == {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
+    assert (properties["R_ned_body"]["minItems"], properties["R_ned_body"]["maxItems"]) == (9, 9)
+    assert properties["R_ned_body"]["description"] == "3 x 3 matrix, row by row"
+
+
+@pytest.mark.parametrize("kind", [VehicleState, PilotOutput, Truth, StepFrames])
+def test_every_recorded_array_declares_its_shape(kind: type) -> None:
+    """Else this raises TypeError."""
+    assert json_schema(kind)["type"] == "object"

@@ -52,7 +52,7 @@ def test_what_is_no_recording_is_refused_in_one_sentence(tmp_path: Path, whole: 
         channel = writer.register_channel("/speed", "json", writer.register_schema("x", "jsonschema", b"{}"))
         writer.add_message(channel, 1, b"{}", 1)
         writer.finish()  # type: ignore[no-untyped-call]
-    assert refusal(path) == "is an MCAP file, but no recording of flockd; name one that flockd wrote"
+    assert refusal(path) == "is an MCAP file, but not a recording of flockd; name one that flockd wrote"
     content = whole.read_bytes()
     path.write_bytes(content.replace(b"\x01\x00\x00\x001", b"\x01\x00\x00\x002", 1))
     assert refusal(path) == "is of format '2', and this flockd reads '1'; use the flockd that wrote it"

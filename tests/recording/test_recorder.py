@@ -147,7 +147,7 @@ def test_a_frame_that_is_no_picture_is_left_out_and_told(tmp_path: Path) -> None
         recorder.step(frames, vehicle, output)
     (step,) = Recording(tmp_path / "drone1.mcap").steps()
     assert set(step.frames.frames) == {"front"}
-    assert told == ["recording: an image of camera left is no picture and is left out"]
+    assert told == ["recording: an image of camera left has no pixels or not three channels and is left out"]
     assert len(messages(tmp_path / "drone1.mcap", "/events")) == 1
 
 

@@ -14,11 +14,14 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
-from flockd.report.figures import error_curves, flight_curves, gabriel_edges, trajectories
-from flockd.report.filmstrip import FilmstripFrame, filmstrip_figure, load_filmstrip, save_filmstrip
+from flockd.flight_log.key_frames import KeyFrame, load_key_frames, save_key_frames
+from flockd.flight_log.log import FlightLog
+from flockd.flight_log.metadata import FlightMetadata
+from flockd.report.curves import error_curves, flight_curves
+from flockd.report.filmstrip import filmstrip_figure
 from flockd.report.page import write_report
 from flockd.report.summary import summarise, write_summary
-from flockd.sim.log import FlightLog
+from flockd.report.trajectories import gabriel_edges, trajectories
 
 Array = NDArray[np.float64]
 RADIUS_M = 2.1
@@ -71,25 +74,25 @@ def _flight(*, drones: int = 5, duration_s: float = 110.0, perception: str = "le
         truth_position=position,
         truth_velocity=velocity,
         stages_ms={} if perception == "truth" else {"flow": np.array([40.0, 60.0]), "ego_motion": np.array([5.0])},
-        meta={
-            "scenario": "polygon",
-            "perception": perception,
-            "flow": "flow",
-            "scale": "height",
-            "drones": drones,
-            "duration_s": duration_s,
-            "step_s": STEP_S,
-            "seed": 7,
-            "wall_s": duration_s * 4,
-            "circle_until_s": 66.0,
-            "desired_distance_m": 3.5,
-            "observation_distance_m": 20.0,
-            "separation_distance_m": 1.5,
-        },
+        metadata=FlightMetadata(
+            scenario="polygon",
+            perception=perception,
+            flow="flow",
+            scale="height",
+            drones=drones,
+            duration_s=duration_s,
+            step_s=STEP_S,
+            seed=7,
+            wall_s=duration_s * 4,
+            circle_until_s=66.0,
+            desired_distance_m=3.5,
+            observation_distance_m=20.0,
+            separation_distance_m=1.5,
+        ),
     )
 
 
-def _moment(*, time_s: float = 3.0) -> FilmstripFrame:
+def _moment(*, time_s: float = 3.0) -> KeyFrame:
     """Two cameras; the same drone, label 2 and track 4, sits on the border between them."""
     rng = np.random.default_rng(0)
     cameras = ("back", "left")
@@ -100,7 +103,7 @@ def _moment(*, time_s: float = 3.0) -> FilmstripFrame:
     labels[50:60, 0:12] = 2
     flow = rng.uniform(-8, 8, (96, 64, 2)).astype(np.float32)
     flow[:10] = np.nan
-    return FilmstripFrame(
+    return KeyFrame(
         time_s=time_s,
         drone=0,
         cameras=cameras,
@@ -113,11 +116,11 @@ def _moment(*, time_s: float = 3.0) -> FilmstripFrame:
     )
 
 
-def _report(folder: Path, log: FlightLog, *moments: FilmstripFrame) -> str:
+def _report(folder: Path, log: FlightLog, *moments: KeyFrame) -> str:
     log.save(folder / "flight.npz")
     write_summary(summarise(log), folder / "summary.json")
     if moments:
-        save_filmstrip(folder / "filmstrip.npz", moments)
+        save_key_frames(folder / "filmstrip.npz", moments)
     page = write_report(folder)
     assert page == folder / "report.html"
     return page.read_text(encoding="utf-8")
@@ -255,7 +258,7 @@ def test_a_flight_with_exact_states_says_what_it_lacks(tmp_path: Path) -> None:
     page = _Page(_report(tmp_path, _flight(perception="truth")))
     assert "Five drones flew 110 s with exact states and stayed one flock" in page.text
     assert "there is no estimate to compare with the truth" in page.text
-    assert "No camera pictures were kept of this flight." in page.text
+    assert "No camera images were kept of this flight." in page.text
     assert "No stage of this flight was timed." in page.text
     assert "it stands alone" in page.text
     assert not [row for row in page.rows if row and row[0][0] in ("maximum", "By sight")]
@@ -306,8 +309,8 @@ def test_a_folder_without_a_flight_is_refused_in_one_sentence(tmp_path: Path) ->
 
 def test_a_name_cannot_break_the_page(tmp_path: Path) -> None:
     log = _flight(drones=1, duration_s=5.0)
-    meta = {**log.meta, "scenario": "<script>alert(1)</script>"}
-    page = _Page(_report(tmp_path, FlightLog(**{**vars(log), "meta": meta})))
+    metadata = log.metadata.model_copy(update={"scenario": "<script>alert(1)</script>"})
+    page = _Page(_report(tmp_path, FlightLog(**{**vars(log), "metadata": metadata})))
     assert "script" not in page.tags
 
 
@@ -377,10 +380,22 @@ def test_formation_edges_have_nobody_between() -> None:
 # ------------------------------------------------------------------------------------------------------ the filmstrip
 
 
+def test_a_key_frame_without_cameras_is_left_out(tmp_path: Path) -> None:
+    """As flights kept them in which a drone touched the ground: the report has all the others."""
+    grounded = KeyFrame(
+        time_s=2.0, drone=0, cameras=(), images={}, depth={}, labels={}, flow={}, track_ids={}, ranges={}
+    )
+    page = _report(tmp_path, _flight(duration_s=20.0), grounded, _moment())
+    assert len(load_key_frames(tmp_path / "filmstrip.npz")) == 2
+    assert "drone 1 at 3.0 s" in page
+    assert "at 2.0 s" not in page
+    assert sorted(path.name for path in (tmp_path / "figures").glob("filmstrip*")) == ["filmstrip_1.png"]
+
+
 def test_a_filmstrip_survives_its_file(tmp_path: Path) -> None:
     moment = _moment()
-    save_filmstrip(tmp_path / "filmstrip.npz", [moment, _moment(time_s=9.5)])
-    loaded, later = load_filmstrip(tmp_path / "filmstrip.npz")
+    save_key_frames(tmp_path / "filmstrip.npz", [moment, _moment(time_s=9.5)])
+    loaded, later = load_key_frames(tmp_path / "filmstrip.npz")
     assert (loaded.time_s, later.time_s, loaded.drone, loaded.cameras) == (3.0, 9.5, 0, ("back", "left"))
     assert loaded.track_ids == {2: 4}
     assert loaded.ranges == {2: 3.214}
@@ -406,14 +421,14 @@ def test_a_moment_shows_its_cameras_in_rig_order_with_named_drones() -> None:
 
 def test_a_camera_may_lack_a_map() -> None:
     moment = _moment()
-    bare = FilmstripFrame(**{**vars(moment), "flow": {}, "depth": {"left": moment.depth["left"]}, "labels": {}})
+    bare = KeyFrame(**{**vars(moment), "flow": {}, "depth": {"left": moment.depth["left"]}, "labels": {}})
     assert filmstrip_figure(bare).axes
 
 
 def test_maps_of_another_size_are_refused() -> None:
     moment = _moment()
     with pytest.raises(ValueError, match=r"camera 'left': the depth is \(48, 32\), the image \(96, 64\)"):
-        FilmstripFrame(**{**vars(moment), "depth": {"left": moment.depth["left"][::2, ::2]}})
+        KeyFrame(**{**vars(moment), "depth": {"left": moment.depth["left"][::2, ::2]}})
 
 
 def test_names_of_close_drones_do_not_cover_each_other() -> None:
@@ -421,7 +436,7 @@ def test_names_of_close_drones_do_not_cover_each_other() -> None:
     labels = np.zeros((96, 64), np.uint8)
     labels[50:56, 20:28], labels[50:56, 32:40] = 1, 2
     figure = filmstrip_figure(
-        FilmstripFrame(**{**vars(moment), "labels": {"left": labels}, "ranges": {1: 3.0, 2: 3.1}, "track_ids": {2: 4}})
+        KeyFrame(**{**vars(moment), "labels": {"left": labels}, "ranges": {1: 3.0, 2: 3.1}, "track_ids": {2: 4}})
     )
     figure.canvas.draw()
     names = [text for axes in figure.axes for text in axes.texts if text.get_text().endswith(" m")]

@@ -13,6 +13,8 @@ import pytest
 
 from flockd.cli import main
 from flockd.config import DroneConfig
+from flockd.flight_log.from_recordings import flight_log, key_frames, recordings_in
+from flockd.flight_log.log import FlightLog
 from flockd.geometry import log_polar, log_polar_covariance
 from flockd.messages import (
     Detection,
@@ -30,9 +32,7 @@ from flockd.recording import Recorder, RecordingError
 from flockd.recording.editing import cut
 from flockd.recording.reader import Recording
 from flockd.recording.truth import TrueDrone, Truth
-from flockd.report.from_recording import filmstrip, flight_log, recordings_in
 from flockd.report.summary import summarise
-from flockd.sim.log import FlightLog
 from tests.recording.made_up import HEIGHT, MODELS, WIDTH, MadeUpPilot, drone_config
 
 NAMES = ("drone1", "drone2")
@@ -232,7 +232,7 @@ def test_a_replays_recording_keeps_the_truth(flight: Path, tmp_path: Path, monke
     flown, replayed = log_of(flight / "drone1.mcap"), log_of(again)
     assert replayed.position.tobytes() == flown.position.tobytes()
     assert replayed.truth_position.tobytes() == flown.truth_position.tobytes()
-    assert [replayed.meta[name] for name in ("scenario", "seed")] == ["side_by_side", 3]
+    assert (replayed.metadata.scenario, replayed.metadata.seed) == ("side_by_side", 3)
     assert replayed.command_velocity.tobytes() != flown.command_velocity.tobytes()  # another pilot's
 
 
@@ -253,16 +253,22 @@ def test_without_truth_nothing_is_made_up(alone: Path, capsys: Capture) -> None:
     for sentence in (
         "One drone flew 6 s by sight",
         "kestrel, begun 20",
-        "The recording holds no truth, so all of this is the drone’s own account.",
+        "The recording holds no truth, so all of this is the drone’s own estimate.",
         "The recording holds no truth, so the true path is not known.",
         "The recording holds no truth, so nothing can be said of the paper&#8217;s deviations",
         "The recording holds no truth to compare the estimates with.",
         "The recording holds no truth of the flock.",
-        "The recording holds no truth of who was there to be seen.",
+        "The recording holds no truth of the neighbours.",
         "scene",
     ):
         assert sentence in text, sentence
-    for claim in ("One drone is no flock", "nobody to be seen", "Nothing was estimated", "stayed one flock", "nan"):
+    for claim in (
+        "One drone is no flock",
+        "There were no neighbours",
+        "Nothing was estimated",
+        "stayed one flock",
+        "nan",
+    ):
         assert claim not in text.partition("<svg")[0], claim
     assert {path.name for path in (folder / "figures").iterdir()} == {"account.png"}
 
@@ -302,14 +308,14 @@ class Looking:
 
 
 def test_pictures_are_of_the_recorded_images(alone: Path, flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flockd.report.from_recording.FlockPilot", Looking)
-    frames = filmstrip(Recording(alone), log_of(alone))
+    monkeypatch.setattr("flockd.flight_log.from_recordings.FlockPilot", Looking)
+    frames = key_frames(Recording(alone), log_of(alone))
     steps = [1, 3, 5, 7, 9, 11]
     assert [frame.time_s for frame in frames] == pytest.approx([STEP_S * step for step in steps])
     assert {frame.title for frame in frames} == {"kestrel"}
     assert [int(frame.images["left"][0, 0, 0]) for frame in frames] == [10 * step for step in steps]
     second = flight / "drone2.mcap"
-    assert {frame.title for frame in filmstrip(Recording(second), log_of(second))} == {"drone 2"}
+    assert {frame.title for frame in key_frames(Recording(second), log_of(second))} == {"drone 2"}
 
 
 # ----------------------------------------------------------------------------------------------------------- refusals

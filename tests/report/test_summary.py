@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flockd.report.paper import TABLE_2, TABLE_3
+from flockd.flight_log.log import FlightLog
+from flockd.flight_log.metadata import FlightMetadata
+from flockd.flight_log.truth_matching import match_neighbours
+from flockd.report.paper_results import TABLE_2, TABLE_3
 from flockd.report.summary import summarise, write_summary
-from flockd.sim.log import FlightLog, match_neighbours
 
 Array = NDArray[np.float64]
 STEPS, DRONES = 30, 2
@@ -87,26 +89,29 @@ def _hand_made() -> FlightLog:
         truth_position=truth_position,
         truth_velocity=truth_velocity,
         stages_ms={"flow": np.arange(1.0, 102.0), "never run": np.empty(0)},
-        meta={
-            "scenario": "side_by_side",
-            "perception": "learned",
-            "flow": "dis",
-            "scale": "height",
-            "drones": DRONES,
-            "duration_s": 15.0,
-            "step_s": 0.5,
-            "seed": 3,
-            "wall_s": 60.0,
-            "circle_until_s": 2.0,
-            "desired_distance_m": 3.5,
-            "observation_distance_m": 20.0,
-        },
+        metadata=FlightMetadata(
+            scenario="side_by_side",
+            perception="learned",
+            flow="dis",
+            scale="height",
+            drones=DRONES,
+            duration_s=15.0,
+            step_s=0.5,
+            seed=3,
+            wall_s=60.0,
+            circle_until_s=2.0,
+            desired_distance_m=3.5,
+            observation_distance_m=20.0,
+            separation_distance_m=1.5,
+        ),
     )
 
 
 def _first(log: FlightLog, steps: int) -> FlightLog:
-    cut = {name: getattr(log, name)[:steps] for name in log.__dataclass_fields__ if name not in ("stages_ms", "meta")}
-    return replace(log, **cut, meta={**log.meta, "duration_s": 0.5 * steps})
+    cut = {
+        name: getattr(log, name)[:steps] for name in log.__dataclass_fields__ if name not in ("stages_ms", "metadata")
+    }
+    return replace(log, **cut, metadata=log.metadata.model_copy(update={"duration_s": 0.5 * steps}))
 
 
 def test_the_flights_own_facts_are_carried_over() -> None:
@@ -193,7 +198,7 @@ def test_drones_beyond_ten_metres_do_not_count_for_recall() -> None:
 
 def test_a_flight_with_exact_states_has_no_estimates_and_is_the_truth() -> None:
     log = _hand_made()
-    summary = summarise(replace(log, meta={**log.meta, "perception": "truth"}))
+    summary = summarise(replace(log, metadata=log.metadata.model_copy(update={"perception": "truth"})))
     nothing = dict.fromkeys(("mean", "median", "p95", "max"))
     assert all(column == nothing for window in summary["table2"].values() for column in window.values())
     assert summary["neighbours"] == {"recall_within_10m": None, "false_per_drone_minute": None}
@@ -228,9 +233,9 @@ def test_a_single_drone_has_no_distances() -> None:
         value = getattr(log, name)
         if name in ("neighbour_position", "neighbour_velocity", "detection_position"):
             alone[name] = value[:, :1, :1]
-        elif name not in ("time_s", "desired", "stages_ms", "meta"):
+        elif name not in ("time_s", "desired", "stages_ms", "metadata"):
             alone[name] = value[:, :1]
-    summary = summarise(replace(log, **alone, meta={**log.meta, "drones": 1}))
+    summary = summarise(replace(log, **alone, metadata=log.metadata.model_copy(update={"drones": 1})))
     assert summary["flock"]["min_distance_m"] is None
     assert summary["flock"]["safety"] == 1.0
     assert summary["neighbours"]["recall_within_10m"] is None
@@ -251,11 +256,11 @@ def test_a_log_survives_its_file(tmp_path: Path) -> None:
     path = tmp_path / "flight.npz"
     log.save(path)
     loaded = FlightLog.load(path)
-    assert loaded.meta == log.meta
+    assert loaded.metadata == log.metadata
     assert loaded.stages_ms.keys() == log.stages_ms.keys()
     np.testing.assert_array_equal(loaded.stages_ms["flow"], log.stages_ms["flow"])
     for name in log.__dataclass_fields__:
-        if name not in ("stages_ms", "meta"):
+        if name not in ("stages_ms", "metadata"):
             np.testing.assert_array_equal(getattr(loaded, name), getattr(log, name))
     assert summarise(loaded) == summarise(log)
 
@@ -268,7 +273,7 @@ def test_a_log_refuses_what_does_not_fit(tmp_path: Path) -> None:
         replace(log, truth_position=log.truth_position[:-1])
     path = tmp_path / "other.npz"
     np.savez(path, time_s=TIME_S)
-    with pytest.raises(ValueError, match="no flight log"):
+    with pytest.raises(ValueError, match="not a flight log"):
         FlightLog.load(path)
 
 

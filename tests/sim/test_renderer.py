@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from flockd.messages import FloatArray
+from flockd.sim.airframe import DroneModel
 from flockd.sim.distractors import Placed, bag, balloon, bird, kite, mast
-from flockd.sim.drone_models import FAMILIES, DroneModel, drone_model
+from flockd.sim.drone_models import FAMILIES, drone_model
 from flockd.sim.renderer import Renderer, View, true_flow
 from flockd.sim.world import GROUND, World
 from tools.training import worlds

@@ -10,7 +10,7 @@ import pytest
 
 from flockd.config import Overrides, ScenarioConfig, load_scenario
 from flockd.data import data_path
-from flockd.sim.log import FlightLog
+from flockd.flight_log.log import FlightLog
 from flockd.sim.start import with_drones
 from flockd.sim.swarm import fly
 from flockd.telemetry import TelemetrySink

@@ -14,7 +14,7 @@ from flockd.config.flocking import FlockingParameters
 from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.config.scenario import ScenarioConfig, SensorConfig, StartConfig, VehicleConfig
 from flockd.flocking.metrics import min_distance, obj2, pair_distances
-from flockd.sim.truth import fly_truth, step_times
+from flockd.sim.exact_states import fly_exact_states, step_times
 from flockd.sim.vehicles import SimulatedAutopilot, Vehicles, attitude, euler_rotation
 
 Array = NDArray[np.float64]
@@ -202,7 +202,7 @@ def test_an_autopilots_errors_depend_on_seed_and_drone_alone() -> None:
 
 def test_five_with_exact_states_become_the_pentagon() -> None:
     """Sides 2.47 m, diagonals 4.00 m, and the paper's convergence error of obj2 for its ground-truth run, 0.0206."""
-    times, positions, velocities = fly_truth(FIVE)
+    times, positions, velocities = fly_exact_states(FIVE)
     assert positions.shape == velocities.shape == (220, 5, 3)
     np.testing.assert_allclose(times[[0, 1, -1]], [0.0, 0.5, 109.5])
     np.testing.assert_array_equal(positions[0], [start.position_m for start in TABLE_1])

@@ -17,8 +17,8 @@ import pytest
 from flockd.autopilot.stand_in import AutopilotStandIn
 from flockd.cli import main
 from flockd.data import data_path
+from flockd.flight_log.log import FlightLog
 from flockd.sim.ground_station import GroundStation, home_deg
-from flockd.sim.log import FlightLog
 from tests.autopilot.conftest import free_port
 
 SECONDS_TO_START = 120.0
@@ -165,7 +165,7 @@ def test_the_ground_station_knows_where_everybody_truly_is() -> None:
         ) as stand_in,
     ):
         until_s = time.monotonic() + 10.0
-        while not (station.heard(0) and station.is_armed(0)):
+        while not (station.is_connected(0) and station.is_armed(0)):
             assert time.monotonic() < until_s
             time.sleep(0.01)
         poses = station.poses()

@@ -28,7 +28,7 @@ class Scene:
     def __init__(self, flyer: Flyer) -> None:
         self._flyer = flyer
         self.frames, self.vehicle = flyer.take_frames()
-        cameras = flyer.photographer.rig.cameras
+        cameras = flyer.cameras.rig.cameras
         maps = {n: flyer.truth.scene(frame, cameras[n], None) for n, frame in self.frames.frames.items()}
         (self.camera,) = [name for name, scene in maps.items() if scene.instances]
         self.maps = maps[self.camera]
@@ -36,7 +36,7 @@ class Scene:
     def detect(self, image: UInt8Array | None = None) -> tuple[tuple[Detection, ...], UInt8Array]:
         """By the true second stage."""
         images = {self.camera: self.frames.frames[self.camera].image if image is None else image}
-        detector = Detector(self._flyer.photographer.rig, self._flyer.truth, PARAMETERS)
+        detector = Detector(self._flyer.cameras.rig, self._flyer.truth, PARAMETERS)
         scenes = {self.camera: self.maps}
         detections, masks = detector.detect(images, scenes, self.vehicle, (), DetectionTrace())
         return detections, masks[self.camera]
@@ -115,7 +115,7 @@ def test_masks_are_drawn_as_colours_say(monkeypatch: pytest.MonkeyPatch) -> None
 def test_a_drone_painted_like_the_one_before_it_is_still_proposed() -> None:
     """By colours, its pixels are the other one's; by the networks alone they are a residual."""
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0), (6.0, -0.6, -4.0)))
-    scene, rig = Scene(flyer), flyer.photographer.rig
+    scene, rig = Scene(flyer), flyer.cameras.rig
     near, far = (scene.maps.labels == instance.label for instance in scene.maps.instances)
     image = np.where((near | far)[:, :, None], np.array([200, 30, 30], np.uint8), np.array([90, 120, 160], np.uint8))
     logit = np.where(near, np.float32(3.0), np.where(far, np.float32(-3.0), np.float32(-7.0)))

@@ -1,31 +1,34 @@
-"""A few moments of a flight as a pilot saw them, for the report's filmstrip."""
+"""Captures key frames: which steps of a flight, and what the pilot worked with in them."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from flockd.flight_log.key_frames import KeyFrame
 from flockd.messages import PilotOutput
 from flockd.pilot import StepTrace
-from flockd.report.filmstrip import FilmstripFrame
 
-_MOMENTS = 6
+_KEY_FRAMES = 6
 _SKY_M = 75.0
-"""What the networks say is farther than this is sky."""
+"""Estimated depth beyond this is shown as sky."""
 
 
-def pictured_steps(steps: int) -> set[int]:
-    """Which of a flight's steps, counted from 0, become pictures: evenly spread from the first that has a flow."""
-    return set(np.linspace(1, steps - 1, _MOMENTS).astype(int).tolist())
+def key_frame_steps(steps: int) -> set[int]:
+    """Which of a flight's steps, counted from 0, are key frames: evenly spread from the first that has optical flow."""
+    return set(np.linspace(1, steps - 1, _KEY_FRAMES).astype(int).tolist())
 
 
-def picture(trace: StepTrace, output: PilotOutput, drone: int, name: str = "") -> list[FilmstripFrame]:
-    """What a pilot worked with in the step that gave ``output``; nothing before its first."""
+def capture(trace: StepTrace, output: PilotOutput, drone: int, name: str = "") -> list[KeyFrame]:
+    """What a pilot worked with in the step that gave ``output`` and ``trace``.
+
+    Empty before its first step, and where no camera had a usable image, as of a drone that touched the ground.
+    """
     view = trace.observation
-    if view is None:
+    if view is None or not view.cameras:
         return []
     cameras = view.cameras
     return [
-        FilmstripFrame(
+        KeyFrame(
             time_s=output.time_s,
             drone=drone,
             name=name,

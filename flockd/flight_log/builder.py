@@ -1,4 +1,4 @@
-"""Fills a flight log step by step, in the simulator or from recordings, and judges estimates against the truth."""
+"""Builds a flight log step by step, in the simulator or from recordings, and matches estimates to the truth."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from flockd.flight_log.log import FlightLog
+from flockd.flight_log.metadata import FlightMetadata
+from flockd.flight_log.truth_matching import match_neighbours
 from flockd.messages import BoolArray, FloatArray, PilotOutput
-from flockd.sim.log import FlightLog, match_neighbours
 
 
-class LogBook:
-    """The log of a flight of ``drones`` drones whose steps begin at ``times`` (S,); NaN until it is told otherwise."""
+class FlightLogBuilder:
+    """Of a flight of ``drones`` drones whose steps begin at ``times`` (S,) s; NaN where nothing is added."""
 
     def __init__(self, times: FloatArray, drones: int) -> None:
         steps, n, nan = len(times), drones, np.nan
@@ -26,34 +28,40 @@ class LogBook:
         self._neighbour_position, self._neighbour_velocity = (np.full((steps, n, n, 3), nan) for _ in range(2))
         self._detection_position = np.full((steps, n, n, 3), nan)
         self._false_tracks = np.zeros((steps, n), np.int64)
-        self._false_seen: list[set[int]] = [set() for _ in range(n)]
+        self._false_so_far: list[set[int]] = [set() for _ in range(n)]
         self._tracked: list[tuple[float, ...]] = []
         self._stages: dict[str, list[float]] = {}
 
-    def truth(self, step: int, position: FloatArray, velocity: FloatArray, R_ned_body: FloatArray) -> None:
-        """Where all drones truly are as a step begins: (N, 3), (N, 3) and (N, 3, 3). Before what they saw in it."""
+    def add_truth(self, step: int, position: FloatArray, velocity: FloatArray, R_ned_body: FloatArray) -> None:
+        """True states of all drones as a step begins: (N, 3) m and (N, 3) m/s NED, (N, 3, 3).
+
+        Call it before `add_output` of the same step, which matches estimates to it.
+        """
         self._position[step], self._velocity[step], self._attitude[step] = position, velocity, R_ned_body
 
-    def desired(self, step: int, velocity: FloatArray) -> None:
-        """What the whole flock was meant to fly, (2,)."""
+    def add_desired(self, step: int, velocity: FloatArray) -> None:
+        """The flock's desired velocity, (2,) m/s north and east."""
         self._desired[step] = velocity
 
-    def exact(
+    def add_exact_states(
         self, step: int, i: int, others: BoolArray, relative: FloatArray, velocities: FloatArray,
         command: FloatArray, acceleration: FloatArray,
     ) -> None:  # fmt: skip
-        """What drone ``i`` was told, and decided."""
+        """What drone ``i`` was given of the others in a flight with exact states, and its command.
+
+        ``others`` (N,) is true for those that ``relative`` (N - 1, 3) m NED are of; ``velocities`` (N, 3) m/s NED.
+        """
         self._neighbour_position[step, i, others] = relative
         self._neighbour_velocity[step, i, others] = velocities[others]
         self._own_velocity[step, i] = velocities[i]
         self._command_velocity[step, i], self._command_acceleration[step, i] = command, acceleration
 
-    def seen(
+    def add_output(
         self, step: int, i: int, output: PilotOutput, R_ned_body: FloatArray, stages_ms: Mapping[str, float]
     ) -> None:
-        """What drone ``i`` saw, with the attitude (3, 3) that its autopilot told it, and decided."""
+        """What the pilot of drone ``i`` estimated and commanded, with the attitude (3, 3) from its autopilot."""
         if np.isfinite(self._position[step]).all():
-            self._judge(step, i, output, R_ned_body)
+            self._match(step, i, output, R_ned_body)
         for neighbour in output.neighbours:
             if neighbour.confirmed:
                 self._tracked.append((float(step), float(i), float(neighbour.track), *neighbour.position.tolist()))
@@ -68,25 +76,25 @@ class LogBook:
         for stage, ms in stages_ms.items():
             self._stages.setdefault(stage, []).append(ms)
 
-    def _judge(self, step: int, i: int, output: PilotOutput, R_ned_body: FloatArray) -> None:
-        """Which neighbour and which detection is which drone, and which is none."""
+    def _match(self, step: int, i: int, output: PilotOutput, R_ned_body: FloatArray) -> None:
+        """Match confirmed tracks and detections to true drones; confirmed tracks without a match are false."""
         others = [j for j in range(self._position.shape[1]) if j != i]
         true = self._position[step, others] - self._position[step, i]
         confirmed = [n for n in output.neighbours if n.confirmed]
-        found = np.array([n.position for n in confirmed]).reshape(-1, 3)
-        matches = match_neighbours(found, true)
+        tracked = np.array([n.position for n in confirmed]).reshape(-1, 3)
+        matches = match_neighbours(tracked, true)
         for estimate, truth in matches:
             self._neighbour_position[step, i, others[truth]] = confirmed[estimate].position
             self._neighbour_velocity[step, i, others[truth]] = confirmed[estimate].velocity
         matched = {estimate for estimate, _ in matches}
-        false = {n.track for k, n in enumerate(confirmed) if k not in matched} - self._false_seen[i]
-        self._false_seen[i] |= false
+        false = {n.track for k, n in enumerate(confirmed) if k not in matched} - self._false_so_far[i]
+        self._false_so_far[i] |= false
         self._false_tracks[step, i] = len(false)
         detected = np.array([R_ned_body @ s.position for s in output.detections]).reshape(-1, 3)
         for estimate, truth in match_neighbours(detected, true):
             self._detection_position[step, i, others[truth]] = detected[estimate]
 
-    def log(self, meta: Mapping[str, object], companion: tuple[FloatArray, FloatArray] | None) -> FlightLog:
+    def build(self, metadata: FlightMetadata, companion: tuple[FloatArray, FloatArray] | None) -> FlightLog:
         """The log, with positions and velocities (S, N, 3) of the companion with exact states, if there is one."""
         drones = self._position.shape[1]
         truth_position, truth_velocity = companion or (np.zeros((0, drones, 3)), np.zeros((0, drones, 3)))
@@ -98,6 +106,6 @@ class LogBook:
             own_velocity_estimate=self._own_velocity, neighbour_position=self._neighbour_position,
             neighbour_velocity=self._neighbour_velocity, detection_position=self._detection_position,
             false_tracks=self._false_tracks, truth_position=truth_position, truth_velocity=truth_velocity,
-            stages_ms={stage: np.array(ms) for stage, ms in self._stages.items()}, meta=meta,
+            stages_ms={stage: np.array(ms) for stage, ms in self._stages.items()}, metadata=metadata,
             tracked=np.array(self._tracked).reshape(-1, 6),
         )  # fmt: skip

@@ -1,33 +1,21 @@
-"""Shows the daemons of a simulated fleet what their cameras see, again and again, and keeps where everybody was."""
+"""Renders and publishes the camera frames of a simulated fleet's daemons, and keeps the truth behind them."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
 from flockd.config.scenario import ScenarioConfig
+from flockd.flight_log.fleet_log import FleetFrame
+from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.ground_station import Poses
-from flockd.sim.photographer import Photographer
 from flockd.sources import FramePublisher
 
 
-@dataclass(frozen=True, eq=False)
-class Shooting:
-    """One frame set of each drone, all taken at once."""
-
-    time_s: float
-    """On the simulated clock: the time stamp of all its frames."""
-    poses: Poses
-    """Of the whole flock then."""
-    took_s: float
-    """Simulated seconds until the last drone had its frames."""
-
-
-class FilmCrew:
-    """Takes and publishes frames on a thread of its own between ``__enter__`` and ``__exit__``."""
+class FrameServer:
+    """Renders and publishes frames on a thread of its own between `start` and ``__exit__``."""
 
     def __init__(
         self,
@@ -40,18 +28,18 @@ class FilmCrew:
         clock: Callable[[], float],
         speed_factor: float,
     ) -> None:
-        """Makes the world, which takes seconds. ``drones`` are names in the order of ``poses``.
+        """Generates the world, which takes seconds. ``drones`` are names in the order of ``poses``.
 
         Raises UnavailableError for an endpoint that cannot be used.
         """
-        self._photographer = Photographer(scenario)
+        self._cameras = CameraSimulator(scenario)
         self._publisher = FramePublisher(listen=[endpoint])
         self._drones, self._period_s = tuple(drones), 1.0 / rate_hz
         self._poses, self._clock, self._speed_factor = poses, clock, speed_factor
-        self._shootings: list[Shooting] = []
+        self._frames: list[FleetFrame] = []
         self._failure: BaseException | None = None
         self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="film crew", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="frame server", daemon=True)
 
     def __enter__(self) -> Self:
         return self
@@ -65,32 +53,33 @@ class FilmCrew:
         self._publisher.close()
 
     def start(self) -> None:
-        """Begins to take pictures."""
+        """Begins to render and publish."""
         self._thread.start()
 
-    def shootings(self) -> tuple[Shooting, ...]:
-        """All so far. Raises what ended the work."""
+    def frames(self) -> tuple[FleetFrame, ...]:
+        """All so far. Raises the exception that ended the thread."""
         if self._failure is not None:
             raise self._failure
-        return tuple(self._shootings)
+        return tuple(self._frames)
 
     def notes(self) -> tuple[str, ...]:
-        """What a person should know although nothing is wrong."""
+        """Remarks of the publisher, for people."""
         return self._publisher.notes()
 
     def _run(self) -> None:
         due_s = self._clock()
         try:
             while not self._closing.wait(max(0.0, due_s - self._clock()) / self._speed_factor):
-                self._shoot(len(self._shootings))
+                self._publish(len(self._frames))
                 due_s = max(due_s + self._period_s, self._clock())
-        except BaseException as error:  # noqa: BLE001 - `shootings` raises it where somebody can do something
+        except BaseException as error:  # noqa: BLE001 - `frames` raises it in the thread that can handle it
             self._failure = error
 
-    def _shoot(self, number: int) -> None:
+    def _publish(self, number: int) -> None:
         poses, time_s = self._poses(), self._clock()
         for i, drone in enumerate(self._drones):
-            frames, _ = self._photographer.photograph(i, number, time_s, poses)
+            frames, _ = self._cameras.capture(i, number, time_s, poses)
             for frame in frames.frames.values():
                 self._publisher.publish(drone, frame)
-        self._shootings.append(Shooting(time_s, poses, self._clock() - time_s))
+        delay_s = self._clock() - time_s
+        self._frames.append(FleetFrame(time_s, poses.position, poses.velocity, poses.R_ned_body, delay_s))

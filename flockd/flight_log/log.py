@@ -1,8 +1,7 @@
-"""The record of a flight: what was true, what was estimated and what was commanded, step by step."""
+"""The log of a flight: what was true, what was estimated and what was commanded, step by step."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from flockd.flight_log.metadata import FlightMetadata
 from flockd.messages import BoolArray, FloatArray, IntArray
 
 _STAGE_PREFIX = "stage "
@@ -17,7 +17,7 @@ _STAGE_PREFIX = "stage "
 
 @dataclass(frozen=True, eq=False)
 class FlightLog:
-    """S steps of N drones; NaN where there was no estimate, and where nobody knows the truth.
+    """S steps of N drones; NaN where there was no estimate, and where the truth is not known.
 
     A drone that was not recorded in a step has no command in it. Raises ValueError for shapes that do not fit together.
     """
@@ -59,9 +59,7 @@ class FlightLog:
     """(S2, N, 3) m/s NED, likewise."""
     stages_ms: Mapping[str, FloatArray]
     """(K,) duration of each run of each stage."""
-    meta: Mapping[str, Any]
-    """What was flown, in values that go into JSON: scenario, perception ("truth": with exact states), flow, scale,
-    drones, duration_s, step_s, seed, wall_s, circle_until_s, desired_distance_m, observation_distance_m, and more."""
+    metadata: FlightMetadata
     tracked: FloatArray = field(default_factory=lambda: np.zeros((0, 6)))
     """(K, 6) each confirmed track at each step: step, observer, track, and metres north, east and down of it."""
 
@@ -74,6 +72,16 @@ class FlightLog:
     def recorded(self) -> BoolArray:
         """(S, N): which drones' steps are in it."""
         return np.asarray(np.isfinite(self.command_velocity).all(axis=2))
+
+    @property
+    def companion(self) -> tuple[FloatArray, FloatArray] | None:
+        """Positions and velocities (S, N, 3) of the companion with exact states.
+
+        None without one, and of a flight that flew on exact states itself.
+        """
+        if not len(self.truth_position) or not self.metadata.by_sight:
+            return None
+        return self.truth_position, self.truth_velocity
 
     def __post_init__(self) -> None:
         steps, drones = self.position.shape[:2]
@@ -106,15 +114,15 @@ class FlightLog:
     def save(self, path: Path) -> None:
         """Write one compressed `.npz`."""
         arrays: dict[str, Any] = {
-            part.name: getattr(self, part.name) for part in fields(self) if part.name not in ("stages_ms", "meta")
+            part.name: getattr(self, part.name) for part in fields(self) if part.name not in ("stages_ms", "metadata")
         }
         arrays |= {_STAGE_PREFIX + stage: samples for stage, samples in self.stages_ms.items()}
         with path.open("wb") as file:
-            np.savez_compressed(file, **arrays, meta=json.dumps(dict(self.meta)))
+            np.savez_compressed(file, **arrays, meta=self.metadata.model_dump_json(exclude_unset=True))
 
     @classmethod
     def load(cls, path: Path) -> FlightLog:
-        """Read what `save` wrote. Raises OSError, or ValueError where the file is no flight log."""
+        """Read what `save` wrote. Raises OSError, or ValueError where the file is not a flight log."""
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         stages = {
@@ -123,25 +131,8 @@ class FlightLog:
             if name.startswith(_STAGE_PREFIX)
         }
         needed = {part.name for part in fields(cls) if part.default_factory is MISSING}
-        missing = needed - {"stages_ms"} - arrays.keys()
+        missing = needed - {"stages_ms", "metadata"} - arrays.keys() | ({"meta"} - arrays.keys())
         if missing:
-            raise ValueError(f"{path} is no flight log: it has no {', '.join(sorted(missing))}")
-        meta = json.loads(str(arrays.pop("meta")))
-        return cls(**arrays, stages_ms=stages, meta=meta)
-
-
-def match_neighbours(estimated: FloatArray, true: FloatArray) -> list[tuple[int, int]]:
-    """Which estimate is which drone: (estimate, drone) index pairs, one to one, the nearest pair first.
-
-    `estimated` (m, 3) and `true` (n, 3) are metres relative to one observer, which is not among them. No pair is
-    farther apart than 1 m or a quarter of the true range, whichever is more.
-    """
-    distances = np.linalg.norm(estimated[:, None] - true[None], axis=2)
-    allowed = np.maximum(1.0, 0.25 * np.linalg.norm(true, axis=1))
-    pairs: list[tuple[int, int]] = []
-    for flat in np.argsort(distances, axis=None, kind="stable"):
-        estimate, drone = divmod(int(flat), len(true))
-        taken = any(estimate == e or drone == d for e, d in pairs)
-        if not taken and distances[estimate, drone] <= allowed[drone]:
-            pairs.append((estimate, drone))
-    return sorted(pairs)
+            raise ValueError(f"{path} is not a flight log: it has no {', '.join(sorted(missing))}")
+        metadata = FlightMetadata.model_validate_json(str(arrays.pop("meta")))
+        return cls(**arrays, stages_ms=stages, metadata=metadata)

@@ -1,4 +1,4 @@
-"""The companion of a flight by sight: the same scenario with exact relative states, nothing rendered."""
+"""The companion of a flight by sight: the same scenario with exact relative states, without rendering."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from flockd.messages import FloatArray
 from flockd.sim.vehicles import Vehicles
 
 
-def fly_truth(scenario: ScenarioConfig) -> tuple[FloatArray, FloatArray, FloatArray]:
+def fly_exact_states(scenario: ScenarioConfig) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Times (S,) s, positions (S, N, 3) m and velocities (S, N, 3) m/s in NED, as each step begins.
 
     The paper's "UAV flocking based on ground truth cluster state": each vehicle gets what the flocking law commands on
-    everybody's true position and velocity.
+    the true positions and velocities of all.
     """
     times = step_times(scenario)
     drone = scenario.drone
@@ -35,6 +35,15 @@ def fly_truth(scenario: ScenarioConfig) -> tuple[FloatArray, FloatArray, FloatAr
         yaw_rad = course(drone.desired, float(time_s))
         vehicles.step(np.array(setpoints), np.full(len(here), yaw_rad), drone.step_s)
     return times, np.array(positions), np.array(velocities)
+
+
+def exact_states_at(times: FloatArray, scenario: ScenarioConfig) -> tuple[FloatArray, FloatArray]:
+    """Positions (S, N, 3) m and velocities (S, N, 3) m/s of `fly_exact_states`, interpolated at ``times`` (S,) s."""
+    steps_s, position, velocity = fly_exact_states(scenario)
+    flat = [values.reshape(len(steps_s), -1) for values in (position, velocity)]
+    at = [np.stack([np.interp(times, steps_s, column) for column in values.T], axis=1) for values in flat]
+    shape = (len(times), *position.shape[1:])
+    return at[0].reshape(shape), at[1].reshape(shape)
 
 
 def step_times(scenario: ScenarioConfig) -> FloatArray:

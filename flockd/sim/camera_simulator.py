@@ -1,4 +1,4 @@
-"""Takes the pictures that each simulated drone's cameras see."""
+"""Simulates the cameras of all drones: rendered frame sets, and the truth behind each."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from flockd.geometry import PinholeCamera, build_rig
 from flockd.messages import FloatArray, Frame, FrameSet, UInt8Array
 from flockd.sim.drone_models import FAMILIES, drone_model
 from flockd.sim.renderer import Renderer
-from flockd.sim.truth_perception import Shot
+from flockd.sim.truth_perception import RenderTruth
 from flockd.sim.world import World
 
 
-class Flock(Protocol):
-    """Where all drones are."""
+class FlockPoses(Protocol):
+    """Poses of all drones."""
 
     @property
     def position(self) -> FloatArray:
@@ -30,8 +30,8 @@ class Flock(Protocol):
         """(n, 3, 3)"""
 
 
-class Photographer:
-    """The world of a scenario, its drones' looks, and everybody's cameras."""
+class CameraSimulator:
+    """The world of a scenario, the models of its drones, and their cameras."""
 
     def __init__(self, scenario: ScenarioConfig) -> None:
         """Raises UsageError for a camera model that cannot be rendered."""
@@ -39,7 +39,7 @@ class Photographer:
         for name, mounted in self.rig.cameras.items():
             if not isinstance(mounted.camera, PinholeCamera) or any(mounted.camera.distortion):
                 raise UsageError(
-                    f"drone.rig: camera {name!r}: the renderer knows only pinhole cameras without distortion; "
+                    f"drone.rig: camera {name!r}: the renderer supports only pinhole cameras without distortion; "
                     "change its intrinsics for simulated flights"
                 )
         world = World.generate(
@@ -58,7 +58,7 @@ class Photographer:
         self._renderer = Renderer(world, models)
         self._noise = _ImageNoise(scenario.sensors.image_noise, scenario.seed)
 
-    def photograph(self, drone: int, step: int, time_s: float, vehicles: Flock) -> tuple[FrameSet, Shot]:
+    def capture(self, drone: int, step: int, time_s: float, vehicles: FlockPoses) -> tuple[FrameSet, RenderTruth]:
         """The frame set of one drone, and the truth behind it."""
         others = [i for i in range(self._count) if i != drone]
         R_ned_body, position = vehicles.R_ned_body[drone], vehicles.position[drone]
@@ -71,12 +71,12 @@ class Photographer:
                 drone_rotations=vehicles.R_ned_body, drone_positions=vehicles.position, shown=others,
             )  # fmt: skip
             frames[name] = Frame(name, self._noise.add(views[name].rgb), time_s, step)
-        shot = Shot(views, turns, places, R_ned_body, position, vehicles.R_ned_body, vehicles.position, others)
-        return FrameSet(time_s, frames), shot
+        truth = RenderTruth(views, turns, places, R_ned_body, position, vehicles.R_ned_body, vehicles.position, others)
+        return FrameSet(time_s, frames), truth
 
 
 class _ImageNoise:
-    """Grain that never repeats at the same place: one large tile, rolled by a seeded amount for each image."""
+    """Noise that differs from image to image: a seeded crop of one large tile of normal noise."""
 
     def __init__(self, sigma: float, seed: int) -> None:
         self._rng = np.random.default_rng([seed, 2])
@@ -88,8 +88,8 @@ class _ImageNoise:
         height, width = image.shape[:2]
         top = int(self._rng.integers(self._tile.shape[0] - height))
         left = int(self._rng.integers(self._tile.shape[1] - width))
-        grain = self._tile[top : top + height, left : left + width]
-        return np.asarray(cv2.add(image, grain, dtype=cv2.CV_8U), dtype=np.uint8)
+        noise = self._tile[top : top + height, left : left + width]
+        return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), dtype=np.uint8)
 
 
 def planned_path(scenario: ScenarioConfig) -> FloatArray:

@@ -1,0 +1,30 @@
+"""Key frames hold what the pilot worked with, and nothing where there was nothing to work with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from flockd.flight_log.capture import capture, key_frame_steps
+from flockd.pilot import FlockPilot
+from flockd.recording.reader import Recording
+
+RECORDING = Path(__file__).parents[1] / "replay" / "normal.mcap"
+
+
+def test_key_frames_are_spread_from_the_first_step_with_flow() -> None:
+    assert sorted(key_frame_steps(11)) == [1, 2, 4, 6, 8, 10]
+    assert sorted(key_frame_steps(3)) == [1, 2]
+
+
+@pytest.mark.parametrize("height_m", [3.0, -0.5], ids=["in the air", "in the ground"])
+def test_a_step_without_a_usable_image_has_no_key_frame(height_m: float) -> None:
+    """Cameras that are not above the ground have no metric scale, so the pilot uses none of their images."""
+    recording = Recording(RECORDING)
+    step = next(iter(recording.steps()))
+    pilot = FlockPilot(recording.config)
+    output = pilot.step(step.frames, replace(step.vehicle, height_m=height_m))
+    captured = capture(pilot, output, drone=0)
+    assert [set(frame.cameras) for frame in captured] == ([set(step.frames.frames)] if height_m > 0 else [])
