@@ -17,7 +17,7 @@ MAY_IMPORT = {
     "messages": set(),
     "errors": set(),
     "data": {"errors"},
-    "peer": {"errors"},
+    "zenoh_session": {"errors"},
     "config": {"messages", "errors"},
     "geometry": BASE,
     "inference": BASE,
@@ -26,9 +26,9 @@ MAY_IMPORT = {
     "flocking": BASE,
     "safety": BASE,
     "pilot": BASE | {"geometry", "inference", "perception", "tracking", "flocking", "safety"},
-    "sources": BASE | {"peer"},
+    "sources": BASE | {"zenoh_session"},
     "autopilot": BASE,
-    "telemetry": BASE | {"peer"},
+    "telemetry": BASE | {"zenoh_session"},
     "recording": BASE | {"telemetry"},  # for the table of topics, which says what is recorded
     "calibration": BASE | {"geometry"},
     "datasets": BASE | {"geometry", "inference", "perception", "pilot"},
@@ -151,7 +151,7 @@ def test_what_flies_needs_none_of_the_simulators_libraries() -> None:
         assert not _libraries(path) & TOOL_LIBRARIES, path
 
 
-PEER = PACKAGE / "peer.py"
+ZENOH_SESSION = PACKAGE / "zenoh_session.py"
 """Opens and closes sessions, whatever goes through them."""
 FRAMES_OVER_ZENOH = PACKAGE / "sources" / "shared_memory.py"
 """A drone's own camera frames may come over zenoh, under keys that no telemetry has."""
@@ -165,7 +165,7 @@ ANSWERS = PACKAGE / "telemetry" / "publisher.py"
     ("library", "adapters"),
     [
         ("mavsdk", ["autopilot/mavsdk_link.py"]),
-        ("pymavlink", ["autopilot/stand_in.py", "sim/ground_station.py"]),
+        ("pymavlink", ["autopilot/fake_autopilot.py", "autopilot/fake_telemetry.py", "sim/ground_station.py"]),
         ("rerun", ["view/rerun_file.py"]),
     ],
 )
@@ -185,7 +185,7 @@ def test_no_drone_reads_telemetry_to_fly() -> None:
         "declare_querier": set(),
     }
     for path in MODULES:
-        if _folder(path) != "telemetry" and path not in {FRAMES_OVER_ZENOH, PEER}:
+        if _folder(path) != "telemetry" and path not in {FRAMES_OVER_ZENOH, ZENOH_SESSION}:
             assert "zenoh" not in _libraries(path), path
         text = path.read_text(encoding="utf-8")
         for word, allowed in readers.items():
@@ -195,7 +195,7 @@ def test_no_drone_reads_telemetry_to_fly() -> None:
 
 
 def test_one_file_opens_and_closes_sessions() -> None:
-    for path in (path for path in MODULES if "zenoh" in _libraries(path) and path != PEER):
+    for path in (path for path in MODULES if "zenoh" in _libraries(path) and path != ZENOH_SESSION):
         text = path.read_text(encoding="utf-8")
         assert "zenoh.open" not in text, path
         assert "zenoh.Config" not in text, path

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.calibration import (
+from flockd.cli.calibrate_options import (
     add_shared,
     board_of,
     ended_by_ctrl_c,

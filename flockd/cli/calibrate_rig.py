@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.calibration import (
+from flockd.cli.calibrate_options import (
     add_shared,
     board_of,
     ended_by_ctrl_c,

@@ -16,7 +16,7 @@ from flockd.errors import ExitCode, UsageError
 if TYPE_CHECKING:
     from flockd.config import DroneConfig
     from flockd.datasets import Dataset
-    from flockd.datasets.motion import Pair
+    from flockd.datasets.pair_motion import Pair
 
 _ANY_ACCELERATION_M_S2 = 1e9
 """A camera in somebody's hand keeps to no drone's limits."""
@@ -118,7 +118,7 @@ def _config(args: argparse.Namespace, dataset: Dataset) -> tuple[DroneConfig, li
 
 
 def _fly(dataset: Dataset, config: DroneConfig, stride: int, *, recorded_depth: bool) -> list[Pair]:
-    from flockd.datasets.motion import fly_pairs
+    from flockd.datasets.pair_motion import fly_pairs
     from flockd.pilot.pilot import load_perception
 
     pairs: list[Pair] = []
@@ -142,7 +142,7 @@ def _result(pairs: Sequence[Pair]) -> dict[str, Any]:
 
 
 def _told(pair: Pair) -> dict[str, Any]:
-    from flockd.datasets.motion import size_of
+    from flockd.datasets.pair_motion import size_of
 
     true_rotation, true_translation = size_of(pair.true) if pair.true else (None, None)
     rotation_error, translation_error = pair.error or (None, None)

@@ -194,13 +194,13 @@ def _frames(source: FrameSource, seconds: float, enough: Callable[[], bool]) -> 
 
 
 def _images(folder: Path) -> list[Path]:
-    from flockd.datasets.images import SUFFIXES
+    from flockd.datasets.image_files import SUFFIXES
 
     return sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
 
 
 def _read(file: Path) -> UInt8Array:
-    from flockd.datasets.images import read_image
+    from flockd.datasets.image_files import read_image
 
     return read_image(file)
 

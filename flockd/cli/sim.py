@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli import fleet
+from flockd.cli import sim_fleet
 from flockd.cli.flights import prepare, save, tell, write_findings
 from flockd.cli.output import complain, progress
 from flockd.cli.parser import Commands, positive_count, positive_number, seed
@@ -59,7 +59,7 @@ def add(commands: Commands) -> None:
         "--speed-factor",
         metavar="F",
         type=positive_number,
-        help=f"with --autopilot: how fast simulated time passes (default: {fleet.DEFAULT_SPEED_FACTOR})",
+        help=f"with --autopilot: how fast simulated time passes (default: {sim_fleet.DEFAULT_SPEED_FACTOR})",
     )
     parser.add_argument("--flow", metavar="NAME", help="the model for optical flow, or `dis`")
     parser.add_argument(
@@ -98,7 +98,7 @@ def _run(args: argparse.Namespace) -> int:
     directory = args.out or Path("out") / _folder_name(scenario, args)
     prepare(directory)
     if args.autopilot is not None:
-        return fleet.fly(args, scenario, directory)
+        return sim_fleet.fly(args, scenario, directory)
     from flockd.sim.swarm import fly
 
     with ExitStack() as stack:
@@ -148,7 +148,7 @@ def _recorders(
 
 
 def _check_options(args: argparse.Namespace) -> None:
-    fleet.check_options(args)
+    sim_fleet.check_options(args)
     if args.perception == "truth":
         idle = [option for option in ("flow", "scale", "swap", "telemetry", "record") if getattr(args, option)]
         if idle:

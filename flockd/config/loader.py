@@ -9,10 +9,10 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from flockd.config.complaints import path_in_file, problems_of
 from flockd.config.document import Document, Place, Value, read_document
 from flockd.config.drone import DroneConfig
 from flockd.config.scenario import ScenarioConfig
+from flockd.config.validation_messages import path_in_file, problems_of
 from flockd.errors import ConfigError
 
 ROLES = ("flow", "depth", "segmentation", "distance")

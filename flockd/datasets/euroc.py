@@ -10,11 +10,11 @@ import numpy as np
 import yaml
 
 from flockd.config.rig import CameraConfig
-from flockd.datasets.calibration import camera_of, read_calibration
+from flockd.datasets.camera_intrinsics import camera_of, read_calibration
 from flockd.datasets.dataset import Entry, FileDataset
 from flockd.datasets.errors import DatasetError
-from flockd.datasets.images import read_image
-from flockd.datasets.poses import PoseTrack, pose_of_matrix, track_of_rows
+from flockd.datasets.image_files import read_image
+from flockd.datasets.pose_track import PoseTrack, pose_of_matrix, track_of_rows
 from flockd.datasets.tables import read_lines, read_rows
 from flockd.errors import ConfigError, ConfigProblem
 from flockd.geometry import RigidTransform

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from flockd.datasets.motion import Pair
-from flockd.datasets.poses import quaternion_from_rotation
+from flockd.datasets.pair_motion import Pair
+from flockd.datasets.pose_track import quaternion_from_rotation
 from flockd.geometry import RigidTransform
 
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from flockd.config import DroneConfig
-from flockd.doctor.finding import Finding, Level, failed, failed_as_told, passed, warned
+from flockd.doctor.finding import Finding, Level, failed, failed_from_error, passed, warned
 from flockd.errors import ModelError
 from flockd.inference import OnnxModel, manifests_of
 from flockd.inference.providers import engines_folder
@@ -45,7 +45,7 @@ def _each(config: DroneConfig) -> Iterator[Finding]:
         try:
             model = OnnxModel(path, threads=wanted.threads, provider=wanted.provider, engines=engines_folder(wanted))
         except ModelError as error:
-            yield failed_as_told(about, str(error))
+            yield failed_from_error(about, str(error))
             continue
         size_mb = path.with_name(model.manifest.file).stat().st_size / 1e6
         yield passed(about, f"hash and golden answer are right, {size_mb:.1f} MB, run by {model.provider}")

@@ -406,7 +406,7 @@ class V4l2Device:
     def _fault(self, what: str, error: OSError) -> CameraError:
         match error.errno:
             case errno.ENODEV | errno.ENOENT | errno.ENXIO:
-                return CameraError(f"{self._who} is not there; plug the camera in, or mend the path")
+                return CameraError(f"{self._who} is not there; plug the camera in, or correct the path")
             case errno.EBUSY:
                 return CameraError(f"{self._who} is in use by another program; stop that one")
             case errno.EACCES if what == "cannot be opened":

@@ -12,8 +12,8 @@ from typing import Self
 import numpy as np
 import zenoh
 
-from flockd.peer import close_peer, open_peer
 from flockd.telemetry.topics import PREFIX, TOPICS, AboutMessage, AnswerMessage, checked_name
+from flockd.zenoh_session import close_session, open_session
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
@@ -43,7 +43,7 @@ class ZenohTelemetry:
         self._publishers: dict[tuple[str, str], zenoh.Publisher] = {}
         self._kept: list[object] = []
         self._lost = 0
-        self._session = open_peer("telemetry", listen, connect, settings=settings)
+        self._session = open_session("telemetry", listen, connect, settings=settings)
 
     @property
     def lost(self) -> int:
@@ -78,7 +78,7 @@ class ZenohTelemetry:
 
     def close(self) -> None:
         """Ends the session; later messages are lost, and counted."""
-        close_peer(self._session)
+        close_session(self._session)
 
     def __enter__(self) -> Self:
         return self

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from flockd.autopilot.stand_in import AutopilotStandIn
+from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.cli import main
 from flockd.data import data_path
 from tests.autopilot.conftest import HEARTBEAT_S, free_port
@@ -82,7 +82,7 @@ def test_it_gets_ready_alone_reads_its_file_again_and_ends_when_told(
     port, frames, telemetry = free_port(), free_endpoint(), free_endpoint()
     config = _written(tmp_path / "tiny.yaml", port, frames, telemetry)
     cameras = Cameras(frames)
-    with AutopilotStandIn(port, heartbeat_s=HEARTBEAT_S), _run(config, tmp_path) as process:
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S), _run(config, tmp_path) as process:
         try:
             manager.until(lambda: "READY=1" in manager.told, process)
             assert any(line.startswith("STATUS=idle: ") for line in manager.told)

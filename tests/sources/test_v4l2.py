@@ -256,7 +256,7 @@ def test_an_unplugged_camera_is_told_of_at_once_and_comes_back_when_plugged_in(s
     kernel.unplug("front")
     fault = _until(source, lambda status: status.fault is not None).fault
     assert time.monotonic() - pulled_s < 0.5
-    assert fault == "front: /dev/front is not there; plug the camera in, or mend the path"
+    assert fault == "front: /dev/front is not there; plug the camera in, or correct the path"
 
     asked_s = time.monotonic()
     kernel.send("back", JPEGS[2])

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from flockd.autopilot.stand_in import AutopilotStandIn
+from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.recording.reader import Recording
-from flockd.sources.images import MjpegFormat
+from flockd.sources.image_formats import MjpegFormat
 from flockd.sources.v4l2_device import CameraError, V4l2Device
 from flockd.telemetry.watcher import FleetWatcher
 from tools.device_check import pictures
@@ -53,7 +53,7 @@ class Service:
     def __init__(self, start: str) -> None:
         """``start``: the lines of the README that start the unit."""
         self._start = start
-        self._stand_in = AutopilotStandIn(PORT).start()
+        self._stand_in = FakeAutopilot(PORT).start()
         self._watcher = FleetWatcher("check", listen=(), connect=(ENDPOINT,))
         self._front: Feeder | None = None
 

@@ -31,8 +31,8 @@ def check_instance(drone: str, environment: Mapping[str, str]) -> Iterator[Findi
             pass
     except UnavailableError as error:
         measured = str(error).rpartition("; ")[0]
-        mend = "stop it while you examine (`systemctl stop flockd`): it holds the cameras and the autopilot's link"
-        yield failed("instance", measured, mend)
+        fix = "stop it while you examine (`systemctl stop flockd`): it holds the cameras and the autopilot's link"
+        yield failed("instance", measured, fix)
     except PermissionError as error:
         yield _unseen(str(error.filename))
     else:
@@ -40,8 +40,8 @@ def check_instance(drone: str, environment: Mapping[str, str]) -> Iterator[Findi
 
 
 def _unseen(lock: str) -> Finding:
-    mend = "examine as the user that flies: `sudo -u flockd flockd doctor ...`"
-    return warned("instance", f"{lock} belongs to another user, so who holds it cannot be seen", mend)
+    fix = "examine as the user that flies: `sudo -u flockd flockd doctor ...`"
+    return warned("instance", f"{lock} belongs to another user, so who holds it cannot be seen", fix)
 
 
 def check_unit(unit: Path | None) -> Iterator[Finding]:
@@ -64,10 +64,10 @@ def check_unit(unit: Path | None) -> Iterator[Finding]:
 def judge_exposure(score: float, unit: Path, whose: str) -> Finding:
     """0 is closed, 10 is open."""
     measured = f"{unit}{whose} exposes {score:.1f} of 10"
-    mend = f"compare it and its drop-ins with systemd/{UNIT}; `systemd-analyze security` lists what is open"
+    fix = f"compare it and its drop-ins with systemd/{UNIT}; `systemd-analyze security` lists what is open"
     if score >= MUCH:
-        return failed("unit", measured, mend)
-    return warned("unit", f"{measured}, more than {BAR:g}", mend) if score > BAR else passed("unit", measured)
+        return failed("unit", measured, fix)
+    return warned("unit", f"{measured}, more than {BAR:g}", fix) if score > BAR else passed("unit", measured)
 
 
 def _find_unit() -> tuple[Path, str]:

@@ -1,4 +1,4 @@
-"""Looks and thinks: takes the newest frames, lets the pilot step, and keeps what it found."""
+"""The pilot's loop: takes the newest frames, runs a step of the pilot, and keeps the result."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ STEPS_REMEMBERED = 20
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
-    """What one step found, and when on the daemon's clock its frames were taken from the cameras."""
+class StepResult:
+    """The output of one step, and when its frames were fetched, on the daemon's clock."""
 
     time_s: float
     output: PilotOutput
     flight: int
-    """Whose pilot found it."""
+    """The number of the flight whose pilot computed it."""
     number: int
-    """Counted from 1 with the first of its pilot."""
+    """Of the step, from 1 for the first of its pilot."""
 
 
 OnStep = Callable[[FrameSet, VehicleState, PilotOutput], None]
 
 
-class Sight:
-    """The pilot's eyes and mind, at the pilot's own rate. Frames that come meanwhile are dropped by the source."""
+class PilotLoop:
+    """Steps the pilot at its own rate; the source drops frames that come meanwhile."""
 
     def __init__(
         self,
@@ -52,12 +52,12 @@ class Sight:
         networks: WatchedNetworks,
         vehicle_at: Callable[[float], VehicleState | None],
         on_step: OnStep,
-        tell: Callable[[str], None],
+        log_event: Callable[[str], None],
         clock: Callable[[], float],
     ) -> None:
         """``vehicle_at`` gives the vehicle's state at a frame's time; None before any is known."""
         self._config, self._source, self._networks = config, source, networks
-        self._vehicle_at, self._on_step, self._tell, self._clock = vehicle_at, on_step, tell, clock
+        self._vehicle_at, self._on_step, self._log_event, self._clock = vehicle_at, on_step, log_event, clock
         self._decoding = Worker("decoding")
         self._geometry = Worker("geometry")
         self._pilot: FlockPilot | None = None
@@ -66,17 +66,17 @@ class Sight:
         self._took_s: deque[float] = deque(maxlen=STEPS_REMEMBERED)
         self.frames: FrameSet | None = None
         """The newest; None before the first."""
-        self.newest: Look | None = None
+        self.newest: StepResult | None = None
         self.steps = 0
         self.failed = 0
-        """Steps that came to nothing, because a network answered nonsense or nothing."""
+        """Steps without a result, because a network failed or was late."""
         self.ego_motion_failures = 0
         """In a row."""
         self.neighbour_seen_s = -math.inf
         """When a confirmed neighbour was last seen."""
 
     def begin_flight(self, number: int) -> None:
-        """From the next step on with a fresh pilot: its time counts from there, and a recording can be replayed."""
+        """Uses a new pilot from the next step on: its time begins there, so that a recording can be replayed."""
         self._flight, self._pilot = number, None
 
     def load(self) -> float:
@@ -84,7 +84,7 @@ class Sight:
         return float(np.percentile(self._took_s, 95)) / self._config.step_s if self._took_s else 0.0
 
     async def run(self) -> None:
-        """Looks for ever. Raises LateError when decoding or a step hangs."""
+        """Steps until cancelled. Raises LateError when decoding or a step hangs."""
         due_s, frame_period_s = self._clock(), _frame_period_s(self._config)
         while True:
             frames = await self._decoding.do(FRAME_DEADLINE_S, self._source.newest, FRAME_WAIT_S)
@@ -111,7 +111,7 @@ class Sight:
         try:
             pilot = self._pilot
             if pilot is None:
-                pilot = await self._geometry.do(STEP_DEADLINE_S, self._fresh_pilot)
+                pilot = await self._geometry.do(STEP_DEADLINE_S, self._new_pilot)
             output = await self._geometry.do(STEP_DEADLINE_S, pilot.step, frames, vehicle)
         except (FloatingPointError, NetworkStuckError) as error:
             self._note_failure(str(error))
@@ -119,28 +119,28 @@ class Sight:
         finally:
             self._took_s.append(self._clock() - taken_s)
         if flight != self._flight:
-            return  # a flight began meanwhile; this was the old pilot's last thought
+            return  # a flight began meanwhile; this result is the old pilot's
         self._failure = None
         number = 1 if self._pilot is None or self.newest is None else self.newest.number + 1
         self._pilot = pilot
-        self.newest = Look(taken_s, output, flight, number)
+        self.newest = StepResult(taken_s, output, flight, number)
         self._count(self.newest)
         self._on_step(frames, vehicle, output)
 
-    def _fresh_pilot(self) -> FlockPilot:
+    def _new_pilot(self) -> FlockPilot:
         return FlockPilot(self._config, self._networks, stopwatch=time.perf_counter)
 
     def _note_failure(self, why: str) -> None:
-        """Tells it when it is new, and counts it."""
+        """Counts a failed step; an event for a new reason."""
         self.failed += 1
         if why != self._failure:
-            self._tell(f"a step came to nothing: {why}")
+            self._log_event(f"a step failed: {why}")
         self._failure = why
 
-    def _count(self, look: Look) -> None:
-        if look.number > 1:  # the first has nothing to compare with
-            self.ego_motion_failures = 0 if look.output.ego_motion is not None else self.ego_motion_failures + 1
-        seen = [look.time_s - neighbour.unseen_s for neighbour in look.output.neighbours if neighbour.confirmed]
+    def _count(self, result: StepResult) -> None:
+        if result.number > 1:  # the first has nothing to compare with
+            self.ego_motion_failures = 0 if result.output.ego_motion is not None else self.ego_motion_failures + 1
+        seen = [result.time_s - neighbour.unseen_s for neighbour in result.output.neighbours if neighbour.confirmed]
         self.neighbour_seen_s = max([self.neighbour_seen_s, *seen])
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 from flockd.autopilot.mavsdk_link import AutopilotLink
 from flockd.autopilot.status import AutopilotError, AutopilotStatus, Firmware
 from flockd.config import DroneConfig
 from flockd.config.autopilot import AutopilotParameters
 from flockd.config.safety import GateParameters
-from flockd.doctor.finding import Finding, failed, failed_as_told, passed, warned
+from flockd.doctor.finding import Finding, failed, failed_from_error, passed, warned
 
 HEARD_S = 10.0
 OLDEST_TRIED = (1, 14)
@@ -35,13 +35,14 @@ async def _ask(config: DroneConfig, parameters: AutopilotParameters) -> list[Fin
             try:
                 value = await link.parameter(name, kind)
             except AutopilotError as error:
-                mend = f"see whether this firmware has {name}, and whether the link loses much"
-                found.append(failed(name, str(error), mend))
+                fix = f"see whether this firmware has {name}, and whether the link loses much"
+                found.append(failed(name, str(error), fix))
                 if link.status().heartbeat_age_s > parameters.max_heartbeat_age_s:
                     found.append(judge_heartbeat(link.system_id, link.status(), parameters))
                     break
             else:
                 found.append(JUDGES[name](value, config))
+        found += judge_messages(link.unknown_values())
     finally:
         await link.close()
     return found
@@ -51,7 +52,7 @@ async def _firmware(link: AutopilotLink) -> Finding:
     try:
         return judge_firmware(await link.firmware())
     except AutopilotError as error:
-        return failed_as_told("firmware", str(error))
+        return failed_from_error("firmware", str(error))
 
 
 def judge_heartbeat(system_id: int, status: AutopilotStatus, parameters: AutopilotParameters) -> Finding:
@@ -62,6 +63,14 @@ def judge_heartbeat(system_id: int, status: AutopilotStatus, parameters: Autopil
     if status.armed:
         return warned("heartbeat", f"{measured}, and armed", "disarm it on the ground before you examine it")
     return passed("heartbeat", f"{measured}, disarmed, in flight mode {status.flight_mode}")
+
+
+def judge_messages(unknown_values: Mapping[str, int]) -> list[Finding]:
+    """A warning where messages had values that flockd does not know."""
+    if not unknown_values:
+        return []
+    values = ", ".join(f"{value} ({count} times)" for value, count in sorted(unknown_values.items()))
+    return [warned("messages", f"values that flockd does not know: {values}", "update flockd, or the firmware")]
 
 
 def judge_firmware(firmware: Firmware) -> Finding:
@@ -79,12 +88,12 @@ def judge_loss_time(value: float, config: DroneConfig) -> Finding:
     """COM_OF_LOSS_T, in seconds."""
     name, measured = "COM_OF_LOSS_T", f"{value:g} s"
     gap_s = AutopilotParameters().max_gap_s if config.autopilot is None else config.autopilot.max_gap_s
-    mend = f"set {name} to {LONGEST_LOSS_S:g} s"
+    fix = f"set {name} to {LONGEST_LOSS_S:g} s"
     if value <= gap_s:
         told = f"{measured}, not above autopilot.max_gap_s {gap_s:g}: PX4 would leave offboard in gaps flockd bridges"
-        return failed(name, told, mend)
+        return failed(name, told, fix)
     if value > LONGEST_LOSS_S:
-        return warned(name, f"{measured}: so long it flies on with the last velocity when setpoints stop", mend)
+        return warned(name, f"{measured}: so long it flies on with the last velocity when setpoints stop", fix)
     return passed(name, f"{measured} without setpoints, then its failsafe")
 
 
@@ -100,13 +109,13 @@ _FATAL_ON_LOSS = {
 
 def judge_loss_action(value: int, config: DroneConfig) -> Finding:
     """COM_OBL_RC_ACT: what it does when setpoints stop."""
-    name, mend = "COM_OBL_RC_ACT", "set COM_OBL_RC_ACT to 5 (Hold), 4 (Land) or 3 (Return)"
+    name, fix = "COM_OBL_RC_ACT", "set COM_OBL_RC_ACT to 5 (Hold), 4 (Land) or 3 (Return)"
     if value in _ON_LOSS:
         return passed(name, f"{value} ({_ON_LOSS[value]}) when setpoints stop")
     if value == 0:
         told = "0 (Position) when setpoints stop: the sticks then fly it; with no remote control it returns home"
-        return warned(name, told, mend)
-    return failed(name, f"{value} ({_FATAL_ON_LOSS.get(value, 'not known')}) when setpoints stop", mend)
+        return warned(name, told, fix)
+    return failed(name, f"{value} ({_FATAL_ON_LOSS.get(value, 'not known')}) when setpoints stop", fix)
 
 
 _ON_LOW_BATTERY = {1: "Return", 2: "Land", 3: "Return, and Land when nearly empty"}
@@ -127,7 +136,7 @@ _AT_FENCE = {2: "Hold", 3: "Return", 5: "Land"}
 
 def judge_fence_action(value: int, config: DroneConfig) -> Finding:
     """GF_ACTION."""
-    name, mend = "GF_ACTION", "set GF_ACTION to 2 (Hold), 3 (Return) or 5 (Land)"
+    name, fix = "GF_ACTION", "set GF_ACTION to 2 (Hold), 3 (Return) or 5 (Land)"
     if value in _AT_FENCE:
         return passed(name, f"{value} ({_AT_FENCE[value]}) at PX4's fence")
     off = {
@@ -135,7 +144,7 @@ def judge_fence_action(value: int, config: DroneConfig) -> Finding:
         1: "Warning: PX4's fence stops nothing",
         4: "Terminate: motors stop at the fence",
     }
-    return warned(name, f"{value} ({off.get(value, 'not known')})", mend)
+    return warned(name, f"{value} ({off.get(value, 'not known')})", fix)
 
 
 def judge_fence_radius(value: float, config: DroneConfig) -> Finding:

@@ -1,4 +1,4 @@
-"""What a service manager is told: ready, alive, reloading, stopping. The protocol of sd_notify(3), over its socket."""
+"""Notifications to a service manager by sd_notify(3): ready, watchdog, reloading, stopping."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FEEDS_A_PERIOD = 4
 
 
 class ServiceManager:
-    """systemd, if it started this process and asked to be told; else nobody. Sending never waits and never fails."""
+    """systemd, if it started this process with a notify socket; else a no-op. Sending never waits and never fails."""
 
     def __init__(self, environment: Mapping[str, str], *, clock: Callable[[], float] = time.monotonic) -> None:
         """``environment`` is the process's own: NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID."""
@@ -25,7 +25,7 @@ class ServiceManager:
         self._fed_s = float("-inf")
 
     def ready(self, status: str) -> None:
-        """Everything runs."""
+        """Startup is complete."""
         self._send("READY=1", f"STATUS={status}")
 
     def status(self, status: str) -> None:
@@ -33,11 +33,11 @@ class ServiceManager:
         self._send(f"STATUS={status}")
 
     def starting(self, status: str, more_s: float) -> None:
-        """Not ready yet, for a good reason: gives it more time."""
+        """Not ready yet: extends the start time-out by ``more_s``."""
         self._send(f"EXTEND_TIMEOUT_USEC={round(more_s * 1e6)}", f"STATUS={status}")
 
     def reloading(self) -> None:
-        """Reads its configuration again; `ready` ends that."""
+        """The configuration is being reloaded, until `ready`."""
         self._send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def stopping(self) -> None:
@@ -45,7 +45,7 @@ class ServiceManager:
         self._send("STOPPING=1")
 
     def alive(self) -> None:
-        """Feeds the watchdog, when it is time. To be called by whoever must not hang, and by nobody else."""
+        """Feeds the watchdog when due. Only the control loop may call it: its hanging is what the watchdog detects."""
         now = self._clock()
         if self._period_s and now - self._fed_s >= self._period_s / FEEDS_A_PERIOD:
             self._fed_s = now
@@ -56,5 +56,5 @@ class ServiceManager:
             return
         try:
             self._socket.sendto("\n".join(lines).encode(), self._address)
-        except OSError:  # a manager that does not listen: its own watchdog then decides, and the flight goes on
+        except OSError:  # the flight goes on; the manager's watchdog decides
             return

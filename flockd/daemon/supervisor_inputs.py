@@ -1,4 +1,4 @@
-"""Gathers all that the supervisor goes by."""
+"""Collects the supervisor's inputs from all components."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ import numpy as np
 
 from flockd.autopilot.status import AutopilotStatus
 from flockd.config import DroneConfig
-from flockd.daemon.computer import LoopLag, Thermometer
+from flockd.daemon.host_monitors import LoopLag, Thermometer
 from flockd.daemon.networks import WatchedNetworks
-from flockd.daemon.sight import Sight
+from flockd.daemon.operator_commands import OperatorRequests
+from flockd.daemon.pilot_loop import PilotLoop
 from flockd.messages import FloatArray, VehicleState
 from flockd.safety import CameraHealth, Gate, Inputs, Objection, outside_fence, outside_heights
 from flockd.sources import CameraStatus, Count, FrameSource
@@ -23,26 +24,14 @@ _BAD: tuple[Count, ...] = ("time_stamp", "flagged", "corrupt", "malformed")
 _REFUSED = (Objection.COMMAND_NOT_FINITE, Objection.COMMAND_TOO_LARGE)
 
 
-@dataclass
-class Asked:
-    """What people want, and what the autopilot refused."""
-
-    shutdown: bool = False
-    hold: bool = False
-    land: bool = False
-    resume: bool = False
-    """Until it was told once, as the next."""
-    offboard_refused: bool = False
-
-
-class Inspector:
-    """Looks at everything, at each tick of the control loop."""
+class InputCollector:
+    """Collects the inputs at each tick of the control loop."""
 
     def __init__(
         self,
         config: DroneConfig,
         source: FrameSource,
-        sight: Sight,
+        pilot_loop: PilotLoop,
         networks: WatchedNetworks,
         gate: Gate,
         lag: LoopLag,
@@ -51,54 +40,54 @@ class Inspector:
         clock: Callable[[], float],
     ) -> None:
         """``dead_tasks``: why each task that has ended did, by name; grows elsewhere."""
-        self._config, self._source, self._sight, self._networks = config, source, sight, networks
+        self._config, self._source, self._pilot_loop, self._networks = config, source, pilot_loop, networks
         self._gate, self._lag, self._thermometer, self._dead_tasks = gate, lag, thermometer, dead_tasks
         self._clock = clock
-        self._eyes = Eyes(config)
-        self._faults_told = 0
-        self._refused_told = 0
+        self._camera_monitor = CameraMonitor(config)
+        self._faults_before = 0
+        self._refused_before = 0
         self._had_satellites = False
 
-    def inspect(self, status: AutopilotStatus, vehicle: VehicleState | None, asked: Asked) -> Inputs:
-        """All as of now; what is asked once is told once."""
+    def collect(self, status: AutopilotStatus, vehicle: VehicleState | None, operator: OperatorRequests) -> Inputs:
+        """All inputs as of now; requests that count once are reset in ``operator``."""
         now = self._clock()
-        sight, look = self._sight, self._sight.newest
-        neighbours = look.output.neighbours if look else ()
+        pilot_loop, result = self._pilot_loop, self._pilot_loop.newest
+        neighbours = result.output.neighbours if result else ()
         ranges = [float(np.linalg.norm(n.position)) for n in neighbours if n.confirmed]
-        eyes = self._eyes.look(now, self._source.status())
+        summary = self._camera_monitor.update(now, self._source.status())
         position = position_from_home(status)
         self._had_satellites = self._had_satellites or status.gps_ok is True
         inputs = Inputs(
-            cameras=eyes.cameras,
-            dropped_share=eyes.dropped_share,
-            estimate_age_s=math.inf if look is None else now - look.time_s,
-            ego_motion_failures=sight.ego_motion_failures,
-            network_faults=self._networks.faults - self._faults_told,
+            cameras=summary.cameras,
+            dropped_share=summary.dropped_share,
+            estimate_age_s=math.inf if result is None else now - result.time_s,
+            ego_motion_failures=pilot_loop.ego_motion_failures,
+            network_faults=self._networks.faults - self._faults_before,
             inference_stuck=self._networks.stuck,
-            load=sight.load(),
+            load=pilot_loop.load(),
             temperature_c=self._thermometer.hottest_c,
             loop_lag_s=self._lag.worst_s(),
             dead_tasks=tuple(self._dead_tasks),
-            neighbours_age_s=now - sight.neighbour_seen_s,
+            neighbours_age_s=now - pilot_loop.neighbour_seen_s,
             nearest_neighbour_m=min(ranges, default=math.inf),
-            refused_commands=self._refused() - self._refused_told,
+            refused_commands=self._refused() - self._refused_before,
             outside_fence=outside_fence(self._config.safety.gate, position),
             outside_heights=vehicle is None or outside_heights(self._config.safety.gate, vehicle.height_m),
             heartbeat_age_s=status.heartbeat_age_s,
             flight_mode=None if status.flight_mode == "unknown" else status.flight_mode,
             armed=None if math.isinf(status.heartbeat_age_s) else status.armed,
             in_air=None if status.landed_state == "unknown" else status.in_air,
-            offboard_refused=asked.offboard_refused,
+            offboard_refused=operator.offboard_refused,
             battery_low=self._battery_low(status),
             position_lost=status.estimate_ok is False or (self._had_satellites and status.gps_ok is False),
-            shutdown_asked=asked.shutdown,
-            hold_asked=asked.hold,
-            land_asked=asked.land,
-            resume_asked=asked.resume,
+            shutdown_asked=operator.shutdown,
+            hold_asked=operator.hold,
+            land_asked=operator.land,
+            resume_asked=operator.resume,
         )
-        self._faults_told += inputs.network_faults
-        self._refused_told += inputs.refused_commands
-        asked.resume = asked.offboard_refused = False
+        self._faults_before += inputs.network_faults
+        self._refused_before += inputs.refused_commands
+        operator.resume = operator.offboard_refused = False
         return inputs
 
     def _refused(self) -> int:
@@ -110,7 +99,7 @@ class Inspector:
 
 
 def position_from_home(status: AutopilotStatus) -> FloatArray:
-    """(2,) metres north and east; NaN where the autopilot has not said."""
+    """(2,) metres north and east; NaN while the autopilot has not sent its position or home."""
     if status.position_ned is None or status.home_ned is None:
         return np.full(2, np.nan)
     from_home: FloatArray = (status.position_ned - status.home_ned)[:2]
@@ -118,15 +107,15 @@ def position_from_home(status: AutopilotStatus) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What the supervisor is told of the cameras."""
+class CameraSummary:
+    """The supervisor's inputs from the cameras."""
 
     cameras: Mapping[str, CameraHealth]
     dropped_share: float
 
 
-class Eyes:
-    """How the cameras are doing, and how many of their frames of late were worth nothing."""
+class CameraMonitor:
+    """The health of each camera, and the share of frames dropped in the last seconds."""
 
     def __init__(self, config: DroneConfig) -> None:
         source = config.source
@@ -137,8 +126,8 @@ class Eyes:
         self._frozen_before = dict.fromkeys(self._periods_s, 0)
         self._window: deque[tuple[float, int, int]] = deque()
 
-    def look(self, now: float, status: Mapping[str, CameraStatus]) -> Seen:
-        """As of now; to be called again and again."""
+    def update(self, now: float, status: Mapping[str, CameraStatus]) -> CameraSummary:
+        """As of now; to be called at each tick."""
         cameras = {name: self._health(name, camera) for name, camera in status.items()}
         received = sum(camera.counts.get("received", 0) for camera in status.values())
         bad = sum(camera.counts.get(what, 0) for camera in status.values() for what in _BAD)
@@ -146,10 +135,10 @@ class Eyes:
             self._window.popleft()
         self._window.append((now, received, bad))
         _, received_before, bad_before = self._window[0]
-        return Seen(cameras, (bad - bad_before) / max(received - received_before, 1))
+        return CameraSummary(cameras, (bad - bad_before) / max(received - received_before, 1))
 
     def _health(self, name: str, camera: CameraStatus) -> CameraHealth:
-        """A fault after which frozen pictures were counted is that of a frozen camera."""
+        """A fault with frozen images counted since the last good state means that the camera is frozen."""
         frozen = camera.counts.get("frozen", 0)
         if camera.fault is None:
             self._frozen_before[name] = frozen

@@ -11,7 +11,7 @@ import zenoh
 from flockd.errors import UnavailableError
 
 
-class PeerError(UnavailableError):
+class SessionError(UnavailableError):
     """Endpoints, or a file of settings, that cannot be used."""
 
     def __init__(self, purpose: str, endpoints: str, reason: str) -> None:
@@ -19,7 +19,7 @@ class PeerError(UnavailableError):
         self.reason = reason
 
 
-def open_peer(
+def open_session(
     purpose: str,
     listen: Sequence[str],
     connect: Sequence[str],
@@ -36,7 +36,7 @@ def open_peer(
         settings: a file of zenoh's own to begin with: for TLS and access control.
         shared_memory: whether large messages go through it; None: as zenoh or the settings have it.
 
-    Raises PeerError.
+    Raises SessionError.
     """
     try:
         return zenoh.open(_config(listen, connect, settings, shared_memory))
@@ -44,10 +44,10 @@ def open_peer(
         endpoints = ", ".join([*listen, *connect]) or "no endpoint"
         with_settings = f" with the settings of {settings}" if settings else ""
         reason = str(error).split(" at ")[0].split(": [")[0]
-        raise PeerError(purpose, f"{endpoints}{with_settings}", reason) from error
+        raise SessionError(purpose, f"{endpoints}{with_settings}", reason) from error
 
 
-def close_peer(session: zenoh.Session) -> None:
+def close_session(session: zenoh.Session) -> None:
     """Ends a session and all that was declared in it."""
     session.close()  # type: ignore[no-untyped-call]
 

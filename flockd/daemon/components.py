@@ -1,4 +1,4 @@
-"""Everything that runs in a flight, for those who look after it."""
+"""The components of a running daemon."""
 
 from __future__ import annotations
 
@@ -7,30 +7,31 @@ from dataclasses import dataclass, field
 
 from flockd.autopilot.mavsdk_link import AutopilotLink
 from flockd.autopilot.streamer import SetpointStreamer
-from flockd.daemon.chronicle import Chronicle
-from flockd.daemon.computer import LoopLag, Thermometer, WallClock
+from flockd.daemon.autopilot_requests import AutopilotRequests
 from flockd.daemon.control import Control
+from flockd.daemon.host_monitors import LoopLag, Thermometer, WallClock
+from flockd.daemon.message_sinks import MessageSinks
 from flockd.daemon.networks import WatchedNetworks
-from flockd.daemon.requests import Requests, TakeOff
-from flockd.daemon.sight import Sight
+from flockd.daemon.pilot_loop import PilotLoop
+from flockd.daemon.take_off import TakeOff
 from flockd.pilot.trim import VelocityTrim
 from flockd.sources import FrameSource
 from flockd.telemetry.publisher import ZenohTelemetry
 
 
 @dataclass(frozen=True, eq=False)
-class Crew:
-    """The parts, made and started by the daemon."""
+class Components:
+    """Created and connected by `startup.open_components`."""
 
     link: AutopilotLink
     streamer: SetpointStreamer
     source: FrameSource
-    sight: Sight
+    pilot_loop: PilotLoop
     networks: WatchedNetworks
     control: Control
-    requests: Requests
+    requests: AutopilotRequests
     take_off: TakeOff
-    chronicle: Chronicle
+    sinks: MessageSinks
     telemetry: ZenohTelemetry
     lag: LoopLag
     thermometer: Thermometer
@@ -39,4 +40,4 @@ class Crew:
     dead_tasks: dict[str, str]
     """Why each task that has ended did, by name."""
     over: asyncio.Event = field(default_factory=asyncio.Event)
-    """The flight is over: the tasks may end."""
+    """Set when the flight is over and the tasks may end."""

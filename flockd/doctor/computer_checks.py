@@ -48,8 +48,8 @@ def check_disk(config: DroneConfig, folder: Path | None) -> Iterator[Finding]:
             file.flush()
             os.fsync(file.fileno())
     except OSError as error:
-        mend = "make the folder and give it to the user that flies, as with `chown flockd`, or name another"
-        yield failed("disk", f"{folder} cannot be written ({error.strerror})", mend)
+        fix = "make the folder and give it to the user that flies, as with `chown flockd`, or name another"
+        yield failed("disk", f"{folder} cannot be written ({error.strerror})", fix)
         return
     own_mb = sum(path.stat().st_size for path in folder.glob(f"{config.name}-*.mcap")) / MB
     yield judge_room(config, folder, shutil.disk_usage(folder).free / MB, own_mb)
@@ -61,11 +61,11 @@ def judge_room(config: DroneConfig, folder: Path, free_mb: float, own_mb: float)
     room_mb = free_mb + own_mb
     measured = f"{free_mb / 1e3:.1f} GB free in {folder}, {own_mb / 1e3:.1f} GB are this drone's recordings"
     if room_mb < wanted.file_mb:
-        mend = f"make room, or write recording.file_mb and quota_mb: {0.8 * room_mb:.0f}"
-        return failed("disk", f"{measured}: not enough for a file of {wanted.file_mb / 1e3:g} GB (file_mb)", mend)
+        fix = f"make room, or write recording.file_mb and quota_mb: {0.8 * room_mb:.0f}"
+        return failed("disk", f"{measured}: not enough for a file of {wanted.file_mb / 1e3:g} GB (file_mb)", fix)
     if room_mb < wanted.quota_mb:
-        mend = f"make room, or write recording.quota_mb: {0.9 * room_mb:.0f}"
-        return warned("disk", f"{measured}: not enough for the quota of {wanted.quota_mb / 1e3:g} GB", mend)
+        fix = f"make room, or write recording.quota_mb: {0.9 * room_mb:.0f}"
+        return warned("disk", f"{measured}: not enough for the quota of {wanted.quota_mb / 1e3:g} GB", fix)
     return passed("disk", f"{measured}; the quota of {wanted.quota_mb / 1e3:g} GB fits")
 
 
@@ -75,11 +75,11 @@ def check_memory(config: DroneConfig, meminfo: Path = MEMORY) -> Iterator[Findin
     free_mb, total_mb = (int(values[key].split()[0]) * 1024 / MB for key in ("MemAvailable", "MemTotal"))
     needs_mb = NEEDS_MB + config.recording.queue_mb
     measured = f"{free_mb:.0f} of {total_mb:.0f} MB are available, flockd needs about {needs_mb:.0f}"
-    mend = "stop other programs, or make recording.queue_mb smaller"
+    fix = "stop other programs, or make recording.queue_mb smaller"
     if free_mb < needs_mb:
-        yield failed("memory", measured, mend)
+        yield failed("memory", measured, fix)
     elif free_mb < needs_mb + SPARE_MB:
-        yield warned("memory", f"{measured}: little is left", mend)
+        yield warned("memory", f"{measured}: little is left", fix)
     else:
         yield passed("memory", measured)
 
@@ -176,12 +176,12 @@ def _ticks(monotonic: Callable[[], float], sleep: Callable[[float], None]) -> li
 
 def judge_monotonic(ticks: list[float]) -> Finding:
     """Readings with pauses of `SAMPLE_S` between them; a pause takes as long or longer."""
-    mend = "look at /sys/devices/system/clocksource/clocksource0/current_clocksource, and boot with another"
+    fix = "look at /sys/devices/system/clocksource/clocksource0/current_clocksource, and boot with another"
     steps = [after - before for before, after in itertools.pairwise(ticks)]
     if min(steps) <= 0.0:
-        return failed("monotonic clock", f"it stood or went back by {-1e3 * min(steps):.1f} ms", mend)
+        return failed("monotonic clock", f"it stood or went back by {-1e3 * min(steps):.1f} ms", fix)
     shortest = min(steps)
     if shortest < (1.0 - DRIFT) * SAMPLE_S:
         told = f"{1e3 * shortest:.1f} ms went by in a pause of {1e3 * SAMPLE_S:.0f} ms: it is slow or coarse"
-        return failed("monotonic clock", told, mend)
+        return failed("monotonic clock", told, fix)
     return passed("monotonic clock", f"runs on; {1e3 * SAMPLE_S:.0f} ms pauses took {1e3 * shortest:.1f} ms and more")

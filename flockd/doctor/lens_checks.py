@@ -67,12 +67,12 @@ def coverage(rig: RigConfig) -> Finding:
     if seen.all():
         return passed("rig", f"{len(rig.cameras)} cameras see all of the horizon")
     if not seen.any():
-        return failed("rig", "no camera sees the horizon", "mend the cameras' extrinsics")
+        return failed("rig", "no camera sees the horizon", "fix the cameras' extrinsics")
     gaps = " and ".join(_gaps(~seen))
     return warned(
         "rig",
         f"blind at the horizon {gaps}, clockwise from forward: neighbours there are not seen",
-        "turn, widen or add cameras, or mend their extrinsics",
+        "turn, widen or add cameras, or fix their extrinsics",
     )
 
 

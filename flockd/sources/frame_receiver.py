@@ -10,13 +10,13 @@ from flockd.config.source import SourceParameters
 from flockd.messages import Frame, FrameSet
 from flockd.sources.assembler import Assembler, RawFrameSet
 from flockd.sources.frames import CameraStatus, Count, RawFrame
-from flockd.sources.images import CorruptImageError
+from flockd.sources.image_formats import CorruptImageError
 
 _TICK_S = 0.01
 """How often a waiting reader looks whether a set that is not complete has waited long enough."""
 
 
-class Intake:
+class FrameReceiver:
     """The assembler behind a lock, and the decoding in front of it: what all sources have in common."""
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Everything the daemon tells, to whoever is there to take it: watchers, the recording of the flight, and the log."""
+"""Sends every message of the daemon to its sinks: telemetry, the recording of the flight, and the log."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ CLOSE_S = 5.0
 _log = logging.getLogger(__name__)
 
 
-class Chronicle:
-    """Nothing here waits, and nothing that goes wrong here ends a flight. `event` and `publish` are for any thread."""
+class MessageSinks:
+    """Only `close` waits, and no error here ends a flight. `event` and `publish` may be called on any thread."""
 
     def __init__(
         self,
@@ -38,22 +38,22 @@ class Chronicle:
         self._recorder: Recorder | None = None
         self._path: Path | None = None
         self.lost = 0
-        """Messages that nobody could take in time."""
+        """Messages dropped because the worker was busy."""
 
     def event(self, sentence: str) -> None:
-        """Something that happened once."""
+        """Logs and publishes one event."""
         _log.info("%s", sentence)
         self.publish("events", EventMessage(time_s=self._clock(), event=sentence))
 
     def publish(self, topic: str, message: Mapping[str, object]) -> None:
         """One message; see `flockd.telemetry.TOPICS`."""
-        self._hand_over(self._telemetry.publish, self._config.name, topic, message)
+        self._submit(self._telemetry.publish, self._config.name, topic, message)
         if self._recorder is not None:
             self._recorder.publish(self._config.name, topic, message)
 
     def step(self, frames: FrameSet, vehicle: VehicleState, output: PilotOutput) -> None:
-        """One step of the pilot, to watchers and into the recording."""
-        self._hand_over(publish_step, self._telemetry, self._config.name, vehicle, output)
+        """Publishes and records one step of the pilot."""
+        self._submit(publish_step, self._telemetry, self._config.name, vehicle, output)
         if self._recorder is not None:
             self._recorder.step(frames, vehicle, output)
 
@@ -65,22 +65,26 @@ class Chronicle:
         return self._recorder.failure or str(self._path)
 
     def begin_recording(self) -> None:
-        """A flight begins: a new file, where flights are recorded."""
+        """Begins a new file for a flight, where flights are recorded."""
         if self._folder is None:
             return
         self.end_recording()
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S%fZ")
         self._path = self._folder / f"{self._config.name}-{stamp}.mcap"
         self._recorder = Recorder(
-            self._path, drone=self._config.name, config=self._config, models=self._models, on_event=self._of_recorder
+            self._path,
+            drone=self._config.name,
+            config=self._config,
+            models=self._models,
+            on_event=self._on_event,
         )
         self.event(f"recording to {self._path}")
 
     def end_recording(self) -> None:
-        """The flight is over; the file is ended in the background."""
+        """Ends the file in the background."""
         recorder, self._recorder = self._recorder, None
         if recorder is not None:
-            self._hand_over(recorder.close, CLOSE_S)
+            self._submit(recorder.close, CLOSE_S)
 
     async def close(self) -> None:
         """Ends the recording, and waits until all is written or it takes too long. Raises LateError."""
@@ -88,13 +92,13 @@ class Chronicle:
         await self._worker.do(CLOSE_S + 1.0, lambda: None)
         self._worker.leave()
 
-    def _of_recorder(self, sentence: str) -> None:
-        """Already in the recording, if that still can be."""
+    def _on_event(self, sentence: str) -> None:
+        """The recorder has recorded it already, if it still can."""
         _log.warning("%s", sentence)
         message = EventMessage(time_s=self._clock(), event=sentence)
-        self._hand_over(self._telemetry.publish, self._config.name, "events", message)
+        self._submit(self._telemetry.publish, self._config.name, "events", message)
 
-    def _hand_over(self, job: Callable[..., None], *arguments: object) -> None:
+    def _submit(self, job: Callable[..., None], *arguments: object) -> None:
         try:
             self._worker.submit(job, *arguments)
         except BusyError:

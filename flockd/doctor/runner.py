@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass
 
-from flockd.doctor.finding import Finding, failed, failed_as_told
+from flockd.doctor.finding import Finding, failed, failed_from_error
 from flockd.errors import FlockdError
 
 
@@ -22,7 +22,7 @@ class Check:
     """Much longer than it should take."""
 
 
-def examine(checks: Sequence[Check], on_done: Callable[[int, int], None]) -> dict[str, tuple[Finding, ...]]:
+def run_checks(checks: Sequence[Check], on_done: Callable[[int, int], None]) -> dict[str, tuple[Finding, ...]]:
     """What each check found, by its name; ``on_done`` is told how many of how many are done."""
     found = {}
     for number, check in enumerate(checks, start=1):
@@ -46,8 +46,8 @@ def _bounded(check: Check) -> tuple[Finding, ...]:
     threading.Thread(target=run, name=f"check {check.name}", daemon=True).start()
     if not wait([ended], check.limit_s).done:
         measured = f"the check has not ended within {check.limit_s:g} s"
-        mend = "something it asked does not answer: see what else this check says, and the kernel's log (`dmesg`)"
-        return (*found, failed(check.name, measured, mend))
+        fix = "something it asked does not answer: see what else this check says, and the kernel's log (`dmesg`)"
+        return (*found, failed(check.name, measured, fix))
     error = ended.exception()
     return tuple(found) if error is None else (*found, _of_error(check.name, error))
 
@@ -55,7 +55,7 @@ def _bounded(check: Check) -> tuple[Finding, ...]:
 def _of_error(about: str, error: BaseException) -> Finding:
     """The failure that an error means."""
     if isinstance(error, FlockdError):
-        return failed_as_told(about, str(error))
+        return failed_from_error(about, str(error))
     if isinstance(error, ImportError):
         return failed(about, f"a library cannot be loaded ({error})", "install flockd again, for this computer")
     if isinstance(error, OSError):

@@ -1,4 +1,4 @@
-"""An event loop for a daemon whose drone is simulated: what waits, waits in simulated seconds."""
+"""An asyncio event loop in simulated time: sleeps and time-outs count simulated seconds."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import asyncio
 import selectors
 from typing import Any
 
-from flockd.sources.simulated_time import clock_at
+from flockd.sources.clock import clock_at
 
 
 def event_loop_at(speed_factor: float) -> asyncio.AbstractEventLoop:

@@ -15,10 +15,10 @@ import numpy as np
 from flockd.config import DroneConfig
 from flockd.config.rig import CameraConfig
 from flockd.config.source import CameraDeviceParameters, SourceParameters
-from flockd.doctor.finding import Finding, failed, failed_as_told, passed, warned
-from flockd.doctor.lenses import coverage, lens_problems, width_deg
+from flockd.doctor.finding import Finding, failed, failed_from_error, passed, warned
+from flockd.doctor.lens_checks import coverage, lens_problems, width_deg
 from flockd.messages import UInt8Array
-from flockd.sources.images import CorruptImageError, ImageFormat, MjpegFormat, YuyvFormat
+from flockd.sources.image_formats import CorruptImageError, ImageFormat, MjpegFormat, YuyvFormat
 from flockd.sources.shared_memory import SharedMemorySource
 from flockd.sources.v4l2 import MAX_AHEAD_S
 from flockd.sources.v4l2_device import CameraError, CapturedBuffer, Kernel, LinuxKernel, V4l2Device
@@ -41,7 +41,7 @@ class Watched:
     """What one camera did."""
 
     fault: str | None = None
-    """Why it gives nothing, in one sentence that ends in its mend."""
+    """Why it gives nothing, in one sentence that ends in its fix."""
     stamps_s: list[float] = field(default_factory=list)
     """When each image was taken, as its time stamp says."""
     arrivals_s: list[float] = field(default_factory=list)
@@ -114,7 +114,7 @@ def stream_problems(
     """What is wrong with the images that came; ``relief`` is what mends too few, uneven or damaged ones."""
     about = f"camera {name}"
     if watched.fault is not None:
-        yield failed_as_told(about, watched.fault.removeprefix(f"{name}: "))
+        yield failed_from_error(about, watched.fault.removeprefix(f"{name}: "))
         return
     came, bad = len(watched.stamps_s), sum(watched.refused.values())
     share = (watched.lost + bad) / max(came + watched.lost + bad, 1)
@@ -125,8 +125,8 @@ def stream_problems(
     pace = watched.rate_hz / rate_hz
     if pace < SLOW or pace > 2.0 - SLOW:
         measured = f"{watched.rate_hz:.1f} images a second instead of {rate_hz:g}"
-        mend = f"{relief}, or write rate_hz: {max(watched.rate_hz, 0.1):.2g}"
-        yield (failed if pace < TOO_SLOW else warned)(about, measured, mend)
+        fix = f"{relief}, or write rate_hz: {max(watched.rate_hz, 0.1):.2g}"
+        yield (failed if pace < TOO_SLOW else warned)(about, measured, fix)
     jitter_s = watched.jitter_s()
     if jitter_s * rate_hz > UNEVEN:
         measured = f"images come unevenly: {1e3 * jitter_s:.1f} ms off their beat of {1e3 / rate_hz:.1f} ms"
@@ -135,16 +135,16 @@ def stream_problems(
         grey = float(watched.picture.mean())
         if not DARK <= grey <= BRIGHT:
             how = "dark" if grey < DARK else "bright"
-            mend = "take off the cap, or set exposure and gain for the light where it flies"
-            yield warned(about, f"the picture is too {how} to see by (mean {grey:.0f} of 255)", mend)
+            fix = "take off the cap, or set exposure and gain for the light where it flies"
+            yield warned(about, f"the picture is too {how} to see by (mean {grey:.0f} of 255)", fix)
 
 
 def _exposure_problems(device: CameraDeviceParameters) -> Iterator[Finding]:
     """The driver refuses controls that it does not accept; here is what was not even asked."""
     if not any("exposure" in control.name for control in device.controls):
         measured = "its exposure is not configured: an automatic one blurs, and looks like motion"
-        mend = "set it in source.cameras[].controls, as in config/quadrotor.yaml"
-        yield warned(f"camera {device.name}", measured, mend)
+        fix = "set it in source.cameras[].controls, as in config/quadrotor.yaml"
+        yield warned(f"camera {device.name}", measured, fix)
 
 
 def watch_devices(config: DroneConfig, source: SourceParameters, seconds: float, kernel: Kernel) -> dict[str, Watched]:
@@ -284,7 +284,7 @@ def watch_shared_memory(config: DroneConfig, source: SourceParameters, seconds: 
             where = source.shared_memory
             nothing = (
                 f"no frame of {where.drone}/{name} came from {', '.join(where.connect)} within {START_S:g} s; "
-                "start the program that publishes them, or mend source.shared_memory"
+                "start the program that publishes them, or fix source.shared_memory"
             )
             record.fault = status[name].fault or nothing
     return watched

@@ -1,4 +1,4 @@
-"""How the computer under the daemon is doing: how late the event loop runs, how hot it is, what its clock does."""
+"""Monitors of the computer: lag of the event loop, temperature, jumps of the wall clock."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from flockd.daemon.worker import LateError, Worker
 
-LOOK_S = 0.05
+SAMPLE_S = 0.05
 MEMORY_S = 1.0
 THERMAL_ZONES = Path("/sys/class/thermal")
 READ_DEADLINE_S = 1.0
@@ -19,7 +19,7 @@ JUMP_S = 0.5
 
 
 class LoopLag:
-    """Measures how late the event loop wakes who sleeps in it."""
+    """Measures how late the event loop wakes a sleeping task."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -27,10 +27,10 @@ class LoopLag:
         self._due_s = math.inf
 
     async def run(self) -> None:
-        """Measures for ever."""
+        """Measures until cancelled."""
         while True:
-            self._due_s = self._clock() + LOOK_S
-            await asyncio.sleep(LOOK_S)
+            self._due_s = self._clock() + SAMPLE_S
+            await asyncio.sleep(SAMPLE_S)
             now = self._clock()
             self._measured.append((now, max(0.0, now - self._due_s)))
 
@@ -52,7 +52,7 @@ class Thermometer:
         """None on a computer that has no thermal zone, and while the reading hangs."""
 
     async def run(self) -> None:
-        """Reads for ever."""
+        """Reads until cancelled."""
         while True:
             try:
                 self.hottest_c = await self._worker.do(READ_DEADLINE_S, hottest_zone_c, self._folder)
@@ -64,25 +64,25 @@ class Thermometer:
 
 
 class WallClock:
-    """Notes when somebody sets the clock. Nothing in a flight goes by it; who reads the log wants to know."""
+    """Reports when the wall clock is set: the flight does not use it, but readers of the log need to know."""
 
     def __init__(
-        self, tell: Callable[[str], None], clock: Callable[[], float], wall: Callable[[], float] = time.time
+        self, log_event: Callable[[str], None], clock: Callable[[], float], wall: Callable[[], float] = time.time
     ) -> None:
-        self._tell, self._clock, self._wall = tell, clock, wall
+        self._log_event, self._clock, self._wall = log_event, clock, wall
         self._ahead_s = wall() - clock()
 
     async def run(self) -> None:
-        """Looks for ever."""
+        """Checks once a second until cancelled."""
         while True:
-            self.look()
+            self.check()
             await asyncio.sleep(1.0)
 
-    def look(self) -> None:
-        """Once."""
+    def check(self) -> None:
+        """Checks once."""
         ahead_s = self._wall() - self._clock()
         if abs(ahead_s - self._ahead_s) > JUMP_S:
-            self._tell(f"the wall clock was set by {ahead_s - self._ahead_s:+.1f} s; nothing in the flight goes by it")
+            self._log_event(f"the wall clock was set by {ahead_s - self._ahead_s:+.1f} s; the flight does not use it")
         self._ahead_s = ahead_s
 
 
