@@ -31,7 +31,8 @@ MAY_IMPORT = {
     "telemetry": BASE | {"zenoh_session"},
     "recording": BASE | {"telemetry"},  # for the table of topics, which says what is recorded
     "calibration": BASE | {"geometry"},
-    "datasets": BASE | {"geometry", "inference", "perception", "pilot"},
+    "datasets": BASE | {"geometry"},
+    "replay": BASE | {"geometry", "inference", "perception", "pilot", "recording", "datasets"},
     "sim": BASE
     | {
         "geometry",
@@ -58,6 +59,7 @@ MAY_IMPORT = {
         "telemetry",
         "recording",
         "datasets",
+        "replay",
         "sim",
         "report",
         "view",

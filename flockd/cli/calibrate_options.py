@@ -15,7 +15,6 @@ from flockd.errors import UsageError
 
 if TYPE_CHECKING:
     from flockd.calibration.board import BoardSpec
-    from flockd.config import DroneConfig
     from flockd.config.rig import MeasurementConfig
 
 SECONDS = 120.0
@@ -65,16 +64,6 @@ def refuse_overwriting(args: argparse.Namespace, *files: Path | None) -> None:
             raise UsageError(f"{file}: exists; name another file, or overwrite it with --force")
         if file is not None and not file.parent.is_dir():
             raise UsageError(f"{file.parent}: is no folder; make it first, or name another file")
-
-
-def loaded(file: Path | None) -> DroneConfig | None:
-    """The drone of --config, which may also name a scenario. Raises ConfigError."""
-    from flockd.config import ScenarioConfig, load
-
-    if file is None:
-        return None
-    config = load(file)
-    return config.drone if isinstance(config, ScenarioConfig) else config
 
 
 @contextmanager

@@ -11,11 +11,11 @@ from flockd.cli.calibrate_options import (
     add_shared,
     board_of,
     ended_by_ctrl_c,
-    loaded,
     measurement,
     refuse_overwriting,
     source_name,
 )
+from flockd.cli.config import loaded
 from flockd.cli.output import complain, progress, say, say_json
 from flockd.cli.parser import Commands, positive_number
 from flockd.errors import ConfigError, ConfigProblem, ExitCode, UsageError

@@ -5,10 +5,14 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flockd.cli.output import say, say_json
 from flockd.cli.parser import Commands, add_commands
 from flockd.errors import ConfigError, ExitCode
+
+if TYPE_CHECKING:
+    from flockd.config import DroneConfig
 
 
 def add(commands: Commands) -> None:
@@ -83,3 +87,13 @@ def _schema(args: argparse.Namespace) -> int:
 
     say_json(schema_of(args.kind))
     return ExitCode.DONE
+
+
+def loaded(file: Path | None) -> DroneConfig | None:
+    """The drone of --config, which may also name a scenario. Raises ConfigError."""
+    from flockd.config import ScenarioConfig, load
+
+    if file is None:
+        return None
+    config = load(file)
+    return config.drone if isinstance(config, ScenarioConfig) else config

@@ -10,8 +10,7 @@ from zipfile import BadZipFile
 from flockd.cli.flights import LOG_NAME, check, prepare, save, tell, write_findings
 from flockd.cli.output import complain, progress
 from flockd.cli.parser import Commands
-from flockd.cli.record import opened
-from flockd.cli.replay import changes, faults
+from flockd.cli.recording_options import opened
 from flockd.errors import UsageError
 
 if TYPE_CHECKING:
@@ -90,18 +89,19 @@ def _recordings(path: Path) -> tuple[Path, ...]:
 
 
 def _flight(paths: Sequence[Path], *, pictured: bool) -> tuple[FlightLog, tuple[FilmstripFrame, ...]]:
+    from flockd.replay.fidelity import damage_warnings, replay_warnings
     from flockd.report.from_recording import filmstrip, flight_log
 
     recordings = [opened(path) for path in paths]
     for recording in recordings:
-        for fault in faults(recording):
+        for fault in damage_warnings(recording):
             complain(fault)
     with progress("reading", "steps") as tell_progress:
         log = flight_log(recordings, tell_progress)
     if not pictured:
         return log, ()
     first = min(recordings, key=lambda recording: log.meta["names"].index(recording.drone))
-    for change in changes(first, first.config, first.start_s):
+    for change in replay_warnings(first, first.config, first.start_s):
         complain(change)
     with progress("computing the pictures again", "steps") as tell_progress:
         return log, filmstrip(first, log, tell_progress)

@@ -50,16 +50,16 @@ def _run(args: argparse.Namespace) -> int:
 
 async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceManager) -> Ending:
     """With SIGTERM and Ctrl-C for standstill, Hold and the end, and SIGHUP for the configuration."""
-    from flockd.cli.record import models_of
     from flockd.config import load_drone
     from flockd.daemon import Daemon, clock_at
+    from flockd.inference.hashes import model_hashes
     from flockd.pilot.pilot import load_perception
 
     daemon = Daemon(
         config,
         str(args.config),
         load_networks=lambda: load_perception(config),
-        models=models_of(config),
+        models=model_hashes(config.perception),
         recordings=args.record,
         service=service,
         clock=clock_at(config.speed_factor),

@@ -124,7 +124,7 @@ def _recorders(
     scenario: ScenarioConfig, swap: frozenset[str], directory: Path, stack: ExitStack
 ) -> tuple[Recorder, ...]:
     """A recorder for each drone, over an earlier flight's recordings."""
-    from flockd.cli.record import models_of
+    from flockd.inference.hashes import model_hashes
     from flockd.recording import Recorder
 
     directory.mkdir(exist_ok=True)
@@ -138,7 +138,7 @@ def _recorders(
                 directory / f"drone{i + 1}.mcap",
                 drone=f"drone{i + 1}",
                 config=scenario.drone,
-                models=models_of(scenario.drone),
+                models=model_hashes(scenario.drone.perception),
                 facts=facts,
                 on_event=complain,
             )

@@ -282,6 +282,7 @@ def test_the_configuration_is_read_again_on_the_ground_only(
     async def on_the_ground(fake_autopilot: FakeAutopilot, port: int) -> None:
         async with aboard(fake_autopilot, port, tmp_path / "ground") as ship:
             await ship.until_state("idle")
+            await ship.ask("about")  # the session that receives events is connected
             ship.daemon.ask_to_reload(_wrong)
             await ship.until_event("the new configuration was refused, and the old one stays in use: tiny.yaml:3: ")
             other = ship.config.model_copy(update={"step_s": 0.2})

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from flockd.datasets.pair_motion import Pair
 from flockd.datasets.pose_track import quaternion_from_rotation
 from flockd.geometry import RigidTransform
+from flockd.replay.dataset_pairs import Pair
 
 
 def integrate(pairs: Iterable[Pair], stride: int) -> tuple[list[tuple[float, RigidTransform]], Pair | None]:
