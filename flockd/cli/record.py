@@ -59,9 +59,7 @@ def _add_export(commands: Commands) -> None:
 
 
 def _with_recording(parser: Parser) -> Parser:
-    parser.add_argument(
-        "recording", metavar="RECORDING", type=Path, help="an MCAP file of flockd"
-    )
+    parser.add_argument("recording", metavar="RECORDING", type=Path, help="an MCAP file of flockd")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     return parser
 

@@ -16,6 +16,7 @@ from flockd.errors import ExitCode, UsageError
 if TYPE_CHECKING:
     from flockd.config import DroneConfig
     from flockd.datasets import Dataset
+    from flockd.replay.dataset_flight import Depth
 
 _OF_RECORDINGS = ("speed", "start", "end", "out", "diff", "reference", "update_reference", "tolerance")
 _OF_DATASETS = ("depth", "stride", "flow", "calibration", "trajectory")
@@ -44,7 +45,8 @@ def run_dataset(args: argparse.Namespace) -> int:
     from flockd.datasets import open_dataset
     from flockd.replay.dataset_flight import dataset_config, dataset_result, replay_dataset, write_trajectory
 
-    stride, depth = args.stride or 1, args.depth or "network"
+    stride = args.stride or 1
+    depth: Depth = args.depth or "network"
     dataset = open_dataset(args.recording, args.calibration)
     _check(dataset, stride, depth)
     given = loaded(args.config)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
-from flockd.cli.flights import LOG_NAME, check, prepare, save, tell, write_findings
+from flockd.cli.flight_summary import show_summary
 from flockd.cli.output import complain, progress
 from flockd.cli.parser import Commands
 from flockd.cli.recording_options import opened
@@ -50,19 +50,23 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
+    from flockd.report.flight_folder import LOG_NAME, check_folder, prepare_folder, save_flight, write_report_files
+
     if (args.flight / LOG_NAME).is_file():
         return _again(args)
     paths = _recordings(args.flight)
     directory = args.out or args.flight.with_name(args.flight.resolve().name.removesuffix(".mcap") + SUFFIX)
-    check(directory)
+    check_folder(directory)
     log, pictures = _flight(paths, pictured=not args.without_pictures)
-    prepare(directory)
-    save(directory, log, pictures)
-    return tell(directory, write_findings(directory, log), as_json=args.json)
+    prepare_folder(directory)
+    save_flight(directory, log, pictures)
+    return show_summary(directory, write_report_files(directory, log), as_json=args.json)
 
 
 def _again(args: argparse.Namespace) -> int:
     """The report of a flight whose folder has its log."""
+    from flockd.report.flight_folder import LOG_NAME, write_report_files
+
     for option in ("out", "without_pictures"):
         if getattr(args, option):
             raise UsageError(f"--{option.replace('_', '-')} is for recordings, and {args.flight} has a flight's log")
@@ -73,11 +77,13 @@ def _again(args: argparse.Namespace) -> int:
         log = FlightLog.load(path)
     except (ValueError, EOFError, BadZipFile) as error:
         raise UsageError(f"{path}: is not a whole flight log ({error}); fly again with `flockd sim`") from error
-    return tell(args.flight, write_findings(args.flight, log), as_json=args.json)
+    return show_summary(args.flight, write_report_files(args.flight, log), as_json=args.json)
 
 
 def _recordings(path: Path) -> tuple[Path, ...]:
     """The recording that was named, or all in the folder that was."""
+    from flockd.report.flight_folder import LOG_NAME
+
     if not path.is_dir():
         return (path,)
     from flockd.report.from_recording import recordings_in

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli import sim_fleet
-from flockd.cli.flights import prepare, save, tell, write_findings
+from flockd.cli.flight_summary import show_summary
 from flockd.cli.output import complain, progress
 from flockd.cli.parser import Commands, positive_count, positive_number, seed
 from flockd.errors import UsageError
@@ -93,10 +93,12 @@ def _roles(text: str) -> frozenset[str]:
 
 
 def _run(args: argparse.Namespace) -> int:
+    from flockd.report.flight_folder import prepare_folder, save_flight, write_report_files
+
     _check_options(args)
     scenario = _scenario(args)
     directory = args.out or Path("out") / _folder_name(scenario, args)
-    prepare(directory)
+    prepare_folder(directory)
     if args.autopilot is not None:
         return sim_fleet.fly(args, scenario, directory)
     from flockd.sim.swarm import fly
@@ -116,8 +118,8 @@ def _run(args: argparse.Namespace) -> int:
             recorders=_recorders(scenario, args.swap, directory / RECORDINGS, stack) if args.record else (),
             progress=tell_progress,
         )
-    save(directory, flight.log, flight.filmstrip)
-    return tell(directory, write_findings(directory, flight.log), as_json=args.json)
+    save_flight(directory, flight.log, flight.filmstrip)
+    return show_summary(directory, write_report_files(directory, flight.log), as_json=args.json)
 
 
 def _recorders(

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from flockd.cli.flights import FLEET_LOGS, save, tell, write_findings
+from flockd.cli.flight_summary import show_summary
 from flockd.cli.output import complain, progress
 from flockd.errors import ExitCode, UsageError
 
@@ -45,6 +45,7 @@ def fly(args: argparse.Namespace, scenario: ScenarioConfig, directory: Path) -> 
     """Flies, writes the same report as the simulator, and says whether all flew to the end."""
     from flockd.config import load_drone
     from flockd.data import data_path
+    from flockd.report.flight_folder import FLEET_LOGS, save_flight, write_report_files
     from flockd.sim.fleet import fly_fleet
 
     with ExitStack() as stack:
@@ -60,9 +61,9 @@ def fly(args: argparse.Namespace, scenario: ScenarioConfig, directory: Path) -> 
             environment=os.environ,
             progress=tell_progress,
         )
-    save(directory, flight.log, flight.filmstrip)
-    summary = write_findings(directory, flight.log)
-    code = tell(directory, summary, as_json=args.json)
+    save_flight(directory, flight.log, flight.filmstrip)
+    summary = write_report_files(directory, flight.log)
+    code = show_summary(directory, summary, as_json=args.json)
     fleet = summary["fleet"]
     faults = [f"{drone} did not fly to the end: {why}" for drone, why in fleet["handed_over"].items()]
     faults += [

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from flockd.calibration.board import BoardFinder, BoardSpec
+from flockd.calibration.image_sources import identity
 from flockd.cli import main
-from flockd.cli.pictures import identity
 from flockd.config import DroneConfig, load_drone
 from flockd.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
 from flockd.messages import Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
@@ -188,7 +188,7 @@ def test_before_a_live_camera_a_person_is_told_what_to_do(
 def test_a_v4l2_camera_is_looked_through(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     kernel = FakeKernel(video7=FakeCamera(formats=((480, 360, b"MJPG"),)))
     monkeypatch.setattr("flockd.sources.v4l2.LinuxKernel", lambda: kernel)
-    monkeypatch.setattr("flockd.cli.pictures.FIRST_FRAME_S", 60.0)
+    monkeypatch.setattr("flockd.calibration.image_sources.FIRST_FRAME_S", 60.0)
     done = threading.Event()
 
     def film() -> None:
@@ -209,7 +209,7 @@ def test_a_v4l2_camera_is_looked_through(tmp_path: Path, capsys: Capture, monkey
 
 
 def test_a_camera_that_is_not_there_is_unavailable(tmp_path: Path, capsys: Capture, monkeypatch: Any) -> None:
-    monkeypatch.setattr("flockd.cli.pictures.FIRST_FRAME_S", 0.2)
+    monkeypatch.setattr("flockd.calibration.image_sources.FIRST_FRAME_S", 0.2)
     assert "/dev/video93 is not there; plug the camera in" in told(
         capsys, 69, "calibrate", "camera", "/dev/video93", "--out", tmp_path / "a"
     )

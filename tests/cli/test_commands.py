@@ -90,7 +90,8 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        ([], "flockd: the following arguments are required: COMMAND; see flockd --help"),
+        (["sims"], "flockd: 'sims' is not a command; did you mean `flockd sim`?; see flockd --help"),
+        (["record", "xyz"], "flockd record: 'xyz' is not a command, of info, recover, cut, export; see "),
         (["sim", "--duration", "-3"], "flockd sim: argument --duration: '-3' is not a positive number"),
         (["sim", "--duration", "nan"], "flockd sim: argument --duration: 'nan' is not a positive number"),
         (["sim", "--drones", "0"], "flockd sim: argument --drones: '0' is not a positive whole number"),
@@ -109,6 +110,15 @@ def test_a_slip_on_the_command_line_is_a_usage_error(
     error = _usage_error(capsys, *arguments)
     assert error.startswith(told)
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", [[], ["record"], ["config"], ["calibrate"]], ids=" ".join)
+def test_without_a_command_the_help_is_shown(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith(" ".join(["usage: flockd", *command]))
+    assert "examples:\n" in captured.err
 
 
 def test_the_roles_to_swap_are_those_that_can_be() -> None:

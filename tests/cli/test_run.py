@@ -155,3 +155,15 @@ def test_a_fleet_that_is_not_there_is_unavailable(capsys: pytest.CaptureFixture[
         f"no drone was heard at {endpoint} within 0.2 s; name where they are with --connect, or let them come with "
         "--listen\n"
     )
+
+
+def test_without_an_autopilot_it_is_unavailable_and_not_aborted(tmp_path: Path) -> None:
+    """The serial port is refused at once, while a thread still loads networks: ended then, the process was aborted."""
+    config = _written(tmp_path / "tiny.yaml", free_port(), free_endpoint(), free_endpoint())
+    values = yaml.safe_load(config.read_text(encoding="utf-8"))
+    values["autopilot"]["address"] = f"serial://{tmp_path / 'none'}:921600"
+    config.write_text(yaml.safe_dump(values), encoding="utf-8")
+    with _run(config, tmp_path) as process:
+        _, err = process.communicate(timeout=SECONDS_TO_FAIL)
+    assert process.returncode == 69, err
+    assert f"autopilot.address: serial://{tmp_path / 'none'}:921600 cannot be opened" in err.splitlines()[-1]

@@ -1,4 +1,4 @@
-"""Pictures to calibrate with: from a folder, a video, a recording or a live camera, and what identifies the camera."""
+"""Images to calibrate with: from a folder, a video, a recording or a live camera, and the camera's identity."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from pydantic import ValidationError
 
 from flockd.calibration.errors import CalibrationError
+from flockd.config import DroneConfig
+from flockd.datasets.image_files import SUFFIXES, read_image
 from flockd.errors import UnavailableError, UsageError
-
-if TYPE_CHECKING:
-    import cv2
-
-    from flockd.config import DroneConfig
-    from flockd.messages import UInt8Array, VehicleState
-    from flockd.sources import FrameSource
+from flockd.messages import UInt8Array, VehicleState
+from flockd.recording.reader import Recording
+from flockd.sources import FrameSource, open_source
 
 FIRST_FRAME_S = 10.0
 FRAME_WAIT_S = 0.2
@@ -26,7 +27,7 @@ SYSFS = Path("/sys/class/video4linux")
 
 
 @dataclass(frozen=True, eq=False)
-class PictureSet:
+class ImageSet:
     """What several cameras saw at one time."""
 
     name: str
@@ -38,27 +39,27 @@ class PictureSet:
 
 
 @dataclass(frozen=True, eq=False)
-class Pictures:
-    """Sets of pictures, one after the other."""
+class ImageStream:
+    """Sets of images, one after the other."""
 
-    sets: Iterator[PictureSet]
+    sets: Iterator[ImageSet]
     count: int
     """How many there are about; 0 for a live camera."""
     live: bool
     identities: Mapping[str, str]
-    """What is known to tell each camera from others: its serial number at best."""
+    """What identifies each camera: its serial number where it has one."""
 
 
-def from_folder(path: Path, camera: str) -> Pictures:
+def from_folder(path: Path, camera: str) -> ImageStream:
     """All images of a folder, by name, as those of one camera. Raises CalibrationError where there are none."""
     files = _images(path)
     if not files:
         raise CalibrationError(f"{path}: has no images; name the folder they are in")
-    sets = (PictureSet(file.name, {camera: _read(file)}) for file in files)
-    return Pictures(sets, len(files), live=False, identities={camera: f"not known (pictures in {path.name})"})
+    sets = (ImageSet(file.name, {camera: read_image(file)}) for file in files)
+    return ImageStream(sets, len(files), live=False, identities={camera: f"not known (images in {path.name})"})
 
 
-def from_folders(path: Path, cameras: Sequence[str]) -> Pictures:
+def from_folders(path: Path, cameras: Sequence[str]) -> ImageStream:
     """A folder for each camera within one; images of the same name were taken at the same time."""
     missing = [camera for camera in cameras if not (path / camera).is_dir()]
     if missing:
@@ -70,24 +71,21 @@ def from_folders(path: Path, cameras: Sequence[str]) -> Pictures:
     if not names:
         raise CalibrationError(f"{path}: has no images in its cameras' folders")
     sets = (
-        PictureSet(name, {camera: _read(found[name]) for camera, found in files.items() if name in found})
+        ImageSet(name, {camera: read_image(found[name]) for camera, found in files.items() if name in found})
         for name in names
     )
-    identities = {camera: f"not known (pictures in {path.name}/{camera})" for camera in cameras}
-    return Pictures(sets, len(names), live=False, identities=identities)
+    identities = {camera: f"not known (images in {path.name}/{camera})" for camera in cameras}
+    return ImageStream(sets, len(names), live=False, identities=identities)
 
 
-def from_video(path: Path, camera: str, every: int) -> Pictures:
-    """Every so manieth frame of a video. Raises CalibrationError for one that cannot be decoded."""
-    import cv2
-    import numpy as np
-
+def from_video(path: Path, camera: str, every: int) -> ImageStream:
+    """Every ``every``-th frame of a video. Raises CalibrationError for one that cannot be decoded."""
     with _video(path) as video:
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         if not video.isOpened() or not video.read()[0]:
             raise CalibrationError(f"{path}: is no video that can be decoded; restore it, or convert it to MP4")
 
-    def sets() -> Iterator[PictureSet]:
+    def sets() -> Iterator[ImageSet]:
         with _video(path) as video:
             index = 0
             while video.grab():
@@ -95,20 +93,19 @@ def from_video(path: Path, camera: str, every: int) -> Pictures:
                     there, image = video.retrieve()
                     if there:
                         rgb = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
-                        yield PictureSet(f"frame {index}", {camera: rgb})
+                        yield ImageSet(f"frame {index}", {camera: rgb})
                 index += 1
 
-    return Pictures(sets(), -(-count // every), live=False, identities={camera: f"not known (filmed in {path.name})"})
+    return ImageStream(
+        sets(), -(-count // every), live=False, identities={camera: f"not known (filmed in {path.name})"}
+    )
 
 
-def from_recording(path: Path, every: int) -> tuple[Pictures, DroneConfig]:
-    """Every so manieth step of a recording of ours, and the configuration in it. Raises RecordingError."""
-    from flockd.cli.record import opened
-
-    recording = opened(path)
+def from_recording(recording: Recording, every: int) -> tuple[ImageStream, DroneConfig]:
+    """Every ``every``-th step of a recording, and the configuration in it. Reading raises RecordingError."""
     config = recording.config
     sets = (
-        PictureSet(
+        ImageSet(
             f"{step.frames.time_s - recording.start_s:.2f} s",
             {name: frame.image for name, frame in step.frames.frames.items()},
             {name: frame.time_s for name, frame in step.frames.frames.items()},
@@ -123,27 +120,25 @@ def from_recording(path: Path, every: int) -> tuple[Pictures, DroneConfig]:
         or f"not known ({camera.name} of {recording.drone}{_at(devices.get(camera.name))})"
         for camera in config.rig.cameras
     }
-    return Pictures(sets, -(-len(recording.contents.steps) // every), live=False, identities=identities), config
+    return ImageStream(sets, -(-len(recording.contents.steps) // every), live=False, identities=identities), config
 
 
-def from_cameras(config: DroneConfig, file: str, seconds: float, enough: Callable[[], bool]) -> Pictures:
+def from_cameras(config: DroneConfig, file: str, seconds: float, enough: Callable[[], bool]) -> ImageStream:
     """Frames of a drone's live cameras, until it is enough, the time is up or Ctrl-C. Raises ConfigError.
 
     Reading raises UnavailableError when no frame comes.
     """
-    from flockd.sources import open_source
-
     source = open_source(config, file)
     devices = {} if config.source is None else {camera.name: camera.device for camera in config.source.cameras}
     identities = {
         camera.name: identity(Path(devices[camera.name])) if camera.name in devices else f"not known ({camera.name})"
         for camera in config.rig.cameras
     }
-    return Pictures(_frames(source, seconds, enough), 0, live=True, identities=identities)
+    return ImageStream(_frames(source, seconds, enough), 0, live=True, identities=identities)
 
 
 def identity(device: Path, sysfs: Path = SYSFS) -> str:
-    """What tells this camera from others: maker, product and serial number of a USB camera, else its name and place."""
+    """What identifies a camera: vendor, product and serial number of a USB camera, else its name and device."""
     entry = sysfs / device.resolve().name
     usb = (entry / "device").resolve().parent
     vendor, product, serial = (_text(usb / name) for name in ("idVendor", "idProduct", "serial"))
@@ -153,11 +148,7 @@ def identity(device: Path, sysfs: Path = SYSFS) -> str:
 
 
 def device_config(device: str, camera: str, size: tuple[int, int], pixel_format: str) -> DroneConfig:
-    """A drone that has nothing but this camera, with a lens made up for want of a better one. Raises UsageError."""
-    from pydantic import ValidationError
-
-    from flockd.config import DroneConfig
-
+    """A drone with this camera alone, with placeholder intrinsics. Raises UsageError."""
     lens = {"fx": size[0] * 1.0, "fy": size[0] * 1.0, "cx": size[0] / 2, "cy": size[1] / 2}
     try:
         return DroneConfig.model_validate(
@@ -174,7 +165,7 @@ def device_config(device: str, camera: str, size: tuple[int, int], pixel_format:
         raise UsageError(f"{device}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
-def _frames(source: FrameSource, seconds: float, enough: Callable[[], bool]) -> Iterator[PictureSet]:
+def _frames(source: FrameSource, seconds: float, enough: Callable[[], bool]) -> Iterator[ImageSet]:
     source.start()
     began_s, seen = time.monotonic(), False
     try:
@@ -183,7 +174,7 @@ def _frames(source: FrameSource, seconds: float, enough: Callable[[], bool]) -> 
             if frames is not None:
                 seen = True
                 stamps = {name: frame.time_s for name, frame in frames.frames.items()}
-                yield PictureSet(f"{since_s:.1f} s", {name: one.image for name, one in frames.frames.items()}, stamps)
+                yield ImageSet(f"{since_s:.1f} s", {name: one.image for name, one in frames.frames.items()}, stamps)
             elif not seen and since_s > FIRST_FRAME_S:
                 break
         if not seen:
@@ -194,22 +185,12 @@ def _frames(source: FrameSource, seconds: float, enough: Callable[[], bool]) -> 
 
 
 def _images(folder: Path) -> list[Path]:
-    from flockd.datasets.image_files import SUFFIXES
-
     return sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
-
-
-def _read(file: Path) -> UInt8Array:
-    from flockd.datasets.image_files import read_image
-
-    return read_image(file)
 
 
 @contextmanager
 def _video(path: Path) -> Iterator[cv2.VideoCapture]:
-    """As it was filmed, without a phone's note to turn the picture; closed at the end."""
-    import cv2
-
+    """Unrotated, whatever orientation the file asks for; closed at the end."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # our own sentence says what is wrong with a file
     logging = cv2.utils.logging
     before = logging.setLogLevel(logging.LOG_LEVEL_SILENT)
