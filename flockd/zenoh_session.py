@@ -1,4 +1,4 @@
-"""A zenoh session: a peer that knows nobody but whom it is told of. The one file that opens and closes sessions."""
+"""Opens and closes zenoh sessions, as peers without discovery. No other file does."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def close_session(session: zenoh.Session) -> None:
 def _config(
     listen: Sequence[str], connect: Sequence[str], settings: Path | None, shared_memory: bool | None
 ) -> zenoh.Config:
-    """A peer opens without a router, unlike a client; it neither shouts nor hearkens on the network."""
+    """A peer opens without a router, unlike a client; discovery by multicast and gossip is off."""
     config = zenoh.Config() if settings is None else zenoh.Config.from_file(str(settings))
     config.insert_json5("mode", '"peer"')
     config.insert_json5("scouting/multicast/enabled", "false")

@@ -228,7 +228,7 @@ class AutopilotLink:
         self._direct.send_command_async(self._message("COMMAND_LONG", fields), on_answer)
         result, ack = await answer
         if result != MavlinkDirectResult.SUCCESS:
-            raise AutopilotError(f"the autopilot was asked {what} and did not answer ({result.name.lower()})")
+            raise AutopilotError(f"the autopilot was asked {what} and did not respond ({result.name.lower()})")
         verdict = int(json.loads(ack)["result"])
         if verdict != 0:
             text = self._received.newest("STATUSTEXT")

@@ -1,4 +1,4 @@
-"""`flockd calibrate camera`: from pictures of a board to a camera's lens."""
+"""`flockd calibrate camera`: a camera's intrinsics from images of a board."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ def _only(config: DroneConfig, name: str) -> DroneConfig:
 def _collect(images: ImageStream, name: str, collector: Collector) -> None:
     """Shows the collector everything; live, a person is told what to do next, and may end it with Ctrl-C."""
     told = ""
-    with progress("looking for the board", "pictures") as tell, ended_by_ctrl_c(images.live):
+    with progress("detecting the board", "images") as tell, ended_by_ctrl_c(images.live):
         for number, one in enumerate(images.sets, start=1):
             if name in one.images:
                 collector.offer(one.name, one.images[name], moving=images.live)
@@ -209,12 +209,12 @@ def _lenses(args: argparse.Namespace, collector: Collector) -> list[Lens]:
 
     counts = collector.counts()
     if collector.size is None:
-        raise CalibrationError(f"{source_name(args)}: holds no picture of the camera; name another source")
+        raise CalibrationError(f"{source_name(args)}: holds no image of the camera; name another source")
     if not collector.views:
         why = ", ".join(f"{count} {reason}" for reason, count in counts.items())
         raise CalibrationError(
-            f"{source_name(args)}: the board is in none of the {sum(counts.values())} pictures ({why}); check "
-            "--squares and --dictionary, and that it fills a good part of the picture"
+            f"{source_name(args)}: the board is in none of the {sum(counts.values())} images ({why}); check "
+            "--squares and --dictionary, and that it fills a good part of the image"
         )
     found, faults = [], []
     for model in (args.model,) if args.model else MODELS:
@@ -264,7 +264,7 @@ def _lens_result(
     rms = lens.rms_of_views_px
     advice = list(collector.coverage.advice(lens.tilts_deg))
     if not lens.reaches_corners:
-        advice.append("show the board in the corners of the picture: the lens, as fitted, does not reach them")
+        advice.append("show the board in the corners of the image: the fitted lens does not reach them")
     sigma = {key: float(value) for key, value in zip(("fx", "fy", "cx", "cy"), lens.sigma, strict=False)}
     return {
         "camera": name,

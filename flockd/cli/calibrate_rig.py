@@ -101,7 +101,7 @@ def _boards(args: argparse.Namespace, config: DroneConfig, images: ImageStream) 
 
     collector = SharedCollector(BoardFinder(board_of(args)))
     told = ""
-    with progress("looking for the board", "pictures") as tell, ended_by_ctrl_c(images.live):
+    with progress("detecting the board", "images") as tell, ended_by_ctrl_c(images.live):
         for number, one in enumerate(images.sets, start=1):
             collector.offer(one.name, _greys(args, config, one), moving=images.live)
             tell(number, images.count or number)
@@ -194,7 +194,7 @@ def _by_motion(args: argparse.Namespace, out: Path) -> int:
     rig = build_rig(config.rig).cameras
     followers = {name: Follower(one.camera, one.T_body_camera.rotation) for name, one in rig.items()}
     states: list[VehicleState] = []
-    with progress("following the pictures", "steps") as tell:
+    with progress("tracking features", "steps") as tell:
         for number, one in enumerate(images.sets, start=1):
             assert one.vehicle is not None  # a recording has one in each step
             if not states or one.vehicle.time_s > states[-1].time_s:

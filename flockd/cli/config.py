@@ -24,7 +24,7 @@ def add(commands: Commands) -> None:
 
 def _add_check(commands: Commands) -> None:
     examples = ("flockd config check my_flight.yaml", "flockd config check --json config/*.yaml")
-    parser = commands("check", "Tell everything that is wrong with drone and scenario files.", examples)
+    parser = commands("check", "Report all errors in drone and scenario files.", examples)
     parser.add_argument("files", nargs="+", metavar="FILE", type=Path)
     parser.add_argument("--json", action="store_true", help="print the problems as JSON")
     parser.set_defaults(run=_check)

@@ -32,8 +32,8 @@ def add(commands: Commands) -> None:
         "flockd doctor --config config/simulator.yaml --json",
     )
     description = (
-        "Examine a drone on the ground: cameras, models, autopilot, computer, telemetry. Only looks: never arms, "
-        "switches modes or sends setpoints."
+        "Examine a drone on the ground: cameras, models, autopilot, computer, telemetry. Changes nothing: "
+        "never arms, switches modes or sends setpoints."
     )
     parser = commands("doctor", description, examples)
     parser.add_argument("--config", metavar="FILE", type=Path, required=True, help="the drone's configuration")

@@ -43,7 +43,7 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--without-pictures",
         action="store_true",
-        help="do not fly a recording again for pictures of what its networks see",
+        help="do not run the networks again for the report's images",
     )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     parser.set_defaults(run=_run)
@@ -109,5 +109,5 @@ def _flight(paths: Sequence[Path], *, pictured: bool) -> tuple[FlightLog, tuple[
     first = min(recordings, key=lambda recording: log.meta["names"].index(recording.drone))
     for change in replay_warnings(first, first.config, first.start_s):
         complain(change)
-    with progress("computing the pictures again", "steps") as tell_progress:
+    with progress("computing the images again", "steps") as tell_progress:
         return log, filmstrip(first, log, tell_progress)

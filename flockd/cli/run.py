@@ -1,4 +1,4 @@
-"""`flockd run`: flies this drone until it is told to stop."""
+"""`flockd run`: flies this drone until SIGTERM or Ctrl-C."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def add(commands: Commands) -> None:
         "flockd run --config config/quadrotor.yaml",
         "flockd run --config /etc/flockd/drone1.yaml --record /var/lib/flockd",
     )
-    description = "Fly this drone: cameras in, setpoints for its autopilot out, until told to stop."
+    description = "Fly this drone: from camera frames to setpoints for its autopilot, until SIGTERM or Ctrl-C."
     parser = commands("run", description, examples)
     parser.add_argument("--config", metavar="FILE", type=Path, required=True, help="the drone's configuration")
     parser.add_argument("--record", metavar="DIR", type=Path, help="write a recording of each flight to this folder")

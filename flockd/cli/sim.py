@@ -41,13 +41,13 @@ def add(commands: Commands) -> None:
         "flockd sim --autopilot standin --drones 2 --duration 20",
         "flockd sim config/px4_flight.yaml --autopilot px4",
     )
-    parser = commands("sim", "Fly a simulated flock by sight, and report how it went.", examples)
+    parser = commands("sim", "Fly a simulated flock, and write a report of the flight.", examples)
     parser.add_argument("scenario", nargs="?", metavar="SCENARIO", type=Path, help="by default the paper's flight")
     parser.add_argument(
         "--perception",
         choices=("learned", "truth"),
         default="learned",
-        help="fly by sight, or on everybody's exact state without looking (default: learned)",
+        help="fly on networks, or on the exact states of all drones (default: learned)",
     )
     parser.add_argument(
         "--autopilot",
@@ -73,7 +73,7 @@ def add(commands: Commands) -> None:
         metavar="ROLE,...",
         type=_roles,
         default=frozenset(),
-        help=f"answer these roles exactly instead of by network: {', '.join(ROLES)}",
+        help=f"use the exact values of these roles instead of a network's: {', '.join(ROLES)}",
     )
     parser.add_argument(
         "--out", metavar="DIR", type=Path, help="default: out/SCENARIO-PERCEPTION-seedN, or -AUTOPILOT-"
@@ -154,7 +154,7 @@ def _check_options(args: argparse.Namespace) -> None:
     if args.perception == "truth":
         idle = [option for option in ("flow", "scale", "swap", "telemetry", "record") if getattr(args, option)]
         if idle:
-            raise UsageError(f"--{idle[0]} has no meaning when nobody looks; drop it or --perception truth")
+            raise UsageError(f"--{idle[0]} has no meaning without networks; drop it or --perception truth")
 
 
 def _scenario(args: argparse.Namespace) -> ScenarioConfig:

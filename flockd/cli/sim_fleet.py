@@ -38,7 +38,7 @@ def check_options(args: argparse.Namespace) -> None:
     own = {"--perception truth": args.perception == "truth", "--swap": args.swap, "--telemetry": args.telemetry}
     idle = [option for option, given in own.items() if given]
     if idle:
-        raise UsageError(f"{idle[0]} has no meaning with real daemons, which look and tell by themselves; drop it")
+        raise UsageError(f"{idle[0]} has no meaning with real daemons, which have their own; drop it")
 
 
 def fly(args: argparse.Namespace, scenario: ScenarioConfig, directory: Path) -> int:

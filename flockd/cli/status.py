@@ -68,8 +68,8 @@ def _run(args: argparse.Namespace) -> int:
     if not rows:
         places = ", ".join([*listen, *connect])
         raise UnavailableError(
-            f"no drone was heard at {places} within {args.seconds or LISTEN_S:g} s; name where they are "
-            "with --connect, or let them come with --listen"
+            f"no drone was found at {places} within {args.seconds or LISTEN_S:g} s; name a drone's endpoint "
+            "with --connect, or listen for drones with --listen"
         )
     return ExitCode.DONE
 

@@ -82,7 +82,7 @@ def _merge_drone(document: Document, folder: Path) -> None:
     try:
         drone = read_document(folder / name)
     except ConfigError as error:
-        document.problems.append(place.problem(f"names {name}, which cannot be used; mend that file or name another"))
+        document.problems.append(place.problem(f"names {name}, which cannot be used; correct it or name another"))
         document.problems.extend(error.problems)
         document.spoiled.add(key)
         return
@@ -109,7 +109,7 @@ def _anchor(document: Document) -> None:
 
 
 def _override(document: Document, overrides: Overrides) -> None:
-    """Sets single values; a problem with one is told of the override, not of the file."""
+    """Sets single values; a problem with one names the override, not the file."""
     for key, value in overrides.items():
         path = tuple(key.split("."))
         if _is_under(path[:-1], document.spoiled):

@@ -1,4 +1,4 @@
-"""Says what is wrong with a value and how to mend it: one sentence for each place that validation complained of."""
+"""Messages for values that fail validation: one sentence for each place, with what to do."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ class AutopilotRequests:
         except AutopilotError as error:
             self._log_event(str(error))
         except TimeoutError:
-            self._log_event(f"the autopilot was asked for {takeover} and has not answered yet")
+            self._log_event(f"the autopilot was asked for {takeover} and has not responded yet")
         else:
             self._log_event(f"the autopilot was asked for {takeover}, and agreed")
         finally:

@@ -68,9 +68,9 @@ def camera_of(
         build_rig(RigConfig(cameras=(camera,)))
     except ValidationError as error:
         first = error.errors()[0]
-        raise _problem(file, f"{'.'.join(map(str, first['loc']))}: {first['msg']}; mend the calibration") from None
+        raise _problem(file, f"{'.'.join(map(str, first['loc']))}: {first['msg']}; correct the calibration") from None
     except ValueError as error:
-        raise _problem(file, f"{error}; mend the calibration") from None
+        raise _problem(file, f"{error}; correct the calibration") from None
     return camera
 
 

@@ -70,7 +70,7 @@ def _settings(sensor: Path) -> Mapping[str, Any]:
     try:
         settings = yaml.safe_load(body)
     except yaml.YAMLError as error:
-        raise _problem(sensor, "", f"is not YAML ({str(error).splitlines()[0]}); mend it") from None
+        raise _problem(sensor, "", f"is not YAML ({str(error).splitlines()[0]}); correct it") from None
     if not isinstance(settings, dict):
         raise _problem(sensor, "", "holds no calibration; it needs intrinsics, distortion and T_BS")
     return settings

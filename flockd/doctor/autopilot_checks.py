@@ -127,7 +127,7 @@ def judge_low_battery(value: int, config: DroneConfig) -> Finding:
     if value in _ON_LOW_BATTERY:
         return passed(name, f"{value} ({_ON_LOW_BATTERY[value]}) when the battery is low")
     what = "only warns" if value == 0 else "not known"
-    own = f"flockd asks for {config.safety.on_battery_low} (safety.on_battery_low), and nobody does while it is down"
+    own = f"flockd asks for {config.safety.on_battery_low} (safety.on_battery_low), and nothing does while it is down"
     return warned(name, f"{value} ({what}) when the battery is low: {own}", f"set {name} to 3 or 2 (Land)")
 
 

@@ -136,7 +136,7 @@ def stream_problems(
         if not DARK <= grey <= BRIGHT:
             how = "dark" if grey < DARK else "bright"
             fix = "take off the cap, or set exposure and gain for the light where it flies"
-            yield warned(about, f"the picture is too {how} to see by (mean {grey:.0f} of 255)", fix)
+            yield warned(about, f"the image is too {how} (mean {grey:.0f} of 255)", fix)
 
 
 def _exposure_problems(device: CameraDeviceParameters) -> Iterator[Finding]:
@@ -161,7 +161,7 @@ def watch_devices(config: DroneConfig, source: SourceParameters, seconds: float,
     for name, thread in threads.items():
         thread.join(max(until_s - time.monotonic(), 0.0))
         if thread.is_alive():
-            hangs = Watched(fault="its driver does not answer; unplug the camera and plug it in again")
+            hangs = Watched(fault="its driver does not respond; unplug the camera and plug it in again")
             watched[name] = hangs
     stopping.set()
     return watched

@@ -37,7 +37,7 @@ def check_disk(config: DroneConfig, folder: Path | None) -> Iterator[Finding]:
     """Whether recordings fit; ``folder`` as for `flockd run --record`, None for the service's where there is one."""
     folder = folder or (STATE_FOLDER if STATE_FOLDER.is_dir() else None)
     if folder is None:
-        measured = "no folder for recordings was named, so none was looked at"
+        measured = "no folder for recordings was named, so none was checked"
         yield warned(
             "disk", measured, "name it with --record DIR, as for `flockd run`; without one nothing is recorded"
         )

@@ -46,7 +46,7 @@ def _bounded(check: Check) -> tuple[Finding, ...]:
     threading.Thread(target=run, name=f"check {check.name}", daemon=True).start()
     if not wait([ended], check.limit_s).done:
         measured = f"the check has not ended within {check.limit_s:g} s"
-        fix = "something it asked does not answer: see what else this check says, and the kernel's log (`dmesg`)"
+        fix = "a device or service does not respond: read this check's other findings and the kernel's log (`dmesg`)"
         return (*found, failed(check.name, measured, fix))
     error = ended.exception()
     return tuple(found) if error is None else (*found, _of_error(check.name, error))
@@ -59,7 +59,5 @@ def _of_error(about: str, error: BaseException) -> Finding:
     if isinstance(error, ImportError):
         return failed(about, f"a library cannot be loaded ({error})", "install flockd again, for this computer")
     if isinstance(error, OSError):
-        return failed(
-            about, f"{error.filename or 'the system'}: {error.strerror or error}", "see to it that it answers"
-        )
+        return failed(about, f"{error.filename or 'the system'}: {error.strerror or error}", "check that it responds")
     return failed(about, f"the check itself broke ({error!r})", "tell the makers of flockd, with your configuration")

@@ -48,7 +48,7 @@ def check_unit(unit: Path | None) -> Iterator[Finding]:
     """The security score of ``unit``; None: of the installed one, else of the one that comes with flockd."""
     chosen, whose = (unit, "") if unit is not None else _find_unit()
     if shutil.which("systemd-analyze") is None:
-        measured = f"{chosen} was not looked at, as systemd-analyze is not here"
+        measured = f"{chosen} was not checked, as systemd-analyze is not installed"
         yield warned("unit", measured, "examine where flockd is to run as a service")
         return
     command = ["systemd-analyze", "security", "--offline=true", "--no-pager", str(chosen)]

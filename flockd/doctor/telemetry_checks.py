@@ -25,12 +25,12 @@ def check_fleet(config: DroneConfig, listen_s: float = LISTEN_S) -> Iterator[Fin
     where = ", ".join([*wanted.listen, *wanted.connect]) or "no endpoint"
     if config.name in names:
         measured = f"another process flies as {wanted.fleet}/{config.name}"
-        fix = "give this drone another `name`, or stop the other one; nobody could tell them apart"
+        fix = "give this drone another `name`, or stop the other one; names in a fleet must differ"
         yield failed("zenoh", measured, fix)
         return
     seen = f"sees {', '.join(names)}" if names else "sees no other drone"
     if wanted.connect and not reached:
-        measured = f"nobody answers at {', '.join(wanted.connect)}"
+        measured = f"nothing listens at {', '.join(wanted.connect)}"
         fix = "start what is to listen there (a router, `flockd status --listen`), or fix telemetry.connect"
         yield warned("zenoh", measured, fix)
     else:

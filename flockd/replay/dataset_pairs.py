@@ -52,7 +52,7 @@ def size_of(motion: RigidTransform) -> tuple[float, float]:
 
 
 class RecordedDepth:
-    """Stands before the learned perception and answers depth as it was recorded."""
+    """The learned perception, with the recorded depth in place of the network's."""
 
     def __init__(self, learned: Perceiver) -> None:
         self.picture_size = learned.picture_size

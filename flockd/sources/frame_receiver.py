@@ -36,7 +36,7 @@ class FrameReceiver:
                 self._faults[frame.camera] = None
                 self._changed.notify_all()
             elif refused == "frozen":
-                self._faults[frame.camera] = f"{frame.camera}: the picture is frozen; restart what takes it"
+                self._faults[frame.camera] = f"{frame.camera}: the image is frozen; restart its camera or program"
         return refused
 
     def count(self, camera: str, *what: Count) -> None:

@@ -168,7 +168,7 @@ def test_before_a_live_camera_a_person_is_told_what_to_do(
     pictures: list[UInt8Array], tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     film = Film(pictures[:8])
-    monkeypatch.setattr("flockd.sources.open_source", lambda config, file: film)
+    monkeypatch.setattr("flockd.calibration.image_sources.open_source", lambda config, file: film)
     out = tmp_path / "live.yaml"
     command = ("calibrate", "camera", "/dev/video7", "--size", "480x360", "--camera", "front", "--out", str(out))
     assert main([*command, "--model", "pinhole", "--json"]) == 0

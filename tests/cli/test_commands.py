@@ -130,7 +130,7 @@ def test_the_roles_to_swap_are_those_that_can_be() -> None:
 )
 def test_options_of_sight_are_refused_without_sight(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sim", "--perception", "truth", *option]) == 2
-    told = f"{option[0]} has no meaning when nobody looks; drop it or --perception truth\n"
+    told = f"{option[0]} has no meaning without networks; drop it or --perception truth\n"
     assert capsys.readouterr().err == told
 
 

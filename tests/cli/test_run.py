@@ -152,8 +152,8 @@ def test_a_fleet_that_is_not_there_is_unavailable(capsys: pytest.CaptureFixture[
     endpoint = free_endpoint()
     assert main(["status", "--connect", endpoint, "--seconds", "0.2"]) == 69
     assert capsys.readouterr().err == (
-        f"no drone was heard at {endpoint} within 0.2 s; name where they are with --connect, or let them come with "
-        "--listen\n"
+        f"no drone was found at {endpoint} within 0.2 s; name a drone's endpoint with --connect, or listen for "
+        "drones with --listen\n"
     )
 
 

@@ -120,7 +120,7 @@ def test_one_camera_gone_is_a_slower_flight_and_all_gone_a_hover_and_then_hold(
             await ship.is_ready_in_the_air()
             await ship.flies()
             ship.cameras.silent.add("back")
-            await ship.until_event("degraded: a blind sector: back silent")
+            await ship.until_event("degraded: a camera is lost: back silent")
             assert fake_autopilot.mode == "OFFBOARD"
             ship.cameras.silent.add("front")
             silent_s = time.monotonic()
@@ -149,7 +149,7 @@ def test_networks_not_finite_or_stuck_degrade_and_sigterm_ends_in_hold(
             await ship.until_state("normal")
             ship.perceiver.not_finite = 1
             await ship.until_event("a step failed: model tiny: output flow is not finite")
-            await ship.until_event("degraded: a network gave numbers that cannot be")
+            await ship.until_event("degraded: a network's output is not finite or not plausible")
             ship.perceiver.hangs.set()
             await ship.until_event("a step failed: a network call took longer than 0.5 s")
             assert ship.perceiver.told_to_end == 1
@@ -274,7 +274,7 @@ def test_the_configuration_is_read_again_on_the_ground_only(
             picture = cv2.imdecode(np.frombuffer(await ship.picture("front"), np.uint8), cv2.IMREAD_COLOR)
             assert picture is not None
             assert picture.shape == (48, 64, 3)
-            assert await ship.picture("bottom") == b"camera 'bottom' has no picture"
+            assert await ship.picture("bottom") == b"camera 'bottom' has no image"
             ship.daemon.ask_to_reload(lambda: pytest.fail("read in the air"))
             await ship.until_event("the configuration was not read again, because the drone is armed or in the air")
             assert not ship.ending.done()

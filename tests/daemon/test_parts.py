@@ -216,7 +216,7 @@ def test_monitor_tell_frozen_from_unplugged_and_count_bad_frames_of_late() -> No
     gone = monitor.update(1.0, _status("front: no such device", received=100, frozen=3)).cameras["front"]
     assert (gone.unplugged, gone.frozen) == (True, False)
     monitor.update(2.0, _status(None, received=110, frozen=3))
-    frozen = monitor.update(3.0, _status("front: the picture is frozen", received=120, frozen=5)).cameras["front"]
+    frozen = monitor.update(3.0, _status("front: the image is frozen", received=120, frozen=5)).cameras["front"]
     assert (frozen.unplugged, frozen.frozen) == (False, True)
     late = monitor.update(4.0, _status(None, received=140, corrupt=10))
     assert late.dropped_share == 10 / 40

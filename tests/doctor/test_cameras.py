@@ -176,7 +176,7 @@ def test_a_cap_on_the_lens() -> None:
     kernel = FakeKernel(front=FakeCamera())
     with _filming(kernel, "front", pictures=BLACK):
         found = _examined(_config("front"), kernel)
-    _problem(found, Level.WARNING, "the picture is too dark to see by")
+    _problem(found, Level.WARNING, "the image is too dark")
 
 
 def test_an_exposure_that_is_not_configured() -> None:
@@ -219,7 +219,7 @@ def test_a_driver_that_hangs_is_told_and_the_other_camera_is_seen(monkeypatch: p
         found = _examined(_config("front", "back"), kernel)
     ended.set()
     assert found["camera front"][0].level is Level.PASS
-    _problem(found, Level.FAILURE, "its driver does not answer", "camera back")
+    _problem(found, Level.FAILURE, "its driver does not respond", "camera back")
 
 
 def _shared(endpoint: str) -> DroneConfig:

@@ -62,7 +62,11 @@ def test_the_other_checks_are_run_whatever_one_does() -> None:
             "restore it",
         ),
         (ModelError("all is lost"), "all is lost", "correct it, and run `flockd doctor` again"),
-        (OSError(5, "Input/output error", "/dev/x"), "/dev/x: Input/output error", "see to it that it answers"),
+        (
+            OSError(5, "Input/output error", "/dev/x"),
+            "/dev/x: Input/output error",
+            "check that it responds",
+        ),
         (
             ImportError("libmavsdk.so is not there"),
             "a library cannot be loaded (libmavsdk.so is not there)",

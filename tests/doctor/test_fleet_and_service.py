@@ -64,7 +64,7 @@ def test_alone_is_well_and_nobody_where_somebody_should_be_is_not() -> None:
     assert alone.measured.endswith("sees no other drone")
     endpoint = free_endpoint()
     waiting = _fleet(_config(connect=(endpoint,)), 0.2)
-    assert (waiting.level, waiting.measured) == (Level.WARNING, f"nobody answers at {endpoint}")
+    assert (waiting.level, waiting.measured) == (Level.WARNING, f"nothing listens at {endpoint}")
 
 
 def test_an_endpoint_that_is_taken_is_a_failure() -> None:
@@ -129,11 +129,11 @@ def test_the_unit_that_comes_with_flockd_and_one_that_is_open(tmp_path: Path, mo
     assert finding.level is Level.FAILURE
 
 
-def test_without_systemd_the_unit_is_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_systemd_the_unit_is_not_checked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "/nowhere")
     (finding,) = check_unit(None)
     assert finding.level is Level.WARNING
-    assert "systemd-analyze is not here" in finding.measured
+    assert "systemd-analyze is not installed" in finding.measured
 
 
 def test_how_open_is_too_open() -> None:

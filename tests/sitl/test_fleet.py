@@ -152,7 +152,7 @@ def test_without_px4_it_says_what_to_do(
         ),
         (
             ["--autopilot", "standin", "--perception", "truth"],
-            "--perception truth has no meaning with real daemons, which look and tell by themselves; drop it",
+            "--perception truth has no meaning with real daemons, which have their own; drop it",
         ),
     ],
 )
