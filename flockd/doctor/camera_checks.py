@@ -21,7 +21,8 @@ from flockd.messages import UInt8Array
 from flockd.sources.image_formats import CorruptImageError, ImageFormat, MjpegFormat, YuyvFormat
 from flockd.sources.shared_memory import SharedMemorySource
 from flockd.sources.v4l2 import MAX_AHEAD_S
-from flockd.sources.v4l2_device import CameraError, CapturedBuffer, Kernel, LinuxKernel, V4l2Device
+from flockd.sources.v4l2_device import CameraError, CapturedBuffer, V4l2Device
+from flockd.sources.v4l2_kernel import Kernel, LinuxKernel
 
 START_S = 5.0
 """To open a camera and get its first image."""

@@ -12,7 +12,8 @@ from flockd.messages import FrameSet
 from flockd.sources.frame_receiver import FrameReceiver
 from flockd.sources.frames import CameraStatus, Count, RawFrame
 from flockd.sources.image_formats import CorruptImageError, ImageFormat, MjpegFormat, YuyvFormat
-from flockd.sources.v4l2_device import CameraError, CapturedBuffer, Kernel, LinuxKernel, V4l2Device
+from flockd.sources.v4l2_device import CameraError, CapturedBuffer, V4l2Device
+from flockd.sources.v4l2_kernel import Kernel, LinuxKernel
 
 _LOOK_S = 0.05
 """How long a thread waits for a frame before it looks whether it should stop."""
