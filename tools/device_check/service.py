@@ -192,7 +192,7 @@ class Service:
     def _is_unplugged(self) -> Iterator[Finding]:
         opened = self._counts("back")["opened"]
         pulled_s = control(WEBCAM, "disconnect")
-        lost_s = _told_since(pulled_s, "a blind sector: back unplugged")
+        lost_s = _told_since(pulled_s, "a camera is lost: back unplugged")
         yield _soon("unplugged in flight", lost_s - pulled_s, NOTICED_S)
         back_s = _told_since(lost_s, "normal")
         again = self._counts("back")["opened"] - opened
@@ -206,7 +206,7 @@ class Service:
     def _falls_silent(self) -> Iterator[Finding]:
         assert self._front is not None
         silent_s = self._front.fall_silent()
-        lost_s = _told_since(silent_s, "a blind sector: front")
+        lost_s = _told_since(silent_s, "a camera is lost: front")
         yield _soon("silent in flight", lost_s - silent_s, SILENCE_S + 0.1)
         spoke_s = self._front.go_on()
         back_s = _told_since(spoke_s, "normal")
