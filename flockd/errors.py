@@ -18,7 +18,7 @@ class ExitCode(IntEnum):
 
 
 class FlockdError(Exception):
-    """Something a person can mend; the text is the whole story, one sentence a line."""
+    """An error that a person can correct; the text says all, one sentence a line."""
 
     exit_code = ExitCode.CHECK_FAILED
 
@@ -43,7 +43,7 @@ class ModelError(FlockdError):
 
 @dataclass(frozen=True, order=True)
 class ConfigProblem:
-    """One thing wrong with a configuration: where, what, and how to mend it."""
+    """One thing wrong with a configuration: where, what, and what to do."""
 
     file: str
     line: int

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flockd.autopilot.stand_in import AutopilotStandIn
+from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.config import DroneConfig, load
 from flockd.data import data_path
 from flockd.inference.feeds import golden_image
@@ -58,7 +58,7 @@ def measure(seconds: float, recording: Path | None) -> dict[str, float]:
     """Every figure by name."""
     port, endpoint = free_port(socket.SOCK_DGRAM), f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     config = at(port, endpoint)
-    with tempfile.TemporaryDirectory() as name, AutopilotStandIn(port, height_m=2.5):
+    with tempfile.TemporaryDirectory() as name, FakeAutopilot(port, height_m=2.5):
         folder = Path(name)
         pictures = Pictures(config, endpoint, recording)
         with Daemons(

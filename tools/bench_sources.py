@@ -23,7 +23,7 @@ from flockd.messages import Frame, UInt8Array
 from flockd.sources import FramePublisher
 from flockd.sources.assembler import Assembler
 from flockd.sources.frames import RawFrame
-from flockd.sources.images import MjpegFormat, RgbFormat, YuyvFormat
+from flockd.sources.image_formats import MjpegFormat, RgbFormat, YuyvFormat
 from flockd.sources.shared_memory import SharedMemorySource
 
 ENDPOINT = "tcp/127.0.0.1:7458"

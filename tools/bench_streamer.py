@@ -23,8 +23,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.autopilot.mavsdk_link import AutopilotLink
-from flockd.autopilot.stand_in import AutopilotStandIn
 from flockd.autopilot.streamer import SetpointStreamer
 from flockd.config.autopilot import AutopilotParameters
 from flockd.data import data_path
@@ -72,11 +72,11 @@ def measure(load: str, seconds: float) -> tuple[Row, Row]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port = int(probe.getsockname()[1])
-    with AutopilotStandIn(port, height_m=2.5) as stand_in:
+    with FakeAutopilot(port, height_m=2.5) as fake_autopilot:
         streaming, ticking = child(port, load, seconds), child(port, "timer", seconds)
         begun_s, ended_s = json.loads(streaming.communicate()[0])
         ticks_s = json.loads(ticking.communicate()[0])
-        times_s = [time_s for time_s, _ in stand_in.setpoints if begun_s <= time_s <= ended_s]
+        times_s = [time_s for time_s, _ in fake_autopilot.setpoints if begun_s <= time_s <= ended_s]
     return intervals_ms(times_s), intervals_ms(ticks_s)
 
 

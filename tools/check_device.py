@@ -48,7 +48,7 @@ SOURCES = (
 """What the README's lines need of this folder."""
 SECTION = "### Install it as a service"
 STAND_IN = "pymavlink>=2.4.40"
-COMPILE = "import flockd.autopilot.stand_in"
+COMPILE = "import flockd.autopilot.fake_autopilot"
 """What it needs of a dozen MAVLink dialects, and no more."""
 PYTHON = "3.11"
 """Debian's."""

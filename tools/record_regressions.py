@@ -28,11 +28,11 @@ import yaml
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from flockd.cli import main as flockd
-from flockd.cli.record import models_of
 from flockd.config import DroneConfig, ScenarioConfig, load_scenario
 from flockd.config.recording import RecordingConfig
 from flockd.config.scenario import StartConfig
 from flockd.data import data_path
+from flockd.inference.hashes import model_hashes
 from flockd.messages import Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
 from flockd.pilot import FlockPilot
 from flockd.recording import Recorder
@@ -172,7 +172,9 @@ def record(path: Path, config: DroneConfig, steps: Sequence[Step]) -> None:
     """Write the steps as a flight of ``DRONE``."""
     pilot = FlockPilot(config)
     settings = RecordingConfig(images="jpeg", jpeg_quality=85)
-    with Recorder(path, drone=DRONE, config=config, settings=settings, models=models_of(config)) as recorder:
+    with Recorder(
+        path, drone=DRONE, config=config, settings=settings, models=model_hashes(config.perception)
+    ) as recorder:
         for frames, vehicle in steps:
             recorder.step(frames, vehicle, pilot.step(frames, vehicle))
             recorder.drain()

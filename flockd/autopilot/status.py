@@ -1,4 +1,4 @@
-"""What an autopilot says of itself, beside where it is, and how its refusals are told."""
+"""The autopilot's status, and its errors."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def _failed(sentence: str, code: int) -> int:
 def _parser() -> Parser:
     parser = Parser(
         prog="flockd",
-        description="Drones that flock by sight alone.",
+        description="Drones that flock by vision alone.",
         examples=("flockd sim", "flockd config check config/paper_flight.yaml"),
     )
     parser.add_argument("--version", action="version", version=f"flockd {__version__}")

@@ -1,4 +1,4 @@
-"""`flockd calibrate camera`: from pictures of a board to a camera's lens."""
+"""`flockd calibrate camera`: a camera's intrinsics from images of a board."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from flockd.choices import LENS_MODELS, PixelFormat
-from flockd.cli.calibration import (
+from flockd.cli.calibrate_options import (
     add_shared,
     board_of,
     ended_by_ctrl_c,
-    loaded,
     measurement,
     pair,
     refuse_overwriting,
     source_name,
 )
+from flockd.cli.config import loaded
 from flockd.cli.output import complain, progress, say, say_json
 from flockd.cli.parser import Commands, positive_count, positive_number
+from flockd.cli.recording_options import opened
 from flockd.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from flockd.calibration.board import BoardSpec
+    from flockd.calibration.image_sources import ImageStream
     from flockd.calibration.intrinsics import Lens
     from flockd.calibration.views import Collector
-    from flockd.cli.pictures import Pictures
     from flockd.config import DroneConfig
     from flockd.config.rig import MeasurementConfig
 
@@ -78,14 +79,14 @@ def _camera(args: argparse.Namespace) -> int:
     from flockd.calibration.views import Collector
 
     collector = Collector(BoardFinder(board), args.views, args.max_blur)
-    name, pictures = _pictures(args, lambda: _is_enough(collector))
+    name, images = _images(args, lambda: _is_enough(collector))
     out = args.out or Path(f"{name}.yaml")
     refuse_overwriting(args, out, args.picture)
-    _collect(pictures, name, collector)
+    _collect(images, name, collector)
     lenses = _lenses(args, collector)
     lens = min(lenses, key=lambda one: one.rms_px)
     measured = measurement(
-        camera=args.serial or pictures.identities[name],
+        camera=args.serial or images.identities[name],
         source=source_name(args),
         views=len(lens.views),
         residual_px=round(lens.rms_px, 4),
@@ -122,31 +123,31 @@ def _print_board(args: argparse.Namespace, board: BoardSpec) -> int:
     return ExitCode.DONE
 
 
-def _pictures(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, Pictures]:
+def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, ImageStream]:
     """Of the one camera that is meant, and its name."""
-    from flockd.cli import pictures
+    from flockd.calibration import image_sources
     from flockd.datasets.video import SUFFIXES
 
     config = loaded(args.config)
     path = None if args.source is None else Path(args.source)
     if path is None:
         if config is None:
-            raise UsageError("no SOURCE was given; name pictures, a recording or a device, or --config for its camera")
+            raise UsageError("no SOURCE was given; name images, a recording or a device, or --config for its camera")
         name = _name_in(config, args, str(args.config))
-        return name, pictures.from_cameras(_only(config, name), str(args.config), args.seconds, enough)
+        return name, image_sources.from_cameras(_only(config, name), str(args.config), args.seconds, enough)
     if path.suffix.lower() == ".mcap":
-        found, recorded = pictures.from_recording(path, args.every)
+        found, recorded = image_sources.from_recording(opened(path), args.every)
         return _name_in(recorded, args, str(path)), found
     name = args.camera or "camera" if config is None else _name_in(config, args, str(args.config))
     if not re.fullmatch("[a-z0-9_-]+", name):
         raise UsageError(f"--camera {name}: a camera's name has small letters, digits, _ and - only")
     if path.is_relative_to("/dev"):
-        live = pictures.device_config(str(path), name, args.size, args.pixel_format)
-        return name, pictures.from_cameras(live, str(path), args.seconds, enough)
+        live = image_sources.device_config(str(path), name, args.size, args.pixel_format)
+        return name, image_sources.from_cameras(live, str(path), args.seconds, enough)
     if path.is_dir():
-        return name, pictures.from_folder(path, name)
+        return name, image_sources.from_folder(path, name)
     if path.suffix.lower() in SUFFIXES and path.is_file():
-        return name, pictures.from_video(path, name, args.every)
+        return name, image_sources.from_video(path, name, args.every)
     fault = "is no folder, video or recording; name one of these" if path.exists() else "does not exist; check the path"
     raise UsageError(f"{path}: {fault}")
 
@@ -169,15 +170,15 @@ def _only(config: DroneConfig, name: str) -> DroneConfig:
     return config.model_copy(update={"rig": rig, "source": source})
 
 
-def _collect(pictures: Pictures, name: str, collector: Collector) -> None:
+def _collect(images: ImageStream, name: str, collector: Collector) -> None:
     """Shows the collector everything; live, a person is told what to do next, and may end it with Ctrl-C."""
     told = ""
-    with progress("looking for the board", "pictures") as tell, ended_by_ctrl_c(pictures.live):
-        for number, one in enumerate(pictures.sets, start=1):
+    with progress("detecting the board", "images") as tell, ended_by_ctrl_c(images.live):
+        for number, one in enumerate(images.sets, start=1):
             if name in one.images:
-                collector.offer(one.name, one.images[name], moving=pictures.live)
-            tell(number, pictures.count or number)
-            if pictures.live and (said := _next_step(collector)) != told:
+                collector.offer(one.name, one.images[name], moving=images.live)
+            tell(number, images.count or number)
+            if images.live and (said := _next_step(collector)) != told:
                 complain(said)
                 told = said
 
@@ -211,12 +212,12 @@ def _lenses(args: argparse.Namespace, collector: Collector) -> list[Lens]:
 
     counts = collector.counts()
     if collector.size is None:
-        raise CalibrationError(f"{source_name(args)}: holds no picture of the camera; name another source")
+        raise CalibrationError(f"{source_name(args)}: holds no image of the camera; name another source")
     if not collector.views:
         why = ", ".join(f"{count} {reason}" for reason, count in counts.items())
         raise CalibrationError(
-            f"{source_name(args)}: the board is in none of the {sum(counts.values())} pictures ({why}); check "
-            "--squares and --dictionary, and that it fills a good part of the picture"
+            f"{source_name(args)}: the board is in none of the {sum(counts.values())} images ({why}); check "
+            "--squares and --dictionary, and that it fills a good part of the image"
         )
     found, faults = [], []
     for model in (args.model,) if args.model else LENS_MODELS:
@@ -266,7 +267,7 @@ def _lens_result(
     rms = lens.rms_of_views_px
     advice = list(collector.coverage.advice(lens.tilts_deg))
     if not lens.reaches_corners:
-        advice.append("show the board in the corners of the picture: the lens, as fitted, does not reach them")
+        advice.append("show the board in the corners of the image: the fitted lens does not reach them")
     sigma = {key: float(value) for key, value in zip(("fx", "fy", "cx", "cy"), lens.sigma, strict=False)}
     return {
         "camera": name,

@@ -7,23 +7,24 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.calibration import (
+from flockd.cli.calibrate_options import (
     add_shared,
     board_of,
     ended_by_ctrl_c,
-    loaded,
     measurement,
     refuse_overwriting,
     source_name,
 )
+from flockd.cli.config import loaded
 from flockd.cli.output import complain, progress, say, say_json
 from flockd.cli.parser import Commands, positive_number
+from flockd.cli.recording_options import opened
 from flockd.errors import ConfigError, ConfigProblem, ExitCode, UsageError
 
 if TYPE_CHECKING:
     from flockd.calibration.alignment import Alignment
     from flockd.calibration.extrinsics import RigFit, SharedBoard
-    from flockd.cli.pictures import Pictures, PictureSet
+    from flockd.calibration.image_sources import ImageSet, ImageStream
     from flockd.config import DroneConfig
     from flockd.config.rig import CameraConfig
     from flockd.messages import UInt8Array, VehicleState
@@ -63,55 +64,55 @@ def _by_board(args: argparse.Namespace, out: Path) -> int:
     from flockd.calibration.extrinsics import calibrate_rig
     from flockd.geometry import build_rig
 
-    config, pictures = _pictures(args)
+    config, images = _images(args)
     where, names = str(args.config or args.source), [camera.name for camera in config.rig.cameras]
     if len(names) < 2:
         raise UsageError(f"{where}: has one camera; a rig that is calibrated by a board has two or more")
     reference = args.reference or names[0]
     if reference not in names:
         raise UsageError(f"{where}: has no camera {reference!r}; choose --reference from {', '.join(names)}")
-    boards = _boards(args, config, pictures)
+    boards = _boards(args, config, images)
     rig = build_rig(config.rig).cameras
     cameras = {name: one.camera for name, one in rig.items()}
     fit = calibrate_rig(cameras, boards, reference, rig[reference].T_body_camera)
-    return _told(args, _rig_of_boards(args, config, pictures, fit, out))
+    return _told(args, _rig_of_boards(args, config, images, fit, out))
 
 
-def _pictures(args: argparse.Namespace) -> tuple[DroneConfig, Pictures]:
+def _images(args: argparse.Namespace) -> tuple[DroneConfig, ImageStream]:
     """And the drone they are of: that of --config before that of the recording."""
-    from flockd.cli import pictures
+    from flockd.calibration import image_sources
 
     config = loaded(args.config)
     path = None if args.source is None else Path(args.source)
     if path is not None and not path.is_dir():
-        found, recorded = pictures.from_recording(path, args.every)
+        found, recorded = image_sources.from_recording(opened(path), args.every)
         return config or recorded, found
     if config is None:
         raise UsageError("the cameras' intrinsics are not known; name the drone's file with --config")
     if path is None:
-        return config, pictures.from_cameras(config, str(args.config), args.seconds, lambda: False)
-    return config, pictures.from_folders(path, [camera.name for camera in config.rig.cameras])
+        return config, image_sources.from_cameras(config, str(args.config), args.seconds, lambda: False)
+    return config, image_sources.from_folders(path, [camera.name for camera in config.rig.cameras])
 
 
-def _boards(args: argparse.Namespace, config: DroneConfig, pictures: Pictures) -> list[SharedBoard]:
+def _boards(args: argparse.Namespace, config: DroneConfig, images: ImageStream) -> list[SharedBoard]:
     """Live, a person is told who saw it together, and ends it with Ctrl-C."""
     from flockd.calibration.board import BoardFinder
     from flockd.calibration.shared import SharedCollector
 
     collector = SharedCollector(BoardFinder(board_of(args)))
     told = ""
-    with progress("looking for the board", "pictures") as tell, ended_by_ctrl_c(pictures.live):
-        for number, one in enumerate(pictures.sets, start=1):
-            collector.offer(one.name, _greys(args, config, one), moving=pictures.live)
-            tell(number, pictures.count or number)
+    with progress("detecting the board", "images") as tell, ended_by_ctrl_c(images.live):
+        for number, one in enumerate(images.sets, start=1):
+            collector.offer(one.name, _greys(args, config, one), moving=images.live)
+            tell(number, images.count or number)
             said = "; ".join(f"{' and '.join(names)} saw {count}" for names, count in collector.links().items())
-            if pictures.live and said != told:
+            if images.live and said != told:
                 complain(f"boards seen together: {said}; Ctrl-C ends it")
                 told = said
     return collector.boards
 
 
-def _greys(args: argparse.Namespace, config: DroneConfig, one: PictureSet) -> dict[str, UInt8Array]:
+def _greys(args: argparse.Namespace, config: DroneConfig, one: ImageSet) -> dict[str, UInt8Array]:
     """By camera, (h, w). Raises ConfigError for an image of another size than the camera's."""
     import cv2
     import numpy as np
@@ -132,7 +133,7 @@ def _greys(args: argparse.Namespace, config: DroneConfig, one: PictureSet) -> di
 
 
 def _rig_of_boards(
-    args: argparse.Namespace, config: DroneConfig, pictures: Pictures, fit: RigFit, out: Path
+    args: argparse.Namespace, config: DroneConfig, images: ImageStream, fit: RigFit, out: Path
 ) -> dict[str, Any]:
     from flockd.calibration.fragment import extrinsics_of
 
@@ -143,7 +144,7 @@ def _rig_of_boards(
         extrinsics = camera.extrinsics
         if camera.name != fit.reference:
             measured = measurement(
-                camera=_identity(camera, pictures),
+                camera=_identity(camera, images),
                 source=source,
                 views=mounting.boards,
                 residual_px=round(mounting.rms_px, 4),
@@ -174,9 +175,9 @@ def _rig_of_boards(
     }
 
 
-def _identity(camera: CameraConfig, pictures: Pictures) -> str:
+def _identity(camera: CameraConfig, images: ImageStream) -> str:
     measured = camera.intrinsics.measured
-    return measured.camera if measured else pictures.identities.get(camera.name, camera.name)
+    return measured.camera if measured else images.identities.get(camera.name, camera.name)
 
 
 def _by_motion(args: argparse.Namespace, out: Path) -> int:
@@ -189,18 +190,18 @@ def _by_motion(args: argparse.Namespace, out: Path) -> int:
 
     if args.source is None or Path(args.source).is_dir():
         raise UsageError("motion is measured in a recording, which knows the autopilot's attitude; name one as SOURCE")
-    config, pictures = _pictures(args)
+    config, images = _images(args)
     rig = build_rig(config.rig).cameras
     followers = {name: Follower(one.camera, one.T_body_camera.rotation) for name, one in rig.items()}
     states: list[VehicleState] = []
-    with progress("following the pictures", "steps") as tell:
-        for number, one in enumerate(pictures.sets, start=1):
+    with progress("tracking features", "steps") as tell:
+        for number, one in enumerate(images.sets, start=1):
             assert one.vehicle is not None  # a recording has one in each step
             if not states or one.vehicle.time_s > states[-1].time_s:
                 states.append(one.vehicle)
             for name, grey in _greys(args, config, one).items():
                 followers[name].add(one.times_s[name], grey, one.vehicle.R_ned_body)
-            tell(number, pictures.count)
+            tell(number, images.count)
     attitudes = Attitudes(
         np.array([state.time_s for state in states]), np.array([state.R_ned_body for state in states])
     )
@@ -213,11 +214,11 @@ def _by_motion(args: argparse.Namespace, out: Path) -> int:
             raise CalibrationError(
                 f"{args.source}: camera {name!r}: {error}" + (f" (not followed: {lost})" if lost else "")
             ) from None
-    return _told(args, _rig_of_motion(args, config, pictures, found, out))
+    return _told(args, _rig_of_motion(args, config, images, found, out))
 
 
 def _rig_of_motion(
-    args: argparse.Namespace, config: DroneConfig, pictures: Pictures, found: Mapping[str, Alignment], out: Path
+    args: argparse.Namespace, config: DroneConfig, images: ImageStream, found: Mapping[str, Alignment], out: Path
 ) -> dict[str, Any]:
     from flockd.calibration.fragment import extrinsics_of
     from flockd.geometry import RigidTransform, build_rig
@@ -230,7 +231,7 @@ def _rig_of_motion(
         one = found[camera.name]
         T_body_camera = RigidTransform(one.R_body_camera, rig.cameras[camera.name].T_body_camera.translation)
         measured = measurement(
-            camera=_identity(camera, pictures),
+            camera=_identity(camera, images),
             source=f"{args.source}, by motion",
             views=one.turns,
             residual_deg=round(one.rms_deg, 4),

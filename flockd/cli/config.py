@@ -5,10 +5,14 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flockd.cli.output import say, say_json
 from flockd.cli.parser import Commands, add_commands
 from flockd.errors import ConfigError, ExitCode
+
+if TYPE_CHECKING:
+    from flockd.config import DroneConfig
 
 
 def add(commands: Commands) -> None:
@@ -20,7 +24,7 @@ def add(commands: Commands) -> None:
 
 def _add_check(commands: Commands) -> None:
     examples = ("flockd config check my_flight.yaml", "flockd config check --json config/*.yaml")
-    parser = commands("check", "Tell everything that is wrong with drone and scenario files.", examples)
+    parser = commands("check", "Report all errors in drone and scenario files.", examples)
     parser.add_argument("files", nargs="+", metavar="FILE", type=Path)
     parser.add_argument("--json", action="store_true", help="print the problems as JSON")
     parser.set_defaults(run=_check)
@@ -83,3 +87,13 @@ def _schema(args: argparse.Namespace) -> int:
 
     say_json(schema_of(args.kind))
     return ExitCode.DONE
+
+
+def loaded(file: Path | None) -> DroneConfig | None:
+    """The drone of --config, which may also name a scenario. Raises ConfigError."""
+    from flockd.config import ScenarioConfig, load
+
+    if file is None:
+        return None
+    config = load(file)
+    return config.drone if isinstance(config, ScenarioConfig) else config

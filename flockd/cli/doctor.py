@@ -32,8 +32,8 @@ def add(commands: Commands) -> None:
         "flockd doctor --config config/simulator.yaml --json",
     )
     description = (
-        "Examine a drone on the ground: cameras, models, autopilot, computer, telemetry. Only looks: never arms, "
-        "switches modes or sends setpoints."
+        "Examine a drone on the ground: cameras, models, autopilot, computer, telemetry. Changes nothing: "
+        "never arms, switches modes or sends setpoints."
     )
     parser = commands("doctor", description, examples)
     parser.add_argument("--config", metavar="FILE", type=Path, required=True, help="the drone's configuration")
@@ -55,7 +55,7 @@ def add(commands: Commands) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     from flockd.config import load_drone
-    from flockd.doctor import CHECKS, Level, examine, plan
+    from flockd.doctor import CHECKS, Level, plan, run_checks
 
     config = load_drone(args.config)
     if args.unit is not None and not args.unit.is_file():
@@ -70,7 +70,7 @@ def _run(args: argparse.Namespace) -> int:
     )
     logging.getLogger("flockd.autopilot").setLevel(logging.CRITICAL)  # what MAVSDK has to tell, the findings do
     with progress("examining", "checks") as tell:
-        found = examine(checks, tell)
+        found = run_checks(checks, tell)
     if args.json:
         say_json(_as_json(config.name, found))
     else:
@@ -81,7 +81,7 @@ def _run(args: argparse.Namespace) -> int:
 
 def _as_json(drone: str, found: Mapping[str, Sequence[Finding]]) -> dict[str, object]:
     rows = [
-        {"check": check, "about": f.about, "level": str(f.level), "measured": f.measured, "mend": f.mend or None}
+        {"check": check, "about": f.about, "level": str(f.level), "measured": f.measured, "mend": f.fix or None}
         for check, findings in found.items()
         for f in findings
     ]
@@ -89,7 +89,7 @@ def _as_json(drone: str, found: Mapping[str, Sequence[Finding]]) -> dict[str, ob
 
 
 def _print(drone: str, found: Mapping[str, Sequence[Finding]]) -> None:
-    """The worst first, each with its mend below."""
+    """The worst first, each with its fix below."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -101,8 +101,8 @@ def _print(drone: str, found: Mapping[str, Sequence[Finding]]) -> None:
     table.add_column(overflow="fold")
     for finding in findings:
         told = Text(finding.measured)
-        if finding.mend:
-            told.append(f"\nmend: {finding.mend}", style="italic")
+        if finding.fix:
+            told.append(f"\nfix: {finding.fix}", style="italic")
         table.add_row(Text(finding.level, STYLES[finding.level]), finding.about, told)
     Console(markup=False, highlight=False).print(table)
     counts = {level: sum(finding.level == level for finding in findings) for level in STYLES}

@@ -1,8 +1,9 @@
-"""An argument parser that speaks in one sentence and shows examples."""
+"""An argument parser with errors of one sentence, and examples in its help."""
 
 from __future__ import annotations
 
 import argparse
+import difflib
 import math
 import re
 import sys
@@ -23,9 +24,16 @@ class Parser(argparse.ArgumentParser):
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
+        self.commands: list[str] = []
+        """Names of its commands, if it has any."""
 
     def error(self, message: str) -> NoReturn:
-        """Says what is wrong with the command line, and where its help is."""
+        """Reports what is wrong with the command line, with a suggestion for a misspelt command."""
+        unknown = re.match("argument COMMAND: invalid choice: '(.*?)' ", message)
+        if unknown is not None:
+            close = difflib.get_close_matches(unknown[1], self.commands, n=1)
+            hint = f"; did you mean `{self.prog} {close[0]}`?" if close else f", of {', '.join(self.commands)}"
+            message = f"{unknown[1]!r} is not a command{hint}"
         sys.stderr.write(f"{self.prog}: {message}; see {self.prog} --help\n")
         raise SystemExit(ExitCode.USAGE)
 
@@ -35,16 +43,23 @@ Commands = Callable[[str, str, Sequence[str]], Parser]
 
 
 def add_commands(parser: Parser, additions: Sequence[Callable[[Commands], None]]) -> None:
-    """Gives a parser its commands, one of which must be named."""
-    subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
+    """Gives a parser its commands; without one it prints its help and exits with a usage error."""
+    subparsers = parser.add_subparsers(metavar="COMMAND", parser_class=Parser)
+    parser.set_defaults(run=lambda _: _print_help(parser))
 
     def add(name: str, description: str, examples: Sequence[str]) -> Parser:
+        parser.commands.append(name)
         return subparsers.add_parser(
             name, prog=f"{parser.prog} {name}", help=description, description=description, examples=examples
         )
 
     for addition in additions:
         addition(add)
+
+
+def _print_help(parser: Parser) -> int:
+    parser.print_help(sys.stderr)
+    return ExitCode.USAGE
 
 
 def positive_number(text: str) -> float:

@@ -1,36 +1,36 @@
-"""`flockd record`: looks into recordings, mends them, cuts them and takes them apart."""
+"""`flockd record`: information about recordings; recovers, cuts and exports them."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from flockd.cli.output import progress, say, say_json
-from flockd.cli.parser import Commands, Parser, add_commands, positive_number
+from flockd.cli.output import say, say_json
+from flockd.cli.parser import Commands, Parser, add_commands
+from flockd.cli.recording_options import add_stretch, opened, refuse_existing, stretch
 from flockd.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.config import DroneConfig
     from flockd.recording.reader import Recording
 
 
 def add(commands: Commands) -> None:
     """Adds the command."""
     examples = ("flockd record info drone1.mcap", "flockd record recover drone1.mcap")
-    parser = commands("record", "Look into recordings, mend, cut and export them.", examples)
+    parser = commands("record", "Inspect, recover, cut and export recordings.", examples)
     add_commands(parser, (_add_info, _add_recover, _add_cut, _add_export))
 
 
 def _add_info(commands: Commands) -> None:
     examples = ("flockd record info drone1.mcap", "flockd record info --json drone1.mcap")
-    parser = _with_recording(commands("info", "Tell what is in a recording: how long, gaps, rates.", examples))
+    parser = _with_recording(commands("info", "Show what a recording contains: duration, gaps, rates.", examples))
     parser.set_defaults(run=_info)
 
 
 def _add_recover(commands: Commands) -> None:
-    examples = ("flockd record recover drone1.mcap", "flockd record recover drone1.mcap --out mended.mcap")
-    description = "Make a whole recording of one that a kill or a loss of power cut off, or that is damaged."
+    examples = ("flockd record recover drone1.mcap", "flockd record recover drone1.mcap --out whole.mcap")
+    description = "Recover a recording that is damaged, or was cut off by a kill or a power loss."
     parser = _with_recording(commands("recover", description, examples))
     parser.add_argument("--out", metavar="FILE", type=Path, help="default: NAME.recovered.mcap")
     parser.set_defaults(run=_recover)
@@ -38,9 +38,9 @@ def _add_recover(commands: Commands) -> None:
 
 def _add_cut(commands: Commands) -> None:
     examples = ("flockd record cut drone1.mcap --start 20 --end 30 --out turn.mcap",)
-    parser = _with_recording(commands("cut", "Make a recording of a stretch of another.", examples))
+    parser = _with_recording(commands("cut", "Copy a part of a recording to a new one.", examples))
     add_stretch(parser)
-    parser.add_argument("--out", metavar="FILE", type=Path, required=True)
+    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="the new recording")
     parser.set_defaults(run=_cut)
 
 
@@ -59,61 +59,16 @@ def _add_export(commands: Commands) -> None:
 
 
 def _with_recording(parser: Parser) -> Parser:
-    parser.add_argument("recording", metavar="RECORDING", type=Path)
+    parser.add_argument("recording", metavar="RECORDING", type=Path, help="an MCAP file of flockd")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     return parser
 
 
-def add_stretch(parser: Parser) -> None:
-    """Adds --start and --end, in seconds from the recording's first step."""
-    parser.add_argument("--start", metavar="S", type=_seconds, default=0.0, help="seconds from the first step")
-    parser.add_argument("--end", metavar="S", type=positive_number, help="seconds from the first step")
-
-
-def _seconds(text: str) -> float:
-    return 0.0 if text in {"0", "0.0"} else positive_number(text)
-
-
-def stretch(recording: Recording, args: argparse.Namespace) -> tuple[float, float]:
-    """From when to when, on the recording's clock, --start and --end ask for. Raises UsageError for nothing."""
-    rounding_s = 1e-6
-    end_s = recording.duration_s if args.end is None else args.end
-    begin, end = recording.start_s + args.start - rounding_s, recording.start_s + end_s + rounding_s
-    if not any(begin <= time_s <= end for _, time_s in recording.contents.steps):
-        raise UsageError(
-            f"{recording.path}: has no step from {args.start:g} s to {end_s:g} s, as it is "
-            f"{recording.duration_s:g} s long; choose --start and --end within it"
-        )
-    return begin, end
-
-
-def opened(path: Path) -> Recording:
-    """The recording, checked as a whole, with a progress bar. Raises RecordingError."""
-    from flockd.recording.reader import Recording
-
-    with progress("checking", "bytes") as tell:
-        return Recording(path, tell)
-
-
-def models_of(config: DroneConfig) -> dict[str, str]:
-    """SHA-256 of each model that a configuration uses, by name. Raises ModelError."""
-    from flockd.inference import load_manifest, manifests_of
-
-    manifests = [load_manifest(path)[0] for path in sorted(manifests_of(config.perception))]
-    return {manifest.name: manifest.sha256 for manifest in manifests}
-
-
-def refuse_existing(path: Path, option: str = "--out") -> None:
-    """Raises UsageError when there is something at `path`, or no folder for it."""
-    if path.exists():
-        raise UsageError(f"{path}: exists; name a new file with {option}")
-    if not path.parent.is_dir():
-        raise UsageError(f"{path.parent}: is no folder; make it first, or name another file with {option}")
-
-
 def _info(args: argparse.Namespace) -> int:
+    from flockd.recording.info import recording_info
+
     recording = opened(args.recording)
-    facts = _facts(recording)
+    facts = recording_info(recording)
     if args.json:
         say_json(facts)
         return ExitCode.DONE
@@ -138,43 +93,13 @@ def _info(args: argparse.Namespace) -> int:
     return ExitCode.DONE
 
 
-def _facts(recording: Recording) -> dict[str, Any]:
-    contents = recording.contents
-    return {
-        **contents.flight,
-        "files": [str(path) for path in contents.paths],
-        "bytes": sum(path.stat().st_size for path in contents.paths),
-        "finished": contents.finished,
-        "steps": len(contents.steps),
-        "start_s": recording.start_s,
-        "duration_s": recording.duration_s,
-        "lost": contents.lost,
-        "models": dict(contents.models),
-        "migrations": list(recording.migrations),
-        "gaps": [{"first_step": first, "last_step": last} for first, last in contents.gaps],
-        "damages": [
-            {"file": str(path), "byte": damage.offset, "reason": damage.reason} for path, damage in contents.damages
-        ],
-        "streams": [
-            {
-                "topic": stream.topic,
-                "schema": stream.schema,
-                "messages": stream.messages,
-                "rate_hz": stream.rate_hz,
-                "bytes": stream.bytes,
-            }
-            for stream in contents.streams.values()
-        ],
-    }
-
-
 def _recover(args: argparse.Namespace) -> int:
     from flockd.recording.editing import recover
 
     out = args.out or args.recording.with_name(f"{args.recording.stem}.recovered.mcap")
     refuse_existing(out)
     recording = opened(args.recording)
-    return _told(args, recording, out, recover(recording, out))
+    return _report_copy(args, recording, out, recover(recording, out))
 
 
 def _cut(args: argparse.Namespace) -> int:
@@ -182,10 +107,10 @@ def _cut(args: argparse.Namespace) -> int:
 
     refuse_existing(args.out)
     recording = opened(args.recording)
-    return _told(args, recording, args.out, cut(recording, args.out, *stretch(recording, args)))
+    return _report_copy(args, recording, args.out, cut(recording, args.out, *stretch(recording, args)))
 
 
-def _told(args: argparse.Namespace, recording: Recording, out: Path, steps: int) -> int:
+def _report_copy(args: argparse.Namespace, recording: Recording, out: Path, steps: int) -> int:
     of = len(recording.contents.steps)
     if args.json:
         say_json({"recording": str(args.recording), "out": str(out), "steps": steps, "of_steps": of})

@@ -1,27 +1,23 @@
-"""`flockd replay`: lets the pilot fly a recorded flight again, and tells what comes out differently."""
+"""`flockd replay`: computes a recorded flight or a dataset again, and compares the outputs."""
 
 from __future__ import annotations
 
 import argparse
 import math
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.datasets import add_dataset_options, refuse_dataset_options, replay_dataset
 from flockd.cli.output import complain, progress, say, say_json
 from flockd.cli.parser import Commands
-from flockd.cli.record import add_stretch, models_of, opened, refuse_existing, stretch
+from flockd.cli.recording_options import add_stretch, opened, refuse_existing, stretch
+from flockd.cli.replay_dataset import add_dataset_options, refuse_dataset_options, run_dataset
 from flockd.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from flockd.config import DroneConfig
-    from flockd.recording import Recorder
     from flockd.recording.difference import Comparison
-    from flockd.recording.reader import RecordedStep, Recording
+    from flockd.recording.reader import Recording
 
 
 def add(commands: Commands) -> None:
@@ -81,39 +77,36 @@ def _tolerance(text: str) -> tuple[str, float]:
     return name, tolerance
 
 
-@dataclass
-class _Replayed:
-    """What came out."""
-
-    outputs: dict[int, Mapping[str, Any]] = field(default_factory=dict)
-    recorded: dict[int, Mapping[str, Any]] = field(default_factory=dict)
-    times_s: list[float] = field(default_factory=list)
-    reading_s: float = 0.0
-    thinking_s: float = 0.0
-    stages_ms: dict[str, list[float]] = field(default_factory=dict)
-
-
 def _run(args: argparse.Namespace) -> int:
     from flockd.datasets import is_dataset
 
     if is_dataset(args.recording):
-        return replay_dataset(args)
+        return run_dataset(args)
     refuse_dataset_options(args)
     _check_options(args)
+    from flockd.replay.fidelity import damage_warnings, replay_warnings
+    from flockd.replay.recorded_flight import compare_replay, replay_flight, replay_result
+
     recording = opened(args.recording)
     config = _config(args, recording)
     start_s, end_s = stretch(recording, args)
-    warnings = [*faults(recording), *changes(recording, config, start_s)]
+    warnings = [*damage_warnings(recording), *replay_warnings(recording, config, start_s)]
     for warning in warnings:
         complain(warning)
     expected = _reference(args)
-    replayed = _replay(args, recording, config, start_s, end_s)
+    with progress("replaying", "steps") as show_progress:
+        replay = replay_flight(
+            recording, config, start_s, end_s, speed=args.speed, out=args.out, progress=show_progress
+        )
     if args.update_reference:
         from flockd.recording.difference import save_reference
 
-        save_reference(args.reference, recording.drone, replayed.outputs)
-    comparison = _compare(args, recording, replayed, expected)
-    result = _result(recording, replayed, warnings, comparison)
+        save_reference(args.reference, recording.drone, replay.outputs)
+    comparison = None
+    if args.diff:
+        part_only = args.start > 0 or args.end is not None
+        comparison = compare_replay(recording.drone, replay, expected, dict(args.tolerance), part_only=part_only)
+    result = replay_result(recording, replay, warnings, comparison)
     if args.json:
         say_json(result)
     else:
@@ -148,40 +141,10 @@ def _config(args: argparse.Namespace, recording: Recording) -> DroneConfig:
             size = recorded.get(camera.name)
             there = f"has it with {size[0]} x {size[1]}" if size else f"has {', '.join(recorded)}"
             raise UsageError(
-                f"{args.config}: rig.cameras: wants camera {camera.name!r} with {camera.size_px[0]} x "
-                f"{camera.size_px[1]} pixels, and {recording.path} {there}; give it the recording's cameras"
+                f"{args.config}: rig.cameras: camera {camera.name!r} has {camera.size_px[0]} x {camera.size_px[1]} "
+                f"pixels, but {recording.path} {there}; use the recording's cameras"
             )
     return config
-
-
-def faults(recording: Recording) -> Iterator[str]:
-    """What is missing of a recording."""
-    contents = recording.contents
-    for path, damage in contents.damages:
-        where = "ends early" if damage.at_end else "is damaged"
-        yield f"{path}: {where} at byte {damage.offset}: {damage.reason}"
-    for first, last in contents.gaps:
-        yield f"{recording.path}: steps {first} to {last} are missing, so that what follows may come out differently"
-
-
-def changes(recording: Recording, config: DroneConfig, start_s: float) -> Iterator[str]:
-    """What may keep a replay from this time on, with these settings, from being the flight."""
-    contents = recording.contents
-    if recording.migrations and config is recording.config:
-        changed = "; ".join(recording.migrations)
-        yield f"{recording.path}: was recorded by version {contents.flight.get('version')}: {changed}"
-    first_step = next(number for number, time_s in contents.steps if time_s >= start_s)
-    if first_step > 0:
-        yield f"the replay begins with step {first_step}: the pilot remembers nothing before it, nor the time it flew"
-    if contents.flight["images"] != "png":
-        yield f"{recording.path}: its images are {contents.flight['images']}, not what the flight saw to the last bit"
-    if contents.flight.get("true_roles"):
-        yield f"{recording.path}: was flown with true {contents.flight['true_roles']}, and is replayed by network"
-    for name, sha256 in models_of(config).items():
-        recorded = contents.models.get(name)
-        if recorded != sha256:
-            flown = f"flew with {recorded[:12]}" if recorded else "flew without it"
-            yield f"model {name} is {sha256[:12]} here, and the recording {flown}: outputs will differ"
 
 
 def _reference(args: argparse.Namespace) -> Mapping[int, Mapping[str, Any]] | None:
@@ -192,127 +155,6 @@ def _reference(args: argparse.Namespace) -> Mapping[int, Mapping[str, Any]] | No
     from flockd.recording.difference import load_reference
 
     return load_reference(args.reference)
-
-
-def _replay(
-    args: argparse.Namespace, recording: Recording, config: DroneConfig, start_s: float, end_s: float
-) -> _Replayed:
-    from flockd.pilot import FlockPilot
-    from flockd.recording.codec import to_json
-
-    pilot = FlockPilot(config, stopwatch=time.perf_counter)
-    total = sum(start_s <= step_s <= end_s for _, step_s in recording.contents.steps)
-    replayed = _Replayed()
-    with ExitStack() as stack:
-        tell = stack.enter_context(progress("replaying", "steps"))
-        recorder = None if args.out is None else stack.enter_context(_recording_to(args.out, recording, config))
-        for step, read_s in _paced(recording.steps(start_s, end_s), args.speed):
-            begin_s = time.perf_counter()
-            output = pilot.step(step.frames, step.vehicle)
-            replayed.thinking_s += time.perf_counter() - begin_s
-            replayed.reading_s += read_s
-            replayed.times_s.append(step.frames.time_s)
-            replayed.outputs[step.number] = to_json(output)
-            if step.output is not None:
-                replayed.recorded[step.number] = step.output
-            for stage, ms in output.stages_ms.items():
-                replayed.stages_ms.setdefault(stage, []).append(ms)
-            if recorder is not None:
-                recorder.drain()  # nobody waits for a replay, so nothing need be dropped
-                recorder.step(step.frames, step.vehicle, output, step.truth)
-            tell(len(replayed.outputs), total)
-    return replayed
-
-
-@contextmanager
-def _recording_to(out: Path, recording: Recording, config: DroneConfig) -> Iterator[Recorder]:
-    """A recorder whose file is there when all is written, and not otherwise: one file, without loss or quota."""
-    from flockd.config.recording import RecordingConfig
-    from flockd.recording import Recorder, RecordingError
-    from flockd.recording.editing import written_whole
-    from flockd.recording.streams import REPLAYED
-
-    settings = RecordingConfig(images="png", file_mb=1e9, quota_mb=1e12)
-    flown = recording.contents.flight
-    facts = {**{name: flown[name] for name in ("scenario", "seed") if name in flown}, REPLAYED: recording.path.name}
-    with written_whole(out) as draft:
-        with Recorder(
-            draft, drone=recording.drone, config=config, settings=settings, models=models_of(config), facts=facts
-        ) as recorder:
-            yield recorder
-        if recorder.failure is not None:
-            raise RecordingError(f"{out}: could not be written ({recorder.failure}); choose another place with --out")
-
-
-def _paced(steps: Iterator[RecordedStep], speed: float) -> Iterator[tuple[RecordedStep, float]]:
-    """Each step not before its time, with how long it took to read."""
-    began_s, first_s = time.monotonic(), None
-    while True:
-        begin_s = time.perf_counter()
-        step = next(steps, None)
-        read_s = time.perf_counter() - begin_s
-        if step is None:
-            return
-        first_s = step.frames.time_s if first_s is None else first_s
-        if speed > 0:
-            due_s = began_s + (step.frames.time_s - first_s) / speed
-            time.sleep(max(0.0, due_s - time.monotonic()))
-        yield step, read_s
-
-
-def _compare(
-    args: argparse.Namespace,
-    recording: Recording,
-    replayed: _Replayed,
-    reference: Mapping[int, Mapping[str, Any]] | None,
-) -> Comparison | None:
-    """With the reference for the steps asked for, or with what was recorded for all that were replayed."""
-    if not args.diff:
-        return None
-    from flockd.recording.difference import compare
-
-    part_only = args.start > 0 or args.end is not None
-    if reference is None:
-        expected, found = replayed.recorded, {step: replayed.outputs[step] for step in replayed.recorded}
-    else:
-        expected = {s: o for s, o in reference.items() if s in replayed.outputs or not part_only}
-        found = replayed.outputs
-    return compare(recording.drone, expected, found, dict(args.tolerance))
-
-
-def _result(
-    recording: Recording, replayed: _Replayed, warnings: Sequence[str], comparison: Comparison | None
-) -> dict[str, Any]:
-    duration_s = replayed.times_s[-1] - replayed.times_s[0]
-    spent_s = replayed.reading_s + replayed.thinking_s
-    return {
-        "recording": str(recording.path),
-        "drone": recording.drone,
-        "steps": len(replayed.outputs),
-        "duration_s": duration_s,
-        "realtime_factor": duration_s / spent_s,
-        "reading_share": replayed.reading_s / spent_s,
-        "stages_ms": {stage: _spread(samples) for stage, samples in replayed.stages_ms.items()},
-        "warnings": list(warnings),
-        "diff": None if comparison is None else _diff(comparison),
-    }
-
-
-def _spread(samples: Sequence[float]) -> dict[str, float]:
-    ordered = sorted(samples)
-    return {"median": ordered[len(ordered) // 2], "p95": ordered[int(0.95 * (len(ordered) - 1))]}
-
-
-def _diff(comparison: Comparison) -> dict[str, Any]:
-    return {
-        "equal": comparison.first is None,
-        "steps": comparison.steps,
-        "values": comparison.values,
-        "first": None if comparison.first is None else asdict(comparison.first),
-        "fields": {
-            name: {"steps": len(told.steps), "largest": told.largest} for name, told in comparison.fields.items()
-        },
-    }
 
 
 def _say_result(args: argparse.Namespace, comparison: Comparison | None, result: Mapping[str, Any]) -> None:
@@ -330,8 +172,8 @@ def _say_result(args: argparse.Namespace, comparison: Comparison | None, result:
         say(f"equal in all {comparison.values} values")
         return
     say(str(comparison.first))
-    for name, told in comparison.fields.items():
-        size = "" if told.largest is None else f", by at most {told.largest:.3g}"
-        say(f"  {name}: in {len(told.steps)} of {comparison.steps} steps{size}")
+    for name, difference in comparison.fields.items():
+        size = "" if difference.largest is None else f", by at most {difference.largest:.3g}"
+        say(f"  {name}: in {len(difference.steps)} of {comparison.steps} steps{size}")
     if args.reference is not None:
         say(f"if this is meant: flockd replay {args.recording} --reference {args.reference} --update-reference")

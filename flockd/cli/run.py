@@ -1,4 +1,4 @@
-"""`flockd run`: flies this drone until it is told to stop."""
+"""`flockd run`: flies this drone until SIGTERM or Ctrl-C."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def add(commands: Commands) -> None:
         "flockd run --config config/quadrotor.yaml",
         "flockd run --config /etc/flockd/drone1.yaml --record /var/lib/flockd",
     )
-    description = "Fly this drone: cameras in, setpoints for its autopilot out, until told to stop."
+    description = "Fly this drone: from camera frames to setpoints for its autopilot, until SIGTERM or Ctrl-C."
     parser = commands("run", description, examples)
     parser.add_argument("--config", metavar="FILE", type=Path, required=True, help="the drone's configuration")
     parser.add_argument("--record", metavar="DIR", type=Path, help="write a recording of each flight to this folder")
@@ -50,16 +50,16 @@ def _run(args: argparse.Namespace) -> int:
 
 async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceManager) -> Ending:
     """With SIGTERM and Ctrl-C for standstill, Hold and the end, and SIGHUP for the configuration."""
-    from flockd.cli.record import models_of
     from flockd.config import load_drone
     from flockd.daemon import Daemon, clock_at
+    from flockd.inference.hashes import model_hashes
     from flockd.perception import load_networks
 
     daemon = Daemon(
         config,
         str(args.config),
         load_networks=lambda: load_networks(config.perception),
-        models=models_of(config),
+        models=model_hashes(config.perception),
         recordings=args.record,
         service=service,
         clock=clock_at(config.speed_factor),

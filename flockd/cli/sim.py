@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
 from flockd.choices import ROLES, AutopilotKind, ScaleSource, SimulatedPerception
-from flockd.cli import fleet
-from flockd.cli.flights import prepare, save, tell, write_findings
+from flockd.cli import sim_fleet
+from flockd.cli.flight_summary import show_summary
 from flockd.cli.output import complain, progress
 from flockd.cli.parser import Commands, positive_count, positive_number, seed
 from flockd.errors import UsageError
@@ -41,13 +41,13 @@ def add(commands: Commands) -> None:
         "flockd sim --autopilot standin --drones 2 --duration 20",
         "flockd sim config/px4_flight.yaml --autopilot px4",
     )
-    parser = commands("sim", "Fly a simulated flock by sight, and report how it went.", examples)
+    parser = commands("sim", "Fly a simulated flock, and write a report of the flight.", examples)
     parser.add_argument("scenario", nargs="?", metavar="SCENARIO", type=Path, help="by default the paper's flight")
     parser.add_argument(
         "--perception",
         choices=get_args(SimulatedPerception),
         default="learned",
-        help="fly by sight, or on everybody's exact state without looking (default: learned)",
+        help="fly on networks, or on the exact states of all drones (default: learned)",
     )
     parser.add_argument(
         "--autopilot",
@@ -59,7 +59,7 @@ def add(commands: Commands) -> None:
         "--speed-factor",
         metavar="F",
         type=positive_number,
-        help=f"with --autopilot: how fast simulated time passes (default: {fleet.DEFAULT_SPEED_FACTOR})",
+        help=f"with --autopilot: how fast simulated time passes (default: {sim_fleet.DEFAULT_SPEED_FACTOR})",
     )
     parser.add_argument("--flow", metavar="NAME", help="the model for optical flow, or `dis`")
     parser.add_argument("--scale", choices=get_args(ScaleSource), help="where the background's scale comes from")
@@ -71,7 +71,7 @@ def add(commands: Commands) -> None:
         metavar="ROLE,...",
         type=_roles,
         default=frozenset(),
-        help=f"answer these roles exactly instead of by network: {', '.join(ROLES)}",
+        help=f"use the exact values of these roles instead of a network's: {', '.join(ROLES)}",
     )
     parser.add_argument(
         "--out", metavar="DIR", type=Path, help="default: out/SCENARIO-PERCEPTION-seedN, or -AUTOPILOT-"
@@ -91,12 +91,14 @@ def _roles(text: str) -> frozenset[str]:
 
 
 def _run(args: argparse.Namespace) -> int:
+    from flockd.report.flight_folder import prepare_folder, save_flight, write_report_files
+
     _check_options(args)
     scenario = _scenario(args)
     directory = args.out or Path("out") / _folder_name(scenario, args)
-    prepare(directory)
+    prepare_folder(directory)
     if args.autopilot is not None:
-        return fleet.fly(args, scenario, directory)
+        return sim_fleet.fly(args, scenario, directory)
     from flockd.sim.swarm import fly
 
     with ExitStack() as stack:
@@ -114,15 +116,15 @@ def _run(args: argparse.Namespace) -> int:
             recorders=_recorders(scenario, args.swap, directory / RECORDINGS, stack) if args.record else (),
             progress=tell_progress,
         )
-    save(directory, flight.log, flight.key_frames)
-    return tell(directory, write_findings(directory, flight.log), as_json=args.json)
+    save_flight(directory, flight.log, flight.key_frames)
+    return show_summary(directory, write_report_files(directory, flight.log), as_json=args.json)
 
 
 def _recorders(
     scenario: ScenarioConfig, swap: frozenset[str], directory: Path, stack: ExitStack
 ) -> tuple[Recorder, ...]:
     """A recorder for each drone, over an earlier flight's recordings."""
-    from flockd.cli.record import models_of
+    from flockd.inference.hashes import model_hashes
     from flockd.recording import Recorder
 
     directory.mkdir(exist_ok=True)
@@ -136,7 +138,7 @@ def _recorders(
                 directory / f"drone{i + 1}.mcap",
                 drone=f"drone{i + 1}",
                 config=scenario.drone,
-                models=models_of(scenario.drone),
+                models=model_hashes(scenario.drone.perception),
                 facts=facts,
                 on_event=complain,
             )
@@ -146,11 +148,11 @@ def _recorders(
 
 
 def _check_options(args: argparse.Namespace) -> None:
-    fleet.check_options(args)
+    sim_fleet.check_options(args)
     if args.perception == "truth":
         idle = [option for option in ("flow", "scale", "swap", "telemetry", "record") if getattr(args, option)]
         if idle:
-            raise UsageError(f"--{idle[0]} has no meaning when nobody looks; drop it or --perception truth")
+            raise UsageError(f"--{idle[0]} has no meaning without networks; drop it or --perception truth")
 
 
 def _scenario(args: argparse.Namespace) -> ScenarioConfig:

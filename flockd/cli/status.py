@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,9 +22,7 @@ if TYPE_CHECKING:
 ENDPOINT = "tcp/127.0.0.1:7447"
 LISTEN_S = 3.0
 REFRESH_S = 0.5
-GONE, QUIET = "gone", "quiet"
-"""Instead of a state: its process has ended or cannot be reached; it is there, and publishes nothing."""
-WORST_FIRST = (GONE, QUIET, "asking", "hover", "silent", "degraded", "idle", "ready", "normal")
+PIPED_COLUMNS = 1000
 
 
 def add(commands: Commands) -> None:
@@ -50,6 +48,7 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
+    from flockd.telemetry.fleet_status import status_rows
     from flockd.telemetry.watcher import FleetWatcher
 
     connect, listen = args.connect or [], args.listen or []
@@ -61,7 +60,7 @@ def _run(args: argparse.Namespace) -> int:
             return _show_live(watcher.drones)
         time.sleep(args.seconds or LISTEN_S)
         drones = watcher.drones()
-    rows = rows_of(drones, time.monotonic())
+    rows = status_rows(drones, time.monotonic())
     if args.json:
         say_json(rows)
     elif rows:
@@ -69,43 +68,18 @@ def _run(args: argparse.Namespace) -> int:
     if not rows:
         places = ", ".join([*listen, *connect])
         raise UnavailableError(
-            f"no drone was heard at {places} within {args.seconds or LISTEN_S:g} s; name where they are "
-            "with --connect, or let them come with --listen"
+            f"no drone was found at {places} within {args.seconds or LISTEN_S:g} s; name a drone's endpoint "
+            "with --connect, or listen for drones with --listen"
         )
     return ExitCode.DONE
-
-
-def rows_of(drones: Iterable[Watched], now_s: float) -> list[dict[str, Any]]:
-    """What is told of each drone, the worst first; ``now_s`` on the watcher's clock."""
-    rows = [_row(drone, now_s) for drone in drones]
-    return sorted(rows, key=lambda row: (WORST_FIRST.index(row["state"]), row["fleet"], row["drone"]))
-
-
-def _row(drone: Watched, now_s: float) -> dict[str, Any]:
-    flight: Mapping[str, Any] = drone.message("flight", now_s) or {}
-    computer: Mapping[str, Any] = drone.message("computer", now_s) or {}
-    neighbours = drone.message("neighbours", now_s)
-    state = flight.get("state", QUIET) if drone.alive else GONE
-    blind = [camera["fault"] for camera in computer.get("cameras", {}).values() if camera["fault"]]
-    return {
-        "fleet": drone.fleet,
-        "drone": drone.drone,
-        "state": state if state in WORST_FIRST else QUIET,
-        "flight_mode": flight.get("flight_mode"),
-        "height_m": flight.get("height_m"),
-        "battery_share": flight.get("battery_share"),
-        "neighbours": None
-        if neighbours is None
-        else sum(1 for neighbour in neighbours["neighbours"] if neighbour["confirmed"]),
-        "load": computer.get("load"),
-        "matters": [reason["sentence"] for reason in flight.get("reasons", ())] + blind,
-    }
 
 
 def _table(rows: list[dict[str, Any]]) -> Table:
     from rich.table import Table
 
-    table = Table("drone", "state", "mode", "height", "battery", "sees", "load", "what is the matter", box=None)
+    table = Table(
+        "drone", "state", "mode", "height", "battery", "sees", "load", "what is the matter", box=None, pad_edge=False
+    )
     for row in rows:
         table.add_row(
             f"{row['fleet']}/{row['drone']}",
@@ -128,9 +102,11 @@ def _show_live(drones: Callable[[], Iterable[Watched]]) -> int:
     """Until Ctrl-C."""
     from rich.live import Live
 
+    from flockd.telemetry.fleet_status import status_rows
+
     with suppress(KeyboardInterrupt), Live(console=_console(), auto_refresh=False) as live:
         while True:
-            rows = rows_of(drones(), time.monotonic())
+            rows = status_rows(drones(), time.monotonic())
             live.update(_table(rows) if rows else "no drone was heard yet", refresh=True)
             time.sleep(REFRESH_S)
     return ExitCode.DONE
@@ -139,4 +115,6 @@ def _show_live(drones: Callable[[], Iterable[Watched]]) -> int:
 def _console() -> Any:
     from rich.console import Console
 
-    return Console(markup=False, highlight=False)
+    # Not on a terminal there is no width to fit: rich would assume 80 columns and cut what does not fit.
+    width = None if sys.stdout.isatty() else PIPED_COLUMNS
+    return Console(markup=False, highlight=False, width=width)

@@ -12,8 +12,7 @@ from typing import Any
 
 from flockd.cli.output import complain, progress, say, say_json
 from flockd.cli.parser import Commands
-from flockd.cli.record import add_stretch, opened, refuse_existing, stretch
-from flockd.cli.replay import changes, faults
+from flockd.cli.recording_options import add_stretch, opened, refuse_existing, stretch
 from flockd.errors import ExitCode, UnavailableError, UsageError
 
 
@@ -67,13 +66,17 @@ def _check_screen() -> None:
 
 def _write(args: argparse.Namespace, path: Path) -> dict[str, Any]:
     from flockd.recording.editing import written_whole
+    from flockd.replay.fidelity import damage_warnings, replay_warnings
     from flockd.view.rerun_file import RerunFile
     from flockd.view.scene import Scenes, texts
 
     recording = opened(args.recording)
     start_s, end_s = stretch(recording, args)
     fly_again = not args.as_recorded
-    for warning in (*faults(recording), *(changes(recording, recording.config, start_s) if fly_again else ())):
+    for warning in (
+        *damage_warnings(recording),
+        *(replay_warnings(recording, recording.config, start_s) if fly_again else ()),
+    ):
         complain(warning)
     scenes = Scenes(recording, fly_again=fly_again)
     total = sum(start_s <= time_s <= end_s for _, time_s in recording.contents.steps)

@@ -239,7 +239,7 @@ _GLUED_KEY = re.compile(r"[\s-]*\w+:[^\s:]+\s*")
 
 
 def _syntax_problem(file: str, text: str, error: yaml.MarkedYAMLError) -> ConfigProblem:
-    """The parser's complaint in the words of someone who wants to mend the file."""
+    """The parser's error as a message that says what to do."""
     mark = error.problem_mark or error.context_mark
     assert mark is not None
     lines = [*text.split("\n"), ""]

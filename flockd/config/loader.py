@@ -10,10 +10,10 @@ from typing import Any, Literal, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from flockd.choices import ROLES
-from flockd.config.complaints import path_in_file, problems_of
 from flockd.config.document import Document, Place, Value, read_document
 from flockd.config.drone import DroneConfig
 from flockd.config.scenario import ScenarioConfig
+from flockd.config.validation_messages import path_in_file, problems_of
 from flockd.errors import ConfigError
 
 PATHS = {("perception", key) for key in ("models_dir", "engines_dir", *ROLES)} | {("telemetry", "zenoh_config")}
@@ -82,7 +82,7 @@ def _merge_drone(document: Document, folder: Path) -> None:
     try:
         drone = read_document(folder / name)
     except ConfigError as error:
-        document.problems.append(place.problem(f"names {name}, which cannot be used; mend that file or name another"))
+        document.problems.append(place.problem(f"names {name}, which cannot be used; correct it or name another"))
         document.problems.extend(error.problems)
         document.spoiled.add(key)
         return
@@ -109,7 +109,7 @@ def _anchor(document: Document) -> None:
 
 
 def _override(document: Document, overrides: Overrides) -> None:
-    """Sets single values; a problem with one is told of the override, not of the file."""
+    """Sets single values; a problem with one names the override, not the file."""
     for key, value in overrides.items():
         path = tuple(key.split("."))
         if _is_under(path[:-1], document.spoiled):

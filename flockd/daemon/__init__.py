@@ -2,8 +2,8 @@
 
 from flockd.daemon.daemon import Daemon, DaemonError, Ending
 from flockd.daemon.lock import only_instance, service_lock
-from flockd.daemon.service import ServiceManager
-from flockd.daemon.simulated_time import event_loop_at
+from flockd.daemon.service_manager import ServiceManager
+from flockd.daemon.simulated_loop import event_loop_at
 from flockd.sources import clock_at
 
 __all__ = [

@@ -1,47 +1,29 @@
-"""The daemon: puts everything together, starts and ends it, and looks after its tasks."""
+"""The daemon's life cycle: start, one task for each concern, hand-over to the autopilot, end."""
 
 from __future__ import annotations
 
 import asyncio
-import functools
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from flockd import __version__
-from flockd.autopilot.mavsdk_link import AutopilotLink
 from flockd.autopilot.status import AutopilotError
-from flockd.autopilot.streamer import SetpointStreamer
 from flockd.config import DroneConfig
-from flockd.config.autopilot import AutopilotParameters
-from flockd.daemon.chronicle import Chronicle
-from flockd.daemon.computer import LoopLag, Thermometer, WallClock
-from flockd.daemon.control import FLYING, Control, Door, VehicleHistory
-from flockd.daemon.crew import Crew
-from flockd.daemon.inspection import Asked, Inspector
-from flockd.daemon.networks import InterruptibleNetworks, WatchedNetworks
-from flockd.daemon.preview import preview
-from flockd.daemon.reports import tell_for_ever, tell_service
-from flockd.daemon.requests import Requests, TakeOff
-from flockd.daemon.service import ServiceManager
-from flockd.daemon.sight import Sight
-from flockd.daemon.worker import BusyError, LateError, Worker
+from flockd.daemon.components import Components
+from flockd.daemon.control import FLYING
+from flockd.daemon.networks import InterruptibleNetworks
+from flockd.daemon.operator_commands import OperatorRequests
+from flockd.daemon.service_manager import ServiceManager
+from flockd.daemon.startup import open_components
+from flockd.daemon.status_messages import notify_service_manager, publish_status
 from flockd.errors import ConfigError, ConfigProblem, FlockdError
-from flockd.safety import Decision, Event, Gate, State
+from flockd.safety import Decision, Event, State
 from flockd.sources import open_source
-from flockd.telemetry.publisher import ZenohTelemetry
-from flockd.telemetry.topics import (
-    AboutMessage,
-    AnswerMessage,
-)
 
-LOAD_S = 60.0
-"""To load the networks from a slow card."""
-OPEN_S = 10.0
-CLOSE_S = 3.0
-LAST_RESORT_S = 2.0
+HOLD_S = 2.0
+"""For the autopilot to confirm Hold after the control loop has failed."""
 
 
 class DaemonError(FlockdError):
@@ -49,10 +31,10 @@ class DaemonError(FlockdError):
 
 
 class Ending(NamedTuple):
-    """How a daemon ended that ended well."""
+    """How a daemon ended that ended without an error."""
 
     reload: DroneConfig | None
-    """Begin again, with this configuration; None: done."""
+    """The configuration to start again with; None: done."""
 
 
 class Daemon:
@@ -69,65 +51,88 @@ class Daemon:
         service: ServiceManager,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``file`` is named in errors; ``models`` are the SHA-256 of each, by name, for the recordings.
+        """Checks the configuration; nothing is opened before `run`.
+
+        Args:
+            config: the drone's.
+            file: its path, named in errors.
+            load_networks: runs on a thread of its own.
+            models: SHA-256 of each model, by name, for the recordings.
+            recordings: the folder for recordings of flights; None: nothing is recorded.
+            service: the service manager, if any.
+            clock: monotonic seconds.
 
         Raises ConfigError for a configuration that cannot be flown.
         """
-        self._autopilot = _autopilot_of(config, file)
+        _check_flyable(config, file)
         self._source = open_source(config, file, clock=clock)
         self._config, self._file = config, file
         self._load_networks, self._models, self._recordings = load_networks, models, recordings
         self._service, self._clock = service, clock
-        self._asked = Asked()
+        self._operator = OperatorRequests()
         self._stopping = asyncio.Event()
         self._reload: DroneConfig | None = None
-        self._crew: Crew | None = None
+        self._components: Components | None = None
 
     def ask_to_stop(self) -> None:
         """As SIGTERM does: standstill, Hold, and the end."""
-        self._asked.shutdown = True
+        self._operator.shutdown = True
         self._stopping.set()
 
     def ask_to_reload(self, read: Callable[[], DroneConfig]) -> None:
-        """As SIGHUP does: begins again with what ``read`` gives, unless the drone flies or the file is wrong."""
+        """As SIGHUP does: ends, to start again with what ``read`` returns.
+
+        Refused, with an event, while the drone is armed or in the air, or when the file is wrong.
+        """
         refusal = self._why_not_reload()
         if refusal is None:
             try:
                 config = read()
-                _autopilot_of(config, self._file)
+                _check_flyable(config, self._file)
                 open_source(config, self._file)
             except FlockdError as error:
-                refusal = f"the configuration was not taken, and the old one stays: {error}"
+                refusal = f"the new configuration was refused, and the old one stays in use: {error}"
             else:
                 self._reload = config
                 self._service.reloading()
                 self.ask_to_stop()
                 return
-        if self._crew is not None:
-            self._crew.chronicle.event(refusal)
+        if self._components is not None:
+            self._components.sinks.event(refusal)
 
     async def run(self) -> Ending:
         """Flies until it is asked to stop.
 
-        Raises FlockdError when it cannot start, DaemonError when something in it died or Hold was not confirmed.
+        Raises FlockdError when it cannot start, DaemonError when a task died or Hold was not confirmed.
         """
         async with AsyncExitStack() as stack:
-            crew = await self._unless_stopped(self._board(stack))
-            if crew is not None:
-                self._crew = crew
-                await self._fly(crew)
+            start = open_components(
+                stack,
+                self._config,
+                source=self._source,
+                load_networks=self._load_networks,
+                models=self._models,
+                recordings=self._recordings,
+                operator=self._operator,
+                on_tick=self._on_tick,
+                clock=self._clock,
+            )
+            components = await self._unless_stopped(start)
+            if components is not None:
+                self._components = components
+                await self._fly(components)
         return Ending(self._reload)
 
     def _why_not_reload(self) -> str | None:
-        if self._crew is None:
+        if self._components is None:
             return None
-        state, status = self._crew.control.decision.state, self._crew.link.status()
+        state, status = self._components.control.decision.state, self._components.link.status()
         if state in FLYING or status.in_air or status.armed:
             return "the configuration was not read again, because the drone is armed or in the air; land and disarm it"
         return None
 
-    async def _unless_stopped(self, start: Coroutine[Any, Any, Crew]) -> Crew | None:
-        """Starts, or stops starting when asked to stop."""
+    async def _unless_stopped(self, start: Coroutine[Any, Any, Components]) -> Components | None:
+        """Starts; None when asked to stop before that is done."""
         starting = asyncio.create_task(start)
         stopping = asyncio.create_task(self._stopping.wait())
         try:
@@ -138,192 +143,84 @@ class Daemon:
             starting.cancel()
             await asyncio.wait({starting})
 
-    async def _board(self, stack: AsyncExitStack) -> Crew:
-        """Opens everything; what was opened is closed by the stack, in the reverse order."""
-        config, clock = self._config, self._clock
-        closing = Worker("closing", backlog=8)
-        stack.callback(closing.leave)
-        telemetry = await closing.do(OPEN_S, _open_telemetry, config)
-        stack.push_async_callback(_patiently, closing, telemetry.close)
-        chronicle = Chronicle(config, telemetry, self._models, self._recordings, clock)
-        stack.push_async_callback(_shrug, chronicle.close)
-        await closing.do(OPEN_S, self._source.start)
-        stack.push_async_callback(_patiently, closing, self._source.stop)
-        networks, link = await _both(self._networks(), AutopilotLink.connect(self._autopilot, clock=clock))
-        stack.push_async_callback(_shrug, link.close)
-        gate = Gate(config.safety.gate)
-        door = Door(gate, clock)
-        streamer = SetpointStreamer(link.send_setpoint, link.status, door, self._autopilot, clock=clock)
-        streamer.start()
-        stack.callback(streamer.close)
-        history, lag, thermometer = VehicleHistory(), LoopLag(clock), Thermometer()
-        sight = Sight(config, self._source, networks, history.at, chronicle.step, chronicle.event, clock)
-        stack.push_async_callback(_patiently, closing, sight.leave)
-        dead: dict[str, str] = {}
-        inspector = Inspector(config, self._source, sight, networks, gate, lag, thermometer, dead, clock)
-        requests = Requests(link, chronicle.event)
-        control = Control(
-            config, link, streamer, door, sight, inspector, requests, history, self._asked, self._on_tick, clock
-        )  # fmt: skip
-        take_off = TakeOff(link, streamer, self._asked, lambda: control.decision, chronicle.event)
-        crew = Crew(
-            link=link, streamer=streamer, source=self._source, sight=sight, networks=networks, control=control,
-            requests=requests, take_off=take_off, chronicle=chronicle, telemetry=telemetry, lag=lag,
-            thermometer=thermometer, wall_clock=WallClock(chronicle.event, time.monotonic), dead_tasks=dead,
-        )  # fmt: skip
-        taker = self._taker(asyncio.get_running_loop(), chronicle)
-        telemetry.announce(config.name, self._about(), taker, functools.partial(_picture, sight))
-        return crew
-
-    async def _networks(self) -> WatchedNetworks:
-        loading = Worker("loading")
-        try:
-            networks = await loading.do(LOAD_S, self._load_networks)
-        finally:
-            loading.leave()
-        return WatchedNetworks(networks, self._config.perception.deadline_s / self._config.speed_factor)
-
-    async def _fly(self, crew: Crew) -> None:
-        """One task a concern, until all is over."""
+    async def _fly(self, components: Components) -> None:
+        """Runs one task for each concern until the flight is over."""
+        assert self._config.autopilot is not None
         concerns = {
-            "control": crew.control.run,
-            "requests": crew.requests.run,
-            "sight": crew.sight.run,
-            "loop lag": crew.lag.run,
-            "thermometer": crew.thermometer.run,
-            "wall clock": crew.wall_clock.run,
-            "telemetry": lambda: tell_for_ever(crew, self._clock),
-            "service": lambda: tell_service(crew, self._service),
+            "control": components.control.run,
+            "requests": components.requests.run,
+            "pilot": components.pilot_loop.run,
+            "loop lag": components.lag.run,
+            "thermometer": components.thermometer.run,
+            "wall clock": components.wall_clock.run,
+            "telemetry": lambda: publish_status(components, self._clock),
+            "service": lambda: notify_service_manager(components, self._service),
         }
-        if self._autopilot.arm_and_take_off:
-            concerns["take-off"] = crew.take_off.run
+        if self._config.autopilot.arm_and_take_off:
+            concerns["take-off"] = components.take_off.run
         async with asyncio.TaskGroup() as group:
-            tasks = [group.create_task(self._watched(name, run, crew), name=name) for name, run in concerns.items()]
-            await crew.over.wait()
+            tasks = [
+                group.create_task(self._supervised(name, run, components), name=name) for name, run in concerns.items()
+            ]
+            await components.over.wait()
             self._service.stopping()
             for task in tasks:
                 task.cancel()
-        self._judge(crew)
+        _raise_failure(components)
 
-    async def _watched(self, name: str, run: Callable[[], Awaitable[None]], crew: Crew) -> None:
-        """A task that ends is an event for the supervisor, which ends the flight; it does not end the others."""
+    async def _supervised(self, name: str, run: Callable[[], Awaitable[None]], components: Components) -> None:
+        """A task that ends is an event for the supervisor, which ends the flight; it does not end the other tasks."""
         try:
             await run()
-            crew.dead_tasks[name] = "it returned"
+            components.dead_tasks[name] = "it returned"
         except Exception as error:  # noqa: BLE001 - whatever it is, the drone has to be handed over
-            crew.dead_tasks[name] = repr(error)
-        crew.chronicle.event(f"the task {name} died: {crew.dead_tasks[name]}")
+            components.dead_tasks[name] = repr(error)
+        components.sinks.event(f"the task {name} died: {components.dead_tasks[name]}")
         if name in {"control", "requests"}:
-            await self._last_resort(crew)
+            await self._hold_without_control(components)
 
-    async def _last_resort(self, crew: Crew) -> None:
-        """Who would ask the autopilot to take over is dead: asks it here, while the streamer sends standstill."""
-        crew.control.stand_still()
-        if crew.link.status().flight_mode == "offboard":
+    async def _hold_without_control(self, components: Components) -> None:
+        """The tasks that request Hold are dead: requests it here, while the streamer sends standstill."""
+        components.control.stand_still()
+        if components.link.status().flight_mode == "offboard":
             try:
-                async with asyncio.timeout(LAST_RESORT_S):
-                    await crew.link.hold()
+                async with asyncio.timeout(HOLD_S):
+                    await components.link.hold()
             except (AutopilotError, TimeoutError) as error:
-                crew.chronicle.event(f"the autopilot did not confirm Hold ({error}); silence makes it")
-        crew.streamer.end("a task died")
-        crew.over.set()
-
-    def _judge(self, crew: Crew) -> None:
-        """Raises DaemonError unless all ended as it should."""
-        if crew.dead_tasks:
-            told = "; ".join(f"{name}: {why}" for name, why in crew.dead_tasks.items())
-            raise DaemonError(f"flockd had to give up, because a task died ({told}); see its log")
-        if Event.NO_ANSWER in {reason.event for reason in crew.control.decision.reasons}:
-            raise DaemonError("the autopilot did not confirm Hold; flockd fell silent, which makes its failsafe act")
+                components.sinks.event(f"the autopilot did not confirm Hold ({error}); setpoints end, so it fails safe")
+        components.streamer.end("a task died")
+        components.over.set()
 
     def _on_tick(self, before: Decision, now: Decision) -> None:
-        """Of the control loop."""
-        crew = self._crew
-        assert crew is not None
-        if not crew.networks.hopeless:
+        """Called by the control loop: feeds the watchdog, reports changes of state, begins and ends recordings."""
+        components = self._components
+        assert components is not None
+        if not components.networks.hopeless:
             self._service.alive()
         if now.state is not before.state:
             why = "; ".join(reason.sentence for reason in now.reasons)
-            crew.chronicle.event(f"{now.state}: {why}" if why else str(now.state))
+            components.sinks.event(f"{now.state}: {why}" if why else str(now.state))
         if now.state in FLYING and before.state not in FLYING:
-            crew.chronicle.begin_recording()
-        elif crew.chronicle.recording is not None and not crew.link.status().armed:
-            crew.chronicle.end_recording()
-        handed_over = now.state in {State.IDLE, State.SILENT} and not crew.requests.asking
-        if (self._asked.shutdown or crew.dead_tasks) and handed_over:
-            crew.over.set()
+            components.sinks.begin_recording()
+        elif components.sinks.recording is not None and not components.link.status().armed:
+            components.sinks.end_recording()
+        handed_over = now.state in {State.IDLE, State.SILENT} and not components.requests.asking
+        if (self._operator.shutdown or components.dead_tasks) and handed_over:
+            components.over.set()
 
-    def _about(self) -> AboutMessage:
-        return AboutMessage(
-            version=__version__,
-            configuration=self._config.model_dump(mode="json"),
-            commands=list(self._config.telemetry.commands),
+
+def _raise_failure(components: Components) -> None:
+    """Raises DaemonError unless all ended as it should."""
+    if components.dead_tasks:
+        deaths = "; ".join(f"{name}: {why}" for name, why in components.dead_tasks.items())
+        raise DaemonError(f"flockd ended because a task died ({deaths}); read its log")
+    if Event.NO_ANSWER in {reason.event for reason in components.control.decision.reasons}:
+        raise DaemonError(
+            "the autopilot did not confirm Hold; flockd stopped sending setpoints, so that its failsafe acts; check it"
         )
 
-    def _taker(self, loop: asyncio.AbstractEventLoop, chronicle: Chronicle) -> Callable[[str], AnswerMessage]:
-        """What takes operators' commands, on threads of zenoh's."""
-        allowed = self._config.telemetry.commands
 
-        def take(command: str) -> AnswerMessage:
-            if command not in allowed:
-                sentence = f"{command!r} is not allowed here; telemetry.commands allows {', '.join(allowed) or 'none'}"
-                chronicle.event(f"an operator's command was refused: {sentence}")
-                return AnswerMessage(accepted=False, sentence=sentence)
-            loop.call_soon_threadsafe(self._obey, command)
-            chronicle.event(f"an operator asked for {command}")
-            return AnswerMessage(accepted=True, sentence=f"{command} is being tried; the topic `flight` tells")
-
-        return take
-
-    def _obey(self, command: str) -> None:
-        self._asked.hold = command == "hold"
-        self._asked.land = command == "land"
-        self._asked.resume = command == "resume"
-
-
-def _autopilot_of(config: DroneConfig, file: str) -> AutopilotParameters:
+def _check_flyable(config: DroneConfig, file: str) -> None:
     if config.autopilot is None:
         problem = ConfigProblem(file, 0, "autopilot", "is missing; add it with the `address` of the autopilot")
         raise ConfigError([problem])
-    return config.autopilot
-
-
-def _picture(sight: Sight, camera: str) -> bytes | None:
-    frame = None if sight.frames is None else sight.frames.frames.get(camera)
-    return None if frame is None else preview(frame)
-
-
-def _open_telemetry(config: DroneConfig) -> ZenohTelemetry:
-    wanted = config.telemetry
-    settings = None if wanted.zenoh_config is None else Path(wanted.zenoh_config)
-    return ZenohTelemetry(wanted.fleet, listen=wanted.listen, connect=wanted.connect, settings=settings)
-
-
-async def _both(
-    networks: Coroutine[Any, Any, WatchedNetworks], link: Coroutine[Any, Any, AutopilotLink]
-) -> tuple[WatchedNetworks, AutopilotLink]:
-    """Both at a time; when one fails the other is given up."""
-    tasks = asyncio.create_task(networks), asyncio.create_task(link)
-    try:
-        return await asyncio.gather(*tasks)
-    except BaseException:
-        for task in tasks:
-            task.cancel()
-        raise
-
-
-async def _patiently(worker: Worker, close: Callable[[], None]) -> None:
-    """Closes something that may hang; then it ends with the process."""
-    try:
-        await worker.do(CLOSE_S, close)
-    except (LateError, BusyError):
-        return
-
-
-async def _shrug(close: Callable[[], Awaitable[None]]) -> None:
-    """The same, for what closes itself."""
-    try:
-        async with asyncio.timeout(2 * CLOSE_S):
-            await close()
-    except (TimeoutError, LateError, BusyError):
-        return

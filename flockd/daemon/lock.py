@@ -12,7 +12,7 @@ from pathlib import Path
 from flockd.errors import UnavailableError
 
 SERVICE_FOLDER = Path("/run/flockd")
-"""Of the systemd unit; a process started by hand looks there too."""
+"""Of the systemd unit; a process started by hand checks there too."""
 
 
 @contextmanager

@@ -25,7 +25,7 @@ class InterruptibleNetworks(Networks, Protocol):
 
 
 class NetworkStuckError(Exception):
-    """A network did not answer by its deadline."""
+    """A network call passed its deadline."""
 
 
 class WatchedNetworks:
@@ -40,9 +40,9 @@ class WatchedNetworks:
         self._abandoned = 0
         self._left = False
         self.stuck = False
-        """The last call has not answered by its deadline."""
+        """The last call passed its deadline."""
         self.faults = 0
-        """Answers that cannot be, since the start."""
+        """Outputs that were not finite, since the start."""
         self.ended = 0
         """Calls that were ended, since the start."""
 
@@ -53,32 +53,32 @@ class WatchedNetworks:
 
     def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
         """Raises NetworkStuckError; so do the next two."""
-        answer: Float32Array = self._call(self._networks.flow, first, second, labels)
-        return answer
+        result: Float32Array = self._call(self._networks.flow, first, second, labels)
+        return result
 
     def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
         """Depth and drones of one image."""
-        answer: SceneMaps = self._call(self._networks.scene, frame, camera, ground)
-        return answer
+        result: SceneMaps = self._call(self._networks.scene, frame, camera, ground)
+        return result
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         """Range and centre of the drone in the middle of each crop."""
-        answer: tuple[RangeEstimate, ...] = self._call(self._networks.ranges, crops)
-        return answer
+        result: tuple[RangeEstimate, ...] = self._call(self._networks.ranges, crops)
+        return result
 
     def leave(self) -> None:
-        """Ends what runs, and answers no more; returns within a fraction of a second, from any thread."""
+        """Ends the running call and refuses later ones; returns within a fraction of a second, on any thread."""
         self._left = True
         self._networks.terminate()
         self._worker.leave(TERMINATE_S)
 
     def _call(self, function: Callable[..., Any], *arguments: object) -> Any:
         if self._left:
-            raise NetworkStuckError("the networks are at rest")
+            raise NetworkStuckError("the networks have been stopped")
         call = self._worker.submit(function, *arguments)
-        if not self._answers(call, self._deadline_s):
+        if not self._done_within(call, self._deadline_s):
             self._end(call)
-            raise NetworkStuckError(f"a network did not answer within {self._deadline_s:g} s")
+            raise NetworkStuckError(f"a network call took longer than {self._deadline_s:g} s")
         self.stuck = False
         self._abandoned = 0
         try:
@@ -91,11 +91,11 @@ class WatchedNetworks:
         self.stuck = True
         self.ended += 1
         self._networks.terminate()
-        if not self._answers(call, TERMINATE_S):
+        if not self._done_within(call, TERMINATE_S):
             self._abandoned += 1
             self._worker.leave()
             self._worker = Worker("networks")
 
     @staticmethod
-    def _answers(call: concurrent.futures.Future[Any], timeout_s: float) -> bool:
+    def _done_within(call: concurrent.futures.Future[Any], timeout_s: float) -> bool:
         return bool(concurrent.futures.wait([call], timeout_s).done)

@@ -1,4 +1,4 @@
-"""What a camera sees, small enough to be looked at over a radio link, for whoever asks."""
+"""A small JPEG of a camera's newest frame, for telemetry over a radio link."""
 
 from __future__ import annotations
 

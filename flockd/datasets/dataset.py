@@ -9,7 +9,7 @@ from typing import Protocol
 
 from flockd.config.rig import CameraConfig
 from flockd.datasets.errors import DatasetError
-from flockd.datasets.images import read_depth, read_image
+from flockd.datasets.image_files import read_depth, read_image
 from flockd.geometry import RigidTransform
 from flockd.messages import Float32Array, UInt8Array
 

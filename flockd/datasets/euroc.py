@@ -11,11 +11,11 @@ import yaml
 
 from flockd.choices import LensModel
 from flockd.config.rig import CameraConfig
-from flockd.datasets.calibration import camera_of, read_calibration
+from flockd.datasets.camera_intrinsics import camera_of, read_calibration
 from flockd.datasets.dataset import Entry, FileDataset
 from flockd.datasets.errors import DatasetError
-from flockd.datasets.images import read_image
-from flockd.datasets.poses import PoseTrack, pose_of_matrix, track_of_rows
+from flockd.datasets.image_files import read_image
+from flockd.datasets.pose_track import PoseTrack, pose_of_matrix, track_of_rows
 from flockd.datasets.tables import read_lines, read_rows
 from flockd.errors import ConfigError, ConfigProblem
 from flockd.geometry import RigidTransform
@@ -71,7 +71,7 @@ def _settings(sensor: Path) -> Mapping[str, Any]:
     try:
         settings = yaml.safe_load(body)
     except yaml.YAMLError as error:
-        raise _problem(sensor, "", f"is not YAML ({str(error).splitlines()[0]}); mend it") from None
+        raise _problem(sensor, "", f"is not YAML ({str(error).splitlines()[0]}); correct it") from None
     if not isinstance(settings, dict):
         raise _problem(sensor, "", "holds no calibration; it needs intrinsics, distortion and T_BS")
     return settings

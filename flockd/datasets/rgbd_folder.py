@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flockd.datasets.calibration import read_calibration
+from flockd.datasets.camera_intrinsics import read_calibration
 from flockd.datasets.dataset import Entry, FileDataset
 from flockd.datasets.errors import DatasetError
-from flockd.datasets.images import SUFFIXES, read_image
-from flockd.datasets.poses import pose_of_matrix
+from flockd.datasets.image_files import SUFFIXES, read_image
+from flockd.datasets.pose_track import pose_of_matrix
 from flockd.datasets.tables import read_rows
 from flockd.geometry import RigidTransform
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from flockd.datasets.calibration import read_calibration
+from flockd.datasets.camera_intrinsics import read_calibration
 from flockd.datasets.dataset import Entry, FileDataset
 from flockd.datasets.errors import DatasetError
-from flockd.datasets.images import read_image
-from flockd.datasets.poses import PoseTrack, track_of_rows
+from flockd.datasets.image_files import read_image
+from flockd.datasets.pose_track import PoseTrack, track_of_rows
 from flockd.datasets.tables import read_lines, read_rows
 from flockd.messages import FloatArray
 

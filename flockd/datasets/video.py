@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from flockd.config.rig import CameraConfig
-from flockd.datasets.calibration import read_calibration
+from flockd.datasets.camera_intrinsics import read_calibration
 from flockd.datasets.dataset import DatasetFrame, Moment
 from flockd.datasets.errors import DatasetError
 from flockd.errors import ConfigError, ConfigProblem

@@ -24,7 +24,7 @@ class Finding:
     about: str
     """Which camera, model, parameter ..."""
     measured: str
-    mend: str
+    fix: str
     """What to do; empty where nothing is to be done."""
 
 
@@ -33,17 +33,17 @@ def passed(about: str, measured: str) -> Finding:
     return Finding(Level.PASS, about, measured, "")
 
 
-def warned(about: str, measured: str, mend: str) -> Finding:
+def warned(about: str, measured: str, fix: str) -> Finding:
     """It could be better."""
-    return Finding(Level.WARNING, about, measured, mend)
+    return Finding(Level.WARNING, about, measured, fix)
 
 
-def failed(about: str, measured: str, mend: str) -> Finding:
+def failed(about: str, measured: str, fix: str) -> Finding:
     """It must not be like this."""
-    return Finding(Level.FAILURE, about, measured, mend)
+    return Finding(Level.FAILURE, about, measured, fix)
 
 
-def failed_as_told(about: str, sentence: str) -> Finding:
-    """The failure that an error's sentence tells of: our own end in their mend, after the last semicolon."""
-    measured, _, mend = sentence.rpartition("; ")
-    return failed(about, measured or mend, mend if measured else "mend that, and examine it again")
+def failed_from_error(about: str, sentence: str) -> Finding:
+    """The failure that an error's sentence tells of: our own end in their fix, after the last semicolon."""
+    measured, _, fix = sentence.rpartition("; ")
+    return failed(about, measured or fix, fix if measured else "correct it, and run `flockd doctor` again")

@@ -12,7 +12,7 @@ import numpy as np
 
 from flockd.config import DroneConfig
 from flockd.doctor.deadline import GOLDEN_S, within
-from flockd.doctor.finding import Finding, Level, failed, failed_as_told, passed, warned
+from flockd.doctor.finding import Finding, Level, failed, failed_from_error, passed, warned
 from flockd.errors import ModelError
 from flockd.inference import OnnxModel, manifests_of
 from flockd.inference.providers import engines_folder
@@ -55,7 +55,7 @@ def _each(config: DroneConfig) -> Iterator[Finding]:
                 deadline=within(GOLDEN_S),
             )
         except ModelError as error:
-            yield failed_as_told(about, str(error))
+            yield failed_from_error(about, str(error))
             continue
         size_mb = path.with_name(model.manifest.file).stat().st_size / 1e6
         yield passed(about, f"hash and golden output are right, {size_mb:.1f} MB, run by {model.provider}")

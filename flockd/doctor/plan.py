@@ -6,8 +6,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.doctor.examination import Check
 from flockd.doctor.finding import Finding
+from flockd.doctor.runner import Check
 
 if TYPE_CHECKING:
     from flockd.config import DroneConfig
@@ -49,47 +49,47 @@ def plan(
 
     # Each imports what it looks at when it runs: a library that does not load fails its check alone.
     def instance() -> Iterable[Finding]:
-        from flockd.doctor.service import check_instance
+        from flockd.doctor.service_checks import check_instance
 
         return check_instance(config.name, environment)
 
     def memory() -> Iterable[Finding]:
-        from flockd.doctor.computer import check_memory
+        from flockd.doctor.computer_checks import check_memory
 
         return check_memory(config)
 
     def disk() -> Iterable[Finding]:
-        from flockd.doctor.computer import check_disk
+        from flockd.doctor.computer_checks import check_disk
 
         return check_disk(config, recordings)
 
     def temperature() -> Iterable[Finding]:
-        from flockd.doctor.computer import check_temperature
+        from flockd.doctor.computer_checks import check_temperature
 
         return check_temperature(config)
 
     def clock() -> Iterable[Finding]:
-        from flockd.doctor.computer import check_clock
+        from flockd.doctor.computer_checks import check_clock
 
         return check_clock()
 
     def exposure() -> Iterable[Finding]:
-        from flockd.doctor.service import check_unit
+        from flockd.doctor.service_checks import check_unit
 
         return check_unit(unit)
 
     def zenoh() -> Iterable[Finding]:
-        from flockd.doctor.fleet import check_fleet
+        from flockd.doctor.telemetry_checks import check_fleet
 
         return check_fleet(config)
 
     def autopilot() -> Iterable[Finding]:
-        from flockd.doctor.autopilot import check_autopilot
+        from flockd.doctor.autopilot_checks import check_autopilot
 
         return check_autopilot(config)
 
     def cameras() -> Iterable[Finding]:
-        from flockd.doctor.cameras import check_cameras
+        from flockd.doctor.camera_checks import check_cameras
 
         return check_cameras(config, seconds)
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from flockd.config.complaints import problems_of
 from flockd.config.document import Place, key_text, read_document
 from flockd.config.perception import PerceptionConfig
+from flockd.config.validation_messages import problems_of
 from flockd.data import data_path
 from flockd.errors import ConfigError, ConfigProblem, ModelError
 from flockd.inference.manifest import Fault, Key, Manifest

@@ -38,10 +38,15 @@ _MIN_RAY_Z = 0.1
 class Networks(Protocol):
     """What perception asks of networks: `OnnxNetworks`, or exact ones that a simulator puts in their place."""
 
-    map_stride: int
-    """Image pixels per pixel of the first stage's maps."""
-    second_stage: SecondStage | None
-    """How the crops are cut that `ranges` takes; None: there is no second stage."""
+    @property
+    def map_stride(self) -> int:
+        """Image pixels per pixel of the first stage's maps."""
+        ...
+
+    @property
+    def second_stage(self) -> SecondStage | None:
+        """How the crops are cut that `ranges` takes; None: there is no second stage."""
+        ...
 
     def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
         """(h, w, 2) pixels from the first image to the second.

@@ -1,4 +1,4 @@
-"""What the supervisor is told, and what it notices in it: faults, and other things that may end a flight."""
+"""The supervisor's inputs, and the events in them: faults, and other reasons to end a flight."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Inputs:
     position_lost: bool
     """The autopilot has lost its estimate, or the satellites that it needs for it."""
     shutdown_asked: bool
-    """The process was told to end."""
+    """The process was asked to end."""
     hold_asked: bool
     """By an operator; so `land_asked`."""
     land_asked: bool
@@ -126,8 +126,8 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
     failures = inputs.ego_motion_failures
     temperature = inputs.temperature_c
     table = (
-        (Event.SIGHT_LOST, sightless, f"too few cameras see: {', '.join(lost) or 'there are none'}"),
-        (Event.CAMERA_LOST, len(lost) > 0 and not sightless, f"a blind sector: {', '.join(lost)}"),
+        (Event.SIGHT_LOST, sightless, f"too few cameras deliver images: {', '.join(lost) or 'there are none'}"),
+        (Event.CAMERA_LOST, len(lost) > 0 and not sightless, f"a camera is lost: {', '.join(lost)}"),
         (
             Event.FRAMES_DROPPED,
             not inputs.dropped_share <= p.max_dropped_share,
@@ -141,21 +141,21 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         (
             Event.EGO_MOTION_POOR,
             p.degraded_ego_motion_failures <= failures < p.max_ego_motion_failures,
-            f"no motion of its own found {failures} times in a row",
+            f"ego-motion not estimated in {failures} steps in a row",
         ),
         (
             Event.EGO_MOTION_LOST,
             failures >= p.max_ego_motion_failures,
-            f"no motion of its own found {failures} times in a row",
+            f"ego-motion not estimated in {failures} steps in a row",
         ),
-        (Event.NETWORK_FAULT, inputs.network_faults > 0, "a network gave numbers that cannot be"),
-        (Event.INFERENCE_STUCK, inputs.inference_stuck, "a network does not answer"),
+        (Event.NETWORK_FAULT, inputs.network_faults > 0, "a network's output is not finite or not plausible"),
+        (Event.INFERENCE_STUCK, inputs.inference_stuck, "a network does not respond"),
         (
             Event.OVERLOADED,
             p.degraded_load < inputs.load <= p.max_load,
-            f"the steps take {inputs.load:.0%} of their time",
+            f"a step takes {inputs.load:.0%} of the step time",
         ),
-        (Event.FAR_OVERLOADED, not inputs.load <= p.max_load, f"the steps take {inputs.load:.0%} of their time"),
+        (Event.FAR_OVERLOADED, not inputs.load <= p.max_load, f"a step takes {inputs.load:.0%} of the step time"),
         (
             Event.HOT,
             temperature is not None and p.degraded_temperature_c < temperature <= p.max_temperature_c,
@@ -196,7 +196,7 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         (Event.OFFBOARD_REFUSED, inputs.offboard_refused, "the autopilot refused offboard mode"),
         (Event.BATTERY_LOW, inputs.battery_low, "the autopilot says that the battery is low"),
         (Event.POSITION_LOST, inputs.position_lost, "the autopilot has lost its position"),
-        (Event.SHUTDOWN_ASKED, inputs.shutdown_asked, "told to end"),
+        (Event.SHUTDOWN_ASKED, inputs.shutdown_asked, "asked to end"),
         (Event.HOLD_ASKED, inputs.hold_asked, "an operator asked for Hold"),
         (Event.LAND_ASKED, inputs.land_asked, "an operator asked for Land"),
     )

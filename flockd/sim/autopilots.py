@@ -13,7 +13,8 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from flockd.autopilot.stand_in import AutopilotStandIn, Demand, MotionState
+from flockd.autopilot.fake_autopilot import FakeAutopilot
+from flockd.autopilot.fake_vehicle import Demand, MotionState
 from flockd.config.scenario import ScenarioConfig, StartConfig, VehicleConfig
 from flockd.errors import UnavailableError, UsageError
 from flockd.sim.ground_station import home_deg
@@ -95,7 +96,7 @@ class SimulatedAutopilots:
         """See `Autopilots`."""
         for i, (vehicle, ports) in enumerate(zip(self._scenario.vehicles, self.ports, strict=True)):
             position = np.array(vehicle.position_m)
-            stand_in = AutopilotStandIn(
+            stand_in = FakeAutopilot(
                 ports.offboard,
                 system_id=i + 1,
                 motion=_Flown(self._scenario.vehicle, self._scenario.seed + i),

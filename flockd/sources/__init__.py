@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 from flockd.config import DroneConfig
 from flockd.errors import ConfigError, ConfigProblem
+from flockd.sources.clock import clock_at
 from flockd.sources.frames import CameraStatus, Count, FrameSource
 from flockd.sources.shared_memory import FramePublisher, SharedMemorySource
-from flockd.sources.simulated_time import clock_at
 from flockd.sources.v4l2 import V4l2Source
 
 __all__ = ["CameraStatus", "Count", "FramePublisher", "FrameSource", "clock_at", "open_source"]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 from flockd.messages import FrameSet
-from flockd.sources.images import Decoder
+from flockd.sources.image_formats import Decoder
 
 Count = Literal[
     "received",  # came from the device or the network, whatever they were worth

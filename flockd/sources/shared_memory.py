@@ -20,10 +20,10 @@ from zenoh import shm
 from flockd.config.drone import DroneConfig
 from flockd.config.source import SourceParameters
 from flockd.messages import Frame, FrameSet
-from flockd.peer import PeerError, close_peer, open_peer
+from flockd.sources.frame_receiver import FrameReceiver
 from flockd.sources.frames import CameraStatus, RawFrame
-from flockd.sources.images import RgbFormat
-from flockd.sources.intake import Intake
+from flockd.sources.image_formats import RgbFormat
+from flockd.zenoh_session import SessionError, close_session, open_session
 
 PREFIX = "flockd-frames/v1"
 """Apart from telemetry, which no drone reads."""
@@ -59,7 +59,7 @@ class FramePublisher:
 
     def close(self) -> None:
         """Ends the session."""
-        close_peer(self._session)
+        close_session(self._session)
 
     def __enter__(self) -> Self:
         return self
@@ -112,7 +112,7 @@ class SharedMemorySource:
     ) -> None:
         self._formats = {camera.name: RgbFormat(camera.size_px) for camera in config.rig.cameras}
         self._where = parameters.shared_memory
-        self._intake = Intake(tuple(self._formats), parameters, clock)
+        self._receiver = FrameReceiver(tuple(self._formats), parameters, clock)
         self._session: zenoh.Session | None = None
         self._subscribers: list[zenoh.Subscriber[None]] = []
         self._notes: list[str] = []
@@ -130,11 +130,11 @@ class SharedMemorySource:
 
     def newest(self, timeout_s: float = 0.0) -> FrameSet | None:
         """See ``FrameSource``."""
-        return self._intake.newest(timeout_s)
+        return self._receiver.newest(timeout_s)
 
     def status(self) -> Mapping[str, CameraStatus]:
         """See ``FrameSource``."""
-        return self._intake.status()
+        return self._receiver.status()
 
     def notes(self) -> tuple[str, ...]:
         """See ``FrameSource``."""
@@ -142,9 +142,9 @@ class SharedMemorySource:
 
     def stop(self) -> None:
         """See ``FrameSource``."""
-        self._intake.stop()
+        self._receiver.stop()
         if self._session is not None:
-            close_peer(self._session)
+            close_session(self._session)
 
     def _receive(self, camera: str, sample: zenoh.Sample) -> None:
         """On a thread of zenoh's."""
@@ -157,22 +157,22 @@ class SharedMemorySource:
         except struct.error:
             magic = b""
         if magic != _MAGIC:
-            self._intake.count(camera, "received", "malformed")
+            self._receiver.count(camera, "received", "malformed")
             return
         if (width, height) != image_format.size:
-            self._intake.count(camera, "received", "corrupt")
+            self._receiver.count(camera, "received", "corrupt")
             asked = "x".join(map(str, image_format.size))
-            self._intake.fault(camera, f"{camera}: frames of {width}x{height} come, but the rig says {asked}; mend one")
+            self._receiver.fault(camera, f"{camera}: frames are {width}x{height}, but the rig has {asked}; correct one")
             return
-        self._intake.offer(RawFrame(camera, sample.payload.to_bytes(), image_format.decode, time_s, sequence))
+        self._receiver.offer(RawFrame(camera, sample.payload.to_bytes(), image_format.decode, time_s, sequence))
 
 
 def _open(*, listen: Sequence[str], connect: Sequence[str]) -> tuple[zenoh.Session, str | None]:
     """A session, and a note if it has to do without shared memory."""
     try:
-        return open_peer("frames", listen, connect, shared_memory=True), None
-    except PeerError as error:
-        session = open_peer("frames", listen, connect, shared_memory=False)
+        return open_session("frames", listen, connect, shared_memory=True), None
+    except SessionError as error:
+        session = open_session("frames", listen, connect, shared_memory=False)
         return session, _without_shared_memory(error.reason)
 
 

@@ -9,10 +9,11 @@ from collections.abc import Callable, Mapping
 from flockd.config.drone import DroneConfig
 from flockd.config.source import CameraDeviceParameters, SourceParameters
 from flockd.messages import FrameSet
+from flockd.sources.frame_receiver import FrameReceiver
 from flockd.sources.frames import CameraStatus, Count, RawFrame
-from flockd.sources.images import CorruptImageError, ImageFormat, MjpegFormat, YuyvFormat
-from flockd.sources.intake import Intake
-from flockd.sources.v4l2_device import CameraError, CapturedBuffer, Kernel, LinuxKernel, V4l2Device
+from flockd.sources.image_formats import CorruptImageError, ImageFormat, MjpegFormat, YuyvFormat
+from flockd.sources.v4l2_device import CameraError, CapturedBuffer, V4l2Device
+from flockd.sources.v4l2_kernel import Kernel, LinuxKernel
 
 _LOOK_S = 0.05
 """How long a thread waits for a frame before it looks whether it should stop."""
@@ -38,9 +39,9 @@ class V4l2Source:
     ) -> None:
         """``parameters`` name one device for each camera of the rig; ``clock`` is that of the kernel's time stamps."""
         sizes = {camera.name: camera.size_px for camera in config.rig.cameras}
-        self._intake = Intake(tuple(sizes), parameters, clock)
+        self._receiver = FrameReceiver(tuple(sizes), parameters, clock)
         self._cameras = [
-            _Camera(camera, sizes[camera.name], parameters.silence_s, self._intake, kernel or LinuxKernel(), clock)
+            _Camera(camera, sizes[camera.name], parameters.silence_s, self._receiver, kernel or LinuxKernel(), clock)
             for camera in parameters.cameras
         ]
 
@@ -51,11 +52,11 @@ class V4l2Source:
 
     def newest(self, timeout_s: float = 0.0) -> FrameSet | None:
         """See ``FrameSource``."""
-        return self._intake.newest(timeout_s)
+        return self._receiver.newest(timeout_s)
 
     def status(self) -> Mapping[str, CameraStatus]:
         """See ``FrameSource``."""
-        return self._intake.status()
+        return self._receiver.status()
 
     def notes(self) -> tuple[str, ...]:
         """See ``FrameSource``."""
@@ -63,7 +64,7 @@ class V4l2Source:
 
     def stop(self) -> None:
         """See ``FrameSource``."""
-        self._intake.stop()
+        self._receiver.stop()
         for camera in self._cameras:
             camera.ask_to_stop()
         until_s = time.monotonic() + _STOP_S
@@ -79,7 +80,7 @@ class _Camera:
         parameters: CameraDeviceParameters,
         size: tuple[int, int],
         silence_s: float,
-        intake: Intake,
+        receiver: FrameReceiver,
         kernel: Kernel,
         clock: Callable[[], float],
     ) -> None:
@@ -87,7 +88,7 @@ class _Camera:
         self._parameters = parameters
         self._size = size
         self._silence_s = silence_s
-        self._intake = intake
+        self._receiver = receiver
         self._kernel = kernel
         self._clock = clock
         self._delivered = False
@@ -113,10 +114,10 @@ class _Camera:
             self._delivered = False
             try:
                 with self._open() as device:
-                    self._intake.count(self._name, "opened")
+                    self._receiver.count(self._name, "opened")
                     self._capture(device)
             except CameraError as error:
-                self._intake.fault(self._name, str(error))
+                self._receiver.fault(self._name, str(error))
             pause_s = _FIRST_PAUSE_S if self._delivered else pause_s
             self._stopping.wait(pause_s)
             pause_s = min(2.0 * pause_s, _LONGEST_PAUSE_S)
@@ -140,7 +141,7 @@ class _Camera:
         while not self._stopping.is_set():
             captured = device.read(_LOOK_S)
             if captured is not None and left_over:
-                self._intake.count(self._name, "received", "late")
+                self._receiver.count(self._name, "received", "late")
                 left_over = False
             elif captured is not None:
                 refused = self._take(captured, image_format)
@@ -156,10 +157,10 @@ class _Camera:
     def _take(self, captured: CapturedBuffer, image_format: ImageFormat) -> Count | None:
         refused = self._refusal(captured, image_format)
         if refused is not None:
-            self._intake.count(self._name, "received", refused)
+            self._receiver.count(self._name, "received", refused)
             return refused
         frame = RawFrame(self._name, captured.data, image_format.decode, captured.time_s, captured.sequence)
-        return self._intake.offer(frame)
+        return self._receiver.offer(frame)
 
     def _refusal(self, captured: CapturedBuffer, image_format: ImageFormat) -> Count | None:
         if captured.flagged:

@@ -1,4 +1,4 @@
-"""Publishes telemetry over zenoh, as one peer for all drones of a process, and answers who asks."""
+"""Publishes telemetry over zenoh, as one peer for all drones of a process, and answers queries."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import Self
 import numpy as np
 import zenoh
 
-from flockd.peer import close_peer, open_peer
 from flockd.telemetry.topics import PREFIX, TOPICS, AboutMessage, AnswerMessage, checked_name
+from flockd.zenoh_session import close_session, open_session
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
@@ -26,7 +26,7 @@ Look = Callable[[str], bytes | None]
 class ZenohTelemetry:
     """A telemetry sink that puts each message under `flockd/v1/<fleet>/<drone>/<topic>`.
 
-    It listens on and connects to the given endpoints only: it neither shouts nor hearkens on the network. A put never
+    It listens on and connects to the given endpoints only: discovery by multicast and gossip is off. A put never
     waits: without a subscriber it goes nowhere, and a congested link drops it. Raises UnavailableError when an endpoint
     or the file of settings cannot be used, and ValueError for a fleet's name that does not fit into a key.
     """
@@ -43,7 +43,7 @@ class ZenohTelemetry:
         self._publishers: dict[tuple[str, str], zenoh.Publisher] = {}
         self._kept: list[object] = []
         self._lost = 0
-        self._session = open_peer("telemetry", listen, connect, settings=settings)
+        self._session = open_session("telemetry", listen, connect, settings=settings)
 
     @property
     def lost(self) -> int:
@@ -62,7 +62,7 @@ class ZenohTelemetry:
             self._lost += 1
 
     def announce(self, drone: str, about: AboutMessage, ask: Ask, look: Look) -> None:
-        """Shows that a drone is alive for as long as this session is, and answers who asks.
+        """Shows that a drone is alive for as long as this session is, and answers queries.
 
         It tells what it flies with, takes commands, and shows what a camera sees.
         """
@@ -78,7 +78,7 @@ class ZenohTelemetry:
 
     def close(self) -> None:
         """Ends the session; later messages are lost, and counted."""
-        close_peer(self._session)
+        close_session(self._session)
 
     def __enter__(self) -> Self:
         return self
@@ -111,7 +111,7 @@ def _show(query: zenoh.Query, look: Look) -> None:
     camera = str(query.key_expr).rpartition("/")[2]
     picture = look(camera)
     if picture is None:
-        query.reply_err(f"camera {camera!r} has no picture", encoding=zenoh.Encoding.TEXT_PLAIN)
+        query.reply_err(f"camera {camera!r} has no image", encoding=zenoh.Encoding.TEXT_PLAIN)
     else:
         query.reply(query.key_expr, picture, encoding=zenoh.Encoding.IMAGE_JPEG)
 

@@ -13,8 +13,8 @@ from typing import Any, Self
 
 import zenoh
 
-from flockd.peer import close_peer, open_peer
 from flockd.telemetry.topics import PREFIX, TOPICS, checked_name
+from flockd.zenoh_session import close_session, open_session
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class FleetWatcher:
         self._drones: dict[tuple[str, str], Watched] = {}
         self.malformed = 0
         """Messages that are none."""
-        self._session = open_peer("telemetry", listen, connect, settings=settings)
+        self._session = open_session("telemetry", listen, connect, settings=settings)
         drones = f"{PREFIX}/{'*' if fleet is None else checked_name(fleet)}/*"
         self._subscribers = [
             self._session.declare_subscriber(f"{drones}/{topic}", self._take_message) for topic in TOPICS
@@ -79,7 +79,7 @@ class FleetWatcher:
 
     def close(self) -> None:
         """Ends the session."""
-        close_peer(self._session)
+        close_session(self._session)
 
     def __enter__(self) -> Self:
         return self

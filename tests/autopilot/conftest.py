@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from flockd.autopilot.stand_in import AutopilotStandIn
+from flockd.autopilot.fake_autopilot import FakeAutopilot
 
 HOVER_M = 2.5
 HEARTBEAT_S = 0.25
@@ -26,6 +26,6 @@ def port() -> int:
 
 
 @pytest.fixture
-def stand_in(port: int) -> Iterator[AutopilotStandIn]:
-    with AutopilotStandIn(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S) as stand_in:
-        yield stand_in
+def fake_autopilot(port: int) -> Iterator[FakeAutopilot]:
+    with FakeAutopilot(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
+        yield fake_autopilot

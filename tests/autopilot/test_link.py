@@ -1,4 +1,4 @@
-"""MAVSDK itself against the stand-in over real UDP: what the link says is true, and what it is told happens."""
+"""MAVSDK itself against the fake autopilot over real UDP: what the link says is true, and what it is told happens."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from flockd.autopilot.fake_autopilot import TICK_S, FakeAutopilot
+from flockd.autopilot.fake_telemetry import TelemetryStreams
+from flockd.autopilot.fake_vehicle import Demand, MotionState
 from flockd.autopilot.mavsdk_link import SETPOINT_TYPE_MASK, AutopilotLink
-from flockd.autopilot.stand_in import TICK_S, AutopilotStandIn, Demand, MotionState
 from flockd.autopilot.status import AutopilotError, Firmware
 from flockd.config.autopilot import AutopilotParameters
 from flockd.messages import Setpoint
@@ -66,19 +68,40 @@ def test_telemetry_is_what_the_vehicle_does(port: int) -> None:
         assert status.battery_share == pytest.approx(0.42)
         assert status.battery_v == pytest.approx(14.0 + 2.8 * 0.42, abs=1e-3)
 
-        stand_in.estimate_ok = False
+        fake_autopilot.estimate_ok = False
         await until(lambda: link.status().estimate_ok is False)
-        stand_in.silent = True
+        fake_autopilot.silent = True
         await until(lambda: link.status().heartbeat_age_s > 4 * HEARTBEAT_S)
         await link.close()
 
-    with AutopilotStandIn(port, height_m=7.5, motion=still, heartbeat_s=HEARTBEAT_S) as stand_in:
-        stand_in.battery_share = 0.42
+    with FakeAutopilot(port, height_m=7.5, motion=still, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
+        fake_autopilot.battery_share = 0.42
         asyncio.run(story())
 
 
-def test_firmware_and_failsafe_parameters_can_be_read(port: int, stand_in: AutopilotStandIn) -> None:
-    stand_in.parameters |= {"COM_OF_LOSS_T": 0.75, "COM_OBL_RC_ACT": 4, "COM_LOW_BAT_ACT": -3}
+def test_a_landed_state_that_mavlink_does_not_have_is_unknown_and_counted(
+    port: int, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A vehicle in the air reports 2, then 5: MAV_LANDED_STATE ends at 4."""
+
+    def sends_5(self: TelemetryStreams) -> None:
+        self._mav.extended_sys_state_send(0, 5)
+
+    async def story() -> None:
+        link = await AutopilotLink.connect(_parameters(port))
+        await until(lambda: link.status().landed_state == "air")
+        monkeypatch.setattr(TelemetryStreams, "_send_landed", sends_5)
+        await until(lambda: link.status().landed_state == "unknown")
+        assert not link.status().in_air
+        assert link.unknown_values().keys() == {"EXTENDED_SYS_STATE.landed_state = 5"}
+        assert link.status().heartbeat_age_s < 2 * HEARTBEAT_S, "the link still receives"
+        await link.close()
+
+    asyncio.run(story())
+
+
+def test_firmware_and_failsafe_parameters_can_be_read(port: int, fake_autopilot: FakeAutopilot) -> None:
+    fake_autopilot.parameters |= {"COM_OF_LOSS_T": 0.75, "COM_OBL_RC_ACT": 4, "COM_LOW_BAT_ACT": -3}
 
     async def story() -> None:
         link = await AutopilotLink.connect(_parameters(port))
@@ -93,27 +116,27 @@ def test_firmware_and_failsafe_parameters_can_be_read(port: int, stand_in: Autop
     asyncio.run(story())
 
 
-def test_offboard_without_setpoints_is_refused_and_the_reason_told(port: int, stand_in: AutopilotStandIn) -> None:
+def test_offboard_without_setpoints_is_refused_and_the_reason_told(port: int, fake_autopilot: FakeAutopilot) -> None:
     async def story() -> None:
         link = await AutopilotLink.connect(_parameters(port))
         with pytest.raises(
             AutopilotError, match=r"asked for offboard, which was refused for now: .*no offboard signal"
         ):
             await link.request_offboard()
-        assert stand_in.mode == "LOITER"
+        assert fake_autopilot.mode == "LOITER"
         await link.close()
 
     asyncio.run(story())
 
 
-def test_the_vehicle_follows_the_velocity_and_holds_its_own_height(port: int, stand_in: AutopilotStandIn) -> None:
+def test_the_vehicle_follows_the_velocity_and_holds_its_own_height(port: int, fake_autopilot: FakeAutopilot) -> None:
     def setpoint() -> Setpoint:
         return Setpoint(north().time_s, np.array([0.6, -0.8]), height_m=3.0, yaw_rad=-0.5)
 
     async def story() -> None:
         async with flying(port, setpoint) as flight:
             await flight.enter_offboard()
-            assert stand_in.mode == "OFFBOARD"
+            assert fake_autopilot.mode == "OFFBOARD"
             await asyncio.sleep(1.5)
             state = flight.link.vehicle_state()
             assert state is not None
@@ -121,12 +144,12 @@ def test_the_vehicle_follows_the_velocity_and_holds_its_own_height(port: int, st
             np.testing.assert_allclose(state.velocity_ned, np.array([0.6, -0.8, 0.0]), atol=0.15)
             assert state.height_m == pytest.approx(3.0, abs=0.15)
             assert math.atan2(state.R_ned_body[1, 0], state.R_ned_body[0, 0]) == pytest.approx(-0.5, abs=0.05)
-            assert stand_in.refused_setpoints == 0
+            assert fake_autopilot.refused_setpoints == 0
 
     asyncio.run(story())
 
 
-def test_a_setpoint_that_is_not_finite_never_leaves(port: int, stand_in: AutopilotStandIn) -> None:
+def test_a_setpoint_that_is_not_finite_never_leaves(port: int, fake_autopilot: FakeAutopilot) -> None:
     async def story() -> None:
         link = await AutopilotLink.connect(_parameters(port))
         for broken in (
@@ -137,8 +160,8 @@ def test_a_setpoint_that_is_not_finite_never_leaves(port: int, stand_in: Autopil
             with pytest.raises(AutopilotError, match="not finite"):
                 link.send_setpoint(broken)
         await asyncio.sleep(0.1)
-        assert not stand_in.setpoints
-        assert stand_in.refused_setpoints == 0
+        assert not fake_autopilot.setpoints
+        assert fake_autopilot.refused_setpoints == 0
         await link.close()
 
     asyncio.run(story())
@@ -150,41 +173,41 @@ def test_arming_taking_off_and_landing_from_offboard(port: int) -> None:
             assert not flight.link.status().armed
             await flight.link.arm()
             await flight.link.take_off()
-            await until(lambda: stand_in.mode == "LOITER" and stand_in.state.position[2] < -2.3)
+            await until(lambda: fake_autopilot.mode == "LOITER" and fake_autopilot.state.position[2] < -2.3)
             await until(lambda: flight.link.status().armed and flight.link.status().in_air)
             await flight.enter_offboard()
             await flight.link.land()
-            await until(lambda: stand_in.mode == "LAND")
+            await until(lambda: fake_autopilot.mode == "LAND")
             await until(lambda: not flight.streamer.report().streaming)
 
-    with AutopilotStandIn(port, heartbeat_s=HEARTBEAT_S) as stand_in:
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
         asyncio.run(story())
 
 
-def test_return_flies_home(port: int, stand_in: AutopilotStandIn) -> None:
+def test_return_flies_home(port: int, fake_autopilot: FakeAutopilot) -> None:
     async def story() -> None:
         async with flying(port) as flight:
             await flight.enter_offboard()
-            await until(lambda: stand_in.state.position[0] > 1.0)
+            await until(lambda: fake_autopilot.state.position[0] > 1.0)
             await flight.link.return_home()
             await until(lambda: flight.link.status().flight_mode == "return")
             await until(lambda: flight.link.status().flight_mode == "land")
-            assert abs(stand_in.state.position[0]) < 0.5
+            assert abs(fake_autopilot.state.position[0]) < 0.5
 
     asyncio.run(story())
 
 
-def test_two_links_on_two_ports_mind_their_own_vehicle(port: int, stand_in: AutopilotStandIn) -> None:
+def test_two_links_on_two_ports_mind_their_own_vehicle(port: int, fake_autopilot: FakeAutopilot) -> None:
     async def story() -> None:
         async with flying(port) as one, flying(second_port, lambda: north(-0.5, height_m=4.0)) as two:
             await asyncio.gather(one.enter_offboard(), two.enter_offboard())
             await asyncio.sleep(1.5)
-            assert stand_in.state.velocity[0] == pytest.approx(1.0, abs=0.15)
+            assert fake_autopilot.state.velocity[0] == pytest.approx(1.0, abs=0.15)
             assert second.state.velocity[0] == pytest.approx(-0.5, abs=0.15)
             assert (one.link.system_id, two.link.system_id) == (1, 9)
 
     second_port = free_port()
-    with AutopilotStandIn(second_port, system_id=9, height_m=4.0, heartbeat_s=HEARTBEAT_S) as second:
+    with FakeAutopilot(second_port, system_id=9, height_m=4.0, heartbeat_s=HEARTBEAT_S) as second:
         asyncio.run(story())
 
 
@@ -198,7 +221,7 @@ def test_the_stand_in_runs_as_a_program_too(port: int) -> None:
         await link.close()
 
     options = ["--port", str(port), "--system-id", "4", "--height", "6"]
-    with subprocess.Popen([sys.executable, "-m", "flockd.autopilot.stand_in", *options]) as program:
+    with subprocess.Popen([sys.executable, "-m", "flockd.autopilot.fake_autopilot", *options]) as program:
         try:
             asyncio.run(story())
         finally:
@@ -217,10 +240,10 @@ def test_a_stand_in_that_is_late_for_every_tick_still_hears(port: int) -> None:
         link = await AutopilotLink.connect(_parameters(port))
         assert await link.parameter("COM_OBL_RC_ACT", int) == 5
         link.send_setpoint(north())
-        await until(lambda: len(stand_in.setpoints) == 1)
+        await until(lambda: len(fake_autopilot.setpoints) == 1)
         await link.close()
 
-    with AutopilotStandIn(port, height_m=2.5, motion=slow, heartbeat_s=HEARTBEAT_S) as stand_in:
+    with FakeAutopilot(port, height_m=2.5, motion=slow, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
         asyncio.run(story())
 
 
@@ -229,12 +252,12 @@ def test_nobody_there_is_told_with_what_to_check(port: int) -> None:
         asyncio.run(AutopilotLink.connect(_parameters(port), timeout_s=0.3))
 
 
-def test_somebody_elses_autopilot_is_not_taken_for_the_own(port: int, stand_in: AutopilotStandIn) -> None:
+def test_somebody_elses_autopilot_is_not_taken_for_the_own(port: int, fake_autopilot: FakeAutopilot) -> None:
     with pytest.raises(AutopilotError, match=r"no autopilot with system id 5 .* heard instead: 1"):
         asyncio.run(AutopilotLink.connect(_parameters(port, system_id=5), timeout_s=0.7))
 
 
-def test_two_programs_cannot_command_one_drone(port: int, stand_in: AutopilotStandIn) -> None:
+def test_two_programs_cannot_command_one_drone(port: int, fake_autopilot: FakeAutopilot) -> None:
     async def story() -> None:
         link = await AutopilotLink.connect(_parameters(port))
         with pytest.raises(AutopilotError, match="is another program on it"):

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from flockd.autopilot.stand_in import AutopilotStandIn
+from flockd.autopilot.fake_autopilot import FakeAutopilot
 from tests.autopilot.conftest import HEARTBEAT_S
 from tests.autopilot.flight import Flight, flying, until
 
@@ -37,46 +37,46 @@ def _child_in_offboard(port: int) -> Iterator[subprocess.Popen[str]]:
 
 
 def _becomes_silent_and_fails_safe(
-    stand_in: AutopilotStandIn, child: subprocess.Popen[str], how: signal.Signals
+    fake_autopilot: FakeAutopilot, child: subprocess.Popen[str], how: signal.Signals
 ) -> None:
     time.sleep(0.3)
-    assert stand_in.mode == "OFFBOARD"
+    assert fake_autopilot.mode == "OFFBOARD"
     stopped_s = time.monotonic()
     os.kill(child.pid, how)
-    asyncio.run(until(lambda: stand_in.mode == "LOITER", FAILSAFE_WITHIN_S))
-    assert stand_in.failsafe
-    assert stand_in.setpoints[-1][0] - stopped_s < STOPS_WITHIN_S
+    asyncio.run(until(lambda: fake_autopilot.mode == "LOITER", FAILSAFE_WITHIN_S))
+    assert fake_autopilot.failsafe
+    assert fake_autopilot.setpoints[-1][0] - stopped_s < STOPS_WITHIN_S
 
 
-def test_a_killed_process_is_silence_and_failsafe(port: int, stand_in: AutopilotStandIn) -> None:
+def test_a_killed_process_is_silence_and_failsafe(port: int, fake_autopilot: FakeAutopilot) -> None:
     with _child_in_offboard(port) as child:
-        _becomes_silent_and_fails_safe(stand_in, child, signal.SIGKILL)
+        _becomes_silent_and_fails_safe(fake_autopilot, child, signal.SIGKILL)
 
 
 def test_a_stopped_process_is_so_too_and_does_not_take_the_drone_back_when_it_goes_on(
-    port: int, stand_in: AutopilotStandIn
+    port: int, fake_autopilot: FakeAutopilot
 ) -> None:
     """PX4 and the stand-in return to offboard with the first setpoint that comes: so none may come."""
     with _child_in_offboard(port) as child:
-        _becomes_silent_and_fails_safe(stand_in, child, signal.SIGSTOP)
-        before = len(stand_in.setpoints)
+        _becomes_silent_and_fails_safe(fake_autopilot, child, signal.SIGSTOP)
+        before = len(fake_autopilot.setpoints)
         os.kill(child.pid, signal.SIGCONT)
         time.sleep(1.0)
         assert child.poll() is None
-        assert len(stand_in.setpoints) == before
-        assert stand_in.mode == "LOITER"
+        assert len(fake_autopilot.setpoints) == before
+        assert fake_autopilot.mode == "LOITER"
 
 
-def test_the_stand_in_itself_would_return_to_offboard(port: int, stand_in: AutopilotStandIn) -> None:
+def test_the_stand_in_itself_would_return_to_offboard(port: int, fake_autopilot: FakeAutopilot) -> None:
     """Or the story above would tell nothing."""
 
     async def story() -> None:
         async with flying(port) as flight:
             await flight.enter_offboard()
             flight.streamer.end("for the test")
-            await until(lambda: stand_in.failsafe)
-            flight.link.send_setpoint((stand_in.setpoints[-1])[1])
-            await until(lambda: stand_in.mode == "OFFBOARD", 1.0)
+            await until(lambda: fake_autopilot.failsafe)
+            flight.link.send_setpoint((fake_autopilot.setpoints[-1])[1])
+            await until(lambda: fake_autopilot.mode == "OFFBOARD", 1.0)
 
     asyncio.run(story())
 
@@ -90,72 +90,72 @@ def _busy(duration_s: float) -> None:
 
 @pytest.mark.parametrize("block", [time.sleep, _busy])
 def test_a_blocked_event_loop_is_silence_and_failsafe(
-    port: int, stand_in: AutopilotStandIn, block: Callable[[float], None]
+    port: int, fake_autopilot: FakeAutopilot, block: Callable[[float], None]
 ) -> None:
     async def story() -> None:
         async with flying(port) as flight:
             await flight.enter_offboard()
             blocked_s = time.monotonic()
             block(1.8)
-            assert stand_in.setpoints[-1][0] - blocked_s < STOPS_WITHIN_S
-            assert stand_in.mode == "LOITER"
-            assert stand_in.failsafe
+            assert fake_autopilot.setpoints[-1][0] - blocked_s < STOPS_WITHIN_S
+            assert fake_autopilot.mode == "LOITER"
+            assert fake_autopilot.failsafe
             await asyncio.sleep(0.3)
-            assert stand_in.setpoints[-1][0] - blocked_s < STOPS_WITHIN_S
+            assert fake_autopilot.setpoints[-1][0] - blocked_s < STOPS_WITHIN_S
             assert not flight.streamer.report().streaming
 
     asyncio.run(story())
 
 
-def test_a_dead_control_task_is_silence_and_failsafe(port: int, stand_in: AutopilotStandIn) -> None:
-    stand_in.parameters["COM_OBL_RC_ACT"] = 4
+def test_a_dead_control_task_is_silence_and_failsafe(port: int, fake_autopilot: FakeAutopilot) -> None:
+    fake_autopilot.parameters["COM_OBL_RC_ACT"] = 4
 
     async def story() -> None:
         async with flying(port) as flight:
             await flight.enter_offboard()
             died_s = time.monotonic()
             flight.control.cancel()
-            await until(lambda: stand_in.mode == "LAND", FAILSAFE_WITHIN_S)
-            assert stand_in.setpoints[-1][0] - died_s < STOPS_WITHIN_S
+            await until(lambda: fake_autopilot.mode == "LAND", FAILSAFE_WITHIN_S)
+            assert fake_autopilot.setpoints[-1][0] - died_s < STOPS_WITHIN_S
             assert flight.link.status().flight_mode in {"offboard", "land"}
 
     asyncio.run(story())
 
 
-def test_when_the_pilot_switches_it_is_silent_at_once_and_stays_so(port: int, stand_in: AutopilotStandIn) -> None:
+def test_when_the_pilot_switches_it_is_silent_at_once_and_stays_so(port: int, fake_autopilot: FakeAutopilot) -> None:
     async def story() -> None:
         async with flying(port) as flight:
             await flight.enter_offboard()
             await asyncio.sleep(0.3)
-            stand_in.pilot_selects("POSCTL")
+            fake_autopilot.pilot_selects("POSCTL")
             seen_s = time.monotonic() + await until(lambda: flight.link.status().flight_mode == "position")
             await asyncio.sleep(0.6)
-            assert stand_in.setpoints[-1][0] - seen_s < 0.2
+            assert fake_autopilot.setpoints[-1][0] - seen_s < 0.2
             assert flight.streamer.report().silence == "the autopilot left offboard for position"
-            assert stand_in.mode == "POSCTL"
-            await _begins_anew(flight, stand_in)
+            assert fake_autopilot.mode == "POSCTL"
+            await _begins_anew(flight, fake_autopilot)
 
     asyncio.run(story())
 
 
-async def _begins_anew(flight: Flight, stand_in: AutopilotStandIn) -> None:
-    before = len(stand_in.setpoints)
+async def _begins_anew(flight: Flight, fake_autopilot: FakeAutopilot) -> None:
+    before = len(fake_autopilot.setpoints)
     flight.streamer.begin()
-    await until(lambda: len(stand_in.setpoints) > before + 5)
-    stand_in.pilot_selects("OFFBOARD")
+    await until(lambda: len(fake_autopilot.setpoints) > before + 5)
+    fake_autopilot.pilot_selects("OFFBOARD")
     await until(lambda: flight.streamer.report().offboard)
 
 
-def test_a_lost_link_is_silence_though_the_autopilot_comes_back(port: int, stand_in: AutopilotStandIn) -> None:
+def test_a_lost_link_is_silence_though_the_autopilot_comes_back(port: int, fake_autopilot: FakeAutopilot) -> None:
     async def story() -> None:
         async with flying(port) as flight:
             await flight.enter_offboard()
-            stand_in.silent = True
+            fake_autopilot.silent = True
             await until(lambda: not flight.streamer.report().streaming, 4.0)
-            stand_in.silent = False
-            before = len(stand_in.setpoints)
+            fake_autopilot.silent = False
+            before = len(fake_autopilot.setpoints)
             await asyncio.sleep(2 * HEARTBEAT_S)
-            assert len(stand_in.setpoints) == before
+            assert len(fake_autopilot.setpoints) == before
             assert flight.streamer.report().silence == "the autopilot's heartbeat is lost"
 
     asyncio.run(story())

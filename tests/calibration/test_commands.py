@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from flockd.calibration.board import BoardFinder, BoardSpec
+from flockd.calibration.image_sources import identity
 from flockd.cli import main
-from flockd.cli.pictures import identity
 from flockd.config import DroneConfig, load_drone
 from flockd.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
 from flockd.messages import Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
@@ -112,7 +112,7 @@ def test_what_is_not_enough_is_said_in_one_sentence(folder: Path, capsys: Captur
         file.unlink()
     assert "has no images" in told(capsys, 1, *command)
     write(folder / "wall.png", np.full((360, 480, 3), 90, np.uint8))
-    assert "the board is in none of the 1 pictures (1 no board)" in told(capsys, 1, *command)
+    assert "the board is in none of the 1 images (1 no board)" in told(capsys, 1, *command)
     assert "does not exist" in told(capsys, 2, "calibrate", "camera", tmp_path / "nowhere", "--out", out)
     assert "does not exist" in told(capsys, 1, "calibrate", "camera", tmp_path / "no.mcap", "--out", out)
     assert "no SOURCE was given" in told(capsys, 2, "calibrate", "camera", "--out", out)
@@ -168,7 +168,7 @@ def test_before_a_live_camera_a_person_is_told_what_to_do(
     pictures: list[UInt8Array], tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     film = Film(pictures[:8])
-    monkeypatch.setattr("flockd.sources.open_source", lambda config, file: film)
+    monkeypatch.setattr("flockd.calibration.image_sources.open_source", lambda config, file: film)
     out = tmp_path / "live.yaml"
     command = ("calibrate", "camera", "/dev/video7", "--size", "480x360", "--camera", "front", "--out", str(out))
     assert main([*command, "--model", "pinhole", "--json"]) == 0
@@ -188,7 +188,7 @@ def test_before_a_live_camera_a_person_is_told_what_to_do(
 def test_a_v4l2_camera_is_looked_through(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     kernel = FakeKernel(video7=FakeCamera(formats=((480, 360, b"MJPG"),)))
     monkeypatch.setattr("flockd.sources.v4l2.LinuxKernel", lambda: kernel)
-    monkeypatch.setattr("flockd.cli.pictures.FIRST_FRAME_S", 60.0)
+    monkeypatch.setattr("flockd.calibration.image_sources.FIRST_FRAME_S", 60.0)
     done = threading.Event()
 
     def film() -> None:
@@ -205,11 +205,11 @@ def test_a_v4l2_camera_is_looked_through(tmp_path: Path, capsys: Capture, monkey
     assert main([*command, "--seconds", "3"]) == 1
     done.set()
     thread.join()
-    assert re.search(r"the board is in none of the \d+ pictures \(\d+ no board\)", capsys.readouterr().err)
+    assert re.search(r"the board is in none of the \d+ images \(\d+ no board\)", capsys.readouterr().err)
 
 
 def test_a_camera_that_is_not_there_is_unavailable(tmp_path: Path, capsys: Capture, monkeypatch: Any) -> None:
-    monkeypatch.setattr("flockd.cli.pictures.FIRST_FRAME_S", 0.2)
+    monkeypatch.setattr("flockd.calibration.image_sources.FIRST_FRAME_S", 0.2)
     assert "/dev/video93 is not there; plug the camera in" in told(
         capsys, 69, "calibrate", "camera", "/dev/video93", "--out", tmp_path / "a"
     )
@@ -350,7 +350,7 @@ def test_a_recording_of_motion_tells_how_a_camera_is_turned_and_its_time(tmp_pat
 def test_a_recording_is_looked_through_for_the_board(tmp_path: Path, capsys: Capture) -> None:
     flight = tmp_path / "drone1.mcap"
     record_turns(flight, steps=3)
-    assert "the board is in none of the 3 pictures (3 no board)" in told(
+    assert "the board is in none of the 3 images (3 no board)" in told(
         capsys, 1, "calibrate", "camera", flight, "--out", tmp_path / "left.yaml"
     )
     assert "has no camera 'up'; choose with --camera from left" in told(

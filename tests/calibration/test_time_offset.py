@@ -7,7 +7,7 @@ from typing import Any
 
 from flockd.config import DroneConfig
 from flockd.config.source import SourceParameters
-from flockd.daemon.sight import Sight
+from flockd.daemon.pilot_loop import PilotLoop
 from flockd.messages import FrameSet, VehicleState
 from tests.recording.made_up import drone_config
 
@@ -36,7 +36,7 @@ def test_frames_get_the_attitude_of_their_own_moment() -> None:
     source: Any = OneSet()
 
     async def look() -> None:
-        sight = Sight(config, source, anything, vehicle_at, anything, anything, asyncio.get_running_loop().time)
+        sight = PilotLoop(config, source, anything, vehicle_at, anything, anything, asyncio.get_running_loop().time)
         running = asyncio.create_task(sight.run())
         while not asked:
             await asyncio.sleep(0.01)

@@ -88,7 +88,8 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        ([], "flockd: the following arguments are required: COMMAND; see flockd --help"),
+        (["sims"], "flockd: 'sims' is not a command; did you mean `flockd sim`?; see flockd --help"),
+        (["record", "xyz"], "flockd record: 'xyz' is not a command, of info, recover, cut, export; see "),
         (["sim", "--duration", "-3"], "flockd sim: argument --duration: '-3' is not a positive number"),
         (["sim", "--duration", "nan"], "flockd sim: argument --duration: 'nan' is not a positive number"),
         (["sim", "--drones", "0"], "flockd sim: argument --drones: '0' is not a positive whole number"),
@@ -109,12 +110,21 @@ def test_a_slip_on_the_command_line_is_a_usage_error(
     assert error.count("\n") == 1
 
 
+@pytest.mark.parametrize("command", [[], ["record"], ["config"], ["calibrate"]], ids=" ".join)
+def test_without_a_command_the_help_is_shown(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith(" ".join(["usage: flockd", *command]))
+    assert "examples:\n" in captured.err
+
+
 @pytest.mark.parametrize(
     "option", [["--flow", "dis"], ["--scale", "height"], ["--swap", "flow"], ["--telemetry"], ["--record"]]
 )
 def test_options_of_sight_are_refused_without_sight(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sim", "--perception", "truth", *option]) == 2
-    told = f"{option[0]} has no meaning when nobody looks; drop it or --perception truth\n"
+    told = f"{option[0]} has no meaning without networks; drop it or --perception truth\n"
     assert capsys.readouterr().err == told
 
 

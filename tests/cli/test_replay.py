@@ -30,8 +30,9 @@ Capture = pytest.CaptureFixture[str]
 @pytest.fixture
 def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A recorded flight of the made-up pilot, which will also be the one to fly it again."""
-    monkeypatch.setattr("flockd.pilot.FlockPilot", MadeUpPilot)
-    monkeypatch.setattr("flockd.cli.replay.models_of", lambda config: MODELS)
+    monkeypatch.setattr("flockd.replay.recorded_flight.FlockPilot", MadeUpPilot)
+    for module in ("recorded_flight", "fidelity"):
+        monkeypatch.setattr(f"flockd.replay.{module}.model_hashes", lambda perception: MODELS)
     path = tmp_path / "drone1.mcap"
     record(path)
     return path
@@ -51,7 +52,7 @@ class Nudged(MadeUpPilot):
 
 @pytest.fixture
 def nudged(path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr("flockd.pilot.FlockPilot", Nudged)
+    monkeypatch.setattr("flockd.replay.recorded_flight.FlockPilot", Nudged)
     return path
 
 
@@ -102,7 +103,7 @@ def test_a_reference_is_written_compared_and_updated(
     assert main(update) == 0
     assert main(against) == 0
     assert main([*against, "--start", "0.4"]) == 1, "a pilot that begins in the middle remembers nothing"
-    monkeypatch.setattr("flockd.pilot.FlockPilot", Nudged)
+    monkeypatch.setattr("flockd.replay.recorded_flight.FlockPilot", Nudged)
     capsys.readouterr()
     assert main(against) == 1
     last = capsys.readouterr().out.splitlines()[-1]
@@ -134,7 +135,7 @@ def test_a_replay_that_breaks_off_leaves_no_recording(
         def step(self, frames: FrameSet, vehicle: VehicleState) -> PilotOutput:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("flockd.pilot.FlockPilot", Broken)
+    monkeypatch.setattr("flockd.replay.recorded_flight.FlockPilot", Broken)
     assert main(["replay", str(path), "--out", str(path.with_name("again.mcap"))]) == 130
     assert [file.name for file in path.parent.iterdir()] == ["drone1.mcap"]
     assert capsys.readouterr().err == "interrupted\n"
@@ -152,8 +153,8 @@ def test_other_settings_can_be_tried(path: Path, capsys: Capture) -> None:
     capsys.readouterr()
     assert main(["replay", str(path), "--config", str(file)]) == 2
     assert capsys.readouterr().err == (
-        f"{file}: rig.cameras: wants camera 'left' with 320 x 240 pixels, and {path} has it with 160 x 120; "
-        "give it the recording's cameras\n"
+        f"{file}: rig.cameras: camera 'left' has 320 x 240 pixels, but {path} has it with 160 x 120; "
+        "use the recording's cameras\n"
     )
 
 
@@ -167,7 +168,7 @@ def test_speed_1_takes_as_long_as_the_flight_took(path: Path, capsys: Capture) -
 def test_what_keeps_a_replay_from_being_the_flight_is_told(
     path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
-    monkeypatch.setattr("flockd.cli.replay.models_of", lambda config: {"flow": "cd" * 32})
+    monkeypatch.setattr("flockd.replay.fidelity.model_hashes", lambda perception: {"flow": "cd" * 32})
     killed = path.with_name("killed.mcap")
     killed.write_bytes(path.read_bytes()[:-200_000])
     assert main(["replay", str(killed), "--diff"]) == 0
@@ -230,7 +231,7 @@ class Flight:
 
 @pytest.fixture(scope="module", params=["dis", "flow"])
 def flight(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Flight:
-    from flockd.cli.record import models_of
+    from flockd.inference.hashes import model_hashes
     from flockd.sim.swarm import fly
 
     flown = scenario({"drone.perception.flow": request.param})
@@ -242,7 +243,7 @@ def flight(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
                     folder / f"{drone}.mcap",
                     drone=drone,
                     config=flown.drone,
-                    models=models_of(flown.drone),
+                    models=model_hashes(flown.drone.perception),
                     on_event=told.append,
                 )
                 for drone in DRONES

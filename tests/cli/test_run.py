@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from flockd.autopilot.stand_in import AutopilotStandIn
+from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.cli import main
 from flockd.data import data_path
 from tests.autopilot.conftest import HEARTBEAT_S, free_port
@@ -78,7 +78,7 @@ def test_it_gets_ready_alone_reads_its_file_again_and_ends_when_told(
     port, frames, telemetry = free_port(), free_endpoint(), free_endpoint()
     config = _written(tmp_path / "tiny.yaml", port, frames, telemetry)
     cameras = Cameras(frames)
-    with AutopilotStandIn(port, heartbeat_s=HEARTBEAT_S), _run(config, tmp_path) as process:
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S), _run(config, tmp_path) as process:
         try:
             manager.until(lambda: "READY=1" in manager.told, process)
             assert any(line.startswith("STATUS=idle: ") for line in manager.told)
@@ -148,6 +148,18 @@ def test_a_fleet_that_is_not_there_is_unavailable(capsys: pytest.CaptureFixture[
     endpoint = free_endpoint()
     assert main(["status", "--connect", endpoint, "--seconds", "0.2"]) == 69
     assert capsys.readouterr().err == (
-        f"no drone was heard at {endpoint} within 0.2 s; name where they are with --connect, or let them come with "
-        "--listen\n"
+        f"no drone was found at {endpoint} within 0.2 s; name a drone's endpoint with --connect, or listen for "
+        "drones with --listen\n"
     )
+
+
+def test_without_an_autopilot_it_is_unavailable_and_not_aborted(tmp_path: Path) -> None:
+    """The serial port is refused at once, while a thread still loads networks: ended then, the process was aborted."""
+    config = _written(tmp_path / "tiny.yaml", free_port(), free_endpoint(), free_endpoint())
+    values = yaml.safe_load(config.read_text(encoding="utf-8"))
+    values["autopilot"]["address"] = f"serial://{tmp_path / 'none'}:921600"
+    config.write_text(yaml.safe_dump(values), encoding="utf-8")
+    with _run(config, tmp_path) as process:
+        _, err = process.communicate(timeout=SECONDS_TO_FAIL)
+    assert process.returncode == 69, err
+    assert f"autopilot.address: serial://{tmp_path / 'none'}:921600 cannot be opened" in err.splitlines()[-1]

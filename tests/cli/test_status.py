@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from flockd.cli.status import rows_of
+from flockd.telemetry.fleet_status import status_rows
 from flockd.telemetry.topics import ComputerMessage, FlightMessage
 from flockd.telemetry.watcher import Heard, Watched
 
@@ -36,7 +36,7 @@ def test_the_worst_stands_first() -> None:
         _drone("j", "normal"),
         _drone("k", "of a later version"),
     ]
-    rows = rows_of(fleet, NOW_S)
+    rows = status_rows(fleet, NOW_S)
     assert [(row["drone"], row["state"]) for row in rows] == [
         ("f", "gone"),
         ("e", "quiet"),
@@ -65,7 +65,7 @@ def test_a_row_tells_what_is_the_matter() -> None:
     )  # fmt: skip
     neighbours = {"time_s": 5.0, "neighbours": [{"confirmed": True}, {"confirmed": False}, {"confirmed": True}]}
     topics = {**drone.topics, "computer": Heard(NOW_S, {**computer}), "neighbours": Heard(NOW_S, neighbours)}
-    (row,) = rows_of([Watched("meadow", "a", alive=True, topics=topics)], NOW_S)
+    (row,) = status_rows([Watched("meadow", "a", alive=True, topics=topics)], NOW_S)
     assert row["matters"] == ["the computer is at 90 °C", "back: no such device"]
     assert (row["neighbours"], row["load"], row["battery_share"], row["height_m"]) == (2, 0.8, 0.5, 4.0)
 
@@ -73,8 +73,19 @@ def test_a_row_tells_what_is_the_matter() -> None:
 def test_a_table_is_printed_for_people(capsys: pytest.CaptureFixture[str]) -> None:
     from flockd.cli.status import _console, _table
 
-    _console().print(_table(rows_of([_drone("a", "normal"), _drone("b", "x", alive=False)], NOW_S)))
+    _console().print(_table(status_rows([_drone("a", "normal"), _drone("b", "x", alive=False)], NOW_S)))
     heading, first, second = (line.split() for line in capsys.readouterr().out.splitlines())
     assert heading[:5] == ["drone", "state", "mode", "height", "battery"]
     assert first[:2] == ["meadow/b", "gone"]
     assert second == ["meadow/a", "normal", "offboard", "4.0", "m", "50%"]
+
+
+def test_a_piped_table_is_not_cut_at_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    from flockd.cli.status import _console, _table
+
+    sentence = "no heartbeat from the autopilot for 12.5 s, and more words than a line of 80 columns has room for"
+    drone = _drone("a", "degraded", reasons=[{"event": "link_lost", "sentence": sentence}])
+    _console().print(_table(status_rows([drone], NOW_S)))
+    _, row = capsys.readouterr().out.splitlines()
+    assert row.rstrip().endswith(sentence)
+    assert row == row.rstrip(), "no padding to the width of a terminal that is not there"

@@ -201,7 +201,7 @@ def test_a_scenario_tells_of_a_drone_file_that_is_not_there(tmp_path: Path) -> N
     scenario.write_text(SCENARIO, encoding="utf-8")
     assert _problems(scenario) == [
         "drone.yaml: does not exist; check the path",
-        "scenario.yaml:2: drone: names drone.yaml, which cannot be used; mend that file or name another",
+        "scenario.yaml:2: drone: names drone.yaml, which cannot be used; correct it or name another",
     ]
     scenario.write_text(SCENARIO.replace("drone: drone.yaml\n", ""), encoding="utf-8")
     assert _problems(scenario) == ["scenario.yaml:1: drone: is missing; write it as in `drone: simulator.yaml`"]

@@ -1,4 +1,4 @@
-"""A daemon in a test: real MAVSDK to the autopilot stand-in, real frames over zenoh, a tiny perceiver, a watcher."""
+"""A daemon in a test: real MAVSDK to the fake autopilot, real frames over zenoh, a tiny perceiver, a watcher."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 import zenoh
 
-from flockd.autopilot.stand_in import AutopilotStandIn
+from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.config import DroneConfig
 from flockd.config.autopilot import AutopilotParameters
 from flockd.config.geometry import GeometryParameters
@@ -52,8 +52,8 @@ class TinyPerceiver:
     second_stage = SECOND_STAGE
 
     def __init__(self) -> None:
-        self.astray = 0
-        """As many flows will be told as not finite, as those of a network are that went astray."""
+        self.not_finite = 0
+        """So many of the next flows are not finite."""
         self.hangs = threading.Event()
         """Set: does not answer."""
         self.ends_when_told = True
@@ -65,8 +65,8 @@ class TinyPerceiver:
             self.hangs.clear()
 
     def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
-        if self.astray > 0:
-            self.astray -= 1
+        if self.not_finite > 0:
+            self.not_finite -= 1
             raise FloatingPointError("model tiny: output flow is not finite")
         while self.hangs.is_set():
             time.sleep(0.01)
@@ -150,7 +150,7 @@ class Aboard:
     """What a story can touch."""
 
     config: DroneConfig
-    stand_in: AutopilotStandIn
+    fake_autopilot: FakeAutopilot
     cameras: Cameras
     perceiver: TinyPerceiver
     daemon: Daemon
@@ -205,17 +205,17 @@ class Aboard:
 
     async def flies(self) -> None:
         """The pilot selects offboard."""
-        await until(lambda: len(self.stand_in.setpoints) > 5, SECONDS_TO_FAIL)
-        self.stand_in.pilot_selects("OFFBOARD")
+        await until(lambda: len(self.fake_autopilot.setpoints) > 5, SECONDS_TO_FAIL)
+        self.fake_autopilot.pilot_selects("OFFBOARD")
         await until(lambda: self.speed() > 0.8 * SPEED_M_S, SECONDS_TO_FAIL)
 
     def speed(self) -> float:
-        return float(np.linalg.norm(self.stand_in.state.velocity[:2]))
+        return float(np.linalg.norm(self.fake_autopilot.state.velocity[:2]))
 
 
 @asynccontextmanager
 async def aboard(
-    stand_in: AutopilotStandIn,
+    fake_autopilot: FakeAutopilot,
     port: int,
     tmp_path: Path,
     *,
@@ -249,7 +249,7 @@ async def aboard(
     )
     listening = asyncio.create_task(_listen(manager, told))
     try:
-        yield Aboard(config, stand_in, cameras, perceiver, daemon, ending, watcher, session, told, events)
+        yield Aboard(config, fake_autopilot, cameras, perceiver, daemon, ending, watcher, session, told, events)
     finally:
         perceiver.hangs.clear()
         listening.cancel()

@@ -1,5 +1,5 @@
 """The autopilot stand-in of the autopilot's own stories."""
 
-from tests.autopilot.conftest import port, stand_in
+from tests.autopilot.conftest import fake_autopilot, port
 
-__all__ = ["port", "stand_in"]
+__all__ = ["fake_autopilot", "port"]

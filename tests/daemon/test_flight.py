@@ -1,4 +1,4 @@
-"""The daemon's stories: it starts, flies, and hands over whatever happens. The autopilot is a stand-in, not PX4."""
+"""The daemon's stories: it starts, flies, and hands over whatever happens. The autopilot is a fake, not PX4."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from flockd.autopilot.stand_in import AutopilotStandIn
+from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.config import DroneConfig
 from flockd.daemon import DaemonError, Ending
 from flockd.errors import ConfigError, ConfigProblem
@@ -27,35 +27,37 @@ def test_from_the_ground_into_the_air_and_back_into_the_pilots_hands(tmp_path: P
     port = free_port()
 
     async def story() -> None:
-        async with aboard(stand_in, port, tmp_path) as ship:
+        async with aboard(fake_autopilot, port, tmp_path) as ship:
             await until(lambda: "READY=1" in ship.service, SECONDS_TO_FAIL)
             await ship.until_state("idle")
             await until(lambda: "started" not in ship.matters())  # it was seen disarmed on the ground
-            assert not stand_in.setpoints, "nothing is sent before it is ready"
-            stand_in.pilot_arms()
-            stand_in.pilot_selects("TAKEOFF")
+            assert not fake_autopilot.setpoints, "nothing is sent before it is ready"
+            fake_autopilot.pilot_arms()
+            fake_autopilot.pilot_selects("TAKEOFF")
             await ship.until_state("ready")
-            await until(lambda: stand_in.mode == "LOITER", SECONDS_TO_FAIL)
-            height_m = -float(stand_in.state.position[2])
+            await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+            height_m = -float(fake_autopilot.state.position[2])
             await ship.flies()
             await ship.until_state("normal", "degraded")
             await until(lambda: ship.speed() > 0.9 * SPEED_M_S)
-            np.testing.assert_allclose(stand_in.state.velocity[:2], [SPEED_M_S, 0.0], atol=0.2)  # north: Eq. 43 at 0 s
-            assert -float(stand_in.state.position[2]) == pytest.approx(height_m, abs=0.2)
-            sent_m = [sent.height_m for _, sent in list(stand_in.setpoints)[-5:]]
+            np.testing.assert_allclose(
+                fake_autopilot.state.velocity[:2], [SPEED_M_S, 0.0], atol=0.2
+            )  # north: Eq. 43 at 0 s
+            assert -float(fake_autopilot.state.position[2]) == pytest.approx(height_m, abs=0.2)
+            sent_m = [sent.height_m for _, sent in list(fake_autopilot.setpoints)[-5:]]
             np.testing.assert_allclose(sent_m, height_m, atol=0.1)
             _tells_what_it_does(ship.heard())
             assert ship.service.count("WATCHDOG=1") >= 4
 
-            stand_in.pilot_selects("POSCTL")
+            fake_autopilot.pilot_selects("POSCTL")
             await ship.until_state("silent")
-            before = len(stand_in.setpoints)
+            before = len(fake_autopilot.setpoints)
             await asyncio.sleep(0.5)
-            assert len(stand_in.setpoints) == before
+            assert len(fake_autopilot.setpoints) == before
             assert "not_offboard" in ship.matters()
-            assert stand_in.mode == "POSCTL"
+            assert fake_autopilot.mode == "POSCTL"
 
-    with AutopilotStandIn(port, heartbeat_s=HEARTBEAT_S) as stand_in:
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
         tell(story)
 
 
@@ -77,29 +79,29 @@ def _tells_what_it_does(heard: object) -> None:
 
 
 def test_eyes_that_lie_about_the_own_motion_add_half_a_metre_a_second_at_most_and_nothing_to_a_hover(
-    tmp_path: Path, port: int, stand_in: AutopilotStandIn
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
     """They see a standstill, whatever is flown: the trim is at its limit, and no farther."""
 
     async def story() -> None:
-        async with aboard(stand_in, port, tmp_path, own_velocity="vision") as ship:
+        async with aboard(fake_autopilot, port, tmp_path, own_velocity="vision") as ship:
             await ship.is_ready_in_the_air()
-            await until(lambda: len(stand_in.setpoints) > 5, SECONDS_TO_FAIL)
-            stand_in.pilot_selects("OFFBOARD")
+            await until(lambda: len(fake_autopilot.setpoints) > 5, SECONDS_TO_FAIL)
+            fake_autopilot.pilot_selects("OFFBOARD")
             chosen_s = time.monotonic()
             await until(lambda: ship.heard()["flight"].message["velocity_trim"][0] > 0.49, SECONDS_TO_FAIL)
-            off_s = next(at_s for at_s, sent in stand_in.setpoints if np.linalg.norm(sent.velocity) > 0.01)
+            off_s = next(at_s for at_s, sent in fake_autopilot.setpoints if np.linalg.norm(sent.velocity) > 0.01)
             assert off_s - chosen_s > 2 * STEP_S - 0.1, "a neighbour counts from its third look on"
             await asyncio.sleep(1.0)
             asked = np.array(ship.heard()["command"].message["velocity_ne"])
             assert np.linalg.norm(asked) < 0.9 * SPEED_M_S, "it believes that it stands, and speeds up slowly"
-            _, sent = stand_in.setpoints[-1]
+            _, sent = fake_autopilot.setpoints[-1]
             np.testing.assert_allclose(np.asarray(sent.velocity)[:2] - asked, [0.5, 0.0], atol=0.02)
 
             ship.cameras.silent |= set(CAMERAS)
             silent_s = time.monotonic()
-            await until(lambda: stand_in.mode == "LOITER", SECONDS_TO_FAIL)
-            last = [sent for at_s, sent in stand_in.setpoints if at_s > silent_s + 1.2]
+            await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+            last = [sent for at_s, sent in fake_autopilot.setpoints if at_s > silent_s + 1.2]
             assert last, "the hover is sent"
             assert all(np.linalg.norm(sent.velocity) < 0.01 for sent in last)
 
@@ -107,22 +109,22 @@ def test_eyes_that_lie_about_the_own_motion_add_half_a_metre_a_second_at_most_an
 
 
 def test_one_camera_gone_is_a_slower_flight_and_all_gone_a_hover_and_then_hold(
-    tmp_path: Path, port: int, stand_in: AutopilotStandIn
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
     async def story() -> None:
-        async with aboard(stand_in, port, tmp_path) as ship:
+        async with aboard(fake_autopilot, port, tmp_path) as ship:
             await ship.is_ready_in_the_air()
             await ship.flies()
             ship.cameras.silent.add("back")
-            await ship.until_event("degraded: a blind sector: back silent")
-            assert stand_in.mode == "OFFBOARD"
+            await ship.until_event("degraded: a camera is lost: back silent")
+            assert fake_autopilot.mode == "OFFBOARD"
             ship.cameras.silent.add("front")
             silent_s = time.monotonic()
-            await until(lambda: stand_in.mode == "LOITER", SECONDS_TO_FAIL)
+            await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
             # Three frame periods of 0.2 s until it is noticed, 1 s of hovering, and some for Hold on a busy computer.
             assert 1.0 < time.monotonic() - silent_s < 3.0
-            assert not stand_in.failsafe, "it was asked for Hold, not left to its failsafe"
-            last = [sent for at_s, sent in stand_in.setpoints if at_s > silent_s + 1.2]
+            assert not fake_autopilot.failsafe, "it was asked for Hold, not left to its failsafe"
+            last = [sent for at_s, sent in fake_autopilot.setpoints if at_s > silent_s + 1.2]
             assert last, "the hover is sent"
             assert all(np.linalg.norm(sent.velocity) < 0.01 for sent in last)
             await ship.until_state("silent")
@@ -133,31 +135,31 @@ def test_one_camera_gone_is_a_slower_flight_and_all_gone_a_hover_and_then_hold(
     tell(story)
 
 
-def test_networks_astray_or_stuck_degrade_and_sigterm_ends_in_hold(
-    tmp_path: Path, port: int, stand_in: AutopilotStandIn
+def test_networks_not_finite_or_stuck_degrade_and_sigterm_ends_in_hold(
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
     async def story() -> None:
-        async with aboard(stand_in, port, tmp_path, recordings=tmp_path) as ship:
+        async with aboard(fake_autopilot, port, tmp_path, recordings=tmp_path) as ship:
             await ship.is_ready_in_the_air()
             await ship.flies()
             await ship.until_state("normal")
-            ship.perceiver.astray = 1
-            await ship.until_event("a step came to nothing: model tiny: output flow is not finite")
-            await ship.until_event("degraded: a network gave numbers that cannot be")
+            ship.perceiver.not_finite = 1
+            await ship.until_event("a step failed: model tiny: output flow is not finite")
+            await ship.until_event("degraded: a network's output is not finite or not plausible")
             ship.perceiver.hangs.set()
-            await ship.until_event("a step came to nothing: a network did not answer within 0.5 s")
+            await ship.until_event("a step failed: a network call took longer than 0.5 s")
             assert ship.perceiver.told_to_end == 1
             await ship.until_state("normal")
-            assert stand_in.mode == "OFFBOARD"
+            assert fake_autopilot.mode == "OFFBOARD"
             assert ship.heard()["computer"].message["recording"].startswith(str(tmp_path))
 
             asked_s = time.monotonic()
             ship.daemon.ask_to_stop()
-            await until(lambda: stand_in.mode == "LOITER", 2.0)
-            assert not stand_in.failsafe
+            await until(lambda: fake_autopilot.mode == "LOITER", 2.0)
+            assert not fake_autopilot.failsafe
             assert await ship.ending == Ending(None)
             assert "STOPPING=1" in ship.service
-            assert stand_in.setpoints[-1][0] - asked_s < 2.0
+            assert fake_autopilot.setpoints[-1][0] - asked_s < 2.0
 
     tell(story)
     (path,) = tmp_path.glob("tiny-*.mcap")
@@ -165,7 +167,7 @@ def test_networks_astray_or_stuck_degrade_and_sigterm_ends_in_hold(
 
 
 def _replays_to_the_last_bit(recording: Recording) -> None:
-    """A recording begins with the flight's own pilot, so that another one can think the same again."""
+    """A recording begins with the flight's own pilot, so that another one can compute the same again."""
     assert recording.contents.finished
     assert recording.contents.models == {"tiny": "0" * 64}
     steps = list(recording.steps())
@@ -178,10 +180,10 @@ def _replays_to_the_last_bit(recording: Recording) -> None:
 
 
 def test_a_dead_control_task_is_held_by_the_last_resort(
-    tmp_path: Path, port: int, stand_in: AutopilotStandIn, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def story() -> None:
-        async with aboard(stand_in, port, tmp_path) as ship:
+        async with aboard(fake_autopilot, port, tmp_path) as ship:
             await ship.is_ready_in_the_air()
             await ship.flies()
 
@@ -189,8 +191,8 @@ def test_a_dead_control_task_is_held_by_the_last_resort(
                 raise ArithmeticError("for the test")
 
             monkeypatch.setattr("flockd.daemon.control.Control.tick", dies)
-            await until(lambda: stand_in.mode == "LOITER", 2.0)
-            assert not stand_in.failsafe
+            await until(lambda: fake_autopilot.mode == "LOITER", 2.0)
+            assert not fake_autopilot.failsafe
             with pytest.raises(DaemonError, match=r"a task died \(control: ArithmeticError\('for the test'\)\)"):
                 await ship.ending
 
@@ -198,30 +200,30 @@ def test_a_dead_control_task_is_held_by_the_last_resort(
 
 
 def test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe(
-    tmp_path: Path, port: int, stand_in: AutopilotStandIn
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
     async def story() -> None:
-        async with aboard(stand_in, port, tmp_path) as ship:
+        async with aboard(fake_autopilot, port, tmp_path) as ship:
             await ship.is_ready_in_the_air()
             await ship.flies()
             ship.service.clear()
             blocked_s = time.monotonic()
             time.sleep(2.0)
-            assert stand_in.setpoints[-1][0] - blocked_s < 0.5
-            assert stand_in.mode == "LOITER"
-            assert stand_in.failsafe
-            before = len(stand_in.setpoints)
+            assert fake_autopilot.setpoints[-1][0] - blocked_s < 0.5
+            assert fake_autopilot.mode == "LOITER"
+            assert fake_autopilot.failsafe
+            before = len(fake_autopilot.setpoints)
             await ship.until_state("silent")
-            assert len(stand_in.setpoints) == before, "one more, and PX4 would be in offboard again"
+            assert len(fake_autopilot.setpoints) == before, "one more, and PX4 would be in offboard again"
 
     tell(story)
 
 
 def test_any_other_dead_task_is_a_hold_too(
-    tmp_path: Path, port: int, stand_in: AutopilotStandIn, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def story() -> None:
-        async with aboard(stand_in, port, tmp_path) as ship:
+        async with aboard(fake_autopilot, port, tmp_path) as ship:
             await ship.is_ready_in_the_air()
             await ship.flies()
 
@@ -229,9 +231,9 @@ def test_any_other_dead_task_is_a_hold_too(
                 raise ArithmeticError("for the test")
 
             monkeypatch.setattr("flockd.pilot.FlockPilot.step", dies)
-            await until(lambda: stand_in.mode == "LOITER", 2.0)
-            assert not stand_in.failsafe
-            with pytest.raises(DaemonError, match="sight: ArithmeticError"):
+            await until(lambda: fake_autopilot.mode == "LOITER", 2.0)
+            assert not fake_autopilot.failsafe
+            with pytest.raises(DaemonError, match="pilot: ArithmeticError"):
                 await ship.ending
 
     tell(story)
@@ -241,15 +243,15 @@ def test_arming_and_taking_off_by_itself_where_configured(tmp_path: Path) -> Non
     port = free_port()
 
     async def story() -> None:
-        async with aboard(stand_in, port, tmp_path, arm_and_take_off=True, height_m=HOVER_M) as ship:
-            await until(lambda: stand_in.mode == "OFFBOARD", SECONDS_TO_FAIL)
+        async with aboard(fake_autopilot, port, tmp_path, arm_and_take_off=True, height_m=HOVER_M) as ship:
+            await until(lambda: fake_autopilot.mode == "OFFBOARD", SECONDS_TO_FAIL)
             await ship.until_state("normal", "degraded")
             assert (await ship.ask("ask/hold"))["accepted"] is False, "not among telemetry.commands"
-            assert stand_in.mode == "OFFBOARD"
+            assert fake_autopilot.mode == "OFFBOARD"
             assert (await ship.ask("ask/land"))["accepted"] is True
-            await until(lambda: stand_in.mode == "LAND", SECONDS_TO_FAIL)
+            await until(lambda: fake_autopilot.mode == "LAND", SECONDS_TO_FAIL)
 
-    with AutopilotStandIn(port, heartbeat_s=HEARTBEAT_S) as stand_in:
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
         tell(story)
 
 
@@ -258,26 +260,27 @@ def _wrong() -> DroneConfig:
 
 
 def test_the_configuration_is_read_again_on_the_ground_only(
-    tmp_path: Path, port: int, stand_in: AutopilotStandIn
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
     async def story() -> None:
-        async with aboard(stand_in, port, tmp_path) as ship:
+        async with aboard(fake_autopilot, port, tmp_path) as ship:
             await ship.until_state("idle")
             about = await ship.ask("about")
             assert about["configuration"]["name"] == "tiny"
             picture = cv2.imdecode(np.frombuffer(await ship.picture("front"), np.uint8), cv2.IMREAD_COLOR)
             assert picture is not None
             assert picture.shape == (48, 64, 3)
-            assert await ship.picture("bottom") == b"camera 'bottom' has no picture"
+            assert await ship.picture("bottom") == b"camera 'bottom' has no image"
             ship.daemon.ask_to_reload(lambda: pytest.fail("read in the air"))
             await ship.until_event("the configuration was not read again, because the drone is armed or in the air")
             assert not ship.ending.done()
 
-    async def on_the_ground(stand_in: AutopilotStandIn, port: int) -> None:
-        async with aboard(stand_in, port, tmp_path / "ground") as ship:
+    async def on_the_ground(fake_autopilot: FakeAutopilot, port: int) -> None:
+        async with aboard(fake_autopilot, port, tmp_path / "ground") as ship:
             await ship.until_state("idle")
+            await ship.ask("about")  # the session that receives events is connected
             ship.daemon.ask_to_reload(_wrong)
-            await ship.until_event("the configuration was not taken, and the old one stays: tiny.yaml:3: ")
+            await ship.until_event("the new configuration was refused, and the old one stays in use: tiny.yaml:3: ")
             other = ship.config.model_copy(update={"step_s": 0.2})
             ship.daemon.ask_to_reload(lambda: other)
             assert await ship.ending == Ending(other)
@@ -285,13 +288,13 @@ def test_the_configuration_is_read_again_on_the_ground_only(
     tell(story)
     (tmp_path / "ground").mkdir()
     second = free_port()
-    with AutopilotStandIn(second, heartbeat_s=HEARTBEAT_S) as on_ground:
+    with FakeAutopilot(second, heartbeat_s=HEARTBEAT_S) as on_ground:
         tell(lambda: on_the_ground(on_ground, second))
 
 
 def test_it_can_be_told_to_stop_before_an_autopilot_is_heard(tmp_path: Path, port: int) -> None:
     async def story() -> None:
-        silent = AutopilotStandIn(port)  # never started
+        silent = FakeAutopilot(port)  # never started
         async with aboard(silent, port, tmp_path) as ship:
             await asyncio.sleep(0.3)
             ship.daemon.ask_to_stop()

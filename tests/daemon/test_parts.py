@@ -18,11 +18,11 @@ import pytest
 from flockd.config.drone import DroneConfig
 from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.config.source import SourceParameters
-from flockd.daemon.computer import LoopLag, WallClock, hottest_zone_c
-from flockd.daemon.inspection import Eyes
+from flockd.daemon.host_monitors import LoopLag, WallClock, hottest_zone_c
 from flockd.daemon.lock import only_instance
 from flockd.daemon.networks import NetworkStuckError, WatchedNetworks
-from flockd.daemon.service import ServiceManager
+from flockd.daemon.service_manager import ServiceManager
+from flockd.daemon.supervisor_inputs import CameraMonitor
 from flockd.daemon.worker import BusyError, LateError, Worker
 from flockd.data import data_path
 from flockd.errors import UnavailableError
@@ -68,7 +68,7 @@ def test_a_stuck_network_is_ended_then_abandoned_then_hopeless() -> None:
     assert (networks.stuck, networks.hopeless) == (False, False)
 
     tiny.hangs.set()
-    with pytest.raises(NetworkStuckError, match=r"did not answer within 0\.05 s"):
+    with pytest.raises(NetworkStuckError, match=r"took longer than 0\.05 s"):
         networks.flow(FRAME, FRAME, NO_DRONES)
     assert (networks.stuck, networks.ended, tiny.told_to_end, networks.hopeless) == (True, 1, 1, False)
     networks.flow(FRAME, FRAME, NO_DRONES)
@@ -103,9 +103,9 @@ def test_the_shipped_networks_end_when_told() -> None:
     worker.leave(5.0)
 
 
-def test_a_network_gone_astray_is_counted() -> None:
+def test_a_network_with_an_output_that_is_not_finite_is_counted() -> None:
     tiny = TinyPerceiver()
-    tiny.astray = 1
+    tiny.not_finite = 1
     networks = WatchedNetworks(tiny, deadline_s=5.0)
     with pytest.raises(FloatingPointError):
         networks.flow(FRAME, FRAME, NO_DRONES)
@@ -193,12 +193,12 @@ def test_a_clock_that_was_set_is_told_once() -> None:
     told: list[str] = []
     ahead_s = 1.7e9
     watch = WallClock(told.append, lambda: 5.0, lambda: 5.0 + ahead_s)
-    watch.look()
+    watch.check()
     assert told == []
     ahead_s -= 3600.0
-    watch.look()
-    watch.look()
-    assert told == ["the wall clock was set by -3600.0 s; nothing in the flight goes by it"]
+    watch.check()
+    watch.check()
+    assert told == ["the wall clock was set by -3600.0 s; the flight does not use it"]
 
 
 def _status(fault: str | None, **counts: int) -> dict[str, CameraStatus]:
@@ -206,26 +206,26 @@ def _status(fault: str | None, **counts: int) -> dict[str, CameraStatus]:
     return {"front": CameraStatus(0.1, fault, known)}
 
 
-def test_eyes_tell_frozen_from_unplugged_and_count_bad_frames_of_late() -> None:
+def test_monitor_tell_frozen_from_unplugged_and_count_bad_frames_of_late() -> None:
     camera = CameraConfig(
         name="front", size_px=(64, 48), intrinsics=IntrinsicsConfig(fx=32.0, fy=32.0, cx=32.0, cy=24.0)
     )
     config = DroneConfig(rig=RigConfig(cameras=(camera,)), source=SourceParameters(kind="shared_memory"))
-    eyes = Eyes(config)
-    fine = eyes.look(0.0, _status(None, received=100, frozen=3)).cameras["front"]
+    monitor = CameraMonitor(config)
+    fine = monitor.update(0.0, _status(None, received=100, frozen=3)).cameras["front"]
     assert (fine.unplugged, fine.frozen, fine.period_s) == (False, False, 0.1)
-    gone = eyes.look(1.0, _status("front: no such device", received=100, frozen=3)).cameras["front"]
+    gone = monitor.update(1.0, _status("front: no such device", received=100, frozen=3)).cameras["front"]
     assert (gone.unplugged, gone.frozen) == (True, False)
-    eyes.look(2.0, _status(None, received=110, frozen=3))
-    frozen = eyes.look(3.0, _status("front: the picture is frozen", received=120, frozen=5)).cameras["front"]
+    monitor.update(2.0, _status(None, received=110, frozen=3))
+    frozen = monitor.update(3.0, _status("front: the image is frozen", received=120, frozen=5)).cameras["front"]
     assert (frozen.unplugged, frozen.frozen) == (False, True)
-    late = eyes.look(4.0, _status(None, received=140, corrupt=10))
+    late = monitor.update(4.0, _status(None, received=140, corrupt=10))
     assert late.dropped_share == 10 / 40
-    assert eyes.look(12.0, _status(None, received=150, corrupt=10)).dropped_share == 0.0
+    assert monitor.update(12.0, _status(None, received=150, corrupt=10)).dropped_share == 0.0
 
 
 def test_frames_get_the_vehicle_state_of_their_time() -> None:
-    from flockd.daemon.control import VehicleHistory
+    from flockd.daemon.vehicle_history import VehicleHistory
 
     history = VehicleHistory()
     assert history.at(1.0) is None

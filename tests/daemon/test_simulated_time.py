@@ -14,7 +14,7 @@ import pytest
 from flockd.config import load_drone
 from flockd.daemon import clock_at, event_loop_at
 from flockd.daemon.networks import WatchedNetworks
-from flockd.daemon.sight import Sight
+from flockd.daemon.pilot_loop import PilotLoop
 from flockd.errors import ConfigError
 from flockd.messages import Frame, FrameSet, VehicleState
 from flockd.sources import CameraStatus
@@ -128,16 +128,16 @@ def test_a_late_step_does_not_make_all_later_ones_late() -> None:
 
     level = VehicleState(0.0, np.eye(3), 2.0, np.zeros(3))
     networks = WatchedNetworks(TinyPerceiver(), 1.0)
-    sight = Sight(config, camera, networks, lambda _: level, on_step, lambda _: None, time.monotonic)
+    pilot_loop = PilotLoop(config, camera, networks, lambda _: level, on_step, lambda _: None, time.monotonic)
 
     async def story() -> None:
-        running = asyncio.create_task(sight.run())
+        running = asyncio.create_task(pilot_loop.run())
         while len(times) < 9:
             await asyncio.sleep(0.01)
         running.cancel()
 
     asyncio.run(story())
-    sight.leave()
+    pilot_loop.leave()
     assert np.median(camera.waited_s[4:9]) < 0.3 * STEP_S
     spans = [round((b - a) / STEP_S) for a, b in pairwise(times[3:])]
     assert np.median(spans) == 1

@@ -32,7 +32,7 @@ def film() -> Film:
 
 @pytest.fixture
 def onlooker(film: Film, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flockd.perception.load_networks", lambda config: Onlooker(film.depth))
+    monkeypatch.setattr("flockd.replay.dataset_flight.load_networks", lambda config: Onlooker(film.depth))
 
 
 @pytest.fixture

@@ -6,15 +6,15 @@ from typing import Any
 
 import pytest
 
+from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.autopilot.mavsdk_link import AutopilotLink
-from flockd.autopilot.stand_in import AutopilotStandIn
 from flockd.autopilot.status import Firmware
 from flockd.config import DroneConfig, load_drone
 from flockd.config.autopilot import AutopilotParameters
 from flockd.config.safety import GateParameters, SafetyParameters
 from flockd.data import data_path
-from flockd.doctor import Check, Finding, Level, autopilot, examine
-from flockd.doctor.autopilot import JUDGES, check_autopilot, judge_firmware
+from flockd.doctor import Check, Finding, Level, autopilot_checks, run_checks
+from flockd.doctor.autopilot_checks import JUDGES, check_autopilot, judge_firmware, judge_messages
 from tests.autopilot.conftest import HEARTBEAT_S, free_port
 
 GOOD: dict[str, float | int] = {
@@ -36,26 +36,26 @@ def _config(port: int) -> DroneConfig:
 
 def _examined(port: int) -> dict[str, Finding]:
     check = Check("autopilot", lambda: check_autopilot(_config(port)), limit_s=60.0)
-    return {finding.about: finding for finding in examine([check], lambda done, total: None)["autopilot"]}
+    return {finding.about: finding for finding in run_checks([check], lambda done, total: None)["autopilot"]}
 
 
 def test_an_autopilot_that_is_set_up_well_and_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
-    obey = AutopilotStandIn._obey
+    obey = FakeAutopilot._obey
 
-    def noting(self: AutopilotStandIn, command: int, message: Any) -> int:
+    def noting(self: FakeAutopilot, command: int, message: Any) -> int:
         asked.append(command)
         return obey(self, command, message)
 
-    monkeypatch.setattr(AutopilotStandIn, "_obey", noting)
+    monkeypatch.setattr(FakeAutopilot, "_obey", noting)
     port = free_port()
-    with AutopilotStandIn(port, heartbeat_s=HEARTBEAT_S) as stand_in:
-        stand_in.parameters.update(GOOD)
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
+        fake_autopilot.parameters.update(GOOD)
         found = _examined(port)
-        assert (stand_in.armed, stand_in.mode) == (False, "LOITER")
-        assert not stand_in.setpoints
-        assert stand_in.refused_setpoints == 0
-        assert stand_in.parameters == {**stand_in.parameters, **GOOD}
+        assert (fake_autopilot.armed, fake_autopilot.mode) == (False, "LOITER")
+        assert not fake_autopilot.setpoints
+        assert fake_autopilot.refused_setpoints == 0
+        assert fake_autopilot.parameters == {**fake_autopilot.parameters, **GOOD}
     assert set(asked) <= {LISTENS, REQUESTS_MESSAGE}, "it listens and asks, and commands nothing"
     assert found.keys() == {"heartbeat", "firmware", *GOOD}
     assert {about for about, finding in found.items() if finding.level is not Level.PASS} == {"firmware"}
@@ -66,29 +66,29 @@ def test_an_autopilot_that_is_set_up_well_and_left_as_it_is(monkeypatch: pytest.
 
 def test_bad_values_are_read_and_told_with_their_mend() -> None:
     port = free_port()
-    with AutopilotStandIn(port, height_m=2.0, heartbeat_s=HEARTBEAT_S) as stand_in:
-        stand_in.parameters.update({**GOOD, "COM_OF_LOSS_T": 2.5, "COM_OBL_RC_ACT": 1, "GF_MAX_HOR_DIST": 0.0})
-        del stand_in.parameters["GF_ACTION"]
+    with FakeAutopilot(port, height_m=2.0, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
+        fake_autopilot.parameters.update({**GOOD, "COM_OF_LOSS_T": 2.5, "COM_OBL_RC_ACT": 1, "GF_MAX_HOR_DIST": 0.0})
+        del fake_autopilot.parameters["GF_ACTION"]
         found = _examined(port)
     assert found["COM_OF_LOSS_T"].level is Level.WARNING
     assert found["COM_OF_LOSS_T"].measured.startswith("2.5 s: so long it flies on")
-    assert found["COM_OF_LOSS_T"].mend == "set COM_OF_LOSS_T to 1 s"
+    assert found["COM_OF_LOSS_T"].fix == "set COM_OF_LOSS_T to 1 s"
     assert found["COM_OBL_RC_ACT"].level is Level.FAILURE
     assert "drifts on" in found["COM_OBL_RC_ACT"].measured
     assert found["GF_MAX_HOR_DIST"].level is Level.WARNING
-    assert found["GF_MAX_HOR_DIST"].mend == "set GF_MAX_HOR_DIST to 60 m, a little outside flockd's own"
+    assert found["GF_MAX_HOR_DIST"].fix == "set GF_MAX_HOR_DIST to 60 m, a little outside flockd's own"
     assert found["GF_ACTION"].level is Level.FAILURE
     assert "GF_ACTION could not be read (timeout)" in found["GF_ACTION"].measured
     assert (found["heartbeat"].level, found["heartbeat"].measured[-9:]) == (Level.WARNING, "and armed")
 
 
 def test_nobody_there_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(autopilot, "HEARD_S", 0.3)
+    monkeypatch.setattr(autopilot_checks, "HEARD_S", 0.3)
     port = free_port()
     (finding,) = _examined(port).values()
     assert (finding.level, finding.about) == (Level.FAILURE, "autopilot")
     assert finding.measured == f"no autopilot was heard at udpin://127.0.0.1:{port} within 0.3 s"
-    assert finding.mend.startswith("check autopilot.address")
+    assert finding.fix.startswith("check autopilot.address")
 
 
 def test_an_autopilot_that_falls_silent_under_examination_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,14 +97,14 @@ def test_an_autopilot_that_falls_silent_under_examination_is_a_failure(monkeypat
 
     async def cut(self: AutopilotLink, name: str, kind: type[float]) -> float:
         """The cable, before the second question."""
-        stand_in.silent = name == "COM_OBL_RC_ACT"
+        fake_autopilot.silent = name == "COM_OBL_RC_ACT"
         return await read(self, name, kind)
 
     monkeypatch.setattr(AutopilotLink, "parameter", cut)
-    with AutopilotStandIn(port, heartbeat_s=HEARTBEAT_S) as stand_in:
-        stand_in.parameters.update(GOOD)
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
+        fake_autopilot.parameters.update(GOOD)
         check = Check("autopilot", lambda: check_autopilot(_config(port)), limit_s=60.0)
-        found = examine([check], lambda done, total: None)["autopilot"]
+        found = run_checks([check], lambda done, total: None)["autopilot"]
     assert [(finding.about, finding.level) for finding in found] == [
         ("heartbeat", Level.PASS),
         ("firmware", Level.WARNING),
@@ -149,7 +149,7 @@ def test_no_autopilot_is_only_for_the_simulator() -> None:
 def test_what_is_made_of_each_value(name: str, value: float, level: Level) -> None:
     finding = JUDGES[name](value, _config(14540))
     assert (finding.about, finding.level) == (name, level)
-    assert (finding.mend == "") == (level is Level.PASS)
+    assert (finding.fix == "") == (level is Level.PASS)
 
 
 def test_a_fence_with_corners_reaches_as_far_as_the_farthest_inside_the_circle() -> None:
@@ -158,10 +158,17 @@ def test_a_fence_with_corners_reaches_as_far_as_the_farthest_inside_the_circle()
     assert "50 m" in JUDGES["GF_MAX_HOR_DIST"](49.0, config).measured
     free = SafetyParameters(gate=GateParameters(fence_radius_m=None))
     endless = JUDGES["GF_MAX_HOR_DIST"](0.0, config.model_copy(update={"safety": free}))
-    assert endless.mend == "set GF_MAX_HOR_DIST to where it must never fly"
+    assert endless.fix == "set GF_MAX_HOR_DIST to where it must never fly"
 
 
 def test_other_firmware() -> None:
     assert judge_firmware(Firmware("PX4", "1.16.0")).level is Level.PASS
     assert judge_firmware(Firmware("PX4", "1.13.3")).level is Level.WARNING
     assert judge_firmware(Firmware("autopilot 3", "4.5.7")).level is Level.FAILURE
+
+
+def test_unknown_values_in_messages_are_a_warning() -> None:
+    assert judge_messages({}) == []
+    (finding,) = judge_messages({"EXTENDED_SYS_STATE.landed_state = 5": 3})
+    assert (finding.level, finding.about) == (Level.WARNING, "messages")
+    assert "EXTENDED_SYS_STATE.landed_state = 5 (3 times)" in finding.measured

@@ -14,8 +14,8 @@ import pytest
 from flockd.config import DroneConfig
 from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.config.source import CameraDeviceParameters, ControlParameters, SharedMemoryParameters, SourceParameters
-from flockd.doctor import Finding, Level, cameras
-from flockd.doctor.cameras import check_cameras
+from flockd.doctor import Finding, Level, camera_checks
+from flockd.doctor.camera_checks import check_cameras
 from flockd.messages import Frame
 from flockd.sources import FramePublisher
 from tests.daemon.aboard import free_endpoint
@@ -114,7 +114,7 @@ def _problem(found: dict[str, list[Finding]], level: Level, told: str, about: st
     (problem,) = found[about]
     assert problem.level is level, problem
     assert told in problem.measured, problem
-    assert problem.mend
+    assert problem.fix
     return problem
 
 
@@ -161,7 +161,7 @@ def test_images_that_are_worth_nothing(film: dict[str, Any], level: Level, told:
 
 def test_time_stamps_of_another_clock_are_no_image_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
     """Some drivers do not name their clock: what counts is whether the stamps are of now."""
-    monkeypatch.setattr(cameras, "START_S", 0.3)
+    monkeypatch.setattr(camera_checks, "START_S", 0.3)
     kernel = FakeKernel(front=FakeCamera())
     with _filming(kernel, "front", flags=lambda number: FLAG_CLOCK_UNKNOWN):
         (finding,) = _examined(_config("front"), kernel)["camera front"]
@@ -176,7 +176,7 @@ def test_a_cap_on_the_lens() -> None:
     kernel = FakeKernel(front=FakeCamera())
     with _filming(kernel, "front", pictures=BLACK):
         found = _examined(_config("front"), kernel)
-    _problem(found, Level.WARNING, "the picture is too dark to see by")
+    _problem(found, Level.WARNING, "the image is too dark")
 
 
 def test_an_exposure_that_is_not_configured() -> None:
@@ -196,7 +196,7 @@ def test_cameras_that_do_not_open_are_told_one_by_one() -> None:
     _problem(found, Level.FAILURE, "/dev/taken is in use by another program", "camera taken")
     _problem(found, Level.FAILURE, "offers 320x240 MJPG instead of 640x480", "camera small")
     problem = _problem(found, Level.FAILURE, "runs at 10 instead of 30 images a second", "camera busless")
-    assert problem.mend == "write rate_hz: 10"
+    assert problem.fix == "write rate_hz: 10"
     refused = _config("controlled", controls=(ControlParameters(name="exposure_time_absolute", value=9999),))
     _problem(
         _examined(refused, kernel), Level.FAILURE, "takes exposure_time_absolute from 1 to 5000", "camera controlled"
@@ -204,8 +204,8 @@ def test_cameras_that_do_not_open_are_told_one_by_one() -> None:
 
 
 def test_a_driver_that_hangs_is_told_and_the_other_camera_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cameras, "START_S", 1.0)
-    monkeypatch.setattr(cameras, "STOP_S", 0.2)
+    monkeypatch.setattr(camera_checks, "START_S", 1.0)
+    monkeypatch.setattr(camera_checks, "STOP_S", 0.2)
     ended = threading.Event()
 
     class Stuck(FakeKernel):
@@ -219,7 +219,7 @@ def test_a_driver_that_hangs_is_told_and_the_other_camera_is_seen(monkeypatch: p
         found = _examined(_config("front", "back"), kernel)
     ended.set()
     assert found["camera front"][0].level is Level.PASS
-    _problem(found, Level.FAILURE, "its driver does not answer", "camera back")
+    _problem(found, Level.FAILURE, "its driver does not respond", "camera back")
 
 
 def _shared(endpoint: str) -> DroneConfig:
@@ -261,12 +261,12 @@ def test_frames_of_another_program() -> None:
 
 
 def test_frames_of_the_wrong_size_and_none_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cameras, "START_S", 2.0)
+    monkeypatch.setattr(camera_checks, "START_S", 2.0)
     endpoint = free_endpoint()
     with _publishing(endpoint, (32, 48)):
         problem = next(iter(check_cameras(_shared(endpoint), SECONDS)))
-    assert (problem.level, problem.measured) == (Level.FAILURE, "frames of 32x48 come, but the rig says 64x48")
-    monkeypatch.setattr(cameras, "START_S", 0.3)
+    assert (problem.level, problem.measured) == (Level.FAILURE, "frames are 32x48, but the rig has 64x48")
+    monkeypatch.setattr(camera_checks, "START_S", 0.3)
     problem = next(iter(check_cameras(_shared(endpoint), SECONDS)))
     assert problem.level is Level.FAILURE
     assert problem.measured == f"no frame of tiny/front came from {endpoint} within 0.3 s"

@@ -10,8 +10,8 @@ import pytest
 from flockd.config import DroneConfig, load_drone
 from flockd.config.recording import RecordingConfig
 from flockd.data import data_path
-from flockd.doctor import Finding, Level, computer
-from flockd.doctor.computer import (
+from flockd.doctor import Finding, Level, computer_checks
+from flockd.doctor.computer_checks import (
     check_clock,
     check_disk,
     check_memory,
@@ -39,10 +39,10 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
 
 
 def test_without_a_folder_none_is_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(computer, "STATE_FOLDER", tmp_path / "none")
+    monkeypatch.setattr(computer_checks, "STATE_FOLDER", tmp_path / "none")
     (finding,) = check_disk(QUADROTOR, None)
     assert finding.level is Level.WARNING
-    monkeypatch.setattr(computer, "STATE_FOLDER", tmp_path)
+    monkeypatch.setattr(computer_checks, "STATE_FOLDER", tmp_path)
     assert str(tmp_path) in next(iter(check_disk(QUADROTOR, None))).measured
 
 

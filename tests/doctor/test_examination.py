@@ -11,7 +11,7 @@ import pytest
 
 from flockd.cli import main
 from flockd.data import data_path
-from flockd.doctor import CHECKS, Check, Finding, Level, examine, passed
+from flockd.doctor import CHECKS, Check, Finding, Level, passed, run_checks
 from flockd.errors import ModelError
 
 QUADROTOR = str(data_path("config") / "quadrotor.yaml")
@@ -19,7 +19,7 @@ QUADROTOR = str(data_path("config") / "quadrotor.yaml")
 
 def _examined(check: Check) -> tuple[Finding, ...]:
     told: list[tuple[int, int]] = []
-    found = examine([check], lambda done, total: told.append((done, total)))
+    found = run_checks([check], lambda done, total: told.append((done, total)))
     assert told == [(1, 1)]
     return found[check.name]
 
@@ -37,7 +37,7 @@ def test_a_check_that_hangs_is_a_failure_and_what_it_found_before_counts() -> No
     assert (first.level, first.about) == (Level.PASS, "camera front")
     assert (late.level, late.about) == (Level.FAILURE, "cameras")
     assert late.measured == "the check has not ended within 0.2 s"
-    assert late.mend
+    assert late.fix
 
 
 def test_the_other_checks_are_run_whatever_one_does() -> None:
@@ -46,7 +46,7 @@ def test_the_other_checks_are_run_whatever_one_does() -> None:
         yield
 
     checks = [Check("models", breaks, 5.0), Check("disk", lambda: [passed("disk", "fine")], 5.0)]
-    found = examine(checks, lambda done, total: None)
+    found = run_checks(checks, lambda done, total: None)
     (broken,) = found["models"]
     assert broken.level is Level.FAILURE
     assert "ArithmeticError('1 / 0')" in broken.measured
@@ -54,15 +54,19 @@ def test_the_other_checks_are_run_whatever_one_does() -> None:
 
 
 @pytest.mark.parametrize(
-    ("error", "measured", "mend"),
+    ("error", "measured", "fix"),
     [
         (
             ModelError("a.yaml: sha256: changed; and more; restore it"),
             "a.yaml: sha256: changed; and more",
             "restore it",
         ),
-        (ModelError("all is lost"), "all is lost", "mend that, and examine it again"),
-        (OSError(5, "Input/output error", "/dev/x"), "/dev/x: Input/output error", "see to it that it answers"),
+        (ModelError("all is lost"), "all is lost", "correct it, and run `flockd doctor` again"),
+        (
+            OSError(5, "Input/output error", "/dev/x"),
+            "/dev/x: Input/output error",
+            "check that it responds",
+        ),
         (
             ImportError("libmavsdk.so is not there"),
             "a library cannot be loaded (libmavsdk.so is not there)",
@@ -70,12 +74,12 @@ def test_the_other_checks_are_run_whatever_one_does() -> None:
         ),
     ],
 )
-def test_an_error_is_told_with_its_mend(error: Exception, measured: str, mend: str) -> None:
+def test_an_error_is_reported_with_its_fix(error: Exception, measured: str, fix: str) -> None:
     def breaks() -> Iterator[Finding]:
         raise error
         yield
 
-    assert _examined(Check("x", breaks, 5.0)) == (Finding(Level.FAILURE, "x", measured, mend),)
+    assert _examined(Check("x", breaks, 5.0)) == (Finding(Level.FAILURE, "x", measured, fix),)
 
 
 def test_json_for_machines_and_exit_code_1_when_a_check_failed(
@@ -100,7 +104,7 @@ def test_a_table_for_people_with_the_worst_first(tmp_path: Path, capsys: pytest.
     assert main([*command, "--record", str(tmp_path / "none")]) == 1
     lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
     assert lines[0].startswith("FAILURE  disk")
-    assert any(line.strip().startswith("mend: make the folder") for line in lines)
+    assert any(line.strip().startswith("fix: make the folder") for line in lines)
     assert lines[-3].startswith("PASS     memory")
     assert lines[-1] == "drone1: 1 failure, 0 warnings, 1 passed"
 

@@ -12,9 +12,9 @@ from flockd.config import DroneConfig, load_drone
 from flockd.config.telemetry import TelemetryParameters
 from flockd.daemon import only_instance
 from flockd.data import data_path
-from flockd.doctor import Check, Finding, Level, examine, service
-from flockd.doctor.fleet import check_fleet
-from flockd.doctor.service import check_instance, check_unit, judge_exposure
+from flockd.doctor import Check, Finding, Level, run_checks, service_checks
+from flockd.doctor.service_checks import check_instance, check_unit, judge_exposure
+from flockd.doctor.telemetry_checks import check_fleet
 from flockd.telemetry.publisher import ZenohTelemetry
 from flockd.telemetry.topics import AboutMessage, AnswerMessage
 from tests.daemon.aboard import free_endpoint
@@ -29,7 +29,7 @@ def _config(*, listen: tuple[str, ...] = (), connect: tuple[str, ...] = ()) -> D
 
 
 def _fleet(config: DroneConfig, listen_s: float = 1.5) -> Finding:
-    (finding,) = examine([Check("zenoh", lambda: check_fleet(config, listen_s), 20.0)], lambda done, total: None)[
+    (finding,) = run_checks([Check("zenoh", lambda: check_fleet(config, listen_s), 20.0)], lambda done, total: None)[
         "zenoh"
     ]
     return finding
@@ -59,7 +59,7 @@ def test_alone_is_well_and_nobody_where_somebody_should_be_is_not() -> None:
     assert alone.measured.endswith("sees no other drone")
     endpoint = free_endpoint()
     waiting = _fleet(_config(connect=(endpoint,)), 0.2)
-    assert (waiting.level, waiting.measured) == (Level.WARNING, f"nobody answers at {endpoint}")
+    assert (waiting.level, waiting.measured) == (Level.WARNING, f"nothing listens at {endpoint}")
 
 
 def test_an_endpoint_that_is_taken_is_a_failure() -> None:
@@ -68,7 +68,7 @@ def test_an_endpoint_that_is_taken_is_a_failure() -> None:
         finding = _fleet(_config(listen=(endpoint,)))
     assert finding.level is Level.FAILURE
     assert finding.measured.startswith(f"telemetry cannot use {endpoint} (")
-    assert finding.mend == "name another endpoint"
+    assert finding.fix == "name another endpoint"
 
 
 def test_a_second_instance(tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_a_second_instance(tmp_path: Path) -> None:
         (finding,) = check_instance("drone1", environment)
         assert finding.level is Level.FAILURE
         assert "flies drone 'drone1'" in finding.measured
-        assert "systemctl stop flockd" in finding.mend
+        assert "systemctl stop flockd" in finding.fix
         assert next(iter(check_instance("drone2", environment))).level is Level.PASS
     assert next(iter(check_instance("drone1", environment))).level is Level.PASS
 
@@ -87,7 +87,7 @@ def test_a_lock_of_another_user_cannot_be_seen(tmp_path: Path, monkeypatch: pyte
     def forbidden(drone: str, environment: object) -> None:
         raise PermissionError(13, "Permission denied", f"/run/flockd/flockd-{drone}.lock")
 
-    monkeypatch.setattr(service, "only_instance", forbidden)
+    monkeypatch.setattr(service_checks, "only_instance", forbidden)
     (finding,) = check_instance("drone1", {})
     assert finding.level is Level.WARNING
     assert "/run/flockd/flockd-drone1.lock belongs to another user" in finding.measured
@@ -98,7 +98,7 @@ def test_the_lock_of_the_service_cannot_be_seen_by_who_may_not_write_there(
 ) -> None:
     lock = tmp_path / "flockd-drone1.lock"
     lock.write_text("1234\n", encoding="ascii")
-    monkeypatch.setattr(service, "service_lock", lambda drone: tmp_path / f"flockd-{drone}.lock")
+    monkeypatch.setattr(service_checks, "service_lock", lambda drone: tmp_path / f"flockd-{drone}.lock")
     access = os.access
     monkeypatch.setattr(os, "access", lambda path, mode: path != lock and access(path, mode))
     environment = {"XDG_RUNTIME_DIR": str(tmp_path)}
@@ -110,7 +110,7 @@ def test_the_lock_of_the_service_cannot_be_seen_by_who_may_not_write_there(
 
 @needs_systemd
 def test_the_unit_that_comes_with_flockd_and_one_that_is_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service, "UNIT_FOLDERS", (tmp_path,))
+    monkeypatch.setattr(service_checks, "UNIT_FOLDERS", (tmp_path,))
     (finding,) = check_unit(None)
     assert finding.level is Level.PASS, finding
     assert "flockd.service (not installed) exposes 1." in finding.measured
@@ -124,11 +124,11 @@ def test_the_unit_that_comes_with_flockd_and_one_that_is_open(tmp_path: Path, mo
     assert finding.level is Level.FAILURE
 
 
-def test_without_systemd_the_unit_is_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_systemd_the_unit_is_not_checked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "/nowhere")
     (finding,) = check_unit(None)
     assert finding.level is Level.WARNING
-    assert "systemd-analyze is not here" in finding.measured
+    assert "systemd-analyze is not installed" in finding.measured
 
 
 def test_how_open_is_too_open() -> None:

@@ -8,7 +8,7 @@ from flockd.config import load_drone
 from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.data import data_path
 from flockd.doctor import Level
-from flockd.doctor.lenses import coverage, lens_problems, width_deg
+from flockd.doctor.lens_checks import coverage, lens_problems, width_deg
 
 QUADROTOR = load_drone(data_path("config") / "quadrotor.yaml").rig
 SIMULATOR = load_drone(data_path("config") / "simulator.yaml").rig
@@ -48,7 +48,7 @@ def test_a_calibration_of_another_size_or_lens_is_told(lens: dict[str, object], 
     (problem,) = lens_problems(_camera(**lens))
     assert (problem.level, problem.about) == (level, "camera front")
     assert told in problem.measured
-    assert "calibrate this camera" in problem.mend
+    assert "calibrate this camera" in problem.fix
 
 
 def test_four_cameras_see_all_around_and_three_do_not() -> None:

@@ -12,7 +12,7 @@ from flockd.config.drone import DroneConfig
 from flockd.config.perception import PerceptionConfig
 from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.data import data_path
-from flockd.doctor import Check, Level, examine
+from flockd.doctor import Check, Level, run_checks
 from flockd.doctor.models import STEPS, check_models, judge_steps, meadow, time_steps
 from flockd.messages import PilotOutput
 from tests.daemon.aboard import TinyPerceiver
@@ -44,12 +44,12 @@ def test_a_flipped_bit_is_a_failure_of_that_model_alone(copies: Path) -> None:
         assert "run by CPUExecutionProvider" in finding.measured
     assert (distance.level, distance.about) == (Level.FAILURE, "model distance_int8")
     assert "was changed or damaged" in distance.measured
-    assert distance.mend == "restore it, or export it again with its manifest"
+    assert distance.fix == "restore it, or export it again with its manifest"
 
 
 def test_a_folder_that_is_not_there_is_a_failure(tmp_path: Path) -> None:
     check = Check("models", lambda: check_models(_with(models_dir=str(tmp_path / "none"))), 60.0)
-    (finding,) = examine([check], lambda done, total: None)["models"]
+    (finding,) = run_checks([check], lambda done, total: None)["models"]
     assert finding.level is Level.FAILURE
     assert finding.measured == f"perception.models_dir: {tmp_path / 'none'} is no folder"
 
@@ -86,4 +86,4 @@ def test_the_first_step_warms_up_and_the_others_have_half_a_second(seconds: floa
 def test_a_busy_computer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "getloadavg", lambda: (9.0, 9.0, 9.0))
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    assert judge_steps(TINY, _timed(0.7)).mend.startswith("stop other programs first (a load of 9 on 2 cores)")
+    assert judge_steps(TINY, _timed(0.7)).fix.startswith("stop other programs first (a load of 9 on 2 cores)")

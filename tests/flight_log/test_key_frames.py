@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from flockd.flight_log.capture import capture, key_frame_steps
-from flockd.pilot import FlockPilot
+from flockd.pilot import FlockPilot, StepTrace
 from flockd.recording.reader import Recording
 
 RECORDING = Path(__file__).parents[1] / "replay" / "normal.mcap"
@@ -25,6 +25,7 @@ def test_a_step_without_a_usable_image_has_no_key_frame(height_m: float) -> None
     recording = Recording(RECORDING)
     step = next(iter(recording.steps()))
     pilot = FlockPilot(recording.config)
-    output = pilot.step(step.frames, replace(step.vehicle, height_m=height_m))
-    captured = capture(pilot, output, drone=0)
+    trace = StepTrace()
+    output = pilot.step(step.frames, replace(step.vehicle, height_m=height_m), trace)
+    captured = capture(trace, output, drone=0)
     assert [set(frame.cameras) for frame in captured] == ([set(step.frames.frames)] if height_m > 0 else [])

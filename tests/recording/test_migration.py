@@ -15,7 +15,6 @@ import pytest
 from pydantic import BaseModel, ConfigDict
 
 from flockd.cli import main
-from flockd.cli.replay import changes
 from flockd.config import DroneConfig
 from flockd.messages import PilotOutput
 from flockd.recording import RecordingError, reader
@@ -24,6 +23,7 @@ from flockd.recording.mcap_file import Entry, read_records
 from flockd.recording.migration import DROPPED, Migrated, migrate_configuration, migrate_output
 from flockd.recording.reader import Recording, head_of
 from flockd.recording.streams import OUTPUT
+from flockd.replay.fidelity import replay_warnings
 
 FLIGHTS = sorted((Path(__file__).parents[1] / "replay").glob("*.mcap"))
 IDS = [path.stem for path in FLIGHTS]
@@ -114,10 +114,10 @@ def test_settings_of_0_1_0_are_read_and_what_is_dropped_is_said(path: Path, caps
 def test_a_replay_says_what_was_changed_in_the_settings_it_flies_with() -> None:
     recording = Recording(FLIGHTS[0])
     recording.migrations = ("desired is now mission", "tracking.size_memory (0) was dropped: it was off")
-    line, *_ = changes(recording, recording.config, recording.start_s)
+    line, *_ = replay_warnings(recording, recording.config, recording.start_s)
     assert "version 0.1.0" in line
     assert "desired is now mission; tracking.size_memory (0) was dropped" in line
-    assert line not in list(changes(recording, DroneConfig(rig=recording.config.rig), recording.start_s))
+    assert line not in list(replay_warnings(recording, DroneConfig(rig=recording.config.rig), recording.start_s))
 
 
 def outputs_of(path: Path) -> list[dict[str, Any]]:

@@ -225,8 +225,8 @@ def test_a_step_in_which_the_recorder_was_killed_does_not_count(flight: Path, tm
 
 
 def test_a_replays_recording_keeps_the_truth(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flockd.pilot.FlockPilot", MadeUpPilot)
-    monkeypatch.setattr("flockd.cli.replay.models_of", lambda config: MODELS)
+    monkeypatch.setattr("flockd.replay.recorded_flight.FlockPilot", MadeUpPilot)
+    monkeypatch.setattr("flockd.replay.recorded_flight.model_hashes", lambda perception: MODELS)
     again = tmp_path / "again.mcap"
     assert main(["replay", str(flight / "drone1.mcap"), "--out", str(again)]) == 0
     flown, replayed = log_of(flight / "drone1.mcap"), log_of(again)

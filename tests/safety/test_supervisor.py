@@ -606,7 +606,7 @@ def test_a_computer_without_a_thermal_zone_is_not_hot() -> None:
     [
         ({"dropped_share": 0.25}, "25%"),
         ({"estimate_age_s": 1.6}, "1.6 s"),
-        ({"ego_motion_failures": 3}, "3 times"),
+        ({"ego_motion_failures": 3}, "in 3 steps in a row"),
         ({"load": 1.5}, "150%"),
         ({"temperature_c": 90.0}, "90.0 °C"),
         ({"loop_lag_s": 0.25}, "0.25 s"),

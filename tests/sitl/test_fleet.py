@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flockd.autopilot.stand_in import AutopilotStandIn
+from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.cli import main
 from flockd.data import data_path
 from flockd.flight_log.log import FlightLog
@@ -146,7 +146,7 @@ def test_without_px4_it_says_what_to_do(
         ),
         (
             ["--autopilot", "standin", "--perception", "truth"],
-            "--perception truth has no meaning with real daemons, which look and tell by themselves; drop it",
+            "--perception truth has no meaning with real daemons, which have their own; drop it",
         ),
     ],
 )
@@ -160,7 +160,7 @@ def test_the_ground_station_knows_where_everybody_truly_is() -> None:
     port = free_port()
     with (
         GroundStation([port], time.monotonic) as station,
-        AutopilotStandIn(
+        FakeAutopilot(
             free_port(), height_m=2.0, yaw_rad=np.pi / 2, home_deg=home_deg(np.array([3.0, 4.0])), truth_port=port
         ) as stand_in,
     ):

@@ -11,7 +11,7 @@ import pytest
 from flockd.config.source import SourceParameters
 from flockd.sources.assembler import Assembler, RawFrameSet
 from flockd.sources.frames import RawFrame
-from flockd.sources.images import RgbFormat
+from flockd.sources.image_formats import RgbFormat
 
 FOUR = ("front", "right", "back", "left")
 PERIOD_S = 1.0 / 30.0

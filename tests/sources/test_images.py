@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from flockd.sources.images import CorruptImageError, MjpegFormat, RgbFormat, YuyvFormat
+from flockd.sources.image_formats import CorruptImageError, MjpegFormat, RgbFormat, YuyvFormat
 from tests.sources.pictures import SIZE, jpeg, scene, yuyv
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from flockd import peer
+from flockd import zenoh_session
 from flockd.config.drone import DroneConfig
 from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.config.source import SharedMemoryParameters, SourceParameters
@@ -136,7 +136,7 @@ with FramePublisher(listen=[{endpoint!r}]) as publisher:
 def test_without_shared_memory_the_same_bytes_come_through_the_socket_with_a_note(
     endpoint: str, source: SharedMemorySource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole_config = peer._config
+    whole_config = zenoh_session._config
     refusals: list[bool] = []
 
     def without(listen: object, connect: object, settings: None, shared_memory: bool | None) -> zenoh.Config:
@@ -145,7 +145,7 @@ def test_without_shared_memory_the_same_bytes_come_through_the_socket_with_a_not
             raise zenoh.ZError("Unable to create POSIX shm segment: OS error 30 at segment.rs:85.")
         return whole_config([endpoint], [], None, False)
 
-    monkeypatch.setattr(peer, "_config", without)
+    monkeypatch.setattr(zenoh_session, "_config", without)
     with FramePublisher(listen=[endpoint]) as publisher:
         assert refusals == [True]
         assert publisher.notes() == (
@@ -194,7 +194,7 @@ def test_messages_that_are_no_frames_are_counted_and_ignored(endpoint: str, sour
             assert time.monotonic() < until_s
             time.sleep(0.01)
         assert status.counts["malformed"] == 3
-        assert status.fault == "front: frames of 320x240 come, but the rig says 640x480; mend one"
+        assert status.fault == "front: frames are 320x240, but the rig has 640x480; correct one"
         stranger.put(b"too short", attachment=header.pack(b"rgb8", 640, 480, number, 0.5 * number))
         publisher.publish("3", Frame("back", scene(), 0.5 * number, number))
         frames = source.newest(5.0)

@@ -19,9 +19,10 @@ from flockd.config.drone import DroneConfig
 from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.config.source import CameraDeviceParameters, ControlParameters, SourceParameters
 from flockd.messages import FrameSet
-from flockd.sources import CameraStatus, v4l2_device
+from flockd.sources import CameraStatus, v4l2_kernel
 from flockd.sources.v4l2 import V4l2Source
-from flockd.sources.v4l2_device import Kernel, LinuxKernel, control_name
+from flockd.sources.v4l2_device import control_name
+from flockd.sources.v4l2_kernel import Kernel, LinuxKernel
 from tests.sources.fake_kernel import (
     FLAG_CLOCK_UNKNOWN,
     FLAG_ERROR,
@@ -93,22 +94,22 @@ def _next(source: V4l2Source) -> FrameSet:
 def test_the_structures_are_those_of_the_header() -> None:
     """Sizes and numbers as a C compiler gives them for linux/videodev2.h on 64-bit machines."""
     sizes = {
-        v4l2_device.Capability: 104,
-        v4l2_device.Format: 208,
-        v4l2_device.StreamParameters: 204,
-        v4l2_device.RequestBuffers: 20,
-        v4l2_device.Buffer: 88,
-        v4l2_device.QueryControl: 68,
-        v4l2_device.Control: 8,
+        v4l2_kernel.Capability: 104,
+        v4l2_kernel.Format: 208,
+        v4l2_kernel.StreamParameters: 204,
+        v4l2_kernel.RequestBuffers: 20,
+        v4l2_kernel.Buffer: 88,
+        v4l2_kernel.QueryControl: 68,
+        v4l2_kernel.Control: 8,
     }
     for structure, size in sizes.items():
         assert ctypes.sizeof(structure) == size, structure
     for request in Request:
-        assert getattr(v4l2_device, f"VIDIOC_{request.name}") == request
+        assert getattr(v4l2_kernel, f"VIDIOC_{request.name}") == request
     offsets = {"timestamp": 24, "timecode": 40, "sequence": 56, "memory": 60, "m": 64, "length": 72, "request_fd": 80}
     names = {"timestamp": "seconds", "m": "offset"}
     for name, offset in offsets.items():
-        assert getattr(v4l2_device.Buffer, names.get(name, name)).offset == offset
+        assert getattr(v4l2_kernel.Buffer, names.get(name, name)).offset == offset
 
 
 def test_two_cameras_become_one_set_with_the_kernels_times_and_numbers(start: Start) -> None:
@@ -256,7 +257,7 @@ def test_an_unplugged_camera_is_told_of_at_once_and_comes_back_when_plugged_in(s
     kernel.unplug("front")
     fault = _until(source, lambda status: status.fault is not None).fault
     assert time.monotonic() - pulled_s < 0.5
-    assert fault == "front: /dev/front is not there; plug the camera in, or mend the path"
+    assert fault == "front: /dev/front is not there; plug the camera in, or correct the path"
 
     asked_s = time.monotonic()
     kernel.send("back", JPEGS[2])
@@ -427,7 +428,7 @@ def test_a_buffer_written_by_the_headers_offsets_is_read_field_by_field() -> Non
     struct.pack_into("<qq", raw, 24, 1_234_567, 654_321)
     struct.pack_into("<IIII", raw, 56, 99, 1, 0x300000, 0)
     struct.pack_into("<I", raw, 72, 614_400)
-    buffer = v4l2_device.Buffer.from_buffer(raw)
+    buffer = v4l2_kernel.Buffer.from_buffer(raw)
     assert (buffer.index, buffer.bytesused, buffer.flags, buffer.field) == (3, 4711, 0x2040, 1)
     assert (buffer.seconds, buffer.microseconds, buffer.sequence) == (1_234_567, 654_321, 99)
     assert (buffer.offset, buffer.length) == (0x300000, 614_400)

@@ -14,10 +14,10 @@ import zenoh
 
 from flockd.data import data_path
 from flockd.errors import UnavailableError
-from flockd.peer import close_peer, open_peer
 from flockd.telemetry.publisher import ZenohTelemetry
 from flockd.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.telemetry.watcher import FleetWatcher
+from flockd.zenoh_session import close_session, open_session
 
 EXAMPLE = (data_path("config") / "zenoh_tls.json5").read_text(encoding="utf-8")
 ABOUT = AboutMessage(version="1.2.3", configuration={"name": "d"}, commands=["hold"])
@@ -58,10 +58,10 @@ def _may(endpoint: str, drone: ZenohTelemetry, settings: Path | None) -> tuple[b
             drone.publish("d", "events", {"time_s": 0.0, "event": "hello"})
             time.sleep(0.05)
         hears = [(watched.drone, watched.alive, set(watched.topics)) for watched in watcher.drones()]
-    session = open_peer("a test", [], [endpoint], settings=settings)
+    session = open_session("a test", [], [endpoint], settings=settings)
     time.sleep(0.5)
     answers = [answer for what in ("about", "ask/hold") for answer in _answers(session, f"flockd/v1/f/d/{what}")]
-    close_peer(session)
+    close_session(session)
     return hears == [("d", True, {"events"})], answers
 
 
@@ -93,7 +93,7 @@ def test_settings_that_are_not_there_are_told(tmp_path: Path) -> None:
     with pytest.raises(
         UnavailableError, match=f"telemetry cannot use no endpoint with the settings of {tmp_path}/none"
     ):
-        open_peer("telemetry", [], [], settings=tmp_path / "none")
+        open_session("telemetry", [], [], settings=tmp_path / "none")
 
 
 def test_what_is_no_message_is_counted_and_not_taken() -> None:
@@ -101,12 +101,12 @@ def test_what_is_no_message_is_counted_and_not_taken() -> None:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     with FleetWatcher(None, listen=[endpoint], connect=[]) as watcher:
-        session = open_peer("a test", [], [endpoint])
+        session = open_session("a test", [], [endpoint])
         until_s = time.monotonic() + 15.0
         while watcher.malformed < 3 and time.monotonic() < until_s:
             for payload in (b"\xff\x00", b"[]", b'{"time_s": 0.0}'):
                 session.put("flockd/v1/f/d/flight", payload)
             time.sleep(0.05)
-        close_peer(session)
+        close_session(session)
         assert watcher.malformed >= 3
         assert watcher.drones() == ()

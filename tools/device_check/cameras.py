@@ -13,7 +13,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from flockd.sources.v4l2_device import VIDIOC_QUERYCTRL, VIDIOC_S_CTRL, Control, QueryControl, control_name
+from flockd.sources.v4l2_device import control_name
+from flockd.sources.v4l2_kernel import VIDIOC_QUERYCTRL, VIDIOC_S_CTRL, Control, QueryControl
 
 WEBCAM = "/dev/video10"
 """Of vivid: shows its own pattern, in sizes and rates as USB cameras have them, and breaks in every way it can."""

@@ -11,7 +11,7 @@ import itertools
 import os
 import time
 
-from flockd.sources.v4l2_device import VIDIOC_S_FMT, Format
+from flockd.sources.v4l2_kernel import VIDIOC_S_FMT, Format
 from tools.device_check import pictures
 
 _OUTPUT = 2  # V4L2_BUF_TYPE_VIDEO_OUTPUT

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from flockd.autopilot.stand_in import AutopilotStandIn
+from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.recording.reader import Recording
-from flockd.sources.images import MjpegFormat
+from flockd.sources.image_formats import MjpegFormat
 from flockd.sources.v4l2_device import CameraError, V4l2Device
 from flockd.telemetry.watcher import FleetWatcher
 from tools.device_check import pictures
@@ -53,7 +53,7 @@ class Service:
     def __init__(self, start: str) -> None:
         """``start``: the lines of the README that start the unit."""
         self._start = start
-        self._stand_in = AutopilotStandIn(PORT).start()
+        self._stand_in = FakeAutopilot(PORT).start()
         self._watcher = FleetWatcher("check", listen=(), connect=(ENDPOINT,))
         self._front: Feeder | None = None
 
@@ -192,7 +192,7 @@ class Service:
     def _is_unplugged(self) -> Iterator[Finding]:
         opened = self._counts("back")["opened"]
         pulled_s = control(WEBCAM, "disconnect")
-        lost_s = _told_since(pulled_s, "a blind sector: back unplugged")
+        lost_s = _told_since(pulled_s, "a camera is lost: back unplugged")
         yield _soon("unplugged in flight", lost_s - pulled_s, NOTICED_S)
         back_s = _told_since(lost_s, "normal")
         again = self._counts("back")["opened"] - opened
@@ -206,7 +206,7 @@ class Service:
     def _falls_silent(self) -> Iterator[Finding]:
         assert self._front is not None
         silent_s = self._front.fall_silent()
-        lost_s = _told_since(silent_s, "a blind sector: front")
+        lost_s = _told_since(silent_s, "a camera is lost: front")
         yield _soon("silent in flight", lost_s - silent_s, SILENCE_S + 0.1)
         spoke_s = self._front.go_on()
         back_s = _told_since(spoke_s, "normal")

@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flockd.choices import ScaleSource
 from flockd.config.perception import PerceptionConfig
 from flockd.geometry import Rig
-from flockd.messages import UNCLASSED, Detection, Frame, FrameSet, ScaleSource, VehicleState
+from flockd.messages import UNCLASSED, Detection, Frame, FrameSet, VehicleState
 from flockd.perception import DisFlow, Networks, Perception
 from flockd.sim.drone_models import drone_model
 from tools.training.dataset import HEIGHT, R_BODY_CAMERA, WIDTH, PairSet, rig_camera
@@ -102,7 +103,8 @@ def look_at_pairs(pairs: PairSet, networks: Networks, indices: Iterable[int]) ->
         _drones(view.detections, pairs, index, depth, ids, found)
         flow = np.asarray(pairs["flow"][index], np.float32)
         valid = np.asarray(pairs["flow_valid"][index])
-        ours = networks.flow(*(Frame("camera", image, 0.5 * k, k) for k, image in enumerate(images[:2])), labels)
+        first, second = (Frame("camera", images[k], 0.5 * k, k) for k in (0, 1))
+        ours = networks.flow(first, second, labels)
         for name, guess in (("network", ours), ("dis", dis.flow(images[0], images[1]))):
             error = np.linalg.norm(np.moveaxis(guess[1::2, 1::2], 2, 0) - flow, axis=0)
             for on_drones in (False, True):

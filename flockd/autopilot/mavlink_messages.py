@@ -1,0 +1,201 @@
+"""What the autopilot's MAVLink messages say: decoding, without MAVSDK and without I/O.
+
+Messages are kept as they come, the newest of each kind, so that no queue grows and the state is known at any time.
+Values of enumerations are checked where they enter: one that is not known here counts as unknown, and is counted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flockd.autopilot.status import AutopilotStatus, FlightMode, LandedState
+from flockd.messages import FloatArray, VehicleState
+
+Fields = Mapping[str, Any]
+
+MAV_MODE_FLAG_SAFETY_ARMED = 128
+MAV_STATE_CRITICAL = 5
+GPS_FIX_3D = 3
+ESTIMATOR_ATTITUDE, ESTIMATOR_VELOCITY_HORIZONTAL = 1, 2
+ESTIMATOR_POSITION_RELATIVE, ESTIMATOR_POSITION_ABSOLUTE, ESTIMATOR_HEIGHT = 8, 16, 32
+
+MODES: Mapping[tuple[int, int], FlightMode] = {
+    (1, 0): "manual",
+    (2, 0): "altitude",
+    (3, 0): "position",
+    (4, 2): "take-off",
+    (4, 3): "hold",
+    (4, 4): "mission",
+    (4, 5): "return",
+    (4, 6): "land",
+    (6, 0): "offboard",
+    (7, 0): "manual",
+}
+"""PX4's main and sub mode."""
+LANDED_STATES: tuple[LandedState, ...] = ("unknown", "ground", "air", "taking off", "landing")
+"""By MAV_LANDED_STATE."""
+RESULTS = (
+    "accepted",
+    "refused for now",
+    "denied",
+    "not supported",
+    "failed",
+    "still in progress",
+    "cancelled",
+    "refused as COMMAND_LONG",
+    "refused as COMMAND_INT",
+    "refused for its frame",
+    "refused because another station has control",
+)
+"""By MAV_RESULT."""
+ENUMERATIONS: Mapping[tuple[str, str], int] = {
+    ("EXTENDED_SYS_STATE", "landed_state"): len(LANDED_STATES),
+    ("GPS_RAW_INT", "fix_type"): 9,  # GPS_FIX_TYPE
+    ("HEARTBEAT", "system_status"): 9,  # MAV_STATE
+}
+"""How many values each field's enumeration has, from 0, by message and field: of the MAVLink dialect `common`."""
+
+
+@dataclass(frozen=True)
+class ReceivedMessage:
+    """A message, and when it arrived on the link's clock."""
+
+    time_s: float
+    fields: Fields
+
+
+class ReceivedMessages:
+    """The newest message of each kind. `add` is for one thread, everything else for any."""
+
+    def __init__(self, log_unknown: Callable[[str], None]) -> None:
+        """``log_unknown`` is called with one sentence the first time that an unknown value arrives."""
+        self._log_unknown = log_unknown
+        self._newest: dict[str, ReceivedMessage] = {}
+        self._unknown_values: Counter[str] = Counter()
+        self.home_down_m: float | None = None
+        """Down from the estimator's origin; None: not known yet."""
+
+    def add(self, name: str, fields: Fields, time_s: float) -> None:
+        """Takes a message by its name and fields, NaN as null, as MAVSDK decodes them to JSON."""
+        self._newest[name] = ReceivedMessage(time_s, self._checked(name, fields))
+        home = _vector(fields, "x", "y", "z") if name == "HOME_POSITION" else None
+        # A home that moves in flight must not move the height that is being held.
+        if home is not None and (self.home_down_m is None or not self.status(time_s).in_air):
+            self.home_down_m = float(home[2])
+
+    def newest(self, name: str) -> ReceivedMessage | None:
+        """The newest of a kind; None before the first."""
+        return self._newest.get(name)
+
+    def unknown_values(self) -> Mapping[str, int]:
+        """How often each unknown value has arrived, as in `EXTENDED_SYS_STATE.landed_state = 5`."""
+        return dict(self._unknown_values)
+
+    def status(self, now_s: float) -> AutopilotStatus:
+        """What they say of the autopilot."""
+        heartbeat = self._newest.get("HEARTBEAT", ReceivedMessage(-math.inf, {}))
+        system = self._fields("SYS_STATUS")
+        landed_state = self._fields("EXTENDED_SYS_STATE").get("landed_state")
+        fix_type = self._fields("GPS_RAW_INT").get("fix_type")
+        return AutopilotStatus(
+            time_s=now_s,
+            heartbeat_age_s=now_s - heartbeat.time_s,
+            flight_mode=self.flight_mode(),
+            armed=bool(heartbeat.fields.get("base_mode", 0) & MAV_MODE_FLAG_SAFETY_ARMED),
+            failsafe=heartbeat.fields.get("system_status") == MAV_STATE_CRITICAL,
+            landed_state="unknown" if landed_state is None else LANDED_STATES[landed_state],
+            battery_share=_known(system.get("battery_remaining", -1), scale=0.01),
+            battery_v=_known(system.get("voltage_battery", 0), scale=0.001, unknown=(0, 65535)),
+            estimate_ok=_estimate_ok(self._newest.get("ESTIMATOR_STATUS")),
+            gps_ok=None if fix_type is None else fix_type >= GPS_FIX_3D,
+            position_ned=_vector(self._fields("LOCAL_POSITION_NED"), "x", "y", "z"),
+            home_ned=_vector(self._fields("HOME_POSITION"), "x", "y", "z"),
+        )
+
+    def vehicle_state(self) -> VehicleState | None:
+        """Attitude, height above home and velocity, as old as the older of them; None before they are known.
+
+        Before home is known the height is above the place where the estimator began.
+        """
+        attitude, position = self._newest.get("ATTITUDE_QUATERNION"), self._newest.get("LOCAL_POSITION_NED")
+        if attitude is None or position is None:
+            return None
+        place = _vector(position.fields, "x", "y", "z")
+        velocity = _vector(position.fields, "vx", "vy", "vz")
+        quaternion = _vector(attitude.fields, "q1", "q2", "q3", "q4")
+        if place is None or velocity is None or quaternion is None:
+            return None
+        return VehicleState(
+            time_s=min(attitude.time_s, position.time_s),
+            R_ned_body=rotation_from_quaternion(quaternion),
+            height_m=float((self.home_down_m or 0.0) - place[2]),
+            velocity_ned=velocity,
+        )
+
+    def flight_mode(self) -> FlightMode:
+        """By the newer of heartbeat and CURRENT_MODE; a mode that is not in `MODES` is `other`."""
+        reports = [self._newest[name] for name in ("HEARTBEAT", "CURRENT_MODE") if name in self._newest]
+        if not reports:
+            return "unknown"
+        mode = int(max(reports, key=lambda message: message.time_s).fields["custom_mode"])
+        return MODES.get((mode >> 16 & 0xFF, mode >> 24 & 0xFF), "other")
+
+    def _fields(self, name: str) -> Fields:
+        message = self._newest.get(name)
+        return {} if message is None else message.fields
+
+    def _checked(self, name: str, fields: Fields) -> Fields:
+        """The same fields with None for values that their enumeration does not have."""
+        unknown = [
+            field
+            for (message, field), count in ENUMERATIONS.items()
+            if message == name and fields.get(field) is not None and not 0 <= fields[field] < count
+        ]
+        for field in unknown:
+            value = f"{name}.{field} = {fields[field]}"
+            if value not in self._unknown_values:
+                self._log_unknown(f"the autopilot sends {value}, which flockd does not know; it counts as unknown")
+            self._unknown_values[value] += 1
+        return {**fields, **dict.fromkeys(unknown)} if unknown else fields
+
+
+def result_text(result: int) -> str:
+    """What a MAV_RESULT means, for people."""
+    return RESULTS[result] if 0 <= result < len(RESULTS) else f"answered with the unknown result {result}"
+
+
+def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
+    """(3, 3) from (4,) w x y z; turns body into NED coordinates as MAVLink's attitude does."""
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _vector(fields: Fields, *names: str) -> FloatArray | None:
+    """The named numbers, or None where one is missing or null, which is how NaN comes."""
+    numbers = [fields.get(name) for name in names]
+    return None if any(number is None for number in numbers) else np.array(numbers, dtype=float)
+
+
+def _known(value: float, *, scale: float, unknown: tuple[float, ...] = (-1,)) -> float | None:
+    return None if value in unknown else value * scale
+
+
+def _estimate_ok(message: ReceivedMessage | None) -> bool | None:
+    if message is None:
+        return None
+    flags = int(message.fields["flags"])
+    needed = ESTIMATOR_ATTITUDE | ESTIMATOR_VELOCITY_HORIZONTAL | ESTIMATOR_HEIGHT
+    position = ESTIMATOR_POSITION_RELATIVE | ESTIMATOR_POSITION_ABSOLUTE
+    return flags & needed == needed and bool(flags & position)

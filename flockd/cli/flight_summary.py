@@ -1,0 +1,51 @@
+"""A flight's summary on the terminal: its key figures, or JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from flockd.cli.output import say, say_json
+from flockd.errors import ExitCode
+
+
+def show_summary(directory: Path, summary: Mapping[str, Any], *, as_json: bool) -> int:
+    """Prints the summary as JSON, or its key figures and where the report is."""
+    from flockd.report.flight_folder import REPORT_NAME
+
+    if as_json:
+        say_json(summary)
+        return ExitCode.DONE
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(justify="left")
+    table.add_column(justify="right")
+    for name, value in _key_figures(summary).items():
+        table.add_row(name, value)
+    Console(markup=False, highlight=False).print(table)
+    say(f"report: {directory / REPORT_NAME}")
+    return ExitCode.DONE
+
+
+def _key_figures(summary: Mapping[str, Any]) -> dict[str, str]:
+    flock, neighbours, own = summary["flock"], summary["neighbours"], summary["own_account"]
+    figures = {
+        "autopilot": summary["autopilot"] or "",
+        "drones": f"{summary['drones']}",
+        "flown": f"{summary['duration_s']:g} s",
+        "speed": _number(summary["realtime_factor"], "x real time", 2),
+        "closest two drones": _number(flock["min_distance_m"], "m", 2),
+        "order at the end": _number(flock["order_tail"], "of 1", 3),
+        "union at the end": _number(flock["union_tail"], "of 1", 2),
+        "own motion estimated": "" if summary["has_truth"] else _number(own["own_motion_ratio"], "of the steps", 3),
+        "neighbours known within 10 m": _number(neighbours["recall_within_10m"], "of 1", 3),
+        "false neighbours": _number(neighbours["false_per_drone_minute"], "a drone and minute", 2),
+    }
+    return {name: value for name, value in figures.items() if value}
+
+
+def _number(value: float | None, unit: str, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f} {unit}"

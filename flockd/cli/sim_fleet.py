@@ -1,0 +1,97 @@
+"""`flockd sim --autopilot`: flies the scenario with real daemons, and sees to it that none is left behind."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING
+
+from flockd.cli.flight_summary import show_summary
+from flockd.cli.output import complain, progress
+from flockd.errors import ExitCode, UsageError
+
+if TYPE_CHECKING:
+    from flockd.config import ScenarioConfig
+
+SITL = "px4_sitl.yaml"
+RECORDINGS = "recordings"
+DEFAULT_SPEED_FACTOR = 0.25
+"""Two cores then keep up with five drones."""
+SPEED_FACTORS = (0.1, 10.0)
+"""What a daemon's configuration allows."""
+
+
+def check_options(args: argparse.Namespace) -> None:
+    """Raises UsageError for options that go with the simulator's own pilots, or with daemons, only."""
+    if args.autopilot is None:
+        if args.speed_factor is not None:
+            raise UsageError("--speed-factor is for real daemons; drop it, or name their --autopilot")
+        return
+    slowest, fastest = SPEED_FACTORS
+    if args.speed_factor is not None and not slowest <= args.speed_factor <= fastest:
+        raise UsageError(f"--speed-factor {args.speed_factor:g} is not from {slowest:g} to {fastest:g}; choose another")
+    own = {"--perception truth": args.perception == "truth", "--swap": args.swap, "--telemetry": args.telemetry}
+    idle = [option for option, given in own.items() if given]
+    if idle:
+        raise UsageError(f"{idle[0]} has no meaning with real daemons, which have their own; drop it")
+
+
+def fly(args: argparse.Namespace, scenario: ScenarioConfig, directory: Path) -> int:
+    """Flies, writes the same report as the simulator, and says whether all flew to the end."""
+    from flockd.config import load_drone
+    from flockd.data import data_path
+    from flockd.report.flight_folder import FLEET_LOGS, save_flight, write_report_files
+    from flockd.sim.fleet import fly_fleet
+
+    with ExitStack() as stack:
+        stack.enter_context(_ended_in_order())
+        tell_progress = stack.enter_context(progress("flying", "s"))
+        flight = fly_fleet(
+            scenario,
+            load_drone(data_path("config") / SITL),
+            kind=args.autopilot,
+            speed_factor=args.speed_factor or DEFAULT_SPEED_FACTOR,
+            logs=directory / FLEET_LOGS,
+            recordings=_emptied(directory / RECORDINGS) if args.record else None,
+            environment=os.environ,
+            progress=tell_progress,
+        )
+    save_flight(directory, flight.log, flight.key_frames)
+    summary = write_report_files(directory, flight.log)
+    code = show_summary(directory, summary, as_json=args.json)
+    fleet = summary["fleet"]
+    faults = [f"{drone} did not fly to the end: {why}" for drone, why in fleet["handed_over"].items()]
+    faults += [
+        f"the daemon of {drone} ended with exit code {code}" for drone, code in fleet["exit_codes"].items() if code
+    ]
+    for sentence in [*faults, *fleet["notes"]]:
+        complain(f"{sentence}; see {directory / FLEET_LOGS}" if sentence in faults else sentence)
+    return ExitCode.CHECK_FAILED if faults else code
+
+
+@contextmanager
+def _ended_in_order() -> Iterator[None]:
+    """SIGTERM and a closed terminal end the fleet as Ctrl-C does."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _emptied(directory: Path) -> Path:
+    """Without an earlier flight's recordings."""
+    directory.mkdir(exist_ok=True)
+    for earlier in directory.glob("drone*.mcap"):
+        earlier.unlink()
+    return directory

@@ -1,0 +1,41 @@
+"""The components of a running daemon."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass, field
+
+from flockd.autopilot.mavsdk_link import AutopilotLink
+from flockd.autopilot.streamer import SetpointStreamer
+from flockd.daemon.autopilot_requests import AutopilotRequests
+from flockd.daemon.control import Control
+from flockd.daemon.host_monitors import LoopLag, Thermometer, WallClock
+from flockd.daemon.message_sinks import MessageSinks
+from flockd.daemon.networks import WatchedNetworks
+from flockd.daemon.pilot_loop import PilotLoop
+from flockd.daemon.take_off import TakeOff
+from flockd.sources import FrameSource
+from flockd.telemetry.publisher import ZenohTelemetry
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """Created and connected by `startup.open_components`."""
+
+    link: AutopilotLink
+    streamer: SetpointStreamer
+    source: FrameSource
+    pilot_loop: PilotLoop
+    networks: WatchedNetworks
+    control: Control
+    requests: AutopilotRequests
+    take_off: TakeOff
+    sinks: MessageSinks
+    telemetry: ZenohTelemetry
+    lag: LoopLag
+    thermometer: Thermometer
+    wall_clock: WallClock
+    dead_tasks: dict[str, str]
+    """Why each task that has ended did, by name."""
+    over: asyncio.Event = field(default_factory=asyncio.Event)
+    """Set when the flight is over and the tasks may end."""

@@ -1,0 +1,108 @@
+"""Periodic status of the daemon, for telemetry and for the service manager."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable, Mapping
+
+from flockd.daemon.components import Components
+from flockd.daemon.service_manager import ServiceManager
+from flockd.safety import Decision
+from flockd.telemetry import TOPICS
+from flockd.telemetry.topics import CameraMessage, ComputerMessage, FlightMessage, ReasonMessage
+
+START_POLL_S = 0.1
+START_MORE_S = 10.0
+STATUS_EVERY_S = 2.0
+
+
+async def notify_service_manager(components: Components, service: ServiceManager) -> None:
+    """Reports ready with the first frame, and a status line before and after it, until cancelled."""
+    while components.pilot_loop.frames is None:
+        faults = [status.fault for status in components.source.status().values() if status.fault]
+        service.starting(f"waits for frames: {'; '.join(faults) or 'none came yet'}", START_MORE_S)
+        await asyncio.sleep(START_POLL_S)
+    service.ready(_status_line(components.control.decision))
+    components.sinks.event("ready: models loaded, autopilot heard, first frames seen")
+    reported: set[str] = set()
+    while True:
+        for note in set(components.source.notes()) - reported:
+            components.sinks.event(note)
+            reported.add(note)
+        await asyncio.sleep(STATUS_EVERY_S)
+        service.status(_status_line(components.control.decision))
+
+
+async def publish_status(components: Components, clock: Callable[[], float]) -> None:
+    """Publishes `flight` and `computer` at the rates of the table of topics, until cancelled."""
+    messages: dict[str, Callable[[float], Mapping[str, object]]] = {
+        "flight": lambda now: _flight_message(components, now),
+        "computer": lambda now: _computer_message(components, now),
+    }
+    due_s = dict.fromkeys(messages, clock())
+    while True:
+        for topic, message in messages.items():
+            rate_hz = TOPICS[topic].rate_hz
+            assert rate_hz is not None
+            now = clock()
+            if now >= due_s[topic]:
+                due_s[topic] = now + 1.0 / rate_hz
+                components.sinks.publish(topic, message(now))
+        await asyncio.sleep(max(0.0, min(due_s.values()) - clock()))
+
+
+def _status_line(decision: Decision) -> str:
+    reasons = "; ".join(reason.sentence for reason in decision.reasons)
+    return f"{decision.state}: {reasons}" if reasons else str(decision.state)
+
+
+def _flight_message(components: Components, now: float) -> FlightMessage:
+    decision, status, stream = components.control.decision, components.link.status(), components.streamer.report()
+    vehicle = components.link.vehicle_state()
+    return FlightMessage(
+        time_s=now,
+        state=decision.state.value,
+        reasons=[ReasonMessage(event=reason.event.value, sentence=reason.sentence) for reason in decision.reasons],
+        flight_mode=status.flight_mode,
+        armed=None if math.isinf(status.heartbeat_age_s) else status.armed,
+        in_air=None if status.landed_state == "unknown" else status.in_air,
+        heartbeat_age_s=status.heartbeat_age_s,
+        battery_share=status.battery_share,
+        height_m=None if vehicle is None else vehicle.height_m,
+        velocity_trim=_velocity_trim(components),
+        silence=stream.silence,
+        setpoints_sent=stream.sent,
+        setpoints_missed=stream.missed,
+    )
+
+
+def _velocity_trim(components: Components) -> list[float]:
+    """(2,) m/s, north and east, of the newest command."""
+    newest = components.pilot_loop.newest
+    trim = None if newest is None else newest.output.command.trim
+    return [0.0, 0.0] if trim is None else [float(v) for v in trim]
+
+
+def _computer_message(components: Components, now: float) -> ComputerMessage:
+    cameras = {
+        name: CameraMessage(
+            age_s=camera.age_s,
+            fault=camera.fault,
+            counts={str(what): number for what, number in camera.counts.items()},
+        )
+        for name, camera in components.source.status().items()
+    }
+    return ComputerMessage(
+        time_s=now,
+        cameras=cameras,
+        load=components.pilot_loop.load(),
+        steps=components.pilot_loop.steps,
+        steps_failed=components.pilot_loop.failed,
+        network_faults=components.networks.faults,
+        networks_stuck=components.networks.ended,
+        loop_lag_s=components.lag.worst_s(),
+        temperature_c=components.thermometer.hottest_c,
+        messages_lost=components.sinks.lost + components.telemetry.lost,
+        recording=components.sinks.recording,
+    )

@@ -1,0 +1,54 @@
+"""The vehicle's states of the last seconds, interpolated at the time of a frame."""
+
+from __future__ import annotations
+
+import bisect
+from collections import deque
+
+import cv2
+import numpy as np
+
+from flockd.messages import VehicleState
+
+HISTORY_S = 2.0
+
+
+class VehicleHistory:
+    """The vehicle's states of the last `HISTORY_S` seconds."""
+
+    def __init__(self) -> None:
+        self._states: deque[VehicleState] = deque()
+
+    def add(self, state: VehicleState) -> None:
+        """Adds the newest state; one that is not newer than the last is ignored."""
+        if not self._states or state.time_s > self._states[-1].time_s:
+            self._states.append(state)
+        while self._states[-1].time_s - self._states[0].time_s > HISTORY_S:
+            self._states.popleft()
+
+    def at(self, time_s: float) -> VehicleState | None:
+        """The state at that time, interpolated; the newest for a time of another clock; None before the first."""
+        if not self._states:
+            return None
+        if not self._states[0].time_s - HISTORY_S <= time_s <= self._states[-1].time_s + HISTORY_S:
+            return self._states[-1]
+        later = bisect.bisect_left(self._states, time_s, key=lambda state: state.time_s)
+        if later in (0, len(self._states)):
+            return self._states[max(0, later - 1)]
+        return _between(self._states[later - 1], self._states[later], time_s)
+
+
+def _between(before: VehicleState, after: VehicleState, time_s: float) -> VehicleState:
+    """At constant rates of turn and motion from the one to the other."""
+    share = (time_s - before.time_s) / (after.time_s - before.time_s)
+    turn, _ = cv2.Rodrigues(before.R_ned_body.T @ after.R_ned_body)
+    part, _ = cv2.Rodrigues(share * np.asarray(turn, np.float64))
+    velocity = after.velocity_ned
+    if velocity is not None and before.velocity_ned is not None:
+        velocity = before.velocity_ned + share * (velocity - before.velocity_ned)
+    return VehicleState(
+        time_s=time_s,
+        R_ned_body=before.R_ned_body @ np.asarray(part, np.float64),
+        height_m=before.height_m + share * (after.height_m - before.height_m),
+        velocity_ned=velocity,
+    )

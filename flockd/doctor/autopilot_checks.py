@@ -1,0 +1,196 @@
+"""The autopilot: heard, known, and set up so that it acts when flockd falls silent. Nothing here changes it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterator, Mapping
+
+from flockd.autopilot.mavsdk_link import AutopilotLink
+from flockd.autopilot.status import AutopilotError, AutopilotStatus, Firmware
+from flockd.config import DroneConfig
+from flockd.config.autopilot import AutopilotParameters
+from flockd.config.safety import GateParameters
+from flockd.doctor.finding import Finding, failed, failed_from_error, passed, warned
+
+HEARD_S = 10.0
+OLDEST_TRIED = (1, 14)
+"""Before PX4 1.14, COM_OBL_RC_ACT held only with a remote control, and COM_OBL_ACT without."""
+LONGEST_LOSS_S = 1.0
+
+
+def check_autopilot(config: DroneConfig) -> Iterator[Finding]:
+    """All of it, over a link of its own."""
+    if config.autopilot is None:
+        measured = "the configuration has no `autopilot`: this drone can be simulated but not flown"
+        yield warned("autopilot", measured, "add `autopilot` with the `address` of the autopilot")
+        return
+    yield from asyncio.run(_ask(config, config.autopilot))
+
+
+async def _ask(config: DroneConfig, parameters: AutopilotParameters) -> list[Finding]:
+    link = await AutopilotLink.connect(parameters, timeout_s=HEARD_S)
+    try:
+        found = [judge_heartbeat(link.system_id, link.status(), parameters), await _firmware(link)]
+        for name, kind in KINDS.items():
+            try:
+                value = await link.parameter(name, kind)
+            except AutopilotError as error:
+                fix = f"see whether this firmware has {name}, and whether the link loses much"
+                found.append(failed(name, str(error), fix))
+                if link.status().heartbeat_age_s > parameters.max_heartbeat_age_s:
+                    found.append(judge_heartbeat(link.system_id, link.status(), parameters))
+                    break
+            else:
+                found.append(JUDGES[name](value, config))
+        found += judge_messages(link.unknown_values())
+    finally:
+        await link.close()
+    return found
+
+
+async def _firmware(link: AutopilotLink) -> Finding:
+    try:
+        return judge_firmware(await link.firmware())
+    except AutopilotError as error:
+        return failed_from_error("firmware", str(error))
+
+
+def judge_heartbeat(system_id: int, status: AutopilotStatus, parameters: AutopilotParameters) -> Finding:
+    """Heard, and at rest."""
+    measured = f"system {system_id} at {parameters.address}, heard {status.heartbeat_age_s:.1f} s ago"
+    if status.heartbeat_age_s > parameters.max_heartbeat_age_s:
+        return failed("heartbeat", f"{measured} and not since", "see to the cable, its baud rate, and who else uses it")
+    if status.armed:
+        return warned("heartbeat", f"{measured}, and armed", "disarm it on the ground before you examine it")
+    return passed("heartbeat", f"{measured}, disarmed, in flight mode {status.flight_mode}")
+
+
+def judge_messages(unknown_values: Mapping[str, int]) -> list[Finding]:
+    """A warning where messages had values that flockd does not know."""
+    if not unknown_values:
+        return []
+    values = ", ".join(f"{value} ({count} times)" for value, count in sorted(unknown_values.items()))
+    return [warned("messages", f"values that flockd does not know: {values}", "update flockd, or the firmware")]
+
+
+def judge_firmware(firmware: Firmware) -> Finding:
+    """Whether it is one whose modes and failsafes flockd knows."""
+    measured = f"{firmware.autopilot} {firmware.version}"
+    if firmware.autopilot != "PX4":
+        return failed("firmware", f"{measured} has other flight modes and failsafes", "flash PX4")
+    if tuple(int(part) for part in firmware.version.split(".")[:2]) < OLDEST_TRIED:
+        oldest = ".".join(map(str, OLDEST_TRIED))
+        return warned("firmware", f"{measured} is older than {oldest}, whose parameters are known here", "update PX4")
+    return passed("firmware", measured)
+
+
+def judge_loss_time(value: float, config: DroneConfig) -> Finding:
+    """COM_OF_LOSS_T, in seconds."""
+    name, measured = "COM_OF_LOSS_T", f"{value:g} s"
+    gap_s = AutopilotParameters().max_gap_s if config.autopilot is None else config.autopilot.max_gap_s
+    fix = f"set {name} to {LONGEST_LOSS_S:g} s"
+    if value <= gap_s:
+        told = f"{measured}, not above autopilot.max_gap_s {gap_s:g}: PX4 would leave offboard in gaps flockd bridges"
+        return failed(name, told, fix)
+    if value > LONGEST_LOSS_S:
+        return warned(name, f"{measured}: so long it flies on with the last velocity when setpoints stop", fix)
+    return passed(name, f"{measured} without setpoints, then its failsafe")
+
+
+_ON_LOSS = {3: "Return", 4: "Land", 5: "Hold"}
+_FATAL_ON_LOSS = {
+    -1: "disabled: it flies on with the last velocity",
+    1: "Altitude: it keeps its height, and drifts on",
+    2: "Stabilized: it keeps level, and drifts on and down",
+    6: "Terminate: the motors stop in the air",
+    7: "Disarm: the motors stop in the air",
+}
+
+
+def judge_loss_action(value: int, config: DroneConfig) -> Finding:
+    """COM_OBL_RC_ACT: what it does when setpoints stop."""
+    name, fix = "COM_OBL_RC_ACT", "set COM_OBL_RC_ACT to 5 (Hold), 4 (Land) or 3 (Return)"
+    if value in _ON_LOSS:
+        return passed(name, f"{value} ({_ON_LOSS[value]}) when setpoints stop")
+    if value == 0:
+        told = "0 (Position) when setpoints stop: the sticks then fly it; with no remote control it returns home"
+        return warned(name, told, fix)
+    return failed(name, f"{value} ({_FATAL_ON_LOSS.get(value, 'not known')}) when setpoints stop", fix)
+
+
+_ON_LOW_BATTERY = {1: "Return", 2: "Land", 3: "Return, and Land when nearly empty"}
+
+
+def judge_low_battery(value: int, config: DroneConfig) -> Finding:
+    """COM_LOW_BAT_ACT."""
+    name = "COM_LOW_BAT_ACT"
+    if value in _ON_LOW_BATTERY:
+        return passed(name, f"{value} ({_ON_LOW_BATTERY[value]}) when the battery is low")
+    what = "only warns" if value == 0 else "not known"
+    own = f"flockd asks for {config.safety.on_battery_low} (safety.on_battery_low), and nothing does while it is down"
+    return warned(name, f"{value} ({what}) when the battery is low: {own}", f"set {name} to 3 or 2 (Land)")
+
+
+_AT_FENCE = {2: "Hold", 3: "Return", 5: "Land"}
+
+
+def judge_fence_action(value: int, config: DroneConfig) -> Finding:
+    """GF_ACTION."""
+    name, fix = "GF_ACTION", "set GF_ACTION to 2 (Hold), 3 (Return) or 5 (Land)"
+    if value in _AT_FENCE:
+        return passed(name, f"{value} ({_AT_FENCE[value]}) at PX4's fence")
+    off = {
+        0: "None: PX4 has no fence",
+        1: "Warning: PX4's fence stops nothing",
+        4: "Terminate: motors stop at the fence",
+    }
+    return warned(name, f"{value} ({off.get(value, 'not known')})", fix)
+
+
+def judge_fence_radius(value: float, config: DroneConfig) -> Finding:
+    """GF_MAX_HOR_DIST, in metres."""
+    return _judge_limit("GF_MAX_HOR_DIST", value, _reach_m(config.safety.gate), "fence")
+
+
+def judge_fence_height(value: float, config: DroneConfig) -> Finding:
+    """GF_MAX_VER_DIST, in metres."""
+    return _judge_limit("GF_MAX_VER_DIST", value, config.safety.gate.max_height_m, "max_height_m")
+
+
+def _judge_limit(name: str, value: float, own_m: float | None, what: str) -> Finding:
+    """PX4's limit should lie a little outside flockd's own, as a second line."""
+    outside = "where it must never fly" if own_m is None else f"{1.2 * own_m:.0f} m, a little outside flockd's own"
+    if value <= 0:
+        return warned(name, f"{value:g}: PX4's fence has no such limit", f"set {name} to {outside}")
+    if own_m is not None and value <= own_m:
+        measured = f"{value:g} m is not outside flockd's own {what} of {own_m:g} m: PX4 ends the flight first"
+        return warned(name, measured, f"set {name} to {outside}, or make safety.gate.{what} smaller")
+    own = "flockd has none itself" if own_m is None else f"outside flockd's own {own_m:g} m"
+    return passed(name, f"{value:g} m, {own}")
+
+
+def _reach_m(gate: GateParameters) -> float | None:
+    """How far from home flockd's own fence lets it fly; None: for ever."""
+    corners = [(north**2 + east**2) ** 0.5 for north, east in gate.fence_corners_m]
+    limits = [max(corners)] if corners else []
+    return min([*limits, *([] if gate.fence_radius_m is None else [gate.fence_radius_m])], default=None)
+
+
+KINDS: dict[str, type[int] | type[float]] = {
+    "COM_OF_LOSS_T": float,
+    "COM_OBL_RC_ACT": int,
+    "COM_LOW_BAT_ACT": int,
+    "GF_ACTION": int,
+    "GF_MAX_HOR_DIST": float,
+    "GF_MAX_VER_DIST": float,
+}
+"""As PX4 declares them."""
+JUDGES: dict[str, Callable[..., Finding]] = {
+    "COM_OF_LOSS_T": judge_loss_time,
+    "COM_OBL_RC_ACT": judge_loss_action,
+    "COM_LOW_BAT_ACT": judge_low_battery,
+    "GF_ACTION": judge_fence_action,
+    "GF_MAX_HOR_DIST": judge_fence_radius,
+    "GF_MAX_VER_DIST": judge_fence_height,
+}
+"""Each takes the value and the drone's configuration."""

@@ -1,0 +1,1 @@
+"""Replays: the pilot computes a recorded flight or a dataset again, and the outputs are compared."""

@@ -1,0 +1,95 @@
+"""Where frames arrive from whatever threads bring them, and where the pilot fetches sets of them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+from flockd.config.source import SourceParameters
+from flockd.messages import Frame, FrameSet
+from flockd.sources.assembler import Assembler, RawFrameSet
+from flockd.sources.frames import CameraStatus, Count, RawFrame
+from flockd.sources.image_formats import CorruptImageError
+
+_TICK_S = 0.01
+"""How often a waiting reader looks whether a set that is not complete has waited long enough."""
+
+
+class FrameReceiver:
+    """The assembler behind a lock, and the decoding in front of it: what all sources have in common."""
+
+    def __init__(
+        self, cameras: Sequence[str], parameters: SourceParameters, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._clock = clock
+        self._assembler = Assembler(cameras, parameters)
+        self._faults: dict[str, str | None] = dict.fromkeys(cameras)
+        self._changed = threading.Condition()
+        self._stopped = False
+
+    def offer(self, frame: RawFrame) -> Count | None:
+        """Takes a frame from any thread; gives what it is refused for, None for a usable one."""
+        with self._changed:
+            refused = self._assembler.offer(frame, self._clock())
+            if refused is None:
+                self._faults[frame.camera] = None
+                self._changed.notify_all()
+            elif refused == "frozen":
+                self._faults[frame.camera] = f"{frame.camera}: the image is frozen; restart its camera or program"
+        return refused
+
+    def count(self, camera: str, *what: Count) -> None:
+        """Counts what happened to a camera, or to a frame of it that is worth nothing."""
+        with self._changed:
+            for one in what:
+                self._assembler.count(camera, one)
+
+    def fault(self, camera: str, sentence: str) -> None:
+        """Says why a camera gives nothing, until it gives something."""
+        with self._changed:
+            self._faults[camera] = sentence
+
+    def newest(self, timeout_s: float) -> FrameSet | None:
+        """See ``FrameSource``."""
+        until_s = self._clock() + timeout_s
+        while (raw := self._next(until_s)) is not None:
+            decoded = {name: self._decoded(frame) for name, frame in raw.frames.items()}
+            frames = {name: frame for name, frame in decoded.items() if frame is not None}
+            if frames:
+                return FrameSet(raw.time_s, frames)
+        return None
+
+    def status(self) -> dict[str, CameraStatus]:
+        """See ``FrameSource``."""
+        with self._changed:
+            now_s = self._clock()
+            return {
+                camera: CameraStatus(self._assembler.age_s(camera, now_s), fault, self._assembler.counts(camera))
+                for camera, fault in self._faults.items()
+            }
+
+    def stop(self) -> None:
+        """Lets a waiting reader go."""
+        with self._changed:
+            self._stopped = True
+            self._changed.notify_all()
+
+    def _next(self, until_s: float) -> RawFrameSet | None:
+        with self._changed:
+            while not self._stopped:
+                now_s = self._clock()
+                raw = self._assembler.take(now_s)
+                if raw is not None or now_s >= until_s:
+                    return raw
+                self._changed.wait(min(until_s - now_s, _TICK_S))
+        return None
+
+    def _decoded(self, raw: RawFrame) -> Frame | None:
+        try:
+            image = raw.decode(raw.data)
+        except CorruptImageError:
+            with self._changed:
+                self._assembler.spoil(raw.camera)
+            return None
+        return Frame(raw.camera, image, raw.time_s, raw.sequence)

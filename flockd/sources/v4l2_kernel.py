@@ -1,0 +1,192 @@
+"""The V4L2 interface of the Linux kernel: structures, ioctl requests and system calls, as videodev2.h defines them."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import fcntl
+import mmap
+import os
+import select
+from typing import ClassVar, Protocol
+
+NAME_LENGTH = 32
+
+
+class Capability(ctypes.Structure):
+    """struct v4l2_capability"""
+
+    _fields_: ClassVar = [
+        ("driver", ctypes.c_char * 16),
+        ("card", ctypes.c_char * 32),
+        ("bus_info", ctypes.c_char * 32),
+        ("version", ctypes.c_uint32),
+        ("capabilities", ctypes.c_uint32),
+        ("device_caps", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32 * 3),
+    ]
+
+
+class Format(ctypes.Structure):
+    """struct v4l2_format with its v4l2_pix_format; the union it sits in is 200 bytes long and aligned to 8."""
+
+    _fields_: ClassVar = [
+        ("type", ctypes.c_uint32),
+        ("padding", ctypes.c_uint32),
+        ("width", ctypes.c_uint32),
+        ("height", ctypes.c_uint32),
+        ("pixelformat", ctypes.c_uint32),
+        ("field", ctypes.c_uint32),
+        ("bytesperline", ctypes.c_uint32),
+        ("sizeimage", ctypes.c_uint32),
+        ("rest", ctypes.c_uint8 * 176),
+    ]
+
+
+class StreamParameters(ctypes.Structure):
+    """struct v4l2_streamparm with its v4l2_captureparm; the union is 200 bytes long."""
+
+    _fields_: ClassVar = [
+        ("type", ctypes.c_uint32),
+        ("capability", ctypes.c_uint32),
+        ("capturemode", ctypes.c_uint32),
+        ("numerator", ctypes.c_uint32),
+        ("denominator", ctypes.c_uint32),
+        ("rest", ctypes.c_uint8 * 184),
+    ]
+
+
+class RequestBuffers(ctypes.Structure):
+    """struct v4l2_requestbuffers"""
+
+    _fields_: ClassVar = [
+        ("count", ctypes.c_uint32),
+        ("type", ctypes.c_uint32),
+        ("memory", ctypes.c_uint32),
+        ("capabilities", ctypes.c_uint32),
+        ("flags", ctypes.c_uint8),
+        ("reserved", ctypes.c_uint8 * 3),
+    ]
+
+
+class Buffer(ctypes.Structure):
+    """struct v4l2_buffer as 64-bit kernels lay it out"""
+
+    _fields_: ClassVar = [
+        ("index", ctypes.c_uint32),
+        ("type", ctypes.c_uint32),
+        ("bytesused", ctypes.c_uint32),
+        ("flags", ctypes.c_uint32),
+        ("field", ctypes.c_uint32),
+        ("seconds", ctypes.c_int64),
+        ("microseconds", ctypes.c_int64),
+        ("timecode", ctypes.c_uint8 * 16),
+        ("sequence", ctypes.c_uint32),
+        ("memory", ctypes.c_uint32),
+        ("offset", ctypes.c_uint64),
+        ("length", ctypes.c_uint32),
+        ("reserved2", ctypes.c_uint32),
+        ("request_fd", ctypes.c_int32),
+    ]
+
+
+class QueryControl(ctypes.Structure):
+    """struct v4l2_queryctrl"""
+
+    _fields_: ClassVar = [
+        ("id", ctypes.c_uint32),
+        ("type", ctypes.c_uint32),
+        ("name", ctypes.c_char * NAME_LENGTH),
+        ("minimum", ctypes.c_int32),
+        ("maximum", ctypes.c_int32),
+        ("step", ctypes.c_int32),
+        ("default_value", ctypes.c_int32),
+        ("flags", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32 * 2),
+    ]
+
+
+class Control(ctypes.Structure):
+    """struct v4l2_control"""
+
+    _fields_: ClassVar = [("id", ctypes.c_uint32), ("value", ctypes.c_int32)]
+
+
+_READ, _WRITE = 2, 1
+
+
+def _request(number: int, argument: type[ctypes.Structure] | type[ctypes.c_int], direction: int) -> int:
+    """The _IOC macro of most architectures, x86_64 and aarch64 among them."""
+    return direction << 30 | ctypes.sizeof(argument) << 16 | ord("V") << 8 | number
+
+
+VIDIOC_QUERYCAP = _request(0, Capability, _READ)
+VIDIOC_S_FMT = _request(5, Format, _READ | _WRITE)
+VIDIOC_REQBUFS = _request(8, RequestBuffers, _READ | _WRITE)
+VIDIOC_QUERYBUF = _request(9, Buffer, _READ | _WRITE)
+VIDIOC_QBUF = _request(15, Buffer, _READ | _WRITE)
+VIDIOC_DQBUF = _request(17, Buffer, _READ | _WRITE)
+VIDIOC_STREAMON = _request(18, ctypes.c_int, _WRITE)
+VIDIOC_STREAMOFF = _request(19, ctypes.c_int, _WRITE)
+VIDIOC_S_PARM = _request(22, StreamParameters, _READ | _WRITE)
+VIDIOC_G_CTRL = _request(27, Control, _READ | _WRITE)
+VIDIOC_S_CTRL = _request(28, Control, _READ | _WRITE)
+VIDIOC_QUERYCTRL = _request(36, QueryControl, _READ | _WRITE)
+
+
+class Mapping(Protocol):
+    """Memory of a driver, as `mmap.mmap` gives it."""
+
+    def __getitem__(self, part: slice) -> bytes:
+        """A copy of some of it."""
+
+    def close(self) -> None:
+        """Gives it back; the driver holds the device open until then."""
+
+
+class Kernel(Protocol):
+    """The system calls a camera is driven by; each raises OSError as the kernel does."""
+
+    def open(self, path: str) -> int:
+        """A file descriptor for reading and writing that never blocks."""
+
+    def close(self, descriptor: int) -> None:
+        """Ends the descriptor."""
+
+    def ioctl(self, descriptor: int, request: int, argument: ctypes.Structure | ctypes.c_int) -> None:
+        """Runs the request; the kernel writes its result into ``argument``."""
+
+    def map(self, descriptor: int, length: int, offset: int) -> Mapping:
+        """Maps a buffer of the driver."""
+
+    def wait(self, descriptor: int, timeout_s: float) -> bool:
+        """Whether there is something to fetch, a frame or an error, within the time."""
+
+
+class LinuxKernel:
+    """The system calls of Linux."""
+
+    def open(self, path: str) -> int:
+        """See ``Kernel``."""
+        return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+
+    def close(self, descriptor: int) -> None:
+        """See ``Kernel``."""
+        os.close(descriptor)
+
+    def ioctl(self, descriptor: int, request: int, argument: ctypes.Structure | ctypes.c_int) -> None:
+        """See ``Kernel``."""
+        while True:
+            with contextlib.suppress(InterruptedError):
+                fcntl.ioctl(descriptor, request, argument)
+                return
+
+    def map(self, descriptor: int, length: int, offset: int) -> Mapping:
+        """See ``Kernel``."""
+        return mmap.mmap(descriptor, length, mmap.MAP_SHARED, mmap.PROT_READ | mmap.PROT_WRITE, offset=offset)
+
+    def wait(self, descriptor: int, timeout_s: float) -> bool:
+        """See ``Kernel``."""
+        poll = select.poll()
+        poll.register(descriptor, select.POLLIN)
+        return bool(poll.poll(timeout_s * 1000.0))

@@ -1,0 +1,39 @@
+"""The state of each drone of a fleet, from its telemetry."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from flockd.telemetry.watcher import Watched
+
+GONE, QUIET = "gone", "quiet"
+"""Instead of a state: its process has ended or cannot be reached; it is there, and publishes nothing."""
+WORST_FIRST = (GONE, QUIET, "asking", "hover", "silent", "degraded", "idle", "ready", "normal")
+
+
+def status_rows(drones: Iterable[Watched], now_s: float) -> list[dict[str, Any]]:
+    """One row for each drone, as JSON, the worst first; ``now_s`` on the watcher's clock."""
+    rows = [_row(drone, now_s) for drone in drones]
+    return sorted(rows, key=lambda row: (WORST_FIRST.index(row["state"]), row["fleet"], row["drone"]))
+
+
+def _row(drone: Watched, now_s: float) -> dict[str, Any]:
+    flight: Mapping[str, Any] = drone.message("flight", now_s) or {}
+    computer: Mapping[str, Any] = drone.message("computer", now_s) or {}
+    neighbours = drone.message("neighbours", now_s)
+    state = flight.get("state", QUIET) if drone.alive else GONE
+    blind = [camera["fault"] for camera in computer.get("cameras", {}).values() if camera["fault"]]
+    return {
+        "fleet": drone.fleet,
+        "drone": drone.drone,
+        "state": state if state in WORST_FIRST else QUIET,
+        "flight_mode": flight.get("flight_mode"),
+        "height_m": flight.get("height_m"),
+        "battery_share": flight.get("battery_share"),
+        "neighbours": None
+        if neighbours is None
+        else sum(1 for neighbour in neighbours["neighbours"] if neighbour["confirmed"]),
+        "load": computer.get("load"),
+        "matters": [reason["sentence"] for reason in flight.get("reasons", ())] + blind,
+    }
