@@ -58,7 +58,7 @@ def test_whole_steps_are_timed_and_the_pilot_sees_its_way() -> None:
     timed = time_steps(TINY, TinyPerceiver())
     assert len(timed) == STEPS
     assert all(seconds > 0.0 for seconds, _ in timed)
-    assert timed[-1][1].stages_ms.keys() >= {"scene", "flow", "distance"}
+    assert timed[-1][1].stages_ms.keys() >= {"scene", "flow", "detection"}
 
 
 def test_the_grass_passes_by() -> None:
