@@ -165,6 +165,15 @@ def device_config(device: str, camera: str, size: tuple[int, int], pixel_format:
         raise UsageError(f"{device}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
+def with_one_camera(config: DroneConfig, name: str) -> DroneConfig:
+    """The same drone with one camera."""
+    rig = config.rig.model_copy(update={"cameras": tuple(one for one in config.rig.cameras if one.name == name)})
+    source = config.source
+    if source is not None and source.cameras:
+        source = source.model_copy(update={"cameras": tuple(one for one in source.cameras if one.name == name)})
+    return config.model_copy(update={"rig": rig, "source": source})
+
+
 def _frames(source: FrameSource, seconds: float, enough: Callable[[], bool]) -> Iterator[ImageSet]:
     source.start()
     began_s, seen = time.monotonic(), False

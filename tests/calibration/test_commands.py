@@ -302,7 +302,7 @@ def test_a_rig_is_calibrated_from_folders(tmp_path: Path, capsys: Capture) -> No
     small = drone("front", "right").model_dump(mode="json", exclude_defaults=True)
     small["rig"]["cameras"][1]["size_px"] = [640, 480]
     config.write_text(json.dumps(small))
-    assert "of camera 'right' is 640 x 480, and its picture 0 has 480 x 360 pixels" in told(
+    assert "of camera 'right' is 640 x 480, and its image 0 has 480 x 360 pixels" in told(
         capsys, 78, *command, "--force"
     )
     for file in (shots / "right").glob("[3-9].png"):
