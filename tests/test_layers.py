@@ -164,8 +164,8 @@ WATCHER = PACKAGE / "telemetry" / "watcher.py"
 """Reads telemetry, for the commands that people run."""
 FLEET_STATUS = PACKAGE / "telemetry" / "fleet_status.py"
 """The table of `flockd status`."""
-ANSWERS = PACKAGE / "telemetry" / "publisher.py"
-"""Answers who asks; what it lets an operator ask says nothing of where another drone is."""
+REPLIES = PACKAGE / "telemetry" / "publisher.py"
+"""Replies to queries; what it lets an operator ask says nothing of where another drone is."""
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,7 @@ def test_no_drone_reads_telemetry_to_fly() -> None:
     assert not shared_memory.PREFIX.startswith(f"{PREFIX.split('/')[0]}/")
     readers = {
         "declare_subscriber": {FRAMES_OVER_ZENOH, WATCHER},
-        "declare_queryable": {ANSWERS},
+        "declare_queryable": {REPLIES},
         "declare_querier": set(),
     }
     for path in MODULES:
@@ -218,8 +218,8 @@ def test_reports_and_flight_logs_know_no_simulator() -> None:
         assert _folder(path) == "report" or "report" not in _imported_folders(path), path
 
 
-def test_no_drone_is_told_the_truth() -> None:
-    """A simulator records where everybody truly is, for those who look at recordings; a pilot gets its own senses."""
+def test_no_drone_gets_the_truth() -> None:
+    """A simulator records where everybody truly is, for those who examine recordings; a pilot gets its own senses."""
     from flockd.pilot import FlockPilot
 
     for path in MODULES:

@@ -96,9 +96,7 @@ def from_video(path: Path, camera: str, every: int) -> ImageStream:
                         yield ImageSet(f"frame {index}", {camera: rgb})
                 index += 1
 
-    return ImageStream(
-        sets(), -(-count // every), live=False, identities={camera: f"not known (filmed in {path.name})"}
-    )
+    return ImageStream(sets(), -(-count // every), live=False, identities={camera: f"not known (video {path.name})"})
 
 
 def from_recording(recording: Recording, every: int) -> tuple[ImageStream, DroneConfig]:

@@ -75,7 +75,7 @@ def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
     before = logging.setLogLevel(logging.LOG_LEVEL_SILENT)
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     logging.setLogLevel(before)
-    # As it was filmed: a phone's note to turn the picture would turn it away from its calibration.
+    # As recorded: a phone's rotation metadata would turn the image away from its calibration.
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     try:
         yield video

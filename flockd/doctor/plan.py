@@ -47,7 +47,7 @@ def plan(
         only: of `CHECKS`.
     """
 
-    # Each imports what it looks at when it runs: a library that does not load fails its check alone.
+    # Each imports what it checks when it runs: a library that does not load fails its check alone.
     def instance() -> Iterable[Finding]:
         from flockd.doctor.service_checks import check_instance
 

@@ -150,7 +150,7 @@ class OnnxNetworks:
         return {name: fitting.inside(map_)[0] for name, map_ in model.infer(contents).items()}
 
     def _at_map_stride(self, maps: Float32Array, image: tuple[int, int]) -> Float32Array:
-        """(c, h, w) at the resolution that drones are told apart in; two channels are pixels of the map."""
+        """(c, h, w) at the resolution that drones are segmented at; two channels are pixels of the map."""
         width, height = image[0] // self.map_stride, image[1] // self.map_stride
         if maps.shape[1:] == (height, width):
             return maps
