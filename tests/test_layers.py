@@ -51,7 +51,8 @@ MAY_IMPORT = {
     | {"sources", "autopilot"},  # real daemons are fed frames and given autopilots
     "report": BASE | {"flocking", "flight_log"},
     "view": BASE | {"geometry", "pilot", "recording"},
-    "daemon": BASE | {"inference", "perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"},
+    "daemon": BASE
+    | {"geometry", "inference", "perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"},
     "doctor": BASE | {"geometry", "inference", "perception", "pilot", "sources", "autopilot", "telemetry", "daemon"},
     "cli": BASE
     | {

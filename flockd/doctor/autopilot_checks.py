@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Iterator, Mapping
 
+from flockd.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware
 from flockd.autopilot.mavsdk_link import AutopilotLink
-from flockd.autopilot.status import AutopilotError, AutopilotStatus, Firmware
 from flockd.config import DroneConfig
 from flockd.config.autopilot import AutopilotParameters
 from flockd.config.safety import GateParameters

@@ -94,7 +94,7 @@ def plan(
         return check_cameras(config, seconds)
 
     def models() -> Iterable[Finding]:
-        from flockd.doctor.models import check_models
+        from flockd.doctor.model_checks import check_models
 
         return check_models(config)
 

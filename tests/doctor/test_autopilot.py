@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
+from flockd.autopilot.autopilot_status import Firmware
 from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.autopilot.mavsdk_link import AutopilotLink
-from flockd.autopilot.status import Firmware
 from flockd.config import DroneConfig, load_drone
 from flockd.config.autopilot import AutopilotParameters
 from flockd.config.safety import GateParameters, SafetyParameters

@@ -13,7 +13,7 @@ from flockd.config.perception import PerceptionConfig
 from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.data import data_path
 from flockd.doctor import Check, Level, run_checks
-from flockd.doctor.models import STEPS, check_models, judge_steps, meadow, time_steps
+from flockd.doctor.model_checks import STEPS, check_models, judge_steps, meadow, time_steps
 from flockd.messages import PilotOutput
 from tests.daemon.aboard import TinyPerceiver
 
