@@ -30,7 +30,7 @@ from flockd.perception.requirements import check_roles
 CROPS_PER_RUN = 24
 """Crops in one run of the distance network, so that an image full of false proposals does not take more memory."""
 _MIN_DEPTH_M, _MAX_DEPTH_M = 1e-3, 1e3
-"""Where a reciprocal is taken: beyond lies the sky."""
+"""Where a reciprocal of depth is taken: nearer than the lens, and where flow and height measure nothing any more."""
 _MIN_RAY_Z = 0.1
 """Of a unit ray, for its tangents to stay finite: 84 degrees off the optical axis."""
 
