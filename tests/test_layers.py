@@ -51,7 +51,7 @@ MAY_IMPORT = {
     }
     | {"sources", "autopilot"},  # real daemons are fed frames and given autopilots
     "report": BASE | {"flocking", "flight_log"},
-    "view": BASE | {"geometry", "pilot", "recording"},
+    "view": BASE | {"geometry", "perception", "pilot", "recording"},
     "daemon": BASE
     | {"geometry", "inference", "perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"},
     "doctor": BASE | {"geometry", "inference", "perception", "pilot", "sources", "autopilot", "telemetry", "daemon"},

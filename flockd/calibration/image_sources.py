@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,6 +14,7 @@ from pydantic import ValidationError
 from flockd.calibration.errors import CalibrationError
 from flockd.config import DroneConfig
 from flockd.datasets.image_files import SUFFIXES, read_image
+from flockd.datasets.video import opened_video
 from flockd.errors import UnavailableError, UsageError
 from flockd.messages import UInt8Array, VehicleState
 from flockd.recording.reader import Recording
@@ -80,13 +79,13 @@ def from_folders(path: Path, cameras: Sequence[str]) -> ImageStream:
 
 def from_video(path: Path, camera: str, every: int) -> ImageStream:
     """Every ``every``-th frame of a video. Raises CalibrationError for one that cannot be decoded."""
-    with _video(path) as video:
+    with opened_video(path) as video:
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         if not video.isOpened() or not video.read()[0]:
             raise CalibrationError(f"{path}: is no video that can be decoded; restore it, or convert it to MP4")
 
     def sets() -> Iterator[ImageSet]:
-        with _video(path) as video:
+        with opened_video(path) as video:
             index = 0
             while video.grab():
                 if index % every == 0:
@@ -193,21 +192,6 @@ def _frames(source: FrameSource, seconds: float, enough: Callable[[], bool]) -> 
 
 def _images(folder: Path) -> list[Path]:
     return sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
-
-
-@contextmanager
-def _video(path: Path) -> Iterator[cv2.VideoCapture]:
-    """Unrotated, whatever orientation the file asks for; closed at the end."""
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # our own sentence says what is wrong with a file
-    logging = cv2.utils.logging
-    before = logging.setLogLevel(logging.LOG_LEVEL_SILENT)
-    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    logging.setLogLevel(before)
-    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-    try:
-        yield video
-    finally:
-        video.release()
 
 
 def _known(config: DroneConfig, camera: str) -> str | None:

@@ -6,14 +6,12 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 import zenoh
 
 from flockd.telemetry.topics import PREFIX, TOPICS, AboutMessage, AnswerMessage, checked_name
-from flockd.zenoh_session import close_session, open_session
+from flockd.zenoh_session import SessionOwner, open_session
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
@@ -23,7 +21,7 @@ NewestImage = Callable[[str], bytes | None]
 """Gives a camera's newest image as JPEG, on a thread of zenoh's; None where there is none."""
 
 
-class ZenohTelemetry:
+class ZenohTelemetry(SessionOwner):
     """A telemetry sink that puts each message under `flockd/v1/<fleet>/<drone>/<topic>`.
 
     It listens on and connects to the given endpoints only: discovery by multicast and gossip is off. A put never
@@ -75,18 +73,6 @@ class ZenohTelemetry:
             ),
             self._session.declare_queryable(f"{key}/image/*", lambda query: _send_image(query, newest_image)),
         ]
-
-    def close(self) -> None:
-        """Ends the session; later messages are lost, and counted."""
-        close_session(self._session)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _publisher(self, drone: str, topic: str) -> zenoh.Publisher:
         publisher = self._publishers.get((drone, topic))
