@@ -49,7 +49,7 @@ def test_a_repeated_time_stamp_restarts_the_pair_and_says_so(flyer: Flyer) -> No
     assert any("time stamps" in reason for reason in output.reasons)
 
 
-def test_the_rest_of_the_rig_flies_on_without_one_camera() -> None:
+def test_the_others_of_the_rig_fly_on_without_one_camera() -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
     flyer.step()
     flyer.move()
