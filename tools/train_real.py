@@ -9,6 +9,7 @@ tools/train.py, and writes the same files.
 from __future__ import annotations
 
 import argparse
+from collections import deque
 from pathlib import Path
 
 import cv2
@@ -30,6 +31,10 @@ MIX = {"rendered": 30, "composite": 18, "real drone": 8, "cut out": 4, "negative
 KINDS = tuple(MIX)
 SOFTENED_SHARE = 0.65
 """Of the rendered ones."""
+PLACES_SHARE = 0.15
+"""Of the negatives: cut anywhere, not where the first stage proposed a drone."""
+HARD_PROBABILITY, HARD_SHARE, HARD_ONES, FEWEST_HARD = 0.3, 0.35, 4000, 200
+"""A negative of more than this probability is remembered, the last so many are, and drawn so often."""
 
 
 class RealTask(Task):
@@ -41,16 +46,19 @@ class RealTask(Task):
         self.negatives = RealPatches(patches, "negative")
         self.places = RealPatches(patches, "place", weights={"skydrones": 8.0, "skyothers": 8.0})
         self.drones = RealPatches(patches, "drone")
+        self.hard: deque[tuple[int, int]] = deque(maxlen=HARD_ONES)
+        self._shown: list[tuple[int, int] | None] = []
 
     def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
         """As many of each kind as `MIX` says."""
         self.rendered.look_for_more()
+        self._shown = []
         kinds = [(number, kind) for number, kind in enumerate(KINDS) for _ in range(MIX[kind])]
         return [self._of_kind(kind, rng) | {"kind": np.array(number)} for number, kind in kinds]
 
     def _of_kind(self, kind: str, rng: np.random.Generator) -> Sample:
         if kind == "negative":
-            return real_samples.negative(self.negatives if rng.random() < 0.85 else self.places, rng)
+            return self._negative(rng)
         if kind == "real drone":
             return real_samples.real_drone(self.drones, rng)
         backgrounds = self.places if rng.random() < 0.6 else self.negatives
@@ -65,6 +73,16 @@ class RealTask(Task):
             return real_samples.softened(drawn, rng)
         (picture,) = photometric([drawn["picture"]], rng)
         return real_samples.sharp({**drawn, "picture": picture})
+
+    def _negative(self, rng: np.random.Generator) -> Sample:
+        """Often one that was taken for a drone when it was shown before."""
+        if rng.random() < PLACES_SHARE:
+            self._shown.append(None)
+            return real_samples.negative(*self.places.draw(rng)[:2], rng)
+        is_hard = len(self.hard) >= FEWEST_HARD and rng.random() < HARD_SHARE
+        place = self.hard[int(rng.integers(len(self.hard)))] if is_hard else self.negatives.draw_place(rng)
+        self._shown.append(place)
+        return real_samples.negative(*self.negatives.at(place)[:2], rng)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         """See ``Task``; what is not known of a sample has no weight."""
@@ -88,6 +106,11 @@ class RealTask(Task):
         sharp &= there > 0.5
         figures = {"median": float(error[sharp].median().detach()), "p95": float(error[sharp].quantile(0.95).detach())}
         kind, sure = batch["kind"], torch.sigmoid(out[:, 4].detach())
+        shown = sure[kind == KINDS.index("negative")].tolist()
+        if len(shown) == len(self._shown):
+            self.hard.extend(
+                p for p, s in zip(self._shown, shown, strict=True) if p is not None and s > HARD_PROBABILITY
+            )
         for number, name in enumerate(KINDS):
             mine = (kind == number) & (there > 0.5) if name != "negative" else kind == number
             right = sure[mine] > 0.8

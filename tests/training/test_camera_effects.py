@@ -95,9 +95,9 @@ def test_jpeg_at_a_low_quality_errs_more_than_at_a_high_one() -> None:
 def test_drawn_cameras_stay_within_what_was_measured_and_differ() -> None:
     rng = np.random.default_rng(0)
     drawn = [drawn_effects(0.3, rng) for _ in range(500)]
-    assert all(one.scale == 0.3 and 0 <= one.blur_px <= 1.2 and 0.5 <= one.resampling <= 1 for one in drawn)
+    assert all(one.scale == 0.3 and 0 <= one.blur_px <= 1.0 and 0.5 <= one.resampling <= 1 for one in drawn)
     assert all(one.quality is None or 30 <= one.quality <= 95 for one in drawn)
-    assert 0.12 < np.mean([one.quality is None for one in drawn]) < 0.28
+    assert 0.17 < np.mean([one.quality is None for one in drawn]) < 0.33
     image = edge()
     for one in drawn[:40]:
         assert through_camera(image, one, rng).shape == image.shape

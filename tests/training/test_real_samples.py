@@ -101,7 +101,7 @@ def test_every_kind_of_sample_has_the_same_parts(tmp_path: Path) -> None:
     of_real = real_drone(drones, rng)
     assert of_real["range_weight"] == 0.0  # nobody measured it
     assert of_real["drone"] == 1.0
-    none = negative(places, rng)
+    none = negative(*places.draw(rng)[:2], rng)
     assert none["drone"] == 0.0
     assert none["mask"].max() == 0
     kinds = [sharp(rendered()), softened(rendered(), rng), composite(rendered(), places, rng), of_real, none]

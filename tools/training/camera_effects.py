@@ -48,14 +48,19 @@ class CameraEffects:
 
 
 def drawn_effects(scale: float, rng: np.random.Generator) -> CameraEffects:
-    """Any camera that flies or films; a fifth have almost nothing wrong with them."""
-    is_good = rng.random() < 0.2
+    """Any camera that flies or films; a quarter have almost nothing wrong with them.
+
+    Width of edges (contrast over the steepest gradient, camera pixels, 10 / 50 / 90 % of the drones of 20-30 px):
+    skydrones' training clips 1.8 / 2.1 / 2.2, renderings merely shrunk 1.5 / 2.0 / 2.7, through these cameras
+    1.7 / 2.4 / 3.4: the clips' sharpness is among them, and so are worse lenses.
+    """
+    is_good = rng.random() < 0.25
     exposure = float(np.exp(rng.normal(0, 0.2)))
     tint = np.exp(rng.normal(0, 0.06, 3))
     return CameraEffects(
         scale=scale,
-        blur_px=float(rng.uniform(0.0, 0.4) if is_good else rng.uniform(0.3, 1.2)),
-        smear_px=float(rng.exponential(1.2)) if not is_good and rng.random() < 0.35 else 0.0,
+        blur_px=float(rng.uniform(0.0, 0.4) if is_good else rng.uniform(0.2, 1.0)),
+        smear_px=float(rng.exponential(1.2)) if not is_good and rng.random() < 0.3 else 0.0,
         smear_angle=float(rng.uniform(0, math.pi)),
         gains=(exposure * float(tint[0]), exposure * float(tint[1]), exposure * float(tint[2])),
         gamma=float(np.exp(rng.normal(0, 0.15))),

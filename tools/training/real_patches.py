@@ -50,8 +50,16 @@ class RealPatches:
 
     def draw(self, rng: np.random.Generator) -> tuple[Image, float, NDArray[np.float32]]:
         """A patch, half of the pipeline's first crop in camera pixels, and the proposal's box in the patch."""
+        return self.at(self.draw_place(rng))
+
+    def draw_place(self, rng: np.random.Generator) -> tuple[int, int]:
+        """Source and row of a patch."""
         source = int(rng.choice(len(self._shares), p=self._shares))
-        row = int(rng.integers(len(self._patches[source])))
+        return source, int(rng.integers(len(self._patches[source])))
+
+    def at(self, place: tuple[int, int]) -> tuple[Image, float, NDArray[np.float32]]:
+        """The patch of that source and row, as `draw` gives it."""
+        source, row = place
         return self._patches[source][row], float(self._half_px[source][row]), self._boxes[source][row]
 
 

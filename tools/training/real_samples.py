@@ -97,9 +97,8 @@ def repainted(picture: Image, rng: np.random.Generator) -> NDArray[np.float32]:
     return np.clip(values * np.exp(rng.normal(0, 0.1, 3)) + rng.normal(0, 8), 0, 255).astype(np.float32)
 
 
-def negative(patches: RealPatches, rng: np.random.Generator) -> Sample:
-    """A real crop without a drone; every other one through another camera as well."""
-    patch, half_px, _ = patches.draw(rng)
+def negative(patch: Image, half_px: float, rng: np.random.Generator) -> Sample:
+    """A real crop without a drone, from a patch of `RealPatches`; every other one through another camera as well."""
     picture, camera_px = crop_of_negative(patch, half_px, rng)
     if rng.random() < 0.5:
         scale = min(1.0, camera_px) * float(rng.uniform(*_NEGATIVE_SCALES))
