@@ -99,6 +99,7 @@ def main() -> None:
 def sky_pictures(folder: Path, *, is_validation: bool) -> dict[str, list[Picture]]:
     """The labelled frames by kind of object; drones whose box is not known are left out."""
     sets: dict[str, list[Picture]] = {}
+    clips = _Clips()
     for label in json.loads((folder / "labels.json").read_text(encoding="utf-8")):
         kind, box = label["object"], label["box"]
         block = (int(Path(label["clip"]).stem.split("_")[-1]) - 1) // 10
@@ -106,7 +107,7 @@ def sky_pictures(folder: Path, *, is_validation: bool) -> dict[str, list[Picture
             continue
         boxes: tuple[Box, ...] = (tuple(box),) if kind == "drone" else ()
         clip, frame = folder / "clips" / label["clip"], int(label["frame"])
-        sets.setdefault(kind, []).append((f"{clip.stem}_{frame:04d}", lambda c=clip, f=frame: _frame(c, f), boxes))
+        sets.setdefault(kind, []).append((f"{clip.stem}_{frame:04d}", lambda c=clip, f=frame: clips.frame(c, f), boxes))
     return sets
 
 
@@ -124,15 +125,24 @@ def _picture(path: Path) -> Image:
     return np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
 
 
-def _frame(clip: Path, number: int) -> Image:
-    """By decoding from the beginning: seeking is not exact in every container."""
-    capture = cv2.VideoCapture(str(clip))
-    for _ in range(number):
-        capture.grab()
-    is_read, image = capture.read()
-    if not is_read:
-        raise SystemExit(f"{clip}: frame {number} cannot be read")
-    return np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
+class _Clips:
+    """Frames of videos by their number, by decoding from the beginning: seeking is not exact in every container."""
+
+    def __init__(self) -> None:
+        self._clip: Path | None = None
+        self._next = 0
+
+    def frame(self, clip: Path, number: int) -> Image:
+        """RGB; quick while frames of one clip are asked for in their order."""
+        if clip != self._clip or number < self._next:
+            self._capture, self._clip, self._next = cv2.VideoCapture(str(clip)), clip, 0
+        for _ in range(number - self._next):
+            self._capture.grab()
+        is_read, image = self._capture.read()
+        self._next = number + 1
+        if not is_read:
+            raise SystemExit(f"{clip}: frame {number} cannot be read")
+        return np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
 
 
 def _print_table(results: dict[str, dict[str, object]]) -> None:
