@@ -1,0 +1,103 @@
+"""What cameras do to pictures, against optics, sensors and JPEG as they are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tools.training.camera_effects import CameraEffects, demosaiced, drawn_effects, smear_kernel, through_camera
+
+PERFECT = CameraEffects(
+    scale=1.0, blur_px=0.0, smear_px=0.0, smear_angle=0.0, gains=(1.0, 1.0, 1.0), gamma=1.0, offset=0.0,
+    has_mosaic=False, noise=0.0, denoising=0.0, sharpening=0.0, quality=None, resampling=1.0,
+)  # fmt: skip
+
+
+def edge(height: int = 96, width: int = 96) -> NDArray[np.uint8]:
+    image = np.full((height, width, 3), 60, np.uint8)
+    image[:, width // 2 :] = 180
+    return image
+
+
+def rise_px(image: NDArray[np.uint8]) -> float:
+    """From 10 to 90 % of the edge in the middle row."""
+    row = image[image.shape[0] // 2, :, 1].astype(float)
+    low, high = row[:8].mean(), row[-8:].mean()
+    places = np.interp([0.1, 0.9], np.maximum.accumulate((row - low) / (high - low)), np.arange(len(row)))
+    return float(places[1] - places[0])
+
+
+def test_a_camera_without_faults_changes_nothing() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (96, 96, 3), dtype=np.uint8)
+    assert np.array_equal(through_camera(image, PERFECT, np.random.default_rng(1)), image)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.25])
+def test_blur_counts_in_pixels_of_the_camera_and_not_of_the_enlarged_crop(scale: float) -> None:
+    effects = replace(PERFECT, scale=scale, blur_px=1.2)
+    # A Gaussian edge rises from 10 to 90 % over 2.563 sigma; enlarging adds the width of a camera pixel's triangle.
+    expected = 2.563 * 1.2 / scale
+    found = rise_px(through_camera(edge(384, 384), effects, np.random.default_rng(0)))
+    assert found == pytest.approx(expected, rel=0.25)
+    assert found > 0.95 * expected
+
+
+def test_a_point_that_moves_is_smeared_along_its_way_and_loses_no_light() -> None:
+    kernel = smear_kernel(6.0, 0.0)
+    middle = kernel.shape[0] // 2
+    assert kernel.sum() == pytest.approx(1.0)
+    assert kernel[middle].sum() == pytest.approx(1.0)
+    # The variance of a uniform line of length 6 is 36 / 12, and interpolation between pixels adds at most 1 / 4.
+    at = np.arange(kernel.shape[1]) - middle
+    assert 3.0 <= float((kernel[middle] * at**2).sum()) <= 3.3
+    upright = smear_kernel(6.0, np.pi / 2)
+    assert np.allclose(upright, kernel.T, atol=1e-5)
+
+
+def test_a_mosaic_keeps_plain_colours_and_makes_fringes_at_an_edge() -> None:
+    plain = np.full((33, 47, 3), (200, 120, 40), np.uint8)
+    assert np.array_equal(demosaiced(plain), plain)
+    fringed = demosaiced(edge()).astype(int)
+    assert fringed.shape == (96, 96, 3)
+    assert np.abs(fringed[..., 0] - fringed[..., 2]).max() > 20  # the edge was grey
+    assert np.abs(fringed[:, :40] - 60).max() == 0
+
+
+def test_noise_has_the_strength_that_was_asked_for_and_denoising_lessens_it() -> None:
+    grey = np.full((96, 96, 3), 128, np.uint8)
+    noisy = through_camera(grey, replace(PERFECT, noise=6.0), np.random.default_rng(0))
+    assert noisy.astype(float).std() == pytest.approx(6.0, rel=0.05)
+    denoised = through_camera(grey, replace(PERFECT, noise=6.0, denoising=25.0), np.random.default_rng(0))
+    assert denoised.astype(float).std() < 3.5
+
+
+def test_sharpening_overshoots_at_an_edge() -> None:
+    sharpened = through_camera(edge(), replace(PERFECT, blur_px=0.8, sharpening=1.0), np.random.default_rng(0))
+    assert sharpened.min() < 55
+    assert sharpened.max() > 185
+
+
+def test_jpeg_at_a_low_quality_errs_more_than_at_a_high_one() -> None:
+    u, v = np.meshgrid(np.arange(96), np.arange(96))
+    waves = 128 + 60 * np.sin(u / 5.0) * np.cos(v / 7.0)
+    image = np.repeat(waves.astype(np.uint8)[:, :, None], 3, 2)
+
+    def error(quality: int) -> float:
+        changed = through_camera(image, replace(PERFECT, quality=quality), np.random.default_rng(0))
+        return float(np.abs(changed.astype(int) - image).mean())
+
+    assert error(30) > 2 * error(95)
+
+
+def test_drawn_cameras_stay_within_what_was_measured_and_differ() -> None:
+    rng = np.random.default_rng(0)
+    drawn = [drawn_effects(0.3, rng) for _ in range(500)]
+    assert all(one.scale == 0.3 and 0 <= one.blur_px <= 1.0 and 0.5 <= one.resampling <= 1 for one in drawn)
+    assert all(one.quality is None or 30 <= one.quality <= 95 for one in drawn)
+    assert 0.17 < np.mean([one.quality is None for one in drawn]) < 0.33
+    image = edge()
+    for one in drawn[:40]:
+        assert through_camera(image, one, rng).shape == image.shape

@@ -1,0 +1,186 @@
+"""Cut from real pictures what the first stage takes for drones though there are none, and places all over them.
+
+python -m tools.mine_pictures OUT --pictures FOLDER [--skydrones FOLDER] --model models/neighbours_int8.yaml
+
+Every folder in FOLDER is one source of pictures without drones: its proposals become negatives, and other places
+backgrounds for composites. SKYDRONES adds the training clips of `skydrones`: what is proposed beside the drones, or
+where there are only birds and aircraft, as negatives, and the drones themselves. Writes one OUT/SOURCE.npz each.
+A patch shows more than the second stage's crop, so that training can aim at it in many ways.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flockd.geometry import PinholeCamera, Rig, RigCamera, RigidTransform, virtual_crop
+from flockd.inference import OnnxModel
+from flockd.perception import group_instances
+from tools.training.real_patches import PATCH_PX, PATCH_REACH
+
+Image = NDArray[np.uint8]
+EAGER_LOGIT = -1.5
+"""The pipeline proposes from this logit up."""
+FIRST_MARGIN = 0.95
+"""Half the pipeline's first crop, as a share of the way from its middle to the proposal's farthest corner."""
+MOST_PROPOSALS, PLACES = 10, 3
+"""In one picture."""
+FRAMES_A_CLIP = 14
+VALIDATION_BLOCKS = (3, 9)
+BESIDE_PX = 25.0
+"""A proposal so near to a drone's box may be part of it."""
+R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+ENDINGS = {".jpg", ".jpeg", ".png"}
+
+
+class Miner:
+    """Collects the patches of one source."""
+
+    def __init__(self, model: OnnxModel, seed: int = 0) -> None:
+        self._model = model
+        self._rng = np.random.default_rng(seed)
+        self._rows: dict[str, list[dict[str, Any]]] = {"negative": [], "place": [], "drone": []}
+        self.pictures, self.proposals = 0, 0
+
+    def add(self, image: Image, boxes: list[tuple[float, float, float, float]], *, places: int = PLACES) -> None:
+        """An RGB image (h, w, 3) and the drones in it; sizes are cut to multiples of 32."""
+        image = image[: image.shape[0] // 32 * 32, : image.shape[1] // 32 * 32]
+        height, width = image.shape[:2]
+        rig = _rig(width, height)
+        proposals = self._proposed(image)
+        self.pictures += 1
+        self.proposals += len(proposals)
+        free = [box for box in proposals if all(_gap(box, other) > BESIDE_PX for other in boxes)]
+        for k in self._rng.permutation(len(free))[:MOST_PROPOSALS]:
+            self._cut("negative", rig, image, free[k])
+        for box in boxes:
+            self._cut("drone", rig, image, box)
+        for _ in range(places):
+            half = float(np.exp(self._rng.uniform(math.log(5.0), math.log(110.0))))
+            u, v = self._rng.uniform(0, width), self._rng.uniform(0, height)
+            self._cut("place", rig, image, (u - half, v - half * 0.5, u + half, v + half * 0.5))
+
+    def save(self, path: Path) -> None:
+        """All that was collected."""
+        arrays = {}
+        for kind, rows in self._rows.items():
+            arrays[kind] = np.array([row["patch"] for row in rows], np.uint8).reshape(-1, PATCH_PX, PATCH_PX, 3)
+            arrays[f"{kind}_half_px"] = np.array([row["half_px"] for row in rows], np.float32)
+            arrays[f"{kind}_box"] = np.array([row["box"] for row in rows], np.float32).reshape(-1, 4)
+        np.savez(path, allow_pickle=False, **arrays)
+
+    def _proposed(self, image: Image) -> list[tuple[float, float, float, float]]:
+        height, width = image.shape[:2]
+        focal = width / 2
+        u = (np.arange(width // 2) * 2 + 1 - width / 2) / focal
+        v = (np.arange(height // 2) * 2 + 1 - height / 2) / focal
+        planes = np.stack([*np.broadcast_arrays(u[None, :], v[:, None]), np.zeros((height // 2, width // 2))])
+        out = self._model.run({"image": image[None], "geometry": planes[None].astype(np.float32)})
+        _, instances = group_instances(out["drone"][0, 0] - np.float32(EAGER_LOGIT), out["offset"][0], scale=2)
+        return [tuple(float(x) for x in one.box) for one in instances]  # type: ignore[misc]
+
+    def _cut(self, kind: str, rig: Rig, image: Image, box: tuple[float, float, float, float]) -> None:
+        """``box`` in the patch's own pixels goes with it, and half of the pipeline's first crop in camera pixels."""
+        camera = rig.cameras["camera"].camera
+        left, top, right, bottom = box
+        corners = np.array([[left, top], [right, top], [left, bottom], [right, bottom]])
+        middle = np.clip((corners[0] + corners[3]) / 2, 1.0, np.array(camera.size) - 1.0)
+        rays = camera.rays(np.vstack([corners, middle]))
+        reach = float(np.arccos(np.clip(rays[:4] @ rays[4], -1, 1)).max())
+        half_angle = float(np.clip(FIRST_MARGIN * reach, math.radians(0.5), math.radians(35)))
+        wide = math.atan(PATCH_REACH * math.tan(half_angle))
+        crop = virtual_crop(rig, R_BODY_CAMERA @ rays[4], wide, PATCH_PX)
+        patch, _ = crop.sample({"camera": image})
+        seen = crop.camera.project(rays[:4] @ R_BODY_CAMERA.T @ crop.T_body_virtual.rotation)
+        self._rows[kind].append(
+            {
+                "patch": patch,
+                "half_px": camera.focal_px * math.tan(half_angle),
+                "box": (*seen.min(0), *seen.max(0)),
+            }
+        )
+
+
+def main() -> None:
+    """One file a source."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--pictures", type=Path)
+    parser.add_argument("--skydrones", type=Path)
+    parser.add_argument("--split", choices=("training", "validation"), default="training", help="of the clips")
+    parser.add_argument("--model", type=Path, required=True, help="manifest of a neighbours network")
+    parser.add_argument("--most", type=int, default=100_000, help="pictures of one source")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    model = OnnxModel(arguments.model, threads=1)
+    if arguments.skydrones:
+        _mine_clips(arguments.skydrones, arguments.split, model, arguments.out)
+    for folder in sorted(arguments.pictures.iterdir()) if arguments.pictures else []:
+        target = arguments.out / f"{folder.name}.npz"
+        if target.is_file():
+            continue
+        paths = sorted(p for p in folder.rglob("*") if p.suffix.lower() in ENDINGS)
+        step = max(1, math.ceil(len(paths) / arguments.most))
+        miner = Miner(model)
+        for path in paths[::step]:
+            image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+            if image is not None:
+                miner.add(np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8), [])
+        _finish(miner, target)
+
+
+def _mine_clips(folder: Path, split: str, model: OnnxModel, out: Path) -> None:
+    by_clip: dict[str, list[dict[str, Any]]] = {}
+    for label in json.loads((folder / "labels.json").read_text(encoding="utf-8")):
+        block = (int(Path(label["clip"]).stem.split("_")[-1]) - 1) // 10
+        if (block in VALIDATION_BLOCKS) == (split == "validation"):
+            by_clip.setdefault(label["clip"], []).append(label)
+    miners = {"skydrones": Miner(model), "skyothers": Miner(model)}
+    for clip, labels in sorted(by_clip.items()):
+        capture = cv2.VideoCapture(str(folder / "clips" / clip))
+        count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        has_drone = labels[0]["object"] == "drone"
+        boxes = {label["frame"]: label["box"] for label in labels if label["box"]}
+        wanted = boxes if has_drone else set(np.linspace(2, max(count - 3, 2), FRAMES_A_CLIP).astype(int).tolist())
+        for number in range(count):
+            if not capture.grab():
+                break
+            if number in wanted:
+                _, image = capture.retrieve()
+                drones = [tuple(boxes[number])] if has_drone else []
+                rgb = np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
+                miners["skydrones" if has_drone else "skyothers"].add(rgb, drones, places=1)
+    for name, miner in miners.items():
+        _finish(miner, out / f"{name}.npz")
+
+
+def _finish(miner: Miner, path: Path) -> None:
+    miner.save(path)
+    print(
+        f"{path}: {miner.pictures} pictures, {miner.proposals / max(miner.pictures, 1):.1f} proposals each", flush=True
+    )
+
+
+def _rig(width: int, height: int) -> Rig:
+    """A camera of 90 degrees, looking forward."""
+    matrix = np.array([[width / 2, 0.0, width / 2], [0.0, width / 2, height / 2], [0.0, 0.0, 1.0]])
+    camera = PinholeCamera(matrix, (width, height))
+    return Rig({"camera": RigCamera("camera", camera, RigidTransform(R_BODY_CAMERA, np.zeros(3)))})
+
+
+def _gap(a: tuple[float, ...], b: tuple[float, ...]) -> float:
+    """Pixels between two boxes; 0 where they touch."""
+    right, down = max(a[0] - b[2], b[0] - a[2], 0.0), max(a[1] - b[3], b[1] - a[3], 0.0)
+    return math.hypot(right, down)
+
+
+if __name__ == "__main__":
+    main()
