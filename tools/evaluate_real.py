@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -25,7 +26,7 @@ from rich.table import Table
 
 from flockd.config.perception import PerceptionConfig
 from flockd.data import data_path
-from flockd.perception import Perception
+from flockd.perception import OnnxNetworks
 from tools.evaluation.on_pictures import WIDTHS_PX, Box, Labelled, detect, summary
 
 Image = NDArray[np.uint8]
@@ -66,7 +67,7 @@ def main() -> None:
         depth=arguments.neighbours, segmentation=arguments.neighbours, distance=arguments.distance, flow="dis",
         threads=arguments.threads,
     )  # fmt: skip
-    perception = Perception(config, arguments.models)
+    networks = OnnxNetworks(config, arguments.models)
     results: dict[str, dict[str, object]] = {}
     written: dict[str, list[dict[str, object]]] = {}
     for name, pictures in sets.items():
@@ -78,7 +79,7 @@ def main() -> None:
             if scale != 1.0:
                 image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
             resized = tuple((scale * a, scale * b, scale * c, scale * d) for a, b, c, d in boxes)
-            measured.append(Labelled(detect(perception, image, arguments.fov), resized))
+            measured.append(Labelled(detect(networks, image, arguments.fov), resized))
         ms = 1e3 * (time.monotonic() - begin) / max(len(pictures), 1)
         results[name] = summary(measured) | {
             "ms_per_image": round(ms, 1),
@@ -107,7 +108,7 @@ def sky_pictures(folder: Path, *, is_validation: bool) -> dict[str, list[Picture
             continue
         boxes: tuple[Box, ...] = (tuple(box),) if kind == "drone" else ()
         clip, frame = folder / "clips" / label["clip"], int(label["frame"])
-        sets.setdefault(kind, []).append((f"{clip.stem}_{frame:04d}", lambda c=clip, f=frame: clips.frame(c, f), boxes))
+        sets.setdefault(kind, []).append((f"{clip.stem}_{frame:04d}", partial(clips.frame, clip, frame), boxes))
     return sets
 
 
@@ -115,7 +116,7 @@ def free_pictures(folder: Path) -> Iterator[Picture]:
     """Every picture in a folder and those below it, in which no drone is."""
     for path in sorted(folder.rglob("*")):
         if path.suffix.lower() in ENDINGS:
-            yield str(path.relative_to(folder)), lambda p=path: _picture(p), ()
+            yield str(path.relative_to(folder)), partial(_picture, path), ()
 
 
 def _picture(path: Path) -> Image:

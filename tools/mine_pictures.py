@@ -69,7 +69,7 @@ class Miner:
 
     def save(self, path: Path) -> None:
         """All that was collected."""
-        arrays = {}
+        arrays: dict[str, NDArray[Any]] = {}
         for kind, rows in self._rows.items():
             arrays[kind] = np.array([row["patch"] for row in rows], np.uint8).reshape(-1, PATCH_PX, PATCH_PX, 3)
             arrays[f"{kind}_half_px"] = np.array([row["half_px"] for row in rows], np.float32)

@@ -1,6 +1,6 @@
 """Make the three short recordings that the fast tests replay, and what is expected of them.
 
-    python tools/record_regressions.py [--out tests/replay] [--only references]
+    python -m tools.record_regressions [--out tests/replay] [--only references]
 
 - ``normal``: three drones on their way.
 - ``crossing``: five drones fly through one another's images, 1 to 4 m away.
@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -24,8 +23,6 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from flockd.cli import main as flockd
 from flockd.config import DroneConfig, ScenarioConfig, load_scenario

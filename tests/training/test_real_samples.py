@@ -21,7 +21,7 @@ def patches(folder: Path, kind: str, images: NDArray[np.uint8], half_px: float, 
         arrays[one] = mine
         arrays[f"{one}_half_px"] = np.full(len(mine), half_px, np.float32)
         arrays[f"{one}_box"] = np.tile(np.array(box, np.float32), (len(mine), 1))
-    np.savez(folder / f"{kind}.npz", allow_pickle=False, **arrays)  # type: ignore[arg-type]
+    np.savez(folder / f"{kind}.npz", allow_pickle=False, **arrays)
     return RealPatches(folder, kind)
 
 
@@ -76,9 +76,9 @@ def test_a_drone_is_cut_out_of_the_sky() -> None:
 
 def test_what_cannot_be_seen_hardly_counts() -> None:
     sample = rendered()
-    assert visibility(sample["picture"], sample["mask"], 0.3) == 1.0
+    assert visibility(sample["picture"].astype(np.uint8), sample["mask"].astype(np.uint8), 0.3) == 1.0
     hidden = rendered(grey=199)
-    assert visibility(hidden["picture"], hidden["mask"], 0.3) < 0.15
+    assert visibility(hidden["picture"].astype(np.uint8), hidden["mask"].astype(np.uint8), 0.3) < 0.15
     assert float(softened(hidden, np.random.default_rng(0))["exists_weight"]) < 0.3
     assert float(sharp(hidden)["exists_weight"]) == 1.0
 

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from flockd.config.perception import PerceptionConfig
 from flockd.geometry import PinholeCamera, Rig, RigCamera, RigidTransform
 from flockd.messages import Frame, FrameSet, VehicleState
-from flockd.perception import Perception
-from flockd.pilot.views import Observer
+from flockd.perception import Networks, Perception
+from flockd.perception.detection.detector import DetectionTrace
 
 WIDTHS_PX = (0, 6, 12, 30, 80)
 """Where the classes of box width begin; the last one is open."""
@@ -49,26 +50,26 @@ class Labelled:
     boxes: tuple[Box, ...] = ()
 
 
-def detect(perception: Perception, image_rgb: NDArray[np.uint8], fov_deg: float) -> PictureResult:
+def detect(networks: Networks, image_rgb: NDArray[np.uint8], fov_deg: float) -> PictureResult:
     """Single-frame detection on an image (h, w, 3), RGB, by the pipeline that flies.
 
-    Nothing is known of attitude, height or expected neighbours. The only place here that calls the pipeline.
+    Nothing is known of attitude, height or tracks. The only place here that calls the pipeline.
     """
     height, width = image_rgb.shape[:2]
     focal = width / 2 / np.tan(np.radians(fov_deg) / 2)
     matrix = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     mounted = RigCamera("camera", PinholeCamera(matrix, (width, height)), RigidTransform(_R_BODY_CAMERA, np.zeros(3)))
-    observer = Observer(Rig({"camera": mounted}), perception, height_fixes_scale=False)
+    perception = Perception(Rig({"camera": mounted}), networks, PerceptionConfig(scale="network"))
     frames = FrameSet(0.0, {"camera": Frame("camera", image_rgb, 0.0, 0)})
     vehicle = VehicleState(0.0, np.eye(3), 5.0)
-    maps, reasons = observer.scenes(frames, vehicle)
-    view = observer.view(frames, vehicle, maps, reasons)
+    trace = DetectionTrace()
+    observation = perception.observe(frames, vehicle, trace=trace)
     found = []
-    for detection in view.detections:
+    for detection in observation.detections:
         u, v = mounted.camera.project(detection.position[None] @ _R_BODY_CAMERA)[0]
-        range_m = float(np.linalg.norm(detection.position))
-        found.append(FoundDrone((float(u), float(v)), detection.drone_probability, range_m, detection.size_m))
-    return PictureResult(tuple(found), sum(len(scene.instances) for scene in maps.values()))
+        centre = float(u), float(v)
+        found.append(FoundDrone(centre, detection.drone_probability, detection.range_m, detection.size_m))
+    return PictureResult(tuple(found), sum(proposal.instance is not None for proposal in trace.proposals))
 
 
 def width_class(box: Box) -> str:

@@ -94,7 +94,8 @@ def repainted(picture: Image, rng: np.random.Generator) -> NDArray[np.float32]:
         values = 255 - (255 - values) * rng.uniform(0.15, 0.6)
     elif kind < 0.5:
         values = values * rng.uniform(0.25, 0.8)
-    return np.clip(values * np.exp(rng.normal(0, 0.1, 3)) + rng.normal(0, 8), 0, 255).astype(np.float32)
+    painted = np.clip(values * np.exp(rng.normal(0, 0.1, 3)) + rng.normal(0, 8), 0, 255)
+    return np.asarray(painted, np.float32)
 
 
 def negative(patch: Image, half_px: float, rng: np.random.Generator) -> Sample:
