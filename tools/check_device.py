@@ -4,8 +4,8 @@ sudo python tools/check_device.py                               # from nothing; 
 sudo python tools/check_device.py --cache /var/cache/flockd     # keeps what it built for the next time
 
 Needs Linux on x86-64 with qemu-system-x86, mmdebstrap and e2fsprogs, and no KVM: the processor is emulated. The machine
-runs Debian 12 with its own kernel and systemd; flockd is installed by the very lines of docs/real_drone.md, and its unit runs
-`flockd run` with the shipped networks. The autopilot is flockd's stand-in, and as an emulated processor is slow, the
+runs Debian 12 with its own kernel and systemd; flockd is installed by the lines of docs/real_drone.md, and its unit
+runs `flockd run` with the shipped networks. The autopilot is flockd's fake; as an emulated processor is slow, the
 pictures are small and the steps far apart. The machine's clock counts instructions, a nanosecond each: how busy this
 computer is changes how long the check takes, and nothing of what it measures.
 

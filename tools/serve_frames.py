@@ -3,7 +3,7 @@
     python -m tools.serve_frames config/px4_flight.yaml --drones 2 --speed-factor 0.25
 
 The poses are the true ones that PX4's simulated vehicle (SIH) sends to UDP port 19410 + N; vehicle N is published as
-drone N+1 at the endpoint that config/px4_sitl.yaml connects to. `flockd sim --autopilot px4` does all of this by itself.
+drone N+1 at the endpoint that config/px4_sitl.yaml connects to. `flockd sim --autopilot px4` does all of this itself.
 """
 
 from __future__ import annotations
