@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from types import TracebackType
+from typing import Self
 
 import zenoh
 
@@ -50,6 +52,24 @@ def open_session(
 def close_session(session: zenoh.Session) -> None:
     """Ends a session and all that was declared in it."""
     session.close()  # type: ignore[no-untyped-call]
+
+
+class SessionOwner:
+    """A context manager that ends its session."""
+
+    _session: zenoh.Session
+
+    def close(self) -> None:
+        """Ends the session; what is sent later is lost."""
+        close_session(self._session)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
 
 
 def _config(

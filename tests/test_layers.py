@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -50,8 +51,9 @@ MAY_IMPORT = {
     }
     | {"sources", "autopilot"},  # real daemons are fed frames and given autopilots
     "report": BASE | {"flocking", "flight_log"},
-    "view": BASE | {"geometry", "pilot", "recording"},
-    "daemon": BASE | {"inference", "perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"},
+    "view": BASE | {"geometry", "perception", "pilot", "recording"},
+    "daemon": BASE
+    | {"geometry", "inference", "perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"},
     "doctor": BASE | {"geometry", "inference", "perception", "pilot", "sources", "autopilot", "telemetry", "daemon"},
     "cli": BASE
     | {
@@ -164,8 +166,8 @@ WATCHER = PACKAGE / "telemetry" / "watcher.py"
 """Reads telemetry, for the commands that people run."""
 FLEET_STATUS = PACKAGE / "telemetry" / "fleet_status.py"
 """The table of `flockd status`."""
-ANSWERS = PACKAGE / "telemetry" / "publisher.py"
-"""Answers who asks; what it lets an operator ask says nothing of where another drone is."""
+REPLIES = PACKAGE / "telemetry" / "publisher.py"
+"""Replies to queries; what it lets an operator ask says nothing of where another drone is."""
 
 
 @pytest.mark.parametrize(
@@ -188,7 +190,7 @@ def test_no_drone_reads_telemetry_to_fly() -> None:
     assert not shared_memory.PREFIX.startswith(f"{PREFIX.split('/')[0]}/")
     readers = {
         "declare_subscriber": {FRAMES_OVER_ZENOH, WATCHER},
-        "declare_queryable": {ANSWERS},
+        "declare_queryable": {REPLIES},
         "declare_querier": set(),
     }
     for path in MODULES:
@@ -218,8 +220,8 @@ def test_reports_and_flight_logs_know_no_simulator() -> None:
         assert _folder(path) == "report" or "report" not in _imported_folders(path), path
 
 
-def test_no_drone_is_told_the_truth() -> None:
-    """A simulator records where everybody truly is, for those who look at recordings; a pilot gets its own senses."""
+def test_no_drone_gets_the_truth() -> None:
+    """A simulator records where everybody truly is, for those who examine recordings; a pilot gets its own senses."""
     from flockd.pilot import FlockPilot
 
     for path in MODULES:
@@ -234,3 +236,30 @@ def test_the_doctor_sees_of_the_daemon_what_everybody_sees() -> None:
     public = {"flockd.daemon", *(f"flockd.daemon.{name}" for name in flockd.daemon.__all__)}
     for path in (path for path in MODULES if _folder(path) == "doctor"):
         assert {name for name in _imports(path) if name.startswith("flockd.daemon")} <= public, path
+
+
+def test_inference_knows_no_drones() -> None:
+    """It runs ONNX files as their manifests say; what a network is for is perception's."""
+    assert {"perception", "geometry", "tracking", "pilot"}.isdisjoint(
+        folder for path in MODULES if _folder(path) == "inference" for folder in _imported_folders(path)
+    )
+
+
+def test_nothing_imports_the_commands() -> None:
+    """Library code does not live in cli; only the entry point of the package may call it."""
+    for path in MODULES:
+        if _folder(path) != "cli" and path != PACKAGE / "__main__.py":
+            assert "cli" not in _imported_folders(path), path
+
+
+FILES_OF_ONE_NAME = {
+    "__init__.py": "marks a package",
+    "errors.py": "the error types of its folder",
+    "rig.py": "the rig's section of the configuration, and the rig built from it",
+}
+"""Names that several files of the package may share, and why."""
+
+
+def test_no_two_files_have_one_name_and_different_meaning() -> None:
+    names = Counter(path.name for path in MODULES if _folder(path) != "cli")
+    assert {name for name, count in names.items() if count > 1} <= FILES_OF_ONE_NAME.keys()

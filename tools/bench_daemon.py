@@ -2,9 +2,9 @@
 
 python -m tools.bench_daemon [--seconds 20] [--recording DRONE.mcap] [--json]
 
-A real `flockd run` with the configuration of PX4 SITL, beside an autopilot stand-in in Hold: pictures of 640x480 from
+A real `flockd run` with the configuration of PX4 SITL, beside a fake autopilot in Hold: images of 640x480 from
 shared memory (a recording's, or plain ones without drones), 2 sets a second, and a recording; in the environment that
-systemd's unit gives it. Memory is what Linux calls resident; pages shared with who sends the pictures are told apart.
+systemd's unit gives it. Memory is what Linux calls resident; pages shared with who sends the images are counted apart.
 Exit code 1: ready after more than 3 s, or more than 350 MB.
 """
 
@@ -60,7 +60,7 @@ def measure(seconds: float, recording: Path | None) -> dict[str, float]:
     config = at(port, endpoint)
     with tempfile.TemporaryDirectory() as name, FakeAutopilot(port, height_m=2.5):
         folder = Path(name)
-        pictures = Pictures(config, endpoint, recording)
+        feed = CameraFeed(config, endpoint, recording)
         with Daemons(
             [config], folder=folder, recordings=folder, environment={**os.environ, **of_the_unit()}
         ) as daemons:
@@ -70,15 +70,15 @@ def measure(seconds: float, recording: Path | None) -> dict[str, float]:
             while not daemons.is_ready(0):
                 if program.ended is not None or time.monotonic() - begin > PATIENCE_S:
                     raise SystemExit(f"the daemon did not become ready: {program.last_output()}")
-                pictures.show()
+                feed.show()
             ready_s, cpu_s = time.monotonic() - begin, program.cpu_s()
             resident = {}
             until = time.monotonic() + seconds
             while time.monotonic() < until:
-                pictures.show()
+                feed.show()
                 resident = status_mb(program.process.pid)
             used = (program.cpu_s() - cpu_s) / seconds
-        pictures.close()
+        feed.close()
     return {
         "ready, s": ready_s,
         "resident at most, MB": resident["VmHWM"],
@@ -110,7 +110,7 @@ def of_the_unit() -> dict[str, str]:
     return dict(pair.split("=", 1) for pair in pairs.split())
 
 
-class Pictures:
+class CameraFeed:
     """Set after set of what the cameras see, each in its turn."""
 
     def __init__(self, config: DroneConfig, endpoint: str, recording: Path | None) -> None:
@@ -118,7 +118,7 @@ class Pictures:
         self._publisher = FramePublisher(listen=[endpoint])
         if recording is None:
             plain = {c.name: golden_image(c.size_px, i) for i, c in enumerate(config.rig.cameras)}
-            # The same picture again would be a frozen camera's.
+            # The same image again would be a frozen camera's.
             self._sets = [{name: np.roll(image, 2 * k, axis=1) for name, image in plain.items()} for k in range(SETS)]
         else:
             steps = islice(Recording(recording).steps(), SETS)

@@ -2,7 +2,7 @@
 
 python -m tools.bench_streamer [--seconds 20] [--json]
 
-A child process streams through MAVSDK to an autopilot stand-in in this one, first idle, then with the shipped networks
+A child process streams through MAVSDK to a fake autopilot in this one, first idle, then with the shipped networks
 and geometry running without a pause. The times are those at which the kernel handed the packets over. `timer` is a bare
 timer of the same period in a third process beside the busy one: how well this computer lets anybody keep time.
 Exit code 1: p99 above 60 ms, or a gap of 0.5 s.

@@ -6,7 +6,7 @@ sudo python tools/check_device.py --cache /var/cache/flockd     # keeps what it 
 Needs Linux on x86-64 with qemu-system-x86, mmdebstrap and e2fsprogs, and no KVM: the processor is emulated. The machine
 runs Debian 12 with its own kernel and systemd; flockd is installed by the lines of docs/real_drone.md, and its unit
 runs `flockd run` with the shipped networks. The autopilot is flockd's fake; as an emulated processor is slow, the
-pictures are small and the steps far apart. The machine's clock counts instructions, a nanosecond each: how busy this
+images are small and the steps far apart. The machine's clock counts instructions, a nanosecond each: how busy this
 computer is changes how long the check takes, and nothing of what it measures.
 
 Exit code 0, 1 a check failed, 69 something needed is not there.
@@ -47,7 +47,7 @@ SOURCES = (
 )
 """What the documentation's lines need of this folder."""
 PAGE, SECTION = ROOT / "docs" / "real_drone.md", "## Install it as a service"
-STAND_IN = "pymavlink>=2.4.40"
+FAKE_AUTOPILOT = "pymavlink>=2.4.40"
 COMPILE = "import flockd.autopilot.fake_autopilot"
 """What it needs of a dozen MAVLink dialects, and no more."""
 PYTHON = "3.11"
@@ -63,7 +63,7 @@ RequiresMountsFor=/mnt/check /mnt/findings
 [Service]
 Type=oneshot
 WorkingDirectory=/mnt/check
-Environment=PYTHONPATH=/opt/stand-in PYTHONDONTWRITEBYTECODE=1 PYTHONUNBUFFERED=1
+Environment=PYTHONPATH=/opt/fake-autopilot PYTHONDONTWRITEBYTECODE=1 PYTHONUNBUFFERED=1
 ExecStart=sh check.sh
 ExecStopPost=systemctl poweroff --no-block
 StandardOutput=journal+console
@@ -184,9 +184,9 @@ def _debian(system: Path) -> None:
 
 
 def _wheels(folder: Path) -> Path:
-    """What flockd and the stand-in need from the package index, for the machine's Python."""
+    """What flockd and the fake autopilot need from the package index, for the machine's Python."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    wanted = [*project["build-system"]["requires"], *project["project"]["dependencies"], STAND_IN]
+    wanted = [*project["build-system"]["requires"], *project["project"]["dependencies"], FAKE_AUTOPILOT]
     wheels = folder / f"wheels-{hashlib.sha256(' '.join(wanted).encode()).hexdigest()[:8]}"
     if wheels.exists():
         return wheels
@@ -201,7 +201,7 @@ def _wheels(folder: Path) -> Path:
 
 def _install(system: Path, wheels: Path, install: str) -> None:
     """Runs the documentation's lines in the machine's files, as on a drone, but for where pip finds its packages."""
-    for old in ("opt/flockd", "opt/stand-in", "etc/flockd", "root/flockd"):
+    for old in ("opt/flockd", "opt/fake-autopilot", "etc/flockd", "root/flockd"):
         shutil.rmtree(system / old, ignore_errors=True)
     source, shelf = system / "root/flockd", system / "root/wheels"
     source.mkdir()
@@ -218,8 +218,8 @@ def _install(system: Path, wheels: Path, install: str) -> None:
     (system / "etc/hostname").write_text("drone\n", encoding="utf-8")
     (system / "etc/hosts").write_text("127.0.0.1 localhost drone\n", encoding="utf-8")
     _inside(system, f"cd /{source.relative_to(system)}\n{install}")
-    stand_in = f"pip install --quiet --no-compile --target /opt/stand-in '{STAND_IN}'"
-    _inside(system, f"/opt/flockd/bin/{stand_in}\nPYTHONPATH=/opt/stand-in /opt/flockd/bin/python -c '{COMPILE}'")
+    install = f"pip install --quiet --no-compile --target /opt/fake-autopilot '{FAKE_AUTOPILOT}'"
+    _inside(system, f"/opt/flockd/bin/{install}\nPYTHONPATH=/opt/fake-autopilot /opt/flockd/bin/python -c '{COMPILE}'")
     shutil.copy(ROOT / "tools/device_check/drone.yaml", system / "etc/flockd/drone.yaml")
     (system / "etc/systemd/system/device-check.service").write_text(UNIT, encoding="utf-8")
     wanted = system / "etc/systemd/system/multi-user.target.wants/device-check.service"
@@ -290,11 +290,11 @@ def _row(line: dict[str, Any]) -> str:
 
 
 def _command(*command: str) -> None:
-    """Raises UnavailableError with the end of what a command that failed has told."""
+    """Raises UnavailableError with the end of what a command that failed has printed."""
     result = subprocess.run(command, capture_output=True, text=True, check=False, env=_environment())
     if result.returncode:
-        told = (result.stdout + result.stderr).strip().splitlines()[-3:]
-        raise UnavailableError(f"{Path(command[0]).name} failed ({'; '.join(told)})")
+        output = (result.stdout + result.stderr).strip().splitlines()[-3:]
+        raise UnavailableError(f"{Path(command[0]).name} failed ({'; '.join(output)})")
 
 
 def _environment() -> dict[str, str]:
@@ -302,7 +302,7 @@ def _environment() -> dict[str, str]:
 
 
 def _end(number: int, _frame: object) -> None:
-    """Told to end: takes the virtual machine with it."""
+    """On SIGTERM: takes the virtual machine with it."""
     sys.exit(128 + number)
 
 

@@ -91,11 +91,11 @@ class Row:
         return WANTED.get(self.name)
 
     def __str__(self) -> str:
-        told = f"{self.name:88s} {self.value:10.4g} {self.unit:3s} {self.count:8d}"
+        line = f"{self.name:88s} {self.value:10.4g} {self.unit:3s} {self.count:8d}"
         if self.wanted is None:
-            return told
+            return line
         low, high = self.wanted
-        return f"{told}   {'met   ' if low <= self.value <= high else 'missed'} {low:g} to {high:g}"
+        return f"{line}   {'met   ' if low <= self.value <= high else 'missed'} {low:g} to {high:g}"
 
 
 def main() -> None:
@@ -200,7 +200,7 @@ def rows_of_rigs(perception: Networks, count: int) -> Iterator[Row]:
 
 
 def rows_of_cost(perception: Networks, pairs: PairSet, threads: int) -> Iterator[Row]:
-    """Time of an image with up to four drones; the pictures of them are cut beforehand."""
+    """Time of an image with up to four drones; their crops are cut beforehand."""
     camera = rig_camera(WIDTH / 2)
     side = perception.second_stage.crop_size if perception.second_stage else 0
     times = []

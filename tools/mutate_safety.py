@@ -45,7 +45,7 @@ EQUIVALENT: dict[str, str] = {
     "policy.py Reaction: SILENCE = (7)": "only the order counts, and it is still the worst",
     "policy.py Barrier: LATCH = (3)": "only the order counts, and it is still the worst",
     'policy.py Barrier: WAIT = 2 """Not ready while it lasts.""" LATCH = 1': (
-        "the order counts for how reasons are told, and what latches is told first anyway"
+        "the order counts for how reasons are reported, and what latches is reported first anyway"
     ),
     "policy.py Rule: later: Reaction = Reaction.RETURN": "it never comes where no `after_s` is given: that is infinite",
     "supervisor.py _Flight: asked: Reaction = Reaction.DEGRADE": "whatever may be asked for is worse still",

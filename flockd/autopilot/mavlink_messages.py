@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from flockd.autopilot.status import AutopilotStatus, FlightMode, LandedState
+from flockd.autopilot.autopilot_status import AutopilotStatus, FlightMode, LandedState
 from flockd.messages import FloatArray, VehicleState
 
 Fields = Mapping[str, Any]

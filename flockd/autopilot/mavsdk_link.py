@@ -24,8 +24,8 @@ from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkDirectError, Mav
 from mavsdk.plugins.param import Param, ParamError
 from mavsdk.system import System
 
+from flockd.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware, FlightMode
 from flockd.autopilot.mavlink_messages import MODES, Fields, ReceivedMessages, result_text
-from flockd.autopilot.status import AutopilotError, AutopilotStatus, Firmware, FlightMode
 from flockd.config.autopilot import AutopilotParameters
 from flockd.messages import Setpoint, VehicleState
 

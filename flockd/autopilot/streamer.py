@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from flockd.autopilot.status import AutopilotError, AutopilotStatus
+from flockd.autopilot.autopilot_status import AutopilotError, AutopilotStatus
 from flockd.config.autopilot import AutopilotParameters
 from flockd.messages import Setpoint
 

@@ -89,13 +89,13 @@ class Attitudes:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """How a camera is turned, and when it took its pictures."""
+    """How a camera is turned, and when it took its images."""
 
     R_body_camera: FloatArray
     sigma_deg: float
     """Standard deviation about the body axis that is known worst: what noise alone leaves open."""
     time_offset_s: float
-    """Added to a picture's time, the autopilot's time of the same moment."""
+    """Added to an image's time, the autopilot's time of the same moment."""
     sigma_s: float
     rms_deg: float
     """Of what is left over of the turns, without outliers."""
@@ -191,7 +191,7 @@ def _check_known(found: Alignment, problem: _Turns, at_limit: bool, parameters: 
     if not found.sigma_s < parameters.max_sigma_s or at_limit:
         raise CalibrationError(
             f"the time offset is known to {1000 * found.sigma_s:.0f} ms only, as the drone turned too evenly or the "
-            "offset is larger than was looked for; turn it back and forth, or raise --max-offset"
+            "offset is larger than --max-offset; turn it back and forth, or raise --max-offset"
         )
 
 

@@ -21,7 +21,7 @@ _CENTRE_PX = 0.5
 _MAX_STEPS, _PRECISION_PX = 50, 0.002
 """Of the search for a corner's exact place."""
 _WINDOW, _WINDOWS_PX = 0.13, (2, 12)
-"""Half the side of what is looked at around a corner: in squares, so that no marker is in it, and its limits."""
+"""Half the side of the window around a corner: in squares, so that no marker is in it, and its limits."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class BoardSpec:
         """Inner corners of the chessboard: what is found in images."""
         return (self.columns - 1) * (self.rows - 1)
 
-    def picture(self, pixels_per_square: int) -> UInt8Array:
+    def image(self, pixels_per_square: int) -> UInt8Array:
         """(h, w) grey: the board without any margin."""
         size = (self.columns * pixels_per_square, self.rows * pixels_per_square)
         return np.asarray(_opencv_board(self).generateImage(size, marginSize=0, borderBits=1), np.uint8)
@@ -86,11 +86,11 @@ class BoardFinder:
         self._detector = cv2.aruco.CharucoDetector(self._board)
 
     def find(self, grey: UInt8Array) -> BoardDetection | None:
-        """The board in a (h, w) picture; None where fewer than `MIN_CORNERS` are seen, or all in one line."""
+        """The board in a (h, w) image; None where fewer than `MIN_CORNERS` are seen, or all in one line."""
         corners, ids, _, _ = self._detector.detectBoard(grey)
         if ids is None or len(ids) < MIN_CORNERS:
             return None
-        # The stubs want a list of pictures here, which would be wrong.
+        # The stubs want a list of images here, which would be wrong.
         points, pixels = self._board.matchImagePoints(corners, ids)  # type: ignore[call-overload]
         points = np.asarray(points, np.float64).reshape(-1, 3)
         if min(len(np.unique(points[:, 0].round(9))), len(np.unique(points[:, 1].round(9)))) < 2:

@@ -13,12 +13,12 @@ from flockd.messages import BoolArray, FloatArray, IntArray, UInt8Array
 
 COLUMNS, ROWS = 8, 6
 _DARK = 16
-"""Grey levels: a cell in which no picture ever shows more lies outside the lens's own picture."""
+"""Grey levels: a cell in which no image ever shows more lies outside the lens's own image."""
 _ENOUGH = 0.75
 _TILT_DEG, _TILTED = 15.0, 4
 """So many views have to be tilted this much: only they tell the focal length from the distance."""
 _NEAR = 0.3
-"""A board in at least one view as wide as this share of the picture."""
+"""A board in at least one view as wide as this share of the image."""
 _PLACES = (("top left", "top", "top right"), ("left", "middle", "right"), ("bottom left", "bottom", "bottom right"))
 
 
@@ -39,7 +39,7 @@ class Coverage:
         self._widest = max(self._widest, float(np.ptp(pixels, axis=0).max()) / max(self.size))
 
     def add_light(self, grey: UInt8Array) -> None:
-        """A (h, w) picture, with a board or without: where it is dark the lens may show nothing at all."""
+        """A (h, w) image, with a board or without: where it is dark the lens may show nothing at all."""
         cells = cv2.resize(grey, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA)
         self._brightest = np.maximum(self._brightest, cells)
 
@@ -71,10 +71,10 @@ class Coverage:
                 f"are tilted by more than {_TILT_DEG:.0f} degrees"
             )
         if self.share < _ENOUGH:
-            found.append(f"hold the board at the {self._emptiest()} of the picture: no corner was seen there")
+            found.append(f"hold the board at the {self._emptiest()} of the image: no corner was seen there")
         if self._widest < _NEAR:
             found.append(
-                f"hold the board nearer: at its largest it takes {100 * self._widest:.0f} % of the picture's length"
+                f"hold the board nearer: at its largest it takes {100 * self._widest:.0f} % of the image's length"
             )
         return tuple(found)
 
@@ -102,28 +102,28 @@ _WIDTH_PX = 960
 _BACKGROUND, _COVERED, _OUTSIDE = (24, 24, 30), (46, 66, 52), (0, 0, 0)
 _LINES, _DOT, _ARROW, _TEXT = (70, 70, 78), (120, 220, 255), (255, 120, 80), (235, 235, 235)
 _ARROW_SCALE = 50.0
-"""A residual of one pixel is drawn this long, in the picture's own pixels."""
+"""A residual of one pixel is drawn this long, in the image's own pixels."""
 
 
 def draw(coverage: Coverage, plot: Plot, title: str) -> UInt8Array:
-    """(h, w, 3) RGB picture: the cells with corners lighter, each corner a dot, its residual a line, 50 times."""
+    """(h, w, 3) RGB image: the cells with corners lighter, each corner a dot, its residual a line, 50 times."""
     width, height = coverage.size
     scale = _WIDTH_PX / width
-    picture = np.empty((round(height * scale), _WIDTH_PX, 3), np.uint8)
+    image = np.empty((round(height * scale), _WIDTH_PX, 3), np.uint8)
     for row in range(ROWS):
         for column in range(COLUMNS):
-            top, bottom = (round(edge * picture.shape[0] / ROWS) for edge in (row, row + 1))
+            top, bottom = (round(edge * image.shape[0] / ROWS) for edge in (row, row + 1))
             left, right = (round(edge * _WIDTH_PX / COLUMNS) for edge in (column, column + 1))
             covered, imaged = coverage.counts[row, column] > 0, coverage.imaged[row, column]
-            picture[top:bottom, left:right] = _COVERED if covered else _BACKGROUND if imaged else _OUTSIDE
-            cv2.rectangle(picture, (left, top), (right, bottom), _LINES, 1)
+            image[top:bottom, left:right] = _COVERED if covered else _BACKGROUND if imaged else _OUTSIDE
+            cv2.rectangle(image, (left, top), (right, bottom), _LINES, 1)
     for seen, residual in zip(plot.pixels, plot.residuals, strict=True):
         start, end = seen * scale, (seen + residual * _ARROW_SCALE) * scale
-        cv2.line(picture, _point(start), _point(end), _ARROW, 1, cv2.LINE_AA)
-        cv2.circle(picture, _point(start), 2, _DOT, -1, cv2.LINE_AA)
+        cv2.line(image, _point(start), _point(end), _ARROW, 1, cv2.LINE_AA)
+        cv2.circle(image, _point(start), 2, _DOT, -1, cv2.LINE_AA)
     bar = np.full((36, _WIDTH_PX, 3), _OUTSIDE, np.uint8)
     cv2.putText(bar, title, (10, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.55, _TEXT, 1, cv2.LINE_AA)
-    return np.concatenate([bar, picture])
+    return np.concatenate([bar, image])
 
 
 def _point(place: FloatArray) -> tuple[int, int]:

@@ -96,9 +96,9 @@ def calibrate_rig(
         if len(dropped) > _REJECTION.max_dropped * given:
             raise CalibrationError(
                 f"{len(dropped)} of {given} boards contradict the others; hold the board still, let every camera take "
-                "its picture at the same time, and check the cameras' intrinsics"
+                "its image at the same time, and check the cameras' intrinsics"
             )
-    return _told(names, problem, solution, reference, tuple(dropped))
+    return _result(names, problem, solution, reference, tuple(dropped))
 
 
 def _poses(cameras: Mapping[str, Camera], board: SharedBoard) -> dict[str, RigidTransform]:
@@ -202,7 +202,7 @@ class _RigProblem(Problem[_State]):
                 yield index, camera, residuals.ravel(), jacobian.reshape(-1, 12)
 
 
-def _told(
+def _result(
     names: Sequence[str],
     problem: _RigProblem,
     solution: Solution[_State],

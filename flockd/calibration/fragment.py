@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import Any
 
 import yaml
 
@@ -11,6 +13,11 @@ from flockd.calibration.intrinsics import Lens
 from flockd.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, MeasurementConfig, RigConfig
 from flockd.geometry import RigidTransform, build_rig, euler_from_rotation
 from flockd.messages import FloatArray
+
+
+def measured_today(**facts: Any) -> MeasurementConfig:
+    """What is known about numbers that were measured today; ``facts``: fields of MeasurementConfig but the date."""
+    return MeasurementConfig(date=datetime.now(UTC).date().isoformat(), **facts)
 
 
 def intrinsics_of(lens: Lens, measured: MeasurementConfig) -> IntrinsicsConfig:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,6 +14,7 @@ from pydantic import ValidationError
 from flockd.calibration.errors import CalibrationError
 from flockd.config import DroneConfig
 from flockd.datasets.image_files import SUFFIXES, read_image
+from flockd.datasets.video import opened_video
 from flockd.errors import UnavailableError, UsageError
 from flockd.messages import UInt8Array, VehicleState
 from flockd.recording.reader import Recording
@@ -80,13 +79,13 @@ def from_folders(path: Path, cameras: Sequence[str]) -> ImageStream:
 
 def from_video(path: Path, camera: str, every: int) -> ImageStream:
     """Every ``every``-th frame of a video. Raises CalibrationError for one that cannot be decoded."""
-    with _video(path) as video:
+    with opened_video(path) as video:
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         if not video.isOpened() or not video.read()[0]:
             raise CalibrationError(f"{path}: is no video that can be decoded; restore it, or convert it to MP4")
 
     def sets() -> Iterator[ImageSet]:
-        with _video(path) as video:
+        with opened_video(path) as video:
             index = 0
             while video.grab():
                 if index % every == 0:
@@ -96,9 +95,7 @@ def from_video(path: Path, camera: str, every: int) -> ImageStream:
                         yield ImageSet(f"frame {index}", {camera: rgb})
                 index += 1
 
-    return ImageStream(
-        sets(), -(-count // every), live=False, identities={camera: f"not known (filmed in {path.name})"}
-    )
+    return ImageStream(sets(), -(-count // every), live=False, identities={camera: f"not known (video {path.name})"})
 
 
 def from_recording(recording: Recording, every: int) -> tuple[ImageStream, DroneConfig]:
@@ -165,6 +162,15 @@ def device_config(device: str, camera: str, size: tuple[int, int], pixel_format:
         raise UsageError(f"{device}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
+def with_one_camera(config: DroneConfig, name: str) -> DroneConfig:
+    """The same drone with one camera."""
+    rig = config.rig.model_copy(update={"cameras": tuple(one for one in config.rig.cameras if one.name == name)})
+    source = config.source
+    if source is not None and source.cameras:
+        source = source.model_copy(update={"cameras": tuple(one for one in source.cameras if one.name == name)})
+    return config.model_copy(update={"rig": rig, "source": source})
+
+
 def _frames(source: FrameSource, seconds: float, enough: Callable[[], bool]) -> Iterator[ImageSet]:
     source.start()
     began_s, seen = time.monotonic(), False
@@ -186,21 +192,6 @@ def _frames(source: FrameSource, seconds: float, enough: Callable[[], bool]) -> 
 
 def _images(folder: Path) -> list[Path]:
     return sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
-
-
-@contextmanager
-def _video(path: Path) -> Iterator[cv2.VideoCapture]:
-    """Unrotated, whatever orientation the file asks for; closed at the end."""
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # our own sentence says what is wrong with a file
-    logging = cv2.utils.logging
-    before = logging.setLogLevel(logging.LOG_LEVEL_SILENT)
-    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    logging.setLogLevel(before)
-    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-    try:
-        yield video
-    finally:
-        video.release()
 
 
 def _known(config: DroneConfig, camera: str) -> str | None:

@@ -24,13 +24,13 @@ _FIRST_FOCALS = {
     "pinhole": np.geomspace(0.3, 4.0, 9),
     "wide_angle": 1.0 / np.radians(np.linspace(60.0, 240.0, 9)),
 }
-"""Focal lengths to begin with, in widths of the picture."""
+"""Focal lengths to begin with, in widths of the image."""
 _REJECTION = OutlierRejection(margin_px=0.1)
 _COEFFICIENT_STEP = 1e-6
 _FOCAL_SIGMA = 0.01
 """A focal length that the views leave more uncertain than this is not known."""
 _CENTRE_SIGMA = 0.01
-"""The same for the principal point, in widths of the picture."""
+"""The same for the principal point, in widths of the image."""
 _LEAST_TILT_DEG = 10.0
 
 
@@ -70,12 +70,12 @@ class Lens:
 
     @property
     def tilts_deg(self) -> tuple[float, ...]:
-        """How far the board's plane was turned away from the picture's, in each view."""
+        """How far the board's plane was turned away from the image's, in each view."""
         return tuple(tilt_deg(pose) for pose in self.poses)
 
     @property
     def reaches_corners(self) -> bool:
-        """Whether the lens, as fitted, says for the whole picture where it looks."""
+        """Whether the fitted lens gives a ray for every pixel of the image."""
         width, height = self.camera.size
         edges = np.array([(u, v) for u in (0.0, width / 2, width) for v in (0.0, height / 2, height)])
         return bool(np.isfinite(self.camera.rays(edges)).all())
@@ -127,7 +127,7 @@ def calibrate(views: Sequence[View], size: tuple[int, int], model: LensModel) ->
 
 
 def tilt_deg(pose: RigidTransform) -> float:
-    """How far the board's plane is turned away from the picture's, 0 to 90."""
+    """How far the board's plane is turned away from the image's, 0 to 90."""
     return math.degrees(math.acos(min(abs(float(pose.rotation[2, 2])), 1.0)))
 
 
@@ -146,14 +146,14 @@ def _check_known(lens: Lens) -> None:
     known = focal < _FOCAL_SIGMA and centre < _CENTRE_SIGMA
     if tilted < _LEAST_TILT_DEG:
         raise CalibrationError(
-            f"the board was tilted by {tilted:.0f} degrees at most, so that the focal length cannot be told from the "
-            "distance; show it tilted by 30 to 45 degrees to each side, up and down, and all over the picture"
+            f"the board was tilted by {tilted:.0f} degrees at most, so that the focal length cannot be separated from "
+            "the distance; show it tilted by 30 to 45 degrees to each side, up and down, and all over the image"
         )
     if not known:
         raise CalibrationError(
             f"the views leave the focal length uncertain by {100 * focal:.2g} % and the principal point by "
             f"{100 * centre:.2g} % of the width, with a residual of {lens.rms_px:.2f} px; show the board tilted, and "
-            "all over the picture, or choose another model"
+            "all over the image, or choose another model"
         )
 
 

@@ -31,11 +31,11 @@ def board_file(spec: BoardSpec, suffix: str) -> bytes:
     pixels_per_square = round(spec.square_m * 1000.0 * _PIXELS_PER_MM)
     if not 8 <= pixels_per_square <= _LARGEST_PIXELS // max(spec.columns, spec.rows):
         raise CalibrationError(f"squares of {spec.square_m * 1000:g} mm cannot be printed; choose another size")
-    picture = spec.picture(pixels_per_square)
+    image = spec.image(pixels_per_square)
     if suffix.lower() == ".png":
-        return _png(picture, pixels_per_square / spec.square_m)
+        return _png(image, pixels_per_square / spec.square_m)
     if suffix.lower() == ".pdf":
-        return _pdf(spec, picture)
+        return _pdf(spec, image)
     raise CalibrationError(f"a board is written as .png or .pdf, not as {suffix or 'a file without a suffix'}")
 
 
@@ -54,16 +54,16 @@ def _page(spec: BoardSpec) -> tuple[str, tuple[float, float]]:
     return "", (width + 2 * _MARGIN_MM, height + 2 * _MARGIN_MM)
 
 
-def _png(picture: UInt8Array, pixels_per_m: float) -> bytes:
-    data = bytes(cv2.imencode(".png", picture)[1])
+def _png(image: UInt8Array, pixels_per_m: float) -> bytes:
+    data = bytes(cv2.imencode(".png", image)[1])
     after_header = 33  # signature 8, IHDR 25: where pHYs has to stand, before the image data
     body = b"pHYs" + struct.pack(">IIB", round(pixels_per_m), round(pixels_per_m), 1)
     chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
     return data[:after_header] + chunk + data[after_header:]
 
 
-def _pdf(spec: BoardSpec, picture: UInt8Array) -> bytes:
-    """One page (ISO 32000-1): the picture, what it is, and a line to check the printer with."""
+def _pdf(spec: BoardSpec, image: UInt8Array) -> bytes:
+    """One page (ISO 32000-1): the image, what it is, and a line to check the printer with."""
     page_width, page_height = (side * _POINTS_PER_MM for side in _page(spec)[1])
     width, height = (1000.0 * spec.square_m * squares * _POINTS_PER_MM for squares in (spec.columns, spec.rows))
     left, bottom = (page_width - width) / 2, (page_height - height) / 2
@@ -85,9 +85,9 @@ def _pdf(spec: BoardSpec, picture: UInt8Array) -> bytes:
         ">>".encode("ascii"),
         _stream("", content),
         _stream(
-            f"/Type /XObject /Subtype /Image /Width {picture.shape[1]} /Height {picture.shape[0]} "
+            f"/Type /XObject /Subtype /Image /Width {image.shape[1]} /Height {image.shape[0]} "
             "/ColorSpace /DeviceGray /BitsPerComponent 8 ",
-            picture.tobytes(),
+            image.tobytes(),
         ),
     )
     data, places = b"%PDF-1.4\n", []

@@ -33,7 +33,7 @@ def first_poses(camera: Camera, seen: BoardDetection) -> list[RigidTransform]:
     usable = np.isfinite(rays).all(axis=1)
     if not usable.any():
         return []
-    # Through a pinhole that looks straight at the board: so a lens may see the board beside or behind itself.
+    # Through a pinhole whose axis points straight at the board: so a lens may see the board beside or behind itself.
     R_virtual_camera = _turn_to_axis(rays[usable].mean(axis=0))
     turned = rays @ R_virtual_camera.T
     usable &= turned[:, 2] > _NEAREST_ANGLE

@@ -1,4 +1,4 @@
-"""Chooses from pictures that several cameras took together those in which a board is seen by two or more."""
+"""Chooses from images that several cameras took together those in which a board is seen by two or more."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flockd.messages import UInt8Array
 
 
 class SharedCollector:
-    """Takes sets of pictures one after the other."""
+    """Takes sets of images one after the other."""
 
     def __init__(self, finder: BoardFinder) -> None:
         self._finder = finder
@@ -21,7 +21,7 @@ class SharedCollector:
         self.boards: list[SharedBoard] = []
 
     def offer(self, name: str, greys: Mapping[str, UInt8Array], *, moving: bool) -> None:
-        """Takes the (h, w) pictures of one time. ``moving``: sets follow each other so fast that motion shows."""
+        """Takes the (h, w) images of one time. ``moving``: sets follow each other so fast that motion shows."""
         found = {camera: (self._finder.find(grey), grey) for camera, grey in greys.items()}
         seen = {
             camera: (board, grey.shape[1])

@@ -19,7 +19,7 @@ _ALONG = np.linspace(-0.2, 0.2, 7)
 def edge_width_px(grey: UInt8Array, seen: BoardDetection, spec: BoardSpec) -> float:
     """Pixels over which black becomes white, in the direction in which the view is blurred more.
 
-    Of a perfectly sharp picture it is between 1 and 2; of one blurred with a deviation of s pixels about 2.5 s. NaN
+    Of a perfectly sharp image it is between 1 and 2; of one blurred with a deviation of s pixels about 2.5 s. NaN
     where the board is too small to tell.
     """
     place = {int(number): index for index, number in enumerate(seen.ids)}

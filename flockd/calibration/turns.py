@@ -1,4 +1,4 @@
-"""How far a camera turned between two pictures of whatever lay before it."""
+"""How far a camera turned between two images of whatever lay before it."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ DEFAULTS = TurnParameters()
 
 @dataclass(frozen=True, eq=False)
 class Turn:
-    """The camera at the second picture, in its own axes at the first."""
+    """The camera at the second image, in its own axes at the first."""
 
     rotation: FloatArray
     """(3, 3) ``x_first = rotation @ x_second``"""
@@ -64,7 +64,7 @@ class Turn:
 
 @dataclass(frozen=True, eq=False)
 class CameraTurn:
-    """How a camera turned from one of its pictures to the next."""
+    """How a camera turned from one of its images to the next."""
 
     start_s: float
     end_s: float
@@ -73,10 +73,10 @@ class CameraTurn:
 
 
 class Follower:
-    """Takes one camera's pictures one after the other, and keeps how it turned meanwhile."""
+    """Takes one camera's images one after the other, and keeps how it turned meanwhile."""
 
     def __init__(self, camera: Camera, R_body_camera: FloatArray, parameters: TurnParameters = DEFAULTS) -> None:
-        """``R_body_camera`` (3, 3): about how it is mounted, as a guess where to look after a large turn."""
+        """``R_body_camera`` (3, 3): about how it is mounted, as a first guess after a large turn."""
         self._camera, self._R_body_camera, self._parameters = camera, R_body_camera, parameters
         self._before: tuple[float, UInt8Array, FloatArray] | None = None
         self.turns: list[CameraTurn] = []
@@ -84,7 +84,7 @@ class Follower:
         """How often there was no turn, by reason."""
 
     def add(self, time_s: float, grey: UInt8Array, R_ned_body: FloatArray) -> None:
-        """The next (h, w) picture, and about the attitude (3, 3) it was taken in."""
+        """The next (h, w) image, and about the attitude (3, 3) it was taken in."""
         before, self._before = self._before, (time_s, grey, R_ned_body)
         if before is None or not 0.0 < time_s - before[0] < self._parameters.max_interval_s:
             return
@@ -103,15 +103,15 @@ def turn_between(
     guesses: Sequence[FloatArray],
     parameters: TurnParameters = DEFAULTS,
 ) -> Turn | str:
-    """The turn from one (h, w) grey picture to the next, or the reason why there is none.
+    """The turn from one (h, w) grey image to the next, or the reason why there is none.
 
-    ``guesses`` (3, 3) say about where to look for what was in the first picture; the best is taken.
+    ``guesses`` (3, 3) are rough turns to start from; the best is taken.
     """
     corners = cv2.goodFeaturesToTrack(
         first, parameters.max_points, parameters.quality, parameters.min_distance * camera.size[0]
     )
     if corners is None or len(corners) < parameters.min_points:
-        return "too few details in the picture"
+        return "too few details in the image"
     start = np.asarray(corners, np.float32).reshape(-1, 2)
     best: tuple[Float32Array, BoolArray] | None = None
     for guess in guesses:
@@ -119,7 +119,7 @@ def turn_between(
         if best is None or found[1].sum() > best[1].sum():
             best = found
     if best is None or best[1].sum() < parameters.min_points:
-        return "the picture could not be followed"
+        return "the image could not be followed"
     end, kept = best
     # OpenCV has pixel centres at whole numbers.
     before, after = (camera.rays(points[kept].astype(np.float64) + 0.5) for points in (start, end))

@@ -1,4 +1,4 @@
-"""Chooses from many pictures of a board those that calibrate a camera, and says why it refuses the others."""
+"""Chooses from many images of a board those that calibrate a camera, and says why it refuses the others."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from flockd.messages import FloatArray, UInt8Array
 
 Refusal = Literal["no board", "blurred", "moving", "like another"]
 _SHARP_PX, _SHARP_SHARE = 4.0, 0.003
-"""Widest edge of a sharp view: so many pixels, or this share of a large picture's width."""
+"""Widest edge of a sharp view: so many pixels, or this share of a large image's width."""
 _ALIKE = 0.03
-"""Two views whose corners are this much of the picture's width apart, on average, say the same."""
+"""Two views whose corners are this much of the image's width apart, on average, say the same."""
 _STILL = 0.003
 """The same, of a board that is held still from one frame to the next."""
 _SAME = 0.6
@@ -30,7 +30,7 @@ _SAME = 0.6
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One picture of the board."""
+    """One image of the board."""
 
     name: str
     """Of the file, or the frame's number or time."""
@@ -41,7 +41,7 @@ class View:
 
 @dataclass(frozen=True)
 class Refused:
-    """A picture that is not used."""
+    """An image that is not used."""
 
     name: str
     why: Refusal
@@ -50,7 +50,7 @@ class Refused:
 
 
 class Collector:
-    """Takes pictures of one camera one after the other. All are of one size: another is a CalibrationError."""
+    """Takes images of one camera one after the other. All are of one size: another is a CalibrationError."""
 
     def __init__(self, finder: BoardFinder, most: int, max_edge_px: float | None = None) -> None:
         """Keeps at most ``most`` views: beyond that, of two that are alike one goes."""
@@ -58,15 +58,15 @@ class Collector:
         self._first = ""
         self._before: BoardDetection | None = None
         self.size: tuple[int, int] | None = None
-        """Width, height; None before the first picture."""
+        """Width, height; None before the first image."""
         self.views: list[View] = []
         self.refused: list[Refused] = []
         self.coverage: Coverage | None = None
 
     def offer(self, name: str, image: UInt8Array, *, moving: bool = False) -> Refusal | None:
-        """Takes a (h, w, 3) RGB picture; gives what it is refused for, None for one that is now a view.
+        """Takes a (h, w, 3) RGB image; gives what it is refused for, None for one that is now a view.
 
-        ``moving``: pictures follow each other so fast that a board in motion shows between them.
+        ``moving``: images follow each other so fast that a board in motion shows between them.
         """
         self._check_size(name, (image.shape[1], image.shape[0]))
         assert self.coverage is not None
@@ -104,7 +104,7 @@ class Collector:
         elif size != self.size:
             raise CalibrationError(
                 f"{name}: is {size[0]} x {size[1]} pixels and {self._first} is {self.size[0]} x {self.size[1]}; "
-                "calibrate with pictures of one size only"
+                "calibrate with images of one size only"
             )
 
     def _refuse(self, refused: Refused) -> Refusal:
@@ -121,12 +121,12 @@ class Collector:
 
 
 def sharp_px(width: int) -> float:
-    """The widest edge of a sharp view in a picture of this width."""
+    """The widest edge of a sharp view in an image of this width."""
     return max(_SHARP_PX, _SHARP_SHARE * width)
 
 
 def is_still(before: BoardDetection, now: BoardDetection, width: int) -> bool:
-    """Whether a board was held still from one frame to the next, in pictures of this width."""
+    """Whether a board was held still from one frame to the next, in images of this width."""
     return _apart(before, now, width) < _STILL
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -14,7 +13,6 @@ from flockd.cli.calibrate_options import (
     add_shared,
     board_of,
     ended_by_ctrl_c,
-    measurement,
     pair,
     refuse_overwriting,
     source_name,
@@ -28,16 +26,12 @@ from flockd.errors import ExitCode, UsageError
 if TYPE_CHECKING:
     from flockd.calibration.board import BoardSpec
     from flockd.calibration.image_sources import ImageStream
-    from flockd.calibration.intrinsics import Lens
     from flockd.calibration.views import Collector
     from flockd.config import DroneConfig
-    from flockd.config.rig import MeasurementConfig
 
 MOST_VIEWS = 60
-ENOUGH_VIEWS, ENOUGH_SHARE = 20, 0.9
-"""A live camera is looked through until there are so many views, which cover this share of the picture."""
 NAMED = 6
-"""How many of the refused pictures are named one by one."""
+"""How many of the refused images are named one by one."""
 
 
 def add(commands: Commands) -> None:
@@ -76,23 +70,27 @@ def _camera(args: argparse.Namespace) -> int:
     if args.print_board is not None:
         return _print_board(args, board)
     from flockd.calibration.board import BoardFinder
+    from flockd.calibration.fragment import measured_today
+    from flockd.calibration.lens_session import CalibratedLens, collect_views, fit_lenses, is_enough
     from flockd.calibration.views import Collector
 
     collector = Collector(BoardFinder(board), args.views, args.max_blur)
-    name, images = _images(args, lambda: _is_enough(collector))
+    name, images = _images(args, lambda: is_enough(collector))
     out = args.out or Path(f"{name}.yaml")
     refuse_overwriting(args, out, args.picture)
-    _collect(images, name, collector)
-    lenses = _lenses(args, collector)
+    with progress("detecting the board", "images") as on_image, ended_by_ctrl_c(images.live):
+        collect_views(images, name, collector, on_image, complain)
+    lenses = fit_lenses(collector, args.model, source_name(args))
     lens = min(lenses, key=lambda one: one.rms_px)
-    measured = measurement(
+    measured = measured_today(
         camera=args.serial or images.identities[name],
         source=source_name(args),
         views=len(lens.views),
         residual_px=round(lens.rms_px, 4),
     )
-    _write_lens(args, out, name, collector, lens, measured)
-    result = _lens_result(collector, lens, lenses, name, out, measured)
+    calibrated = CalibratedLens(name, collector, lens, lenses, measured)
+    calibrated.write(out, args.picture)
+    result = calibrated.as_json(out)
     if args.json:
         say_json(result)
     else:
@@ -134,7 +132,9 @@ def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, 
         if config is None:
             raise UsageError("no SOURCE was given; name images, a recording or a device, or --config for its camera")
         name = _name_in(config, args, str(args.config))
-        return name, image_sources.from_cameras(_only(config, name), str(args.config), args.seconds, enough)
+        return name, image_sources.from_cameras(
+            image_sources.with_one_camera(config, name), str(args.config), args.seconds, enough
+        )
     if path.suffix.lower() == ".mcap":
         found, recorded = image_sources.from_recording(opened(path), args.every)
         return _name_in(recorded, args, str(path)), found
@@ -159,136 +159,6 @@ def _name_in(config: DroneConfig, args: argparse.Namespace, where: str) -> str:
         said = "has several cameras" if name is None else f"has no camera {name!r}"
         raise UsageError(f"{where}: {said}; choose with --camera from {', '.join(names)}")
     return name
-
-
-def _only(config: DroneConfig, name: str) -> DroneConfig:
-    """The same drone with one camera."""
-    rig = config.rig.model_copy(update={"cameras": tuple(one for one in config.rig.cameras if one.name == name)})
-    source = config.source
-    if source is not None and source.cameras:
-        source = source.model_copy(update={"cameras": tuple(one for one in source.cameras if one.name == name)})
-    return config.model_copy(update={"rig": rig, "source": source})
-
-
-def _collect(images: ImageStream, name: str, collector: Collector) -> None:
-    """Shows the collector everything; live, a person is told what to do next, and may end it with Ctrl-C."""
-    told = ""
-    with progress("detecting the board", "images") as tell, ended_by_ctrl_c(images.live):
-        for number, one in enumerate(images.sets, start=1):
-            if name in one.images:
-                collector.offer(one.name, one.images[name], moving=images.live)
-            tell(number, images.count or number)
-            if images.live and (said := _next_step(collector)) != told:
-                complain(said)
-                told = said
-
-
-def _next_step(collector: Collector) -> str:
-    """For a person who holds a board before a live camera."""
-    assert collector.coverage is not None
-    assert collector.size is not None
-    from flockd.calibration.intrinsics import rough_tilts_deg
-
-    head = f"{len(collector.views)} views, {100 * collector.coverage.share:.0f} % covered"
-    if not collector.views:
-        return f"{head}: hold the board before the camera, and hold it still"
-    advice = collector.coverage.advice(rough_tilts_deg(collector.views, collector.size, "wide_angle"))
-    return f"{head}: {advice[0] if advice else 'go on, or end it with Ctrl-C'}"
-
-
-def _is_enough(collector: Collector) -> bool:
-    if len(collector.views) < ENOUGH_VIEWS or collector.coverage is None or collector.size is None:
-        return False
-    from flockd.calibration.intrinsics import rough_tilts_deg
-
-    tilts = rough_tilts_deg(collector.views, collector.size, "wide_angle")
-    return collector.coverage.share >= ENOUGH_SHARE and not collector.coverage.advice(tilts)
-
-
-def _lenses(args: argparse.Namespace, collector: Collector) -> list[Lens]:
-    """Of the model that was asked for, or of both as far as they fit."""
-    from flockd.calibration.errors import CalibrationError
-    from flockd.calibration.intrinsics import calibrate
-
-    counts = collector.counts()
-    if collector.size is None:
-        raise CalibrationError(f"{source_name(args)}: holds no image of the camera; name another source")
-    if not collector.views:
-        why = ", ".join(f"{count} {reason}" for reason, count in counts.items())
-        raise CalibrationError(
-            f"{source_name(args)}: the board is in none of the {sum(counts.values())} images ({why}); check "
-            "--squares and --dictionary, and that it fills a good part of the image"
-        )
-    found, faults = [], []
-    for model in (args.model,) if args.model else LENS_MODELS:
-        try:
-            found.append(calibrate(collector.views, collector.size, model))
-        except CalibrationError as error:
-            faults.append(error)
-    if not found:
-        raise CalibrationError(f"{source_name(args)}: {faults[0]}")
-    return found
-
-
-def _write_lens(
-    args: argparse.Namespace, out: Path, name: str, collector: Collector, lens: Lens, measured: MeasurementConfig
-) -> None:
-    import cv2
-    import numpy as np
-
-    from flockd.calibration.coverage import Plot, draw
-    from flockd.calibration.fragment import intrinsics_of, rig_text
-    from flockd.calibration.views import all_pixels
-    from flockd.config.rig import CameraConfig
-    from flockd.recording.editing import written_whole
-
-    assert collector.coverage is not None
-    camera = CameraConfig(name=name, size_px=lens.camera.size, intrinsics=intrinsics_of(lens, measured))
-    comment = (
-        f"The lens of camera {name}, written by `flockd calibrate camera`. Copy `intrinsics` to the camera of this",
-        "name in your drone's file, then run `flockd config check` on that; this file too is a drone with one camera.",
-    )
-    with written_whole(out) as draft:
-        draft.write_text(rig_text((camera,), comment), encoding="utf-8")
-    if args.picture is not None:
-        residuals = np.concatenate(lens.residuals())
-        title = f"{name}: {100 * collector.coverage.share:.0f} % covered, rms {lens.rms_px:.3f} px (lines: x 50)"
-        picture = draw(collector.coverage, Plot(all_pixels(lens.views), residuals), title)
-        with written_whole(args.picture) as draft:
-            draft.write_bytes(bytes(cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1]))
-
-
-def _lens_result(
-    collector: Collector, lens: Lens, lenses: Sequence[Lens], name: str, out: Path, measured: MeasurementConfig
-) -> dict[str, Any]:
-    from flockd.calibration.fragment import intrinsics_of
-
-    assert collector.coverage is not None
-    rms = lens.rms_of_views_px
-    advice = list(collector.coverage.advice(lens.tilts_deg))
-    if not lens.reaches_corners:
-        advice.append("show the board in the corners of the image: the fitted lens does not reach them")
-    sigma = {key: float(value) for key, value in zip(("fx", "fy", "cx", "cy"), lens.sigma, strict=False)}
-    return {
-        "camera": name,
-        "size_px": list(lens.camera.size),
-        "intrinsics": intrinsics_of(lens, measured).model_dump(mode="json"),
-        "sigma_px": sigma,
-        "field_of_view_deg": [angle if math.isfinite(angle) else None for angle in lens.field_of_view_deg],
-        "residual_px": {"rms": lens.rms_px, "max": lens.max_px, "views": dict(zip(_names(lens), rms, strict=True))},
-        "models": {one.model: {"rms_px": one.rms_px} for one in lenses},
-        "coverage": collector.coverage.share,
-        "views": len(lens.views),
-        "refused": collector.counts(),
-        "blurred": {one.name: one.edge_px for one in collector.refused if one.why == "blurred"},
-        "dropped": {view.name: value for view, value in lens.dropped},
-        "advice": advice,
-        "out": str(out),
-    }
-
-
-def _names(lens: Lens) -> list[str]:
-    return [view.name for view in lens.views]
 
 
 def _say_lens(result: Mapping[str, Any], collector: Collector) -> None:

@@ -6,16 +6,14 @@ import argparse
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from flockd.cli.parser import Parser, positive_count, positive_number
 from flockd.errors import UsageError
 
 if TYPE_CHECKING:
     from flockd.calibration.board import BoardSpec
-    from flockd.config.rig import MeasurementConfig
 
 SECONDS = 120.0
 MARKER_SHARE = 0.75
@@ -77,12 +75,5 @@ def ended_by_ctrl_c(live: bool) -> Iterator[None]:
 
 
 def source_name(args: argparse.Namespace) -> str:
-    """Where the pictures come from."""
+    """Where the images come from."""
     return str(args.source or args.config)
-
-
-def measurement(**facts: Any) -> MeasurementConfig:
-    """What is known about numbers that were measured today."""
-    from flockd.config.rig import MeasurementConfig
-
-    return MeasurementConfig(date=datetime.now(UTC).date().isoformat(), **facts)

@@ -14,7 +14,7 @@ class WeightParameters(Section):
 
     kind: Literal["uniform", "nearest"] = "uniform"
     nearest: Annotated[int, Field(ge=1)] = 3
-    """With kind `nearest`: weight 1 on this many, 0 on the rest."""
+    """With kind `nearest`: weight 1 on this many, 0 on the others."""
 
 
 class FlockingParameters(Section):

@@ -119,7 +119,7 @@ def _override(document: Document, overrides: Overrides) -> None:
             document.places.setdefault(path[:length], replace(document.places[path[: length - 1]], key=key))
             inner = values.setdefault(path[length - 1], {})
             if not isinstance(inner, dict):
-                break  # not a section: validation tells of it
+                break  # not a section: validation reports it
             values = inner
         else:
             values[path[-1]] = value
@@ -132,12 +132,12 @@ def _validated(model: type[Model], document: Document) -> Model:
     try:
         config = model.model_validate(document.values)
     except ValidationError as error:
-        told = [
+        remaining = [
             detail
             for detail in error.errors()
             if not _is_under(path_in_file(detail, document.places), document.spoiled)
         ]
-        raise ConfigError([*document.problems, *problems_of(told, model, document.places)]) from error
+        raise ConfigError([*document.problems, *problems_of(remaining, model, document.places)]) from error
     if document.problems:
         raise ConfigError(document.problems)
     return config

@@ -58,8 +58,8 @@ class PerceptionConfig(Section):
     """`dis` is OpenCV's DIS flow instead of a network."""
     flow_refinement: FlowRefinement = "quick_dis"
     """A network's flow finds what moved far; DIS then makes it exact. `quick_dis` is for flight: 12 ms an image, where
-    `dis` takes 34, and where the images show nothing, what is around tells the flow. With a sensor's depth, on images
-    that are blurred and moved far, `dis` is worth its time, and every pixel keeps its own flow.
+    `dis` takes 34, and where the images show nothing, the surroundings determine the flow. With a sensor's depth, on
+    images that are blurred and moved far, `dis` is worth its time, and every pixel keeps its own flow.
     """
     flow_refinement_scale: Annotated[int, Field(ge=0, le=5)] = 1
     """Where DIS after a network stops: at a 2^n-th of the size."""

@@ -55,7 +55,7 @@ class SafetyParameters(Section):
     camera_timeout_periods: Positive = 3.0
     """A camera without a usable frame for this many of its frame periods is lost."""
     max_lost_cameras: Annotated[int, Field(ge=0)] = 1
-    """Fly on with the rest, degraded, while no more than this many are lost; at least one has to see."""
+    """Fly on with the others, degraded, while no more than this many are lost; at least one has to see."""
     max_dropped_share: Share = 0.2
     """Of the frames of late; above it, degraded."""
     estimate_timeout_s: Positive = 1.5

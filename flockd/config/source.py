@@ -60,7 +60,7 @@ class SourceParameters(Section):
     silence_s: Positive = 0.5
     """A camera without a usable frame for this long is closed and opened again."""
     frozen_after: Annotated[int, Field(ge=0)] = 5
-    """A picture that repeats itself this many times is frozen, and counts as no picture; 0: may repeat for ever."""
+    """An image that repeats itself this many times is frozen, and counts as no image; 0: may repeat for ever."""
 
     @model_validator(mode="after")
     def _fits_its_kind(self) -> Self:

@@ -6,8 +6,8 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Literal
 
+from flockd.autopilot.autopilot_status import AutopilotError
 from flockd.autopilot.mavsdk_link import AutopilotLink
-from flockd.autopilot.status import AutopilotError
 
 Takeover = Literal["hold", "return", "land"]
 

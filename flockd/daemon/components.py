@@ -11,9 +11,9 @@ from flockd.daemon.autopilot_requests import AutopilotRequests
 from flockd.daemon.control import Control
 from flockd.daemon.host_monitors import LoopLag, Thermometer, WallClock
 from flockd.daemon.message_sinks import MessageSinks
-from flockd.daemon.networks import WatchedNetworks
 from flockd.daemon.pilot_loop import PilotLoop
 from flockd.daemon.take_off import TakeOff
+from flockd.daemon.watched_networks import WatchedNetworks
 from flockd.sources import FrameSource
 from flockd.telemetry.publisher import ZenohTelemetry
 

@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from flockd.autopilot.autopilot_status import AutopilotStatus
 from flockd.autopilot.mavsdk_link import AutopilotLink
-from flockd.autopilot.status import AutopilotStatus
 from flockd.autopilot.streamer import SetpointStreamer
 from flockd.config import DroneConfig
 from flockd.daemon.autopilot_requests import AutopilotRequests, Takeover

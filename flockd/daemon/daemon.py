@@ -9,15 +9,15 @@ from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from flockd.autopilot.status import AutopilotError
+from flockd.autopilot.autopilot_status import AutopilotError
 from flockd.config import DroneConfig
 from flockd.daemon.components import Components
 from flockd.daemon.control import FLYING
-from flockd.daemon.networks import InterruptibleNetworks
 from flockd.daemon.operator_commands import OperatorRequests
 from flockd.daemon.service_manager import ServiceManager
 from flockd.daemon.startup import open_components
 from flockd.daemon.status_messages import notify_service_manager, publish_status
+from flockd.daemon.watched_networks import InterruptibleNetworks
 from flockd.errors import ConfigError, ConfigProblem, FlockdError
 from flockd.safety import Decision, Event, State
 from flockd.sources import open_source

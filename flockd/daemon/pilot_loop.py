@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flockd.config import DroneConfig
-from flockd.daemon.networks import NetworkStuckError, WatchedNetworks
+from flockd.daemon.watched_networks import NetworkStuckError, WatchedNetworks
 from flockd.daemon.worker import Worker
 from flockd.messages import FrameSet, PilotOutput, VehicleState
 from flockd.pilot import FlockPilot

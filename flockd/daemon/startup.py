@@ -19,7 +19,6 @@ from flockd.daemon.components import Components
 from flockd.daemon.control import Control
 from flockd.daemon.host_monitors import LoopLag, Thermometer, WallClock
 from flockd.daemon.message_sinks import MessageSinks
-from flockd.daemon.networks import InterruptibleNetworks, WatchedNetworks
 from flockd.daemon.operator_commands import OperatorRequests, command_handler
 from flockd.daemon.pilot_loop import PilotLoop
 from flockd.daemon.preview import preview
@@ -27,6 +26,7 @@ from flockd.daemon.stream_gate import StreamGate
 from flockd.daemon.supervisor_inputs import InputCollector
 from flockd.daemon.take_off import TakeOff
 from flockd.daemon.vehicle_history import VehicleHistory
+from flockd.daemon.watched_networks import InterruptibleNetworks, WatchedNetworks
 from flockd.daemon.worker import BusyError, LateError, Worker
 from flockd.safety import Decision, Gate
 from flockd.sources import FrameSource

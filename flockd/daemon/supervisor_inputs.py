@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flockd.autopilot.status import AutopilotStatus
+from flockd.autopilot.autopilot_status import AutopilotStatus
 from flockd.config import DroneConfig
 from flockd.daemon.host_monitors import LoopLag, Thermometer
-from flockd.daemon.networks import WatchedNetworks
 from flockd.daemon.operator_commands import OperatorRequests
 from flockd.daemon.pilot_loop import PilotLoop
+from flockd.daemon.watched_networks import WatchedNetworks
 from flockd.messages import FloatArray, VehicleState
 from flockd.safety import CameraHealth, Gate, Inputs, Objection, outside_fence, outside_heights
 from flockd.sources import CameraStatus, Count, FrameSource

@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
+from flockd.autopilot.autopilot_status import AutopilotError
 from flockd.autopilot.mavsdk_link import AutopilotLink
-from flockd.autopilot.status import AutopilotError
 from flockd.autopilot.streamer import SetpointStreamer
 from flockd.daemon.operator_commands import OperatorRequests
 from flockd.safety import Decision, Event, State

@@ -53,10 +53,6 @@ class Dataset(Protocol):
         """Whether depth was recorded."""
 
     @property
-    def has_poses(self) -> bool:
-        """Whether it is known where the camera was."""
-
-    @property
     def notes(self) -> tuple[str, ...]:
         """What a person should know although nothing is wrong: each is one sentence."""
 
@@ -99,11 +95,6 @@ class FileDataset:
     def has_depth(self) -> bool:
         """See ``Dataset``."""
         return any(entry.depth for entry in self.entries)
-
-    @property
-    def has_poses(self) -> bool:
-        """See ``Dataset``."""
-        return any(entry.T_world_camera for entry in self.entries)
 
     def __len__(self) -> int:
         return len(self.entries)

@@ -6,4 +6,4 @@ from flockd.errors import FlockdError
 
 
 class DatasetError(FlockdError):
-    """Something is no dataset, or a part of it is missing, damaged or does not fit the rest."""
+    """Something is no dataset, or a part of it is missing, damaged or does not fit the others."""

@@ -33,7 +33,6 @@ class VideoDataset:
     """How many frames the file says it has."""
     rate_hz: float
     has_depth: bool = False
-    has_poses: bool = False
     notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -41,7 +40,7 @@ class VideoDataset:
 
     def frames(self, *, with_depth: bool) -> Iterator[DatasetFrame]:
         """See ``Dataset``; there is no depth."""
-        with _opened(self.path) as video:
+        with opened_video(self.path) as video:
             index = 0
             while (image := _next(video)) is not None:
                 yield DatasetFrame(Moment(index, f"{index}", index / self.rate_hz, None), image, None)
@@ -54,7 +53,7 @@ def open_video(path: Path, calibration: Path | None) -> VideoDataset:
     """A video, its frames evenly spaced in time. Raises DatasetError and ConfigError."""
     if not path.is_file():
         raise DatasetError(f"{path}: does not exist; name a video")
-    with _opened(path) as video:
+    with opened_video(path) as video:
         first = _next(video)
         rate_hz, claimed = video.get(cv2.CAP_PROP_FPS), int(video.get(cv2.CAP_PROP_FRAME_COUNT))
     if first is None or not rate_hz > 0 or claimed < 1:
@@ -67,15 +66,15 @@ def open_video(path: Path, calibration: Path | None) -> VideoDataset:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
-    """Closed at the end."""
+def opened_video(path: Path) -> Iterator[cv2.VideoCapture]:
+    """A video for OpenCV, unrotated whatever orientation the file asks for; closed at the end."""
     # What the decoder thinks of a damaged file would stand on stderr, beside our own sentence.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     logging = cv2.utils.logging
     before = logging.setLogLevel(logging.LOG_LEVEL_SILENT)
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     logging.setLogLevel(before)
-    # As it was filmed: a phone's note to turn the picture would turn it away from its calibration.
+    # As recorded: a phone's rotation metadata would turn the image away from its calibration.
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     try:
         yield video

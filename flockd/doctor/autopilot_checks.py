@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Iterator, Mapping
 
+from flockd.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware
 from flockd.autopilot.mavsdk_link import AutopilotLink
-from flockd.autopilot.status import AutopilotError, AutopilotStatus, Firmware
 from flockd.config import DroneConfig
 from flockd.config.autopilot import AutopilotParameters
 from flockd.config.safety import GateParameters
@@ -90,8 +90,10 @@ def judge_loss_time(value: float, config: DroneConfig) -> Finding:
     gap_s = AutopilotParameters().max_gap_s if config.autopilot is None else config.autopilot.max_gap_s
     fix = f"set {name} to {LONGEST_LOSS_S:g} s"
     if value <= gap_s:
-        told = f"{measured}, not above autopilot.max_gap_s {gap_s:g}: PX4 would leave offboard in gaps flockd bridges"
-        return failed(name, told, fix)
+        measured = (
+            f"{measured}, not above autopilot.max_gap_s {gap_s:g}: PX4 would leave offboard in gaps flockd bridges"
+        )
+        return failed(name, measured, fix)
     if value > LONGEST_LOSS_S:
         return warned(name, f"{measured}: so long it flies on with the last velocity when setpoints stop", fix)
     return passed(name, f"{measured} without setpoints, then its failsafe")
@@ -113,8 +115,8 @@ def judge_loss_action(value: int, config: DroneConfig) -> Finding:
     if value in _ON_LOSS:
         return passed(name, f"{value} ({_ON_LOSS[value]}) when setpoints stop")
     if value == 0:
-        told = "0 (Position) when setpoints stop: the sticks then fly it; with no remote control it returns home"
-        return warned(name, told, fix)
+        measured = "0 (Position) when setpoints stop: the sticks then fly it; with no remote control it returns home"
+        return warned(name, measured, fix)
     return failed(name, f"{value} ({_FATAL_ON_LOSS.get(value, 'not known')}) when setpoints stop", fix)
 
 

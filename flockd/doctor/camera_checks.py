@@ -32,9 +32,9 @@ SLOW, TOO_SLOW = 0.95, 0.8
 """Of the configured rate. Cheap cameras halve theirs by themselves in dim light."""
 UNEVEN, TOO_UNEVEN = 0.2, 0.5
 """Of a frame period, the 95th percentile of how far a frame is from its beat. By half a period sets fall apart."""
-RELIEF = "try another cable and port, fewer cameras on one USB bus, or a shorter exposure that is set by hand"
+FIX_RATE = "try another cable and port, fewer cameras on one USB bus, or a shorter exposure that is set by hand"
 DARK, BRIGHT = 12.0, 243.0
-"""Of 0-255, the mean grey of a picture in which little can be seen."""
+"""Of 0-255, the mean grey of an image in which little can be seen."""
 
 
 @dataclass
@@ -51,7 +51,7 @@ class Watched:
     """Gaps in the sequence numbers."""
     refused: Counter[str] = field(default_factory=Counter)
     """Images that are worth nothing, by reason."""
-    picture: UInt8Array | None = None
+    image: UInt8Array | None = None
 
     @property
     def rate_hz(self) -> float:
@@ -84,20 +84,20 @@ def check_cameras(config: DroneConfig, seconds: float, kernel: Kernel | None = N
         watched = watch_shared_memory(config, source, seconds)
     for camera in config.rig.cameras:
         yield from _judged(camera, config, watched.get(camera.name))
-    with contextlib.suppress(ValueError):  # a calibration that makes no camera, which was told above
+    with contextlib.suppress(ValueError):  # a calibration that makes no camera, which was reported above
         yield coverage(config.rig)
 
 
 def _judged(camera: CameraConfig, config: DroneConfig, watched: Watched | None) -> Iterator[Finding]:
     problems = list(lens_problems(camera))
-    told = []
+    measured = []
     if watched is not None and config.source is not None:
         device = next((entry for entry in config.source.cameras if entry.name == camera.name), None)
         rate_hz = device.rate_hz if device else config.source.shared_memory.rate_hz
-        relief = RELIEF if device else "see what keeps the program that publishes them from it"
-        problems += stream_problems(camera.name, watched, rate_hz, config.safety.max_dropped_share, relief)
+        fix_rate = FIX_RATE if device else "see what keeps the program that publishes them from it"
+        problems += stream_problems(camera.name, watched, rate_hz, config.safety.max_dropped_share, fix_rate)
         problems += [] if device is None else _exposure_problems(device)
-        told = [
+        measured = [
             f"{watched.rate_hz:.1f} of {rate_hz:g} images a second, jitter {1e3 * watched.jitter_s():.1f} ms, no gaps",
             f"{len(device.controls)} controls accepted" if device else "",
         ]
@@ -106,13 +106,13 @@ def _judged(camera: CameraConfig, config: DroneConfig, watched: Watched | None) 
         yield from problems
     else:
         calibration = f"calibration fits {size}, {width_deg(camera):.0f} degrees wide"
-        yield passed(f"camera {camera.name}", ", ".join(part for part in [*told, calibration] if part))
+        yield passed(f"camera {camera.name}", ", ".join(part for part in [*measured, calibration] if part))
 
 
 def stream_problems(
-    name: str, watched: Watched, rate_hz: float, max_dropped_share: float, relief: str
+    name: str, watched: Watched, rate_hz: float, max_dropped_share: float, fix_rate: str
 ) -> Iterator[Finding]:
-    """What is wrong with the images that came; ``relief`` is what mends too few, uneven or damaged ones."""
+    """What is wrong with the images that came; ``fix_rate``: what to do about too few, uneven or damaged ones."""
     about = f"camera {name}"
     if watched.fault is not None:
         yield failed_from_error(about, watched.fault.removeprefix(f"{name}: "))
@@ -122,18 +122,18 @@ def stream_problems(
     if watched.lost or bad:
         what = [f"{count} {reason}" for reason, count in (("lost", watched.lost), *watched.refused.items()) if count]
         measured = f"of {came + watched.lost + bad} images {', '.join(what)} ({share:.0%})"
-        yield (failed if share > max_dropped_share else warned)(about, measured, relief)
+        yield (failed if share > max_dropped_share else warned)(about, measured, fix_rate)
     pace = watched.rate_hz / rate_hz
     if pace < SLOW or pace > 2.0 - SLOW:
         measured = f"{watched.rate_hz:.1f} images a second instead of {rate_hz:g}"
-        fix = f"{relief}, or write rate_hz: {max(watched.rate_hz, 0.1):.2g}"
+        fix = f"{fix_rate}, or write rate_hz: {max(watched.rate_hz, 0.1):.2g}"
         yield (failed if pace < TOO_SLOW else warned)(about, measured, fix)
     jitter_s = watched.jitter_s()
     if jitter_s * rate_hz > UNEVEN:
-        measured = f"images come unevenly: {1e3 * jitter_s:.1f} ms off their beat of {1e3 / rate_hz:.1f} ms"
-        yield (failed if jitter_s * rate_hz > TOO_UNEVEN else warned)(about, measured, relief)
-    if watched.picture is not None:
-        grey = float(watched.picture.mean())
+        measured = f"images come unevenly: {1e3 * jitter_s:.1f} ms off their period of {1e3 / rate_hz:.1f} ms"
+        yield (failed if jitter_s * rate_hz > TOO_UNEVEN else warned)(about, measured, fix_rate)
+    if watched.image is not None:
+        grey = float(watched.image.mean())
         if not DARK <= grey <= BRIGHT:
             how = "dark" if grey < DARK else "bright"
             fix = "take off the cap, or set exposure and gain for the light where it flies"
@@ -143,7 +143,7 @@ def stream_problems(
 def _exposure_problems(device: CameraDeviceParameters) -> Iterator[Finding]:
     """The driver refuses controls that it does not accept; here is what was not even asked."""
     if not any("exposure" in control.name for control in device.controls):
-        measured = "its exposure is not configured: an automatic one blurs, and looks like motion"
+        measured = "its exposure is not configured: an automatic one blurs, which is taken for motion"
         fix = "set it in source.cameras[].controls, as in config/quadrotor.yaml"
         yield warned(f"camera {device.name}", measured, fix)
 
@@ -233,7 +233,7 @@ def _record(
         record.fault = f"{came}; try another cable, port and pixel_format"
         return
     try:
-        record.picture = image_format.decode(last.data)
+        record.image = image_format.decode(last.data)
     except CorruptImageError as error:
         record.refused[f"not to be decoded ({error})"] += 1
 
@@ -267,7 +267,7 @@ def watch_shared_memory(config: DroneConfig, source: SourceParameters, seconds: 
             for name, frame in newest.frames.items():
                 watched[name].stamps_s.append(frame.time_s)
                 watched[name].arrivals_s.append(time.monotonic())
-                watched[name].picture = frame.image
+                watched[name].image = frame.image
         status = frames.status()
     finally:
         frames.stop()

@@ -92,7 +92,7 @@ def check_temperature(config: DroneConfig, folder: Path = THERMAL) -> Iterator[F
         measured = f"the processor is being slowed down ({', '.join(slowed)})"
         yield warned("temperature", measured, "cool it, and see to its power supply; then measure the step again")
     if not zones:
-        measured = "this computer tells no temperature, so flockd will not notice when it gets too hot"
+        measured = "this computer reports no temperature, so flockd will not notice when it gets too hot"
         yield warned("temperature", measured, "load the driver of its thermal sensor, if it has one")
         return
     hottest = max(zones, key=zones.__getitem__)
@@ -127,7 +127,7 @@ def _slowed(folder: Path) -> Iterator[str]:
 
 
 class _Timex(ctypes.Structure):
-    """The beginning of struct timex of 64-bit Linux (adjtimex(2)), and room for the rest."""
+    """The beginning of struct timex of 64-bit Linux (adjtimex(2)), and room for what follows."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),
@@ -176,12 +176,12 @@ def _ticks(monotonic: Callable[[], float], sleep: Callable[[float], None]) -> li
 
 def judge_monotonic(ticks: list[float]) -> Finding:
     """Readings with pauses of `SAMPLE_S` between them; a pause takes as long or longer."""
-    fix = "look at /sys/devices/system/clocksource/clocksource0/current_clocksource, and boot with another"
+    fix = "check /sys/devices/system/clocksource/clocksource0/current_clocksource, and boot with another"
     steps = [after - before for before, after in itertools.pairwise(ticks)]
     if min(steps) <= 0.0:
         return failed("monotonic clock", f"it stood or went back by {-1e3 * min(steps):.1f} ms", fix)
     shortest = min(steps)
     if shortest < (1.0 - DRIFT) * SAMPLE_S:
-        told = f"{1e3 * shortest:.1f} ms went by in a pause of {1e3 * SAMPLE_S:.0f} ms: it is slow or coarse"
-        return failed("monotonic clock", told, fix)
+        measured = f"{1e3 * shortest:.1f} ms went by in a pause of {1e3 * SAMPLE_S:.0f} ms: it is slow or coarse"
+        return failed("monotonic clock", measured, fix)
     return passed("monotonic clock", f"runs on; {1e3 * SAMPLE_S:.0f} ms pauses took {1e3 * shortest:.1f} ms and more")

@@ -18,7 +18,7 @@ class Level(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at."""
+    """The result of one check of one thing."""
 
     level: Level
     about: str
@@ -44,6 +44,6 @@ def failed(about: str, measured: str, fix: str) -> Finding:
 
 
 def failed_from_error(about: str, sentence: str) -> Finding:
-    """The failure that an error's sentence tells of: our own end in their fix, after the last semicolon."""
+    """The failure that an error's sentence describes: our sentences end in what to do, after the last semicolon."""
     measured, _, fix = sentence.rpartition("; ")
     return failed(about, measured or fix, fix if measured else "correct it, and run `flockd doctor` again")

@@ -16,7 +16,7 @@ from flockd.geometry import build_rig
 ODD_CENTRE, WRONG_CENTRE = 0.08, 0.2
 """Of the width or height, between the principal point and the middle."""
 ODD_PIXELS, WRONG_PIXELS = 0.03, 0.15
-"""How much fx and fy differ: pixels are square, unless pictures were squeezed from another aspect."""
+"""How much fx and fy differ: pixels are square, unless images were squeezed from another aspect."""
 NARROW_DEG, MOST_PINHOLE_DEG, MOST_WIDE_DEG = 40.0, 130.0, 220.0
 _STEP_DEG = 1
 

@@ -47,7 +47,7 @@ def plan(
         only: of `CHECKS`.
     """
 
-    # Each imports what it looks at when it runs: a library that does not load fails its check alone.
+    # Each imports what it checks when it runs: a library that does not load fails its check alone.
     def instance() -> Iterable[Finding]:
         from flockd.doctor.service_checks import check_instance
 
@@ -94,7 +94,7 @@ def plan(
         return check_cameras(config, seconds)
 
     def models() -> Iterable[Finding]:
-        from flockd.doctor.models import check_models
+        from flockd.doctor.model_checks import check_models
 
         return check_models(config)
 

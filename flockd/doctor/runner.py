@@ -13,17 +13,17 @@ from flockd.errors import FlockdError
 
 @dataclass(frozen=True)
 class Check:
-    """One kind of thing to look at."""
+    """One check of the doctor."""
 
     name: str
     run: Callable[[], Iterable[Finding]]
-    """Only looks; what it finds on the way counts even if it hangs later."""
+    """Changes nothing; what it finds counts even if it hangs later."""
     limit_s: float
     """Much longer than it should take."""
 
 
 def run_checks(checks: Sequence[Check], on_done: Callable[[int, int], None]) -> dict[str, tuple[Finding, ...]]:
-    """What each check found, by its name; ``on_done`` is told how many of how many are done."""
+    """What each check found, by its name; ``on_done`` is called with how many of how many are done."""
     found = {}
     for number, check in enumerate(checks, start=1):
         found[check.name] = _bounded(check)
@@ -38,7 +38,7 @@ def _bounded(check: Check) -> tuple[Finding, ...]:
     def run() -> None:
         try:
             found.extend(check.run())
-        except BaseException as error:  # noqa: BLE001 - told below, whatever it is
+        except BaseException as error:  # noqa: BLE001 - reported below, whatever it is
             ended.set_exception(error)
         else:
             ended.set_result(None)

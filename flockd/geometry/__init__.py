@@ -2,11 +2,11 @@
 
 from flockd.geometry.cameras import Camera, PinholeCamera, WideAngleCamera
 from flockd.geometry.ego_motion import estimate_ego_motion
+from flockd.geometry.ego_motion_refinement import refine_ego_motion
 from flockd.geometry.ground import ground_inverse_depth
 from flockd.geometry.neighbour_motion import estimate_neighbour_motion
 from flockd.geometry.pairs import BACKGROUND_LABEL, PointPairs, grid_pixels, label_pixels, lift_matches
 from flockd.geometry.polar import log_polar, log_polar_covariance, log_polar_residual
-from flockd.geometry.refinement import refine_ego_motion
 from flockd.geometry.rig import Rig, RigCamera, build_rig
 from flockd.geometry.rigid_fit import fit_rigid
 from flockd.geometry.robust.ransac import RansacResult, ransac_rigid

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from flockd.config.geometry import GeometryParameters
+from flockd.geometry.ego_motion_refinement import refine_ego_motion
 from flockd.geometry.pairs import BACKGROUND_LABEL, PointPairs
-from flockd.geometry.refinement import refine_ego_motion
 from flockd.geometry.rig import Rig
 from flockd.geometry.robust.ransac import ransac_rigid
 from flockd.geometry.transform import RigidTransform

@@ -14,7 +14,7 @@ from flockd.geometry.rotations import rotation_from_euler
 from flockd.geometry.transform import RigidTransform
 from flockd.messages import BoolArray, FloatArray
 
-# A camera that looks forward: its right is the body's right, its down the body's down, its optical axis forward.
+# A camera that faces forward: its right is the body's right, its down the body's down, its optical axis forward.
 _R_FRD_RDF = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 

@@ -1,4 +1,4 @@
-"""A small camera that faces one direction, its picture drawn from whichever real cameras see there."""
+"""A small camera that faces one direction, its image drawn from whichever real cameras see there."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ _MINIFICATION = 1.5
 
 @dataclass(frozen=True, eq=False)
 class VirtualCrop:
-    """A square pinhole camera in the body, at the optical centre of its main camera, and the way to its picture."""
+    """A square pinhole camera in the body, at the optical centre of its main camera, and the way to its image."""
 
     camera: PinholeCamera
     T_body_virtual: RigidTransform
     main: str
-    """The real camera at whose optical centre it sits: from there its picture is exact at every range."""
+    """The real camera at whose optical centre it sits: from there its image is exact at every range."""
     rig: Rig
 
     def sample(self, images: Mapping[str, UInt8Array], *, range_m: float | None = None) -> tuple[UInt8Array, BoolArray]:
-        """The picture (size, size, 3) and the mask (size, size) of its pixels that some camera sees; grey elsewhere.
+        """The image (size, size, 3) and the mask (size, size) of its pixels that some camera sees; grey elsewhere.
 
         Each pixel comes from the main camera wherever that sees it, else from the camera in whose image it lies
         deepest. ``images`` are (h, w, 3) by camera name; a camera without an image sees nothing. With ``range_m``,
-        the distance of the thing looked at, other cameras are sampled where they see that distance, which corrects
+        the distance of the target, other cameras are sampled where they see that distance, which corrects
         their parallax; without it, where they see infinity.
         """
         size = self.camera.size
@@ -56,7 +56,7 @@ class VirtualCrop:
         return crop, valid
 
     def look_up(self, values: Float32Array, points_body: FloatArray) -> Float32Array:
-        """(n,) what a map (size, size) over the picture says at points (n, 3) of the body; NaN where not in it."""
+        """(n,) what a map (size, size) over the image says at points (n, 3) of the body; NaN where not in it."""
         pixels = self.camera.project(self.T_body_virtual.inverse().apply(points_body))
         inside = self.camera.in_image(pixels)
         found = np.full(len(points_body), np.nan, np.float32)
@@ -158,7 +158,7 @@ def _draw(image: UInt8Array, where: Float32Array, minification: int) -> UInt8Arr
     """The image's colours at u and v (2, h, w), averaged over ``minification`` pixels both ways; any at NaN."""
     origin = np.zeros(2, dtype=np.float32)
     if minification > 1:
-        # Only the part that is looked at, a block wider, cut along whole blocks.
+        # Only the part that the crop covers, a block wider, cut along whole blocks.
         low = np.maximum(np.nanmin(where, axis=(1, 2)) // minification - 1, 0).astype(np.int64) * minification
         blocks = np.nanmax(where, axis=(1, 2)).astype(np.int64) // minification + 2 - low // minification
         blocks = np.minimum(blocks, (np.array(image.shape[1::-1]) - low) // minification)

@@ -19,7 +19,7 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True)
 class Fitting:
-    """An image resized to ``inner`` at the top left of the ``full`` input; its borders fill the rest."""
+    """An image resized to ``inner`` at the top left of the ``full`` input; its borders fill what is left."""
 
     image: Size
     inner: Size

@@ -1,4 +1,4 @@
-"""The weights inside an ONNX file: each has to be a number, which neither a hash nor ONNX Runtime tells.
+"""The weights inside an ONNX file: each has to be a number, which neither a hash nor ONNX Runtime checks.
 
 Reads just as much of the format (onnx.proto3, a protobuf) as that takes; the flight install has no `onnx`.
 """

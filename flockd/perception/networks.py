@@ -30,7 +30,7 @@ from flockd.perception.requirements import check_roles
 CROPS_PER_RUN = 24
 """Crops in one run of the distance network, so that an image full of false proposals does not take more memory."""
 _MIN_DEPTH_M, _MAX_DEPTH_M = 1e-3, 1e3
-"""Where a reciprocal is taken: beyond lies the sky."""
+"""Where a reciprocal of depth is taken: nearer than the lens, and where flow and height measure nothing any more."""
 _MIN_RAY_Z = 0.1
 """Of a unit ray, for its tangents to stay finite: 84 degrees off the optical axis."""
 
@@ -150,7 +150,7 @@ class OnnxNetworks:
         return {name: fitting.inside(map_)[0] for name, map_ in model.infer(contents).items()}
 
     def _at_map_stride(self, maps: Float32Array, image: tuple[int, int]) -> Float32Array:
-        """(c, h, w) at the resolution that drones are told apart in; two channels are pixels of the map."""
+        """(c, h, w) at the resolution that drones are segmented at; two channels are pixels of the map."""
         width, height = image[0] // self.map_stride, image[1] // self.map_stride
         if maps.shape[1:] == (height, width):
             return maps

@@ -37,6 +37,7 @@ class Requirements:
 
 
 _LOGIT = (-50.0, 50.0)
+"""The bounds of a threshold that is a logit: beyond, a float32 probability is 0 or 1."""
 _GEOMETRY = ("geometry",)
 """Planes of the rays' tangents right and down, and of the inverse depth (1/m) of flat ground, 0 where unknown."""
 

@@ -28,7 +28,7 @@ from flockd.recording.mcap_file import RecordingError, Stream
 Quaternion = tuple[float, float, float, float]
 """w, x, y, z"""
 _FRD_RDF: Quaternion = (0.5, 0.5, 0.5, 0.5)
-"""From a camera's axes (right, down, forward) to those of a body that looks along it."""
+"""From a camera's axes (right, down, forward) to those of a body that faces along it."""
 _CENTRE_PX = 0.5
 """Pixel centres lie at whole numbers in Foxglove, as in OpenCV, and half a pixel farther here."""
 
@@ -128,7 +128,7 @@ def _descriptor_set(file: Any) -> bytes:
 
 
 def _mounting(camera: CameraConfig) -> Quaternion:
-    """From the camera's axes to the body's: yaw, then pitch, then roll of a camera that looks forward."""
+    """From the camera's axes to the body's: yaw, then pitch, then roll of a camera that faces forward."""
     extrinsics = camera.extrinsics
     turn = _times(
         _times(_about(2, extrinsics.yaw_deg), _about(1, extrinsics.pitch_deg)), _about(0, extrinsics.roll_deg)

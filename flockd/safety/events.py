@@ -24,7 +24,7 @@ class CameraHealth:
     unplugged: bool
     """Its device reported an error or is gone, and is not open again yet."""
     frozen: bool
-    """It keeps sending the same picture or the same sequence number."""
+    """It keeps sending the same image or the same sequence number."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class Inputs:
     ego_motion_failures: int
     """Steps in a row in which the pilot found no motion of its own."""
     network_faults: int
-    """Answers of a network with NaN, infinity or nonsense in them, since the last call."""
+    """Outputs of a network that are NaN, infinite or out of range, since the last call."""
     inference_stuck: bool
-    """A network has passed its deadline and not answered yet."""
+    """A network has passed its deadline and not returned yet."""
     load: float
     """How long the steps take (95th percentile, slowest stage) over how long they may."""
     temperature_c: float | None
@@ -68,7 +68,7 @@ class Inputs:
     armed: bool | None
     in_air: bool | None
     offboard_refused: bool
-    """Since the last call the autopilot has refused offboard mode when flockd asked for it, or not answered."""
+    """Since the last call the autopilot has refused offboard mode when flockd asked for it, or not replied."""
     battery_low: bool
     """So says the autopilot."""
     position_lost: bool

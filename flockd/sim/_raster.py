@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
-BANDS = 16
 # Bit-reversed, so that a thread's contiguous share of the loop is spread over the whole image.
 BAND_ORDER = np.array([0, 8, 4, 12, 2, 10, 6, 14, 1, 9, 5, 13, 3, 11, 7, 15], dtype=np.int64)
 SUBSAMPLES = 3

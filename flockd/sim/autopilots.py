@@ -1,4 +1,4 @@
-"""Autopilots for the daemons of a simulated fleet: PX4 in software, or stand-ins."""
+"""Autopilots for the daemons of a simulated fleet: PX4 in software, or fake autopilots."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MAX_INSTANCES = 10
 """PX4 sends all further ones to one port."""
 PARAMETERS = {
     "SIH_KDV": "0.1",  # drag; with the default of 1.0 it takes eight seconds to reach 3 m/s
-    # PX4's simulated IMU has more noise than its estimator expects. Told of it, velocity errs by 0.15 m/s instead of
+    # PX4's simulated IMU has more noise than its estimator expects. With these, velocity errs by 0.15 m/s instead of
     # 0.4, and the heading by 2 degrees instead of up to 10.
     "EKF2_GYR_NOISE": "0.1",
     "EKF2_ACC_NOISE": "1.0",
@@ -77,7 +77,7 @@ class Autopilots(Protocol):
 class SimulatedAutopilots:
     """The autopilots that `flockd.autopilot` simulates, on the simulator's own vehicle model."""
 
-    name = "stand-in"
+    name = "fake autopilot"
 
     def __init__(self, scenario: ScenarioConfig, speed_factor: float) -> None:
         self._scenario, self._speed_factor = scenario, speed_factor
@@ -96,7 +96,7 @@ class SimulatedAutopilots:
         """See `Autopilots`."""
         for i, (vehicle, ports) in enumerate(zip(self._scenario.vehicles, self.ports, strict=True)):
             position = np.array(vehicle.position_m)
-            stand_in = FakeAutopilot(
+            fake = FakeAutopilot(
                 ports.offboard,
                 system_id=i + 1,
                 motion=_Flown(self._scenario.vehicle, self._scenario.seed + i),
@@ -104,8 +104,8 @@ class SimulatedAutopilots:
                 truth_port=ports.truth,
                 speed_factor=self._speed_factor,
             )
-            stand_in.parameters["MIS_TAKEOFF_ALT"] = -float(position[2])
-            self._stack.enter_context(stand_in)
+            fake.parameters["MIS_TAKEOFF_ALT"] = -float(position[2])
+            self._stack.enter_context(fake)
 
     def programs(self) -> Sequence[Program]:
         """See `Autopilots`."""

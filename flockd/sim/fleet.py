@@ -158,8 +158,8 @@ class _Fleet:
         run.cores = {kind: (after - cpu_s[kind]) / run.wall_s for kind, after in self._cpu_s().items()}
         run.clock_rates = [rate for i in self._all if (rate := _rate(booted[i], self._station.uptime_s(i))) is not None]
         version = self._station.version(0)
-        stand_in = self._autopilots.name == SimulatedAutopilots.name
-        run.autopilot = self._autopilots.name if stand_in or version is None else f"{self._autopilots.name} {version}"
+        is_fake = self._autopilots.name == SimulatedAutopilots.name
+        run.autopilot = self._autopilots.name if is_fake or version is None else f"{self._autopilots.name} {version}"
         run.frames = tuple(s for s in self._server.frames() if run.began_s <= s.time_s < run.ended_s)
         return run
 

@@ -92,7 +92,7 @@ class Programs:
         return self._programs[-1]
 
     def end(self) -> None:
-        """Tells all that run to end and waits for them; who does not is killed, with all it has started."""
+        """Terminates all that run and waits for them; one that does not end is killed, with all it has started."""
         with _uninterrupted():
             running = [program for program in self._programs if program.ended is None]
             for program in running:

@@ -193,8 +193,8 @@ class Scenery:
                 corners, np.array([(0, 1, 2), (0, 2, 3)]), facade, tint, tile, wall.at(length, out, z - wall_m)
             )
             if side == 0 and rng.random() < 0.7:
-                door = wall.at(rng.uniform(-0.6, 0.6) * length, out, z - 1.0)
-                self.mesh.box(door, (0.5, 0.04, 1.05), wall.heading, self.planks, _paint(rng), (1.0, 2.0))
+                entrance = wall.at(rng.uniform(-0.6, 0.6) * length, out, z - 1.0)
+                self.mesh.box(entrance, (0.5, 0.04, 1.05), wall.heading, self.planks, _paint(rng), (1.0, 2.0))
         roof_tint = _roof_colour(rng)
         roof = int(rng.choice(self.roofs))
         top = z - wall_m

@@ -13,7 +13,7 @@ from flockd.sources.frames import CameraStatus, Count, RawFrame
 from flockd.sources.image_formats import CorruptImageError
 
 _TICK_S = 0.01
-"""How often a waiting reader looks whether a set that is not complete has waited long enough."""
+"""How often a waiting reader checks whether a set that is not complete has waited long enough."""
 
 
 class FrameReceiver:

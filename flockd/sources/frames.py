@@ -17,7 +17,7 @@ Count = Literal[
     "missing",  # sets handed out without this camera
     "lost",  # never came: gaps in the sequence numbers
     "time_stamp",  # not after the one before, or not of this computer's monotonic clock
-    "frozen",  # the same picture or sequence number again and again
+    "frozen",  # the same image or sequence number again and again
     "flagged",  # the driver itself says that the data are damaged
     "corrupt",  # wrong size, cannot be decoded, or decodes into what no camera sees
     "malformed",  # a message that is not a frame
@@ -27,7 +27,7 @@ Count = Literal[
 
 @dataclass(frozen=True, eq=False)
 class RawFrame:
-    """One image as the camera sent it: not decoded, because most frames are superseded before anybody looks."""
+    """One image as the camera sent it: not decoded, because most frames are superseded before they are used."""
 
     camera: str
     data: bytes

@@ -20,9 +20,9 @@ _FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _SCAN = 0xDA
 _SAMPLE_STRIDE = 8
 _FLAT_DEVIATION = 1.0
-"""Standard deviation in grey levels below which a whole picture shows nothing: the noise of a sensor alone is more."""
+"""Standard deviation in grey levels below which a whole image shows nothing: the noise of a sensor alone is more."""
 _LOST_SHARE = 16
-"""A picture is cut off where its last 1/16 of rows is one value: what decoders fill in for data that never came."""
+"""An image is cut off where its last 1/16 of rows is one value: what decoders fill in for data that never came."""
 _SATURATED = (8, 247)
 """Between these a strip of one value is not just too dark or too bright."""
 

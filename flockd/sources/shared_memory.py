@@ -11,8 +11,6 @@ import functools
 import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
-from types import TracebackType
-from typing import Self
 
 import zenoh
 from zenoh import shm
@@ -23,7 +21,7 @@ from flockd.messages import Frame, FrameSet
 from flockd.sources.frame_receiver import FrameReceiver
 from flockd.sources.frames import CameraStatus, RawFrame
 from flockd.sources.image_formats import RgbFormat
-from flockd.zenoh_session import SessionError, close_session, open_session
+from flockd.zenoh_session import SessionError, SessionOwner, close_session, open_session
 
 PREFIX = "flockd-frames/v1"
 """Apart from telemetry, which no drone reads."""
@@ -34,7 +32,7 @@ _POOL_BYTES = 16 << 20
 """For one drone, in whose memory it counts: four sets of four 640x480 cameras."""
 
 
-class FramePublisher:
+class FramePublisher(SessionOwner):
     """Publishes the frames of any number of drones; what a simulator calls. Raises UnavailableError without endpoint.
 
     Nothing waits for a reader: a frame that nobody can take in time is dropped on the way.
@@ -56,18 +54,6 @@ class FramePublisher:
     def notes(self) -> tuple[str, ...]:
         """What a person should know although nothing is wrong: each is one sentence."""
         return tuple(self._notes)
-
-    def close(self) -> None:
-        """Ends the session."""
-        close_session(self._session)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _payload(self, drone: str, data: bytes) -> bytes | shm.ZShmMut:
         if drone not in self._pools:

@@ -16,7 +16,7 @@ from flockd.sources.v4l2_device import CameraError, CapturedBuffer, V4l2Device
 from flockd.sources.v4l2_kernel import Kernel, LinuxKernel
 
 _LOOK_S = 0.05
-"""How long a thread waits for a frame before it looks whether it should stop."""
+"""How long a thread waits for a frame before it checks whether it should stop."""
 _START_S = 3.0
 """Cameras may take this long to their first frame."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
@@ -137,7 +137,7 @@ class _Camera:
         """Until it is asked to stop; raises CameraError when the camera fails or falls silent."""
         image_format = self._image_format(device)
         usable_s, refused = self._clock(), None
-        left_over = self._has_delivered  # drivers may begin again with the last picture of before, stamped as of now
+        left_over = self._has_delivered  # drivers may begin again with the last image of before, stamped as of now
         while not self._stopping.is_set():
             captured = device.read(_LOOK_S)
             if captured is not None and left_over:

@@ -1,4 +1,4 @@
-"""Publishes telemetry over zenoh, as one peer for all drones of a process, and answers queries."""
+"""Publishes telemetry over zenoh, as one peer for all drones of a process, and replies to queries."""
 
 from __future__ import annotations
 
@@ -6,24 +6,22 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 import zenoh
 
 from flockd.telemetry.topics import PREFIX, TOPICS, AboutMessage, AnswerMessage, checked_name
-from flockd.zenoh_session import close_session, open_session
+from flockd.zenoh_session import SessionOwner, open_session
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 Ask = Callable[[str], AnswerMessage]
 """Takes an operator's command by name, on a thread of zenoh's; returns at once."""
-Look = Callable[[str], bytes | None]
-"""Gives a camera's newest picture as JPEG, on a thread of zenoh's; None where there is none."""
+NewestImage = Callable[[str], bytes | None]
+"""Gives a camera's newest image as JPEG, on a thread of zenoh's; None where there is none."""
 
 
-class ZenohTelemetry:
+class ZenohTelemetry(SessionOwner):
     """A telemetry sink that puts each message under `flockd/v1/<fleet>/<drone>/<topic>`.
 
     It listens on and connects to the given endpoints only: discovery by multicast and gossip is off. A put never
@@ -61,32 +59,20 @@ class ZenohTelemetry:
         except zenoh.ZError:  # telemetry never ends a flight
             self._lost += 1
 
-    def announce(self, drone: str, about: AboutMessage, ask: Ask, look: Look) -> None:
-        """Shows that a drone is alive for as long as this session is, and answers queries.
+    def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
+        """Publishes that a drone is alive for as long as this session is, and replies to queries.
 
-        It tells what it flies with, takes commands, and shows what a camera sees.
+        Queries are for what it flies with, operators' commands, and a camera's newest image.
         """
         key = f"{self._prefix}/{checked_name(drone)}"
         self._kept += [
             self._session.liveliness().declare_token(f"{key}/alive"),
-            self._session.declare_queryable(f"{key}/about", lambda query: _answer(query, about)),
+            self._session.declare_queryable(f"{key}/about", lambda query: _reply(query, about)),
             self._session.declare_queryable(
-                f"{key}/ask/*", lambda query: _answer(query, ask(str(query.key_expr).rpartition("/")[2]))
+                f"{key}/ask/*", lambda query: _reply(query, ask(str(query.key_expr).rpartition("/")[2]))
             ),
-            self._session.declare_queryable(f"{key}/image/*", lambda query: _show(query, look)),
+            self._session.declare_queryable(f"{key}/image/*", lambda query: _send_image(query, newest_image)),
         ]
-
-    def close(self) -> None:
-        """Ends the session; later messages are lost, and counted."""
-        close_session(self._session)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _publisher(self, drone: str, topic: str) -> zenoh.Publisher:
         publisher = self._publishers.get((drone, topic))
@@ -102,18 +88,18 @@ class ZenohTelemetry:
         return publisher
 
 
-def _answer(query: zenoh.Query, message: Mapping[str, object]) -> None:
-    """Answers under the key that was asked for; a query for several at once, as with `*`, is answered as one."""
+def _reply(query: zenoh.Query, message: Mapping[str, object]) -> None:
+    """Replies under the key of the query; a query for several at once, as with `*`, gets one reply."""
     query.reply(query.key_expr, json.dumps(_finite(message), allow_nan=False), encoding=zenoh.Encoding.APPLICATION_JSON)
 
 
-def _show(query: zenoh.Query, look: Look) -> None:
+def _send_image(query: zenoh.Query, newest_image: NewestImage) -> None:
     camera = str(query.key_expr).rpartition("/")[2]
-    picture = look(camera)
-    if picture is None:
+    image = newest_image(camera)
+    if image is None:
         query.reply_err(f"camera {camera!r} has no image", encoding=zenoh.Encoding.TEXT_PLAIN)
     else:
-        query.reply(query.key_expr, picture, encoding=zenoh.Encoding.IMAGE_JPEG)
+        query.reply(query.key_expr, image, encoding=zenoh.Encoding.IMAGE_JPEG)
 
 
 def _finite(value: object) -> object:

@@ -4,7 +4,7 @@ A key is `flockd/v1/<fleet>/<drone>/<topic>`; a message is a JSON object in UTF-
 Vectors are lists: NED is north, east, down. Times are seconds on the drone's monotonic clock.
 
 `state` to `timings` follow from each step of the pilot; `flight` and `computer` come from the daemon, at all times.
-Beside the topics, a drone's daemon has a liveliness token `.../alive`, answers a query for `.../about` with an
+Beside the topics, a drone's daemon has a liveliness token `.../alive`, replies to a query for `.../about` with an
 `AboutMessage`, one for `.../ask/hold`, `land` or `resume` with an `AnswerMessage`, and one for `.../image/<camera>`
 with a small JPEG of what that camera sees.
 """
@@ -154,9 +154,9 @@ class ComputerMessage(TypedDict):
     steps: int
     steps_failed: int
     network_faults: int
-    """Answers that cannot be."""
+    """Outputs that are NaN, infinite or out of range."""
     networks_stuck: int
-    """Calls that were ended because they did not answer."""
+    """Calls that were ended because they passed their deadline."""
     loop_lag_s: float
     """How late the event loop was, at worst, in the last second."""
     temperature_c: float | None
@@ -179,7 +179,7 @@ class AnswerMessage(TypedDict):
     """What became of an operator's command."""
 
     accepted: bool
-    """The drone will try; `flight` tells what comes of it."""
+    """The drone will try; `flight` reports the result."""
     sentence: str
 
 

@@ -8,13 +8,12 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import zenoh
 
 from flockd.telemetry.topics import PREFIX, TOPICS, checked_name
-from flockd.zenoh_session import close_session, open_session
+from flockd.zenoh_session import SessionOwner, open_session
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ class Watched:
         return heard.message
 
 
-class FleetWatcher:
+class FleetWatcher(SessionOwner):
     """Hears all that the drones of a fleet publish. Raises UnavailableError for an endpoint that cannot be used."""
 
     def __init__(
@@ -76,18 +75,6 @@ class FleetWatcher:
     def reached(self) -> int:
         """How many peers and routers it is connected to."""
         return len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
-
-    def close(self) -> None:
-        """Ends the session."""
-        close_session(self._session)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _take_message(self, sample: zenoh.Sample) -> None:
         """On a thread of zenoh's."""

@@ -13,7 +13,7 @@ from flockd.tracking.filter import MIN_RANGE_M, Innovation, State, innovation
 from flockd.tracking.measurement import Measurement
 
 _FORBIDDEN = 1e9
-"""More than any sum of the costs of pairs within the gate."""
+"""More than any sum of the costs of pairs within the gate: those are tens each, of a few hundred pairs at most."""
 
 
 def assign(

@@ -15,7 +15,7 @@ from flockd.tracking.measurement import Measurement
 _LINEARISATIONS = 3
 """Of the iterated update (B. Bell, F. Cathey, IEEE Transactions on Automatic Control 38(2), 1993)."""
 MIN_RANGE_M = 0.01
-"""A predicted position nearer than this has no bearing."""
+"""A predicted position nearer than this, inside the drone itself, has no bearing."""
 
 
 @dataclass(frozen=True, eq=False)

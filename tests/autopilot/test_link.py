@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from flockd.autopilot.autopilot_status import AutopilotError, Firmware
 from flockd.autopilot.fake_autopilot import TICK_S, FakeAutopilot
 from flockd.autopilot.fake_telemetry import TelemetryStreams
 from flockd.autopilot.fake_vehicle import Demand, MotionState
 from flockd.autopilot.mavsdk_link import SETPOINT_TYPE_MASK, AutopilotLink
-from flockd.autopilot.status import AutopilotError, Firmware
 from flockd.config.autopilot import AutopilotParameters
 from flockd.messages import Setpoint
 from tests.autopilot.conftest import HEARTBEAT_S, free_port

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flockd.autopilot.status import AutopilotError, AutopilotStatus
+from flockd.autopilot.autopilot_status import AutopilotError, AutopilotStatus
 from flockd.autopilot.streamer import SetpointStreamer
 from flockd.config.autopilot import AutopilotParameters
 from flockd.messages import Setpoint

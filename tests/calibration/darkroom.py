@@ -78,7 +78,7 @@ def _fisheye_rays(x: FloatArray, y: FloatArray, k: Sequence[float]) -> FloatArra
 @cache
 def _texture(spec: BoardSpec) -> UInt8Array:
     """The board with a margin of half a square."""
-    picture = spec.picture(_TEXTURE_PX)
+    picture = spec.image(_TEXTURE_PX)
     edge = _TEXTURE_PX // 2
     return cv2.copyMakeBorder(picture, edge, edge, edge, edge, cv2.BORDER_CONSTANT, value=255)  # type: ignore[return-value]
 

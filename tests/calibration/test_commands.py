@@ -64,7 +64,7 @@ def told(capsys: Capture, code: int, *arguments: object) -> str:
     return captured.out if code == 0 else captured.err
 
 
-def test_a_folder_of_pictures_becomes_a_camera_that_checks(folder: Path, capsys: Capture) -> None:
+def test_a_folder_of_images_becomes_a_camera_that_checks(folder: Path, capsys: Capture) -> None:
     out, picture = folder.with_name("front.yaml"), folder.with_name("coverage.png")
     command = ("calibrate", "camera", folder, "--camera", "front", "--out", out, "--picture", picture)
     text = told(capsys, 0, *command, "--serial", "A1B2", "--model", "pinhole")
@@ -123,7 +123,7 @@ def test_what_is_not_enough_is_said_in_one_sentence(folder: Path, capsys: Captur
     assert not out.exists()
 
 
-def test_a_video_is_looked_through(pictures: list[UInt8Array], tmp_path: Path, capsys: Capture) -> None:
+def test_a_video_is_read(pictures: list[UInt8Array], tmp_path: Path, capsys: Capture) -> None:
     film, out = tmp_path / "film.avi", tmp_path / "film.yaml"
     writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, PINHOLE.size)
     for image in pictures:
@@ -164,7 +164,7 @@ class Film:
         self.ended = True
 
 
-def test_before_a_live_camera_a_person_is_told_what_to_do(
+def test_before_a_live_camera_a_person_gets_instructions(
     pictures: list[UInt8Array], tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     film = Film(pictures[:8])
@@ -185,7 +185,7 @@ def test_before_a_live_camera_a_person_is_told_what_to_do(
     assert measured.camera == "not known, /dev/video7"
 
 
-def test_a_v4l2_camera_is_looked_through(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_v4l2_camera_is_read(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     kernel = FakeKernel(video7=FakeCamera(formats=((480, 360, b"MJPG"),)))
     monkeypatch.setattr("flockd.sources.v4l2.LinuxKernel", lambda: kernel)
     monkeypatch.setattr("flockd.calibration.image_sources.FIRST_FRAME_S", 60.0)
@@ -302,7 +302,7 @@ def test_a_rig_is_calibrated_from_folders(tmp_path: Path, capsys: Capture) -> No
     small = drone("front", "right").model_dump(mode="json", exclude_defaults=True)
     small["rig"]["cameras"][1]["size_px"] = [640, 480]
     config.write_text(json.dumps(small))
-    assert "of camera 'right' is 640 x 480, and its picture 0 has 480 x 360 pixels" in told(
+    assert "of camera 'right' is 640 x 480, and its image 0 has 480 x 360 pixels" in told(
         capsys, 78, *command, "--force"
     )
     for file in (shots / "right").glob("[3-9].png"):
@@ -329,7 +329,7 @@ def record_turns(path: Path, axes: tuple[float, float, float] = (1.0, 1.0, 1.0),
             recorder.drain()
 
 
-def test_a_recording_of_motion_tells_how_a_camera_is_turned_and_its_time(tmp_path: Path, capsys: Capture) -> None:
+def test_a_recording_of_motion_gives_how_a_camera_is_turned_and_its_time(tmp_path: Path, capsys: Capture) -> None:
     flight, out = tmp_path / "drone1.mcap", tmp_path / "rig.yaml"
     record_turns(flight)
     text = told(capsys, 0, "calibrate", "rig", flight, "--by", "motion", "--out", out)
@@ -347,7 +347,7 @@ def test_a_recording_of_motion_tells_how_a_camera_is_turned_and_its_time(tmp_pat
     assert facts["time_offset_s"] == pytest.approx(OFFSET_S, abs=5e-3)
 
 
-def test_a_recording_is_looked_through_for_the_board(tmp_path: Path, capsys: Capture) -> None:
+def test_a_recording_is_searched_for_the_board(tmp_path: Path, capsys: Capture) -> None:
     flight = tmp_path / "drone1.mcap"
     record_turns(flight, steps=3)
     assert "the board is in none of the 3 images (3 no board)" in told(

@@ -84,7 +84,7 @@ def test_a_wide_lens_does_not_pass_for_a_pinhole() -> None:
 
 
 @pytest.mark.parametrize("lens", [PINHOLE, WIDE], ids=lambda lens: lens.model)
-def test_boards_that_are_all_parallel_to_the_picture_tell_no_focal_length(lens: Lens) -> None:
+def test_boards_that_are_all_parallel_to_the_image_give_no_focal_length(lens: Lens) -> None:
     collector = Collector(BoardFinder(SPEC), most=60)
     for number, place in enumerate(darkroom.sight(lens, 14, seed=3, tilt_deg=0.0)):
         collector.offer(f"{number}", photograph(lens, place, seed=number))
@@ -133,7 +133,7 @@ def test_a_board_in_motion_is_no_view_and_one_held_still_is() -> None:
     assert [collector.offer("", image, moving=True) for image in (here, there, there)] == ["moving", "moving", None]
 
 
-def test_pictures_of_two_sizes_are_told_apart() -> None:
+def test_images_of_two_sizes_are_refused() -> None:
     collector = Collector(BoardFinder(SPEC), most=60)
     collector.offer("a.png", np.zeros((360, 480, 3), np.uint8))
     with pytest.raises(CalibrationError, match=r"^b\.png: is 640 x 480 pixels and a\.png is 480 x 360; calibrate"):
@@ -147,7 +147,7 @@ def test_of_many_views_those_that_differ_most_are_kept() -> None:
     assert [view.name for view in collector.views] == ["-0.06", "0.0", "0.06"]
 
 
-def test_coverage_counts_the_lenss_own_picture_and_says_where_to_go() -> None:
+def test_coverage_counts_the_lenss_own_image_and_says_where_to_go() -> None:
     coverage = Coverage((480, 360))
     light = np.full((360, 480), 120, np.uint8)
     light[:, :60] = 0  # the lens shows nothing in the first of eight columns

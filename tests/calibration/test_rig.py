@@ -180,7 +180,7 @@ def test_turns_of_something_else_are_refused() -> None:
 
 
 @pytest.mark.parametrize("sway_m", [0.0, 0.25], ids=["turning", "swaying"])
-def test_turns_are_seen_in_pictures_of_a_room(sway_m: float) -> None:
+def test_turns_are_seen_in_images_of_a_room(sway_m: float) -> None:
     """Whether or not the camera also moves among things at all distances."""
     lens = Lens("wide_angle", (240, 180), 86.0, 86.0, 118.0, 92.0, (0.028, -0.011, 0.004, -0.0012))
     frames = 10.0 + np.arange(60) / 10.0

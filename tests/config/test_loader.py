@@ -140,7 +140,7 @@ def test_words_that_old_yaml_takes_for_truth_values_stay_words(tmp_path: Path) -
         ("<<: {yaw: hold}", "<<: merge keys are not supported; write the values out"),
     ],
 )
-def test_a_slip_in_line_six_is_told_with_its_mend(tmp_path: Path, line: str, told: str) -> None:
+def test_a_slip_in_line_six_is_reported_with_what_to_do(tmp_path: Path, line: str, told: str) -> None:
     assert _drone_problems(tmp_path, _with(line)) == [f"drone.yaml:6: {told}"]
 
 
@@ -196,7 +196,7 @@ def test_all_problems_of_both_files_come_at_once(tmp_path: Path) -> None:
     ]
 
 
-def test_a_scenario_tells_of_a_drone_file_that_is_not_there(tmp_path: Path) -> None:
+def test_a_scenario_reports_a_drone_file_that_is_not_there(tmp_path: Path) -> None:
     scenario = tmp_path / "scenario.yaml"
     scenario.write_text(SCENARIO, encoding="utf-8")
     assert _problems(scenario) == [
@@ -280,7 +280,7 @@ def test_a_relative_path_counts_from_the_folder_of_the_file_it_stands_in(
     assert overridden.perception.models_dir == "here", "who overrides it stands elsewhere"
 
 
-def test_models_that_are_not_there_are_told_with_where_they_were_looked_for(tmp_path: Path) -> None:
+def test_models_that_are_not_there_are_reported_with_where_they_were_searched_for(tmp_path: Path) -> None:
     (tmp_path / "models").mkdir()
     (tmp_path / "drone.yaml").write_text(_with("perception: {models_dir: modles}"), encoding="utf-8")
     with pytest.raises(ModelError, match=rf"^perception\.models_dir: {tmp_path}/modles is no folder; name the one "):
@@ -295,7 +295,7 @@ def test_models_that_are_not_there_are_told_with_where_they_were_looked_for(tmp_
         load_networks(load_drone(tmp_path / "drone.yaml").perception)
 
 
-def test_a_wrong_override_is_told_as_such() -> None:
+def test_a_wrong_override_is_reported_as_such() -> None:
     with pytest.raises(ConfigError) as caught:
         load_scenario(CONFIG / "paper_flight.yaml", {"duration_s": -3.0, "drone.perception.sclae": "height"})
     assert caught.value.problems == (

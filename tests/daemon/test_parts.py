@@ -20,9 +20,9 @@ from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.config.source import SourceParameters
 from flockd.daemon.host_monitors import LoopLag, WallClock, hottest_zone_c
 from flockd.daemon.lock import only_instance
-from flockd.daemon.networks import NetworkStuckError, WatchedNetworks
 from flockd.daemon.service_manager import ServiceManager
 from flockd.daemon.supervisor_inputs import CameraMonitor
+from flockd.daemon.watched_networks import NetworkStuckError, WatchedNetworks
 from flockd.daemon.worker import BusyError, LateError, Worker
 from flockd.data import data_path
 from flockd.errors import UnavailableError

@@ -13,8 +13,8 @@ import pytest
 
 from flockd.config import load_drone
 from flockd.daemon import clock_at, event_loop_at
-from flockd.daemon.networks import WatchedNetworks
 from flockd.daemon.pilot_loop import PilotLoop
+from flockd.daemon.watched_networks import WatchedNetworks
 from flockd.errors import ConfigError
 from flockd.messages import Frame, FrameSet, VehicleState
 from flockd.sources import CameraStatus

@@ -1,4 +1,4 @@
-"""What others recorded, flown again: each layout gives the motions that were filmed, or one sentence about itself."""
+"""Datasets of others, replayed: each layout gives the motions that were rendered, or one sentence about itself."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from scipy.spatial.transform import Rotation
 
 from flockd.cli import main
 
-from . import filmed
-from .filmed import FRAMES, HEIGHT, WIDTH, Film, Onlooker
+from . import rendered_dataset
+from .rendered_dataset import FRAMES, HEIGHT, WIDTH, Onlooker, Scene
 
 Capture = pytest.CaptureFixture[str]
 
 
 @pytest.fixture(scope="module")
-def film() -> Film:
-    return filmed.film()
+def scene() -> Scene:
+    return rendered_dataset.scene()
 
 
 @pytest.fixture
-def onlooker(film: Film, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flockd.replay.dataset_flight.load_networks", lambda config: Onlooker(film.depth))
+def onlooker(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flockd.replay.dataset_flight.load_networks", lambda config: Onlooker(scene.depth))
 
 
 @pytest.fixture
-def folder(film: Film, tmp_path: Path, onlooker: None) -> Path:
-    return filmed.write_rgbd_folder(film, tmp_path / "folder")
+def folder(scene: Scene, tmp_path: Path, onlooker: None) -> Path:
+    return rendered_dataset.write_rgbd_folder(scene, tmp_path / "folder")
 
 
 def replayed(capsys: Capture, *arguments: str | Path) -> dict[str, Any]:
@@ -46,32 +46,32 @@ def replayed(capsys: Capture, *arguments: str | Path) -> dict[str, Any]:
     return result
 
 
-def rgbd_folder(film: Film, path: Path) -> list[str | Path]:
-    return [filmed.write_rgbd_folder(film, path), "--depth", "recorded"]
+def rgbd_folder(scene: Scene, path: Path) -> list[str | Path]:
+    return [rendered_dataset.write_rgbd_folder(scene, path), "--depth", "recorded"]
 
 
-def tum(film: Film, path: Path) -> list[str | Path]:
-    return [filmed.write_tum(film, path), "--depth", "recorded"]
+def tum(scene: Scene, path: Path) -> list[str | Path]:
+    return [rendered_dataset.write_tum(scene, path), "--depth", "recorded"]
 
 
-def euroc(film: Film, path: Path) -> list[str | Path]:
-    return [filmed.write_euroc(film, path)]
+def euroc(scene: Scene, path: Path) -> list[str | Path]:
+    return [rendered_dataset.write_euroc(scene, path)]
 
 
 @pytest.mark.parametrize("layout", [rgbd_folder, tum, euroc])
 @pytest.mark.parametrize("stride", [1, 2])
-def test_each_layout_gives_the_motions_that_were_filmed(
-    layout: Callable[[Film, Path], list[str | Path]],
+def test_each_layout_gives_the_motions_that_were_rendered(
+    layout: Callable[[Scene, Path], list[str | Path]],
     stride: int,
-    film: Film,
+    scene: Scene,
     tmp_path: Path,
     onlooker: None,
     capsys: Capture,
 ) -> None:
-    result = replayed(capsys, *layout(film, tmp_path), "--stride", f"{stride}", "--flow", "dis")
+    result = replayed(capsys, *layout(scene, tmp_path), "--stride", f"{stride}", "--flow", "dis")
     assert [(pair["from"], pair["to"]) for pair in result["pairs"]] == [(k, k + stride) for k in range(FRAMES - stride)]
     for pair in result["pairs"]:
-        motion = film.motion(pair["from"], pair["to"])
+        motion = scene.motion(pair["from"], pair["to"])
         turn = np.degrees(Rotation.from_matrix(motion[:3, :3]).magnitude())
         assert pair["true_rotation_deg"] == pytest.approx(turn, abs=1e-3)
         assert pair["true_translation_m"] == pytest.approx(np.linalg.norm(motion[:3, 3]), abs=1e-4)
@@ -91,24 +91,26 @@ def test_the_figures_are_those_of_the_pairs(folder: Path, capsys: Capture) -> No
 
 
 def test_a_video_is_flown_with_a_drones_camera_and_without_truth(
-    film: Film, tmp_path: Path, onlooker: None, capsys: Capture
+    scene: Scene, tmp_path: Path, onlooker: None, capsys: Capture
 ) -> None:
-    video, path = filmed.write_video(film, tmp_path), tmp_path / "path.txt"
+    video, path = rendered_dataset.write_video(scene, tmp_path), tmp_path / "path.txt"
     result = replayed(capsys, video, "--calibration", tmp_path / "camera.yaml", "--trajectory", path)
     assert result["estimated_ratio"] == 1.0
     assert result["rotation_error_deg"] == {"median": None, "p95": None, "max": None}
     assert {pair["true_translation_m"] for pair in result["pairs"]} == {None}
     # From the origin, along the camera's axes, wherever the camera sits in the drone.
-    end = film.motion(0, FRAMES - 1)[:3, 3]
+    end = scene.motion(0, FRAMES - 1)[:3, 3]
     assert np.allclose(np.loadtxt(path)[-1, 1:4], end, atol=0.05)
 
 
-def test_the_trajectory_is_the_path_that_was_filmed(film: Film, folder: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_the_trajectory_is_the_path_that_was_rendered(
+    scene: Scene, folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
     path = tmp_path / "path.txt"
     replayed(capsys, folder, "--depth", "recorded", "--stride", "2", "--trajectory", path)
     rows = np.loadtxt(path)
     assert rows[:, 0].tolist() == [0.0, 2.0, 4.0]
-    for row, pose in zip(rows, film.poses[::2], strict=True):
+    for row, pose in zip(rows, scene.poses[::2], strict=True):
         assert np.allclose(row[1:4], pose[:3, 3], atol=0.03)
         off = Rotation.from_quat(row[4:]) * Rotation.from_matrix(pose[:3, :3]).inv()
         assert np.degrees(off.magnitude()) < 0.2
@@ -143,10 +145,10 @@ def test_too_little_depth_is_no_motion(folder: Path, capsys: Capture) -> None:
     assert "no motion could be estimated: ego-motion: fewer than three pairs" in captured.err
 
 
-def test_an_image_without_depth_of_its_time_is_left_out_and_told(
-    film: Film, tmp_path: Path, onlooker: None, capsys: Capture
+def test_an_image_without_depth_of_its_time_is_left_out_and_reported(
+    scene: Scene, tmp_path: Path, onlooker: None, capsys: Capture
 ) -> None:
-    filmed.write_tum(film, tmp_path)
+    rendered_dataset.write_tum(scene, tmp_path)
     assert main(["replay", str(tmp_path), "--depth", "recorded"]) == 0
     assert "1 of 7 images have no depth map within 0.02 s" in capsys.readouterr().err
 
@@ -226,11 +228,11 @@ def one_small_image(folder: Path) -> None:
 
 
 def doubled_calibration(folder: Path) -> None:
-    np.savetxt(folder / "K.txt", 2 * filmed.OTHERS_MATRIX - np.diag([0.0, 0.0, 1.0]))
+    np.savetxt(folder / "K.txt", 2 * rendered_dataset.OTHERS_MATRIX - np.diag([0.0, 0.0, 1.0]))
 
 
 def halved_calibration(folder: Path) -> None:
-    np.savetxt(folder / "K.txt", np.diag([0.5, 0.5, 1.0]) @ filmed.OTHERS_MATRIX)
+    np.savetxt(folder / "K.txt", np.diag([0.5, 0.5, 1.0]) @ rendered_dataset.OTHERS_MATRIX)
 
 
 def no_calibration(folder: Path) -> None:
@@ -282,17 +284,17 @@ def test_what_is_wrong_is_one_sentence(
 
 
 def test_a_listed_image_that_is_gone_is_named(
-    film: Film, tmp_path: Path, onlooker: None, capfd: pytest.CaptureFixture[str]
+    scene: Scene, tmp_path: Path, onlooker: None, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    filmed.write_tum(film, tmp_path)
+    rendered_dataset.write_tum(scene, tmp_path)
     gone = sorted((tmp_path / "rgb").iterdir())[3]
     gone.unlink()
     assert main(["replay", str(tmp_path), "--depth", "network"]) == 1
     assert f"{gone}: is missing" in capfd.readouterr().err
 
 
-def test_poses_of_another_time_are_named(film: Film, tmp_path: Path, onlooker: None, capsys: Capture) -> None:
-    filmed.write_tum(film, tmp_path)
+def test_poses_of_another_time_are_named(scene: Scene, tmp_path: Path, onlooker: None, capsys: Capture) -> None:
+    rendered_dataset.write_tum(scene, tmp_path)
     truth = tmp_path / "groundtruth.txt"
     rows = np.loadtxt(truth)
     rows[:, 0] += 1000.0
@@ -301,10 +303,10 @@ def test_poses_of_another_time_are_named(film: Film, tmp_path: Path, onlooker: N
     assert "groundtruth.txt: has no pose at the time of any image" in capsys.readouterr().err
 
 
-def test_a_video_that_breaks_off_is_told_from_one_that_ends(
-    film: Film, tmp_path: Path, onlooker: None, capsys: Capture
+def test_a_video_that_breaks_off_is_distinguished_from_one_that_ends(
+    scene: Scene, tmp_path: Path, onlooker: None, capsys: Capture
 ) -> None:
-    video = filmed.write_video(film, tmp_path)
+    video = rendered_dataset.write_video(scene, tmp_path)
     data = video.read_bytes()
     video.write_bytes(data[: len(data) // 2])
     assert main(["replay", str(video), "--calibration", str(tmp_path / "camera.yaml"), "--json"]) == 1
@@ -322,9 +324,9 @@ def test_what_is_no_video_is_one_sentence_whatever_the_decoder_thinks(tmp_path: 
     assert done.stderr == f"{video}: is no video that can be decoded; restore it, or convert it to MP4\n"
 
 
-def test_a_videos_calibration_is_of_its_size(film: Film, tmp_path: Path, capsys: Capture) -> None:
-    video = filmed.write_video(film, tmp_path)
-    other = filmed.write_camera(tmp_path / "other.yaml", (2 * WIDTH, 2 * HEIGHT))
+def test_a_videos_calibration_is_of_its_size(scene: Scene, tmp_path: Path, capsys: Capture) -> None:
+    video = rendered_dataset.write_video(scene, tmp_path)
+    other = rendered_dataset.write_camera(tmp_path / "other.yaml", (2 * WIDTH, 2 * HEIGHT))
     assert main(["replay", str(video), "--calibration", str(other)]) == 78
     assert "rig.cameras[0].size_px: is the calibration of another size, 640 x 480" in capsys.readouterr().err
     assert main(["replay", str(video)]) == 78
@@ -345,8 +347,8 @@ def test_what_cannot_be_asked_of_a_dataset(arguments: list[str], words: str, fol
     assert words in capsys.readouterr().err
 
 
-def test_euroc_has_no_depth_to_use(film: Film, tmp_path: Path, capsys: Capture) -> None:
-    filmed.write_euroc(film, tmp_path)
+def test_euroc_has_no_depth_to_use(scene: Scene, tmp_path: Path, capsys: Capture) -> None:
+    rendered_dataset.write_euroc(scene, tmp_path)
     assert main(["replay", str(tmp_path), "--depth", "recorded"]) == 2
     assert "has no recorded depth; replay it with --depth network" in capsys.readouterr().err
 

@@ -1,4 +1,4 @@
-"""What is asked of the autopilot over real MAVLink, and what is made of its answers. It is a stand-in, not PX4."""
+"""What is asked of the autopilot over real MAVLink, and what is made of its replies. It is a fake, not PX4."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
+from flockd.autopilot.autopilot_status import Firmware
 from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.autopilot.mavsdk_link import AutopilotLink
-from flockd.autopilot.status import Firmware
 from flockd.config import DroneConfig, load_drone
 from flockd.config.autopilot import AutopilotParameters
 from flockd.config.safety import GateParameters, SafetyParameters
@@ -59,12 +59,12 @@ def test_an_autopilot_that_is_set_up_well_and_left_as_it_is(monkeypatch: pytest.
     assert set(asked) <= {LISTENS, REQUESTS_MESSAGE}, "it listens and asks, and commands nothing"
     assert found.keys() == {"heartbeat", "firmware", *GOOD}
     assert {about for about, finding in found.items() if finding.level is not Level.PASS} == {"firmware"}
-    assert found["firmware"].measured.startswith("PX4 0.0.1 is older than 1.14"), "the stand-in is not PX4"
+    assert found["firmware"].measured.startswith("PX4 0.0.1 is older than 1.14"), "the fake autopilot is not PX4"
     assert "system 1 at udpin://127.0.0.1" in found["heartbeat"].measured
     assert "disarmed, in flight mode hold" in found["heartbeat"].measured
 
 
-def test_bad_values_are_read_and_told_with_their_mend() -> None:
+def test_bad_values_are_read_and_reported_with_what_to_do() -> None:
     port = free_port()
     with FakeAutopilot(port, height_m=2.0, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
         fake_autopilot.parameters.update({**GOOD, "COM_OF_LOSS_T": 2.5, "COM_OBL_RC_ACT": 1, "GF_MAX_HOR_DIST": 0.0})

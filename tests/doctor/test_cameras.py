@@ -1,4 +1,4 @@
-"""Cameras as they come: steady, slow, uneven, dark, gone, stuck in their driver. The kernel's side is a stand-in."""
+"""Cameras as they come: steady, slow, uneven, dark, gone, stuck in their driver. The kernel's side is a fake."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from flockd.doctor.camera_checks import check_cameras
 from flockd.messages import Frame
 from flockd.sources import FramePublisher
 from tests.daemon.aboard import free_endpoint
+from tests.sources.camera_images import SIZE, jpeg, scene
 from tests.sources.fake_kernel import FLAG_CLOCK_UNKNOWN, FLAG_ERROR, FakeCamera, FakeKernel
-from tests.sources.pictures import SIZE, jpeg, scene
 
 RATE_HZ = 30.0
 SECONDS = 0.7
@@ -186,7 +186,7 @@ def test_an_exposure_that_is_not_configured() -> None:
     _problem(found, Level.WARNING, "its exposure is not configured")
 
 
-def test_cameras_that_do_not_open_are_told_one_by_one() -> None:
+def test_cameras_that_do_not_open_are_reported_one_by_one() -> None:
     taken, small, busless = FakeCamera(), FakeCamera(formats=((320, 240, b"MJPG"),)), FakeCamera(rates=(10,))
     kernel = FakeKernel(taken=taken, small=small, busless=busless, controlled=FakeCamera())
     taken.owner = 1
@@ -203,7 +203,7 @@ def test_cameras_that_do_not_open_are_told_one_by_one() -> None:
     )
 
 
-def test_a_driver_that_hangs_is_told_and_the_other_camera_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_driver_that_hangs_is_reported_and_the_other_camera_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(camera_checks, "START_S", 1.0)
     monkeypatch.setattr(camera_checks, "STOP_S", 0.2)
     ended = threading.Event()

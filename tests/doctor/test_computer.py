@@ -38,7 +38,7 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     assert finding.measured == f"{tmp_path / 'none'} cannot be written (No such file or directory)"
 
 
-def test_without_a_folder_none_is_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_folder_none_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(computer_checks, "STATE_FOLDER", tmp_path / "none")
     (finding,) = check_disk(QUADROTOR, None)
     assert finding.level is Level.WARNING
@@ -112,7 +112,7 @@ def test_a_processor_that_is_slowed_down_and_a_fan_that_runs(tmp_path: Path) -> 
     assert "slowed down (cpufreq-cpu0)" in slowed.measured
 
 
-def test_a_computer_that_tells_no_temperature(tmp_path: Path) -> None:
+def test_a_computer_that_reports_no_temperature(tmp_path: Path) -> None:
     (finding,) = _temperature(tmp_path)
     assert finding.level is Level.WARNING
 

@@ -44,7 +44,7 @@ def test_the_shipped_calibrations_can_be_true(camera: CameraConfig) -> None:
         ({"distortion": (-0.5, 0.0, 0.0, 0.0)}, Level.FAILURE, "sees no direction at its border"),
     ],
 )
-def test_a_calibration_of_another_size_or_lens_is_told(lens: dict[str, object], level: Level, told: str) -> None:
+def test_a_calibration_of_another_size_or_lens_is_reported(lens: dict[str, object], level: Level, told: str) -> None:
     (problem,) = lens_problems(_camera(**lens))
     assert (problem.level, problem.about) == (level, "camera front")
     assert told in problem.measured
@@ -63,7 +63,7 @@ def test_four_cameras_see_all_around_and_three_do_not() -> None:
     assert "from 331 to 29 degrees" in coverage(ahead_is_blind).measured.replace("330 to 30", "331 to 29")
 
 
-def test_cameras_that_look_at_the_ground_see_no_horizon() -> None:
+def test_cameras_that_face_the_ground_see_no_horizon() -> None:
     down = [
         camera.model_copy(update={"extrinsics": camera.extrinsics.model_copy(update={"pitch_deg": -90.0})})
         for camera in SIMULATOR.cameras

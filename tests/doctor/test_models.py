@@ -13,7 +13,7 @@ from flockd.config.perception import PerceptionConfig
 from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.data import data_path
 from flockd.doctor import Check, Level, run_checks
-from flockd.doctor.models import STEPS, check_models, judge_steps, meadow, time_steps
+from flockd.doctor.model_checks import STEPS, check_models, judge_steps, meadow, time_steps
 from flockd.messages import PilotOutput
 from tests.daemon.aboard import TinyPerceiver
 
@@ -58,7 +58,7 @@ def test_whole_steps_are_timed_and_the_pilot_sees_its_way() -> None:
     timed = time_steps(TINY, TinyPerceiver())
     assert len(timed) == STEPS
     assert all(seconds > 0.0 for seconds, _ in timed)
-    assert timed[-1][1].stages_ms.keys() >= {"scene", "flow", "distance"}
+    assert timed[-1][1].stages_ms.keys() >= {"scene", "flow", "detection"}
 
 
 def test_the_grass_passes_by() -> None:
@@ -83,7 +83,7 @@ def test_the_first_step_warms_up_and_the_others_have_half_a_second(seconds: floa
     assert f"a step takes {1e3 * seconds:.0f} of 500 ms with 2 threads and 1 camera" in finding.measured
 
 
-def test_a_busy_computer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_busy_computer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "getloadavg", lambda: (9.0, 9.0, 9.0))
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     assert judge_steps(TINY, _timed(0.7)).fix.startswith("stop other programs first (a load of 9 on 2 cores)")

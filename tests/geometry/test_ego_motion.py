@@ -107,7 +107,7 @@ def test_a_polish_that_costs_more_than_its_start_is_refused(monkeypatch: pytest.
     assert (refine_ego_motion(pairs, RIG, truth) is None) == rises
 
 
-def test_a_refused_polish_leaves_algorithm_1s_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_polish_leaves_algorithm_1s_result(monkeypatch: pytest.MonkeyPatch) -> None:
     pairs, _ = flight(3, Flaws())
     monkeypatch.setattr(ego_motion, "refine_ego_motion", lambda *_, **__: None)
     raw, kept = (estimate_ego_motion(pairs, RIG, 0.5, parameters) for parameters in (UNPOLISHED, POLISHED))
@@ -162,7 +162,7 @@ def test_a_start_some_degrees_and_decimetres_off_converges() -> None:
     assert metres < 0.01
 
 
-def test_one_seed_gives_one_answer() -> None:
+def test_one_seed_gives_one_result() -> None:
     pairs, _ = flight(5, Flaws())
     one, same = (estimate_ego_motion(pairs, RIG, 0.5, POLISHED, seed=9) for _ in range(2))
     assert np.array_equal(one.rotation, same.rotation)

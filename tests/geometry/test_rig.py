@@ -35,7 +35,7 @@ def mounted(**extrinsics: float) -> RigCamera:
         ({"roll_deg": 90.0}, (0, 0, 1), (0, -1, 0), (1, 0, 0)),
     ],
 )
-def test_a_camera_looks_where_its_angles_say(
+def test_a_camera_faces_where_its_angles_say(
     extrinsics: dict[str, float], right: tuple[int, ...], down: tuple[int, ...], ahead: tuple[int, ...]
 ) -> None:
     mount = mounted(**extrinsics).T_body_camera

@@ -24,7 +24,7 @@ def test_a_known_motion_is_found_exactly() -> None:
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_noisy_points_give_scipys_least_squares_answer(weighted: bool) -> None:
+def test_noisy_points_give_scipys_least_squares_result(weighted: bool) -> None:
     random = np.random.default_rng(1)
     for _ in range(20):
         source = random.normal(0.0, 5.0, (30, 3))

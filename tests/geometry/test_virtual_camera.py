@@ -48,7 +48,7 @@ def centroid(picture: UInt8Array) -> FloatArray:
     return np.array([np.average(columns, weights=weight), np.average(rows, weights=weight)])
 
 
-def test_it_sits_in_the_best_camera_and_looks_level_along_the_direction() -> None:
+def test_it_sits_in_the_best_camera_and_faces_level_along_the_direction() -> None:
     direction = np.array([0.9, 0.3, 0.2])
     crop = virtual_crop(RIG, direction, 0.2, 96)
     assert crop.main == "front"
@@ -98,7 +98,7 @@ def test_a_ball_seen_by_the_main_camera_is_exact_with_and_without_its_range(rang
     assert centroid(picture) == pytest.approx(expected, abs=0.5)
 
 
-def test_a_ball_across_two_cameras_is_seen_whole_and_its_range_mends_the_seam() -> None:
+def test_a_ball_across_two_cameras_is_seen_whole_and_its_range_closes_the_seam() -> None:
     centre = np.array([1.5, 1.6, 0.2])
     images = {name: picture_of_ball(camera, centre, 0.4) for name, camera in RIG.cameras.items()}
     crop = virtual_crop(RIG, centre, 0.3, 96)
@@ -149,7 +149,7 @@ def test_a_direction_nobody_sees_and_an_impossible_angle_are_refused() -> None:
         virtual_crop(RIG, np.array([1.0, 0.0, 0.0]), 1.6, 96)
 
 
-def test_the_widest_crop_can_be_drawn_wherever_the_rig_looks() -> None:
+def test_the_widest_crop_can_be_drawn_wherever_the_rig_sees() -> None:
     """Also where a second camera sees no more than a corner of it, at a right angle to its middle."""
     images = {name: np.full((640, 480, 3), 90, np.uint8) for name in RIG.cameras}
     for azimuth in np.radians(np.arange(0.0, 93.0, 4.0)):
@@ -161,7 +161,7 @@ def test_the_widest_crop_can_be_drawn_wherever_the_rig_looks() -> None:
             assert seen.mean() > 0.5
 
 
-def test_a_map_over_the_picture_is_looked_up_at_places_of_the_body() -> None:
+def test_a_map_over_the_image_is_sampled_at_places_of_the_body() -> None:
     crop = virtual_crop(RIG, np.array([0.9, 0.3, 0.2]), 0.2, 96)
     pixels = np.random.default_rng(0).uniform(1.0, 95.0, (40_000, 2))
     points = crop.T_body_virtual.apply(crop.camera.unproject(pixels, np.full(len(pixels), 3.0)))

@@ -105,7 +105,7 @@ def test_words_that_older_yaml_takes_for_booleans_are_words(tmp_path: Path) -> N
     assert read_manifest(path).manifest.inputs["picture"].shape == ("y", 96, 96, 3)
 
 
-def test_a_missing_model_file_is_told_at_the_key_that_names_it(tmp_path: Path) -> None:
+def test_a_missing_model_file_is_reported_at_the_key_that_names_it(tmp_path: Path) -> None:
     path = one_channel_depth(tmp_path, output={})
     path.with_suffix(".onnx").unlink()
     with refused(rf"^{path}:4: file: cannot read .*someones_depth\.onnx \(No such file.*; put the model file back or"):

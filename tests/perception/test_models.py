@@ -40,7 +40,7 @@ def test_three_models_and_their_twins_fill_the_four_roles() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_model_opens_and_gives_its_golden_answer(name: str) -> None:
+def test_a_model_opens_and_gives_its_golden_output(name: str) -> None:
     OnnxModel(MODELS / f"{name}.yaml", threads=1)
 
 
@@ -74,7 +74,7 @@ def test_a_truncated_file_whose_hash_was_updated_is_still_refused(copies: Path) 
         OnnxModel(manifest, threads=1)
 
 
-def test_another_models_weights_do_not_give_the_golden_answer(copies: Path) -> None:
+def test_another_models_weights_do_not_give_the_golden_output(copies: Path) -> None:
     manifest = copies / "distance.yaml"
     text = manifest.read_text()
     golden = next(line for line in text.splitlines() if "golden_mean" in line)
@@ -195,7 +195,7 @@ def test_the_twins_in_8_bits_say_what_the_float_networks_say() -> None:
         np.testing.assert_allclose(mine.centre, other.centre, atol=1.5)
 
 
-def test_what_a_mirror_shows_is_told_as_if_there_were_none() -> None:
+def test_what_a_mirror_shows_is_estimated_as_if_there_were_none() -> None:
     view = Renderer(World.generate(11), [drone_model(0, 0)]).render(
         np.array([[100.0, 0.0, 48.0], [0.0, 100.0, 48.0], [0.0, 0.0, 1.0]]), (96, 96),
         np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([0.0, 0.0, -4.0]),
@@ -214,7 +214,7 @@ def test_what_a_mirror_shows_is_told_as_if_there_were_none() -> None:
         assert math.exp(told.log_range) == pytest.approx(1.5, rel=0.25)
 
 
-def test_many_pictures_go_in_batches_no_larger_than_what_is_prepared(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_images_go_in_batches_no_larger_than_what_is_prepared(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     images = rng.integers(0, 256, (31, 96, 96, 3), dtype=np.uint8)
     pictures = [crop_of(image, 100.0) for image in images]
@@ -231,7 +231,7 @@ def test_many_pictures_go_in_batches_no_larger_than_what_is_prepared(monkeypatch
     np.testing.assert_allclose(ranges, [perception.ranges([picture])[0].log_range for picture in pictures], atol=1e-3)
 
 
-def test_the_network_of_flow_is_sharpened_by_dis_unless_told_otherwise() -> None:
+def test_the_network_of_flow_is_sharpened_by_dis_unless_configured_otherwise() -> None:
     first, second = shifted_pictures((9, -5), (480, 640))
     network = OnnxFlow(OnnxModel(MODELS / "flow_int8.yaml", threads=1))
     for refinement, expected in (
@@ -249,7 +249,7 @@ def test_the_network_of_flow_is_sharpened_by_dis_unless_told_otherwise() -> None
         np.testing.assert_allclose(found, settled, atol=1e-4)
 
 
-def test_the_second_stage_tells_which_pixels_are_the_drones_in_a_mirror_too() -> None:
+def test_the_second_stage_marks_which_pixels_are_the_drones_in_a_mirror_too() -> None:
     K = np.array([[200.0, 0.0, 48.0], [0.0, 200.0, 48.0], [0.0, 0.0, 1.0]])
     view = Renderer(World.generate(11), [drone_model(0, 0)]).render(
         K, (96, 96), np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([0.0, 0.0, -4.0]),

@@ -28,7 +28,7 @@ def ego(moved_with: FloatArray | None) -> EgoMotion | None:
     return EgoMotion(np.eye(3), R_NED_BODY.T @ moved_with * STEP_S, STEP_S, 100, 90, 0.1)
 
 
-def test_a_drone_flies_as_it_was_told_although_its_autopilot_errs() -> None:
+def test_a_drone_flies_as_commanded_although_its_autopilot_errs() -> None:
     """The autopilot makes its own estimate what it is told; the truth is less by what it errs."""
     wanted, errs = np.array([1.0, 0.3]), np.array([0.2, -0.15, 0.05])
     trim = VelocityTrim(0.5, 0.7)

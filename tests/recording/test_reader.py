@@ -78,7 +78,7 @@ def test_a_file_cut_off_anywhere_is_refused_or_played_as_far_as_it_goes(tmp_path
     assert (outcomes[0], outcomes[-1]) == (0, 10)
 
 
-def test_damage_within_is_told_and_recovered_from(tmp_path: Path, whole: Path) -> None:
+def test_damage_within_is_reported_and_recovered_from(tmp_path: Path, whole: Path) -> None:
     content = bytearray(whole.read_bytes())
     at = len(content) // 2
     content[at : at + 2000] = bytes(2000)
@@ -193,7 +193,7 @@ def test_a_cut_holds_its_stretch_and_what_is_needed_to_play_it(tmp_path: Path, w
     assert [path.name for path in tmp_path.iterdir()] == ["cut.mcap"]
 
 
-def test_tables_and_pictures_hold_what_was_flown(tmp_path: Path) -> None:
+def test_tables_and_images_hold_what_was_flown(tmp_path: Path) -> None:
     outputs = record(tmp_path / "drone1.mcap", steps=3)
     recording = Recording(tmp_path / "drone1.mcap")
     folder = tmp_path / "tables"

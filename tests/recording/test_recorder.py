@@ -137,7 +137,7 @@ def test_jpeg_is_smaller_and_near(tmp_path: Path) -> None:
     assert not np.array_equal(step.frames.frames["front"].image, frames.frames["front"].image)
 
 
-def test_a_frame_that_is_no_picture_is_left_out_and_told(tmp_path: Path) -> None:
+def test_a_frame_that_is_no_image_is_left_out_and_reported(tmp_path: Path) -> None:
     config = drone_config()
     told: list[str] = []
     with Recorder(tmp_path / "drone1.mcap", drone="drone1", config=config, on_event=told.append) as recorder:
@@ -247,7 +247,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_flight(tmp_path: Path, kind:
     assert len(kept) >= 5
 
 
-def test_nowhere_to_write_is_told_once_and_does_not_raise(tmp_path: Path) -> None:
+def test_nowhere_to_write_is_reported_once_and_does_not_raise(tmp_path: Path) -> None:
     told: list[str] = []
     config = drone_config()
     path = tmp_path / "missing" / "drone1.mcap"

@@ -147,7 +147,7 @@ def test_a_yaw_that_is_not_finite_is_refused_and_the_last_one_kept() -> None:
     assert verdict.objections == (Objection.COMMAND_NOT_FINITE,)
 
 
-def test_standing_still_it_looks_where_it_looked_last() -> None:
+def test_standing_still_it_faces_where_it_faced_last() -> None:
     stream = Stream()
     stream.second([0.5, 0.0])
     assert sent(stream.step([0.5, 0.0], Action.HOVER)).yaw_rad == 1.0

@@ -46,7 +46,7 @@ def test_limits_of_the_supervisor(limits: dict[str, Any], words: str) -> None:
         SafetyParameters(**limits)
 
 
-def test_a_law_faster_than_the_gate_is_told_with_both_keys() -> None:
+def test_a_law_faster_than_the_gate_is_reported_with_both_keys() -> None:
     with pytest.raises(
         ConfigError, match=r"flocking.max_speed_m_s 6 is above safety.gate.max_speed_m_s.*write 4 or less"
     ):

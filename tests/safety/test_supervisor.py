@@ -208,7 +208,7 @@ def test_silent_stays_silent_whatever_happens_and_afterwards(event: Event) -> No
 
 
 @EVENTS
-def test_of_two_events_the_worse_wins_and_is_told_first(event: Event) -> None:
+def test_of_two_events_the_worse_wins_and_is_reported_first(event: Event) -> None:
     for other, fault in FAULTS.items():
         if fault.changes.keys() & FAULTS[event].changes.keys():
             continue  # two values of one number
@@ -279,7 +279,7 @@ def test_the_pilot_takes_over_and_it_never_comes_back_by_itself() -> None:
     assert flight.events == [Event.NOT_OFFBOARD]
 
 
-def test_what_was_mild_when_the_pilot_took_over_is_not_told_as_a_reason_for_it() -> None:
+def test_what_was_mild_when_the_pilot_took_over_is_not_reported_as_a_reason_for_it() -> None:
     flight = flying().step(cameras=ONE_LOST, flight_mode="position").step(cameras=ALL_SEE)
     assert flight.events == [Event.NOT_OFFBOARD]
 
@@ -401,7 +401,7 @@ def test_every_flight_asks_anew() -> None:
 
 
 @pytest.mark.parametrize("asked", ["hold_asked", "land_asked", "shutdown_asked"])
-def test_an_autopilot_that_does_not_answer_is_left_to_its_failsafe_after_two_seconds(asked: str) -> None:
+def test_an_autopilot_that_does_not_reply_is_left_to_its_failsafe_after_two_seconds(asked: str) -> None:
     flight = flying().step(**{asked: True}).run(2.0 - STEP_S)
     assert flight.state is State.ASKING
     flight.step()
@@ -418,7 +418,7 @@ def test_a_worse_event_while_asking_asks_for_more_and_has_its_own_two_seconds() 
     assert flight.step().state is State.SILENT
 
 
-def test_told_to_end_it_stands_still_until_hold_is_confirmed() -> None:
+def test_when_stopped_it_stands_still_until_hold_is_confirmed() -> None:
     flight = flying().step(shutdown_asked=True)
     assert flight.action is Action.ASK_HOLD
     flight.run(0.5).step(flight_mode="hold")
@@ -624,7 +624,7 @@ def test_the_reason_says_how_bad_it_is(changes: dict[str, Any], words: str) -> N
     assert words in sentence
 
 
-def test_in_waiting_what_keeps_it_from_flying_is_told_first() -> None:
+def test_in_waiting_what_keeps_it_from_flying_is_reported_first() -> None:
     flight = ready().step(cameras=ONE_LOST, outside_fence=True, offboard_refused=True)
     assert flight.events[0] is Event.OFFBOARD_REFUSED
     assert flight.events[1] is Event.FENCE_LEFT

@@ -224,7 +224,7 @@ def test_the_bytes_do_not_depend_on_the_threads(scenes: list[Scene]) -> None:
 
 
 @pytest.mark.parametrize("size", [(96, 96), (31, 17), (640, 480)])
-def test_any_image_size_is_a_crop_of_the_same_picture(scenes: list[Scene], size: tuple[int, int]) -> None:
+def test_any_image_size_is_a_crop_of_the_same_image(scenes: list[Scene], size: tuple[int, int]) -> None:
     scene = scenes[0]
     whole = scene.render()
     shifted = MATRIX.copy()

@@ -39,7 +39,7 @@ def _yaw_pitch_roll_deg(R_ned_body: Array) -> Array:
     return np.asarray(Rotation.from_matrix(R_ned_body).as_euler("ZYX", degrees=True))
 
 
-def test_velocity_answers_a_setpoint_as_a_first_order_lag() -> None:
+def test_velocity_responds_to_a_setpoint_as_a_first_order_lag() -> None:
     tau = 0.25
     vehicles = Vehicles([START], VehicleConfig(velocity_time_constant_s=tau))
     setpoint = np.array([[0.6, -0.3]])
@@ -159,7 +159,7 @@ def test_gusts_depend_on_the_seed_alone() -> None:
     assert np.any(flown[0] != flown[2])
 
 
-def test_an_autopilot_without_errors_tells_the_truth() -> None:
+def test_an_autopilot_without_errors_gives_true_values() -> None:
     perfect = SensorConfig(barometer_drift_m=0.0, barometer_noise_m=0.0, attitude_error_deg=0.0, velocity_error_m_s=0.0)
     autopilot = SimulatedAutopilot(perfect, seed=0, drone=0)
     turn = euler_rotation(0.1, -0.2, 1.0)

@@ -1,4 +1,4 @@
-"""A fleet of real daemons: two with autopilot stand-ins, from rendered frames, over real MAVLink; PX4 where it is."""
+"""A fleet of real daemons: two with fake autopilots, from rendered frames, over real MAVLink; PX4 where it is."""
 
 from __future__ import annotations
 
@@ -73,11 +73,11 @@ def test_two_daemons_fly_from_rendered_frames_and_the_report_is_the_simulators(
     assert code == 0, told.err
     summary = json.loads(told.out)
     assert summary == json.loads((out / "summary.json").read_text(encoding="utf-8"))
-    assert (summary["autopilot"], summary["drones"], summary["perception"]) == ("stand-in", 2, "learned")
+    assert (summary["autopilot"], summary["drones"], summary["perception"]) == ("fake autopilot", 2, "learned")
     assert summary["fleet"]["handed_over"] == {}
     assert summary["fleet"]["exit_codes"] == {"drone1": 0, "drone2": 0}
     assert summary["realtime_factor"] == pytest.approx(1.0, rel=0.05)
-    assert "stand-in" in (out / "report.html").read_text(encoding="utf-8")
+    assert "fake autopilot" in (out / "report.html").read_text(encoding="utf-8")
 
     log = FlightLog.load(out / "flight.npz")
     assert len(log.time_s) == summary["fleet"]["frame_sets"] >= 4
@@ -162,7 +162,7 @@ def test_the_ground_station_knows_where_everybody_truly_is() -> None:
         GroundStation([port], time.monotonic) as station,
         FakeAutopilot(
             free_port(), height_m=2.0, yaw_rad=np.pi / 2, home_deg=home_deg(np.array([3.0, 4.0])), truth_port=port
-        ) as stand_in,
+        ) as fake_autopilot,
     ):
         until_s = time.monotonic() + 10.0
         while not (station.is_connected(0) and station.is_armed(0)):
@@ -176,7 +176,7 @@ def test_the_ground_station_knows_where_everybody_truly_is() -> None:
         while not station.mode_is(0, "LAND"):
             assert time.monotonic() < until_s
             time.sleep(0.01)
-        assert stand_in.mode == "LAND"
+        assert fake_autopilot.mode == "LAND"
 
 
 @PX4

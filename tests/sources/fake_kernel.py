@@ -1,4 +1,4 @@
-"""A stand-in for the kernel's side of V4L2: plays cameras to the capture code by the bytes of linux/videodev2.h.
+"""A fake of the kernel's side of V4L2: plays cameras to the capture code by the bytes of linux/videodev2.h.
 
 The request numbers and offsets are those that a C compiler gives for the header on 64-bit machines, written down here
 independently of the code under test.

@@ -76,7 +76,7 @@ def test_cameras_that_run_freely_are_put_together_within_half_a_period() -> None
     assert all(later > earlier for earlier, later in itertools.pairwise(times))
 
 
-def test_a_slow_reader_gets_the_newest_and_the_rest_is_superseded() -> None:
+def test_a_slow_reader_gets_the_newest_and_the_others_are_superseded() -> None:
     stage = Stage("front", "back")
     for n in range(15):
         stage.now_s += PERIOD_S
@@ -98,7 +98,7 @@ def test_a_camera_that_is_late_within_the_wait_is_waited_for() -> None:
 
 
 def test_a_constantly_later_camera_still_gets_its_place() -> None:
-    """The back camera's pictures come 70 ms after the front's; sets are as old as that, and complete."""
+    """The back camera's images come 70 ms after the front's; sets are as old as that, and complete."""
     stage = Stage("front", "back")
     events = sorted(
         [(n * PERIOD_S, "front", n * PERIOD_S) for n in range(30)]
@@ -234,7 +234,7 @@ def test_a_stamp_that_stands_still_or_goes_back_or_is_no_number_is_dropped(time_
     assert stage.count("front", "time_stamp") == 1
 
 
-def test_a_picture_that_repeats_itself_is_frozen_until_it_changes() -> None:
+def test_an_image_that_repeats_itself_is_frozen_until_it_changes() -> None:
     stage = Stage("front", "back", frozen_after=3)
     verdicts = []
     for n in range(7):
@@ -248,12 +248,12 @@ def test_a_picture_that_repeats_itself_is_frozen_until_it_changes() -> None:
     assert stage.send("front", 7 * PERIOD_S, data=b"another") is None
 
 
-def test_a_sequence_number_that_stands_still_is_frozen_whatever_the_picture() -> None:
+def test_a_sequence_number_that_stands_still_is_frozen_whatever_the_image() -> None:
     stage = Stage("front", frozen_after=2)
     assert [stage.send("front", 0.1 * n, sequence=7) for n in range(4)] == [None, None, "frozen", "frozen"]
 
 
-def test_a_simulators_pictures_may_repeat_for_ever() -> None:
+def test_a_simulators_images_may_repeat_for_ever() -> None:
     stage = Stage("front", frozen_after=0)
     assert {stage.send("front", 0.1 * n, data=b"the same") for n in range(50)} == {None}
 

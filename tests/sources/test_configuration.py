@@ -65,7 +65,7 @@ def test_a_drone_without_source_can_be_simulated_but_opens_none(tmp_path: Path) 
     assert str(caught.value) == "drone.yaml: source: is missing; add it with kind `v4l2` or `shared_memory`"
 
 
-def test_slips_inside_the_optional_section_are_told_with_their_mend(tmp_path: Path) -> None:
+def test_slips_inside_the_optional_section_are_reported_with_what_to_do(tmp_path: Path) -> None:
     text = (
         "source:\n  kind: v4l3\n  silence: 1\n  cameras:\n"
         "    - {name: front, device: /dev/video0, rate_hz: 0, controls: [{name: gain, value: 1.5}]}\n"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flockd.sources.image_formats import CorruptImageError, MjpegFormat, RgbFormat, YuyvFormat
-from tests.sources.pictures import SIZE, jpeg, scene, yuyv
+from tests.sources.camera_images import SIZE, jpeg, scene, yuyv
 
 
 def _without_huffman_tables(data: bytes) -> bytes:

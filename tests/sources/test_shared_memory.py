@@ -21,7 +21,7 @@ from flockd.errors import UnavailableError
 from flockd.messages import Frame, FrameSet
 from flockd.sources import FramePublisher, shared_memory
 from flockd.sources.shared_memory import SharedMemorySource
-from tests.sources.pictures import SIZE, scene
+from tests.sources.camera_images import SIZE, scene
 
 CAMERAS = ("front", "back")
 
@@ -102,7 +102,7 @@ def test_frames_arrive_byte_for_byte_from_another_process(endpoint: str, source:
 import time
 from flockd.messages import Frame
 from flockd.sources import FramePublisher
-from tests.sources.pictures import scene
+from tests.sources.camera_images import scene
 scenes = [scene(number) for number in range(40)]
 with FramePublisher(listen=[{endpoint!r}]) as publisher:
     for number in range(4000):
@@ -202,7 +202,7 @@ def test_messages_that_are_no_frames_are_counted_and_ignored(endpoint: str, sour
         assert frames.frames.keys() == {"back"}
 
 
-def test_an_endpoint_that_is_none_is_told_in_one_sentence() -> None:
+def test_an_endpoint_that_is_none_is_reported_in_one_sentence() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

@@ -1,4 +1,4 @@
-"""Cameras are plugged in, pulled out, disturbed and taken by others; the kernel's side of it is a stand-in."""
+"""Cameras are plugged in, pulled out, disturbed and taken by others; the kernel's side of it is a fake."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from flockd.sources import CameraStatus, v4l2_kernel
 from flockd.sources.v4l2 import V4l2Source
 from flockd.sources.v4l2_device import control_name
 from flockd.sources.v4l2_kernel import Kernel, LinuxKernel
+from tests.sources.camera_images import SIZE, jpeg, scene, yuyv
 from tests.sources.fake_kernel import (
     FLAG_CLOCK_UNKNOWN,
     FLAG_ERROR,
@@ -34,7 +35,6 @@ from tests.sources.fake_kernel import (
     FakeKernel,
     Request,
 )
-from tests.sources.pictures import SIZE, jpeg, scene, yuyv
 
 JPEGS = [jpeg(scene(number)) for number in range(8)]
 BY_HAND = (
@@ -166,7 +166,7 @@ def test_uncompressed_images_may_have_padded_rows(start: Start) -> None:
     np.testing.assert_allclose(image[:, 340:630].mean((0, 1)), (0, 0, 255), atol=2)
 
 
-def test_the_newest_frame_wins_and_the_rest_is_counted(start: Start) -> None:
+def test_the_newest_frame_wins_and_the_others_are_counted(start: Start) -> None:
     kernel = FakeKernel(front=FakeCamera())
     source = start(kernel, _camera())
     for number in range(4):
@@ -245,7 +245,7 @@ def test_a_stamp_that_does_not_increase_is_dropped(start: Start) -> None:
     assert _next(source).frames["front"].sequence == 0
 
 
-def test_an_unplugged_camera_is_told_of_at_once_and_comes_back_when_plugged_in(start: Start) -> None:
+def test_an_unplugged_camera_is_reported_at_once_and_comes_back_when_plugged_in(start: Start) -> None:
     kernel = FakeKernel(front=FakeCamera(), back=FakeCamera())
     source = start(kernel, _camera("front", controls=BY_HAND), _camera("back"))
     kernel.send("front", JPEGS[0])
@@ -314,7 +314,7 @@ def test_a_frozen_camera_counts_as_silent(start: Start) -> None:
     assert source.status()["front"].fault is None
 
 
-def test_a_camera_that_another_program_uses_is_told_of_and_taken_when_it_is_free(start: Start) -> None:
+def test_a_camera_that_another_program_uses_is_reported_and_taken_when_it_is_free(start: Start) -> None:
     kernel = FakeKernel(front=FakeCamera(owner=1))
     source = start(kernel, _camera())
     status = _until(source, lambda status: status.fault is not None)
@@ -385,7 +385,7 @@ def test_what_the_camera_cannot_do_is_said_in_one_sentence(
     assert _until(source, lambda status: status.fault is not None).fault == sentence
 
 
-def test_a_control_that_takes_no_such_step_is_told_of(start: Start) -> None:
+def test_a_control_that_takes_no_such_step_is_reported(start: Start) -> None:
     camera = FakeCamera()
     camera.controls[GAIN].step = 16
     source = start(FakeKernel(front=camera), _camera(controls=(ControlParameters(name="gain", value=40),)))
@@ -434,7 +434,7 @@ def test_a_buffer_written_by_the_headers_offsets_is_read_field_by_field() -> Non
     assert (buffer.offset, buffer.length) == (0x300000, 614_400)
 
 
-def test_the_real_system_calls_answer_into_the_structures_they_are_given() -> None:
+def test_the_real_system_calls_write_into_the_structures_they_are_given() -> None:
     """Without a camera: a pipe tells how many bytes wait in it (FIONREAD), and when; a file is mapped."""
     kernel = LinuxKernel()
     reading, writing = os.pipe()
@@ -457,7 +457,7 @@ def test_the_real_system_calls_answer_into_the_structures_they_are_given() -> No
     memory.close()
 
 
-def test_what_is_no_camera_is_told_by_the_real_kernel(start: Start) -> None:
+def test_what_is_no_camera_is_reported_by_the_real_kernel(start: Start) -> None:
     camera = CameraDeviceParameters(name="front", device="/dev/null")
     source = start(LinuxKernel(), camera)
     sentence = "front: /dev/null is not a V4L2 camera (Inappropriate ioctl for device)"

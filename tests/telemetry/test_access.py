@@ -89,7 +89,7 @@ def test_who_may_watch_hears_and_who_may_command_commands(settings: dict[str, Pa
         assert asked == ["hold"]
 
 
-def test_settings_that_are_not_there_are_told(tmp_path: Path) -> None:
+def test_settings_that_are_not_there_are_reported(tmp_path: Path) -> None:
     with pytest.raises(
         UnavailableError, match=f"telemetry cannot use no endpoint with the settings of {tmp_path}/none"
     ):

@@ -147,7 +147,7 @@ def test_names_that_would_break_a_key_are_refused(endpoint: str) -> None:
         telemetry.publish("1", "stat", {})
 
 
-def test_a_taken_port_is_told_in_one_sentence() -> None:
+def test_a_taken_port_is_reported_in_one_sentence() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

@@ -10,7 +10,7 @@ import pytest
 from tools.training.pictures import PictureFiles
 
 
-def test_a_family_of_few_pictures_is_drawn_as_often_as_one_of_many(tmp_path: Path) -> None:
+def test_a_family_of_few_images_is_drawn_as_often_as_one_of_many(tmp_path: Path) -> None:
     for name, families, drones in (("a", [0] * 90 + [1] * 5, 1.0), ("b", [0] * 5, 0.0), ("c", [1], 1.0)):
         values = np.arange(len(families), dtype=np.float32)
         np.savez(
@@ -29,7 +29,7 @@ def test_a_family_of_few_pictures_is_drawn_as_often_as_one_of_many(tmp_path: Pat
     assert {float(sample["apparent"]) for sample in lonely} == {0.0} | {float(n) for n in range(90, 95)}
 
 
-def test_pictures_like_the_last_look_at_a_drone_are_drawn_more_often_than_others(tmp_path: Path) -> None:
+def test_images_like_the_last_crop_of_a_drone_are_drawn_more_often_than_others(tmp_path: Path) -> None:
     target = np.zeros((100, 3))
     target[:80, 1], target[80:90, 2] = 20.0, -9.0
     values = np.full(100, np.log(70.0))
@@ -42,6 +42,6 @@ def test_pictures_like_the_last_look_at_a_drone_are_drawn_more_often_than_others
     assert np.mean(like_it) == pytest.approx(0.6 + 0.4 * 0.09, abs=0.03)
 
 
-def test_a_folder_without_pictures_says_how_to_make_them(tmp_path: Path) -> None:
+def test_a_folder_without_images_says_how_to_make_them(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"make them with `python -m tools\.render_drone_pictures`"):
         PictureFiles(tmp_path)

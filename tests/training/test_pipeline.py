@@ -81,7 +81,7 @@ def test_a_warped_image_goes_where_its_flow_says() -> None:
         assert np.median(np.abs(np.roll(smooth, 7, axis=1).astype(float) - smooth).max(axis=2)) > 5.0, "it has texture"
 
 
-def test_the_mask_of_a_picture_is_the_drone_that_it_faces() -> None:
+def test_the_mask_of_a_crop_is_the_drone_that_it_faces() -> None:
     """A red drone and a blue one beside it; the picture of the red one masks what is red."""
     rng = np.random.default_rng(2)
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
@@ -107,7 +107,7 @@ def test_some_images_stay_clear_and_the_others_are_spoilt_each_in_its_own_way() 
     assert all(part.shape == image.shape and part.dtype == np.uint8 for pair in spoilt for part in pair)
 
 
-def test_pictures_from_before_they_had_masks_are_refused_by_name(tmp_path: Path) -> None:
+def test_images_from_before_they_had_masks_are_refused_by_name(tmp_path: Path) -> None:
     np.savez(tmp_path / "1.npz", picture=np.zeros((1, 96, 96, 3), np.uint8), drone=np.ones(1, np.float32))
     with pytest.raises(ValueError, match=r"1\.npz: its pictures have no masks; make the folder anew"):
         PictureFiles(tmp_path)

@@ -38,13 +38,13 @@ def load() -> None:
     run("modprobe", "v4l2loopback", "devices=1", "video_nr=20", "card_label=front")
     run("udevadm", "settle")
     for device in (WEBCAM, CABLE):
-        control(device, "timestamp_source")  # stamped when the picture begins; else the stamps lie in the future
+        control(device, "timestamp_source")  # stamped when the image begins; else the stamps lie in the future
     for device in (CABLE_OUT, CABLE):
         run("v4l2-ctl", "-d", device, "--set-dv-bt-timings", f"index={_vga(device)}")
     control(WEBCAM, "test_pattern", _WHITE)
-    control(WEBCAM, "osd_text_mode", _COUNTERS)  # so that no two pictures are the same
+    control(WEBCAM, "osd_text_mode", _COUNTERS)  # so that no two images are the same
     control(CABLE, "loop_video")
-    control(CABLE, "osd_text_mode", _NOTHING)  # written over the pictures
+    control(CABLE, "osd_text_mode", _NOTHING)  # written over the images
 
 
 def control(device: str, name: str, value: int = 1) -> float:
@@ -71,19 +71,19 @@ class Feeder:
     """The process behind a camera."""
 
     def __init__(self, *command: str) -> None:
-        """Begins once the process has said something, which it does with its first picture."""
+        """Begins once the process has said something, which it does with its first image."""
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
         assert self._process.stdout is not None
         if not self._process.stdout.read(1):
             raise RuntimeError(f"{' '.join(command)}: ended at once")
 
     def fall_silent(self) -> float:
-        """No more pictures; since when, on the monotonic clock."""
+        """Stops its images; since when, on the monotonic clock."""
         os.kill(self._process.pid, signal.SIGSTOP)
         return time.monotonic()
 
     def go_on(self) -> float:
-        """Pictures again; since when."""
+        """Sends images again; since when."""
         os.kill(self._process.pid, signal.SIGCONT)
         return time.monotonic()
 
@@ -99,10 +99,10 @@ def loopback(size: tuple[int, int], rate_hz: float) -> Feeder:
     return Feeder(*module, LOOPBACK, *map(str, size), str(rate_hz))
 
 
-def cable(pictures: Sequence[bytes]) -> Feeder:
+def cable(images: Sequence[bytes]) -> Feeder:
     """Feeds the HDMI output with frames, over and over."""
     with tempfile.NamedTemporaryFile(delete=False) as file:
-        file.write(b"".join(pictures))
+        file.write(b"".join(images))
     return Feeder("v4l2-ctl", "-d", CABLE_OUT, "--stream-out-mmap", f"--stream-from={file.name}", "--stream-loop")
 
 

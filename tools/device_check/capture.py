@@ -16,7 +16,7 @@ from flockd.config.source import CameraDeviceParameters, SourceParameters
 from flockd.sources.frames import CameraStatus, Count
 from flockd.sources.v4l2 import V4l2Source
 from flockd.sources.v4l2_device import CameraError, CapturedBuffer, V4l2Device
-from tools.device_check import pictures
+from tools.device_check import camera_images
 from tools.device_check.cameras import CABLE, LOOPBACK, WEBCAM, cable, control, feeding, loopback
 from tools.device_check.findings import Finding
 from tools.device_check.waiting import until
@@ -60,22 +60,22 @@ def streams() -> Iterator[Finding]:
 
 
 def carries_yuyv() -> Iterator[Finding]:
-    """Pictures of ours, through a driver that copies each as a camera's DMA would."""
-    known = {pictures.yuyv(SIZE, number): number for number in range(pictures.COUNT)}
+    """Images of ours, through a driver that copies each as a camera's DMA would."""
+    known = {camera_images.yuyv(SIZE, number): number for number in range(camera_images.COUNT)}
     with feeding(cable(list(known))), _opened(CABLE, "yuyv", CABLE_HZ) as device:
-        until(lambda: _next(device)[0].data in known, "the cable to carry pictures")
+        until(lambda: _next(device)[0].data in known, "the cable to carry images")
         frames = [frame for frame, _ in _read(device)]
     yield _exact("bytes of YUYV", frames, known)
 
 
 def carries_mjpeg() -> Iterator[Finding]:
-    """The same compressed, through a driver that hands over each picture once, in its turn."""
-    known = {pictures.mjpeg(SIZE, number): number for number in range(pictures.COUNT)}
+    """The same compressed, through a driver that hands over each image once, in its turn."""
+    known = {camera_images.mjpeg(SIZE, number): number for number in range(camera_images.COUNT)}
     with feeding(loopback(SIZE, RATE_HZ)), _opened(LOOPBACK, "mjpeg", RATE_HZ) as device:
-        _next(device)  # to whoever comes the driver gives the last picture, with all that follows it in the buffer
+        _next(device)  # to whoever comes the driver gives the last image, with all that follows it in the buffer
         frames = [frame for frame, _ in _read(device)]
     yield _exact("bytes of MJPEG", frames, known)
-    turns = [(known.get(b.data, -1) - known.get(a.data, -1)) % pictures.COUNT for a, b in pairwise(frames)]
+    turns = [(known.get(b.data, -1) - known.get(a.data, -1)) % camera_images.COUNT for a, b in pairwise(frames)]
     wrong = sum(turn != 1 for turn in turns)
     yield Finding(
         "order of MJPEG",
@@ -156,7 +156,7 @@ def is_taken() -> Iterator[Finding]:
         before = _counts(first)
         with _running(WEBCAM, "yuyv", wait=False) as second:
             until(lambda: _status(second).fault is not None, "the second to be refused")
-            told = str(_status(second).fault)
+            reported = str(_status(second).fault)
             time.sleep(1.0)
             lost = _grown(before, _counts(first), "lost")
             first.stop()
@@ -164,8 +164,8 @@ def is_taken() -> Iterator[Finding]:
             back_s = until(lambda: _status(second).fault is None, "the second to get the camera", look_s=LOOK_S)
     yield Finding(
         "a second opener",
-        "in use by another program" in told and lost == 0,
-        f"{told!r}; the first lost {lost}; it is the second's {back_s - freed_s:.2f} s after the first let go",
+        "in use by another program" in reported and lost == 0,
+        f"{reported!r}; the first lost {lost}; it is the second's {back_s - freed_s:.2f} s after the first let go",
         "refused, the first undisturbed",
     )
 
@@ -174,13 +174,13 @@ def _fails_and_returns(source: V4l2Source, what: str, fail: Callable[[], float])
     before = _counts(source)
     failed_s = fail()
     noticed_s = until(lambda: _status(source).fault is not None, f"{what} to be noticed", look_s=LOOK_S)
-    told = _status(source).fault
+    reported = _status(source).fault
     back_s = until(lambda: _status(source).fault is None, f"frames after {what}", look_s=LOOK_S)
     opened, took_s = _grown(before, _counts(source), "opened"), noticed_s - failed_s
     return Finding(
         what,
         took_s <= NOTICED_S and opened >= 1,
-        f"noticed after {took_s:.3f} s ({told}), frames again {back_s - noticed_s:.2f} s later",
+        f"noticed after {took_s:.3f} s ({reported}), frames again {back_s - noticed_s:.2f} s later",
         f"noticed within {NOTICED_S:g} s, opened again",
     )
 
@@ -193,7 +193,7 @@ def _opened(device: str, pixel_format: PixelFormat, rate_hz: float) -> Iterator[
 
 @contextmanager
 def _running(device: str, pixel_format: PixelFormat, *, wait: bool = True) -> Iterator[V4l2Source]:
-    """A source of this one camera; begins when frames come, unless told not to wait."""
+    """A source of this one camera; begins when frames come, unless asked not to wait."""
     lens = IntrinsicsConfig(fx=300.0, fy=300.0, cx=160.0, cy=90.0)
     rig = RigConfig(cameras=(CameraConfig(name="check", size_px=SMALL, intrinsics=lens),))
     camera = CameraDeviceParameters(name="check", device=device, pixel_format=pixel_format, rate_hz=RATE_HZ)
@@ -229,7 +229,7 @@ def _exact(check: str, frames: list[CapturedBuffer], known: Mapping[bytes, int])
     return Finding(
         check,
         len(exact) == len(frames) and len(set(exact)) > 1,
-        f"{len(exact)} of {len(frames)} frames equal in every byte, of {len(set(exact))} different pictures",
+        f"{len(exact)} of {len(frames)} frames equal in every byte, of {len(set(exact))} different images",
         "all equal",
     )
 

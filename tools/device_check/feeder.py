@@ -12,14 +12,14 @@ import os
 import time
 
 from flockd.sources.v4l2_kernel import VIDIOC_S_FMT, Format
-from tools.device_check import pictures
+from tools.device_check import camera_images
 
 _OUTPUT = 2  # V4L2_BUF_TYPE_VIDEO_OUTPUT
 _PROGRESSIVE = 1  # V4L2_FIELD_NONE
 
 
 def main() -> None:
-    """Prints a word when the first picture is out."""
+    """Prints a word when the first image is out."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("device")
     parser.add_argument("width", type=int)
@@ -27,7 +27,7 @@ def main() -> None:
     parser.add_argument("rate_hz", type=float)
     arguments = parser.parse_args()
     size = (arguments.width, arguments.height)
-    frames = [pictures.mjpeg(size, number) for number in range(pictures.COUNT)]
+    frames = [camera_images.mjpeg(size, number) for number in range(camera_images.COUNT)]
     descriptor = os.open(arguments.device, os.O_RDWR)
     wanted = Format(
         type=_OUTPUT,
@@ -40,7 +40,7 @@ def main() -> None:
     fcntl.ioctl(descriptor, VIDIOC_S_FMT, wanted)
     due_s = time.monotonic()
     for number in itertools.count():
-        os.write(descriptor, frames[number % pictures.COUNT])
+        os.write(descriptor, frames[number % camera_images.COUNT])
         if number == 0:
             print("feeds", flush=True)
         due_s = max(due_s + 1.0 / arguments.rate_hz, time.monotonic())

@@ -41,8 +41,10 @@ class Notebook:
                     self._write(asdict(finding))
             except Exception as error:  # noqa: BLE001 - whatever it is, the other checks still have something to say
                 traceback.print_exc()
-                told = f"{type(error).__name__}: {error}"
-                self._write(asdict(Finding(check.__name__, passed=False, measured=told, wanted="to run to its end")))
+                measured = f"{type(error).__name__}: {error}"
+                self._write(
+                    asdict(Finding(check.__name__, passed=False, measured=measured, wanted="to run to its end"))
+                )
         self._write({"group": group, "took_s": round(time.monotonic() - begun_s, 1)})
 
     def close(self) -> None:

@@ -19,7 +19,7 @@ from tools.device_check.findings import Finding
 
 UNIT = "flockd.service"
 DROP_IN = Path("/run/systemd/system/flockd.service.d/probe.conf")
-ANSWERS = Path("/run/probe.json")
+RESULTS = Path("/run/probe.json")
 PROBE = Path(__file__).with_name("sandbox_probe.py")
 OPEN_FOLDERS = {"/etc/open", "/home/open", "/opt/open", "/srv/open", "/usr/open", "/var/open"}
 OPEN_DISK = Path("/dev/open-disk")
@@ -37,7 +37,7 @@ TELLING = {
     *("map a written file executable", "map a file in memory executable", "start a written program"),
     *("new user namespace", "see process 1", "setuid file", "to the internet", "to this computer"),
 }
-"""What goes through outside, so that its refusal inside is the sandbox's; the rest is for root only."""
+"""What goes through outside, so that its refusal inside is the sandbox's; everything else is for root only."""
 FOREIGN_ADDRESS = "203.0.113.1/32"
 
 
@@ -82,7 +82,7 @@ def _probe_inside() -> Mapping[str, Any]:
     DROP_IN.parent.mkdir(parents=True, exist_ok=True)
     DROP_IN.write_text(
         "[Service]\nType=oneshot\nRestart=no\nWatchdogSec=0\nTimeoutStartSec=300\n"
-        f"ExecStart=\nExecStart={sys.executable} {PROBE}\nStandardOutput=truncate:{ANSWERS}\n",
+        f"ExecStart=\nExecStart={sys.executable} {PROBE}\nStandardOutput=truncate:{RESULTS}\n",
         encoding="utf-8",
     )
     try:
@@ -91,12 +91,12 @@ def _probe_inside() -> Mapping[str, Any]:
     finally:
         DROP_IN.unlink()
         run("systemctl", "daemon-reload")
-    return _parsed(ANSWERS.read_text(encoding="utf-8"))
+    return _parsed(RESULTS.read_text(encoding="utf-8"))
 
 
 def _parsed(text: str) -> Mapping[str, Any]:
-    answers: Mapping[str, Any] = json.loads(text)
-    return answers
+    results: Mapping[str, Any] = json.loads(text)
+    return results
 
 
 def _folders(inside: Mapping[str, Any], outside: Mapping[str, Any]) -> Finding:
@@ -128,15 +128,15 @@ def _devices(inside: Mapping[str, Any], outside: Mapping[str, Any]) -> Finding:
 
 
 def _attempts(part: str, inside: Mapping[str, str], outside: Mapping[str, str]) -> Finding:
-    allowed = sorted(what for what, answer in inside.items() if answer == "done" and what not in NEEDED)
-    powerless = sorted(what for what, answer in outside.items() if answer != "done" and what in TELLING)
-    broken = sorted(what for what, answer in inside.items() if answer != "done" and what in NEEDED)
-    refused = ", ".join(f"{what} {answer}" for what, answer in inside.items() if answer != "done")
+    allowed = sorted(what for what, result in inside.items() if result == "done" and what not in NEEDED)
+    powerless = sorted(what for what, result in outside.items() if result != "done" and what in TELLING)
+    broken = sorted(what for what, result in inside.items() if result != "done" and what in NEEDED)
+    refused = ", ".join(f"{what} {result}" for what, result in inside.items() if result != "done")
     needed = ", ".join(sorted(NEEDED & inside.keys()))
-    told = f"{', '.join(allowed) or 'nothing'} allowed{f' but {needed}, which it needs' if needed else ''}; "
-    told += f"refused: {refused}"
-    told += f"; outside could not either: {', '.join(powerless)}" if powerless else ""
-    return Finding(f"sandbox: {part}", not allowed and not powerless and not broken, told, "all others refused")
+    measured = f"{', '.join(allowed) or 'nothing'} allowed{f' but {needed}, which it needs' if needed else ''}; "
+    measured += f"refused: {refused}"
+    measured += f"; outside could not either: {', '.join(powerless)}" if powerless else ""
+    return Finding(f"sandbox: {part}", not allowed and not powerless and not broken, measured, "all others refused")
 
 
 def _is_within(folder: str, roots: set[str]) -> bool:

@@ -1,6 +1,6 @@
-"""Tries what flockd's unit forbids, and tells as JSON what came of it. Run in flockd's place, and outside the sandbox.
+"""Tries what flockd's unit forbids, and prints the results as JSON. Run in flockd's place, and outside the sandbox.
 
-Each attempt is answered with "done" or the name of the error. Needs the standard library only.
+The result of each attempt is "done" or the name of the error. Needs the standard library only.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ _libc.shmat.argtypes = [ctypes.c_int, ctypes.c_void_p, ctypes.c_int]
 
 
 def main() -> None:
-    """Prints the answers."""
-    answers = {
+    """Prints the results."""
+    results = {
         "writable folders": sorted(_writable_folders()),
         "marks": [str(path) for folder in ("/dev/shm", "/tmp", "/var/tmp") for path in Path(folder).glob("seen-*")],
         "devices opened": sorted(_opened_devices()),
@@ -44,7 +44,7 @@ def main() -> None:
         "network": _attempts(_network()),
         "status": _status(),
     }
-    print(json.dumps(answers))
+    print(json.dumps(results))
 
 
 def _attempts(attempts: dict[str, Callable[[], object]]) -> dict[str, str]:

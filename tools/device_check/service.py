@@ -1,6 +1,6 @@
 """Checks of flockd as a service: the real `flockd run` with the shipped networks, under the real unit.
 
-Its autopilot is a stand-in. Its cameras are virtual: the front one has a process of ours behind it, the back one is of
+Its autopilot is a fake. Its cameras are virtual: the front one has a process of ours behind it, the back one is of
 `vivid` and can be unplugged.
 """
 
@@ -23,7 +23,7 @@ from flockd.recording.reader import Recording
 from flockd.sources.image_formats import MjpegFormat
 from flockd.sources.v4l2_device import CameraError, V4l2Device
 from flockd.telemetry.watcher import FleetWatcher
-from tools.device_check import pictures
+from tools.device_check import camera_images
 from tools.device_check.cameras import WEBCAM, Feeder, control, loopback, run
 from tools.device_check.findings import Finding
 from tools.device_check.waiting import PATIENCE_S, until
@@ -53,22 +53,24 @@ class Service:
     def __init__(self, start: str) -> None:
         """``start``: the lines of the documentation that start the unit."""
         self._start = start
-        self._stand_in = FakeAutopilot(PORT).start()
+        self._autopilot = FakeAutopilot(PORT).start()
         self._watcher = FleetWatcher("check", listen=(), connect=(ENDPOINT,))
         self._front: Feeder | None = None
 
     def close(self) -> None:
         """Leaves no process behind."""
         self._watcher.close()
-        self._stand_in.close()
+        self._autopilot.close()
         if self._front is not None:
             self._front.close()
 
     def is_installed(self) -> Iterator[Finding]:
         """The documentation's lines were run when this machine's disk was made."""
         verify = subprocess.run(["systemd-analyze", "verify", UNIT_FILE], capture_output=True, text=True, check=False)
-        told = (verify.stdout + verify.stderr).strip()
-        yield Finding("unit verified", verify.returncode == 0 and not told, told or "no complaint", "no complaint")
+        reported = (verify.stdout + verify.stderr).strip()
+        yield Finding(
+            "unit verified", verify.returncode == 0 and not reported, reported or "no complaint", "no complaint"
+        )
         *_, verdict = run("systemd-analyze", "security", "--no-pager", UNIT).splitlines()
         exposure = float(verdict.split(": ")[1].split()[0])
         yield Finding("unit's exposure", exposure <= MAX_EXPOSURE, f"{exposure:g}", f"at most {MAX_EXPOSURE:g}")
@@ -83,9 +85,12 @@ class Service:
                 "the unit to tell of its camera",
                 look_s=LOOK_S,
             )
-            told, state, waited_s = _shown("StatusText"), _shown("ActiveState"), time.monotonic() - begun_s
+            reported, state, waited_s = _shown("StatusText"), _shown("ActiveState"), time.monotonic() - begun_s
         yield Finding(
-            "not ready without frames", state == "activating", f"{state} after {waited_s:.0f} s, {told!r}", "activating"
+            "not ready without frames",
+            state == "activating",
+            f"{state} after {waited_s:.0f} s, {reported!r}",
+            "activating",
         )
         freed_s = time.monotonic()
         self._front = loopback(FRONT_SIZE, RATE_HZ)
@@ -96,7 +101,7 @@ class Service:
         )
 
     def runs(self) -> Iterator[Finding]:
-        """Ten seconds of its life, after two pictures of each camera: the loopback gives the first the number 0."""
+        """Ten seconds of its life, after two images of each camera: the loopback gives the first the number 0."""
         until(lambda: all(self._counts(camera).get("received", 0) > 1 for camera in CAMERAS), "both cameras")
         before, begun_s, feeds = self._computer(), time.monotonic(), set[int]()
         while time.monotonic() - begun_s < WATCHED_S:
@@ -126,7 +131,7 @@ class Service:
         """It takes off by itself, as it is configured to; in flight its cameras fail one after the other."""
         self._wait_for_flight()
         time.sleep(WATCHED_S)
-        came_s = [time_s for time_s, _ in self._stand_in.setpoints if time_s > time.monotonic() - WATCHED_S]
+        came_s = [time_s for time_s, _ in self._autopilot.setpoints if time_s > time.monotonic() - WATCHED_S]
         hz, worst_ms = len(came_s) / WATCHED_S, 1e3 * max(after - before for before, after in pairwise(came_s))
         yield Finding(
             "flies", hz > 19.0, f"{hz:.1f} setpoints a second, at most {worst_ms:.0f} ms apart", "20 a second"
@@ -139,15 +144,15 @@ class Service:
         """Stopped in flight as by a debugger: nothing in it runs any more, and it ends only when it is killed."""
         stopped_s = time.monotonic()
         os.kill(int(_shown("MainPID")), signal.SIGSTOP)
-        until(lambda: self._stand_in.mode != "OFFBOARD", "the autopilot to see that setpoints stopped")
-        yield _soon("setpoints stop", max(self._stand_in.setpoints[-1][0] - stopped_s, 0.0), SETPOINTS_STOP_S)
+        until(lambda: self._autopilot.mode != "OFFBOARD", "the autopilot to see that setpoints stopped")
+        yield _soon("setpoints stop", max(self._autopilot.setpoints[-1][0] - stopped_s, 0.0), SETPOINTS_STOP_S)
         until(lambda: _shown("NRestarts") == "1" and _shown("MainPID") != "0", "the unit to start again", look_s=LOOK_S)
         began_s = 1e-6 * int(_shown("ExecMainStartTimestampMonotonic"))
         yield _soon("a hang is restarted", began_s - stopped_s, RESTARTED_S)
         ready_s = until(lambda: _shown("ActiveState") == "active", "the unit to be ready again", look_s=LOOK_S)
         time.sleep(WATCHED_S)
         state = self._message("flight", ready_s)["state"]
-        sent = sum(time_s > began_s for time_s, _ in self._stand_in.setpoints)
+        sent = sum(time_s > began_s for time_s, _ in self._autopilot.setpoints)
         yield Finding(
             "idle after a restart in the air",
             (state, sent, _shown("NRestarts")) == ("idle", 0, "1"),
@@ -157,16 +162,16 @@ class Service:
         )
 
     def stops(self) -> Iterator[Finding]:
-        """The pilot lands; flockd, which saw it on the ground, flies again, and is told to end in the air."""
-        self._stand_in.pilot_selects("LAND")
-        until(lambda: not self._stand_in.armed, "the landing")
+        """The pilot lands; flockd, which saw it on the ground, flies again, and is stopped in the air."""
+        self._autopilot.pilot_selects("LAND")
+        until(lambda: not self._autopilot.armed, "the landing")
         self._wait_for_flight()
         time.sleep(WATCHED_S)
         begun_s = time.monotonic()
         run("systemctl", "stop", UNIT)
         took_s = time.monotonic() - begun_s
         result, status = _shown("Result"), _shown("ExecMainStatus")
-        holds = self._stand_in.mode == "LOITER" and not self._stand_in.failsafe
+        holds = self._autopilot.mode == "LOITER" and not self._autopilot.failsafe
         yield Finding(
             "clean stop in the air",
             (result, status) == ("success", "0") and holds and took_s < STOPPED_S,
@@ -176,16 +181,16 @@ class Service:
         yield _recorded()
 
     def _is_refused_to_others(self) -> Finding:
-        before, told = self._counts("back"), "opened it"
+        before, reported = self._counts("back"), "opened it"
         try:
             V4l2Device("second", WEBCAM, size=BACK_SIZE, pixel_format="yuyv", rate_hz=RATE_HZ).close()
         except CameraError as error:
-            told = str(error)
+            reported = str(error)
         lost = self._counts("back").get("lost", 0) - before.get("lost", 0)
         return Finding(
             "a second opener of the unit's",
-            "in use by another program" in told and lost == 0,
-            f"{told!r}; the unit lost {lost} frames",
+            "in use by another program" in reported and lost == 0,
+            f"{reported!r}; the unit lost {lost} frames",
             "refused, the unit undisturbed",
         )
 
@@ -218,7 +223,7 @@ class Service:
         )
 
     def _wait_for_flight(self) -> None:
-        until(lambda: self._stand_in.mode == "OFFBOARD", "flockd to take off")
+        until(lambda: self._autopilot.mode == "OFFBOARD", "flockd to take off")
         until(lambda: self._message("flight", time.monotonic())["state"] == "normal", "a quiet flight")
 
     def _counts(self, camera: str) -> Mapping[str, int]:
@@ -232,23 +237,23 @@ class Service:
         """The first that was sent later than that."""
 
         def newest() -> list[Mapping[str, Any]]:
-            told = [drone.message(topic, time.monotonic()) for drone in self._watcher.drones()]
-            return [message for message in told if message is not None and message["time_s"] > since_s]
+            reported = [drone.message(topic, time.monotonic()) for drone in self._watcher.drones()]
+            return [message for message in reported if message is not None and message["time_s"] > since_s]
 
         until(lambda: bool(newest()), f"telemetry of {topic}")
         return newest()[0]
 
 
 def _recorded() -> Finding:
-    """The pictures in the flight's recording, against what the camera was fed with."""
+    """The images in the flight's recording, against what the camera was fed with."""
     recording = Recording(max(RECORDINGS.glob("*.mcap"), key=lambda path: path.stat().st_mtime))
     decode = MjpegFormat(FRONT_SIZE).decode
-    known = {decode(pictures.mjpeg(FRONT_SIZE, number)).tobytes() for number in range(pictures.COUNT)}
+    known = {decode(camera_images.mjpeg(FRONT_SIZE, number)).tobytes() for number in range(camera_images.COUNT)}
     seen = [step.frames.frames["front"].image for step in recording.steps() if "front" in step.frames.frames]
     equal = sum(np.ascontiguousarray(image).tobytes() in known for image in seen)
     end = "finished" if recording.contents.finished else "cut off"
     return Finding(
-        "recorded pictures",
+        "recorded images",
         0 < len(seen) == equal and recording.contents.finished,
         f"{equal} of {len(seen)} equal what the camera was fed with in every pixel; the recording is {end}",
         "all, finished",
@@ -261,10 +266,10 @@ def _shown(what: str) -> str:
 
 
 def _told_since(time_s: float, what: str) -> float:
-    """When the unit told its journal of something, on the monotonic clock."""
+    """When the unit wrote something to its journal, on the monotonic clock."""
     found: list[float] = []
 
-    def told() -> bool:
+    def reported() -> bool:
         for line in run("journalctl", "-u", UNIT, "-b", "-o", "json", "-n", "50").splitlines():
             entry = json.loads(line)
             entry_s = 1e-6 * int(entry["__MONOTONIC_TIMESTAMP"])
@@ -272,7 +277,7 @@ def _told_since(time_s: float, what: str) -> float:
                 found.append(entry_s)
         return bool(found)
 
-    until(told, f"{what!r} in the journal", look_s=LOOK_S)
+    until(reported, f"{what!r} in the journal", look_s=LOOK_S)
     return found[0]
 
 

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from flockd.messages import Float32Array, FloatArray, UInt8Array
 
 _LEVELS = 20
-"""Of red, green and blue each, that are told apart."""
+"""Histogram bins of red, green and blue each: 8,000 bins, which the thousands of pixels around a drone can fill."""
 _SHADES = 0.5 * np.eye(_LEVELS) + 0.25 * (np.eye(_LEVELS, k=1) + np.eye(_LEVELS, k=-1))
-"""A colour also counts, by less, for those beside it."""
+"""A colour also counts, by less, for those beside it: the binomial kernel 1 2 1 over 4."""
 _MIN_LOGIT = -8.0
 """From here on a pixel may be the drone's at all, or lies so near to it that it shows what surrounds it."""
 _RARE = 0.02

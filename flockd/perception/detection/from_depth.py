@@ -18,6 +18,7 @@ from flockd.perception.maps import SceneMaps
 _MAX_RADIUS_M = 0.6
 """Pixels whose depth is farther from the median are not the drone's: it is at most 1.2 m wide."""
 _MIN_ANGLE = 1e-3
+"""rad, about a pixel of a 90 degree camera of 1280 pixels: no instance appears narrower."""
 
 
 def candidates_from_depth(

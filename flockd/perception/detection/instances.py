@@ -9,9 +9,11 @@ import numpy as np
 
 from flockd.messages import Float32Array, FloatArray, UInt8Array
 
-_CELL = 2  # votes are gathered in cells of this many map pixels
+_CELL = 2
+"""Map pixels: the side of the cells in which votes are counted, as the bins of a Hough transform (Ballard 1981)."""
 _MAX_INSTANCES = 48
-"""More than this in one image is a network gone astray; the weakest are joined to the others."""
+"""In one image; the weakest are joined to the others. Far more than the drones of a flock in view: it bounds the time
+of a faulty output, as every instance costs crops."""
 
 
 @dataclass(frozen=True, eq=False)

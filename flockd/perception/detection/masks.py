@@ -18,7 +18,7 @@ from flockd.perception.maps import SceneMaps
 _CROP_CORNERS = 1.5
 """Angle to the corners of a crop over that to its borders, and a little more: sqrt(2) for a narrow one."""
 _CERTAINLY_NOT = -20.0
-"""Logit of a pixel outside every crop."""
+"""Logit of a pixel outside every crop: a probability of 2e-9, which no weight of colours brings above one half."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class CropMask:
 
 @dataclass(frozen=True, eq=False)
 class DroneLogits:
-    """What the networks say of one drone's pixels."""
+    """The networks' outputs for one drone's pixels."""
 
     label: int
     box: tuple[slice, slice]
@@ -69,7 +69,7 @@ class MaskRenderer:
         """``stride``: image pixels per pixel of the first stage's map."""
         self._camera, self._stride = camera, stride
         width, height = camera.camera.size
-        # A pixel of the map tells of the last one of its block: those are the ones that networks are trained on.
+        # A pixel of the map stands for the last one of its block: those are the ones that networks are trained on.
         u, v = np.meshgrid(*(np.arange(stride, size + 1, stride) - 0.5 for size in (width, height)))
         rays = camera.camera.rays(np.stack([u.ravel(), v.ravel()], 1)) @ camera.T_body_camera.rotation.T
         self._rays: Float32Array = np.asarray(rays.reshape(*u.shape, 3), dtype=np.float32)

@@ -21,7 +21,7 @@ MAX_DETECTIONS = UNCLASSED - 1
 
 @dataclass(frozen=True, eq=False)
 class Suppressed:
-    """One detection a drone, and what its candidates said of pixels."""
+    """One detection a drone, and its candidates' masks."""
 
     detections: tuple[Detection, ...]
     label_of: Mapping[tuple[str, int], int]
@@ -69,7 +69,7 @@ def _labelled(groups: Sequence[Sequence[Candidate]]) -> Suppressed:
 def without_occluded(candidates: Sequence[Candidate], parameters: DetectionParameters) -> list[Candidate]:
     """Without what would be hidden behind a nearer one whose range is known better.
 
-    A part of a drone that an image's border cuts off may look like a whole one far behind it. The nearer one always
+    A part of a drone that an image's border cuts off may resemble a whole one far behind it. The nearer one always
     stays: a false drone costs less than one overlooked.
     """
 

@@ -163,7 +163,7 @@ class Cascade:
         return together
 
     def _next_roi(self, rig: Rig, stage: _Stage, candidate: Candidate) -> Roi:
-        """With the drone in its middle, or where the proposal was if no camera looks that way."""
+        """With the drone in its middle, or where the proposal was if no camera sees that direction."""
         seen = bool(rig.covers(candidate.bearing[None])[0])
         direction = candidate.bearing if seen else stage.proposal.roi.direction
         half_angle = self._rules.half_angle(candidate.size_m, candidate.range_m, stage.roi.half_angle)

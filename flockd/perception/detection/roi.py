@@ -1,4 +1,4 @@
-"""Regions of interest: where a virtual camera looks for a drone and how wide, and the crops that it takes there."""
+"""Regions of interest: the direction and width of a virtual camera that may show a drone, and the crops taken there."""
 
 from __future__ import annotations
 

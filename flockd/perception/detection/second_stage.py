@@ -12,7 +12,7 @@ from flockd.perception.detection.roi import CropRules
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Decisions on what the network says. They belong to its weights, and stand in its manifest."""
+    """Decision thresholds on the network's outputs. They belong to its weights, and are in its manifest."""
 
     drone: float
     """Least drone probability of a detection."""

@@ -21,7 +21,7 @@ class OnnxFlow:
         """See `Flow`."""
         height, width = first.shape[:2]
         fitting = fit(self._model.manifest, (width, height))
-        answers = self._model.infer({"first": [fitting.enter(first)], "second": [fitting.enter(second)]})
-        flow = np.moveaxis(fitting.inside(answers["flow"])[0], 0, 2) / np.array(fitting.scale, np.float32)
+        outputs = self._model.infer({"first": [fitting.enter(first)], "second": [fitting.enter(second)]})
+        flow = np.moveaxis(fitting.inside(outputs["flow"])[0], 0, 2) / np.array(fitting.scale, np.float32)
         full = cv2.resize(flow, (width, height), interpolation=cv2.INTER_LINEAR)
         return np.asarray(full, dtype=np.float32)

@@ -85,7 +85,7 @@ def test_the_motion_is_the_least_squares_fit_to_its_inliers() -> None:
     assert result.inliers.sum() > 0.2 * 500
 
 
-def test_one_seed_gives_one_answer_and_leaves_its_input_alone() -> None:
+def test_one_seed_gives_one_result_and_leaves_its_input_alone() -> None:
     random = np.random.default_rng(7)
     source = random.uniform(-5.0, 5.0, (300, 3))
     target = moved(source) + random.normal(0.0, 0.1, source.shape)

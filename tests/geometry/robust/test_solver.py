@@ -94,7 +94,7 @@ def test_before_its_least_number_of_steps_nothing_has_converged() -> None:
     assert not GaussNewton(max_steps=3, tolerance=1e-3, min_steps=4).minimise(problem, best).converged
 
 
-def test_what_is_no_solution_is_told_from_what_is() -> None:
+def test_what_is_no_solution_is_distinguished() -> None:
     nowhere = np.array([math.nan, 0.5])
     for optimizer in (GaussNewton(max_steps=5, tolerance=1e-3), LevenbergMarquardt()):
         found = optimizer.minimise(Decay(T, NOISY), nowhere)

@@ -117,7 +117,7 @@ def wall_now(before: VehicleState, now: VehicleState, wall_north_m: float) -> tu
 
 
 @pytest.mark.parametrize("shift", [False, True])
-def test_velocity_tells_how_far_away_things_are_by_how_they_pass(shift: bool) -> None:
+def test_velocity_gives_how_far_away_things_are_by_how_they_pass(shift: bool) -> None:
     scale = VelocityScale(rig_of())
     before, now = seen_from(0.0, (0.3, 1.0, -0.2)), seen_from(0.5, (0.3, 1.0, -0.2), yaw=0.05)
     depth_before, depth_now = wall_now(before, now, 6.0)

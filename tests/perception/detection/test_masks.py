@@ -66,7 +66,7 @@ def test_the_second_stage_draws_what_the_first_only_boxed(half_angle: float) -> 
     assert (drawn[(labels == 0) & (drawn != 3)] == 0).all()
 
 
-def test_both_stages_count_and_all_pictures() -> None:
+def test_both_stages_count_and_all_images() -> None:
     left = np.zeros((HEIGHT // 2, WIDTH // 2), np.float32)
     u = int(np.nonzero(disc(AHEAD))[1].mean())
     left[:, : u // 2] = -7.0  # outweighs 5, not 5 and 15 by their mean
@@ -120,7 +120,7 @@ def painted(
     return np.clip(image + np.random.default_rng(0).normal(0, 6, image.shape), 0, 255).astype(np.uint8)
 
 
-def test_colours_mend_the_outline_that_networks_see_too_coarsely() -> None:
+def test_colours_refine_the_outline_that_networks_see_too_coarsely() -> None:
     true, nothing = disc(AHEAD), np.zeros((HEIGHT, WIDTH), np.uint8)
     aside = AHEAD + np.array([0.0, 0.05, -0.03])  # a quarter of the disc's radius
     coarse = {1: [mask_of(aside, 0.2, height=3.0)]}

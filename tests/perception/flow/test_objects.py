@@ -83,7 +83,7 @@ def test_a_drone_that_half_leaves_the_image_is_followed() -> None:
     assert np.median(scene.off(found)[stays]) < 0.6
 
 
-def test_two_drones_are_told_apart() -> None:
+def test_two_drones_are_separated() -> None:
     near = Scene(motion((18.0, 5.0), 0.0, 1.0, (120, 160)), (120, 160))
     far = Scene(motion((-14.0, 9.0), 0.0, 1.0, (290, 150)), (290, 150))
     labels = near.mask + 2 * far.mask

@@ -1,4 +1,4 @@
-"""Pictures that a camera of the check shows: made alike wherever they are needed, each with its number."""
+"""Images that a camera of the check shows: made alike wherever they are needed, each with its number."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ def yuyv(size: Size, number: int) -> bytes:
 
 
 def _scene(size: Size, number: int) -> UInt8Array:
-    """Sky above grass that passes by. Nothing looks like a drone: to range one takes an emulated processor long."""
+    """Sky above grass that passes by. Nothing resembles a drone: to range one takes an emulated processor long."""
     width, height = size
     wide, high = width + _PASSING_PX * COUNT, height - height // 2
     blades = np.random.default_rng(0).integers(*_GRASS, (high // 2, wide // 2, 3), dtype=np.uint8)
     grass = cv2.resize(blades, (wide, high))
-    picture = np.full((height, width, 3), _SKY, np.uint8)
-    picture[height // 2 :] = grass[:, _PASSING_PX * number :][:, :width]
-    return picture
+    image = np.full((height, width, 3), _SKY, np.uint8)
+    image[height // 2 :] = grass[:, _PASSING_PX * number :][:, :width]
+    return image

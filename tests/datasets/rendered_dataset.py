@@ -1,4 +1,4 @@
-"""A short film of a rendered world with exact depth and poses, written down in each layout."""
+"""A short scene of a rendered world with exact depth and poses, written down in each layout."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ R_FRD_RDF = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 @dataclass(frozen=True, eq=False)
-class Film:
+class Scene:
     images: list[UInt8Array]
     depth: list[FloatArray]
     """Metres, infinite for the sky."""
@@ -40,7 +40,7 @@ class Film:
         return np.asarray(np.linalg.inv(self.poses[first]) @ self.poses[second])
 
 
-def film() -> Film:
+def scene() -> Scene:
     """Ahead, down and to the side, with all three turns, 4 m above ground."""
     renderer = Renderer(World.generate(5), [])
     images, depth, poses = [], [], []
@@ -56,11 +56,11 @@ def film() -> Film:
         images.append(view.rgb)
         depth.append(view.depth.astype(np.float64))
         poses.append(pose)
-    return Film(images, depth, np.array(poses))
+    return Scene(images, depth, np.array(poses))
 
 
 class Onlooker:
-    """In the place of the networks: OpenCV's flow, no drones, and the film's depth in its order."""
+    """In the place of the networks: OpenCV's flow, no drones, and the scene's depth in its order."""
 
     map_stride = 2
     second_stage = SECOND_STAGE
@@ -84,24 +84,24 @@ def times_s() -> list[float]:
     return [START_S + PERIOD_S * k for k in range(FRAMES)]
 
 
-def write_rgbd_folder(film: Film, path: Path) -> Path:
+def write_rgbd_folder(scene: Scene, path: Path) -> Path:
     for folder in ("images", "depth"):
         (path / folder).mkdir(parents=True)
-    for k, (image, depth) in enumerate(zip(film.images, film.depth, strict=True)):
+    for k, (image, depth) in enumerate(zip(scene.images, scene.depth, strict=True)):
         name = f"{10 + 3 * k:05}.png"  # numbers have gaps
         _write(path / "images" / name, image)
         cv2.imwrite(str(path / "depth" / name), _units(depth, 1000.0))
     np.savetxt(path / "K.txt", OTHERS_MATRIX)
-    np.savetxt(path / "poses.txt", film.poses.reshape(-1, 16), fmt="%.6e")
+    np.savetxt(path / "poses.txt", scene.poses.reshape(-1, 16), fmt="%.6e")
     return path
 
 
-def write_tum(film: Film, path: Path) -> Path:
+def write_tum(scene: Scene, path: Path) -> Path:
     """Depth 4 ms after its image; one image more, without any; poses at other times than the images."""
     for folder in ("rgb", "depth"):
         (path / folder).mkdir(parents=True)
     rgb, maps = ["# color images", "# timestamp filename"], ["# depth maps"]
-    for k, (image, depth) in enumerate(zip(film.images, film.depth, strict=True)):
+    for k, (image, depth) in enumerate(zip(scene.images, scene.depth, strict=True)):
         time_s = times_s()[k]
         rgb.append(f"{time_s:.6f} rgb/{time_s:.6f}.png")
         _write(path / "rgb" / f"{time_s:.6f}.png", image)
@@ -109,12 +109,12 @@ def write_tum(film: Film, path: Path) -> Path:
         cv2.imwrite(str(path / "depth" / f"{time_s + 0.004:.6f}.png"), _units(depth, 5000.0))
     late_s = times_s()[-1] + PERIOD_S / 2
     rgb.append(f"{late_s:.6f} rgb/{late_s:.6f}.png")
-    _write(path / "rgb" / f"{late_s:.6f}.png", film.images[-1])
+    _write(path / "rgb" / f"{late_s:.6f}.png", scene.images[-1])
     (path / "rgb.txt").write_text("\n".join(rgb) + "\n")
     (path / "depth.txt").write_text("\n".join(maps) + "\n")
     np.savetxt(path / "K.txt", OTHERS_MATRIX)
     lines = ["# timestamp tx ty tz qx qy qz qw"]
-    for time_s, pose in zip(times_s(), film.poses, strict=True):
+    for time_s, pose in zip(times_s(), scene.poses, strict=True):
         for shift_s in (-0.01, 0.01):  # as if it stood still there: between the two lies the pose itself
             numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
             lines.append(f"{time_s + shift_s:.6f} {' '.join(f'{number:.9f}' for number in numbers)}")
@@ -133,7 +133,7 @@ T_BODY_CAMERA = np.array(
 """Rounded as files are; its rotation is put right when it is used."""
 
 
-def write_euroc(film: Film, path: Path) -> Path:
+def write_euroc(scene: Scene, path: Path) -> Path:
     camera, truth = path / "mav0" / "cam0", path / "mav0" / "state_groundtruth_estimate0"
     (camera / "data").mkdir(parents=True)
     truth.mkdir()
@@ -141,7 +141,7 @@ def write_euroc(film: Film, path: Path) -> Path:
     u, _, vt = np.linalg.svd(mount[:3, :3])
     mount[:3, :3] = u @ vt
     table, states = ["#timestamp [ns],filename"], ["#timestamp,p x,p y,p z,q w,q x,q y,q z,v x,v y,v z"]
-    for k, (image, pose) in enumerate(zip(film.images, film.poses, strict=True)):
+    for k, (image, pose) in enumerate(zip(scene.images, scene.poses, strict=True)):
         time_ns = round(times_s()[k] * 1e9)
         table.append(f"{time_ns},{time_ns}.png")
         cv2.imwrite(str(camera / "data" / f"{time_ns}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
@@ -160,12 +160,12 @@ def write_euroc(film: Film, path: Path) -> Path:
     return path
 
 
-def write_video(film: Film, path: Path) -> Path:
+def write_video(scene: Scene, path: Path) -> Path:
     """The video, and a drone's YAML beside it as its calibration."""
     path.mkdir(parents=True, exist_ok=True)
     video = path / "clip.avi"
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 1 / PERIOD_S, (WIDTH, HEIGHT))
-    for image in film.images:
+    for image in scene.images:
         writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     writer.release()
     write_camera(path / "camera.yaml", (WIDTH, HEIGHT))
