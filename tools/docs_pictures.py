@@ -12,12 +12,12 @@ The other pictures in docs/pictures are drawn by hand.
 from __future__ import annotations
 
 import argparse
+import io
 from pathlib import Path
 
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -69,7 +69,6 @@ def save_flock(log: FlightLog, path: Path) -> None:
 
 def _flock_frame(log: FlightLog, step: int) -> Image.Image:
     figure = Figure(figsize=SIZE_IN, dpi=DPI, facecolor=PAPER)
-    canvas = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()
     axes.set_aspect("equal")
@@ -89,8 +88,7 @@ def _flock_frame(log: FlightLog, step: int) -> Image.Image:
         _draw_drone(axes, path[-1], log.attitude[step, drone], colour)
     axes.text(-12.6, 11.6, f"t = {log.time_s[step]:5.1f} s", color=INK, fontsize=11, fontweight="bold", va="center")
     axes.text(-12.6, 9.6, "grid: 10 m, north to the right", color=MUTED, fontsize=8.5, va="center")
-    canvas.draw()
-    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+    return _image(figure)
 
 
 def _on_screen(ned: FloatArray) -> FloatArray:
@@ -120,11 +118,13 @@ def _draw_drone(axes: Axes, position: FloatArray, R_ned_body: FloatArray, colour
 
 def save_seen(key_frames: Path, path: Path) -> None:
     """The last key frame of a flight: images with detections, depth, optical flow."""
-    figure = filmstrip_figure(load_key_frames(key_frames)[-1])
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    image = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-    image.save(path, quality=72, method=6)
+    _image(filmstrip_figure(load_key_frames(key_frames)[-1])).save(path, quality=72, method=6)
+
+
+def _image(figure: Figure) -> Image.Image:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=figure.dpi)
+    return Image.open(buffer).convert("RGB")
 
 
 def save_law(path: Path) -> None:

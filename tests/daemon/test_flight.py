@@ -96,9 +96,7 @@ def test_eyes_that_lie_about_the_own_motion_add_half_a_metre_a_second_at_most_an
             commanded = np.array(ship.heard()["command"].message["velocity_ne"])
             trim = np.array(ship.heard()["flight"].message["velocity_trim"])
             np.testing.assert_allclose(trim, [0.5, 0.0], atol=0.02)
-            assert np.linalg.norm(commanded - trim) < 0.9 * SPEED_M_S, (
-                "it believes that it stands"
-            )
+            assert np.linalg.norm(commanded - trim) < 0.9 * SPEED_M_S, "it believes that it stands"
             _, sent = fake_autopilot.setpoints[-1]
             np.testing.assert_allclose(np.asarray(sent.velocity)[:2], commanded, atol=0.02)
 
