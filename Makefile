@@ -5,13 +5,17 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help demo lint test test-all mutate mutate-all references clean
+.PHONY: help demo docs lint test test-all mutate mutate-all references clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
 
 demo: $(VENV)/sim.installed ## fly the paper's flight in the simulator and write its report
 	$(BIN)/flockd sim
+
+docs: $(VENV)/docs.installed ## build the documentation as a site in out/site
+	$(BIN)/python -m tools.docs_reference
+	$(BIN)/mkdocs build --strict
 
 lint: $(VENV)/test.installed ## ruff and mypy
 	$(BIN)/ruff check .

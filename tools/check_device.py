@@ -4,8 +4,8 @@ sudo python tools/check_device.py                               # from nothing; 
 sudo python tools/check_device.py --cache /var/cache/flockd     # keeps what it built for the next time
 
 Needs Linux on x86-64 with qemu-system-x86, mmdebstrap and e2fsprogs, and no KVM: the processor is emulated. The machine
-runs Debian 12 with its own kernel and systemd; flockd is installed by the very lines of the README, and its unit runs
-`flockd run` with the shipped networks. The autopilot is flockd's fake, and as an emulated processor is slow, the
+runs Debian 12 with its own kernel and systemd; flockd is installed by the lines of docs/real_drone.md, and its unit
+runs `flockd run` with the shipped networks. The autopilot is flockd's fake; as an emulated processor is slow, the
 images are small and the steps far apart. The machine's clock counts instructions, a nanosecond each: how busy this
 computer is changes how long the check takes, and nothing of what it measures.
 
@@ -45,8 +45,8 @@ SOURCES = (
     *("flockd", "models", "config", "systemd"),
     *("pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE"),
 )
-"""What the README's lines need of this folder."""
-SECTION = "### Install it as a service"
+"""What the documentation's lines need of this folder."""
+PAGE, SECTION = ROOT / "docs" / "real_drone.md", "## Install it as a service"
 FAKE_AUTOPILOT = "pymavlink>=2.4.40"
 COMPILE = "import flockd.autopilot.fake_autopilot"
 """What it needs of a dozen MAVLink dialects, and no more."""
@@ -102,7 +102,7 @@ def main() -> int:
 def _check(folder: Path, only: Sequence[str], *, as_json: bool) -> int:
     begun_s = time.monotonic()
     rows: list[dict[str, Any]] = []
-    install, start = _readme_lines()
+    install, start = _documented_lines()
     image = _build(folder, install)
     _note("booting")
     for line in _run(folder, image, start, only):
@@ -143,9 +143,9 @@ def _folder(cache: Path | None) -> Iterator[Path]:
         yield Path(folder)
 
 
-def _readme_lines() -> tuple[str, str]:
-    """What the README says to install flockd as a service, and to start it."""
-    _, _, section = (ROOT / "README.md").read_text(encoding="utf-8").partition(SECTION)
+def _documented_lines() -> tuple[str, str]:
+    """What docs/real_drone.md says to install flockd as a service, and to start it."""
+    _, _, section = PAGE.read_text(encoding="utf-8").partition(SECTION)
     blocks: list[str] = re.findall(r"```sh\n(.*?)```", section, re.DOTALL)
     return blocks[0], blocks[1]
 
@@ -200,7 +200,7 @@ def _wheels(folder: Path) -> Path:
 
 
 def _install(system: Path, wheels: Path, install: str) -> None:
-    """Runs the README's lines in the machine's files, as on a drone, but for where pip finds its packages."""
+    """Runs the documentation's lines in the machine's files, as on a drone, but for where pip finds its packages."""
     for old in ("opt/flockd", "opt/fake-autopilot", "etc/flockd", "root/flockd"):
         shutil.rmtree(system / old, ignore_errors=True)
     source, shelf = system / "root/flockd", system / "root/wheels"

@@ -33,11 +33,11 @@ class TrackingParameters(Section):
 
     detection_probability: Probability = 0.7
     """P_D: of a neighbour that the cameras can show being detected in one frame set. The shipped networks detect 93 %
-    of drones at least 12 px wide and 34 % of those of 6 to 12 px (README), and misses come in runs. At 0.7 a track
+    of drones at least 12 px wide and 34 % at 6 to 12 px (docs/networks.md), and misses come in runs. At 0.7 a track
     stays confirmed through three frame sets in a row without a detection."""
     clutter_density: Positive = 0.01
     """False detections in one frame set, per steradian and unit of log range. The shipped networks give 18 in 500
-    images (README), each of about 1.5 sr and 0.5 to 20 m, thus 0.0065; rounded up."""
+    images (docs/networks.md), each of about 1.5 sr and 0.5 to 20 m, thus 0.0065; rounded up."""
     survival_time_s: Positive = 60.0
     """Mean time that a neighbour stays within sight: existence probability decays with this time constant."""
     birth_probability: Probability = 0.5

@@ -24,9 +24,11 @@ def test_without_its_programs_it_says_what_to_install(tmp_path: Path) -> None:
     )
 
 
-def test_the_readme_installs_what_the_unit_starts() -> None:
+def test_the_documentation_installs_what_the_unit_starts() -> None:
     """The check runs these lines; a drone's owner does so by hand."""
-    _, _, section = (ROOT / "README.md").read_text(encoding="utf-8").partition("### Install it as a service")
+    _, _, section = (
+        (ROOT / "docs" / "real_drone.md").read_text(encoding="utf-8").partition("## Install it as a service")
+    )
     install, start = re.findall(r"```sh\n(.*?)```", section, re.DOTALL)[:2]
     unit = (ROOT / "systemd" / "flockd.service").read_text(encoding="utf-8")
     command = re.search(r"^ExecStart=(\S+)/bin/flockd run --config (\S+)", unit, re.MULTILINE)

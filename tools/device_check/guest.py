@@ -17,7 +17,7 @@ def main() -> None:
     """All groups in their order."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("findings", type=Path)
-    parser.add_argument("start", type=Path, help="the README's lines that start the unit")
+    parser.add_argument("start", type=Path, help="the documentation's lines that start the unit")
     parser.add_argument("groups", nargs="*")
     arguments = parser.parse_args()
     notebook = Notebook(arguments.findings, arguments.groups)

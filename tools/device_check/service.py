@@ -51,7 +51,7 @@ class Service:
     """The unit, and whom it talks to."""
 
     def __init__(self, start: str) -> None:
-        """``start``: the lines of the README that start the unit."""
+        """``start``: the lines of the documentation that start the unit."""
         self._start = start
         self._autopilot = FakeAutopilot(PORT).start()
         self._watcher = FleetWatcher("check", listen=(), connect=(ENDPOINT,))
@@ -65,7 +65,7 @@ class Service:
             self._front.close()
 
     def is_installed(self) -> Iterator[Finding]:
-        """The README's lines were run when this machine's disk was made."""
+        """The documentation's lines were run when this machine's disk was made."""
         verify = subprocess.run(["systemd-analyze", "verify", UNIT_FILE], capture_output=True, text=True, check=False)
         reported = (verify.stdout + verify.stderr).strip()
         yield Finding(
