@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
@@ -13,7 +14,7 @@ from flockd.cli import sim_fleet
 from flockd.cli.flight_summary import show_summary
 from flockd.cli.output import complain, progress
 from flockd.cli.parser import Commands, positive_count, positive_number, seed
-from flockd.errors import UsageError
+from flockd.errors import ConfigError, ConfigProblem, UsageError
 
 if TYPE_CHECKING:
     from flockd.config import Overrides, ScenarioConfig
@@ -63,7 +64,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument("--flow", metavar="NAME", help="the model for optical flow, or `dis`")
     parser.add_argument("--scale", choices=get_args(ScaleSource), help="where the background's scale comes from")
-    parser.add_argument("--drones", metavar="N", type=positive_count, help="size of the flock")
+    parser.add_argument("--drones", metavar="N", type=_flock_size, help="size of the flock")
     parser.add_argument("--duration", metavar="S", type=positive_number, help="seconds to fly")
     parser.add_argument("--seed", metavar="N", type=seed, help="of the world and of all noise")
     parser.add_argument(
@@ -80,6 +81,15 @@ def add(commands: Commands) -> None:
     parser.add_argument("--record", action="store_true", help="write a recording of each drone to DIR/recordings")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     parser.set_defaults(run=_run)
+
+
+def _flock_size(text: str) -> int:
+    from flockd.config.scenario import MAX_DRONES
+
+    count = positive_count(text)
+    if count > MAX_DRONES:
+        raise argparse.ArgumentTypeError(f"{text!r} is more than the {MAX_DRONES} drones that can be simulated")
+    return count
 
 
 def _roles(text: str) -> frozenset[str]:
@@ -164,10 +174,21 @@ def _scenario(args: argparse.Namespace) -> ScenarioConfig:
     overrides: Overrides = {
         key: getattr(args, option) for option, key in OPTIONS.items() if getattr(args, option) is not None
     }
-    scenario = load_scenario(args.scenario or data_path("config") / SCENARIO, overrides)
-    if round(scenario.duration_s / scenario.drone.step_s) < 1:
-        raise UsageError(f"{scenario.duration_s:g} s is shorter than a step of {scenario.drone.step_s:g} s; fly longer")
+    try:
+        scenario = load_scenario(args.scenario or data_path("config") / SCENARIO, overrides)
+    except ConfigError as error:
+        raise ConfigError([_of_option(problem) for problem in error.problems]) from error
     return scenario if args.drones is None else with_drones(scenario, args.drones)
+
+
+def _of_option(problem: ConfigProblem) -> ConfigProblem:
+    """With the option's name where an option gave the value."""
+    from flockd.config.loader import OVERRIDE
+
+    options = {key: option for option, key in OPTIONS.items()}
+    if problem.file != OVERRIDE or problem.key not in options:
+        return problem
+    return replace(problem, file=f"--{options[problem.key]}", key="")
 
 
 def _folder_name(scenario: ScenarioConfig, args: argparse.Namespace) -> str:

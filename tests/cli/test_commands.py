@@ -132,7 +132,7 @@ CAMERAS = SIMULATOR.split("cameras:")[1].split("perception:")[0]
 SPOILT = {
     "negative duration": (
         ("flight.yaml", "duration_s: 110.0", "duration_s: -110.0"),
-        "flight.yaml:3: duration_s: -110.0 is not greater than 0; write a positive number of seconds",
+        "flight.yaml:3: duration_s: -110.0 is not greater than 0; write a number of seconds above 0 and up to 86400",
     ),
     "unknown key": (
         ("flight.yaml", "duration_s:", "duration:"),
@@ -165,8 +165,38 @@ def test_a_scenario_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_a_flight_shorter_than_a_step_is_refused(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["sim", str(scenario), "--duration", "0.1"]) == 2
-    assert capsys.readouterr().err == "0.1 s is shorter than a step of 0.5 s; fly longer\n"
+    assert main(["sim", str(scenario), "--duration", "0.1"]) == 78
+    assert capsys.readouterr().err == "--duration: 0.1 s is shorter than a step of 0.5 s; write 0.5 or more\n"
+
+
+def test_more_drones_than_can_be_flown_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    told = "flockd sim: argument --drones: '5000' is more than the 100 drones that can be simulated"
+    assert _usage_error(capsys, "sim", "--drones", "5000").startswith(told)
+
+
+def test_config_check_finds_models_that_are_not_there(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    drone = scenario.with_name("simulator.yaml")
+    drone.write_text(SIMULATOR.replace("flow: flow_int8", "flow: flow_in8"), encoding="utf-8")
+    assert main(["config", "check", str(scenario)]) == 78
+    error = capsys.readouterr().err
+    assert error.startswith(f"{drone}:23: perception.flow: flow_in8 is not a known model, as ")
+    assert error.endswith("is missing; write one of flow, flow_int8\n")
+    drone.write_text(SIMULATOR.replace("flow: flow_int8", "flow: distance_int8"), encoding="utf-8")
+    assert main(["config", "check", str(drone)]) == 78
+    assert capsys.readouterr().err == (
+        f"{drone}:23: perception.flow: distance_int8 is for distance, not for flow; name another\n"
+    )
+
+
+def test_a_shown_scenario_can_be_loaded_again(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["config", "show", "--json", str(scenario)]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert main(["config", "show", str(scenario)]) == 0
+    scenario.write_text(capsys.readouterr().out, encoding="utf-8")
+    assert main(["config", "check", str(scenario)]) == 0
+    capsys.readouterr()
+    assert main(["config", "show", "--json", str(scenario)]) == 0
+    assert json.loads(capsys.readouterr().out) == values
 
 
 def test_config_check_reports_for_people_and_machines(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
