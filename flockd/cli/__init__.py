@@ -17,7 +17,15 @@ EXTRAS = {
     "pyarrow": "parquet",
     "rerun": "view",
 }
-INTERRUPTED = 130
+
+EXIT_CODES = """\
+exit codes:
+  0    done
+  1    a check failed
+  2    the command line is wrong
+  69   something is not there: an autopilot, a device, an extra
+  78   a configuration or a model is wrong
+  130  interrupted by Ctrl-C; what was flown until then is reported"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         return _failed(f"{error.filename or 'the system'}: {error.strerror or error}", ExitCode.UNAVAILABLE)
     except KeyboardInterrupt:
-        return _failed("interrupted", INTERRUPTED)
+        return _failed("interrupted", ExitCode.INTERRUPTED)
     return code
 
 
@@ -54,7 +62,8 @@ def _parser() -> Parser:
     parser = Parser(
         prog="flockd",
         description="Drones that flock by vision alone.",
-        examples=("flockd sim", "flockd config check config/paper_flight.yaml"),
+        examples=("flockd sim --duration 10", "flockd sim", "flockd config check config/paper_flight.yaml"),
+        notes=EXIT_CODES,
     )
     parser.add_argument("--version", action="version", version=f"flockd {__version__}")
     commands = (run, status, doctor, sim, report, record, replay, view, calibrate, config, models)

@@ -36,7 +36,7 @@ def alone() -> FlightLog:
 
 def assert_same_flight(a: FlightLog, b: FlightLog) -> None:
     for part in fields(FlightLog):
-        if part.name not in ("stages_ms", "meta"):
+        if part.name not in ("stages_ms", "metadata"):
             assert getattr(a, part.name).tobytes() == getattr(b, part.name).tobytes(), part.name
 
 
