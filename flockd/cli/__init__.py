@@ -1,4 +1,5 @@
 """The command line: `flockd COMMAND ...`."""
+# PYTHON_ARGCOMPLETE_OK
 
 from __future__ import annotations
 
@@ -13,9 +14,10 @@ from flockd.errors import ExitCode, FlockdError, UnavailableError
 
 # Packages of an extra: without them a command is unavailable, not broken.
 EXTRAS = {
-    **dict.fromkeys(("numba", "llvmlite", "matplotlib", "jinja2"), "sim"),
+    **dict.fromkeys(("numba", "llvmlite", "matplotlib", "jinja2", "markupsafe"), "sim"),
     "pyarrow": "parquet",
     "rerun": "view",
+    "argcomplete": "completion",
 }
 
 EXIT_CODES = """\
@@ -30,7 +32,12 @@ exit codes:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit code; an expected error is one sentence on stderr."""
-    args = _parser().parse_args(arguments)
+    parser = _parser()
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks for completions of its command line
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
+    args = parser.parse_args(arguments)
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # before ONNX Runtime is imported: it keeps statistics
     try:
         code: int = args.run(args)

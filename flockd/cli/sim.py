@@ -163,8 +163,12 @@ def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespac
         telemetry = None
         if args.telemetry:
             from flockd.telemetry.publisher import ZenohTelemetry
+            from flockd.telemetry.repeater import Repeater
 
-            telemetry = stack.enter_context(ZenohTelemetry(_plain(scenario.scenario)))
+            zenoh = stack.enter_context(ZenohTelemetry(_plain(scenario.scenario)))
+            for number in range(1, len(scenario.vehicles) + 1):
+                zenoh.show_alive(f"drone{number}")
+            telemetry = stack.enter_context(Repeater(zenoh))
         phases = stack.enter_context(Phases(quiet=args.quiet, verbose=args.verbose))
         flight = fly(
             scenario,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -61,10 +62,18 @@ def _setting(summary: Summary) -> str:
 
 def _colophon(summary: Summary) -> str:
     """When it was flown, and with which flockd."""
-    parts = [f"begun {summary['began']}"] * bool(summary["began"])
+    parts = [f"begun {_minute(summary['began'])}"] * bool(summary["began"])
     parts += [f"flockd {summary['version']}"] * bool(summary["version"])
     parts += ["interrupted before its end"] * bool(summary["interrupted"])
     return ", ".join(parts)
+
+
+def _minute(iso: str) -> str:
+    """An ISO 8601 time as people write it."""
+    try:
+        return f"{datetime.fromisoformat(iso).astimezone(UTC):%Y-%m-%d %H:%M} UTC"
+    except ValueError:  # of a recording by another writer
+        return iso
 
 
 def _of_five(summary: Summary) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -272,6 +273,19 @@ def test_a_report_of_a_damaged_log(tmp_path: Path, capsys: pytest.CaptureFixture
         assert error.count("\n") == 1
 
 
+def test_a_shell_completes_commands_and_options() -> None:
+    """As argcomplete's script for bash asks: by environment, with the answer on file descriptor 8."""
+    for line, expected in (("flockd rep", {"report", "replay"}), ("flockd sim --wi", {"--wind"})):
+        code = "import os, sys; from flockd.cli import main; os.dup2(1, 8); sys.argv[0] = 'flockd'; main()"
+        environment = {
+            **os.environ, "_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n",
+        }  # fmt: skip
+        told = subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
+        )
+        assert {word.strip() for word in told.stdout.splitlines()} == expected, told.stderr
+
+
 def test_a_missing_extra_is_unavailable(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def without_numba(_: object) -> int:
         raise ModuleNotFoundError("No module named 'numba'", name="numba")
@@ -316,7 +330,6 @@ def test_a_flight_leaves_its_log_summary_and_report(tmp_path: Path, capsys: pyte
     captured = capsys.readouterr()
     summary = json.loads(captured.out)
     assert (summary["drones"], summary["duration_s"], summary["seed"]) == (6, 5.0, 3)
-    assert captured.err == ""
     assert {"flight.npz", "summary.json", "report.html"} <= {path.name for path in folder.iterdir()}
     assert json.loads((folder / "summary.json").read_text(encoding="utf-8")) == summary
 
@@ -329,4 +342,90 @@ def test_a_flight_leaves_its_log_summary_and_report(tmp_path: Path, capsys: pyte
     assert json.loads((folder / "summary.json").read_text(encoding="utf-8")) == summary
     assert (folder / "report.html").is_file()
 
-    assert main(short) == 0, "an earlier flight may be flown over"
+    assert main(short) == 2
+    assert capsys.readouterr().err == (
+        f"{folder}: holds a flight; name another folder with --out, or overwrite it with --force\n"
+    )
+    (folder / "recordings").mkdir()
+    (folder / "recordings" / "drone1.mcap").touch()
+    assert main([*short, "--quiet", "--force"]) == 0
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == (f"{folder / 'report.html'}\n", "")
+    assert not (folder / "recordings").exists(), "nothing of the flight before is left beside the new one"
+
+
+def test_each_flight_has_its_own_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("flockd.report.flight_folder.write_report", lambda folder, progress: folder)
+    for expected in ("", "-2", "-3"):
+        assert main(["sim", "--perception", "truth", "--duration", "2", "--quiet"]) == 0
+        assert capsys.readouterr().out == f"out/paper_flight-truth-seed0{expected}/report.html\n"
+
+
+def test_an_interrupted_flight_leaves_its_report_and_can_be_flown_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from flockd.flight_log.log import FlightLog
+    from flockd.sim.vehicles import Vehicles
+
+    step, steps = Vehicles.step, iter(range(1000))
+
+    def interrupted(vehicles: Vehicles, *arguments: object) -> None:
+        if next(steps) == 40 + 7:  # after the companion's 40 steps
+            raise KeyboardInterrupt
+        step(vehicles, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Vehicles, "step", interrupted)
+    monkeypatch.setattr("flockd.report.flight_folder.write_report", lambda folder, progress: folder)
+    folder = tmp_path / "flight"
+    command = ["sim", "--perception", "truth", "--duration", "20", "--quiet", "--out", str(folder)]
+    assert main(command) == 130
+    captured = capsys.readouterr()
+    assert captured.out == f"{folder / 'report.html'}\n"
+    assert captured.err == "interrupted after 3.5 s of 20 s; the report is of what was flown\n"
+    log = FlightLog.load(folder / "flight.npz")
+    assert (len(log.time_s), log.metadata.duration_s, log.metadata.interrupted) == (7, 3.5, True)
+    assert log.truth_position.shape == (7, 5, 3)
+
+    monkeypatch.setattr(Vehicles, "step", step)
+    assert main(command) == 0, "the same command works again"
+    moved = tmp_path / "flight-interrupted"
+    assert capsys.readouterr().err == f"{folder}: held an interrupted flight, which is in {moved} now\n"
+    assert FlightLog.load(moved / "flight.npz").metadata.interrupted
+    assert not FlightLog.load(folder / "flight.npz").metadata.interrupted
+
+
+def test_wind_speed_and_radius_are_what_is_flown(capsys: pytest.CaptureFixture[str]) -> None:
+    from flockd.cli import _parser
+    from flockd.cli.sim import _scenario
+
+    args = _parser().parse_args(["sim", "--wind", "2,-1.5", "--speed", "1.5", "--radius", "15"])
+    scenario = _scenario(args)
+    assert scenario.vehicle.wind_m_s == (2.0, -1.5)
+    assert (scenario.drone.desired.speed_m_s, scenario.drone.desired.radius_m) == (1.5, 15.0)
+    assert "argument --wind: '3' is not two numbers such as 2.0,-1.5" in _usage_error(capsys, "sim", "--wind", "3")
+
+
+def test_two_flights_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from flockd.config import load_scenario
+    from flockd.sim.swarm import fly
+
+    for name, seed in (("a", 0), ("b", 1)):
+        (tmp_path / name).mkdir()
+        scenario = load_scenario(
+            ROOT / "config" / "paper_flight.yaml",
+            {"duration_s": 5.0 + seed, "seed": seed, "vehicle.gust_m_s": 0.5},
+        )
+        log = fly(scenario, perception="truth").log
+        log.save(tmp_path / name / "flight.npz")
+    assert main(["report", str(tmp_path / "a"), str(tmp_path / "b"), "--json"]) == 0
+    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)["rows"]}
+    assert (rows["seed"]["first"], rows["seed"]["second"]) == (0, 1)
+    assert (rows["flown"]["first"], rows["flown"]["second"], rows["flown"]["difference"]) == (5.0, 6.0, 1.0)
+    assert "neighbours known within 10 m" not in rows, "neither has it"
+    assert main(["report", str(tmp_path / "a"), str(tmp_path / "b")]) == 0
+    table = capsys.readouterr().out
+    assert "+1.0 s" in table
+    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["flight.npz"], "nothing is written"
