@@ -55,7 +55,7 @@ def add(commands: Commands) -> None:
     help_of_source = "a folder of images, a video, a recording or a /dev/video; by default --config's own camera, live"
     parser.add_argument("source", metavar="SOURCE", nargs="?", help=help_of_source)
     parser.add_argument("--camera", metavar="NAME", help="the camera's name in the rig")
-    parser.add_argument("--model", choices=LENS_MODELS, help="default: whichever leaves less residual")
+    parser.add_argument("--model", choices=LENS_MODELS, help="default: pinhole, unless the other fits clearly better")
     parser.add_argument(
         "--views", metavar="N", type=positive_count, default=MOST_VIEWS, help="use N views at most (60)"
     )
@@ -76,6 +76,7 @@ def _camera(args: argparse.Namespace) -> int:
     if args.print_board is not None:
         return _print_board(args, board)
     from flockd.calibration.board import BoardFinder
+    from flockd.calibration.intrinsics import simplest_that_fits
     from flockd.calibration.views import Collector
 
     collector = Collector(BoardFinder(board), args.views, args.max_blur)
@@ -84,7 +85,7 @@ def _camera(args: argparse.Namespace) -> int:
     refuse_overwriting(args, out, args.picture)
     _collect(images, name, collector)
     lenses = _lenses(args, collector)
-    lens = min(lenses, key=lambda one: one.rms_px)
+    lens = simplest_that_fits(lenses)
     measured = measurement(
         camera=args.serial or images.identities[name],
         source=source_name(args),
@@ -206,7 +207,7 @@ def _is_enough(collector: Collector) -> bool:
 
 
 def _lenses(args: argparse.Namespace, collector: Collector) -> list[Lens]:
-    """Of the model that was asked for, or of both as far as they fit."""
+    """Of the model that was asked for, or of both as far as they fit, the simpler one first."""
     from flockd.calibration.errors import CalibrationError
     from flockd.calibration.intrinsics import calibrate
 

@@ -155,7 +155,7 @@ def _facts(summary: Summary, log: FlightLog) -> list[dict[str, str]]:
         ]
     if summary["has_truth"]:
         heights = -log.position[..., 2]
-        facts.append(_fact("Heights", f"{heights.min():.1f} to {heights.max():.1f}", "above the start’s ground", "m"))
+        facts.append(_fact("Heights", f"{heights.min():.1f}–{heights.max():.1f}", "above the start’s ground", "m"))
     if neighbours["recall_within_10m"] is not None:
         facts += [
             _fact("Neighbours known", _number(100 * neighbours["recall_within_10m"], 1), "of those within 10 m", "%"),

@@ -228,7 +228,7 @@ def test_the_page_speaks_of_the_flight_it_shows(tmp_path: Path) -> None:
     metadata = log.metadata.model_copy(update={"began": "2026-11-21T09:05:00+00:00", "version": "0.1.0"})
     text = " ".join(_Page(_report(tmp_path, FlightLog(**{**vars(log), "metadata": metadata}))).text.split())
     assert "begun 2026-11-21 09:05 UTC, flockd 0.1.0" in text
-    assert "to 6.2 m" in text
+    assert "–6.2 m" in text
     assert "in 3D, drones" in text
     assert "Five drones" not in text, "this flight is of three"
     assert "The paper’s are of 5 drones, this flight is of 3." in text
