@@ -62,7 +62,7 @@ def _setting(summary: Summary) -> str:
 
 def _colophon(summary: Summary) -> str:
     """When it was flown, and with which flockd."""
-    parts = [f"begun {_minute(summary['began'])}"] * bool(summary["began"])
+    parts = [f"begun {_minute(summary['began'])}"] if summary["began"] else []
     parts += [f"flockd {summary['version']}"] * bool(summary["version"])
     parts += ["interrupted before its end"] * bool(summary["interrupted"])
     return ", ".join(parts)

@@ -278,8 +278,12 @@ def test_a_shell_completes_commands_and_options() -> None:
     for line, expected in (("flockd rep", {"report", "replay"}), ("flockd sim --wi", {"--wind"})):
         code = "import os, sys; from flockd.cli import main; os.dup2(1, 8); sys.argv[0] = 'flockd'; main()"
         environment = {
-            **os.environ, "_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n",
-        }  # fmt: skip
+            **os.environ,
+            "_ARGCOMPLETE": "1",
+            "COMP_LINE": line,
+            "COMP_POINT": str(len(line)),
+            "_ARGCOMPLETE_IFS": "\n",
+        }
         told = subprocess.run(
             [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
         )
