@@ -28,13 +28,14 @@ def trajectories(log: FlightLog, *, narrow: bool = False) -> Figure:
     with rc_context(STYLE):
         if narrow:
             figure = Figure(figsize=(NARROW_IN, 12.0 if drones > 1 else 4.5), layout="constrained")
-            panels = figure.subplots(3 if drones > 1 else 1, 1, squeeze=False)[:, 0]
+            panels = list(figure.subplots(3 if drones > 1 else 1, 1, squeeze=False)[:, 0])
         else:
             figure = Figure(figsize=(11.0, 7.4), layout="constrained")
-            panels = figure.subplot_mosaic(
+            mosaic = figure.subplot_mosaic(
                 [["paths", "start"], ["paths", "end"]] if drones > 1 else [["paths"]],
                 width_ratios=(1.9, 1.0) if drones > 1 else (1.0,),
-            ).values()
+            )
+            panels = list(mosaic.values())
         paths, *formations = panels
         if exact:
             for number in range(drones):

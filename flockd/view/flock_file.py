@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 from types import TracebackType
@@ -30,7 +30,7 @@ class FlockFile:
     Raises OSError where the file cannot be.
     """
 
-    def __init__(self, path: Path, name: str, cameras: dict[str, Sequence[str]]) -> None:
+    def __init__(self, path: Path, name: str, cameras: Mapping[str, Sequence[str]]) -> None:
         """``cameras``: the names of each recorded drone's cameras, by the drone's name."""
         path.open("wb").close()  # Rerun's own writer reports a failure only in its log
         self._tracks: dict[str, list[list[float]]] = {}
@@ -105,7 +105,7 @@ class FlockFile:
         self._recording.log(entity, what, static=static)
 
 
-def _blueprint(cameras: dict[str, Sequence[str]]) -> Any:
+def _blueprint(cameras: Mapping[str, Sequence[str]]) -> Any:
     images = [
         rrb.Grid(*(rrb.Spatial2DView(name=name, origin=f"images/{drone}/{name}") for name in names), name=drone)
         for drone, names in cameras.items()
