@@ -23,12 +23,13 @@ if TYPE_CHECKING:
 
 SCENARIO = "paper_flight.yaml"
 COSTS = """\
-costs, measured on two cores without 8-bit instructions:
-  time       about 40 s a simulated second with five drones that fly on networks; under 1 s with --perception truth
-  memory     about 1 GB with five drones
-  disk       about 10 MB for the report and what it is made of
-  --record   another 4.5 MB a drone and simulated second: 2.5 GB for five drones and 110 s
-Try `--duration 10 --drones 3` before the full flight. Ctrl-C ends a flight early, with a report of what was flown."""
+costs, measured with five drones on a processor without 8-bit instructions, November 2026:
+  time       12 s of processor time a simulated second, so 11 minutes on two free cores for the whole flight, and 10 s
+             to begin; with --perception truth a few seconds
+  memory     1 GB
+  disk       35 MB for the report and what it is made of
+  --record   another 4.5 MB a drone and simulated second: 2.5 GB for the whole flight
+Try `--duration 10 --drones 3` first. Ctrl-C ends a flight early, with a report of what was flown and exit code 130."""
 OPTIONS = {
     "duration": "duration_s",
     "seed": "seed",

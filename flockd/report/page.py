@@ -54,7 +54,9 @@ def write_report(directory: Path, progress: Callable[[int, int], None] = lambda 
     plates = []
     for number, frame in enumerate(frames, start=1):
         progress(len(drawings) + number - 1, total)
-        plates.append(_plate(frame, number, folder))
+        # As files only the first drone's: 1.4 MB each.
+        file = folder / f"filmstrip_{number}.png" if frame.drone == frames[0].drone else None
+        plates.append(_plate(frame, file))
     page = _template().render(
         **page_texts(summary, log),
         **embedded,
@@ -129,12 +131,13 @@ def _embed(log: FlightLog, draw: _Draw, path: Path, description: str) -> Markup 
     return Markup("\n".join(parts))  # drawn here, from numbers
 
 
-def _plate(frame: KeyFrame, number: int, folder: Path) -> dict[str, Any]:
+def _plate(frame: KeyFrame, file: Path | None) -> dict[str, Any]:
     """The filmstrip's figure as a PNG file and, for the page, as WebP, a sixth of the size."""
     canvas = FigureCanvasAgg(filmstrip_figure(frame))
     canvas.draw()  # type: ignore[no-untyped-call]
     image: UInt8Array = np.asarray(canvas.buffer_rgba())[..., 2::-1]  # type: ignore[no-untyped-call]
-    (folder / f"filmstrip_{number}.png").write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    if file is not None:
+        file.write_bytes(cv2.imencode(".png", image)[1].tobytes())
     small = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, 82])[1].tobytes()
     return {
         "drone": frame.title,

@@ -1,4 +1,4 @@
-"""The one adapter to Rerun: writes a recording's scenes to a file, and opens its viewer on one.
+"""The adapter to Rerun for one recording: writes a recording's scenes to a file, and opens its viewer on one.
 
 Neither does anything beyond this computer: the viewer listens on the loopback interface alone, its usage statistics are
 off, and what it would ask the web for (whether it is the newest) ends at a closed port.
