@@ -66,7 +66,7 @@ def test_help_shows_examples_of_the_command(command: list[str], capsys: pytest.C
     with pytest.raises(SystemExit) as exit_:
         main([*command, "--help"])
     assert exit_.value.code == 0
-    examples = capsys.readouterr().out.split("examples:\n")[1].splitlines()
+    examples = capsys.readouterr().out.split("examples:\n")[1].split("\n\n")[0].splitlines()
     assert examples
     assert all(example.startswith("  " + " ".join(["flockd", *command])) for example in examples)
 
