@@ -210,7 +210,8 @@ def test_the_report_of_a_folder_lies_beside_it(flight: Path, tmp_path: Path, cap
     page = tmp_path / "recordings.report" / "report.html"
     assert out.splitlines()[-1] == f"report: {page}"
     assert "holds a flight" not in err
-    assert "side_by_side, seed 3, recorded by drone1, drone2, begun 20" in text_of(page)
+    assert "side_by_side, seed 3, recorded by drone1, drone2" in text_of(page)
+    assert "begun 20" in text_of(page)
     # Its folder is a flight's: the report can be written again.
     assert told(capsys, 0, page.parent)[0].splitlines()[-1] == f"report: {page}"
 
