@@ -8,13 +8,14 @@ from enum import IntEnum
 
 
 class ExitCode(IntEnum):
-    """What a command's exit status means; 69 and 78 are the numbers of sysexits.h."""
+    """What a command's exit status means; 69 and 78 are the numbers of sysexits.h, 130 the shell's of Ctrl-C."""
 
     DONE = 0
     CHECK_FAILED = 1
     USAGE = 2
     UNAVAILABLE = 69
     BAD_CONFIGURATION = 78
+    INTERRUPTED = 130
 
 
 class FlockdError(Exception):

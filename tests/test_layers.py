@@ -175,7 +175,7 @@ REPLIES = PACKAGE / "telemetry" / "publisher.py"
     [
         ("mavsdk", ["autopilot/mavsdk_link.py"]),
         ("pymavlink", ["autopilot/fake_autopilot.py", "autopilot/fake_telemetry.py", "sim/ground_station.py"]),
-        ("rerun", ["view/rerun_file.py"]),
+        ("rerun", ["view/flock_file.py", "view/rerun_file.py"]),
     ],
 )
 def test_an_outside_library_sits_behind_its_adapters(library: str, adapters: list[str]) -> None:

@@ -32,6 +32,8 @@ _FOCAL_SIGMA = 0.01
 _CENTRE_SIGMA = 0.01
 """The same for the principal point, in widths of the image."""
 _LEAST_TILT_DEG = 10.0
+CLEARLY_BETTER = 0.8
+"""A more complicated model has to leave less than this share of a simpler one's residual."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +126,15 @@ def calibrate(views: Sequence[View], size: tuple[int, int], model: LensModel) ->
     lens = Lens(model, state.camera, sigma, tuple(kept), state.poses, tuple(dropped))
     _check_known(lens)
     return lens
+
+
+def simplest_that_fits(lenses: Sequence[Lens]) -> Lens:
+    """Of lenses fitted to the same views, simplest first: the first that none fits clearly better than.
+
+    Noise alone leaves one model a little less residual than another, and an absurd distortion can imitate a plain lens.
+    """
+    best_px = min(lens.rms_px for lens in lenses)
+    return next(lens for lens in lenses if lens.rms_px * CLEARLY_BETTER <= best_px)
 
 
 def tilt_deg(pose: RigidTransform) -> float:

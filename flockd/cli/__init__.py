@@ -1,4 +1,5 @@
 """The command line: `flockd COMMAND ...`."""
+# PYTHON_ARGCOMPLETE_OK
 
 from __future__ import annotations
 
@@ -13,16 +14,30 @@ from flockd.errors import ExitCode, FlockdError, UnavailableError
 
 # Packages of an extra: without them a command is unavailable, not broken.
 EXTRAS = {
-    **dict.fromkeys(("numba", "llvmlite", "matplotlib", "jinja2"), "sim"),
+    **dict.fromkeys(("numba", "llvmlite", "matplotlib", "jinja2", "markupsafe"), "sim"),
     "pyarrow": "parquet",
     "rerun": "view",
+    "argcomplete": "completion",
 }
-INTERRUPTED = 130
+
+EXIT_CODES = """\
+exit codes:
+  0    done
+  1    a check failed
+  2    the command line is wrong
+  69   something is not there: an autopilot, a device, an extra
+  78   a configuration or a model is wrong
+  130  interrupted by Ctrl-C; what was flown until then is reported"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit code; an expected error is one sentence on stderr."""
-    args = _parser().parse_args(arguments)
+    parser = _parser()
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks for completions of its command line
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
+    args = parser.parse_args(arguments)
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # before ONNX Runtime is imported: it keeps statistics
     try:
         code: int = args.run(args)
@@ -41,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         return _failed(f"{error.filename or 'the system'}: {error.strerror or error}", ExitCode.UNAVAILABLE)
     except KeyboardInterrupt:
-        return _failed("interrupted", INTERRUPTED)
+        return _failed("interrupted", ExitCode.INTERRUPTED)
     return code
 
 
@@ -54,7 +69,8 @@ def _parser() -> Parser:
     parser = Parser(
         prog="flockd",
         description="Drones that flock by vision alone.",
-        examples=("flockd sim", "flockd config check config/paper_flight.yaml"),
+        examples=("flockd sim --duration 10", "flockd sim", "flockd config check config/paper_flight.yaml"),
+        notes=EXIT_CODES,
     )
     parser.add_argument("--version", action="version", version=f"flockd {__version__}")
     commands = (run, status, doctor, sim, report, record, replay, view, calibrate, config, models)

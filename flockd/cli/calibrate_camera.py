@@ -49,7 +49,7 @@ def add(commands: Commands) -> None:
     help_of_source = "a folder of images, a video, a recording or a /dev/video; by default --config's own camera, live"
     parser.add_argument("source", metavar="SOURCE", nargs="?", help=help_of_source)
     parser.add_argument("--camera", metavar="NAME", help="the camera's name in the rig")
-    parser.add_argument("--model", choices=LENS_MODELS, help="default: whichever leaves less residual")
+    parser.add_argument("--model", choices=LENS_MODELS, help="default: pinhole, unless the other fits clearly better")
     parser.add_argument(
         "--views", metavar="N", type=positive_count, default=MOST_VIEWS, help="use N views at most (60)"
     )
@@ -71,6 +71,7 @@ def _camera(args: argparse.Namespace) -> int:
         return _print_board(args, board)
     from flockd.calibration.board import BoardFinder
     from flockd.calibration.fragment import measured_today
+    from flockd.calibration.intrinsics import simplest_that_fits
     from flockd.calibration.lens_session import CalibratedLens, collect_views, fit_lenses, is_enough
     from flockd.calibration.views import Collector
 
@@ -81,7 +82,7 @@ def _camera(args: argparse.Namespace) -> int:
     with progress("detecting the board", "images") as on_image, ended_by_ctrl_c(images.live):
         collect_views(images, name, collector, on_image, complain)
     lenses = fit_lenses(collector, args.model, source_name(args))
-    lens = min(lenses, key=lambda one: one.rms_px)
+    lens = simplest_that_fits(lenses)
     measured = measured_today(
         camera=args.serial or images.identities[name],
         source=source_name(args),

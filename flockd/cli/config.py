@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli.output import say, say_json
 from flockd.cli.parser import Commands, add_commands
-from flockd.errors import ConfigError, ExitCode
+from flockd.errors import ConfigError, ConfigProblem, ExitCode, ModelError
 
 if TYPE_CHECKING:
     from flockd.config import DroneConfig
@@ -46,12 +46,10 @@ def _add_schema(commands: Commands) -> None:
 
 
 def _check(args: argparse.Namespace) -> int:
-    from flockd.config import load
-
     results: dict[str, ConfigError | None] = {}
     for file in args.files:
         try:
-            load(file)
+            _check_file(file)
         except ConfigError as error:
             results[str(file)] = error
         else:
@@ -67,6 +65,42 @@ def _check(args: argparse.Namespace) -> int:
     if failed:
         raise ConfigError(problems)
     return ExitCode.DONE
+
+
+def _check_file(file: Path) -> None:
+    """Raises ConfigError for what is wrong with the file, and for models that it names and that are not there."""
+    from flockd.config import ScenarioConfig, load_with_places
+    from flockd.config.document import KeyPath
+    from flockd.inference.manifest_file import find_manifests, manifest_path, models_folder, read_manifest
+
+    config, places = load_with_places(file)
+    section: KeyPath = ("drone", "perception") if isinstance(config, ScenarioConfig) else ("perception",)
+    perception = config.drone.perception if isinstance(config, ScenarioConfig) else config.perception
+
+    def problem(key: str, message: str) -> ConfigProblem:
+        path: KeyPath = (*section, key)
+        while path not in places:  # a default: the section's line, or the file's
+            path = path[:-1]
+        return replace(places[path].problem(message), key=".".join(("perception", key)))
+
+    try:
+        folder = models_folder(perception)
+    except ModelError as error:
+        raise ConfigError([problem("models_dir", str(error).partition(": ")[2])]) from error
+    problems = []
+    for role, name in perception.networks.items():
+        path = manifest_path(folder, name)
+        try:
+            if not path.is_file():
+                known = [found.stem for found in find_manifests(folder) if role in read_manifest(found).manifest.roles]
+                hint = f"write one of {', '.join(known)}" if known else "name another"
+                problems.append(problem(role, f"{name} is not a known model, as {path} is missing; {hint}"))
+            elif role not in (roles := read_manifest(path).manifest.roles):
+                problems.append(problem(role, f"{name} is for {', '.join(roles)}, not for {role}; name another"))
+        except ModelError as error:
+            problems.append(problem(role, f"names a model that cannot be used: {error}"))
+    if problems:
+        raise ConfigError(problems)
 
 
 def _show(args: argparse.Namespace) -> int:

@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from flockd.cli.output import say, say_json
+from flockd.cli.output import Phases, say, say_json
 from flockd.errors import ExitCode
+
+if TYPE_CHECKING:
+    from flockd.sim.swarm import Flight
+
+
+def report_flight(directory: Path, flight: Flight, args: argparse.Namespace) -> int:
+    """Saves a flight, writes its report with progress, and shows its summary as --json and --quiet say."""
+    from flockd.report.flight_folder import REPORT_NAME, save_flight, write_report_files
+
+    with Phases(quiet=args.quiet, verbose=args.verbose) as phases:
+        save_flight(directory, flight.log, flight.key_frames)
+        summary = write_report_files(directory, flight.log, phases.of("writing the report", "figures"))
+    if args.quiet and not args.json:
+        say(f"{directory / REPORT_NAME}")
+        return ExitCode.DONE
+    return show_summary(directory, summary, as_json=args.json)
 
 
 def show_summary(directory: Path, summary: Mapping[str, Any], *, as_json: bool) -> int:

@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from time import monotonic
+from types import TracebackType
+from typing import Self
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 PLAIN_LINE_EVERY_S = 10.0
+PIPED_COLUMNS = 1000
+"""Width of tables that are not on a terminal, which has none: no column is cut."""
 
 
 def say(text: str) -> None:
@@ -32,19 +45,83 @@ def say_json(value: object) -> None:
 @contextmanager
 def progress(label: str, unit: str) -> Iterator[Callable[[int, int], None]]:
     """Gives a function that tells how many of how many are done: a bar on a terminal, else a line now and then."""
-    if sys.stderr.isatty():
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-            task = bar.add_task(label, total=None)
-            yield lambda done, total: bar.update(task, completed=done, total=total)
-        return
-    told_s = monotonic()
+    with Phases() as phases:
+        yield phases.of(label, unit)
 
-    def tell(done: int, total: int) -> None:
-        nonlocal told_s
+
+class Phases:
+    """Progress of phases one after the other, with a unit and the time left: a bar on a terminal, else lines.
+
+    ``quiet``: nothing. ``verbose``: also a line for each phase that is done, with the time it took.
+    """
+
+    def __init__(self, *, quiet: bool = False, verbose: bool = False) -> None:
+        self._quiet, self._verbose = quiet, verbose
+        self._bar: Progress | None = None
+        self._label = ""
+        self._task: TaskID | None = None
+        self._began_s = self._told_s = 0.0
+
+    def __enter__(self) -> Self:
+        if sys.stderr.isatty() and not self._quiet:
+            columns = (
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[unit]}"),
+                TimeElapsedColumn(),
+                TextColumn("left"),
+                TimeRemainingColumn(),
+            )
+            self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+        self._end_phase()
+
+    def say(self, sentence: str) -> None:
+        """One line, unless quiet."""
+        if not self._quiet:
+            complain(sentence)
+
+    def of(self, label: str, unit: str) -> Callable[[int, int], None]:
+        """Gives a function that tells how many of how many are done in this phase; its first call begins it."""
+        return functools.partial(self._tell, label, unit)
+
+    def _tell(self, label: str, unit: str, done: int, total: int) -> None:
+        if self._quiet:
+            return
+        if label != self._label:
+            self._end_phase()
+            self._label = label
+            self._began_s = self._told_s = monotonic()
+            if self._bar is not None:
+                self._task = self._bar.add_task(label, total=total, unit=unit)
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, completed=done, total=total)
+            return
         now_s = monotonic()
-        if now_s - told_s >= PLAIN_LINE_EVERY_S:
-            told_s = now_s
-            sys.stderr.write(f"{label}: {done} of {total} {unit}\n")
+        if now_s - self._told_s >= PLAIN_LINE_EVERY_S:
+            self._told_s = now_s
+            left = _duration((now_s - self._began_s) * (total - done) / done) if done else "unknown"
+            complain(f"{label}: {done} of {total} {unit}, {left} left")
 
-    yield tell
+    def _end_phase(self) -> None:
+        if not self._label:
+            return
+        if self._bar is not None and self._task is not None:
+            self._bar.remove_task(self._task)
+        if self._verbose:
+            complain(f"{self._label}: done in {_duration(monotonic() - self._began_s)}")
+        self._label, self._task = "", None
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"

@@ -8,7 +8,7 @@ import math
 import re
 import sys
 from collections.abc import Callable, Sequence
-from typing import NoReturn
+from typing import NoReturn, Protocol
 
 from flockd.errors import ExitCode
 
@@ -16,11 +16,12 @@ from flockd.errors import ExitCode
 class Parser(argparse.ArgumentParser):
     """With examples below the help, no abbreviated options, and errors of one sentence."""
 
-    def __init__(self, *, prog: str, description: str, examples: Sequence[str]) -> None:
+    def __init__(self, *, prog: str, description: str, examples: Sequence[str], notes: str = "") -> None:
+        """``notes`` stand below the examples."""
         super().__init__(
             prog=prog,
             description=description,
-            epilog="\n".join(["examples:", *(f"  {example}" for example in examples)]),
+            epilog="\n".join(["examples:", *(f"  {example}" for example in examples), *(["", notes] if notes else [])]),
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
@@ -38,8 +39,12 @@ class Parser(argparse.ArgumentParser):
         raise SystemExit(ExitCode.USAGE)
 
 
-Commands = Callable[[str, str, Sequence[str]], Parser]
-"""Adds a command by name, one-line description and examples."""
+class Commands(Protocol):
+    """Adds a command."""
+
+    def __call__(self, name: str, description: str, examples: Sequence[str], notes: str = "") -> Parser:
+        """By name, one-line description, examples, and what stands below them in its help."""
+        ...
 
 
 def add_commands(parser: Parser, additions: Sequence[Callable[[Commands], None]]) -> None:
@@ -47,10 +52,15 @@ def add_commands(parser: Parser, additions: Sequence[Callable[[Commands], None]]
     subparsers = parser.add_subparsers(metavar="COMMAND", parser_class=Parser)
     parser.set_defaults(run=lambda _: _print_help(parser))
 
-    def add(name: str, description: str, examples: Sequence[str]) -> Parser:
+    def add(name: str, description: str, examples: Sequence[str], notes: str = "") -> Parser:
         parser.commands.append(name)
         return subparsers.add_parser(
-            name, prog=f"{parser.prog} {name}", help=description, description=description, examples=examples
+            name,
+            prog=f"{parser.prog} {name}",
+            help=description,
+            description=description,
+            examples=examples,
+            notes=notes,
         )
 
     for addition in additions:

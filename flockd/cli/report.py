@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
 from flockd.cli.flight_summary import show_summary
-from flockd.cli.output import complain, progress
+from flockd.cli.output import PIPED_COLUMNS, complain, progress, say_json
 from flockd.cli.parser import Commands
 from flockd.cli.recording_options import opened
-from flockd.errors import UsageError
+from flockd.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,8 +32,9 @@ def add(commands: Commands) -> None:
         "flockd report out/short/recordings",
         "flockd report kestrel-20261120T101500Z.mcap --out reports/kestrel",
         "flockd report drone1.mcap --without-pictures --json",
+        "flockd report out/calm out/windy",
     )
-    description = "Write the summary and the report of a flight, from its folder or from recordings."
+    description = "Write the summary and the report of a flight, from its folder or from recordings; or compare two."
     parser = commands("report", description, examples)
     parser.add_argument(
         "flight",
@@ -39,6 +42,14 @@ def add(commands: Commands) -> None:
         type=Path,
         help="a recording, a folder of one flight's, or what `flockd sim` wrote",
     )
+    parser.add_argument(
+        "other",
+        nargs="?",
+        metavar="OTHER",
+        type=Path,
+        help="another flight: the key figures of both are printed, and nothing is written",
+    )
+    parser.add_argument("--force", action="store_true", help="overwrite a flight in --out")
     parser.add_argument("--out", metavar="DIR", type=Path, help=f"of a recording's report; default: NAME{SUFFIX}")
     parser.add_argument(
         "--without-pictures",
@@ -50,34 +61,82 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from flockd.report.flight_folder import LOG_NAME, check_folder, prepare_folder, save_flight, write_report_files
+    from flockd.report.flight_folder import LOG_NAME, check_report_folder, prepare_report_folder, save_flight
 
+    if args.other is not None:
+        return _compare(args)
     if (args.flight / LOG_NAME).is_file():
         return _again(args)
     paths = _recordings(args.flight)
     directory = args.out or args.flight.with_name(args.flight.resolve().name.removesuffix(".mcap") + SUFFIX)
-    check_folder(directory)
+    check_report_folder(directory, force=args.force)
     log, pictures = _flight(paths, pictured=not args.without_pictures)
-    prepare_folder(directory)
+    prepare_report_folder(directory, force=args.force)
     save_flight(directory, log, pictures)
-    return show_summary(directory, write_report_files(directory, log), as_json=args.json)
+    return _write(directory, log, args)
+
+
+def _write(directory: Path, log: FlightLog, args: argparse.Namespace) -> int:
+    from flockd.report.flight_folder import write_report_files
+
+    with progress("writing the report", "figures") as tell_progress:
+        summary = write_report_files(directory, log, tell_progress)
+    return show_summary(directory, summary, as_json=args.json)
 
 
 def _again(args: argparse.Namespace) -> int:
     """The report of a flight whose folder has its log."""
-    from flockd.report.flight_folder import LOG_NAME, write_report_files
-
-    for option in ("out", "without_pictures"):
+    for option in ("out", "without_pictures", "force"):
         if getattr(args, option):
-            raise UsageError(f"--{option.replace('_', '-')} is for recordings, and {args.flight} has a flight's log")
-    from flockd.flight_log.log import FlightLog
+            raise UsageError(
+                f"--{option.replace('_', '-')} is for recordings, and {args.flight} is a flight's folder, whose report "
+                "is written into it; drop it"
+            )
+    return _write(args.flight, _log_in(args.flight), args)
 
-    path = args.flight / LOG_NAME
+
+def _compare(args: argparse.Namespace) -> int:
+    """The key figures of two flights side by side."""
+    for option in ("out", "without_pictures", "force"):
+        if getattr(args, option):
+            raise UsageError(f"--{option.replace('_', '-')} has no meaning with two flights; drop it")
+    from flockd.report.comparison import compare
+    from flockd.report.summary import summarise
+
+    flights = (args.flight, args.other)
+    rows = compare(*(summarise(_log_of(flight)) for flight in flights))
+    if args.json:
+        say_json({"flights": [str(flight) for flight in flights], "rows": [asdict(row) for row in rows]})
+        return ExitCode.DONE
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("", *(str(flight) for flight in flights), "difference", box=None, pad_edge=False)
+    for row in rows:
+        table.add_row(row.name, *row.cells)
+    # Not on a terminal there is no width to fit.
+    Console(markup=False, highlight=False, width=None if sys.stdout.isatty() else PIPED_COLUMNS).print(table)
+    return ExitCode.DONE
+
+
+def _log_of(flight: Path) -> FlightLog:
+    """The log in a flight's folder, or the one that recordings make."""
+    from flockd.report.flight_folder import LOG_NAME
+
+    if (flight / LOG_NAME).is_file():
+        return _log_in(flight)
+    return _flight(_recordings(flight), pictured=False)[0]
+
+
+def _log_in(folder: Path) -> FlightLog:
+    from flockd.flight_log.log import FlightLog
+    from flockd.report.flight_folder import LOG_NAME
+
+    path = folder / LOG_NAME
     try:
-        log = FlightLog.load(path)
+        return FlightLog.load(path)
     except (ValueError, EOFError, BadZipFile) as error:
         raise UsageError(f"{path}: is not a whole flight log ({error}); fly again with `flockd sim`") from error
-    return show_summary(args.flight, write_report_files(args.flight, log), as_json=args.json)
 
 
 def _recordings(path: Path) -> tuple[Path, ...]:

@@ -16,7 +16,9 @@ from flockd.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from flockd.config import DroneConfig
-    from flockd.daemon import Ending, ServiceManager
+    from flockd.daemon import Daemon, Ending, ServiceManager
+
+WAITING_EVERY_S = 5.0
 
 
 def add(commands: Commands) -> None:
@@ -28,7 +30,12 @@ def add(commands: Commands) -> None:
     description = "Fly this drone: from camera frames to setpoints for its autopilot, until SIGTERM or Ctrl-C."
     parser = commands("run", description, examples)
     parser.add_argument("--config", metavar="FILE", type=Path, required=True, help="the drone's configuration")
-    parser.add_argument("--record", metavar="DIR", type=Path, help="write a recording of each flight to this folder")
+    parser.add_argument(
+        "--record",
+        metavar="DIR",
+        type=Path,
+        help="write a recording of each flight to this folder, which is made; see `recording` in the configuration",
+    )
     parser.set_defaults(run=_run)
 
 
@@ -36,11 +43,14 @@ def _run(args: argparse.Namespace) -> int:
     from flockd.config import load_drone
     from flockd.daemon import ServiceManager, event_loop_at, only_instance
 
-    if args.record is not None and not args.record.is_dir():
-        raise UsageError(f"{args.record}: is no folder; make it first, or name another with --record")
     _log_to_stderr()
     service = ServiceManager(os.environ)
     config: DroneConfig | None = load_drone(args.config)
+    if args.record is not None:
+        try:
+            args.record.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError) as error:
+            raise UsageError(f"{args.record}: is no folder; name another with --record") from error
     while config is not None:
         event_loop = functools.partial(event_loop_at, config.speed_factor)
         with only_instance(config.name, os.environ), asyncio.Runner(loop_factory=event_loop) as runner:
@@ -68,7 +78,18 @@ async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceMa
     loop.add_signal_handler(signal.SIGTERM, daemon.ask_to_stop)
     loop.add_signal_handler(signal.SIGINT, daemon.ask_to_stop)
     loop.add_signal_handler(signal.SIGHUP, lambda: daemon.ask_to_reload(lambda: load_drone(args.config)))
-    return await daemon.run()
+    waiting = asyncio.create_task(_say_what_it_waits_for(daemon, WAITING_EVERY_S * config.speed_factor))
+    try:
+        return await daemon.run()
+    finally:
+        waiting.cancel()
+
+
+async def _say_what_it_waits_for(daemon: Daemon, every_s: float) -> None:
+    """Every few seconds of the event loop's clock, until it is ready."""
+    while (what := daemon.waits_for()) is not None:
+        logging.getLogger("flockd").info("waits for %s", what)
+        await asyncio.sleep(every_s)
 
 
 def _log_to_stderr() -> None:

@@ -3,29 +3,41 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
 from flockd.choices import ROLES, AutopilotKind, ScaleSource, SimulatedPerception
 from flockd.cli import sim_fleet
-from flockd.cli.flight_summary import show_summary
-from flockd.cli.output import complain, progress
+from flockd.cli.flight_summary import report_flight
+from flockd.cli.output import Phases, complain
 from flockd.cli.parser import Commands, positive_count, positive_number, seed
-from flockd.errors import UsageError
+from flockd.errors import ConfigError, ConfigProblem, ExitCode, UsageError
 
 if TYPE_CHECKING:
     from flockd.config import Overrides, ScenarioConfig
     from flockd.recording import Recorder
 
 SCENARIO = "paper_flight.yaml"
-RECORDINGS = "recordings"
+COSTS = """\
+costs, measured with five drones on a processor without 8-bit instructions, November 2026:
+  time       12 s of processor time a simulated second, so 11 minutes on two free cores for the whole flight, and 10 s
+             to begin; with --perception truth a few seconds
+  memory     1 GB
+  disk       35 MB for the report and what it is made of
+  --record   another 4.5 MB a drone and simulated second: 2.5 GB for the whole flight
+Try `--duration 10 --drones 3` first. Ctrl-C ends a flight early, with a report of what was flown and exit code 130."""
 OPTIONS = {
     "duration": "duration_s",
     "seed": "seed",
     "flow": "drone.perception.flow",
     "scale": "drone.perception.scale",
+    "wind": "vehicle.wind_m_s",
+    "speed": "drone.desired.speed_m_s",
+    "radius": "drone.desired.radius_m",
 }
 """Which key of the configuration an option sets."""
 
@@ -33,15 +45,16 @@ OPTIONS = {
 def add(commands: Commands) -> None:
     """Adds the command."""
     examples = (
+        "flockd sim --duration 10 --drones 3",
         "flockd sim",
-        "flockd sim --duration 20 --drones 3 --out out/short",
+        "flockd sim --duration 20 --wind 3,-1 --speed 1.5 --radius 15 --out out/windy",
         "flockd sim --perception truth --json > truth.json",
         "flockd sim my_flight.yaml --flow dis --seed 7",
         "flockd sim --record --duration 20",
         "flockd sim --autopilot standin --drones 2 --duration 20",
         "flockd sim config/px4_flight.yaml --autopilot px4",
     )
-    parser = commands("sim", "Fly a simulated flock, and write a report of the flight.", examples)
+    parser = commands("sim", "Fly a simulated flock, and write a report of the flight.", examples, COSTS)
     parser.add_argument("scenario", nargs="?", metavar="SCENARIO", type=Path, help="by default the paper's flight")
     parser.add_argument(
         "--perception",
@@ -63,8 +76,13 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument("--flow", metavar="NAME", help="the model for optical flow, or `dis`")
     parser.add_argument("--scale", choices=get_args(ScaleSource), help="where the background's scale comes from")
-    parser.add_argument("--drones", metavar="N", type=positive_count, help="size of the flock")
+    parser.add_argument("--drones", metavar="N", type=_flock_size, help="size of the flock")
     parser.add_argument("--duration", metavar="S", type=positive_number, help="seconds to fly")
+    parser.add_argument("--wind", metavar="N,E", type=_wind, help="mean wind in m/s, to the north and to the east")
+    parser.add_argument("--speed", metavar="V", type=positive_number, help="desired speed of the flock in m/s")
+    parser.add_argument(
+        "--radius", metavar="R", type=positive_number, help="of the circle in m, measured at the middle"
+    )
     parser.add_argument("--seed", metavar="N", type=seed, help="of the world and of all noise")
     parser.add_argument(
         "--swap",
@@ -74,12 +92,42 @@ def add(commands: Commands) -> None:
         help=f"use the exact values of these roles instead of a network's: {', '.join(ROLES)}",
     )
     parser.add_argument(
-        "--out", metavar="DIR", type=Path, help="default: out/SCENARIO-PERCEPTION-seedN, or -AUTOPILOT-"
+        "--out",
+        metavar="DIR",
+        type=Path,
+        help="a new folder; default: out/SCENARIO-PERCEPTION-seedN, or -AUTOPILOT-, with -2, -3, ... if there is one",
     )
+    parser.add_argument("--force", action="store_true", help="overwrite an earlier flight in that folder")
     parser.add_argument("--telemetry", action="store_true", help="publish over zenoh while flying")
-    parser.add_argument("--record", action="store_true", help="write a recording of each drone to DIR/recordings")
+    parser.add_argument(
+        "--record",
+        action="store_true",
+        help="write a recording of each drone to DIR/recordings, 4.5 MB a drone and simulated second",
+    )
+    told = parser.add_mutually_exclusive_group()
+    told.add_argument("--quiet", action="store_true", help="no progress, and nothing but the path of the report")
+    told.add_argument("--verbose", action="store_true", help="say what is flown, and each phase with its time")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     parser.set_defaults(run=_run)
+
+
+def _wind(text: str) -> tuple[float, float]:
+    try:
+        north, east = (float(number) for number in text.split(","))
+    except ValueError:
+        north = east = math.nan
+    if not (math.isfinite(north) and math.isfinite(east)):
+        raise argparse.ArgumentTypeError(f"{text!r} is not two numbers such as 2.0,-1.5")
+    return north, east
+
+
+def _flock_size(text: str) -> int:
+    from flockd.config.scenario import MAX_DRONES
+
+    count = positive_count(text)
+    if count > MAX_DRONES:
+        raise argparse.ArgumentTypeError(f"{text!r} is more than the {MAX_DRONES} drones that can be simulated")
+    return count
 
 
 def _roles(text: str) -> frozenset[str]:
@@ -91,12 +139,23 @@ def _roles(text: str) -> frozenset[str]:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from flockd.report.flight_folder import prepare_folder, save_flight, write_report_files
-
     _check_options(args)
     scenario = _scenario(args)
-    directory = args.out or Path("out") / _folder_name(scenario, args)
-    prepare_folder(directory)
+    directory = _folder(scenario, args)
+    try:
+        return _fly_into(directory, scenario, args)
+    except BaseException:
+        with suppress(OSError):
+            directory.rmdir()  # nothing was flown, so that the folder is empty
+        raise
+
+
+def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespace) -> int:
+    from flockd.report.flight_folder import RECORDINGS
+
+    if args.verbose:
+        for line in _settings(scenario, directory, args):
+            complain(line)
     if args.autopilot is not None:
         return sim_fleet.fly(args, scenario, directory)
     from flockd.sim.swarm import fly
@@ -105,32 +164,54 @@ def _run(args: argparse.Namespace) -> int:
         telemetry = None
         if args.telemetry:
             from flockd.telemetry.publisher import ZenohTelemetry
+            from flockd.telemetry.repeater import Repeater
 
-            telemetry = stack.enter_context(ZenohTelemetry(_plain(scenario.scenario)))
-        tell_progress = stack.enter_context(progress("flying", "steps"))
+            zenoh = stack.enter_context(ZenohTelemetry(_plain(scenario.scenario)))
+            for number in range(1, len(scenario.vehicles) + 1):
+                zenoh.show_alive(f"drone{number}")
+            telemetry = stack.enter_context(Repeater(zenoh))
+        phases = stack.enter_context(Phases(quiet=args.quiet, verbose=args.verbose))
         flight = fly(
             scenario,
             perception=args.perception,
             swap=args.swap,
             telemetry=telemetry,
             recorders=_recorders(scenario, args.swap, directory / RECORDINGS, stack) if args.record else (),
-            progress=tell_progress,
+            progress=phases.of("flying", "steps"),
+            preparing=phases.of("loading networks and building the world", "parts"),
         )
-    save_flight(directory, flight.log, flight.key_frames)
-    return show_summary(directory, write_report_files(directory, flight.log), as_json=args.json)
+    code = report_flight(directory, flight, args)
+    if flight.log.metadata.interrupted:
+        complain(
+            f"interrupted after {flight.log.metadata.duration_s:g} s of {scenario.duration_s:g} s; "
+            "the report is of what was flown"
+        )
+        return ExitCode.INTERRUPTED
+    return code
+
+
+def _settings(scenario: ScenarioConfig, directory: Path, args: argparse.Namespace) -> list[str]:
+    """What is flown, for --verbose."""
+    drone, wind = scenario.drone, scenario.vehicle.wind_m_s
+    networks = ", ".join(f"{role} {name}" for role, name in drone.perception.networks.items())
+    lines = [
+        f"scenario: {scenario.scenario}, seed {scenario.seed}, {scenario.duration_s:g} s, "
+        f"{len(scenario.vehicles)} drones, a step every {drone.step_s:g} s",
+        f"desired: {drone.desired.speed_m_s:g} m/s on a circle of {drone.desired.radius_m:g} m until "
+        f"{drone.desired.circle_until_s:g} s; wind {wind[0]:g} m/s north, {wind[1]:g} m/s east",
+        f"folder: {directory}",
+    ]
+    return lines if args.perception == "truth" else [*lines, f"networks: {networks}"]
 
 
 def _recorders(
     scenario: ScenarioConfig, swap: frozenset[str], directory: Path, stack: ExitStack
 ) -> tuple[Recorder, ...]:
-    """A recorder for each drone, over an earlier flight's recordings."""
+    """A recorder for each drone."""
     from flockd.inference.hashes import model_hashes
     from flockd.recording import Recorder
 
     directory.mkdir(exist_ok=True)
-    for earlier in directory.iterdir():
-        if re.fullmatch(r"drone\d+(\.\d+)?\.mcap", earlier.name):
-            earlier.unlink()
     facts = {"scenario": scenario.scenario, "seed": str(scenario.seed), "true_roles": ", ".join(sorted(swap))}
     return tuple(
         stack.enter_context(
@@ -164,10 +245,34 @@ def _scenario(args: argparse.Namespace) -> ScenarioConfig:
     overrides: Overrides = {
         key: getattr(args, option) for option, key in OPTIONS.items() if getattr(args, option) is not None
     }
-    scenario = load_scenario(args.scenario or data_path("config") / SCENARIO, overrides)
-    if round(scenario.duration_s / scenario.drone.step_s) < 1:
-        raise UsageError(f"{scenario.duration_s:g} s is shorter than a step of {scenario.drone.step_s:g} s; fly longer")
+    try:
+        scenario = load_scenario(args.scenario or data_path("config") / SCENARIO, overrides)
+    except ConfigError as error:
+        raise ConfigError([_of_option(problem) for problem in error.problems]) from error
     return scenario if args.drones is None else with_drones(scenario, args.drones)
+
+
+def _of_option(problem: ConfigProblem) -> ConfigProblem:
+    """With the option's name where an option gave the value."""
+    from flockd.config.loader import OVERRIDE
+
+    options = {key: option for option, key in OPTIONS.items()}
+    if problem.file != OVERRIDE or problem.key not in options:
+        return problem
+    return replace(problem, file=f"--{options[problem.key]}", key="")
+
+
+def _folder(scenario: ScenarioConfig, args: argparse.Namespace) -> Path:
+    """A folder for this flight alone."""
+    from flockd.report.flight_folder import new_folder, prepare_folder
+
+    if args.out is None and not args.force:
+        return new_folder(Path("out") / _folder_name(scenario, args))
+    directory: Path = args.out or Path("out") / _folder_name(scenario, args)
+    moved = prepare_folder(directory, force=args.force)
+    if moved is not None:
+        complain(f"{directory}: held an interrupted flight, which is in {moved} now")
+    return directory
 
 
 def _folder_name(scenario: ScenarioConfig, args: argparse.Namespace) -> str:

@@ -11,15 +11,14 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from flockd.cli.flight_summary import show_summary
-from flockd.cli.output import complain, progress
+from flockd.cli.flight_summary import report_flight
+from flockd.cli.output import Phases, complain
 from flockd.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from flockd.config import ScenarioConfig
 
 SITL = "px4_sitl.yaml"
-RECORDINGS = "recordings"
 DEFAULT_SPEED_FACTOR = 0.25
 """Two cores then keep up with five drones."""
 SPEED_FACTORS = (0.1, 10.0)
@@ -45,32 +44,33 @@ def fly(args: argparse.Namespace, scenario: ScenarioConfig, directory: Path) -> 
     """Flies, writes the same report as the simulator, and says whether all flew to the end."""
     from flockd.config import load_drone
     from flockd.data import data_path
-    from flockd.report.flight_folder import FLEET_LOGS, save_flight, write_report_files
+    from flockd.report.flight_folder import FLEET_LOGS, RECORDINGS
     from flockd.sim.fleet import fly_fleet
 
     with ExitStack() as stack:
         stack.enter_context(_ended_in_order())
-        tell_progress = stack.enter_context(progress("flying", "s"))
+        phases = stack.enter_context(Phases(quiet=args.quiet, verbose=args.verbose))
+        phases.say("starting autopilots and daemons, and taking off")
         flight = fly_fleet(
             scenario,
             load_drone(data_path("config") / SITL),
             kind=args.autopilot,
             speed_factor=args.speed_factor or DEFAULT_SPEED_FACTOR,
             logs=directory / FLEET_LOGS,
-            recordings=_emptied(directory / RECORDINGS) if args.record else None,
+            recordings=directory / RECORDINGS if args.record else None,
             environment=os.environ,
-            progress=tell_progress,
+            progress=phases.of("flying", "s"),
         )
-    save_flight(directory, flight.log, flight.key_frames)
-    summary = write_report_files(directory, flight.log)
-    code = show_summary(directory, summary, as_json=args.json)
-    fleet = summary["fleet"]
-    faults = [f"{drone} did not fly to the end: {why}" for drone, why in fleet["handed_over"].items()]
-    faults += [
-        f"the daemon of {drone} ended with exit code {code}" for drone, code in fleet["exit_codes"].items() if code
-    ]
-    for sentence in [*faults, *fleet["notes"]]:
+    code = report_flight(directory, flight, args)
+    fleet = flight.log.metadata.fleet
+    assert fleet is not None
+    faults = [f"{drone} did not fly to the end: {why}" for drone, why in fleet.handed_over.items()]
+    faults += [f"the daemon of {drone} ended with exit code {code}" for drone, code in fleet.exit_codes.items() if code]
+    for sentence in [*faults, *fleet.notes]:
         complain(f"{sentence}; see {directory / FLEET_LOGS}" if sentence in faults else sentence)
+    if flight.log.metadata.interrupted:
+        complain("interrupted; the report is of what was flown")
+        return ExitCode.INTERRUPTED
     return ExitCode.CHECK_FAILED if faults else code
 
 
@@ -87,11 +87,3 @@ def _ended_in_order() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _emptied(directory: Path) -> Path:
-    """Without an earlier flight's recordings."""
-    directory.mkdir(exist_ok=True)
-    for earlier in directory.glob("drone*.mcap"):
-        earlier.unlink()
-    return directory

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.output import say_json
+from flockd.cli.output import PIPED_COLUMNS, say_json
 from flockd.cli.parser import Commands, positive_number
 from flockd.errors import ExitCode, UnavailableError
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 ENDPOINT = "tcp/127.0.0.1:7447"
 LISTEN_S = 3.0
 REFRESH_S = 0.5
-PIPED_COLUMNS = 1000
 
 
 def add(commands: Commands) -> None:

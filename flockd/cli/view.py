@@ -1,4 +1,4 @@
-"""`flockd view`: a recording in Rerun."""
+"""`flockd view`: a recording, or the flock of a whole flight, in Rerun."""
 
 from __future__ import annotations
 
@@ -23,10 +23,15 @@ def add(commands: Commands) -> None:
         "flockd view drone1.mcap --start 60 --end 70",
         "flockd view drone1.mcap --save drone1.rrd --json",
         "flockd view drone1.mcap --as-recorded",
+        "flockd view out/short/recordings --save flock.rrd",
     )
-    description = "Show a recording in Rerun: images, drones, depth, point pairs, neighbours, commands and curves."
+    description = (
+        "Show a recording or a flock in Rerun: images, drones, depth, point pairs, neighbours, commands and curves."
+    )
     parser = commands("view", description, examples)
-    parser.add_argument("recording", metavar="RECORDING", type=Path)
+    parser.add_argument(
+        "recording", metavar="RECORDING", type=Path, help="a recording, or a folder of one flight's: shows the flock"
+    )
     add_stretch(parser)
     parser.add_argument("--save", metavar="FILE", type=Path, help="write a file for Rerun (.rrd) and open nothing")
     parser.add_argument(
@@ -51,7 +56,7 @@ def _run(args: argparse.Namespace) -> int:
     from flockd.view.rerun_file import open_viewer
 
     with tempfile.TemporaryDirectory(prefix="flockd-") as folder:
-        path = Path(folder) / f"{args.recording.stem}.rrd"
+        path = Path(folder) / f"{args.recording.resolve().stem}.rrd"
         _tell(args, _write(args, path))
         code = open_viewer(path)
     if code != 0:
@@ -65,6 +70,8 @@ def _check_screen() -> None:
 
 
 def _write(args: argparse.Namespace, path: Path) -> dict[str, Any]:
+    if args.recording.is_dir():
+        return _write_flock(args, path)
     from flockd.recording.editing import written_whole
     from flockd.replay.fidelity import damage_warnings, replay_warnings
     from flockd.view.rerun_file import RerunFile
@@ -96,6 +103,56 @@ def _write(args: argparse.Namespace, path: Path) -> dict[str, Any]:
         "steps": shown,
         "flown_again": scenes.compared,
         "as_recorded": scenes.equal,
+    }
+
+
+def _write_flock(args: argparse.Namespace, path: Path) -> dict[str, Any]:
+    """All drones of one flight, as recorded, by the truth in their recordings."""
+    from flockd.flight_log.from_recordings import recordings_in
+    from flockd.recording import RecordingError
+    from flockd.recording.editing import written_whole
+    from flockd.replay.fidelity import damage_warnings
+    from flockd.view.flock_file import FlockFile
+
+    folder: Path = args.recording
+    if not recordings_in(folder) and (folder / "recordings").is_dir():
+        folder = folder / "recordings"  # of a flight's own folder
+    recordings = [opened(one) for one in recordings_in(folder)]
+    if not recordings:
+        raise UsageError(f"{folder}: holds no recordings; name another folder, or fly with --record")
+    for recording in recordings:
+        if not recording.has_truth:
+            raise RecordingError(
+                f"{recording.path}: holds no truth, and without it the drones of a flight cannot be placed in one "
+                "view; name one recording"
+            )
+        for warning in damage_warnings(recording):
+            complain(warning)
+    stretches = [stretch(recording, args) for recording in recordings]
+    cameras = {one.drone: [camera.name for camera in one.config.rig.cameras] for one in recordings}
+    shown = 0
+    total = sum(
+        start_s <= time_s <= end_s
+        for recording, (start_s, end_s) in zip(recordings, stretches, strict=True)
+        for _, time_s in recording.contents.steps
+    )
+    with (
+        written_whole(path) as draft,
+        FlockFile(draft, folder.resolve().name, cameras) as file,
+        progress("reading", "steps") as tell,
+    ):
+        for recording, (start_s, end_s) in zip(recordings, stretches, strict=True):
+            for step in recording.steps(start_s, end_s):
+                file.show(recording.drone, step)
+                shown += 1
+                tell(shown, total)
+    return {
+        "recording": str(args.recording),
+        "file": str(path),
+        "drone": ", ".join(one.drone for one in recordings),
+        "steps": shown,
+        "flown_again": 0,
+        "as_recorded": 0,
     }
 
 

@@ -1,7 +1,16 @@
 """The typed configuration and its loader."""
 
 from flockd.config.drone import DroneConfig
-from flockd.config.loader import Overrides, load, load_drone, load_scenario, schema_of
+from flockd.config.loader import Overrides, load, load_drone, load_scenario, load_with_places, schema_of
 from flockd.config.scenario import ScenarioConfig
 
-__all__ = ["DroneConfig", "Overrides", "ScenarioConfig", "load", "load_drone", "load_scenario", "schema_of"]
+__all__ = [
+    "DroneConfig",
+    "Overrides",
+    "ScenarioConfig",
+    "load",
+    "load_drone",
+    "load_scenario",
+    "load_with_places",
+    "schema_of",
+]

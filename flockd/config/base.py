@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -18,3 +20,16 @@ class Section(BaseModel):
     model_config = ConfigDict(
         strict=True, extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
+
+
+def refuse(model: BaseModel, faults: Mapping[tuple[str | int, ...], str]) -> None:
+    """Raises the validation error that has these messages at these keys of the section; nothing without any.
+
+    For the validators of a section: a ValueError of theirs would stand at the section as a whole.
+    """
+    if faults:
+        details = [
+            InitErrorDetails(type=PydanticCustomError("value_error", "{error}", {"error": text}), loc=loc, input=model)
+            for loc, text in faults.items()
+        ]
+        raise ValidationError.from_exception_data(type(model).__name__, details)

@@ -10,11 +10,11 @@ from typing import Any, Literal, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from flockd.choices import ROLES
-from flockd.config.document import Document, Place, Value, read_document
+from flockd.config.document import Document, KeyPath, Place, Value, read_document
 from flockd.config.drone import DroneConfig
 from flockd.config.scenario import ScenarioConfig
 from flockd.config.validation_messages import path_in_file, problems_of
-from flockd.errors import ConfigError
+from flockd.errors import ConfigError, ConfigProblem
 
 PATHS = {("perception", key) for key in ("models_dir", "engines_dir", *ROLES)} | {("telemetry", "zenoh_config")}
 """Keys of a drone whose values are paths; of a model's role only where it ends in `.yaml`, else it is a name."""
@@ -31,9 +31,7 @@ def load_drone(path: Path | str, overrides: Overrides | None = None) -> DroneCon
     `overrides` sets single values over the file's, by dotted key: `{"perception.flow": "dis"}`.
     Raises ConfigError with every problem found.
     """
-    document = read_document(Path(path))
-    _override(document, overrides or {})
-    return _validated(DroneConfig, document)
+    return _validated(DroneConfig, _drone_document(Path(path), overrides or {}))
 
 
 def load_scenario(path: Path | str, overrides: Overrides | None = None) -> ScenarioConfig:
@@ -42,17 +40,22 @@ def load_scenario(path: Path | str, overrides: Overrides | None = None) -> Scena
     `overrides` sets single values over the files', by dotted key: `{"seed": 3, "drone.perception.flow": "dis"}`.
     Raises ConfigError with every problem found in both files.
     """
-    document = read_document(Path(path))
-    _merge_drone(document, Path(path).parent)
-    _override(document, overrides or {})
-    return _validated(ScenarioConfig, document)
+    return _validated(ScenarioConfig, _scenario_document(Path(path), overrides or {}))
 
 
 def load(path: Path | str) -> DroneConfig | ScenarioConfig:
     """A drone's or a scenario's configuration, whichever the file's keys speak for. Raises ConfigError."""
-    keys = read_document(Path(path)).values.keys()
-    is_drone = len(keys & DroneConfig.model_fields.keys()) > len(keys & ScenarioConfig.model_fields.keys())
-    return load_drone(path) if is_drone else load_scenario(path)
+    return load_with_places(path)[0]
+
+
+def load_with_places(path: Path | str) -> tuple[DroneConfig | ScenarioConfig, Mapping[KeyPath, Place]]:
+    """The same, with the place of each value in the file, for checks of more than the file. Raises ConfigError."""
+    path = Path(path)
+    if _kind(read_document(path)) == "drone":
+        document = _drone_document(path, {})
+        return _validated(DroneConfig, document), document.places
+    document = _scenario_document(path, {})
+    return _validated(ScenarioConfig, document), document.places
 
 
 def schema_of(kind: Literal["drone", "scenario"]) -> dict[str, Any]:
@@ -60,27 +63,59 @@ def schema_of(kind: Literal["drone", "scenario"]) -> dict[str, Any]:
     if kind == "drone":
         return DroneConfig.model_json_schema()
     schema = ScenarioConfig.model_json_schema()
-    description = schema["properties"]["drone"]["description"]
-    schema["properties"]["drone"] = {"type": "string", "title": "Drone", "description": description}
-    used = ("StartConfig", "VehicleConfig", "SensorConfig", "WorldConfig")
-    schema["$defs"] = {name: schema["$defs"][name] for name in used}
+    drone = schema["properties"]["drone"]
+    inline = {"$ref": drone.pop("$ref")}
+    schema["properties"]["drone"] = {"title": "Drone", **drone, "anyOf": [{"type": "string"}, inline]}
     return schema
 
 
+def _kind(document: Document) -> Literal["drone", "scenario"]:
+    """Whichever the keys speak for."""
+    keys = document.values.keys()
+    is_drone = len(keys & DroneConfig.model_fields.keys()) > len(keys & ScenarioConfig.model_fields.keys())
+    return "drone" if is_drone else "scenario"
+
+
+def _drone_document(path: Path, overrides: Overrides) -> Document:
+    document = read_document(path)
+    if document.values.keys() & {"scenario", "vehicles"} and _kind(document) == "scenario":
+        drone = document.values.get("drone")
+        hint = f"{path.parent / drone}" if isinstance(drone, str) else "one with the key `rig`"
+        fault = f"is a scenario, and a drone's own file is needed here; name that: {hint}"
+        raise ConfigError([ConfigProblem(str(path), 0, "", fault)])
+    _override(document, overrides)
+    return document
+
+
+def _scenario_document(path: Path, overrides: Overrides) -> Document:
+    document = read_document(path)
+    if "rig" in document.values and _kind(document) == "drone":
+        fault = "is a drone's own file, and a scenario is needed here; name one with the keys `vehicles` and `drone`"
+        raise ConfigError([ConfigProblem(str(path), 0, "", fault)])
+    _merge_drone(document, path.parent)
+    _override(document, overrides)
+    return document
+
+
 def _merge_drone(document: Document, folder: Path) -> None:
-    """Puts the drone's values and places where the scenario's file names the drone's file."""
+    """Puts the drone's values and places where the scenario's file names the drone's file.
+
+    A scenario may also hold the drone's values itself, as `flockd config show` prints them.
+    """
     key = ("drone",)
     if key in document.spoiled:
         return
     place = document.places.get(key, replace(document.places[()], key="drone"))
     name = document.values.get("drone")
+    if isinstance(name, dict):
+        return
     if not isinstance(name, str) or not name:
         fault = "must be the path of the drone's own YAML file" if "drone" in document.values else "is missing"
         document.problems.append(place.problem(f"{fault}; write it as in `drone: simulator.yaml`"))
         document.spoiled.add(key)
         return
     try:
-        drone = read_document(folder / name)
+        drone = _drone_document(folder / name, {})
     except ConfigError as error:
         document.problems.append(place.problem(f"names {name}, which cannot be used; correct it or name another"))
         document.problems.extend(error.problems)

@@ -7,7 +7,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from flockd.choices import LensModel
-from flockd.config.base import NonNegative, Positive, Section, Vector3
+from flockd.config.base import NonNegative, Positive, Section, Vector3, refuse
 
 
 class MeasurementConfig(Section):
@@ -57,6 +57,20 @@ class CameraConfig(Section):
     """Width, height."""
     intrinsics: IntrinsicsConfig
     extrinsics: ExtrinsicsConfig = ExtrinsicsConfig()
+
+    @model_validator(mode="after")
+    def _the_principal_point_is_in_the_image(self) -> Self:
+        points = {"cx": self.intrinsics.cx, "cy": self.intrinsics.cy}
+        refuse(
+            self,
+            {
+                ("intrinsics", key): f"{value:g} is outside the image, which is {size} pixels {side}; "
+                f"check {key} and size_px"
+                for (key, value), size, side in zip(points.items(), self.size_px, ("wide", "high"), strict=True)
+                if value >= size
+            },
+        )
+        return self
 
 
 class RigConfig(Section):

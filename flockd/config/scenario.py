@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from itertools import combinations
+from math import dist
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from flockd.config.base import NonNegative, Positive, Section, Vector3
+from flockd.config.base import NonNegative, Positive, Section, Vector3, refuse
 from flockd.config.drone import DroneConfig
+
+MAX_DRONES = 100
+"""More would take days and all memory."""
+MAX_DURATION_S = 86400.0
+DRONE_FAMILIES = 14
+"""Meshes that the simulator can build, counted from 0."""
+_LOWEST_M = 0.5
+"""A drone that begins lower touches the uneven ground."""
+_HIGHEST_M = 1000.0
+_SMALLEST_DISTANCE_M = 0.7
+"""Of two drones at the start, about the size of one: nearer, they touch."""
 
 
 class StartConfig(Section):
     """Where one vehicle begins."""
 
     position_m: Vector3
-    """NED."""
+    """North, east, down: a height of 4.5 m is -4.5."""
     velocity_m_s: tuple[float, float] = (0.0, 0.0)
     """North, east."""
 
@@ -55,7 +68,7 @@ class WorldConfig(Section):
     """Standard deviation of the gently uneven ground; 0 is flat."""
     clearance_m: NonNegative = 9.0
     """Free of obstacles on both sides of the planned path."""
-    drone_family: Annotated[int, Field(ge=0)] | Literal["any"] = "any"
+    drone_family: Annotated[int, Field(ge=0, le=DRONE_FAMILIES - 1)] | Literal["any"] = "any"
     """Which mesh the drones wear; `any`: drawn from the seed, the same for the whole flock."""
 
 
@@ -63,11 +76,53 @@ class ScenarioConfig(Section):
     """One simulated flight."""
 
     scenario: Annotated[str, Field(min_length=1)]
-    duration_s: Positive = 110.0
+    duration_s: Annotated[float, Field(gt=0, le=MAX_DURATION_S)] = 110.0
+    """One step of the drone at least, one day at most."""
     seed: Annotated[int, Field(ge=0)] = 0
-    vehicles: Annotated[tuple[StartConfig, ...], Field(min_length=1)]
+    vehicles: Annotated[tuple[StartConfig, ...], Field(min_length=1, max_length=MAX_DRONES)]
     vehicle: VehicleConfig = VehicleConfig()
     sensors: SensorConfig = SensorConfig()
     world: WorldConfig = WorldConfig()
     drone: DroneConfig
-    """In the file: the path of the drone's own configuration, relative to the scenario's."""
+    """In the file: the path of the drone's own configuration, relative to the scenario's; or that configuration."""
+
+    @model_validator(mode="after")
+    def _lasts_a_step(self) -> Self:
+        step_s = self.drone.step_s
+        if round(self.duration_s / step_s) < 1:
+            text = f"{self.duration_s:g} s is shorter than a step of {step_s:g} s; write {step_s:g} or more"
+            refuse(self, {("duration_s",): text})
+        return self
+
+    @model_validator(mode="after")
+    def _begins_in_the_air_and_apart(self) -> Self:
+        faults: dict[tuple[str | int, ...], str] = {}
+        for number, vehicle in enumerate(self.vehicles):
+            fault = _fault_of_height(vehicle.position_m[2])
+            if fault is not None:
+                faults["vehicles", number, "position_m"] = fault
+        for one, other in combinations(range(len(self.vehicles)), 2):
+            apart_m = dist(self.vehicles[one].position_m, self.vehicles[other].position_m)
+            if apart_m < _SMALLEST_DISTANCE_M:
+                faults.setdefault(
+                    ("vehicles", other, "position_m"),
+                    f"is {apart_m:.2g} m from vehicles[{one}], and drones touch below {_SMALLEST_DISTANCE_M:g} m; "
+                    "move one of them",
+                )
+        refuse(self, faults)
+        return self
+
+
+def _fault_of_height(down_m: float) -> str | None:
+    """What is wrong with the third number of a start position."""
+    if down_m > 0:
+        return (
+            f"the third number points down, so that {down_m:g} is {down_m:g} m below the ground; "
+            f"write {-max(down_m, _LOWEST_M):g}"
+        )
+    if down_m > -_LOWEST_M:
+        height_m = abs(down_m)
+        return f"begins {height_m:g} m above the ground; write -{_LOWEST_M:g} or less as the third number"
+    if down_m < -_HIGHEST_M:
+        return f"begins {-down_m:g} m above the ground; write -{_HIGHEST_M:g} or more as the third number"
+    return None

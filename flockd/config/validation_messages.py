@@ -173,6 +173,8 @@ def _wanted(root: Schema, schema: Schema, unit: str) -> str:
             count = len(schema.get("prefixItems", ()))
             if count:
                 return f"a list of {count} numbers{unit}"
+            if "maxItems" in schema:
+                return f"a list of {schema.get('minItems', 0)} to {schema['maxItems']} entries"
             return "a list of at least 1 entry" if schema.get("minItems") else "a list"
         case _:
             keys = schema.get("required") or schema.get("properties", {})  # what must be there, or else what may
@@ -185,6 +187,8 @@ def _wanted_number(schema: Schema, unit: str) -> str:
     over, under = schema.get("exclusiveMinimum"), schema.get("exclusiveMaximum")
     if over == 0 and high is None and under is None:
         return f"a positive {noun}{unit}"
+    if over is not None and high is not None:
+        return f"a {noun}{unit} above {over:g} and up to {high:g}"
     if over is not None and under is not None:
         return f"a {noun}{unit} above {over:g} and below {under:g}"
     if low is not None and high is not None:

@@ -74,6 +74,16 @@ class Daemon:
         self._reload: DroneConfig | None = None
         self._components: Components | None = None
 
+    def waits_for(self) -> str | None:
+        """What has to come before it can fly, for people; None once it has all."""
+        assert self._config.autopilot is not None
+        if self._components is None:
+            return f"the autopilot at {self._config.autopilot.address}, and for the networks to load"
+        if self._components.pilot_loop.frames is None:
+            faults = [status.fault for status in self._components.source.status().values() if status.fault]
+            return f"camera frames: {'; '.join(faults) or 'none came yet'}"
+        return None
+
     def ask_to_stop(self) -> None:
         """As SIGTERM does: standstill, Hold, and the end."""
         self._operator.shutdown = True

@@ -11,6 +11,13 @@ from flockd.flight_log.metadata import FlightMetadata
 from flockd.flight_log.truth_matching import match_neighbours
 from flockd.messages import BoolArray, FloatArray, PilotOutput
 
+_BY_STEP = (
+    "_times", "_position", "_velocity", "_attitude", "_desired", "_command_velocity", "_command_acceleration",
+    "_ego_rotation", "_ego_translation", "_ego_inlier_ratio", "_own_velocity", "_neighbour_position",
+    "_neighbour_velocity", "_detection_position", "_false_tracks",
+)  # fmt: skip
+"""Arrays with a row for each step."""
+
 
 class FlightLogBuilder:
     """Of a flight of ``drones`` drones whose steps begin at ``times`` (S,) s; NaN where nothing is added."""
@@ -93,6 +100,12 @@ class FlightLogBuilder:
         detected = np.array([R_ned_body @ s.position for s in output.detections]).reshape(-1, 3)
         for estimate, truth in match_neighbours(detected, true):
             self._detection_position[step, i, others[truth]] = detected[estimate]
+
+    def cut(self, steps: int) -> None:
+        """Leaves only the first ``steps`` steps: the flight ended there."""
+        for name in _BY_STEP:
+            setattr(self, name, getattr(self, name)[:steps])
+        self._tracked = [row for row in self._tracked if row[0] < steps]
 
     def build(self, metadata: FlightMetadata, companion: tuple[FloatArray, FloatArray] | None) -> FlightLog:
         """The log, with positions and velocities (S, N, 3) of the companion with exact states, if there is one."""

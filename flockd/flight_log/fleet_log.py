@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from flockd import __version__
 from flockd.config import DroneConfig
 from flockd.config.flocking import FlockingParameters
 from flockd.config.scenario import ScenarioConfig
@@ -53,6 +54,9 @@ class FleetRun:
     """What the simulator measures while a fleet flies."""
 
     began_s: float
+    began: str = ""
+    """Wall time, ISO 8601."""
+    interrupted: bool = False
     ended_s: float = 0.0
     wall_s: float = 0.0
     frames: tuple[FleetFrame, ...] = ()
@@ -105,7 +109,10 @@ def fleet_log(
         drone,
         scenario=scenario.scenario,
         drones=len(configs),
-        duration_s=scenario.duration_s,
+        duration_s=float(times[-1]) + drone.step_s if run.interrupted else scenario.duration_s,
+        interrupted=run.interrupted,
+        began=run.began or None,
+        version=__version__,
         seed=scenario.seed,
         perception="learned",
         wall_s=run.wall_s,

@@ -85,7 +85,11 @@ class FlightMetadata(BaseModel):
     recorded: list[str] | None = None
     """Drones whose recordings the log was made of; None of a log that a simulator wrote."""
     began: str | None = None
-    """Wall time, ISO 8601, at which the first recording was begun."""
+    """Wall time, ISO 8601, at which the flight, or its first recording, was begun."""
+    version: str | None = None
+    """Of flockd."""
+    interrupted: bool = False
+    """It was ended before its time; `duration_s` is what was flown."""
     clock_at_start_s: float | None = None
     """Time of the recordings' clock at the log's 0 s."""
 

@@ -23,11 +23,14 @@ from flockd.report.paper_results import TABLE_2
 from flockd.report.style import BAND, FEW, INK, MUTED, STYLE, colour_of, drone_name
 from flockd.report.summary import estimation_errors, objective_sums
 
+NARROW_IN = 3.9
+"""Width of a figure for a phone: one column of panels."""
 
-def flight_curves(log: FlightLog) -> Figure:
-    """Airspeed, course, distances, and the sums of obj1 and obj2, the flight beside its exact-state companion.
 
-    One drone has no distances and no shape.
+def flight_curves(log: FlightLog, *, narrow: bool = False) -> Figure:
+    """Airspeed, course, heights, distances, and the sums of obj1 and obj2, the flight beside its exact-state companion.
+
+    One drone has no distances and no shape. ``narrow``: below each other.
     """
     flights = [(_flight_title(log), log.position, log.velocity)]
     exact = log.companion
@@ -36,20 +39,29 @@ def flight_curves(log: FlightLog) -> Figure:
     drones = log.position.shape[1]
     labels = [label for label in _CURVES if drones > 1 or label not in _CURVES_OF_PAIRS]
     with rc_context(STYLE):
-        figure = Figure(figsize=(11.0, 2.1 * len(labels)), layout="constrained")
-        rows = figure.subplots(len(labels), len(flights), sharex=True, sharey="row", squeeze=False)
+        rows: Any
+        if narrow:
+            figure = Figure(figsize=(NARROW_IN, 1.7 * len(labels) * len(flights)), layout="constrained")
+            rows = figure.subplots(len(labels) * len(flights), 1, sharex=True).reshape(len(flights), len(labels)).T
+            for row in rows:
+                for other in row[1:]:
+                    other.sharey(row[0])
+        else:
+            figure = Figure(figsize=(11.0, 2.1 * len(labels)), layout="constrained")
+            rows = figure.subplots(len(labels), len(flights), sharex=True, sharey="row", squeeze=False)
         for column, (title, position, velocity) in enumerate(flights):
             _flight_column(dict(zip(labels, rows[:, column], strict=True)), log, position, velocity)
             rows[0, column].set_title(title)
             rows[-1, column].set_xlabel("time, s")
-        for axes, label in zip(rows[:, 0], labels, strict=True):
-            axes.set_ylabel(label)
+        for column in range(len(flights) if narrow else 1):
+            for axes, label in zip(rows[:, column], labels, strict=True):
+                axes.set_ylabel(label)
         figure.align_ylabels(rows[:, 0])
-        _legend(figure, log, Line2D([], [], label="desired", **_DESIRED))
+        _legend(figure, log, Line2D([], [], label="desired", **_DESIRED), narrow=narrow)
     return figure
 
 
-_CURVES: Final = ("airspeed, m/s", "course, °", "distance, m", "Σ obj1", "Σ obj2")
+_CURVES: Final = ("airspeed, m/s", "course, °", "height, m", "distance, m", "Σ obj1", "Σ obj2")
 _CURVES_OF_PAIRS: Final = ("distance, m", "Σ obj2")
 
 
@@ -76,6 +88,8 @@ def _flight_column(axes: Mapping[str, Axes], log: FlightLog, position: FloatArra
     _flock_lines(course, time_s, asked_deg[:, None] + (course_deg - asked_deg[:, None] + 180) % 360 - 180)
     course.plot(time_s, asked_deg, **_DESIRED)
     course.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 3, 4.5, 9, 10]))
+
+    _flock_lines(axes["height, m"], time_s, -position[..., 2])
 
     for steps in _windows(log):  # obj1 is another figure on the circle and after it, so no line joins the two
         axes["Σ obj1"].plot(time_s[steps], sums["obj1"][steps], color=INK)
@@ -135,17 +149,23 @@ def _flock_handles(drones: int) -> list[Line2D | Patch]:
     ]
 
 
-def _legend(figure: Figure, log: FlightLog, *more: Line2D) -> None:
+def _legend(figure: Figure, log: FlightLog, *more: Line2D, narrow: bool = False) -> None:
     handles = [*_flock_handles(log.position.shape[1]), *more]
     if _circle_ends(log):
         handles.append(Line2D([], [], color=MUTED, linewidth=0.8, label="circle ends"))
-    figure.legend(handles=handles, loc="outside upper left", ncols=len(handles), handlelength=1.8, columnspacing=1.4)
+    figure.legend(
+        handles=handles,
+        loc="outside upper left",
+        ncols=3 if narrow else len(handles),
+        handlelength=1.8,
+        columnspacing=1.4,
+    )
 
 
 # ---------------------------------------------------------------------------------------------------- without truth
 
 
-def account_curves(log: FlightLog) -> Figure:
+def account_curves(log: FlightLog, *, narrow: bool = False) -> Figure:
     """Estimates and commands of one recorded drone: speed, course, and the distances of the neighbours it tracked."""
     time_s = log.time_s
     own, command = log.own_velocity_estimate[:, 0, :2], log.command_velocity[:, 0]
@@ -155,7 +175,7 @@ def account_curves(log: FlightLog) -> Figure:
         (log.desired, {"label": "desired", **_DESIRED}),
     )
     with rc_context(STYLE):
-        figure = Figure(figsize=(11.0, 6.3), layout="constrained")
+        figure = Figure(figsize=(NARROW_IN if narrow else 11.0, 6.3), layout="constrained")
         speed, course, distance = figure.subplots(3, 1, sharex=True)
         for velocity, style in drawn:
             speed.plot(time_s, np.linalg.norm(velocity, axis=1), **style)
@@ -168,7 +188,7 @@ def account_curves(log: FlightLog) -> Figure:
             axes.set_ylim(bottom=0)
         figure.align_ylabels([speed, course, distance])
         handles, labels = speed.get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper left", ncols=len(handles))
+        figure.legend(handles, labels, loc="outside upper left", ncols=2 if narrow else len(handles))
     return figure
 
 
@@ -201,15 +221,15 @@ def _tracked_lines(axes: Axes, log: FlightLog) -> None:
 # -------------------------------------------------------------------------------------------------- errors of Fig. 5
 
 
-def error_curves(log: FlightLog) -> Figure | None:
+def error_curves(log: FlightLog, *, narrow: bool = False) -> Figure | None:
     """Errors of the estimated own motion and of the distance to the tracked neighbours; None without any estimate."""
     errors = estimation_errors(log)
     if not log.metadata.by_sight or not any(np.isfinite(values).any() for values in errors.values()):
         return None
     drones = log.position.shape[1]
     with rc_context(STYLE):
-        figure = Figure(figsize=(11.0, 6.6), layout="constrained")
-        panels = figure.subplots(2, 3, sharex=True)
+        figure = Figure(figsize=(NARROW_IN, 11.0) if narrow else (11.0, 6.6), layout="constrained")
+        panels = figure.subplots(6, 1, sharex=True)[:, None] if narrow else figure.subplots(2, 3, sharex=True)
         for axes, (column, title) in zip(panels.flat, _ERROR_TITLES.items(), strict=True):
             values = errors[column]
             axes.set_title(title)
@@ -226,7 +246,7 @@ def error_curves(log: FlightLog) -> Figure | None:
             _mark_circle(axes, log)
         for axes in panels[-1]:
             axes.set_xlabel("time, s")
-        _legend(figure, log, Line2D([], [], label="the paper’s maximum", **_REFERENCE))
+        _legend(figure, log, Line2D([], [], label="the paper’s maximum", **_REFERENCE), narrow=narrow)
     return figure
 
 

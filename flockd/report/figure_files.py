@@ -1,10 +1,9 @@
-"""Figures as the report ships them: PNG files, and SVG elements that follow the reader's colour scheme."""
+"""Figures as the report's page holds them: SVG elements that follow the reader's colour scheme."""
 
 from __future__ import annotations
 
 import io
 import re
-from pathlib import Path
 from typing import Final
 
 from matplotlib import rc_context
@@ -20,11 +19,6 @@ _THEMED: Final = {
     PAPER: "var(--paper)",
     BAND: "var(--blue)",
 }
-
-
-def save_png(figure: Figure, path: Path) -> None:
-    """Write the figure in the light palette at its own resolution."""
-    figure.savefig(path, format="png")
 
 
 def inline_svg(figure: Figure, name: str, description: str) -> str:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +20,14 @@ from flockd.flight_log.key_frames import KeyFrame, load_key_frames
 from flockd.flight_log.log import FlightLog
 from flockd.messages import UInt8Array
 from flockd.report.curves import account_curves, error_curves, flight_curves
-from flockd.report.figure_files import inline_svg, save_png
+from flockd.report.figure_files import inline_svg
 from flockd.report.filmstrip import filmstrip_figure
 from flockd.report.page_texts import page_texts
+from flockd.report.style import colour_of
 from flockd.report.trajectories import trajectories
 
 
-def write_report(directory: Path) -> Path:
+def write_report(directory: Path, progress: Callable[[int, int], None] = lambda done, total: None) -> Path:
     """Write `report.html` and `figures/*.png` into a flight's folder and return the page's path.
 
     The folder holds `flight.npz` (FlightLog), `summary.json` (of `summarise`) and, if key frames were kept,
@@ -40,30 +43,61 @@ def write_report(directory: Path) -> Path:
 
     folder = directory / "figures"
     folder.mkdir(exist_ok=True)
-    errors = error_curves(log)
     for old in folder.glob("*.png"):
         old.unlink()
+    drawings = _DRAWINGS_OF_TRUTH if log.has_truth else _DRAWINGS_OF_ACCOUNT
+    total = len(drawings) + len(frames)
+    embedded: dict[str, Markup | None] = {"trajectories": None, "errors": None}
+    for number, (name, (draw, file, description)) in enumerate(drawings.items()):
+        progress(number, total)
+        embedded[name] = _embed(log, draw, folder / f"{file}.png", description)
+    plates = []
+    for number, frame in enumerate(frames, start=1):
+        progress(len(drawings) + number - 1, total)
+        # As files only the first drone's: 1.4 MB each.
+        path = folder / f"filmstrip_{number}.png" if frame.drone == frames[0].drone else None
+        plates.append(_plate(frame, path))
     page = _template().render(
         **page_texts(summary, log),
-        **(_of_truth(log, folder) if log.has_truth else _of_account(log, folder)),
-        errors=_embed(errors, folder, "errors", "Errors of the estimates over time") if errors else None,
-        filmstrip=[_plate(frame, number, folder) for number, frame in enumerate(frames, start=1)],
+        **embedded,
+        filmstrip=plates,
+        plated=list(dict.fromkeys(plate["drone"] for plate in plates)),
+        player=Markup(_flight_data(log)) if log.has_truth else None,
+        script=Markup((Path(__file__).parent / "report.js").read_text(encoding="utf-8")),
     )
+    progress(total, total)
     path = directory / "report.html"
     path.write_text(page, encoding="utf-8")
     return path
 
 
-def _of_truth(log: FlightLog, folder: Path) -> dict[str, Markup | None]:
-    return {
-        "trajectories": _embed(trajectories(log), folder, "trajectories", "Paths and formation from above"),
-        "curves": _embed(flight_curves(log), folder, "curves", "Airspeed, course, distances and deviations over time"),
+_Draw = Callable[..., Figure | None]
+_DRAWINGS_OF_TRUTH: dict[str, tuple[_Draw, str, str]] = {
+    "trajectories": (trajectories, "trajectories", "Paths and formation from above"),
+    "curves": (flight_curves, "curves", "Airspeed, course, heights, distances and deviations over time"),
+    "errors": (error_curves, "errors", "Errors of the estimates over time"),
+}
+"""By their name in the template: the figure's function, its file's name, and what it shows."""
+_DRAWINGS_OF_ACCOUNT: dict[str, tuple[_Draw, str, str]] = {
+    "curves": (
+        account_curves,
+        "account",
+        "Airspeed, course and distances of neighbours over time, as the drone knew them",
+    ),
+}
+
+
+def _flight_data(log: FlightLog) -> str:
+    """What the page plays: times, and of each drone metres north, east and up, to the centimetre."""
+    drones = log.position.shape[1]
+    up = log.position * (1.0, 1.0, -1.0)
+    data = {
+        "time": np.round(log.time_s, 3).tolist(),
+        "position": (np.round(up, 2) + 0.0).tolist(),
+        "colours": [colour_of(number, drones) for number in range(drones)],
+        "names": [f"{number + 1}" for number in range(drones)],
     }
-
-
-def _of_account(log: FlightLog, folder: Path) -> dict[str, Markup | None]:
-    description = "Airspeed, course and distances of neighbours over time, as the drone knew them"
-    return {"trajectories": None, "curves": _embed(account_curves(log), folder, "account", description)}
+    return json.dumps(data, separators=(",", ":"))
 
 
 def _template() -> jinja2.Template:
@@ -78,24 +112,36 @@ _MAX_SVG_BYTES = 700_000
 """Long flights of many drones make SVG elements larger than the PNG file."""
 
 
-def _embed(figure: Figure, folder: Path, name: str, description: str) -> Markup:
-    """Write the figure's PNG; for the page, a drawing that follows the reader's scheme, or that PNG if it is less."""
-    path = folder / f"{name}.png"
-    save_png(figure, path)
-    element = inline_svg(figure, name, description)
-    if len(element) > _MAX_SVG_BYTES:
-        element = f'<img src="{_data_url("image/png", path.read_bytes())}" alt="{description}">'
-    return Markup(element)  # drawn here, from numbers
+def _embed(log: FlightLog, draw: _Draw, path: Path, description: str) -> Markup | None:
+    """Writes the figure's PNG. For the page, drawings for a wide and for a narrow window, or PNGs if those are less."""
+    parts = []
+    for narrow in (False, True):
+        figure = draw(log, narrow=narrow)
+        if figure is None:
+            return None
+        image = io.BytesIO()
+        figure.savefig(image, format="png")
+        if not narrow:
+            path.write_bytes(image.getvalue())
+        kind = "narrow" if narrow else "wide"
+        element = inline_svg(figure, f"{path.stem}-{kind}", description)
+        if len(element) > _MAX_SVG_BYTES:
+            element = f'<img src="{_data_url("image/png", image.getvalue())}" alt="{description}">'
+        parts.append(f'<div class="{kind}">{element}</div>')
+    return Markup("\n".join(parts))  # drawn here, from numbers
 
 
-def _plate(frame: KeyFrame, number: int, folder: Path) -> dict[str, Any]:
+def _plate(frame: KeyFrame, file: Path | None) -> dict[str, Any]:
     """The filmstrip's figure as a PNG file and, for the page, as WebP, a sixth of the size."""
     canvas = FigureCanvasAgg(filmstrip_figure(frame))
     canvas.draw()  # type: ignore[no-untyped-call]
     image: UInt8Array = np.asarray(canvas.buffer_rgba())[..., 2::-1]  # type: ignore[no-untyped-call]
-    (folder / f"filmstrip_{number}.png").write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    if file is not None:
+        file.write_bytes(cv2.imencode(".png", image)[1].tobytes())
     small = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, 82])[1].tobytes()
     return {
+        "drone": frame.title,
+        "time_s": f"{frame.time_s:.3f}",
         "source": _data_url("image/webp", small),
         "width": image.shape[1],
         "height": image.shape[0],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -24,15 +25,19 @@ def page_texts(summary: Summary, log: FlightLog) -> dict[str, Any]:
         "truth": summary["has_truth"],
         "recomputed": summary["recorded"] is not None,
         "headline": _headline(summary),
+        "colophon": _colophon(summary),
+        "of_five": _of_five(summary),
+        "table2_columns": _TABLE_2_NAMES,
+        "table3_columns": _TABLE_3_NAMES,
         "lead": _lead(summary),
         "facts": _facts(summary, log),
         "by_sight": by_sight,
         "companion": log.companion is not None,
         "drones": summary["drones"],
         "distance_note": (
-            "Distances are horizontal and wear the colours of both drones."
+            "Distances here are horizontal and wear the colours of both drones; the closest distance above is in 3D."
             if summary["drones"] <= FEW
-            else "Distances are horizontal, each drone’s to its nearest."
+            else "Distances here are horizontal, each drone’s to its nearest; the closest distance above is in 3D."
         ),
         "circle_until": f"{summary['circle_until_s']:g}",
         "table2": _table2(summary),
@@ -40,7 +45,7 @@ def page_texts(summary: Summary, log: FlightLog) -> dict[str, Any]:
         "flock": _flock(summary["flock"]) if summary["drones"] > 1 and summary["has_truth"] else [],
         "neighbours": _neighbours(summary["neighbours"]) if _knows_neighbours(summary) else [],
         "stages": _stages(summary["stages_ms"]),
-        "definitions": _DEFINITIONS,
+        "definitions": _definitions(summary),
     }
 
 
@@ -51,8 +56,35 @@ def _setting(summary: Summary) -> str:
         parts.append(f"seed {summary['seed']}")
     if summary["recorded"] is not None:
         names = [name for name in summary["recorded"] if name != summary["scenario"]]
-        parts += [f"recorded by {', '.join(names)}"] * bool(names) + [f"begun {summary['began']}"]
+        parts += [f"recorded by {', '.join(names)}"] * bool(names)
     return ", ".join(parts)
+
+
+def _colophon(summary: Summary) -> str:
+    """When it was flown, and with which flockd."""
+    parts = [f"begun {_minute(summary['began'])}"] if summary["began"] else []
+    parts += [f"flockd {summary['version']}"] * bool(summary["version"])
+    parts += ["interrupted before its end"] * bool(summary["interrupted"])
+    return ", ".join(parts)
+
+
+def _minute(iso: str) -> str:
+    """An ISO 8601 time as people write it."""
+    try:
+        return f"{datetime.fromisoformat(iso).astimezone(UTC):%Y-%m-%d %H:%M} UTC"
+    except ValueError:  # of a recording by another writer
+        return iso
+
+
+def _of_five(summary: Summary) -> str:
+    """Where the paper's figures are of another flock."""
+    drones = summary["drones"]
+    if drones == _PAPERS_DRONES:
+        return ""
+    return f" The paper’s are of {_PAPERS_DRONES} drones, this flight is of {drones}."
+
+
+_PAPERS_DRONES = 5
 
 
 _WORDS = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine", "Ten", "Eleven", "Twelve")
@@ -117,10 +149,13 @@ def _facts(summary: Summary, log: FlightLog) -> list[dict[str, str]]:
     facts = []
     if summary["drones"] > 1 and summary["has_truth"]:
         facts += [
-            _fact("Closest two drones", _number(flock["min_distance_m"], 2), _closest(log), "m"),
+            _fact("Closest two drones", _number(flock["min_distance_m"], 2), f"in 3D, {_closest(log)}", "m"),
             _fact("Order", _number(flock["order_tail"], 3), "1 is all flying one way"),
             _fact("Union", _number(flock["union_tail"], 2), "1 is one connected flock"),
         ]
+    if summary["has_truth"]:
+        heights = -log.position[..., 2]
+        facts.append(_fact("Heights", f"{heights.min():.1f}–{heights.max():.1f}", "above the start’s ground", "m"))
     if neighbours["recall_within_10m"] is not None:
         facts += [
             _fact("Neighbours known", _number(100 * neighbours["recall_within_10m"], 1), "of those within 10 m", "%"),
@@ -182,6 +217,8 @@ def _table2(summary: Summary) -> list[dict[str, Any]]:
 
 
 _TABLE_2_COLUMNS = ("translation_x_m", "translation_y_m", "yaw_deg", "pitch_deg", "roll_deg", "distance_m")
+_TABLE_2_NAMES = ("x, m", "y, m", "yaw, °", "pitch, °", "roll, °", "distance, m")
+_TABLE_3_NAMES = ("obj1 time, s", "obj1 error", "obj1 bias", "obj2 time, s", "obj2 error", "obj2 bias")
 _STATISTICS = {"mean": "mean", "median": "median", "p95": "95th percentile", "max": "maximum"}
 
 
@@ -234,8 +271,8 @@ def _flock(flock: Mapping[str, Any]) -> list[dict[str, str]]:
     return _rows(
         flock,
         (
-            ("min_distance_m", "smallest distance, m", 3),
-            ("min_distance_after_10s_m", "smallest distance after 10 s, m", 3),
+            ("min_distance_m", "smallest distance in 3D, m", 3),
+            ("min_distance_after_10s_m", "smallest distance in 3D after 10 s, m", 3),
             ("order_tail", "order, last 10 s", 4),
             ("union_tail", "union, last 10 s", 4),
             ("connectivity_tail", "connectivity, last 10 s", 4),
@@ -267,6 +304,20 @@ def _stages(stages: Mapping[str, Mapping[str, float]]) -> list[dict[str, Any]]:
     ]
 
 
+def _definitions(summary: Summary) -> list[tuple[str, str]]:
+    drones, distance_m = summary["drones"], summary["desired_distance_m"]
+    of_flock = ""
+    if drones == _PAPERS_DRONES and distance_m == _PAPERS_DISTANCE_M:
+        of_flock = " Five drones cannot all be 3.5 m apart: their sum settles at 15.27, not 0."
+    elif drones > _MOST_EQUIDISTANT:
+        of_flock = f" {drones} drones cannot all be {distance_m:g} m apart in a plane: their sum does not settle at 0."
+    return [(term, meaning.format(obj2_of_flock=of_flock)) for term, meaning in _DEFINITIONS]
+
+
+_PAPERS_DISTANCE_M = 3.5
+_MOST_EQUIDISTANT = 3
+"""Points in a plane that can all be equally far from each other."""
+
 _DEFINITIONS = (
     (
         "x, y, yaw, pitch, roll",
@@ -282,7 +333,7 @@ _DEFINITIONS = (
     (
         "obj2",
         "Eq. 45: over all others within the observation distance, how far the distance is from the desired one plus "
-        "the L1 difference in velocity. Five drones cannot all be 3.5 m apart: their sum settles at 15.27, not 0.",
+        "the L1 difference in velocity.{obj2_of_flock}",
     ),
     (
         "convergence",

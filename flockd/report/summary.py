@@ -55,7 +55,8 @@ def summarise(log: FlightLog) -> Json:
 
 _FROM_METADATA = (
     "scenario", "perception", "flow", "scale", "drones", "duration_s", "step_s", "seed", "wall_s", "circle_until_s",
-    "recorded", "began", "autopilot", "fleet",
+    "desired_distance_m",
+    "recorded", "began", "version", "interrupted", "autopilot", "fleet",
 )  # fmt: skip
 
 

@@ -50,8 +50,6 @@ class CameraSimulator:
         )
         rng = np.random.default_rng([scenario.seed, 1])
         drawn, wanted = int(rng.integers(FAMILIES)), scenario.world.drone_family
-        if wanted != "any" and wanted >= FAMILIES:
-            raise UsageError(f"world.drone_family: there are families 0 to {FAMILIES - 1}, not {wanted}; choose one")
         family = drawn if wanted == "any" else wanted
         self._count = len(scenario.vehicles)
         models = [drone_model(family, int(rng.integers(1 << 31))) for _ in range(self._count)]

@@ -9,6 +9,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from flockd.choices import AutopilotKind
 from flockd.config import DroneConfig
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import UnavailableError
-from flockd.flight_log.fleet_log import FleetRun, fleet_key_frames, fleet_log
+from flockd.flight_log.fleet_log import FleetFrame, FleetRun, fleet_key_frames, fleet_log
 from flockd.sim.autopilots import Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.daemons import Daemons, fleet_configs
 from flockd.sim.exact_states import exact_states_at
@@ -36,6 +37,8 @@ ARM_S, CLIMB_S, READY_S, OFFBOARD_S, LAND_S = 60.0, 60.0, 60.0, 10.0, 60.0
 POLL_S = 0.05
 REQUEST_AGAIN_S = 1.0
 ON_GROUND_M, AT_HEIGHT_M = 0.5, 1.0
+LEAST_FRAME_SETS = 2
+"""A flight interrupted before has nothing to report."""
 
 
 def fly_fleet(
@@ -144,24 +147,32 @@ class _Fleet:
         )
 
     def fly(self, progress: Progress) -> FleetRun:
-        """Monitors the flight until its time is over."""
-        run = FleetRun(self._clock())
+        """Monitors the flight until its time is over, or until KeyboardInterrupt once there is something to report."""
+        run = FleetRun(self._clock(), began=datetime.now(UTC).isoformat(timespec="seconds"))
         wall_s, cpu_s, booted = time.monotonic(), self._cpu_s(), [self._station.uptime_s(i) for i in self._all]
         total_s = self._scenario.duration_s
-        while (flying_s := self._clock() - run.began_s) < total_s:
-            progress(int(flying_s), int(total_s))
-            self._note_handovers(run, flying_s)
-            self._server.frames()
-            time.sleep(POLL_S)
-        progress(int(total_s), int(total_s))
+        try:
+            while (flying_s := self._clock() - run.began_s) < total_s:
+                progress(int(flying_s), int(total_s))
+                self._note_handovers(run, flying_s)
+                self._server.frames()
+                time.sleep(POLL_S)
+            progress(int(total_s), int(total_s))
+        except KeyboardInterrupt:
+            if len(self._frames_of(run, self._clock())) < LEAST_FRAME_SETS:
+                raise
+            run.interrupted = True
         run.ended_s, run.wall_s = self._clock(), time.monotonic() - wall_s
         run.cores = {kind: (after - cpu_s[kind]) / run.wall_s for kind, after in self._cpu_s().items()}
         run.clock_rates = [rate for i in self._all if (rate := _rate(booted[i], self._station.uptime_s(i))) is not None]
         version = self._station.version(0)
         is_fake = self._autopilots.name == SimulatedAutopilots.name
         run.autopilot = self._autopilots.name if is_fake or version is None else f"{self._autopilots.name} {version}"
-        run.frames = tuple(s for s in self._server.frames() if run.began_s <= s.time_s < run.ended_s)
+        run.frames = self._frames_of(run, run.ended_s)
         return run
+
+    def _frames_of(self, run: FleetRun, until_s: float) -> tuple[FleetFrame, ...]:
+        return tuple(s for s in self._server.frames() if run.began_s <= s.time_s < until_s)
 
     def land(self, run: FleetRun) -> None:
         """Ends the daemons, which leaves the drones in Hold, and lands them."""

@@ -7,9 +7,11 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 import numpy as np
 
+from flockd import __version__
 from flockd.choices import ROLES, SimulatedPerception
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import UsageError
@@ -30,12 +32,15 @@ from flockd.sim.truth_perception import TruthPerception
 from flockd.sim.vehicles import SimulatedAutopilot, Vehicles
 from flockd.telemetry import TelemetrySink, publish_step
 
-_KEY_FRAME_DRONE = 0
+_KEY_FRAME_DRONES = 8
+"""Of more, only the first ones' are kept."""
+_LEAST_STEPS = 2
+"""A flight interrupted before has nothing to report."""
 
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """A finished flight: its log, and key frames of one drone."""
+    """A finished flight: its log, and key frames of its drones, one after the other."""
 
     log: FlightLog
     key_frames: tuple[KeyFrame, ...]
@@ -49,8 +54,11 @@ def fly(
     telemetry: TelemetrySink | None = None,
     recorders: Sequence[Recorder] = (),
     progress: Callable[[int, int], None] = lambda done, total: None,
+    preparing: Callable[[int, int], None] = lambda done, total: None,
 ) -> Flight:
     """Fly a scenario. The same scenario gives the same flight, bit for bit, except for the times it took.
+
+    KeyboardInterrupt ends the flight early: after its second step the log of what was flown is returned.
 
     Args:
         scenario: what to fly.
@@ -59,42 +67,61 @@ def fly(
         telemetry: where every drone's output is published; nothing comes back from there.
         recorders: one a drone, or none; nothing comes back from there either.
         progress: called with (steps done, steps in all).
+        preparing: the same, of what is done before the first step: the companion, the networks, the world.
     """
     unknown = swap - set(ROLES)
     if unknown:
         raise UsageError(f"there is no role {sorted(unknown)[0]!r} to swap for truth; choose from {', '.join(ROLES)}")
-    begin = time.perf_counter()
+    begin, began = time.perf_counter(), datetime.now(UTC)
     times = step_times(scenario)
     builder = FlightLogBuilder(times, len(scenario.vehicles))
+    preparing(0, _PREPARATIONS)
     companion = fly_exact_states(scenario)[1:]
     pilots = (
         _ExactStatePilots(scenario)
         if perception == "truth"
-        else _VisionPilots(scenario, swap, telemetry, recorders, companion)
+        else _VisionPilots(scenario, swap, telemetry, recorders, companion, preparing)
     )
+    preparing(_PREPARATIONS, _PREPARATIONS)
     yaw = course(scenario.drone.desired, 0.0)
     vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=yaw, seed=scenario.seed)
     chosen = key_frame_steps(len(times))
     key_frames: list[KeyFrame] = []
-    for step, time_s in enumerate(times):
-        builder.add_truth(step, vehicles.position, vehicles.velocity, vehicles.R_ned_body)
-        builder.add_desired(step, desired_velocity(scenario.drone.desired, float(time_s)))
-        velocity, yaws = pilots.step(step, float(time_s), vehicles, builder)
-        if step in chosen:
-            key_frames += pilots.key_frames()
-        vehicles.step(velocity, yaws, scenario.drone.step_s)
-        progress(step + 1, len(times))
+    flown = 0
+    try:
+        for step, time_s in enumerate(times):
+            builder.add_truth(step, vehicles.position, vehicles.velocity, vehicles.R_ned_body)
+            builder.add_desired(step, desired_velocity(scenario.drone.desired, float(time_s)))
+            velocity, yaws = pilots.step(step, float(time_s), vehicles, builder)
+            if step in chosen:
+                key_frames += pilots.key_frames()
+            vehicles.step(velocity, yaws, scenario.drone.step_s)
+            flown = step + 1
+            progress(flown, len(times))
+    except KeyboardInterrupt:
+        if flown < _LEAST_STEPS:
+            raise
+        builder.cut(flown)
+        companion = companion[0][:flown], companion[1][:flown]
     metadata = FlightMetadata.of_configuration(
         scenario.drone,
         scenario=scenario.scenario,
         drones=len(scenario.vehicles),
-        duration_s=scenario.duration_s,
+        duration_s=scenario.duration_s if flown == len(times) else flown * scenario.drone.step_s,
+        interrupted=flown < len(times),
+        began=began.isoformat(timespec="seconds"),
+        version=__version__,
         seed=scenario.seed,
         perception=perception if not swap else f"learned, true {', '.join(sorted(swap))}",
         flow="none" if perception == "truth" else "truth" if "flow" in swap else scenario.drone.perception.flow,
         wall_s=time.perf_counter() - begin,
     )
+    key_frames = sorted((frame for frame in key_frames if frame.time_s < metadata.duration_s), key=lambda f: f.drone)
     return Flight(builder.build(metadata, companion), tuple(key_frames))
+
+
+_PREPARATIONS = 4
+"""The companion on exact states, the world, the networks, the pilots."""
 
 
 class _ExactStatePilots:
@@ -136,12 +163,16 @@ class _VisionPilots:
         telemetry: TelemetrySink | None,
         recorders: Sequence[Recorder],
         companion: tuple[FloatArray, FloatArray],
+        preparing: Callable[[int, int], None],
     ) -> None:
         self._companion = companion
+        preparing(1, _PREPARATIONS)
         self._telemetry, self._recorders = telemetry, recorders
         self._cameras = CameraSimulator(scenario)
+        preparing(2, _PREPARATIONS)
         count = len(scenario.vehicles)
         learned = load_networks(scenario.drone.perception)
+        preparing(3, _PREPARATIONS)
         self._truths = [TruthPerception(learned, swap, self._cameras.rig) for _ in range(count)] if swap else []
         self._pilots = [
             FlockPilot(scenario.drone, self._truths[i] if swap else learned, stopwatch=time.perf_counter)
@@ -197,5 +228,10 @@ class _VisionPilots:
         return Truth(time_s, tuple(drones))
 
     def key_frames(self) -> list[KeyFrame]:
-        """What the chosen drone's pilot worked with in the last step."""
-        return capture(self._traces[_KEY_FRAME_DRONE], self._outputs[_KEY_FRAME_DRONE], _KEY_FRAME_DRONE)
+        """What the pilots worked with in the last step."""
+        of_drones = zip(self._traces[:_KEY_FRAME_DRONES], self._outputs, strict=False)
+        return [
+            frame.at_half_size()
+            for drone, (trace, output) in enumerate(of_drones)
+            for frame in capture(trace, output, drone)
+        ]

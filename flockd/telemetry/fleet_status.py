@@ -22,18 +22,25 @@ def _row(drone: Watched, now_s: float) -> dict[str, Any]:
     flight: Mapping[str, Any] = drone.message("flight", now_s) or {}
     computer: Mapping[str, Any] = drone.message("computer", now_s) or {}
     neighbours = drone.message("neighbours", now_s)
+    pilot: Mapping[str, Any] = drone.message("state", now_s) or {}
+    health: Mapping[str, Any] = drone.message("health", now_s) or {}
     state = flight.get("state", QUIET) if drone.alive else GONE
+    simulated = drone.alive and "flight" not in drone.topics and bool(health)  # the simulator's own pilot: no daemon
+    if simulated:
+        state = "normal" if health["ok"] else "degraded"
     blind = [camera["fault"] for camera in computer.get("cameras", {}).values() if camera["fault"]]
     return {
         "fleet": drone.fleet,
         "drone": drone.drone,
         "state": state if state in WORST_FIRST else QUIET,
-        "flight_mode": flight.get("flight_mode"),
-        "height_m": flight.get("height_m"),
+        "flight_mode": "simulated" if simulated else flight.get("flight_mode"),
+        "height_m": pilot.get("height_m") if simulated else flight.get("height_m"),
         "battery_share": flight.get("battery_share"),
         "neighbours": None
         if neighbours is None
         else sum(1 for neighbour in neighbours["neighbours"] if neighbour["confirmed"]),
         "load": computer.get("load"),
-        "matters": [reason["sentence"] for reason in flight.get("reasons", ())] + blind,
+        "matters": [reason["sentence"] for reason in flight.get("reasons", ())]
+        + [str(reason) for reason in (health.get("reasons", ()) if simulated else ())]
+        + blind,
     }

@@ -59,6 +59,10 @@ class ZenohTelemetry(SessionOwner):
         except zenoh.ZError:  # telemetry never ends a flight
             self._lost += 1
 
+    def show_alive(self, drone: str) -> None:
+        """Publishes that a drone is alive for as long as this session is, without a daemon to ask."""
+        self._kept.append(self._session.liveliness().declare_token(f"{self._prefix}/{checked_name(drone)}/alive"))
+
     def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
         """Publishes that a drone is alive for as long as this session is, and replies to queries.
 

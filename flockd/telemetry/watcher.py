@@ -15,6 +15,9 @@ import zenoh
 from flockd.telemetry.topics import PREFIX, TOPICS, checked_name
 from flockd.zenoh_session import SessionOwner, open_session
 
+_SLOWEST = 10.0
+"""The smallest speed factor that a daemon's configuration allows is 0.1."""
+
 
 @dataclass(frozen=True)
 class Heard:
@@ -22,6 +25,18 @@ class Heard:
 
     time_s: float
     message: Mapping[str, Any]
+    slowness: float = 1.0
+    """Seconds of the watcher's clock in one of the drone's: a simulated drone's time may pass slowly."""
+
+
+def _heard(before: Heard | None, now_s: float, message: Mapping[str, Any]) -> Heard:
+    """With how slowly the drone's time passed since its message before."""
+    if before is None:
+        return Heard(now_s, message, _SLOWEST)  # not known yet
+    own_s = message.get("time_s", 0.0) - before.message.get("time_s", 0.0)
+    if own_s <= 0:
+        return Heard(now_s, message, before.slowness)  # sent once more, or begun again
+    return Heard(now_s, message, min(max((now_s - before.time_s) / own_s, 1.0), _SLOWEST))
 
 
 @dataclass(frozen=True)
@@ -37,7 +52,7 @@ class Watched:
     def message(self, topic: str, now_s: float) -> Mapping[str, Any] | None:
         """The newest of a topic; None where there is none, or one too old to say anything of now."""
         heard, stale_s = self.topics.get(topic), TOPICS[topic].stale_after_s
-        if heard is None or (stale_s is not None and now_s - heard.time_s > stale_s):
+        if heard is None or (stale_s is not None and now_s - heard.time_s > stale_s * heard.slowness):
             return None
         return heard.message
 
@@ -88,7 +103,8 @@ class FleetWatcher(SessionOwner):
             return
         with self._lock:
             watched = self._drones.get((fleet, drone), Watched(fleet, drone))
-            topics = {**watched.topics, topic: Heard(self._clock(), message)}
+            heard = _heard(watched.topics.get(topic), self._clock(), message)
+            topics = {**watched.topics, topic: heard}
             self._drones[fleet, drone] = replace(watched, topics=topics)
 
     def _take_token(self, sample: zenoh.Sample) -> None:

@@ -1,4 +1,4 @@
-"""The one adapter to Rerun: writes a recording's scenes to a file, and opens its viewer on one.
+"""The adapter to Rerun for one recording: writes a recording's scenes to a file, and opens its viewer on one.
 
 Neither does anything beyond this computer: the viewer listens on the loopback interface alone, its usage statistics are
 off, and what it would ask the web for (whether it is the newest) ends at a closed port.
@@ -70,7 +70,7 @@ class RerunFile:
         self._log(_BODY, rr.Transform3D(translation=place.position, mat3x3=place.R_ned_body))
         for name, image in moment.images.items():
             if name in self._rig.cameras:
-                self._log(f"{_BODY}/{name}/image", rr.EncodedImage(contents=_jpeg(image), media_type="image/jpeg"))
+                self._log(f"{_BODY}/{name}/image", rr.EncodedImage(contents=jpeg(image), media_type="image/jpeg"))
         if moment.maps is not None:
             self._show_maps(moment.maps)
         names, positions = list(moment.true_neighbours), list(moment.true_neighbours.values())
@@ -117,7 +117,7 @@ class RerunFile:
             )
             self._log(entity, pinhole, static=True)
         classes = [rr.AnnotationInfo(0, "background", (0, 0, 0, 0)), rr.AnnotationInfo(255, "not used", (90, 90, 90))]
-        classes += [rr.AnnotationInfo(label, f"drone {label}", _colour(label)) for label in range(1, 255)]
+        classes += [rr.AnnotationInfo(label, f"drone {label}", colour_of(label)) for label in range(1, 255)]
         self._log(entity, rr.AnnotationContext(classes), static=True)
 
     def _show_maps(self, maps: Maps) -> None:
@@ -134,14 +134,14 @@ class RerunFile:
             self._log(f"world/pairs/{kind}", rr.LineStrips3D(lines, colors=[colour] * len(lines), radii=0.008))
         moving = {kind: lines for kind, lines in maps.pairs.items() if kind.startswith("drone")}
         lines = np.concatenate([*moving.values(), np.zeros((0, 2, 3))])
-        colours = [_colour(int(kind.split()[1])) for kind, several in moving.items() for _ in several]
+        colours = [colour_of(int(kind.split()[1])) for kind, several in moving.items() for _ in several]
         self._log("world/pairs/drones", rr.LineStrips3D(lines, colors=colours, radii=0.012))
 
     def _show_output(self, output: PilotOutput, moment: Moment) -> None:
         here = moment.place.position
         neighbours = output.neighbours
         centres = [here + neighbour.position for neighbour in neighbours]
-        colours = [_colour(neighbour.track) for neighbour in neighbours]
+        colours = [colour_of(neighbour.track) for neighbour in neighbours]
         ranges = [float(np.linalg.norm(neighbour.position)) for neighbour in neighbours]
         labels = [
             f"#{n.track} {range_m:.2f} m{'' if n.confirmed else ' ?'}"
@@ -234,11 +234,13 @@ def _blueprint(rig: Rig) -> Any:
     )
 
 
-def _colour(number: int) -> tuple[int, int, int]:
+def colour_of(number: int) -> tuple[int, int, int]:
+    """Of a drone or a track, by its number."""
     return _DRONES[number % len(_DRONES)]
 
 
-def _jpeg(image: UInt8Array) -> bytes:
+def jpeg(image: UInt8Array) -> bytes:
+    """An RGB image (h, w, 3), encoded."""
     bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     return bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1])
 

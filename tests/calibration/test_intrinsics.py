@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from functools import cache
+from types import SimpleNamespace
+from typing import cast
 
 import cv2
 import numpy as np
@@ -12,8 +14,10 @@ from scipy.spatial.transform import Rotation
 from flockd.calibration.board import BoardFinder
 from flockd.calibration.coverage import Coverage
 from flockd.calibration.errors import CalibrationError
-from flockd.calibration.intrinsics import calibrate
+from flockd.calibration.intrinsics import Lens as Fitted
+from flockd.calibration.intrinsics import calibrate, simplest_that_fits
 from flockd.calibration.views import Collector
+from flockd.choices import LENS_MODELS
 from tests.calibration import darkroom
 from tests.calibration.darkroom import PINHOLE, SPEC, WIDE, Lens, facing, photograph
 
@@ -76,6 +80,21 @@ def test_opencv_finds_the_same_lens_from_the_same_corners(lens: Lens) -> None:
     assert [ours[0, 0], ours[1, 1]] == pytest.approx([matrix[0, 0], matrix[1, 1]], abs=0.01)
     assert ours[:2, 2] - 0.5 == pytest.approx(matrix[:2, 2], abs=0.01)
     assert found.camera.distortion == pytest.approx(np.ravel(distortion), abs=2e-3)
+
+
+def test_a_plain_pinhole_is_not_taken_for_a_wide_angle_with_absurd_distortion() -> None:
+    """Both models fit a lens without distortion, and noise decides which leaves less residual."""
+    plain = Lens("pinhole", (480, 360), 402.3, 405.1, 246.7, 175.2, (0.0, 0.0, 0.0, 0.0, 0.0))
+    views = collected(plain).views
+    pinhole, wide = (calibrate(views, plain.size, model) for model in LENS_MODELS)
+    assert wide.rms_px == pytest.approx(pinhole.rms_px, rel=0.05), "the residual does not tell"
+    assert simplest_that_fits([pinhole, wide]) is pinhole
+
+
+@pytest.mark.parametrize(("wide_px", "chosen"), [(0.11, "pinhole"), (0.09, "pinhole"), (0.05, "wide_angle")])
+def test_a_more_complicated_lens_has_to_fit_clearly_better(wide_px: float, chosen: str) -> None:
+    fitted = {"pinhole": SimpleNamespace(rms_px=0.10), "wide_angle": SimpleNamespace(rms_px=wide_px)}
+    assert simplest_that_fits(cast("list[Fitted]", list(fitted.values()))) is cast("Fitted", fitted[chosen])
 
 
 def test_a_wide_lens_does_not_pass_for_a_pinhole() -> None:

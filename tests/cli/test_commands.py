@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -65,7 +66,7 @@ def test_help_shows_examples_of_the_command(command: list[str], capsys: pytest.C
     with pytest.raises(SystemExit) as exit_:
         main([*command, "--help"])
     assert exit_.value.code == 0
-    examples = capsys.readouterr().out.split("examples:\n")[1].splitlines()
+    examples = capsys.readouterr().out.split("examples:\n")[1].split("\n\n")[0].splitlines()
     assert examples
     assert all(example.startswith("  " + " ".join(["flockd", *command])) for example in examples)
 
@@ -132,7 +133,7 @@ CAMERAS = SIMULATOR.split("cameras:")[1].split("perception:")[0]
 SPOILT = {
     "negative duration": (
         ("flight.yaml", "duration_s: 110.0", "duration_s: -110.0"),
-        "flight.yaml:3: duration_s: -110.0 is not greater than 0; write a positive number of seconds",
+        "flight.yaml:3: duration_s: -110.0 is not greater than 0; write a number of seconds above 0 and up to 86400",
     ),
     "unknown key": (
         ("flight.yaml", "duration_s:", "duration:"),
@@ -165,8 +166,38 @@ def test_a_scenario_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_a_flight_shorter_than_a_step_is_refused(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["sim", str(scenario), "--duration", "0.1"]) == 2
-    assert capsys.readouterr().err == "0.1 s is shorter than a step of 0.5 s; fly longer\n"
+    assert main(["sim", str(scenario), "--duration", "0.1"]) == 78
+    assert capsys.readouterr().err == "--duration: 0.1 s is shorter than a step of 0.5 s; write 0.5 or more\n"
+
+
+def test_more_drones_than_can_be_flown_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    told = "flockd sim: argument --drones: '5000' is more than the 100 drones that can be simulated"
+    assert _usage_error(capsys, "sim", "--drones", "5000").startswith(told)
+
+
+def test_config_check_finds_models_that_are_not_there(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    drone = scenario.with_name("simulator.yaml")
+    drone.write_text(SIMULATOR.replace("flow: flow_int8", "flow: flow_in8"), encoding="utf-8")
+    assert main(["config", "check", str(scenario)]) == 78
+    error = capsys.readouterr().err
+    assert error.startswith(f"{drone}:23: perception.flow: flow_in8 is not a known model, as ")
+    assert error.endswith("is missing; write one of flow, flow_int8\n")
+    drone.write_text(SIMULATOR.replace("flow: flow_int8", "flow: distance_int8"), encoding="utf-8")
+    assert main(["config", "check", str(drone)]) == 78
+    assert capsys.readouterr().err == (
+        f"{drone}:23: perception.flow: distance_int8 is for distance, not for flow; name another\n"
+    )
+
+
+def test_a_shown_scenario_can_be_loaded_again(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["config", "show", "--json", str(scenario)]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert main(["config", "show", str(scenario)]) == 0
+    scenario.write_text(capsys.readouterr().out, encoding="utf-8")
+    assert main(["config", "check", str(scenario)]) == 0
+    capsys.readouterr()
+    assert main(["config", "show", "--json", str(scenario)]) == 0
+    assert json.loads(capsys.readouterr().out) == values
 
 
 def test_config_check_reports_for_people_and_machines(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -242,6 +273,23 @@ def test_a_report_of_a_damaged_log(tmp_path: Path, capsys: pytest.CaptureFixture
         assert error.count("\n") == 1
 
 
+def test_a_shell_completes_commands_and_options() -> None:
+    """As argcomplete's script for bash asks: by environment, with the answer on file descriptor 8."""
+    for line, expected in (("flockd rep", {"report", "replay"}), ("flockd sim --wi", {"--wind"})):
+        code = "import os, sys; from flockd.cli import main; os.dup2(1, 8); sys.argv[0] = 'flockd'; main()"
+        environment = {
+            **os.environ,
+            "_ARGCOMPLETE": "1",
+            "COMP_LINE": line,
+            "COMP_POINT": str(len(line)),
+            "_ARGCOMPLETE_IFS": "\n",
+        }
+        told = subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
+        )
+        assert {word.strip() for word in told.stdout.splitlines()} == expected, told.stderr
+
+
 def test_a_missing_extra_is_unavailable(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def without_numba(_: object) -> int:
         raise ModuleNotFoundError("No module named 'numba'", name="numba")
@@ -286,7 +334,6 @@ def test_a_flight_leaves_its_log_summary_and_report(tmp_path: Path, capsys: pyte
     captured = capsys.readouterr()
     summary = json.loads(captured.out)
     assert (summary["drones"], summary["duration_s"], summary["seed"]) == (6, 5.0, 3)
-    assert captured.err == ""
     assert {"flight.npz", "summary.json", "report.html"} <= {path.name for path in folder.iterdir()}
     assert json.loads((folder / "summary.json").read_text(encoding="utf-8")) == summary
 
@@ -299,4 +346,90 @@ def test_a_flight_leaves_its_log_summary_and_report(tmp_path: Path, capsys: pyte
     assert json.loads((folder / "summary.json").read_text(encoding="utf-8")) == summary
     assert (folder / "report.html").is_file()
 
-    assert main(short) == 0, "an earlier flight may be flown over"
+    assert main(short) == 2
+    assert capsys.readouterr().err == (
+        f"{folder}: holds a flight; name another folder with --out, or overwrite it with --force\n"
+    )
+    (folder / "recordings").mkdir()
+    (folder / "recordings" / "drone1.mcap").touch()
+    assert main([*short, "--quiet", "--force"]) == 0
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == (f"{folder / 'report.html'}\n", "")
+    assert not (folder / "recordings").exists(), "nothing of the flight before is left beside the new one"
+
+
+def test_each_flight_has_its_own_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("flockd.report.flight_folder.write_report", lambda folder, progress: folder)
+    for expected in ("", "-2", "-3"):
+        assert main(["sim", "--perception", "truth", "--duration", "2", "--quiet"]) == 0
+        assert capsys.readouterr().out == f"out/paper_flight-truth-seed0{expected}/report.html\n"
+
+
+def test_an_interrupted_flight_leaves_its_report_and_can_be_flown_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from flockd.flight_log.log import FlightLog
+    from flockd.sim.vehicles import Vehicles
+
+    step, steps = Vehicles.step, iter(range(1000))
+
+    def interrupted(vehicles: Vehicles, *arguments: object) -> None:
+        if next(steps) == 40 + 7:  # after the companion's 40 steps
+            raise KeyboardInterrupt
+        step(vehicles, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Vehicles, "step", interrupted)
+    monkeypatch.setattr("flockd.report.flight_folder.write_report", lambda folder, progress: folder)
+    folder = tmp_path / "flight"
+    command = ["sim", "--perception", "truth", "--duration", "20", "--quiet", "--out", str(folder)]
+    assert main(command) == 130
+    captured = capsys.readouterr()
+    assert captured.out == f"{folder / 'report.html'}\n"
+    assert captured.err == "interrupted after 3.5 s of 20 s; the report is of what was flown\n"
+    log = FlightLog.load(folder / "flight.npz")
+    assert (len(log.time_s), log.metadata.duration_s, log.metadata.interrupted) == (7, 3.5, True)
+    assert log.truth_position.shape == (7, 5, 3)
+
+    monkeypatch.setattr(Vehicles, "step", step)
+    assert main(command) == 0, "the same command works again"
+    moved = tmp_path / "flight-interrupted"
+    assert capsys.readouterr().err == f"{folder}: held an interrupted flight, which is in {moved} now\n"
+    assert FlightLog.load(moved / "flight.npz").metadata.interrupted
+    assert not FlightLog.load(folder / "flight.npz").metadata.interrupted
+
+
+def test_wind_speed_and_radius_are_what_is_flown(capsys: pytest.CaptureFixture[str]) -> None:
+    from flockd.cli import _parser
+    from flockd.cli.sim import _scenario
+
+    args = _parser().parse_args(["sim", "--wind", "2,-1.5", "--speed", "1.5", "--radius", "15"])
+    scenario = _scenario(args)
+    assert scenario.vehicle.wind_m_s == (2.0, -1.5)
+    assert (scenario.drone.desired.speed_m_s, scenario.drone.desired.radius_m) == (1.5, 15.0)
+    assert "argument --wind: '3' is not two numbers such as 2.0,-1.5" in _usage_error(capsys, "sim", "--wind", "3")
+
+
+def test_two_flights_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from flockd.config import load_scenario
+    from flockd.sim.swarm import fly
+
+    for name, seed in (("a", 0), ("b", 1)):
+        (tmp_path / name).mkdir()
+        scenario = load_scenario(
+            ROOT / "config" / "paper_flight.yaml",
+            {"duration_s": 5.0 + seed, "seed": seed, "vehicle.gust_m_s": 0.5},
+        )
+        log = fly(scenario, perception="truth").log
+        log.save(tmp_path / name / "flight.npz")
+    assert main(["report", str(tmp_path / "a"), str(tmp_path / "b"), "--json"]) == 0
+    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)["rows"]}
+    assert (rows["seed"]["first"], rows["seed"]["second"]) == (0, 1)
+    assert (rows["flown"]["first"], rows["flown"]["second"], rows["flown"]["difference"]) == (5.0, 6.0, 1.0)
+    assert "neighbours known within 10 m" not in rows, "neither has it"
+    assert main(["report", str(tmp_path / "a"), str(tmp_path / "b")]) == 0
+    table = capsys.readouterr().out
+    assert "+1.0 s" in table
+    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["flight.npz"], "nothing is written"

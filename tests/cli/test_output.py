@@ -26,10 +26,27 @@ def test_without_a_terminal_there_is_a_plain_line_now_and_then(
 ) -> None:
     _count_to_three()
     assert capsys.readouterr() == ("", ""), "quick work is not worth a line"
-    seconds = iter((0.0, 4.0, 11.0, 12.0))  # as it begins, then at each count
+    seconds = iter((0.0, 4.0, 12.0, 13.0))  # as the first count begins the phase, then at each count
     monkeypatch.setattr(output, "monotonic", lambda: next(seconds))
     _count_to_three()
-    assert capsys.readouterr() == ("", "flying: 2 of 3 steps\n")
+    assert capsys.readouterr() == ("", "flying: 2 of 3 steps, 6 s left\n"), "12 s for two, so 6 s for the third"
+
+
+def test_quiet_is_quiet_and_verbose_says_how_long_a_phase_took(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seconds = iter((0.0, 20.0, 90.0, 90.0, 91.0, 93.0))
+    monkeypatch.setattr(output, "monotonic", lambda: next(seconds))
+    with output.Phases(quiet=True) as phases:
+        phases.of("flying", "steps")(1, 3)
+        phases.say("taking off")
+    assert capsys.readouterr() == ("", "")
+    with output.Phases(verbose=True) as phases:
+        phases.of("loading", "parts")(1, 2)
+        phases.of("flying", "steps")(1, 3)
+    assert capsys.readouterr().err == (
+        "loading: 1 of 2 parts, 20 s left\nloading: done in 1 min 30 s\nflying: done in 3 s\n"
+    )
 
 
 def test_on_a_terminal_there_is_a_bar_that_leaves_no_trace(

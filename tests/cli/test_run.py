@@ -137,11 +137,11 @@ def test_a_drone_that_cannot_be_flown_is_bad_configuration(
     assert capsys.readouterr().err.splitlines()[-1].startswith(f"{config}: {told}; ")
 
 
-def test_recordings_need_their_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", "--config", "none.yaml", "--record", str(tmp_path / "none")]) == 2
-    assert capsys.readouterr().err == (
-        f"{tmp_path / 'none'}: is no folder; make it first, or name another with --record\n"
-    )
+def test_a_file_where_the_recordings_folder_would_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = _written(tmp_path / "tiny.yaml", free_port(), free_endpoint(), free_endpoint())
+    for name in (config, config / "recordings"):
+        assert main(["run", "--config", str(config), "--record", str(name)]) == 2
+        assert capsys.readouterr().err == f"{name}: is no folder; name another with --record\n"
 
 
 def test_a_fleet_that_is_not_there_is_unavailable(capsys: pytest.CaptureFixture[str]) -> None:
@@ -159,7 +159,10 @@ def test_without_an_autopilot_it_is_unavailable_and_not_aborted(tmp_path: Path) 
     values = yaml.safe_load(config.read_text(encoding="utf-8"))
     values["autopilot"]["address"] = f"serial://{tmp_path / 'none'}:921600"
     config.write_text(yaml.safe_dump(values), encoding="utf-8")
-    with _run(config, tmp_path) as process:
+    recordings = tmp_path / "new" / "recordings"
+    with _run(config, tmp_path, "--record", str(recordings)) as process:
         _, err = process.communicate(timeout=SECONDS_TO_FAIL)
     assert process.returncode == 69, err
+    assert recordings.is_dir(), "it is made"
+    assert f"waits for the autopilot at serial://{tmp_path / 'none'}:921600, and for the networks to load" in err
     assert f"autopilot.address: serial://{tmp_path / 'none'}:921600 cannot be opened" in err.splitlines()[-1]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Mapping
 from typing import Any
 
 import pytest
 
 from flockd.telemetry.fleet_status import status_rows
+from flockd.telemetry.repeater import Repeater
 from flockd.telemetry.topics import ComputerMessage, FlightMessage
 from flockd.telemetry.watcher import Heard, Watched
 
@@ -68,6 +71,52 @@ def test_a_row_tells_what_is_the_matter() -> None:
     (row,) = status_rows([Watched("meadow", "a", alive=True, topics=topics)], NOW_S)
     assert row["matters"] == ["the computer is at 90 °C", "back: no such device"]
     assert (row["neighbours"], row["load"], row["battery_share"], row["height_m"]) == (2, 0.8, 0.5, 4.0)
+
+
+def test_a_simulated_drone_is_there_and_healthy() -> None:
+    """`flockd sim --telemetry` has no daemon, so no `flight` message: its pilots' own messages say how it is."""
+    state = {"time_s": 5.0, "height_m": 4.2}
+    topics = {"state": Heard(NOW_S - 0.5, state), "health": Heard(NOW_S - 0.5, {"ok": True, "reasons": []})}
+    (row,) = status_rows([Watched("paper_flight", "drone1", alive=True, topics=topics)], NOW_S)
+    assert (row["state"], row["flight_mode"], row["height_m"], row["matters"]) == ("normal", "simulated", 4.2, [])
+    topics["health"] = Heard(NOW_S - 0.5, {"ok": False, "reasons": ["no flow"]})
+    (row,) = status_rows([Watched("paper_flight", "drone1", alive=True, topics=topics)], NOW_S)
+    assert (row["state"], row["matters"]) == ("degraded", ["no flow"])
+
+
+def test_a_drone_whose_time_passes_slowly_is_not_quiet() -> None:
+    """At a speed factor of 0.25 two messages a second come every 2 s, above the 1.5 s after which they are stale."""
+    from flockd.telemetry.watcher import _heard
+
+    def row(*heard: tuple[float, float], now_s: float) -> str:
+        flight = None
+        for watcher_s, own_s in heard:
+            flight = _heard(flight, watcher_s, {**_drone("a", "normal").topics["flight"].message, "time_s": own_s})
+        assert flight is not None
+        (row,) = status_rows([Watched("meadow", "a", alive=True, topics={"flight": flight})], now_s)
+        return str(row["state"])
+
+    assert row((0.0, 10.0), (2.0, 10.5), now_s=3.9) == "normal"
+    assert row((0.0, 10.0), (2.0, 10.5), now_s=8.5) == "quiet", "1.5 s of its own time are 6 s here"
+    assert row((0.0, 10.0), (0.5, 10.5), now_s=2.1) == "quiet", "in real time"
+
+
+def test_newest_messages_are_sent_again_while_the_simulation_computes() -> None:
+    sent: list[tuple[str, str, object]] = []
+    again = threading.Event()
+
+    class Sink:
+        def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
+            sent.append((drone, topic, message["time_s"]))
+            if sent.count(("drone1", "state", 2)) == 3:
+                again.set()
+
+    with Repeater(Sink(), every_s=0.01) as repeater:
+        repeater.publish("drone1", "state", {"time_s": 1})
+        repeater.publish("drone1", "state", {"time_s": 2})
+        assert again.wait(30.0)
+    assert sent[0] == ("drone1", "state", 1)
+    assert sent[1:].count(("drone1", "state", 1)) <= len(sent) - 4
 
 
 def test_a_table_is_printed_for_people(capsys: pytest.CaptureFixture[str]) -> None:

@@ -192,7 +192,7 @@ def test_all_problems_of_both_files_come_at_once(tmp_path: Path) -> None:
         "drone.yaml:6: stepp_s: is not a known key; did you mean `step_s`?",
         "drone.yaml:7: yaw: corse is not known; did you mean `course`?",
         "scenario.yaml:5: vehicles[1].position_m: has 2 entries; write a list of 3 numbers of metres",
-        "scenario.yaml:6: duration_s: 0 is not greater than 0; write a positive number of seconds",
+        "scenario.yaml:6: duration_s: 0 is not greater than 0; write a number of seconds above 0 and up to 86400",
     ]
 
 
@@ -300,11 +300,113 @@ def test_a_wrong_override_is_reported_as_such() -> None:
         load_scenario(CONFIG / "paper_flight.yaml", {"duration_s": -3.0, "drone.perception.sclae": "height"})
     assert caught.value.problems == (
         ConfigProblem("override", 0, "drone.perception.sclae", "is not a known key; did you mean `scale`?"),
-        ConfigProblem("override", 0, "duration_s", "-3.0 is not greater than 0; write a positive number of seconds"),
+        ConfigProblem(
+            "override",
+            0,
+            "duration_s",
+            "-3.0 is not greater than 0; write a number of seconds above 0 and up to 86400",
+        ),
     )
 
 
 def test_the_schema_describes_the_file_and_not_the_merged_model() -> None:
-    assert schema_of("scenario")["properties"]["drone"]["type"] == "string"
-    assert "DroneConfig" not in schema_of("scenario")["$defs"]
+    drone = schema_of("scenario")["properties"]["drone"]
+    assert drone["anyOf"] == [{"type": "string"}, {"$ref": "#/$defs/DroneConfig"}], "a path, or the drone itself"
     assert schema_of("drone")["required"] == ["rig"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        (
+            "[0, 0, -4]",
+            "[0, 0, 4.5]",
+            "scenario.yaml:4: vehicles[0].position_m: the third number points down, so that 4.5 is 4.5 m below the "
+            "ground; write -4.5",
+        ),
+        (
+            "[0, 0, -4]",
+            "[0, 0, -0.2]",
+            "scenario.yaml:4: vehicles[0].position_m: begins 0.2 m above the ground; write -0.5 or less as the third "
+            "number",
+        ),
+        (
+            "[0, 5, -4]",
+            "[0, 0, -4]",
+            "scenario.yaml:5: vehicles[1].position_m: is 0 m from vehicles[0], and drones touch below 0.7 m; move one "
+            "of them",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nworld: {drone_family: 99}",
+            "scenario.yaml:2: world.drone_family: 99 is not at most 13; write a whole number from 0 to 13 or `any`",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nduration_s: 0.1",
+            "scenario.yaml:2: duration_s: 0.1 s is shorter than a step of 0.5 s; write 0.5 or more",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nduration_s: 1e6",
+            "scenario.yaml:2: duration_s: 1e6 is not at most 86400; write a number of seconds above 0 and up to 86400",
+        ),
+        (
+            "  - {position_m: [0, 0, -4]}\n",
+            "".join(f"  - {{position_m: [{north}, 0, -4]}}\n" for north in range(5000)),
+            "scenario.yaml:3: vehicles: has 5001 entries; write a list of 1 to 100 entries",
+        ),
+    ],
+)
+def test_a_flight_that_cannot_be_flown_is_refused_at_its_line(tmp_path: Path, old: str, new: str, told: str) -> None:
+    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
+    scenario = tmp_path / "scenario.yaml"
+    scenario.write_text(SCENARIO.replace(old, new), encoding="utf-8")
+    assert _problems(scenario) == [told]
+
+
+def test_a_principal_point_outside_the_image_is_refused_at_its_line(tmp_path: Path) -> None:
+    assert _drone_problems(tmp_path, DRONE.replace("cx: 320", "cx: 3200").replace("cy: 240", "cy: 480")) == [
+        "drone.yaml:5: rig.cameras[0].intrinsics.cx: 3200 is outside the image, which is 640 pixels wide; check cx and "
+        "size_px",
+        "drone.yaml:5: rig.cameras[0].intrinsics.cy: 480 is outside the image, which is 480 pixels high; check cy and "
+        "size_px",
+    ]
+
+
+def test_a_file_of_the_other_kind_is_named_as_such(tmp_path: Path) -> None:
+    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
+    (tmp_path / "flight.yaml").write_text(SCENARIO, encoding="utf-8")
+    assert _problems(tmp_path / "flight.yaml") == [
+        "flight.yaml: is a scenario, and a drone's own file is needed here; name that: drone.yaml"
+    ]
+    (tmp_path / "scenario.yaml").write_text(DRONE, encoding="utf-8")
+    assert _problems(tmp_path / "scenario.yaml") == [
+        "scenario.yaml: is a drone's own file, and a scenario is needed here; name one with the keys `vehicles` and "
+        "`drone`"
+    ]
+    (tmp_path / "scenario.yaml").write_text(SCENARIO.replace("drone.yaml", "flight.yaml"), encoding="utf-8")
+    assert "flight.yaml: is a scenario, and a drone's own file is needed here; name that: drone.yaml" in _problems(
+        tmp_path / "scenario.yaml"
+    )
+
+
+def test_a_scenario_may_hold_its_drone(tmp_path: Path) -> None:
+    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
+    (tmp_path / "named.yaml").write_text(SCENARIO, encoding="utf-8")
+    inline = "drone:\n" + "".join(f"  {line}\n" for line in DRONE.splitlines())
+    (tmp_path / "held.yaml").write_text(SCENARIO.replace("drone: drone.yaml\n", inline), encoding="utf-8")
+    assert load_scenario(tmp_path / "held.yaml") == load_scenario(tmp_path / "named.yaml")
+    (tmp_path / "scenario.yaml").write_text(
+        SCENARIO.replace("drone: drone.yaml\n", inline.replace("cx: 320", "cx: -1")), encoding="utf-8"
+    )
+    assert _problems(tmp_path / "scenario.yaml") == [
+        "scenario.yaml:7: drone.rig.cameras[0].intrinsics.cx: -1 is not greater than 0; write a positive number"
+    ]
+
+
+def test_the_configuration_knows_how_many_families_the_simulator_has() -> None:
+    from flockd.config.scenario import DRONE_FAMILIES
+    from flockd.sim.drone_models import FAMILIES
+
+    assert DRONE_FAMILIES == FAMILIES

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -162,7 +164,7 @@ class _Page(HTMLParser):
         assert self._open.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        if "style" in self._open:
+        if {"style", "script"} & set(self._open):
             return
         self.text += data
         if self._open and self._open[-1] in ("td", "th"):
@@ -190,7 +192,8 @@ def test_the_page_needs_nothing_but_itself(five: Path, five_page: _Page) -> None
     html = (five / "report.html").read_text(encoding="utf-8")
     assert "http" not in html
     assert "@import" not in html
-    assert not five_page.tags & {"script", "link", "iframe", "object", "embed"}
+    assert not five_page.tags & {"link", "iframe", "object", "embed"}
+    assert "script" not in {tag for tag, _ in five_page.links}, "scripts stand in the page"
     assert [link for tag, link in five_page.links if tag == "img" and not link.startswith("data:image/")] == []
     assert [link for _, link in five_page.links if not link.startswith(("data:", "#"))] == []
     assert set(re.findall(r"url\(([^)]{0,1})", html)) <= {"#"}
@@ -203,6 +206,39 @@ def test_every_reference_inside_the_page_has_one_target(five: Path) -> None:
     references = set(re.findall(r'href="#([^"]+)"|url\(#([^)]+)\)', html))
     assert len(targets) == len(set(targets))
     assert {one or other for one, other in references} == set(targets)
+
+
+def test_a_reader_chooses_drone_and_moment_and_plays_the_flight(tmp_path: Path) -> None:
+    moments = [replace(_moment(time_s=time_s), drone=drone) for drone in (0, 2) for time_s in (3.0, 9.0)]
+    log = _flight(drones=3, duration_s=10.0)
+    html = _report(tmp_path, log, *moments)
+    assert re.findall(r'data-drone="([^"]+)" data-time="([^"]+)"', html) == [
+        ("drone 1", "3.000"), ("drone 1", "9.000"), ("drone 3", "3.000"), ("drone 3", "9.000"),
+    ]  # fmt: skip
+    assert "<option>drone 1</option><option>drone 3</option>" in html
+    data = json.loads(re.search(r'<script type="application/json">(.*?)</script>', html)[1])  # type: ignore[index]
+    assert data["time"] == log.time_s.tolist()
+    north, east, down = log.position[4, 2]
+    assert data["position"][4][2] == pytest.approx([north, east, -down], abs=0.005)
+
+
+def test_the_page_speaks_of_the_flight_it_shows(tmp_path: Path) -> None:
+    log = _flight(drones=3, duration_s=20.0)
+    log.position[:, 0, 2] = -6.25
+    metadata = log.metadata.model_copy(update={"began": "2026-11-21T09:05:00+00:00", "version": "0.1.0"})
+    text = " ".join(_Page(_report(tmp_path, FlightLog(**{**vars(log), "metadata": metadata}))).text.split())
+    assert "begun 2026-11-21 09:05 UTC, flockd 0.1.0" in text
+    assert "–6.2 m" in text
+    assert "in 3D, drones" in text
+    assert "Five drones" not in text, "this flight is of three"
+    assert "The paper’s are of 5 drones, this flight is of 3." in text
+
+
+def test_figures_have_a_form_for_narrow_windows(five: Path) -> None:
+    html = (five / "report.html").read_text(encoding="utf-8")
+    for name in ("wide", "narrow"):
+        assert len(re.findall(rf'<div class="{name}"><(?:svg|img)', html)) == 3, "paths, curves and errors"
+    assert len({axes.get_position().x1 for axes in flight_curves(_flight(), narrow=True).axes}) == 1, "one column"
 
 
 def test_the_headline_tells_what_happened(five_page: _Page) -> None:
@@ -233,7 +269,7 @@ def test_table_3_and_the_flock(five_page: _Page) -> None:
     cells = [cell.lstrip("-") for cell, _ in five_page.row("By sight")]
     assert cells == ["66.0", "0.0000", "0.0000", "0.0", "0.0000", "0.0000"]
     assert [cell for cell, _ in five_page.row("the paper’s", 1)] == ["67.0", "0.0000", "–", "67.0", "0.1273", "–"]
-    assert five_page.row("smallest distance, m")[0][0] == f"{SIDE_M:.3f}"
+    assert five_page.row("smallest distance in 3D, m")[0][0] == f"{SIDE_M:.3f}"
     assert five_page.row("order, last 10 s")[0][0] == "1.0000"
     assert five_page.row("share known of those within 10 m")[0][0] == "1.0000"
     assert five_page.row("ego motion")[0][0] == "5.0"
@@ -310,8 +346,9 @@ def test_a_folder_without_a_flight_is_refused_in_one_sentence(tmp_path: Path) ->
 def test_a_name_cannot_break_the_page(tmp_path: Path) -> None:
     log = _flight(drones=1, duration_s=5.0)
     metadata = log.metadata.model_copy(update={"scenario": "<script>alert(1)</script>"})
-    page = _Page(_report(tmp_path, FlightLog(**{**vars(log), "metadata": metadata})))
-    assert "script" not in page.tags
+    html = _report(tmp_path, FlightLog(**{**vars(log), "metadata": metadata}))
+    assert "<script>alert" not in html
+    assert "&lt;script&gt;alert" in html
 
 
 # -------------------------------------------------------------------------------------------------------- the figures

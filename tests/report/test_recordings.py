@@ -34,6 +34,7 @@ from flockd.recording.reader import Recording
 from flockd.recording.truth import TrueDrone, Truth
 from flockd.report.summary import summarise
 from tests.recording.made_up import HEIGHT, MODELS, WIDTH, MadeUpPilot, drone_config
+from tests.view.test_view import shown_in
 
 NAMES = ("drone1", "drone2")
 STEPS, STEP_S = 12, 0.5
@@ -169,6 +170,22 @@ def test_a_flights_recordings_are_judged_by_the_truth_in_them(flight: Path) -> N
     np.testing.assert_allclose(np.arctan2(log.desired[:, 1], log.desired[:, 0]), log.time_s / 10)
 
 
+def test_a_folder_of_recordings_shows_the_flock(flight: Path, tmp_path: Path, capsys: Capture) -> None:
+    """Both drones where they truly were, and each one's neighbour where it took it to be."""
+    out = tmp_path / "flock.rrd"
+    assert main(["view", str(flight), "--save", str(out), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert (result["drone"], result["steps"]) == ("drone1, drone2", 2 * STEPS)
+    shown = shown_in(out)
+    drones = [row["Points3D:positions"] for row in shown["/world/drones"] if "Points3D:positions" in row]
+    assert len(drones) == STEPS
+    assert drones[3][1][1] - drones[3][0][1] == pytest.approx(APART_M)
+    assert set(NAMES) == {path.rpartition("/")[2] for path in shown if path.startswith("/world/path/")}
+    known = [row["Points3D:positions"] for row in shown["/world/neighbours/drone1"] if "Points3D:positions" in row]
+    assert known[-1][0][1] - drones[-1][0][1] == pytest.approx(1.01 * APART_M, rel=1e-3)
+    assert [path for path in shown if path.startswith("/images/drone2/")]
+
+
 def test_one_drones_recording_tells_of_the_flock_and_of_its_own_sight(flight: Path, capsys: Capture) -> None:
     out, _ = told(capsys, 0, flight / "drone2.mcap", "--without-pictures", "--json", "--out", flight / "of_drone2")
     summary = json.loads(out)
@@ -192,8 +209,9 @@ def test_the_report_of_a_folder_lies_beside_it(flight: Path, tmp_path: Path, cap
     out, err = told(capsys, 0, folder, "--without-pictures")
     page = tmp_path / "recordings.report" / "report.html"
     assert out.splitlines()[-1] == f"report: {page}"
-    assert err == ""
-    assert "side_by_side, seed 3, recorded by drone1, drone2, begun 20" in text_of(page)
+    assert "holds a flight" not in err
+    assert "side_by_side, seed 3, recorded by drone1, drone2" in text_of(page)
+    assert "begun 20" in text_of(page)
     # Its folder is a flight's: the report can be written again.
     assert told(capsys, 0, page.parent)[0].splitlines()[-1] == f"report: {page}"
 

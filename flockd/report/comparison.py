@@ -1,0 +1,68 @@
+"""Two flights compared: what was flown, and their key figures with the difference."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+Summary = Mapping[str, Any]
+
+_SETTINGS = ("scenario", "drones", "perception", "flow", "scale", "seed", "began", "version")
+_FIGURES = (
+    ("flown", ("duration_s",), "s", 1),
+    ("closest two drones in 3D", ("flock", "min_distance_m"), "m", 2),
+    ("closest in 3D after 10 s", ("flock", "min_distance_after_10s_m"), "m", 2),
+    ("order at the end", ("flock", "order_tail"), "", 3),
+    ("union at the end", ("flock", "union_tail"), "", 2),
+    ("neighbours known within 10 m", ("neighbours", "recall_within_10m"), "", 3),
+    ("false neighbours a drone and minute", ("neighbours", "false_per_drone_minute"), "", 2),
+    ("own motion, 95th percentile of x, on the circle", ("table2", "before", "translation_x_m", "p95"), "m", 4),
+    ("own motion, 95th percentile of y, on the circle", ("table2", "before", "translation_y_m", "p95"), "m", 4),
+    ("distance, 95th percentile, on the circle", ("table2", "before", "distance_m", "p95"), "m", 4),
+    ("simulation, times real time", ("realtime_factor",), "", 3),
+)
+"""Name, keys of the summary, unit, digits."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the comparison; None where a flight has no such value, and where there is no difference to give."""
+
+    name: str
+    unit: str
+    digits: int | None
+    """Of a number; None of a word."""
+    first: Any
+    second: Any
+    difference: float | None
+    """Second less first."""
+
+    @property
+    def cells(self) -> tuple[str, str, str]:
+        """Both values and their difference, for people."""
+        return self._text(self.first), self._text(self.second), self._text(self.difference, sign="+")
+
+    def _text(self, value: Any, sign: str = "") -> str:
+        if value is None:
+            return ""
+        if self.digits is None:
+            return str(value)
+        return f"{value:{sign}.{self.digits}f} {self.unit}".rstrip()
+
+
+def compare(first: Summary, second: Summary) -> tuple[Row, ...]:
+    """Rows for two flights by their summaries, without those that neither has a value for."""
+    rows = [Row(name, "", None, first[name], second[name], None) for name in _SETTINGS]
+    for name, keys, unit, digits in _FIGURES:
+        one, other = _value(first, keys), _value(second, keys)
+        difference = None if one is None or other is None else other - one
+        rows.append(Row(name, unit, digits, one, other, difference))
+    return tuple(row for row in rows if row.first is not None or row.second is not None)
+
+
+def _value(summary: Summary, keys: tuple[str, ...]) -> float | None:
+    value: Any = summary
+    for key in keys:
+        value = value[key]
+    return None if value is None else float(value)
