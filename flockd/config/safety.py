@@ -26,6 +26,10 @@ class GateParameters(Section):
     """Nearer than this to a neighbour, no velocity towards it."""
     degraded_separation_m: NonNegative = 1.5
     """Instead, while the drone is degraded."""
+    braking_m_s2: Annotated[float, Field(gt=0, le=20)] = 1.5
+    """How hard every drone of the flock can brake: none flies faster towards a neighbour than it can stop in time."""
+    reaction_s: Annotated[float, Field(ge=0, le=5)] = 0.5
+    """From a neighbour's change of velocity until the own drone has begun to brake."""
     fence_radius_m: Positive | None = 100.0
     """Around home, level; beyond it only inward velocity. null: no circle."""
     fence_corners_m: tuple[tuple[float, float], ...] = ()
