@@ -15,8 +15,11 @@ class GateParameters(Section):
 
     permission_timeout_s: Annotated[float, Field(gt=0, le=0.4)] = 0.3
     """The supervisor's permission is good for this long: what has stalled sends nothing half a second later."""
-    command_timeout_s: Positive = 1.5
-    """A command older than this is not flown; leave the pilot three of its steps."""
+    command_fresh_s: Annotated[float, Field(gt=0, le=10)] = 0.9
+    """A command older than this is flown ever slower: the pilot has missed a step. Leave it a step and its duration."""
+    command_timeout_s: Annotated[float, Field(gt=0, le=10)] = 1.5
+    """By this age of the command the drone stands still, and one that is older is not flown at all; leave the pilot
+    three of its steps."""
     max_speed_m_s: Positive = 4.0
     """A command that asks for more is a fault, and refused."""
     max_acceleration_m_s2: Positive = 5.0
@@ -39,6 +42,10 @@ class GateParameters(Section):
 
     @model_validator(mode="after")
     def _limits_agree(self) -> Self:
+        if self.command_fresh_s >= self.command_timeout_s:
+            raise ValueError(
+                f"command_fresh_s {self.command_fresh_s:g} is not below command_timeout_s; write a smaller one"
+            )
         if self.min_height_m >= self.max_height_m:
             raise ValueError(f"min_height_m {self.min_height_m:g} is not below max_height_m; write a smaller one")
         if self.degraded_speed_m_s > self.max_speed_m_s:

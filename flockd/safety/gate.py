@@ -128,16 +128,22 @@ class Gate:
             if math.isfinite(wanted.command.yaw_rad):
                 yaw_rad = wanted.command.yaw_rad
             if self._accepts(wanted.command, around, objections):
-                target = wanted.command.velocity
-            if permission.action is Action.FLY_DEGRADED and math.hypot(*target) > self._parameters.degraded_speed_m_s:
-                target = _limited(target, self._parameters.degraded_speed_m_s)
-                objections.append(Objection.SLOWED)
+                target = self._slowed(wanted.command.velocity, now_s - wanted.time_s, permission.action)
+                if (target != wanted.command.velocity).any():
+                    objections.append(Objection.SLOWED)
         velocity = self._within_acceleration(target, now_s, around)
         velocity = self._within_space(velocity, permission.action, around, objections)
         if not np.isfinite([*velocity, wanted.height_m, yaw_rad]).all():
             objections.append(Objection.SETPOINT_NOT_FINITE)
             return None
         return Setpoint(now_s, velocity, self._within_heights(wanted.height_m, objections), yaw_rad)
+
+    def _slowed(self, velocity: FloatArray, age_s: float, action: Action) -> FloatArray:
+        """A command's velocity: slower once a newer command is missed, nothing when it is too old, slow if degraded."""
+        p = self._parameters
+        share = min((p.command_timeout_s - age_s) / (p.command_timeout_s - p.command_fresh_s), 1.0)
+        limit_m_s = p.degraded_speed_m_s if action is Action.FLY_DEGRADED else p.max_speed_m_s
+        return _limited(share * velocity, limit_m_s)
 
     def _accepts(self, command: VelocityCommand, around: Surroundings, objections: list[Objection]) -> bool:
         """Whether the command may move the drone at all."""

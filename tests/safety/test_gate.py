@@ -107,7 +107,24 @@ def test_a_permission_is_good_for_so_long(action: Action, age_s: float, good: bo
 def test_a_command_is_good_for_so_long(action: Action, age_s: float, good: bool) -> None:
     verdict = Gate(DRAG_FREE).step(8.0, Permission(action, 8.0), wanted([1.0, 0.0], time_s=8.0 - age_s), HOME)
     assert (verdict.setpoint is not None) == good
-    assert verdict.objections == (() if good else (Objection.COMMAND_STALE,))
+    assert (verdict.objections == (Objection.COMMAND_STALE,)) is not good
+
+
+@pytest.mark.parametrize("speed_m_s", [1.0, 3.0])
+def test_after_the_pilots_last_output_the_drone_slows_down_and_stands_still_before_the_time_out(
+    speed_m_s: float,
+) -> None:
+    """The last command is of 1.0 s; with a step of 0.5 s the next one is missed some time after 1.5 s."""
+    gate, speeds = Gate(GateParameters()), {}
+    for tick in range(0, 70):
+        now_s = tick / 20
+        command = wanted([speed_m_s, 0.0], time_s=min(now_s, 1.0))
+        setpoint = gate.step(now_s, Permission(Action.FLY, now_s), command, HOME).setpoint
+        speeds[now_s] = None if setpoint is None else float(setpoint.velocity[0])
+    assert speeds[1.9] == pytest.approx(speed_m_s)  # a pilot whose steps take 0.4 s is not slowed down
+    assert speeds[2.2] == pytest.approx(speed_m_s / 2)  # half of the way from 0.9 s to 1.5 s
+    assert speeds[2.5] == pytest.approx(0.0, abs=1e-9)
+    assert speeds[2.55] is None
 
 
 def test_before_the_first_command_there_is_none_to_fly() -> None:
@@ -217,6 +234,13 @@ def test_without_a_fence_the_position_does_not_matter() -> None:
 
 
 # Speed and acceleration.
+
+
+def test_an_old_command_is_reported_as_slowed_once() -> None:
+    gate = Gate(DRAG_FREE)
+    for action in (Action.FLY, Action.FLY_DEGRADED):
+        verdict = gate.step(8.0, Permission(action, 8.0), wanted([3.0, 0.0], time_s=6.8), HOME)
+        assert verdict.objections == (Objection.SLOWED,)
 
 
 def test_degraded_it_flies_slower_and_says_so() -> None:
