@@ -179,7 +179,7 @@ class VelocityCommand:
     """(2,) m/s^2, north and east: u of Eq. 38 after limits."""
     yaw_rad: float
     """Heading, clockwise from north."""
-    trim: FloatArray | None = None
+    trim: Vector2 | None = None
     """(2,) m/s, north and east: what of the velocity corrects the autopilot's own estimate; None: nothing."""
 
 
