@@ -84,7 +84,7 @@ class ReceivedMessages:
         self._unknown_values: Counter[str] = Counter()
         self._home: FloatArray | None = None
         self._flies = False
-        """Seen in the air and not disarmed since."""
+        """In the air, or seen there and not disarmed since: a landed state alone does not end a flight."""
         self._home_moved = False
         self._text = _Text()
 
@@ -98,7 +98,7 @@ class ReceivedMessages:
         self._newest[name] = ReceivedMessage(time_s, self._checked(name, fields))
         if name in ("HEARTBEAT", "EXTENDED_SYS_STATE"):
             status = self.status(time_s)
-            self._flies = status.armed and (self._flies or status.in_air)
+            self._flies = status.in_air or (self._flies and status.armed)
             self._home_moved = self._home_moved and self._flies
         elif name == "HOME_POSITION":
             self._take_home(_vector(fields, "x", "y", "z"))

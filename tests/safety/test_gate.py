@@ -14,7 +14,7 @@ from flockd.safety import Action, Gate, GateParameters, Objection, Permission, S
 
 STILL = np.zeros(2)
 NOBODY = np.empty((0, 3))
-DRAG_FREE = GateParameters(max_acceleration_m_s2=1e6)
+DRAG_FREE = GateParameters().model_copy(update={"max_acceleration_m_s2": 1e6})
 """So that a step shows the limit it is about at once."""
 HOME = Surroundings(position=STILL, velocity=STILL, yaw_rad=0.5, neighbours=NOBODY, neighbour_velocities=NOBODY[:, :2])
 
@@ -174,7 +174,7 @@ def test_standing_still_it_looks_where_it_looked_last() -> None:
 
 
 def test_a_command_faster_than_any_may_be_is_refused_not_slowed() -> None:
-    stream = Stream(GateParameters(max_speed_m_s=5.0, max_acceleration_m_s2=1e6))
+    stream = Stream(DRAG_FREE.model_copy(update={"max_speed_m_s": 5.0}))
     verdict = stream.second([3.0, 4.0])
     np.testing.assert_allclose(sent(verdict).velocity, [3.0, 4.0])
     assert verdict.objections == ()
