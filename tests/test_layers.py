@@ -19,6 +19,7 @@ MAY_IMPORT = {
     "messages": set(),
     "errors": set(),
     "data": {"errors"},
+    "image_header": set(),
     "zenoh_session": {"errors"},
     "config": {"choices", "messages", "errors"},
     "geometry": BASE,
@@ -28,10 +29,11 @@ MAY_IMPORT = {
     "flocking": BASE,
     "safety": BASE,
     "pilot": BASE | {"geometry", "inference", "perception", "tracking", "flocking", "safety"},
-    "sources": BASE | {"zenoh_session"},
+    "sources": BASE | {"zenoh_session", "image_header"},
     "autopilot": BASE,
     "telemetry": BASE | {"zenoh_session"},
-    "recording": BASE | {"geometry", "telemetry"},  # telemetry for the table of topics, which says what is recorded
+    "recording": BASE
+    | {"geometry", "telemetry", "image_header"},  # telemetry for the table of topics, which says what is recorded
     "flight_log": BASE | {"flocking", "perception", "pilot", "recording"},
     "calibration": BASE | {"geometry", "recording", "datasets", "sources"},
     "datasets": BASE | {"geometry"},

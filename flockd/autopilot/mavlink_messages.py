@@ -60,6 +60,10 @@ ENUMERATIONS: Mapping[tuple[str, str], int] = {
     ("HEARTBEAT", "system_status"): 9,  # MAV_STATE
 }
 """How many values each field's enumeration has, from 0, by message and field: of the MAVLink dialect `common`."""
+HOME_TOLERANCE_M = 0.5
+"""A home that moves less in flight is not reported: estimators drift."""
+TEXT_CHUNK = 50
+"""Characters of a STATUSTEXT; one with fewer is the last of its text."""
 
 
 @dataclass(frozen=True)
@@ -74,20 +78,48 @@ class ReceivedMessages:
     """The newest message of each kind. `add` is for one thread, everything else for any."""
 
     def __init__(self, log_unknown: Callable[[str], None]) -> None:
-        """``log_unknown`` is called with one sentence the first time that an unknown value arrives."""
+        """``log_unknown`` is called with one sentence the first time that an unknown value arrives, or home moves."""
         self._log_unknown = log_unknown
         self._newest: dict[str, ReceivedMessage] = {}
         self._unknown_values: Counter[str] = Counter()
-        self.home_down_m: float | None = None
-        """Down from the estimator's origin; None: not known yet."""
+        self._home: FloatArray | None = None
+        self._flies = False
+        """In the air, or seen there and not disarmed since: a landed state alone does not end a flight."""
+        self._home_moved = False
+        self._text = _Text()
 
     def add(self, name: str, fields: Fields, time_s: float) -> None:
         """Takes a message by its name and fields, NaN as null, as MAVSDK decodes them to JSON."""
+        if name == "STATUSTEXT":
+            whole = self._text.joined(fields)
+            if whole is None:
+                return
+            fields = {**fields, "text": whole}
         self._newest[name] = ReceivedMessage(time_s, self._checked(name, fields))
-        home = _vector(fields, "x", "y", "z") if name == "HOME_POSITION" else None
-        # A home that moves in flight must not move the height that is being held.
-        if home is not None and (self.home_down_m is None or not self.status(time_s).in_air):
-            self.home_down_m = float(home[2])
+        if name in ("HEARTBEAT", "EXTENDED_SYS_STATE"):
+            status = self.status(time_s)
+            self._flies = status.in_air or (self._flies and status.armed)
+            self._home_moved = self._home_moved and self._flies
+        elif name == "HOME_POSITION":
+            self._take_home(_vector(fields, "x", "y", "z"))
+
+    @property
+    def home_down_m(self) -> float | None:
+        """Down from the estimator's origin; None: not known yet."""
+        return None if self._home is None else float(self._home[2])
+
+    def _take_home(self, home: FloatArray | None) -> None:
+        """Home as it is until the next flight: one that moves in flight would move the height band and the fence."""
+        if home is None:
+            return
+        if self._home is None or not self._flies:
+            self._home = home
+        elif not self._home_moved and np.linalg.norm(home - self._home) > HOME_TOLERANCE_M:
+            self._home_moved = True
+            self._log_unknown(
+                f"the autopilot's home moved by {np.linalg.norm(home - self._home):.1f} m in flight; "
+                "height band and fence stay where they were until it is disarmed"
+            )
 
     def newest(self, name: str) -> ReceivedMessage | None:
         """The newest of a kind; None before the first."""
@@ -115,7 +147,7 @@ class ReceivedMessages:
             estimate_ok=_estimate_ok(self._newest.get("ESTIMATOR_STATUS")),
             gps_ok=None if fix_type is None else fix_type >= GPS_FIX_3D,
             position_ned=_vector(self._fields("LOCAL_POSITION_NED"), "x", "y", "z"),
-            home_ned=_vector(self._fields("HOME_POSITION"), "x", "y", "z"),
+            home_ned=self._home,
         )
 
     def vehicle_state(self) -> VehicleState | None:
@@ -165,6 +197,26 @@ class ReceivedMessages:
         return {**fields, **dict.fromkeys(unknown)} if unknown else fields
 
 
+class _Text:
+    """Joins the chunks of a STATUSTEXT, which carry an id and number themselves from 0."""
+
+    def __init__(self) -> None:
+        self._id, self._chunks = 0, [""]
+
+    def joined(self, fields: Fields) -> str | None:
+        """The whole text with its last chunk, None before; where a chunk was lost, dots stand for it."""
+        text = str(fields.get("text") or "").partition("\0")[0]
+        number, chunk = fields.get("id") or 0, fields.get("chunk_seq") or 0
+        if number == 0:
+            return text
+        if number != self._id or chunk == 0:
+            self._id, self._chunks = number, []
+        if chunk > len(self._chunks):
+            self._chunks += ["..."] * (chunk - len(self._chunks))
+        self._chunks.append(text)
+        return "".join(self._chunks) if len(text) < TEXT_CHUNK else None
+
+
 def result_text(result: int) -> str:
     """What a MAV_RESULT means, for people."""
     return RESULTS[result] if 0 <= result < len(RESULTS) else f"answered with the unknown result {result}"
@@ -183,9 +235,10 @@ def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
 
 
 def _vector(fields: Fields, *names: str) -> FloatArray | None:
-    """The named numbers, or None where one is missing or null, which is how NaN comes."""
+    """The named numbers, or None where one is missing, null, which is how NaN comes, or infinite."""
     numbers = [fields.get(name) for name in names]
-    return None if any(number is None for number in numbers) else np.array(numbers, dtype=float)
+    vector = np.array([math.nan if number is None else number for number in numbers], dtype=float)
+    return vector if np.isfinite(vector).all() else None
 
 
 def _known(value: float, *, scale: float, unknown: tuple[float, ...] = (-1,)) -> float | None:

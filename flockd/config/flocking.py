@@ -37,5 +37,5 @@ class FlockingParameters(Section):
     weight: WeightParameters = WeightParameters()
     own_weight: NonNegative = 1.0
     """W_i of Eq. 42"""
-    max_speed_m_s: Positive = 3.0
-    max_acceleration_m_s2: Positive = 2.0
+    max_speed_m_s: Annotated[float, Field(gt=0, le=50)] = 3.0
+    max_acceleration_m_s2: Annotated[float, Field(gt=0, le=50)] = 2.0

@@ -7,7 +7,9 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from flockd.choices import AutopilotMode
-from flockd.config.base import NonNegative, Positive, Section, Share
+from flockd.config.base import Positive, Section, Share
+
+_Metres = Annotated[float, Field(ge=-100_000, le=100_000)]
 
 
 class GateParameters(Section):
@@ -15,26 +17,37 @@ class GateParameters(Section):
 
     permission_timeout_s: Annotated[float, Field(gt=0, le=0.4)] = 0.3
     """The supervisor's permission is good for this long: what has stalled sends nothing half a second later."""
-    command_timeout_s: Positive = 1.5
-    """A command older than this is not flown; leave the pilot three of its steps."""
-    max_speed_m_s: Positive = 4.0
+    command_fresh_s: Annotated[float, Field(gt=0, le=60)] = 0.9
+    """A command older than this is flown ever slower: the pilot has missed a step. Leave it a step and its duration."""
+    command_timeout_s: Annotated[float, Field(gt=0, le=60)] = 1.5
+    """By this age of the command the drone stands still, and one that is older is not flown at all; leave the pilot
+    three of its steps."""
+    max_speed_m_s: Annotated[float, Field(gt=0, le=50)] = 4.0
     """A command that asks for more is a fault, and refused."""
-    max_acceleration_m_s2: Positive = 5.0
-    degraded_speed_m_s: Positive = 1.0
+    max_acceleration_m_s2: Annotated[float, Field(gt=0, le=50)] = 5.0
+    degraded_speed_m_s: Annotated[float, Field(gt=0, le=50)] = 1.0
     """Instead, while the drone is degraded: a command that asks for more is flown this fast."""
-    min_separation_m: NonNegative = 1.0
+    min_separation_m: Annotated[float, Field(ge=0, le=1000)] = 1.0
     """Nearer than this to a neighbour, no velocity towards it."""
-    degraded_separation_m: NonNegative = 1.5
+    degraded_separation_m: Annotated[float, Field(ge=0, le=1000)] = 1.5
     """Instead, while the drone is degraded."""
-    fence_radius_m: Positive | None = 100.0
+    braking_m_s2: Annotated[float, Field(gt=0, le=20)] = 1.5
+    """How hard every drone of the flock can brake: none flies faster towards a neighbour than it can stop in time."""
+    reaction_s: Annotated[float, Field(ge=0, le=5)] = 0.5
+    """From a neighbour's change of velocity until the own drone has begun to brake."""
+    fence_radius_m: Annotated[float, Field(gt=0, le=100_000)] | None = 100.0
     """Around home, level; beyond it only inward velocity. null: no circle."""
-    fence_corners_m: tuple[tuple[float, float], ...] = ()
+    fence_corners_m: tuple[tuple[_Metres, _Metres], ...] = ()
     """A fence of any shape: its corners north and east of home, in order. With a radius too, both hold."""
-    min_height_m: float = 1.0
-    max_height_m: float = 30.0
+    min_height_m: Annotated[float, Field(ge=-1000, le=10_000)] = 1.0
+    max_height_m: Annotated[float, Field(ge=-1000, le=10_000)] = 30.0
 
     @model_validator(mode="after")
     def _limits_agree(self) -> Self:
+        if self.command_fresh_s >= self.command_timeout_s:
+            raise ValueError(
+                f"command_fresh_s {self.command_fresh_s:g} is not below command_timeout_s; write a smaller one"
+            )
         if self.min_height_m >= self.max_height_m:
             raise ValueError(f"min_height_m {self.min_height_m:g} is not below max_height_m; write a smaller one")
         if self.degraded_speed_m_s > self.max_speed_m_s:
@@ -52,13 +65,13 @@ class SafetyParameters(Section):
     """When the drone slows down, hovers, hands over to the autopilot and falls silent."""
 
     gate: GateParameters = GateParameters()
-    camera_timeout_periods: Positive = 3.0
+    camera_timeout_periods: Annotated[float, Field(gt=0, le=100)] = 3.0
     """A camera without a usable frame for this many of its frame periods is lost."""
     max_lost_cameras: Annotated[int, Field(ge=0)] = 1
     """Fly on with the others, degraded, while no more than this many are lost; at least one has to see."""
     max_dropped_share: Share = 0.2
     """Of the frames of late; above it, degraded."""
-    estimate_timeout_s: Positive = 1.5
+    estimate_timeout_s: Annotated[float, Field(gt=0, le=60)] = 1.5
     """Hover when the pilot's newest output is older than this; leave it three of its steps."""
     degraded_ego_motion_failures: Annotated[int, Field(ge=1)] = 2
     """Steps in a row without own motion, to be degraded."""
@@ -72,15 +85,15 @@ class SafetyParameters(Section):
     """Of the hottest thermal zone, to be degraded."""
     max_temperature_c: float = 95.0
     """The same, to hover."""
-    max_loop_lag_s: Positive = 0.2
+    max_loop_lag_s: Annotated[float, Field(gt=0, le=10)] = 0.2
     """Of the event loop; above it, degraded."""
-    heartbeat_timeout_s: Positive = 2.0
+    heartbeat_timeout_s: Annotated[float, Field(gt=0, le=10)] = 2.0
     """The link to the autopilot counts as lost, and flockd falls silent for good."""
-    neighbours_timeout_s: Positive = 2.0
+    neighbours_timeout_s: Annotated[float, Field(gt=0, le=60)] = 2.0
     """No confirmed neighbour seen for this long: the drone is alone."""
     alone_s: Positive | None = 10.0
     """How long it flies on alone before it asks for Hold. null: for ever."""
-    outside_s: Positive = 3.0
+    outside_s: Annotated[float, Field(gt=0, le=60)] = 3.0
     """How long it may take to come back into the fence and the heights before it asks for Hold."""
     on_battery_low: AutopilotMode = "hold"
     """What is asked of the autopilot when it says that its battery is low."""
@@ -88,7 +101,7 @@ class SafetyParameters(Section):
     """What is asked of the autopilot when it has lost its position; it acts by itself too."""
     hover_s: Annotated[float, Field(gt=0, le=3)] = 1.0
     """The longest hover, before Hold is asked for."""
-    recovery_s: NonNegative = 2.0
+    recovery_s: Annotated[float, Field(ge=0, le=600)] = 2.0
     """How long all has to be well before a degraded drone flies as usual again."""
     ask_timeout_s: Annotated[float, Field(gt=0, le=5)] = 2.0
     """How long the autopilot has to leave offboard when asked, before silence makes it."""

@@ -132,22 +132,18 @@ class Control:
         known = vehicle is not None and vehicle.velocity_ned is not None
         velocity = vehicle.velocity_ned if vehicle is not None and known else np.full(3, np.nan)
         assert velocity is not None
+        result = self._pilot_loop.newest
+        confirmed = [] if result is None else [n for n in result.output.neighbours if n.confirmed]
+        age_s = 0.0 if result is None else now - result.time_s
+        own = np.nan_to_num(velocity)
+        places = [n.position + age_s * (n.velocity - own) for n in confirmed]  # at constant velocity since the step
         return Surroundings(
             position=position_from_home(status),
             velocity=velocity[:2],
             yaw_rad=math.nan if vehicle is None else _yaw(vehicle),
-            neighbours=self._neighbours(now, velocity),
+            neighbours=np.reshape(places, (len(places), 3)),
+            neighbour_velocities=np.reshape([n.velocity[:2] for n in confirmed], (len(confirmed), 2)),
         )
-
-    def _neighbours(self, now: float, velocity: FloatArray) -> FloatArray:
-        """(n, 3) metres, the confirmed ones extrapolated to now at constant velocity."""
-        result = self._pilot_loop.newest
-        if result is None:
-            return np.empty((0, 3))
-        own = np.nan_to_num(velocity)
-        age_s = now - result.time_s
-        places = [n.position + age_s * (n.velocity - own) for n in result.output.neighbours if n.confirmed]
-        return np.reshape(places, (len(places), 3))
 
     def _takeover(self) -> Takeover | None:
         takeover = _TAKEOVERS.get(self.decision.action)

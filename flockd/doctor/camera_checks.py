@@ -18,9 +18,9 @@ from flockd.config.source import CameraDeviceParameters, SourceParameters
 from flockd.doctor.finding import Finding, failed, failed_from_error, passed, warned
 from flockd.doctor.lens_checks import coverage, lens_problems, width_deg
 from flockd.messages import UInt8Array
+from flockd.sources.frame_receiver import MAX_AHEAD_S
 from flockd.sources.image_formats import CorruptImageError, ImageFormat, MjpegFormat, YuyvFormat
 from flockd.sources.shared_memory import SharedMemorySource
-from flockd.sources.v4l2 import MAX_AHEAD_S
 from flockd.sources.v4l2_device import CameraError, CapturedBuffer, V4l2Device
 from flockd.sources.v4l2_kernel import Kernel, LinuxKernel
 

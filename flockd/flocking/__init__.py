@@ -8,7 +8,7 @@ from __future__ import annotations
 from flockd.config.flocking import FlockingParameters, WeightParameters
 from flockd.config.mission import DesiredVelocityParameters
 from flockd.flocking.desired import course, desired_velocity
-from flockd.flocking.law import FlockingLaw, limit_norm
+from flockd.flocking.law import FlockingLaw, level_offsets, limit_norm
 
 __all__ = [
     "DesiredVelocityParameters",
@@ -17,5 +17,6 @@ __all__ = [
     "WeightParameters",
     "course",
     "desired_velocity",
+    "level_offsets",
     "limit_norm",
 ]

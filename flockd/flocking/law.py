@@ -13,6 +13,9 @@ from flockd.messages import BoolArray, FloatArray
 _MIN_DISTANCE_M = 1e-3
 """Nearer than this counts as this far: Eq. 39 and 41 have a pole at zero distance."""
 
+SAME_SPOT_M = 0.1
+"""Neighbours at a smaller level range are above or below: their direction is not measured that well."""
+
 
 class FlockingLaw:
     """Eq. 38-42 for one drone. Holds no state: the same input gives the same output."""
@@ -27,8 +30,9 @@ class FlockingLaw:
 
         All arguments are level, north and east. `velocity` (2,) is the own one over ground; `positions` (n, 2) metres
         are the neighbours' relative to the own drone (Q_j - Q_i); `velocities` (n, 2) theirs over ground;
-        `desired_velocity` (2,) is efv of Eq. 42. n may be 0. A neighbour exactly above or below pushes to the south, as
-        one that sits 1 mm to the north. Raises ValueError for other shapes and for numbers that are not finite.
+        `desired_velocity` (2,) is efv of Eq. 42. n may be 0. A neighbour at no distance pushes to the south, as one
+        that sits 1 mm to the north; `level_offsets` keeps two drones from that. Raises ValueError for other shapes
+        and for numbers that are not finite.
         """
         p = self.parameters
         own = _finite(velocity, (2,), "the own velocity")
@@ -65,6 +69,20 @@ class FlockingLaw:
             self.acceleration(velocity, positions, velocities, desired), self.parameters.max_acceleration_m_s2
         )
         return limit_norm(np.asarray(velocity, dtype=float) + u * step_s, self.parameters.max_speed_m_s), u
+
+
+def level_offsets(offsets: FloatArray) -> FloatArray:
+    """(n, 2) metres north and east of neighbours at (n, 3) metres NED, such that drones at one level spot part.
+
+    Directions within `SAME_SPOT_M` are noise, and two drones with the same noise would fly off the same way. Such a
+    neighbour counts as that far to the west where it is below and to the east where it is not: of two drones that face
+    each other, both with north overhead, each then flies to its own right.
+    """
+    same_spot = np.hypot(offsets[:, 0], offsets[:, 1]) < SAME_SPOT_M
+    sides = np.where(offsets[:, 2] > 0, -SAME_SPOT_M, SAME_SPOT_M)
+    aside = np.column_stack([np.zeros(len(offsets)), sides])
+    level: FloatArray = np.where(same_spot[:, None], aside, offsets[:, :2])
+    return level
 
 
 def influence_weights(parameters: WeightParameters, distances: FloatArray, observed: BoolArray) -> FloatArray:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flockd.config.drone import DroneConfig
-from flockd.flocking import FlockingLaw, course, desired_velocity
+from flockd.flocking import FlockingLaw, course, desired_velocity, level_offsets
 from flockd.geometry import build_rig
 from flockd.messages import (
     BoolArray,
@@ -29,6 +29,9 @@ from flockd.perception.detection.detector import DetectionTrace
 from flockd.pilot.motions import ego_motion, neighbour_motions
 from flockd.pilot.trim import VelocityTrim
 from flockd.tracking import Blind, Measurement, Prediction, Tracker
+
+_ROTATION_TOLERANCE = 1e-3
+"""Of an attitude's R R^T from the identity: MAVLink sends quaternions in single precision, which are 1e-6 off."""
 
 
 @dataclass
@@ -65,6 +68,7 @@ class FlockPilot:
         self._first_time_s: float | None = None
         self._last_time_s: float | None = None
         self._velocity: FloatArray | None = None
+        self._yaw_rad = 0.0
         self._refused_in_a_row = 0
 
     def step(self, frames: FrameSet, vehicle: VehicleState, trace: StepTrace | None = None) -> PilotOutput:
@@ -74,7 +78,12 @@ class FlockPilot:
             frames: the newest image of every camera that has one.
             vehicle: what the own autopilot says, at the frames' time.
             trace: filled with what was seen; changes nothing.
+
+        Input that cannot be is refused with a reason: the command is standstill, and nothing of it is remembered.
         """
+        refusal = _why_refused(frames, vehicle)
+        if refusal is not None:
+            return self._refused(frames, refusal)
         laps = _Laps(self._stopwatch)
         trace = trace or StepTrace()
         predictions = self._predictions(frames.time_s)
@@ -105,6 +114,22 @@ class FlockPilot:
             reasons=reasons,
             counts=Counter(reasons),
             stages_ms=laps.stages_ms,
+        )
+
+    def _refused(self, frames: FrameSet, reason: str) -> PilotOutput:
+        """The output of a step that was not done."""
+        last_s = 0.0 if self._last_time_s is None else self._last_time_s
+        return PilotOutput(
+            time_s=frames.time_s if math.isfinite(frames.time_s) else last_s,
+            ego_motion=None,
+            velocity=self._velocity,
+            detections=(),
+            detection_tracks=(),
+            neighbour_motions={},
+            neighbours=self._tracker.neighbours(),
+            command=VelocityCommand(np.zeros(2), np.zeros(2), self._yaw_rad),
+            reasons=(reason,),
+            counts={reason: 1},
         )
 
     def _predictions(self, time_s: float) -> tuple[Prediction, ...]:
@@ -188,18 +213,32 @@ class FlockPilot:
     ) -> VelocityCommand:
         if self._first_time_s is None:
             self._first_time_s = observation.time_s
-        elapsed_s = observation.time_s - self._first_time_s
+        elapsed_s = max(observation.time_s - self._first_time_s, 0.0)
         desired = desired_velocity(self._config.desired, elapsed_s)
         seen = [n for n in neighbours if n.confirmed]
-        positions = np.array([n.position[:2] for n in seen]).reshape(-1, 2)
+        positions = level_offsets(np.array([n.position for n in seen]).reshape(-1, 3))
         velocities = np.array([n.velocity[:2] for n in seen]).reshape(-1, 2)
         own = desired if velocity is None else velocity[:2]  # before the first pair: as desired
         command, acceleration = self._law.command(own, positions, velocities, desired, self._config.step_s)
         R = observation.vehicle.R_ned_body
         heading = math.atan2(R[1, 0], R[0, 0])
-        yaw = course(self._config.desired, elapsed_s) if self._config.yaw == "course" else heading
+        self._yaw_rad = course(self._config.desired, elapsed_s) if self._config.yaw == "course" else heading
         trim = self._trim.velocity
-        return VelocityCommand(command + trim, acceleration, yaw, trim if trim.any() else None)
+        return VelocityCommand(command + trim, acceleration, self._yaw_rad, trim if trim.any() else None)
+
+
+def _why_refused(frames: FrameSet, vehicle: VehicleState) -> str | None:
+    """What of a step's input cannot be; None: nothing."""
+    R, velocity = vehicle.R_ned_body, vehicle.velocity_ned
+    if not (math.isfinite(frames.time_s) and math.isfinite(vehicle.time_s)):
+        return "input refused: a time is not finite"
+    if not np.allclose(R @ R.T, np.eye(3), atol=_ROTATION_TOLERANCE):  # false for NaN too
+        return "input refused: the attitude is not a rotation"
+    if not math.isfinite(vehicle.height_m):
+        return "input refused: the height is not finite"
+    if velocity is not None and not np.isfinite(velocity).all():
+        return "input refused: the autopilot's velocity is not finite"
+    return None
 
 
 def _displacement(observation: Observation, ego: EgoMotion) -> FloatArray:

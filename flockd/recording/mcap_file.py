@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import os
 import struct
@@ -13,12 +14,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Literal, Self
 
+import lz4.frame
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
-from mcap.stream_reader import CRCValidationError, breakup_chunk
+from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from flockd.errors import FlockdError
@@ -29,7 +31,10 @@ SYNC_EVERY_S = 1.0
 """How much a loss of power takes, where the disk keeps its word."""
 _MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")
-_BROKEN = (McapError, CRCValidationError, zstandard.ZstdError, struct.error, UnicodeDecodeError, MemoryError)
+MAX_RECORD_BYTES = 256 << 20
+"""Of a record in the file, and of a chunk uncompressed: what takes more is damaged. The largest holds one image."""
+# RuntimeError and EOFError: lz4; ValueError: a wrong checksum, text that is not UTF-8; OverflowError: sizes over 2^63
+_BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError, RuntimeError, EOFError, MemoryError)
 
 
 class RecordingError(FlockdError):
@@ -211,6 +216,10 @@ class _Reader:
             if opcode == 0:
                 yield Damage(offset, "zeros stand where a record should begin", at_end=True)
                 return
+            if length > MAX_RECORD_BYTES:
+                yield Damage(offset, f"a {_name(opcode)} is {length:,} bytes long", at_end=False)
+                self._file.seek(length, io.SEEK_CUR)
+                continue
             content = self._file.read(length)
             try:
                 found = list(self._parsed(opcode, content))
@@ -223,7 +232,7 @@ class _Reader:
         stream = ReadDataStream(io.BytesIO(content))
         match opcode:
             case Opcode.CHUNK:
-                for record in breakup_chunk(Chunk.read(stream), validate_crc=True):
+                for record in breakup_chunk(_uncompressed(Chunk.read(stream)), validate_crc=True):
                     yield from self._unpacked(record)
             case Opcode.SCHEMA:
                 yield from self._unpacked(Schema.read(stream))
@@ -249,6 +258,23 @@ class _Reader:
                 self._streams[record.id] = Stream(record.topic, encoding, name, data)
             case Message() if record.channel_id in self._streams:  # its channel was in a damaged chunk
                 yield Entry(self._streams[record.channel_id], record.log_time, record.sequence, record.data)
+
+
+def _uncompressed(chunk: Chunk) -> Chunk:
+    """The chunk without its compression, in no more memory than it says. Raises ValueError and those of `_BROKEN`."""
+    size = chunk.uncompressed_size
+    if size > MAX_RECORD_BYTES:
+        raise ValueError(f"{size:,} bytes uncompressed")
+    match chunk.compression:
+        case "zstd":
+            data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
+        case "lz4":
+            data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+        case _:
+            return chunk
+    if len(data) != size:
+        raise ValueError("its uncompressed size is not what it says")
+    return dataclasses.replace(chunk, compression="", data=data)
 
 
 def _name(opcode: int) -> str:

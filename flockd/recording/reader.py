@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -14,6 +15,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from flockd.config import DroneConfig
+from flockd.image_header import MAX_IMAGE_PIXELS, image_size
 from flockd.messages import Frame, FrameSet, UInt8Array, VehicleState
 from flockd.recording import foxglove
 from flockd.recording.codec import from_json
@@ -237,7 +239,7 @@ def _survey(first: Path, progress: Callable[[int, int], None]) -> Contents:
 def _all_parts(first: Path, flight: Note) -> Iterator[Path]:
     """The file, and those after it that say they are of the same recording."""
     yield first
-    number = int(flight.facts.get("part", "0"))
+    number = _count(first, flight.facts, "part")
     start = first if number == 0 else first.with_name(first.name.replace(f".{number}.mcap", ".mcap"))
     while (path := part_path(start, number + 1)).is_file() and path != first:
         number += 1
@@ -261,16 +263,26 @@ def _note(found: Contents, path: Path, record: Record | Damage) -> None:
             if stream.topic == FRAMES.topic:
                 found.steps.append((sequence, _time_of(path, data)))
         case Note(name, facts_of_end) if name == END_NOTE:
-            found.lost = int(facts_of_end.get("lost", "0"))
+            found.lost = _count(path, facts_of_end, "lost")
         case Damage():
             found.damages.append((path, record))
 
 
+def _count(path: Path, facts: Mapping[str, str], name: str) -> int:
+    text = facts.get(name, "0")
+    if not (text.isascii() and text.isdecimal() and len(text) < 10):
+        raise RecordingError(f"{path}: says {name} {text[:20]!r}, which is no number; use another copy")
+    return int(text)
+
+
 def _time_of(path: Path, data: bytes) -> float:
     try:
-        return float(json.loads(data)["time_s"])
-    except (ValueError, KeyError, TypeError) as error:
+        time_s = float(json.loads(data)["time_s"])
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise RecordingError(f"{path}: holds a frame set without a time; use another copy") from error
+    if not math.isfinite(time_s):
+        raise RecordingError(f"{path}: holds a frame set without a time; use another copy")
+    return time_s
 
 
 def _migrated(path: Path, text: bytes) -> Migrated:
@@ -310,7 +322,13 @@ def makes_steps(topic: str) -> bool:
 
 def _image(message: bytes) -> UInt8Array:
     data, kind = foxglove.image_data(message)
-    bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    width, height = image_size(data) or (0, 0)
+    if width * height > MAX_IMAGE_PIXELS:
+        raise ValueError(f"a {kind} image claims {width}x{height} pixels")
+    try:
+        bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    except cv2.error:
+        bgr = None
     if bgr is None:
         raise ValueError(f"a {kind} image does not decode")
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)

@@ -330,6 +330,7 @@ class _Parts:
         self._flight = {"format": FORMAT, "recording": uuid.uuid4().hex, **flight}
         self._head, self._rig, self._settings, self._tell = head, rig, settings, tell
         self._number = 0
+        self._skipped: set[Path] = set()
         self._file: McapFile | None = None
         self._calibrated = False
 
@@ -387,7 +388,7 @@ class _Parts:
 
         Only what a recorder wrote: what someone cut or recovered from it stays and does not count.
         """
-        others = [path for path in self._first.parent.glob("*.mcap") if path != self.path and self._is_ours(path)]
+        others = [path for path in self._first.parent.glob("*.mcap") if path != self.path and self._may_delete(path)]
         others.sort(key=lambda path: path.stat().st_mtime)
         room = (self._settings.quota_mb - self._settings.file_mb) * _MB - sum(path.stat().st_size for path in others)
         for path in others:
@@ -397,10 +398,17 @@ class _Parts:
             path.unlink()
             self._tell(f"recording: {path} was deleted, as all recordings may take {self._settings.quota_mb:g} MB")
 
-    def _is_ours(self, path: Path) -> bool:
+    def _may_delete(self, path: Path) -> bool:
+        """Whether a recorder of this drone wrote the file; what is no readable file is reported once and left alone."""
         try:
-            facts = head_of(path)[0].facts
-        except RecordingError:
+            facts = head_of(path)[0].facts if path.is_file() else None  # a pipe would wait for ever to be opened
+            why = "is not a file"
+        except (RecordingError, OSError) as error:
+            facts, why = None, str(error).removeprefix(f"{path}: ")
+        if facts is None:
+            if path not in self._skipped:
+                self._skipped.add(path)
+                self._tell(f"recording: {path} was skipped and does not count for the quota: it {why}")
             return False
         return facts.get("drone") == self._flight["drone"] and not facts.keys() & EDITED
 

@@ -49,6 +49,8 @@ class Surroundings:
     yaw_rad: float
     neighbours: FloatArray
     """(n, 3) metres, NED, relative to the drone."""
+    neighbour_velocities: FloatArray
+    """(n, 2) m/s over ground, north and east."""
 
 
 class Objection(StrEnum):
@@ -77,6 +79,11 @@ class Verdict:
 
 
 _ROUNDING_M_S = 1e-9
+_PARALLEL = 1e-6
+"""Sine of the angle between two directions below which their limits are not combined."""
+
+SAME_SPOT_M = 0.1
+"""A neighbour whose level range is smaller is above or below, in no direction: cameras do not measure one that well."""
 
 _MOVES = frozenset({Action.FLY, Action.FLY_DEGRADED})
 _STANDS_STILL = frozenset({Action.OFFER, Action.HOVER, Action.ASK_HOLD, Action.ASK_RETURN, Action.ASK_LAND})
@@ -86,8 +93,8 @@ class Gate:
     """Passes each setpoint, makes it smaller, or sends nothing.
 
     A speed above the limit or a number that is not finite is refused: the drone is brought to a standstill instead.
-    Every change of velocity stays within the acceleration limit, except that towards a neighbour too near, or outward
-    beyond the fence, nothing is sent at all.
+    Towards a neighbour the drone flies no faster than it can brake before the minimum distance. Every change of
+    velocity stays within the acceleration limit, except that this one, and no velocity outward beyond the fence, win.
     """
 
     def __init__(self, parameters: GateParameters) -> None:
@@ -121,16 +128,22 @@ class Gate:
             if math.isfinite(wanted.command.yaw_rad):
                 yaw_rad = wanted.command.yaw_rad
             if self._accepts(wanted.command, around, objections):
-                target = wanted.command.velocity
-            if permission.action is Action.FLY_DEGRADED and math.hypot(*target) > self._parameters.degraded_speed_m_s:
-                target = _limited(target, self._parameters.degraded_speed_m_s)
-                objections.append(Objection.SLOWED)
+                target = self._slowed(wanted.command.velocity, now_s - wanted.time_s, permission.action)
+                if (target != wanted.command.velocity).any():
+                    objections.append(Objection.SLOWED)
         velocity = self._within_acceleration(target, now_s, around)
         velocity = self._within_space(velocity, permission.action, around, objections)
         if not np.isfinite([*velocity, wanted.height_m, yaw_rad]).all():
             objections.append(Objection.SETPOINT_NOT_FINITE)
             return None
         return Setpoint(now_s, velocity, self._within_heights(wanted.height_m, objections), yaw_rad)
+
+    def _slowed(self, velocity: FloatArray, age_s: float, action: Action) -> FloatArray:
+        """A command's velocity: slower once a newer command is missed, nothing when it is too old, slow if degraded."""
+        p = self._parameters
+        share = min((p.command_timeout_s - age_s) / (p.command_timeout_s - p.command_fresh_s), 1.0)
+        limit_m_s = p.degraded_speed_m_s if action is Action.FLY_DEGRADED else p.max_speed_m_s
+        return _limited(share * velocity, limit_m_s)
 
     def _accepts(self, command: VelocityCommand, around: Surroundings, objections: list[Objection]) -> bool:
         """Whether the command may move the drone at all."""
@@ -141,7 +154,10 @@ class Gate:
             ),
             (Objection.COMMAND_TOO_LARGE, math.hypot(*command.velocity) > self._parameters.max_speed_m_s),
             (Objection.POSITION_UNKNOWN, is_fenced(self._parameters) and not np.isfinite(around.position).all()),
-            (Objection.NEIGHBOUR_UNKNOWN, not np.isfinite(around.neighbours).all()),
+            (
+                Objection.NEIGHBOUR_UNKNOWN,
+                not (np.isfinite(around.neighbours).all() and np.isfinite(around.neighbour_velocities).all()),
+            ),
         )
         found = [objection for objection, holds in refusals if holds]
         objections.extend(found)
@@ -161,15 +177,44 @@ class Gate:
     def _within_space(
         self, velocity: FloatArray, action: Action, around: Surroundings, objections: list[Objection]
     ) -> FloatArray:
-        """The velocity without what leads farther out of the fence or towards a neighbour too near."""
+        """The velocity without what leads farther out of the fence or too fast towards a neighbour."""
         p = self._parameters
         separation_m = p.min_separation_m if action is Action.FLY else p.degraded_separation_m
-        near = around.neighbours[np.linalg.norm(around.neighbours, axis=1) < separation_m, :2]
-        outward, towards = _units(offsets_outside(p, around.position)), _units(near)
-        for objection, directions in ((Objection.FENCE, outward), (Objection.SEPARATION, towards)):
-            if (directions @ velocity > 0).any():
+        outward = _units(offsets_outside(p, around.position))
+        towards, most_m_s = self._approaches(around, separation_m)
+        limits = np.concatenate([np.zeros(len(outward)), most_m_s])
+        for objection, directions, most in (
+            (Objection.FENCE, outward, np.zeros(len(outward))),
+            (Objection.SEPARATION, towards, most_m_s),
+        ):
+            if (directions @ velocity > most).any():
                 objections.append(objection)
-        return _without(velocity, np.concatenate([outward, towards]))
+        return _within(velocity, np.concatenate([outward, towards]), limits)
+
+    def _approaches(self, around: Surroundings, separation_m: float) -> tuple[FloatArray, FloatArray]:
+        """For each neighbour at the drone's height the direction to it, (n, 2), and how fast to fly there, (n,) m/s.
+
+        Nearer than the separation: not at all. Farther, so fast that the distance left suffices if both brake, as in
+        Shalev-Shwartz et al. 2017, "On a formal model of safe and scalable self-driving cars": with v towards a
+        neighbour that comes at w (negative: goes), the drone's reaction time r and its braking b,
+        (v + w) r + v^2 / 2b + w |w| / 2b <= distance left. The neighbour's gate may let it begin to come just now; so,
+        but for following one that goes, this has to hold for w = v too.
+        """
+        p = self._parameters
+        offsets = around.neighbours
+        ranges = np.hypot(offsets[:, 0], offsets[:, 1])
+        meets = (ranges >= SAME_SPOT_M) & (ranges < math.inf) & (np.abs(offsets[:, 2]) < separation_m)
+        offsets, ranges = offsets[meets], ranges[meets]
+        towards = offsets[:, :2] / ranges[:, None]
+        velocities = np.nan_to_num(around.neighbour_velocities[meets], posinf=0.0, neginf=0.0)
+        comes = -np.clip(np.sum(velocities * towards, axis=1), -p.max_speed_m_s, p.max_speed_m_s)
+        left_m = ranges - np.sqrt(separation_m**2 - offsets[:, 2] ** 2)
+        lag = p.braking_m_s2 * p.reaction_s
+        square = lag**2 + 2 * p.braking_m_s2 * (left_m - comes * p.reaction_s) - comes * np.abs(comes)
+        most_m_s = np.sqrt(np.maximum(square, lag**2)) - lag
+        if_both_come = np.sqrt(lag**2 + p.braking_m_s2 * np.maximum(left_m, 0.0)) - lag
+        most_m_s = np.minimum(most_m_s, np.maximum(if_both_come, -comes))
+        return towards, np.where(left_m > 0, most_m_s, 0.0)
 
     def _within_heights(self, height_m: float, objections: list[Objection]) -> float:
         within = min(max(height_m, self._parameters.min_height_m), self._parameters.max_height_m)
@@ -178,24 +223,39 @@ class Gate:
         return within
 
 
-def _without(velocity: FloatArray, directions: FloatArray) -> FloatArray:
-    """The nearest velocity that has no part along any of the directions, (n, 2) of length 1; standstill always fits.
+def _within(velocity: FloatArray, directions: FloatArray, limits: FloatArray) -> FloatArray:
+    """The nearest velocity whose part along each direction, (n, 2) of length 1, is within its limit, (n,), 0 or more.
 
-    In the plane that is the velocity itself, or it with its part along one direction taken away, or zero.
+    In the plane that is the velocity itself, or its foot on the line where one limit is reached, or the point where
+    two such lines cross. Standstill always fits.
     """
-    along = directions @ velocity
-    if (along <= 0).all():
+    over = directions @ velocity - limits
+    if (over <= 0).all():
         return velocity
-    candidates = np.vstack([np.zeros(2), velocity - along[:, None] * directions])
-    fitting = candidates[np.max(candidates @ directions.T, axis=1) <= _ROUNDING_M_S]
-    nearest: FloatArray = fitting[np.argmax(np.linalg.norm(fitting, axis=1))]  # of such projections, the longest
+    feet = velocity - over[:, None] * directions
+    candidates = np.vstack([np.zeros(2), feet, _crossings(directions, limits)])
+    fitting = candidates[np.max(candidates @ directions.T - limits, axis=1) <= _ROUNDING_M_S]
+    nearest: FloatArray = fitting[np.argmin(np.linalg.norm(fitting - velocity, axis=1))]
     return nearest
 
 
+def _crossings(directions: FloatArray, limits: FloatArray) -> FloatArray:
+    """(m, 2): where two of the lines n . v = limit cross, for each two that are not parallel (Cramer's rule)."""
+    i, j = np.triu_indices(len(directions), 1)
+    a, b = directions[i], directions[j]
+    determinants = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    cross = np.abs(determinants) > _PARALLEL
+    a, b, c, d = a[cross], b[cross], limits[i][cross], limits[j][cross]
+    crossings: FloatArray = (
+        np.column_stack([c * b[:, 1] - d * a[:, 1], d * a[:, 0] - c * b[:, 0]]) / determinants[cross, None]
+    )
+    return crossings
+
+
 def _units(vectors: FloatArray) -> FloatArray:
-    """The vectors (n, 2) at length 1, without those of no length: straight above or below is in no direction."""
-    somewhere = vectors[np.any(vectors != 0, axis=1)]
-    units: FloatArray = somewhere / np.linalg.norm(somewhere, axis=1, keepdims=True)
+    """The vectors (n, 2) at length 1, without those of no length."""
+    lengths = np.hypot(vectors[:, 0], vectors[:, 1])
+    units: FloatArray = vectors[lengths > 0] / lengths[lengths > 0, None]
     return units
 
 

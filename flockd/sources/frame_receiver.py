@@ -15,6 +15,9 @@ from flockd.sources.image_formats import CorruptImageError
 _TICK_S = 0.01
 """How often a waiting reader checks whether a set that is not complete has waited long enough."""
 
+MAX_AHEAD_S = 0.02
+"""Drivers that work out time stamps from the camera's own clock may be this much ahead."""
+
 
 class FrameReceiver:
     """The assembler behind a lock, and the decoding in front of it: what all sources have in common."""
@@ -27,6 +30,13 @@ class FrameReceiver:
         self._faults: dict[str, str | None] = dict.fromkeys(cameras)
         self._changed = threading.Condition()
         self._stopped = False
+
+    def is_of_now(self, time_s: float, max_age_s: float) -> bool:
+        """Whether a time stamp is of the receiver's clock and not older than that; one ahead would silence all cameras.
+
+        False for NaN.
+        """
+        return -MAX_AHEAD_S <= self._clock() - time_s <= max_age_s
 
     def offer(self, frame: RawFrame) -> Count | None:
         """Takes a frame from any thread; gives what it is refused for, None for a usable one."""

@@ -9,15 +9,13 @@ from typing import Protocol
 import cv2
 import numpy as np
 
+from flockd.image_header import jpeg_size
 from flockd.messages import UInt8Array
 
 Decoder = Callable[[bytes], UInt8Array]
 """Bytes to (height, width, 3) RGB; raises CorruptImageError."""
 
 _START, _END = b"\xff\xd8", b"\xff\xd9"
-_STANDALONE = frozenset({0x01, *range(0xD0, 0xD8)})
-_FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_SCAN = 0xDA
 _SAMPLE_STRIDE = 8
 _FLAT_DEVIATION = 1.0
 """Standard deviation in grey levels below which a whole image shows nothing: the noise of a sensor alone is more."""
@@ -54,7 +52,7 @@ class MjpegFormat:
             raise CorruptImageError("no JPEG begins here")
         if not data.rstrip(b"\0").endswith(_END):  # some cameras pad with zeros
             raise CorruptImageError("JPEG ends too early")
-        found = _jpeg_size(data)
+        found = jpeg_size(data)
         if found != self.size:
             shown = "no size" if found is None else f"{found[0]}x{found[1]}"
             raise CorruptImageError(f"JPEG has {shown} instead of {self.size[0]}x{self.size[1]}")
@@ -113,22 +111,6 @@ class RgbFormat:
 def _check_length(data: bytes, length: int) -> None:
     if len(data) != length:
         raise CorruptImageError(f"{len(data)} bytes instead of {length}")
-
-
-def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height of the frame header; None without one before the first scan."""
-    at = 2
-    while at + 9 <= len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
-        if marker == 0xFF or marker in _STANDALONE:
-            at += 1 if marker == 0xFF else 2
-        elif marker in _FRAME_HEADERS:
-            return int.from_bytes(data[at + 7 : at + 9]), int.from_bytes(data[at + 5 : at + 7])
-        elif marker == _SCAN:
-            return None
-        else:
-            at += 2 + int.from_bytes(data[at + 2 : at + 4])
-    return None
 
 
 def _plausible(image: UInt8Array) -> UInt8Array:

@@ -28,6 +28,8 @@ PREFIX = "flockd-frames/v1"
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7448"
 _HEADER = struct.Struct("<4sHHQd")
 _MAGIC = b"rgb8"
+MAX_AGE_S = 5.0
+"""Of a frame on arrival: a simulator stamps before it draws, and may draw for long."""
 _POOL_BYTES = 16 << 20
 """For one drone, in whose memory it counts: four sets of four 640x480 cameras."""
 
@@ -149,6 +151,10 @@ class SharedMemorySource:
             self._receiver.count(camera, "received", "corrupt")
             asked = "x".join(map(str, image_format.size))
             self._receiver.fault(camera, f"{camera}: frames are {width}x{height}, but the rig has {asked}; correct one")
+            return
+        if not self._receiver.is_of_now(time_s, MAX_AGE_S):
+            self._receiver.count(camera, "received", "time_stamp")
+            self._receiver.fault(camera, f"{camera}: a time stamp is not of this computer's clock; correct the program")
             return
         self._receiver.offer(RawFrame(camera, sample.payload.to_bytes(), image_format.decode, time_s, sequence))
 

@@ -20,8 +20,6 @@ _LOOK_S = 0.05
 _START_S = 3.0
 """Cameras may take this long to their first frame."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
-MAX_AHEAD_S = 0.02
-"""Drivers that work out time stamps from the camera's own clock may be this much ahead."""
 _STOP_S = 1.0
 """A thread that hangs in a driver for longer is left to end with the process."""
 
@@ -166,8 +164,7 @@ class _Camera:
         if captured.flagged:
             return "flagged"
         # Some drivers do not say which clock is in their stamps: what is of now is of ours.
-        age_s = self._clock() - captured.time_s
-        if not -MAX_AHEAD_S <= age_s <= self._silence_s:
+        if not self._receiver.is_of_now(captured.time_s, self._silence_s):
             return "time_stamp"
         try:
             image_format.check(captured.data)

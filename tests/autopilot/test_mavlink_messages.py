@@ -74,3 +74,65 @@ def test_a_home_that_moves_counts_on_the_ground_only_and_with_an_unknown_landed_
 def test_an_unknown_result_of_a_command_has_words_too() -> None:
     assert result_text(4) == "failed"
     assert result_text(200) == "answered with the unknown result 200"
+
+
+ARMED, DISARMED = {"base_mode": 128, "custom_mode": 6 << 16}, {"base_mode": 0, "custom_mode": 6 << 16}
+GROUND, AIR = {"landed_state": 1}, {"landed_state": 2}
+
+
+def _home(north_m: float, down_m: float) -> tuple[str, dict[str, Any]]:
+    return "HOME_POSITION", {"x": north_m, "y": 0.0, "z": down_m}
+
+
+def test_home_stays_while_armed_whatever_landed_state_and_home_say_and_moves_after() -> None:
+    position = ("LOCAL_POSITION_NED", {"x": 0.0, "y": 0.0, "z": -5.0, "vx": 0.0, "vy": 0.0, "vz": 0.0})
+    attitude = ("ATTITUDE_QUATERNION", {"q1": 1.0, "q2": 0.0, "q3": 0.0, "q4": 0.0})
+    received, log = _received(_home(0.0, 0.0), ("HEARTBEAT", ARMED), ("EXTENDED_SYS_STATE", GROUND), position, attitude)
+    received.add(*_home(1.0, -0.2), 6.0)
+    assert received.home_down_m == -0.2, "PX4 sets home when it is armed, still on the ground"
+    received.add("EXTENDED_SYS_STATE", AIR, 7.0)
+    received.add("EXTENDED_SYS_STATE", GROUND, 8.0)  # a second sender with the autopilot's ids
+    received.add(*_home(50.0, 20.0), 9.0)
+    received.add(*_home(60.0, 20.0), 10.0)
+    status, vehicle = received.status(11.0), received.vehicle_state()
+    assert status.home_ned is not None and vehicle is not None
+    assert list(status.home_ned) == [1.0, 0.0, -0.2]
+    assert vehicle.height_m == pytest.approx(4.8)  # -0.2 + 5.0
+    assert len(log) == 1
+    assert "home moved by 53.0 m in flight" in log[0]  # sqrt(49^2 + 20.2^2)
+    received.add("HEARTBEAT", DISARMED, 12.0)
+    received.add(*_home(2.0, -0.1), 13.0)
+    assert received.home_down_m == -0.1
+
+
+def test_a_home_that_is_not_finite_is_none() -> None:
+    received, _ = _received(("HOME_POSITION", {"x": None, "y": 0.0, "z": 0.0}), _home(float("inf"), 0.0))
+    assert received.home_down_m is None
+    assert received.status(3.0).home_ned is None
+
+
+def _text(chunk: str, number: int = 0, sequence: int = 0) -> tuple[str, dict[str, Any]]:
+    return "STATUSTEXT", {"severity": 4, "text": chunk, "id": number, "chunk_seq": sequence}
+
+
+def test_a_text_in_chunks_is_seen_whole_and_not_before() -> None:
+    sentence = "Preflight Fail: the battery is far below what a take-off needs, and the compass disagrees with the yaw"
+    received, _ = _received(_text("short"), _text(sentence[:50], 7, 0), _text(sentence[50:100], 7, 1))
+    newest = received.newest("STATUSTEXT")
+    assert newest is not None
+    assert newest.fields["text"] == "short"
+    received.add(*_text(sentence[100:], 7, 2), 3.0)
+    newest = received.newest("STATUSTEXT")
+    assert newest is not None
+    assert (newest.fields["text"], newest.time_s) == (sentence, 3.0)
+
+
+def test_a_chunk_that_is_lost_is_marked_and_does_not_mix_texts() -> None:
+    received, _ = _received(_text("a" * 50, 7, 0), _text("end", 7, 2), _text("b" * 50, 8, 0), _text("tail", 8, 1))
+    newest = received.newest("STATUSTEXT")
+    assert newest is not None
+    assert newest.fields["text"] == "b" * 50 + "tail"
+    lost, _ = _received(_text("a" * 50, 7, 0), _text("end", 7, 2))
+    newest = lost.newest("STATUSTEXT")
+    assert newest is not None
+    assert newest.fields["text"] == "a" * 50 + "...end"

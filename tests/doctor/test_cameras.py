@@ -235,11 +235,11 @@ def _publishing(endpoint: str, size: tuple[int, int]) -> Iterator[None]:
     publisher = FramePublisher(listen=[endpoint])
 
     def publish() -> None:
-        rng, number = np.random.default_rng(0), 0
+        rng, number, began_s = np.random.default_rng(0), 0, time.monotonic()
         while not ended.wait(0.05):
             number += 1
             image = rng.integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
-            publisher.publish("tiny", Frame("front", image, 0.05 * number, number))
+            publisher.publish("tiny", Frame("front", image, began_s + 0.05 * number, number))
 
     thread = threading.Thread(target=publish)
     thread.start()

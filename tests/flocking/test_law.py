@@ -15,6 +15,7 @@ from flockd.flocking import (
     WeightParameters,
     course,
     desired_velocity,
+    level_offsets,
     limit_norm,
 )
 from flockd.flocking.metrics import min_distance, obj1, obj2, pair_distances
@@ -108,6 +109,33 @@ def test_a_neighbour_exactly_below_pushes_south_and_nothing_overflows() -> None:
         np.testing.assert_allclose(acceleration, [-2.0, 0.0])
         np.testing.assert_allclose(velocity, [-1.0, 0.0])
     assert np.isfinite(law.acceleration(STILL, [[1e308, 1e308]], np.zeros((1, 2)), STILL)).all()
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 1e-163, 0.02])
+def test_two_drones_at_one_level_spot_part_each_to_its_own_right(noise_m: float) -> None:
+    """One 0.8 m above the other, both on the same course: they come apart by the separation distance of 1.5 m."""
+    law, rng = FlockingLaw(), np.random.default_rng(1)
+    places, velocities = np.array([[0.0, 0.0, -5.8], [0.0, 0.0, -5.0]]), np.tile([1.0, 0.0], (2, 1))
+    for _ in range(20):
+        seen = [places[1] - places[0], places[0] - places[1]] + noise_m * np.array([1.0, 1.0, 0.0]) * rng.normal(
+            size=(2, 1)
+        )
+        velocities = np.array(
+            [
+                law.command(velocities[i], level_offsets(seen[i : i + 1]), velocities[[1 - i]], [1.0, 0.0], 0.5)[0]
+                for i in range(2)
+            ]
+        )
+        places[:, :2] += 0.5 * velocities
+    above, below = places[:, 1]
+    assert above > 0.5 > -0.5 > below  # looking down with north overhead, east is at the right; looking up, west
+    assert np.linalg.norm(places[0, :2] - places[1, :2]) > 1.5
+
+
+def test_neighbours_that_are_not_above_or_below_are_where_they_are_seen() -> None:
+    offsets = np.array([[0.1, 0.0, 1.0], [-2.0, 3.0, 0.5]])
+    np.testing.assert_array_equal(level_offsets(offsets), offsets[:, :2])
+    assert level_offsets(np.empty((0, 3))).shape == (0, 2)
 
 
 def test_the_command_limits_first_the_acceleration_and_then_the_speed() -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -129,6 +131,44 @@ def test_blind_cameras_still_give_a_finite_command() -> None:
     assert len(output.reasons) == 4
     assert np.isfinite(output.command.velocity).all()
     assert math.isfinite(output.command.yaw_rad)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"frames_s": math.nan}, "a time is not finite"),
+        ({"frames_s": math.inf}, "a time is not finite"),
+        ({"time_s": math.nan}, "a time is not finite"),
+        ({"R_ned_body": np.full((3, 3), math.nan)}, "the attitude is not a rotation"),
+        ({"R_ned_body": 2.0 * np.eye(3)}, "the attitude is not a rotation"),
+        ({"height_m": -math.inf}, "the height is not finite"),
+        ({"velocity_ned": np.array([0.0, math.nan, 0.0])}, "the autopilot's velocity is not finite"),
+    ],
+)
+def test_input_that_cannot_be_is_refused_and_the_next_step_is_as_if_it_had_not_come(
+    changes: dict[str, Any], reason: str
+) -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+    flyer.step()
+    frames, state = flyer.take_frames()
+    spoilt = replace(state, **{name: value for name, value in changes.items() if name != "frames_s"})
+    output = flyer.pilot.step(FrameSet(changes.get("frames_s", frames.time_s), frames.frames), spoilt)
+    assert output.reasons == (f"input refused: {reason}",)
+    np.testing.assert_array_equal(output.command.velocity, [0.0, 0.0])
+    assert math.isfinite(output.time_s)
+    assert math.isfinite(output.command.yaw_rad)
+    flyer.move()
+    after = flyer.step()
+    assert after.reasons == ()
+    assert after.ego_motion is not None
+    assert after.ego_motion.interval_s == pytest.approx(STEP_S)
+
+
+def test_a_time_before_the_first_step_is_no_error() -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0)))
+    flyer.step()
+    flyer.time_s -= 5.0
+    assert np.isfinite(flyer.step().command.velocity).all()
 
 
 def test_an_impossible_ego_motion_is_refused_but_not_for_ever() -> None:

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import csv
 import json
+import struct
 import subprocess
 import sys
+import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
 from mcap.writer import Writer
 
 from flockd.recording import RecordingError
 from flockd.recording.codec import to_json
 from flockd.recording.editing import cut, recover
 from flockd.recording.export import export_images, export_tables
-from flockd.recording.mcap_file import Damage, Entry, McapFile, read_records
-from flockd.recording.reader import Recording
+from flockd.recording.mcap_file import Damage, Entry, McapFile, Note, read_records
+from flockd.recording.reader import Recording, is_image
 from tests.recording.made_up import record
 
 ROOT = Path(__file__).parents[2]
@@ -99,6 +104,73 @@ def test_damage_within_is_reported_and_recovered_from(tmp_path: Path, whole: Pat
     assert 7 <= steps <= 9
     ((first, last),) = mended.contents.gaps
     assert last - first + 1 == 10 - steps
+
+
+def _chunk(compression: str, uncompressed_size: int, data: bytes) -> bytes:
+    """As the MCAP specification writes a chunk: times, size, no checksum, compression, data."""
+    name = compression.encode()
+    body = struct.pack("<QQQII", 0, 0, uncompressed_size, 0, len(name)) + name + struct.pack("<Q", len(data)) + data
+    return struct.pack("<BQ", 6, len(body)) + body
+
+
+_BOMB = zstandard.compress(b"\0" * (300 << 20))
+_LZ4 = lz4.frame.compress(bytes(range(256)) * 100)
+
+
+@pytest.mark.parametrize(
+    ("record_bytes", "reason"),
+    [
+        (_chunk("zstd", 3 << 30, _BOMB), "3,221,225,472 bytes uncompressed"),
+        (_chunk("zstd", 1000, _BOMB), "uncompressed size"),
+        (_chunk("zstd", (1 << 63) + 5, b"x"), "bytes uncompressed"),
+        (_chunk("lz4", 25600, _LZ4[:200]), "uncompressed size"),
+        (_chunk("lz4", 25600, b"no lz4 at all"), "chunk"),
+        (_chunk("", 9, struct.pack("<BQ", 5, (1 << 63) + 1)), "chunk"),
+        (_chunk("brotli", 9, b"x"), "chunk"),
+    ],
+)
+def test_a_hostile_chunk_is_damage_and_takes_little_memory(
+    tmp_path: Path, whole: Path, record_bytes: bytes, reason: str
+) -> None:
+    content = whole.read_bytes()
+    end = content.rindex(struct.pack("<BQ", 15, 4))  # DATA_END: a checksum of 4 bytes
+    path = tmp_path / "x.mcap"
+    path.write_bytes(content[:end] + record_bytes + content[end:])
+    tracemalloc.start()
+    (damage,) = [record for record in read_records(path) if isinstance(record, Damage)]
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert reason in damage.reason
+    assert not damage.at_end
+    assert peak < 100 << 20
+    assert len(list(Recording(path).steps())) == len(list(Recording(whole).steps()))
+
+
+def test_an_image_that_claims_to_be_huge_is_not_decoded(tmp_path: Path, whole: Path) -> None:
+    """A PNG's width and height are bytes 16 to 24; zlib packs an all-black image of 60000x60000 into some megabytes."""
+    path = tmp_path / "x.mcap"
+    with McapFile(path) as file:
+        for entry in read_records(whole):
+            if isinstance(entry, Entry) and is_image(entry.stream.topic):
+                at = entry.data.index(b"IHDR") + 4
+                huge = entry.data[:at] + struct.pack(">II", 60000, 60000) + entry.data[at + 8 :]
+                entry = replace(entry, data=huge)  # noqa: PLW2901 - the rest of the loop is the same
+            if not isinstance(entry, Damage):
+                file.write(entry)
+    with pytest.raises(RecordingError, match="claims 60000x60000 pixels"):
+        list(Recording(path).steps())
+
+
+@pytest.mark.parametrize("number", ["NaN", "-1", "1e9", "9" * 5000, ""])
+def test_a_number_of_lost_steps_that_is_none_is_refused(tmp_path: Path, whole: Path, number: str) -> None:
+    path = tmp_path / "x.mcap"
+    with McapFile(path) as file:
+        for entry in read_records(whole):
+            if isinstance(entry, Note) and "lost" in entry.facts:
+                entry = replace(entry, facts={**entry.facts, "lost": number})  # noqa: PLW2901
+            if not isinstance(entry, Damage):
+                file.write(entry)
+    assert "which is no number" in refusal(path)
 
 
 def test_a_step_without_its_vehicle_is_the_last_of_a_killed_one_or_an_error(tmp_path: Path, whole: Path) -> None:

@@ -27,6 +27,7 @@ from flockd.config.recording import RecordingConfig
 from flockd.geometry import build_rig
 from flockd.recording import Recorder
 from flockd.recording.editing import cut
+from flockd.recording.mcap_file import Entry, read_records
 from flockd.recording.reader import Recording
 from flockd.telemetry import TOPICS
 from tests.recording.made_up import MODELS, MadeUpPilot, drone_config, inputs, record
@@ -173,6 +174,23 @@ def test_files_turn_over_and_stay_within_the_quota(tmp_path: Path) -> None:
     numbers = [step.number for step in first.steps()]
     assert numbers == list(range(numbers[0], 15))
     assert Recording(files[-1]).config == drone_config(), "each file is complete in itself"
+
+
+def test_what_is_no_readable_file_in_the_folder_is_skipped_with_a_warning(tmp_path: Path) -> None:
+    (tmp_path / "folder.mcap").mkdir()
+    (tmp_path / "dangling.mcap").symlink_to(tmp_path / "nowhere")
+    os.mkfifo(tmp_path / "pipe.mcap")
+    (tmp_path / "damaged.mcap").write_bytes(b"\x89MCAP0\r\n" + b"\xff" * 100)
+    odd = sorted(path.name for path in tmp_path.iterdir())
+    record(tmp_path / "drone1.mcap", steps=5)
+    assert len(list(Recording(tmp_path / "drone1.mcap").steps())) == 5
+    told = [
+        entry.data.decode(errors="replace")
+        for entry in read_records(tmp_path / "drone1.mcap")
+        if isinstance(entry, Entry) and entry.stream.topic == "/events"
+    ]
+    for name in odd:
+        assert sum(name in text and "skipped" in text for text in told) == 1, name
 
 
 def test_a_disk_that_never_answers_costs_steps_but_no_time(tmp_path: Path) -> None:

@@ -14,9 +14,9 @@ from flockd.safety import Action, Gate, GateParameters, Objection, Permission, S
 
 STILL = np.zeros(2)
 NOBODY = np.empty((0, 3))
-DRAG_FREE = GateParameters(max_acceleration_m_s2=1e6)
+DRAG_FREE = GateParameters().model_copy(update={"max_acceleration_m_s2": 1e6})
 """So that a step shows the limit it is about at once."""
-HOME = Surroundings(position=STILL, velocity=STILL, yaw_rad=0.5, neighbours=NOBODY)
+HOME = Surroundings(position=STILL, velocity=STILL, yaw_rad=0.5, neighbours=NOBODY, neighbour_velocities=NOBODY[:, :2])
 
 
 def wanted(velocity: ArrayLike, *, time_s: float = 0.0, height_m: float = 5.0, yaw_rad: float = 1.0) -> Wanted:
@@ -53,7 +53,10 @@ def sent(verdict: Verdict) -> Setpoint:
 
 
 def near(*neighbours: ArrayLike) -> Surroundings:
-    return replace(HOME, neighbours=np.array(neighbours, dtype=float))
+    """Neighbours that stand still."""
+    return replace(
+        HOME, neighbours=np.array(neighbours, dtype=float), neighbour_velocities=np.zeros((len(neighbours), 2))
+    )
 
 
 # Silence.
@@ -104,7 +107,24 @@ def test_a_permission_is_good_for_so_long(action: Action, age_s: float, good: bo
 def test_a_command_is_good_for_so_long(action: Action, age_s: float, good: bool) -> None:
     verdict = Gate(DRAG_FREE).step(8.0, Permission(action, 8.0), wanted([1.0, 0.0], time_s=8.0 - age_s), HOME)
     assert (verdict.setpoint is not None) == good
-    assert verdict.objections == (() if good else (Objection.COMMAND_STALE,))
+    assert (verdict.objections == (Objection.COMMAND_STALE,)) is not good
+
+
+@pytest.mark.parametrize("speed_m_s", [1.0, 3.0])
+def test_after_the_pilots_last_output_the_drone_slows_down_and_stands_still_before_the_time_out(
+    speed_m_s: float,
+) -> None:
+    """The last command is of 1.0 s; with a step of 0.5 s the next one is missed some time after 1.5 s."""
+    gate, speeds = Gate(GateParameters()), {}
+    for tick in range(0, 70):
+        now_s = tick / 20
+        command = wanted([speed_m_s, 0.0], time_s=min(now_s, 1.0))
+        setpoint = gate.step(now_s, Permission(Action.FLY, now_s), command, HOME).setpoint
+        speeds[now_s] = None if setpoint is None else float(setpoint.velocity[0])
+    assert speeds[1.9] == pytest.approx(speed_m_s)  # a pilot whose steps take 0.4 s is not slowed down
+    assert speeds[2.2] == pytest.approx(speed_m_s / 2)  # half of the way from 0.9 s to 1.5 s
+    assert speeds[2.5] == pytest.approx(0.0, abs=1e-9)
+    assert speeds[2.55] is None
 
 
 def test_before_the_first_command_there_is_none_to_fly() -> None:
@@ -154,7 +174,7 @@ def test_standing_still_it_faces_where_it_faced_last() -> None:
 
 
 def test_a_command_faster_than_any_may_be_is_refused_not_slowed() -> None:
-    stream = Stream(GateParameters(max_speed_m_s=5.0, max_acceleration_m_s2=1e6))
+    stream = Stream(DRAG_FREE.model_copy(update={"max_speed_m_s": 5.0}))
     verdict = stream.second([3.0, 4.0])
     np.testing.assert_allclose(sent(verdict).velocity, [3.0, 4.0])
     assert verdict.objections == ()
@@ -195,6 +215,7 @@ def test_without_any_yaw_nothing_can_be_sent() -> None:
         (replace(HOME, position=np.array([0.0, math.nan])), Objection.POSITION_UNKNOWN),
         (near([9.0, 0.0, 0.0], [math.nan, 5.0, 0.0]), Objection.NEIGHBOUR_UNKNOWN),
         (near([9.0, 0.0, math.inf]), Objection.NEIGHBOUR_UNKNOWN),
+        (replace(near([9.0, 0.0, 0.0]), neighbour_velocities=np.array([[0.0, math.nan]])), Objection.NEIGHBOUR_UNKNOWN),
     ],
 )
 def test_where_the_drone_or_a_neighbour_is_not_known_it_stands_still(
@@ -213,6 +234,13 @@ def test_without_a_fence_the_position_does_not_matter() -> None:
 
 
 # Speed and acceleration.
+
+
+def test_an_old_command_is_reported_as_slowed_once() -> None:
+    gate = Gate(DRAG_FREE)
+    for action in (Action.FLY, Action.FLY_DEGRADED):
+        verdict = gate.step(8.0, Permission(action, 8.0), wanted([3.0, 0.0], time_s=6.8), HOME)
+        assert verdict.objections == (Objection.SLOWED,)
 
 
 def test_degraded_it_flies_slower_and_says_so() -> None:
@@ -339,8 +367,8 @@ def test_no_velocity_towards_a_neighbour_that_is_too_near() -> None:
     assert verdict.objections == (Objection.SEPARATION,)
 
 
-def test_away_from_it_and_past_a_farther_one_the_drone_may_fly() -> None:
-    for around in (near([-0.9, 0.0, 0.0]), near([1.0, 0.0, 0.0]), near([0.7, 0.0, 0.8])):
+def test_away_from_it_and_below_or_far_from_another_the_drone_may_fly() -> None:
+    for around in (near([-0.9, 0.0, 0.0]), near([3.0, 0.0, 0.0]), near([0.7, 0.0, 1.1])):
         verdict = Stream().second([1.0, 0.5], around=around)
         np.testing.assert_allclose(sent(verdict).velocity, [1.0, 0.5])
         assert verdict.objections == ()
@@ -348,9 +376,9 @@ def test_away_from_it_and_past_a_farther_one_the_drone_may_fly() -> None:
 
 def test_degraded_it_keeps_farther_away() -> None:
     parameters = DRAG_FREE.model_copy(update={"min_separation_m": 1.0, "degraded_separation_m": 1.5})
-    for action, velocity in ((Action.FLY, [0.5, 0.5]), (Action.FLY_DEGRADED, [0.0, 0.5])):
+    for action, velocity in ((Action.FLY, [0.2, 0.5]), (Action.FLY_DEGRADED, [0.0, 0.5])):
         np.testing.assert_allclose(
-            sent(Stream(parameters).second([0.5, 0.5], action, near([1.4, 0.0, 0.0]))).velocity, velocity
+            sent(Stream(parameters).second([0.2, 0.5], action, near([1.4, 0.0, 0.0]))).velocity, velocity
         )
     moving = replace(near([1.4, 0.0, 0.0]), velocity=np.array([1.0, 0.0]))
     np.testing.assert_allclose(sent(Stream(parameters).step([0.0, 0.0], Action.HOVER, moving)).velocity, STILL)
@@ -360,6 +388,61 @@ def test_a_neighbour_straight_above_is_in_no_direction() -> None:
     verdict = Stream().second([1.0, 0.5], around=near([0.0, 0.0, -0.5]))
     np.testing.assert_allclose(sent(verdict).velocity, [1.0, 0.5])
     assert verdict.objections == ()
+
+
+@pytest.mark.parametrize("range_m", [0.0, 1e-163, 1e-9, 0.099])
+def test_a_neighbour_nearer_than_its_direction_can_be_measured_is_in_no_direction(range_m: float) -> None:
+    verdict = Stream().second([1.0, 0.5], around=near([range_m, 0.0, 0.0]))
+    np.testing.assert_allclose(sent(verdict).velocity, [1.0, 0.5])
+    assert verdict.objections == ()
+
+
+def test_towards_a_neighbour_it_flies_no_faster_than_it_can_brake() -> None:
+    parameters = DRAG_FREE.model_copy(update={"braking_m_s2": 2.0, "reaction_s": 0.5})
+    # 3 m to the minimum distance of 1 m. Both at 1.65 m/s: half a second takes 1.65 m, braking 2 * 1.65^2 / (2 * 2) m.
+    verdict = Stream(parameters).second([3.5, 0.5], around=near([4.0, 0.0, 0.0]))
+    np.testing.assert_allclose(sent(verdict).velocity, [1.6458, 0.5], atol=1e-4)
+    assert verdict.objections == (Objection.SEPARATION,)
+    # It comes at 2 m/s: 1 m for its half second and 1 m to brake; 1 m is left for 0.5 s and the braking from 1.24 m/s.
+    coming = replace(near([4.0, 0.0, 0.0]), neighbour_velocities=np.array([[-2.0, 0.3]]))
+    verdict = Stream(parameters).second([3.5, 0.0], around=coming)
+    np.testing.assert_allclose(sent(verdict).velocity, [1.2361, 0.0], atol=1e-4)
+    # One that comes at 4 m/s needs all of the 3 m and more.
+    racing = replace(near([4.0, 0.0, 0.0]), neighbour_velocities=np.array([[-4.0, 0.0]]))
+    np.testing.assert_allclose(sent(Stream(parameters).second([3.5, 0.0], around=racing)).velocity, STILL, atol=1e-9)
+    # Behind one that flies ahead at the same 2 m/s just outside the minimum distance nothing is held back.
+    ahead = replace(near([1.01, 0.0, 0.0]), neighbour_velocities=np.array([[2.0, 0.0]]))
+    np.testing.assert_allclose(sent(Stream(parameters).second([2.0, 0.0], around=ahead)).velocity, [2.0, 0.0])
+
+
+@pytest.mark.parametrize(("lag_s", "period_s", "least_m"), [(0.0, 0.05, 1.0), (0.35, 0.5, 0.999)])
+def test_two_that_fly_at_each_other_at_3_m_s_stop_before_the_minimum_distance(
+    lag_s: float, period_s: float, least_m: float
+) -> None:
+    """Point masses, 20 m apart, that brake at 5 m/s^2; then ones that lag too, and see each other twice a second."""
+    gates = [Stream(GateParameters()), Stream(GateParameters())]
+    places, velocities = np.array([[0.0, 0.0], [20.0, 0.0]]), np.array([[3.0, 0.0], [-3.0, 0.0]])
+    seen, seen_velocities, nearest_m = places, velocities, 20.0
+    for step in range(400):
+        if step % round(period_s / 0.05) == 0:
+            seen, seen_velocities, seen_s = places, velocities, step * 0.05
+        setpoints = np.zeros((2, 2))
+        for me, other in ((0, 1), (1, 0)):
+            offset = seen[other] + seen_velocities[other] * (step * 0.05 - seen_s) - places[me]
+            around = Surroundings(
+                position=places[me],
+                velocity=velocities[me],
+                yaw_rad=0.0,
+                neighbours=np.array([[*offset, 0.0]]),
+                neighbour_velocities=seen_velocities[[other]],
+            )
+            setpoints[me] = sent(gates[me].step([3.0 - 6.0 * me, 0.0], around=around)).velocity
+        for _ in range(5):
+            change = (setpoints - velocities) * (1.0 if lag_s == 0.0 else 0.01 / lag_s)
+            velocities = velocities + np.clip(change, -0.05, 0.05)  # 5 m/s^2 for 0.01 s
+            places = places + 0.01 * velocities
+            nearest_m = min(nearest_m, float(np.linalg.norm(places[1] - places[0])))
+    assert least_m <= nearest_m < 1.3
 
 
 def test_between_two_neighbours_only_the_way_between_or_standstill_is_left() -> None:
@@ -431,11 +514,13 @@ def test_whatever_is_asked_for_what_is_sent_is_safe(seed: int, odd: float) -> No
             height_m=10.0 + _number(rng, 8.0, odd),
             yaw_rad=_number(rng, 2.0, odd),
         )
+        number = int(rng.integers(0, 4))
         around = Surroundings(
             position=_vector(rng, 2, 6.0, odd),
             velocity=_vector(rng, 2, 2.0, odd),
             yaw_rad=_number(rng, 2.0, odd),
-            neighbours=np.array([_vector(rng, 3, 1.0, odd) for _ in range(rng.integers(0, 4))]).reshape(-1, 3),
+            neighbours=np.array([_vector(rng, 3, 1.0, odd) for _ in range(number)]).reshape(-1, 3),
+            neighbour_velocities=np.array([_vector(rng, 2, 1.0, odd) for _ in range(number)]).reshape(-1, 2),
         )
         verdict = gate.step(now_s, permission, want, around)
         setpoint = verdict.setpoint
@@ -463,7 +548,11 @@ def test_whatever_is_asked_for_what_is_sent_is_safe(seed: int, odd: float) -> No
 
 
 def _assert_not_towards_a_near_one(setpoint: Setpoint, around: Surroundings, separation_m: float) -> bool:
-    near_ones = [n for n in around.neighbours if np.isfinite(n).all() and math.hypot(*n) < separation_m]
+    near_ones = [
+        n
+        for n in around.neighbours
+        if np.isfinite(n).all() and math.hypot(*n) < separation_m and math.hypot(*n[:2]) >= 0.1
+    ]
     for neighbour in near_ones:
         soon = neighbour[:2] - 1e-6 * setpoint.velocity
         assert math.hypot(*soon) >= math.hypot(*neighbour[:2]) - 1e-14
@@ -487,17 +576,21 @@ def _assert_not_outward(setpoint: Setpoint, around: Surroundings) -> bool:
 
 
 def test_what_is_left_is_the_nearest_to_what_was_asked_for() -> None:
-    """Against all velocities of a fine grid."""
+    """Against all velocities of a fine grid: none leads towards what is within 1 m, nor faster than can be braked."""
     rng = np.random.default_rng(5)
     angles = np.linspace(0.0, math.tau, 360, endpoint=False)
     speeds = np.linspace(0.0, 1.5, 151)
     grid = np.concatenate([speed * np.column_stack([np.cos(angles), np.sin(angles)]) for speed in speeds])
-    for _ in range(25):
-        offsets = rng.normal(0.0, 0.3, (int(rng.integers(1, 4)), 2))
-        neighbours = np.hstack([offsets, np.zeros((len(offsets), 1))])
-        velocity = rng.normal(0.0, 0.5, 2)
-        around = replace(HOME, neighbours=neighbours)
-        left = sent(Stream().second(velocity, around=around)).velocity
-        allowed = grid[(grid @ neighbours[:, :2].T <= 1e-9).all(axis=1)]
+    parameters = DRAG_FREE.model_copy(update={"braking_m_s2": 1.5, "reaction_s": 0.5})
+    for _ in range(40):
+        bearings, ranges = rng.uniform(0.0, math.tau, (n := int(rng.integers(1, 4)))), rng.uniform(0.1, 1.4, n)
+        towards = np.column_stack([np.cos(bearings), np.sin(bearings)])
+        velocity = rng.normal(0.0, 0.6, 2)
+        around = near(*np.column_stack([ranges[:, None] * towards, np.zeros(n)]))
+        left = sent(Stream(parameters).second(velocity, around=around)).velocity
+        along = grid @ towards.T
+        needed_m = 2 * (0.5 * along + along**2 / 3.0)
+        allowed = grid[((along <= 1e-9) | (needed_m <= ranges - 1.0)).all(axis=1)]
         nearest = np.linalg.norm(allowed - velocity, axis=1).min()
         assert np.linalg.norm(left - velocity) <= nearest + 1e-6
+        assert np.linalg.norm(left - velocity) >= nearest - 0.02  # the grid's step

@@ -46,6 +46,26 @@ def test_limits_of_the_supervisor(limits: dict[str, Any], words: str) -> None:
         SafetyParameters(**limits)
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("safety.gate.command_timeout_s", 1e9),
+        ("safety.gate.max_speed_m_s", 1e6),
+        ("safety.gate.max_acceleration_m_s2", 1e6),
+        ("safety.gate.fence_radius_m", 1e300),
+        ("safety.gate.max_height_m", 1e9),
+        ("safety.gate.min_separation_m", 1e9),
+        ("safety.estimate_timeout_s", 1e9),
+        ("safety.heartbeat_timeout_s", 1e9),
+        ("safety.outside_s", 1e9),
+        ("flocking.max_speed_m_s", 1e6),
+    ],
+)
+def test_limits_beyond_what_any_multirotor_does_are_refused(key: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=key.rpartition(".")[2]):
+        load_drone(SIMULATOR, {key: value})
+
+
 def test_a_law_faster_than_the_gate_is_reported_with_both_keys() -> None:
     with pytest.raises(
         ConfigError, match=r"flocking.max_speed_m_s 6 is above safety.gate.max_speed_m_s.*write 4 or less"

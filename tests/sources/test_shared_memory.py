@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import socket
 import struct
 import subprocess
@@ -47,9 +48,12 @@ def source(endpoint: str) -> Iterator[SharedMemorySource]:
     source.stop()
 
 
-def _send(publisher: FramePublisher, number: int, drone: str = "3") -> None:
+def _send(publisher: FramePublisher, number: int, drone: str = "3") -> float:
+    """Gives the time stamp."""
+    time_s = time.monotonic()
     for offset, camera in enumerate(CAMERAS):
-        publisher.publish(drone, Frame(camera, scene(2 * number + offset), 0.5 * number, number))
+        publisher.publish(drone, Frame(camera, scene(2 * number + offset), time_s, number))
+    return time_s
 
 
 def _first(publisher: FramePublisher, source: SharedMemorySource) -> tuple[FrameSet, int]:
@@ -63,11 +67,10 @@ def _first(publisher: FramePublisher, source: SharedMemorySource) -> tuple[Frame
 
 
 def _assert_same(frames: FrameSet, number: int) -> None:
-    assert frames.time_s == 0.5 * number
     assert frames.frames.keys() == set(CAMERAS)
     for offset, camera in enumerate(CAMERAS):
         frame = frames.frames[camera]
-        assert (frame.camera, frame.time_s, frame.sequence) == (camera, 0.5 * number, number)
+        assert (frame.camera, frame.time_s, frame.sequence) == (camera, frames.time_s, number)
         np.testing.assert_array_equal(frame.image, scene(2 * number + offset))
 
 
@@ -84,11 +87,12 @@ def _shared_memory_works() -> bool:
 def test_frames_arrive_byte_for_byte_in_one_process(endpoint: str, source: SharedMemorySource) -> None:
     with FramePublisher(listen=[endpoint]) as publisher:
         frames, number = _first(publisher, source)
-        _assert_same(frames, int(frames.time_s / 0.5))
+        _assert_same(frames, frames.frames["front"].sequence)
         for later in range(number, number + 10):
-            _send(publisher, later)
+            time_s = _send(publisher, later)
             received = source.newest(5.0)
             assert received is not None
+            assert received.time_s == time_s
             _assert_same(received, later)
         status = source.status()["front"]
         assert status.fault is None
@@ -106,9 +110,10 @@ from tests.sources.camera_images import scene
 scenes = [scene(number) for number in range(40)]
 with FramePublisher(listen=[{endpoint!r}]) as publisher:
     for number in range(4000):
+        time_s = time.monotonic()
         for offset, camera in enumerate({CAMERAS!r}):
             image = scenes[(2 * number + offset) % 40]
-            publisher.publish("3", Frame(camera, image, 0.5 * number, number))
+            publisher.publish("3", Frame(camera, image, time_s, number))
         time.sleep(0.05)
 """
     with subprocess.Popen([sys.executable, "-c", simulator]) as process:
@@ -119,7 +124,7 @@ with FramePublisher(listen=[{endpoint!r}]) as publisher:
     whole = [frames for frames in received if frames is not None and len(frames.frames) == 2]
     assert len(whole) >= 18, "the first may lack a camera that was not connected yet"
     for frames in whole:
-        number = round(frames.time_s / 0.5)
+        number = frames.frames["front"].sequence
         for offset, camera in enumerate(CAMERAS):
             assert frames.frames[camera].sequence == number
             np.testing.assert_array_equal(frames.frames[camera].image, scene((2 * number + offset) % 40))
@@ -153,7 +158,7 @@ def test_without_shared_memory_the_same_bytes_come_through_the_socket_with_a_not
             "slower, and otherwise the same",
         )
         frames, _ = _first(publisher, source)
-        _assert_same(frames, int(frames.time_s / 0.5))
+        _assert_same(frames, frames.frames["front"].sequence)
         assert len(source.notes()) == 1
         assert "through a socket instead of shared memory" in source.notes()[0]
 
@@ -164,7 +169,7 @@ def test_a_pool_that_is_full_sends_through_the_socket_and_says_so_once(
     monkeypatch.setattr(shared_memory, "_POOL_BYTES", 1 << 16)
     with FramePublisher(listen=[endpoint]) as publisher:
         frames, _ = _first(publisher, source)
-        _assert_same(frames, int(frames.time_s / 0.5))
+        _assert_same(frames, frames.frames["front"].sequence)
         assert len(publisher.notes()) == 1
         assert "instead of shared memory" in publisher.notes()[0]
 
@@ -195,11 +200,31 @@ def test_messages_that_are_no_frames_are_counted_and_ignored(endpoint: str, sour
             time.sleep(0.01)
         assert status.counts["malformed"] == 3
         assert status.fault == "front: frames are 320x240, but the rig has 640x480; correct one"
-        stranger.put(b"too short", attachment=header.pack(b"rgb8", 640, 480, number, 0.5 * number))
-        publisher.publish("3", Frame("back", scene(), 0.5 * number, number))
+        stranger.put(b"too short", attachment=header.pack(b"rgb8", 640, 480, number, time.monotonic()))
+        publisher.publish("3", Frame("back", scene(), time.monotonic(), number))
         frames = source.newest(5.0)
         assert frames is not None
         assert frames.frames.keys() == {"back"}
+
+
+@pytest.mark.parametrize("wrong_by_s", [3.0, 86400.0, 1e300, -86400.0, math.nan, math.inf])
+def test_stamps_of_another_clock_are_dropped_and_good_frames_go_on_at_once(
+    endpoint: str, source: SharedMemorySource, wrong_by_s: float
+) -> None:
+    with FramePublisher(listen=[endpoint]) as publisher:
+        _, number = _first(publisher, source)
+        while source.newest(0.1) is not None:
+            pass
+        publisher.publish("3", Frame("front", scene(), time.monotonic() + wrong_by_s, number))
+        assert source.newest(0.2) is None
+        status = source.status()["front"]
+        assert status.counts["time_stamp"] == 1
+        assert status.fault == "front: a time stamp is not of this computer's clock; correct the program"
+        _send(publisher, number + 1)
+        received = source.newest(5.0)
+        assert received is not None
+        _assert_same(received, number + 1)
+        assert source.status()["front"].fault is None
 
 
 def test_an_endpoint_that_is_none_is_reported_in_one_sentence() -> None:
