@@ -55,10 +55,11 @@ EQUIVALENT: dict[str, str] = {
     "supervisor.py Supervisor.__init__: pass  # self._now_s = -math.inf": "each step writes it before it is read",
     "supervisor.py Supervisor.__init__: self._now_s = (math.inf)": "each step writes it before it is read",
     "supervisor.py Supervisor.__init__: self._now_s = -(0.0)": "each step writes it before it is read",
-    "gate.py _without: if ((along < 0)).all():": "with no part along a direction, none is taken away",
-    "gate.py _without: fitting = candidates[(np.max(candidates @ directions.T, axis=1) < _ROUNDING_M_S)]": (
+    "gate.py _within: if ((over < 0)).all():": "with a limit just reached, its foot is the velocity itself",
+    "gate.py _within: fitting = candidates[(np.max(candidates @ directions.T - limits, axis=1) < _ROUNDING_M_S)]": (
         "differs where the rounding is exactly the rounding allowed"
     ),
+    "gate.py _crossings: i, j = np.triu_indices(len(directions), (0))": "a line is parallel to itself, and does not cross",
     "fence.py _inside: ends = np.roll(corners, (1), axis=0)": "the same outline, the other way round",
     "fence.py _inside: return bool(np.sum((east >= e1 + (e2 - e1) * (north - n1) / (n2 - n1))) % 2)": (
         "the same ray, to the west; a closed outline is crossed an even number of times in all"
