@@ -59,7 +59,7 @@ EQUIVALENT: dict[str, str] = {
     "gate.py _within: fitting = candidates[(np.max(candidates @ directions.T - limits, axis=1) < _ROUNDING_M_S)]": (
         "differs where the rounding is exactly the rounding allowed"
     ),
-    "gate.py _crossings: i, j = np.triu_indices(len(directions), (0))": "a line is parallel to itself, and does not cross",
+    "gate.py _crossings: i, j = np.triu_indices(len(directions), (0))": "a line is parallel to itself",
     "fence.py _inside: ends = np.roll(corners, (1), axis=0)": "the same outline, the other way round",
     "fence.py _inside: return bool(np.sum((east >= e1 + (e2 - e1) * (north - n1) / (n2 - n1))) % 2)": (
         "the same ray, to the west; a closed outline is crossed an even number of times in all"
