@@ -112,7 +112,7 @@ def main() -> None:
     """One file a source."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--pictures", type=Path)
+    parser.add_argument("--crops", type=Path)
     parser.add_argument("--skydrones", type=Path)
     parser.add_argument("--split", choices=("training", "validation"), default="training", help="of the clips")
     parser.add_argument("--model", type=Path, required=True, help="manifest of a neighbours network")
@@ -123,7 +123,7 @@ def main() -> None:
     model = OnnxModel(arguments.model, threads=1)
     if arguments.skydrones:
         _mine_clips(arguments.skydrones, arguments.split, model, arguments.out)
-    for folder in sorted(arguments.pictures.iterdir()) if arguments.pictures else []:
+    for folder in sorted(arguments.crops.iterdir()) if arguments.crops else []:
         target = arguments.out / f"{folder.name}.npz"
         if target.is_file():
             continue

@@ -1,7 +1,7 @@
 """Make the 8-bit twin of a network: half the time on a CPU. The range of its numbers is learnt from rendered images.
 
 python -m tools.quantise models/neighbours.yaml --data DATA/training --out models
-python -m tools.quantise models/distance.yaml --data DATA/pictures --out models
+python -m tools.quantise models/distance.yaml --data DATA/crops --out models
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("manifest", type=Path, help="of the float network")
     parser.add_argument(
-        "--data", type=Path, required=True, help="folder of tools.render_training_data, or tools.render_drone_pictures"
+        "--data", type=Path, required=True, help="folder of tools.render_training_data, or tools.render_drone_crops"
     )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--accuracy", action="append", default=[], metavar="WHAT=FIGURE", help="measured accuracy")
@@ -185,7 +185,7 @@ def _crops(manifest: Manifest, folder: Path, count: int) -> Iterator[Feeds]:
     rng = np.random.Generator(np.random.PCG64(0))
     files = sorted(folder.glob("*.npz"))[:count]
     if not files:
-        raise SystemExit(f"{folder}: no pictures here; make them with `python -m tools.render_drone_pictures`")
+        raise SystemExit(f"{folder}: no crops here; make them with `python -m tools.render_drone_crops`")
     for index in range(count):
         with np.load(files[index % len(files)]) as arrays:
             yield {name: rng.choice(arrays["picture"], 16)}

@@ -1,7 +1,7 @@
 """Train one network on rendered pairs; resumes from its last checkpoint.
 
     python -m tools.train neighbours --data DATA --out RUNS/neighbours --minutes 40
-    python -m tools.train distance   --data DATA --out RUNS/distance --minutes 90 --pictures P --negatives N.npy
+    python -m tools.train distance   --data DATA --out RUNS/distance --minutes 90 --crops P --negatives N.npy
     python -m tools.train flow       --data DATA --out RUNS/flow --minutes 40
 
 Writes OUT/checkpoint.pt, OUT/curve.csv and a picture of it every few minutes. Uses a GPU where there is one.
@@ -28,10 +28,10 @@ from torch.nn import functional as F
 from torch.optim.swa_utils import AveragedModel
 
 from tools.training.augment import photometric
+from tools.training.crop_files import CropFiles
 from tools.training.dataset import PairSet, open_pairs
 from tools.training.from_onnx import begin_with_onnx
 from tools.training.networks import MAX_DEPTH_M, DistanceNet, FlowNet, NeighboursNet
-from tools.training.pictures import PictureFiles
 from tools.training.samples import (
     Sample,
     flow_sample,
@@ -107,9 +107,9 @@ class NeighboursTask(Task):
 
 
 class DistanceTask(Task):
-    """Range of the drone in the middle of a picture, and which pixels are its own.
+    """Range of the drone in the middle of a crop, and which pixels are its own.
 
-    Drones come from the files of render_drone_pictures.py, as many as there are by now. Most of what is no drone is cut
+    Drones come from the files of render_drone_crops.py, as many as there are by now. Most of what is no drone is cut
     from whole images, into a pool that is renewed a little with every batch: cutting costs more than learning from it.
     """
 
@@ -120,7 +120,7 @@ class DistanceTask(Task):
     def __init__(self, pairs: PairSet, negatives: Path, pictures: Path) -> None:
         super().__init__(DistanceNet(), 64, 2e-3)
         self.pairs, self.negatives = pairs, np.load(negatives)
-        self.drones = PictureFiles(pictures)
+        self.drones = CropFiles(pictures)
         self.no_drones: list[Sample] = []
 
     def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
@@ -184,7 +184,7 @@ def _mask_loss(logits: Tensor, mask: Tensor, drone: Tensor) -> tuple[Tensor, flo
 
 
 def _flipped(batch: Batch) -> Batch:
-    """Another half of the pictures each time left to right, a tenth in strange colours, all in another light."""
+    """Another half of the crops each time left to right, a tenth in strange colours, all in another light."""
     n = len(batch["picture"])
     mirror = torch.rand(n) < 0.5
     sign = torch.where(mirror, -1.0, 1.0)
@@ -201,9 +201,9 @@ def _flipped(batch: Batch) -> Batch:
 
 
 def _motor_maps(motors: Tensor, sigma: float = 1.5) -> Tensor:
-    """(n, 4, 2) places in px from the picture's middle -> (n, 4, 48 * 48) shares of maps of half its size.
+    """(n, 4, 2) places in px from the crop's middle -> (n, 4, 48 * 48) shares of maps of half its size.
 
-    From left to right; what lies outside the picture counts for its border.
+    From left to right; what lies outside the crop counts for its border.
     """
     order = motors[:, :, 0].argsort(1)
     places = torch.gather(motors, 1, order[:, :, None].expand(-1, -1, 2)).clamp(-47.0, 47.0)
@@ -250,9 +250,9 @@ def _task(arguments: argparse.Namespace) -> Task:
     pairs = open_pairs(arguments.data)
     if arguments.network != "distance":
         return NeighboursTask(pairs) if arguments.network == "neighbours" else FlowTask(pairs)
-    if arguments.negatives is None or arguments.pictures is None:
-        raise SystemExit("the distance network needs --pictures and --negatives")
-    return DistanceTask(pairs, arguments.negatives, arguments.pictures)
+    if arguments.negatives is None or arguments.crops is None:
+        raise SystemExit("the distance network needs --crops and --negatives")
+    return DistanceTask(pairs, arguments.negatives, arguments.crops)
 
 
 def main() -> None:
@@ -263,7 +263,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--minutes", type=float, default=60.0, help="of training in all, over every resumption")
     parser.add_argument("--negatives", type=Path, help="what is no drone, for `distance`: file of mine_negatives.py")
-    parser.add_argument("--pictures", type=Path, help="drones, for `distance`: folder of render_drone_pictures.py")
+    parser.add_argument("--crops", type=Path, help="drones, for `distance`: folder of render_drone_crops.py")
     parser.add_argument("--rate", type=float, help="learning rate to begin with")
     parser.add_argument("--start", type=Path, help="weights to begin with: another run's checkpoint.pt, or an .onnx")
     parser.add_argument("--compile", action="store_true", help="`distance` a fifth faster; needs a C++ compiler")

@@ -2,7 +2,7 @@
 
     python -m tools.train_real --rendered PICTURES --patches PATCHES --start models/distance.onnx --out RUN --minutes 60
 
-PICTURES is the folder of tools/render_drone_pictures.py, PATCHES that of tools/mine_pictures.py. Resumes like
+PICTURES is the folder of tools/render_drone_crops.py, PATCHES that of tools/mine_pictures.py. Resumes like
 tools/train.py, and writes the same files.
 """
 
@@ -21,8 +21,8 @@ from torch.nn import functional as F
 from tools.train import Batch, Task, _flipped, _motor_maps, _start, train
 from tools.training import real_samples
 from tools.training.augment import photometric
+from tools.training.crop_files import CropFiles
 from tools.training.networks import DistanceNet
-from tools.training.pictures import PictureFiles
 from tools.training.real_patches import RealPatches
 from tools.training.samples import Sample
 
@@ -42,7 +42,7 @@ class RealTask(Task):
 
     def __init__(self, rendered: Path, patches: Path) -> None:
         super().__init__(DistanceNet(), sum(MIX.values()), 5e-4)
-        self.rendered = PictureFiles(rendered)
+        self.rendered = CropFiles(rendered)
         self.negatives = RealPatches(patches, "negative")
         self.places = RealPatches(patches, "place", weights={"skydrones": 8.0, "skyothers": 8.0})
         self.drones = RealPatches(patches, "drone")

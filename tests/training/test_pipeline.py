@@ -15,9 +15,9 @@ from flockd.cli import main
 from flockd.data import data_path
 from tools.training import worlds
 from tools.training.augment import UNTOUCHED, photometric
+from tools.training.crop_files import CropFiles
 from tools.training.dataset import FOCAL_PX, HEIGHT, WIDTH
-from tools.training.pictures import PictureFiles
-from tools.training.samples import DroneInView, crop_around, picture_of, warped
+from tools.training.samples import DroneInView, crop_around, sample_of, warped
 
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
 
@@ -89,7 +89,7 @@ def test_the_mask_of_a_crop_is_the_drone_that_it_faces() -> None:
     mine = image[:, :, 0] > 0
     seen = DroneInView(FOCAL_PX, np.array([(240 - WIDTH / 2) / FOCAL_PX * 4, 0.0, 4.0]), np.eye(3), 0)
     for _ in range(10):
-        sample = picture_of(seen, crop_around(seen, rng), image, mine)
+        sample = sample_of(seen, crop_around(seen, rng), image, mine)
         red = sample["picture"][:, :, 0] > 127
         mask = sample["mask"] > 127
         assert red.sum() > 200
@@ -109,5 +109,5 @@ def test_some_images_stay_clear_and_the_others_are_spoilt_each_in_its_own_way() 
 
 def test_images_from_before_they_had_masks_are_refused_by_name(tmp_path: Path) -> None:
     np.savez(tmp_path / "1.npz", picture=np.zeros((1, 96, 96, 3), np.uint8), drone=np.ones(1, np.float32))
-    with pytest.raises(ValueError, match=r"1\.npz: its pictures have no masks; make the folder anew"):
-        PictureFiles(tmp_path)
+    with pytest.raises(ValueError, match=r"1\.npz: its crops have no masks; make the folder anew"):
+        CropFiles(tmp_path)

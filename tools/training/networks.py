@@ -1,7 +1,7 @@
 """The architectures of the shipped networks, in torch. Every one takes 8-bit RGB and normalises inside.
 
 - ``NeighboursNet``: one image -> metric depth, drone mask, and each drone pixel's offset to its drone's centre.
-- ``DistanceNet``: a small picture centred on one drone -> its range, centre and uncertainty.
+- ``DistanceNet``: a small crop centred on one drone -> its range, centre and uncertainty.
 - ``FlowNet``: two images -> optical flow, by recurrent lookups in an all-pairs correlation (RAFT, Teed & Deng 2020).
 """
 
@@ -178,14 +178,14 @@ class NeighboursNet(nn.Module):
 
 
 class DistanceNet(nn.Module):
-    """Range of the drone in the middle of a picture.
+    """Range of the drone in the middle of a crop.
 
-    Maps of half the picture's size say where its four motors are, from the leftmost to the rightmost; how far they lie
-    apart tells how large the drone appears, to a fraction of a pixel. What the whole picture looks like tells which
+    Maps of half the crop's size say where its four motors are, from the leftmost to the rightmost; how far they lie
+    apart tells how large the drone appears, to a fraction of a pixel. What the whole crop tells which
     shape of drone it is, hence its size in metres. Range is one over the other.
 
-    Input: picture (n, 96, 96, 3) uint8 of a virtual camera that faces the drone. Outputs (n, 6):
-    log of (range in m / focal length in px), the drone's centre right and down of the picture's centre in px,
+    Input: `picture` (n, 96, 96, 3) uint8, the crop of a virtual camera that faces the drone. Outputs (n, 6):
+    log of (range in m / focal length in px), the drone's centre right and down of the crop's centre in px,
     log of the standard deviation of the first, logit of there being a drone at all, log of the drone's size in px
     as it would appear from the side (its size in m times focal length over range). And (n, 96, 96): for each pixel the
     logit of being this drone's.
@@ -218,7 +218,7 @@ class DistanceNet(nn.Module):
         self.family = nn.Linear(160, MAX_FAMILIES)
 
     def forward(self, picture: Tensor) -> tuple[Tensor, ...]:
-        """One row and one mask a picture.
+        """One row and one mask a crop.
 
         In training also a logit for each family, and log maps of the motors (n, 4, 48 * 48).
         """
@@ -247,7 +247,7 @@ class DistanceNet(nn.Module):
 
 
 def _moments(where: Tensor) -> tuple[Tensor, Tensor]:
-    """Of maps (n, k, h, w) of logits: their middles (n, k, 2) in picture pixels, and all their moments (n, 6 k)."""
+    """Of maps (n, k, h, w) of logits: their middles (n, k, 2) in crop pixels, and all their moments (n, 6 k)."""
     n, k, h, w = where.shape
     flat = where.flatten(2)
     v, u = torch.meshgrid(torch.arange(h).float() + 0.5 - h / 2, torch.arange(w).float() + 0.5 - w / 2, indexing="ij")

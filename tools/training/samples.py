@@ -96,7 +96,7 @@ def crop_around(drone: DroneInView, rng: np.random.Generator) -> VirtualCrop:
 def crop_at(centre: NDArray[Any], size_m: float, focal: float, rng: np.random.Generator) -> VirtualCrop:
     """Where the second stage might look: half of the time as aimed by the first network, else by itself."""
     aimed = rng.random() < 0.5
-    # How much of the picture the drone fills must say nothing about metres: it is drawn apart from family and range.
+    # How much of the crop the drone fills must say nothing about metres: it is drawn apart from family and range.
     fill = float(np.exp(np.clip(rng.normal(np.log(1.35), 0.1 if aimed else 0.27), np.log(0.7), np.log(2.4))))
     half_width = size_m / 2 * fill
     shift_m = rng.normal(0, 0.03 if aimed else 0.15, 2) * half_width
@@ -106,7 +106,7 @@ def crop_at(centre: NDArray[Any], size_m: float, focal: float, rng: np.random.Ge
     return virtual_crop(Rig({"camera": rig_camera(focal)}), aim / np.linalg.norm(aim), half_angle, 96)
 
 
-def picture_of(drone: DroneInView, crop: VirtualCrop, image: NDArray[Any], mine: NDArray[Any]) -> Sample:
+def sample_of(drone: DroneInView, crop: VirtualCrop, image: NDArray[Any], mine: NDArray[Any]) -> Sample:
     """What ``crop`` shows of the camera's ``image`` (h, w, 3), with the truth; ``mine`` (h, w): the drone's pixels."""
     picture, _ = crop.sample({"camera": image})
     hubs = drone.centre + HUBS[drone.family] @ drone.rotation.T
@@ -131,7 +131,7 @@ def _mask_of(crop: VirtualCrop, mine: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def no_drone_sample(pairs: PairSet, negative: NDArray[Any] | None, rng: np.random.Generator) -> Sample:
-    """A picture of something else: a row of mine_negatives.py, or anywhere in any image."""
+    """A crop of something else: a row of mine_negatives.py, or anywhere in any image."""
     if negative is not None:
         pair, k = int(negative[0]), int(negative[1])
         middle, half_px = negative[2:4] + rng.normal(0, 0.15, 2) * negative[4], negative[4]
@@ -147,10 +147,10 @@ def no_drone_sample(pairs: PairSet, negative: NDArray[Any] | None, rng: np.rando
     aim = R_BODY_CAMERA @ np.array([*((middle - (WIDTH / 2, HEIGHT / 2)) / focal), 1.0])
     half_angle = float(np.arctan(max(half_px, 4.0) / focal))
     crop = virtual_crop(Rig({"camera": rig_camera(focal)}), aim / np.linalg.norm(aim), half_angle, 96)
-    return picture_of_no_drone(crop, np.asarray(pairs["image"][pair][k]))
+    return sample_without_drone(crop, np.asarray(pairs["image"][pair][k]))
 
 
-def picture_of_no_drone(crop: VirtualCrop, image: NDArray[Any]) -> Sample:
+def sample_without_drone(crop: VirtualCrop, image: NDArray[Any]) -> Sample:
     """What ``crop`` shows of the camera's ``image``, where nothing is to be found."""
     picture, _ = crop.sample({"camera": image})
     return {

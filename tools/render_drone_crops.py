@@ -1,9 +1,9 @@
-"""Render pictures of single drones as the distance network is shown them: many more than whole images would give.
+"""Render crops of single drones as the distance network is shown them: many more than whole images would give.
 
-    python -m tools.render_drone_pictures OUT --worlds 300 --scenes 300
+    python -m tools.render_drone_crops OUT --worlds 300 --scenes 300
 
-Only the window of the camera's image that the pictures look at is drawn. Every drone stands in another place. One file
-a world, which `train.py distance --pictures OUT` takes up as they appear.
+Only the window of the camera's image that the crops show is drawn. Every drone stands in another place. One file
+a world, which `train.py distance --crops OUT` takes up as they appear.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--worlds", type=int, default=300)
-    parser.add_argument("--skip", type=int, default=0, help="worlds, of which there are pictures already elsewhere")
+    parser.add_argument("--skip", type=int, default=0, help="worlds, of which there are crops already elsewhere")
     parser.add_argument("--scenes", type=int, default=400, help="drones a world")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     arguments = parser.parse_args()
@@ -77,7 +77,7 @@ def _scene(world: Any, place: Array, models: dict[int, list[Any]], rng: np.rando
     """Pictures of one drone from one camera; other drones and distractors may stand before or behind it."""
     from flockd.sim.renderer import Renderer  # noqa: PLC0415
     from tools.training.distractions import drawn_distraction  # noqa: PLC0415
-    from tools.training.samples import DroneInView, crop_around, crop_at, picture_of, picture_of_no_drone  # noqa: PLC0415
+    from tools.training.samples import DroneInView, crop_around, crop_at, sample_of, sample_without_drone  # noqa: PLC0415
 
     focal = FOCAL_PX * float(np.exp(rng.normal(0, 0.08)))
     ground = float(world.height_at(place[:1], place[1:2])[0])
@@ -118,10 +118,10 @@ def _scene(world: Any, place: Array, models: dict[int, list[Any]], rng: np.rando
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     image[top:bottom, left:right] = view.rgb
     if alone:
-        return [picture_of_no_drone(crop, image) for crop in crops]
+        return [sample_without_drone(crop, image) for crop in crops]
     mine = np.zeros((HEIGHT, WIDTH), np.bool_)
     mine[top:bottom, left:right] = view.ids == 1
-    return [picture_of(seen, crop, image, mine) for crop in crops]
+    return [sample_of(seen, crop, image, mine) for crop in crops]
 
 
 def _places(position: Array, R_ned_camera: Array, focal: float, count: int, rng: np.random.Generator) -> Array:

@@ -12,12 +12,12 @@ from tools.training.samples import Sample
 _LOOK_EVERY = 200
 """Calls between two looks into the folder."""
 _AIMED_SHARE = 0.6
-"""At least so many of the drones are in the middle and fill their picture: the last look at a drone is what counts."""
+"""At least so many of the drones are in the middle and fill their crop: the last crop of a drone is what counts."""
 _AIMED_OFF_PX, _AIMED_PX = 4.0, (60.0, 84.0)
 
 
-class PictureFiles:
-    """Every sample of every file of ``render_drone_pictures.py``, in memory."""
+class CropFiles:
+    """Every sample of every file of ``render_drone_crops.py``, in memory."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -38,10 +38,10 @@ class PictureFiles:
                 with np.load(path) as arrays:
                     self._files[path] = dict(arrays)
                 if "mask" not in self._files[path]:
-                    raise ValueError(f"{path}: its pictures have no masks; make the folder anew")
+                    raise ValueError(f"{path}: its crops have no masks; make the folder anew")
         if not self._files:
             raise FileNotFoundError(
-                f"{self._folder}: no pictures here; make them with `python -m tools.render_drone_pictures`"
+                f"{self._folder}: no crops here; make them with `python -m tools.render_drone_crops`"
             )
         self._ends = np.cumsum([len(file["drone"]) for file in self._files.values()])
         family = np.concatenate([np.where(file["drone"] > 0.5, file["family"], -1) for file in self._files.values()])
@@ -50,7 +50,7 @@ class PictureFiles:
         self._aimed_of_family = [np.flatnonzero((family == one) & aimed) for one in np.unique(family)]
 
     def draw(self, rng: np.random.Generator) -> Sample:
-        """Any of them: every family, and what is none, as often, however many pictures there are of it."""
+        """Any of them: every family, and what is none, as often, however many crops there are of it."""
         one = int(rng.integers(len(self._of_family)))
         rows = self._of_family[one]
         if rng.random() < _AIMED_SHARE and len(self._aimed_of_family[one]):

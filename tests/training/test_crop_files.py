@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.training.pictures import PictureFiles
+from tools.training.crop_files import CropFiles
 
 
 def test_a_family_of_few_images_is_drawn_as_often_as_one_of_many(tmp_path: Path) -> None:
@@ -17,7 +17,7 @@ def test_a_family_of_few_images_is_drawn_as_often_as_one_of_many(tmp_path: Path)
             tmp_path / f"{name}.npz", family=families, drone=np.full(len(families), drones), apparent=values,
             target=np.zeros((len(families), 3)), mask=np.zeros((len(families), 1, 1)),
         )  # fmt: skip
-    files, rng = PictureFiles(tmp_path), np.random.default_rng(0)
+    files, rng = CropFiles(tmp_path), np.random.default_rng(0)
     drawn = [files.draw(rng) for _ in range(3000)]
     shares = [
         np.mean([sample["drone"] > 0.5 and sample["family"] == 0 for sample in drawn]),
@@ -36,12 +36,12 @@ def test_images_like_the_last_crop_of_a_drone_are_drawn_more_often_than_others(t
     values[90] = np.log(120.0)
     masks = np.zeros((100, 1, 1))
     np.savez(tmp_path / "a.npz", family=np.zeros(100), drone=np.ones(100), apparent=values, target=target, mask=masks)
-    files, rng = PictureFiles(tmp_path), np.random.default_rng(0)
+    files, rng = CropFiles(tmp_path), np.random.default_rng(0)
     drawn = [files.draw(rng) for _ in range(3000)]
     like_it = [np.abs(sample["target"]).max() == 0.0 and sample["apparent"] < np.log(100.0) for sample in drawn]
     assert np.mean(like_it) == pytest.approx(0.6 + 0.4 * 0.09, abs=0.03)
 
 
 def test_a_folder_without_images_says_how_to_make_them(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"make them with `python -m tools\.render_drone_pictures`"):
-        PictureFiles(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"make them with `python -m tools\.render_drone_crops`"):
+        CropFiles(tmp_path)
