@@ -19,12 +19,12 @@ from tools.training.crop_files import CropFiles
 from tools.training.dataset import FOCAL_PX, HEIGHT, WIDTH
 from tools.training.samples import DroneInView, crop_around, sample_of, warped
 
-TOOLS = Path(__file__).resolve().parents[2] / "tools"
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def run(tool: str, *options: str | Path) -> str:
-    command = [sys.executable, str(TOOLS / tool), *map(str, options)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    command = [sys.executable, "-m", f"tools.{tool}", *map(str, options)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -33,24 +33,24 @@ def test_a_network_is_trained_resumed_and_exported_by_one_command_each(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data, runs, models = tmp_path / "data", tmp_path / "runs", tmp_path / "models"
-    run("render_training_data.py", data, "--worlds", "1", "--pairs", "2", "--processes", "1")
+    run("render_training_data", data, "--worlds", "1", "--pairs", "2", "--processes", "1")
     training = ("flow", "--data", data, "--out", runs, "--threads", "1")
-    run("train.py", *training, "--minutes", "0.05")
+    run("train", *training, "--minutes", "0.05")
     first = (runs / "curve.csv").read_text(encoding="utf-8").splitlines()
-    run("train.py", *training, "--minutes", "0.1")
+    run("train", *training, "--minutes", "0.1")
     second = (runs / "curve.csv").read_text(encoding="utf-8").splitlines()
     assert second[: len(first)] == first, "resumed, not begun anew"
     steps = [int(line.split(",")[0]) for line in second[1:]]
     assert steps == sorted(set(steps))
     assert cv2.imread(str(runs / "curve.png")) is not None
 
-    run("export.py", "flow", "--checkpoint", runs / "checkpoint.pt", "--out", models)
-    run("quantise.py", models / "flow.yaml", "--data", data, "--out", models)
+    run("export", "flow", "--checkpoint", runs / "checkpoint.pt", "--out", models)
+    run("quantise", models / "flow.yaml", "--data", data, "--out", models)
 
     further = tmp_path / "further"
-    run("train.py", "flow", "--data", data, "--out", further, "--minutes", "0.03", "--start", models / "flow.onnx")
+    run("train", "flow", "--data", data, "--out", further, "--minutes", "0.03", "--start", models / "flow.onnx")
     begun = ("--checkpoint", further / "checkpoint.pt", "--begun-with", further / "start.pt")
-    run("export.py", "flow", *begun, "--out", tmp_path / "once_more")
+    run("export", "flow", *begun, "--out", tmp_path / "once_more")
     said = [(folder / "flow.onnx").read_bytes() for folder in (models, tmp_path / "once_more")]
     assert said[0] != said[1], "it learnt"
 
