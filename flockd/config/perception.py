@@ -67,6 +67,8 @@ class PerceptionConfig(Section):
     segmentation: str = "neighbours_int8"
     distance: str = "distance_int8"
     """Second stage: a drone's range from its crop alone. `none`: the depth map decides."""
+    verification: str = "verification_int8"
+    """Whether a crop of the second stage shows a drone at all. `none`: the distance network's own probability."""
     models_dir: str | None = None
     """Folder of the manifests; by default the one that comes with flockd."""
     threads: Annotated[int, Field(ge=1, le=64)] = 2
@@ -84,4 +86,6 @@ class PerceptionConfig(Section):
     @property
     def networks(self) -> dict[Role, str]:
         """The model's name, or its manifest's path, of each role that a network fills."""
-        return {role: name for role in ROLES if (name := getattr(self, role)) not in {DIS, NO_MODEL}}
+        unused = {"verification"} if self.distance == NO_MODEL else set()
+        names = {role: getattr(self, role) for role in ROLES if role not in unused}
+        return {role: name for role, name in names.items() if name not in {DIS, NO_MODEL}}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -12,7 +13,7 @@ import cv2
 import numpy as np
 
 from flockd.choices import Role
-from flockd.config.perception import PerceptionConfig
+from flockd.config.perception import NO_MODEL, PerceptionConfig
 from flockd.errors import ModelError
 from flockd.geometry import RigCamera
 from flockd.inference.fitting import fit
@@ -28,7 +29,7 @@ from flockd.perception.maps import Crop, OpenDepth, RangeEstimate, SceneMaps
 from flockd.perception.requirements import check_roles
 
 CROPS_PER_RUN = 24
-"""Crops in one run of the distance network, so that an image full of false proposals does not take more memory."""
+"""Crops in one run of a network, so that an image full of false proposals does not take more memory."""
 _MIN_DEPTH_M, _MAX_DEPTH_M = 1e-3, 1e3
 """Where a reciprocal of depth is taken: nearer than the lens, and where flow and height measure nothing any more."""
 _MIN_RAY_Z = 0.1
@@ -64,7 +65,10 @@ class Networks(Protocol):
         ...
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
-        """Range and centre of the drone in the middle of each crop."""
+        """Range and centre of the drone in the middle of each crop.
+
+        The range may be NaN where the probability is no more than `second_stage` asks for another crop.
+        """
         ...
 
 
@@ -81,9 +85,14 @@ class OnnxNetworks:
         self._depth = self._model(config.depth, "depth")
         self._segmentation = self._model(config.segmentation, "segmentation")
         self._unknown = self._what_is_unknown(config)
-        self._distance = None if config.distance == "none" else self._model(config.distance, "distance")
+        self._distance = None if config.distance == NO_MODEL else self._model(config.distance, "distance")
+        has_verification = self._distance is not None and config.verification != NO_MODEL
+        self._verification = self._model(config.verification, "verification") if has_verification else None
         self.map_stride = self._segmentation.manifest.map_stride or 1
-        self.second_stage = None if self._distance is None else SecondStage.of(self._distance.manifest)
+        self.second_stage = None
+        if self._distance is not None:
+            verification = None if self._verification is None else self._verification.manifest
+            self.second_stage = SecondStage.of(self._distance.manifest, verification)
 
     def terminate(self) -> None:
         """Ends every run of a network that is under way; whoever called it gets an error."""
@@ -129,13 +138,30 @@ class OnnxNetworks:
         if not crops:
             return ()
         images = [np.ascontiguousarray(c.image[:, ::-1]) if c.mirrored else c.image for c in crops]
-        batches = [images[i : i + CROPS_PER_RUN] for i in range(0, len(images), CROPS_PER_RUN)]
-        outputs = [self._distance.infer({"crop": batch}) for batch in batches]
-        columns = self._distance.manifest.results["range"].by_column(np.concatenate([o["range"] for o in outputs]))
-        masks: Sequence[Float32Array | None] = [None] * len(crops)
-        if "mask" in outputs[0]:
-            masks = list(np.concatenate([output["mask"][:, 0] for output in outputs]))
         size = self.second_stage.crop_size
+        if self._verification is None:
+            return self._ranges(self._distance, crops, images, size)
+        outputs = _in_batches(self._verification, images)
+        logits = self._verification.manifest.results["drone"].by_column(outputs["drone"])["drone_logit"]
+        probabilities = [float(1.0 / (1.0 + np.exp(-logit))) for logit in logits.astype(float)]
+        # Where there is no drone, there is no range to ask for: most crops of a cluttered image end here.
+        rest = [k for k, p in enumerate(probabilities) if p > self.second_stage.thresholds.another_crop]
+        ranged = self._ranges(self._distance, [crops[k] for k in rest], [images[k] for k in rest], size)
+        estimates = [_no_range(p, size) for p in probabilities]
+        for k, estimate in zip(rest, ranged, strict=True):
+            estimates[k] = replace(estimate, drone_probability=probabilities[k])
+        return tuple(estimates)
+
+    @staticmethod
+    def _ranges(
+        distance: OnnxModel, crops: Sequence[Crop], images: Sequence[UInt8Array], size: int
+    ) -> tuple[RangeEstimate, ...]:
+        """What the distance network says of crops, given their images as they enter."""
+        if not crops:
+            return ()
+        outputs = _in_batches(distance, images)
+        columns = distance.manifest.results["range"].by_column(outputs["range"])
+        masks = list(outputs["mask"][:, 0]) if "mask" in outputs else [None] * len(crops)
         return tuple(
             _estimate({name: float(column[k]) for name, column in columns.items()}, crop, masks[k], size)
             for k, crop in enumerate(crops)
@@ -218,6 +244,19 @@ class OnnxNetworks:
                 "choose another"
             )
         return model
+
+
+def _in_batches(model: OnnxModel, images: Sequence[UInt8Array]) -> dict[str, Float32Array]:
+    """A model's outputs for all crops, (n, ...) each."""
+    batches = [images[i : i + CROPS_PER_RUN] for i in range(0, len(images), CROPS_PER_RUN)]
+    outputs = [model.infer({"crop": batch}) for batch in batches]
+    return {name: np.concatenate([output[name] for output in outputs]) for name in outputs[0]}
+
+
+def _no_range(drone_probability: float, size: int) -> RangeEstimate:
+    """Of a crop that shows no drone."""
+    middle = np.full(2, size / 2)
+    return RangeEstimate(math.nan, math.nan, middle, math.nan, drone_probability=drone_probability)
 
 
 def _estimate(columns: Mapping[str, float], crop: Crop, mask: Float32Array | None, size: int) -> RangeEstimate:
