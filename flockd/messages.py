@@ -68,6 +68,44 @@ class VehicleState:
     """Height above ground from the barometer, metres, up positive."""
     velocity_ned: Vector3 | None = None
     """(3,) m/s, the autopilot's own estimate, where it has one."""
+    position: Vector2 | None = None
+    """(2,) metres north and east of home, the autopilot's own estimate, where it has one."""
+    home_deg: Vector2 | None = None
+    """(2,) latitude and longitude of home, where the autopilot knows it."""
+
+
+@dataclass(frozen=True, eq=False)
+class MissionOrder:
+    """What an operator asks of one drone's mission: a goal, in metres or in degrees, or a velocity."""
+
+    place: Vector2 | None = None
+    """(2,) metres north and east of the mission's origin."""
+    place_deg: Vector2 | None = None
+    """(2,) latitude and longitude."""
+    velocity: Vector2 | None = None
+    """(2,) m/s, north and east."""
+    height_m: float | None = None
+    """Above the ground at home; None: as before."""
+    speed_m_s: float | None = None
+    """On the way to the goal; None: the mission's."""
+
+
+@dataclass(frozen=True, eq=False)
+class MissionStatus:
+    """How far a drone is with its mission."""
+
+    kind: str
+    desired: Vector2
+    """(2,) m/s: W_i efv of Eq. 42, less flocking's own weight."""
+    sentence: str
+    """What it does now, for people."""
+    goal: Vector2 | None = None
+    """(2,) metres north and east of home: where it flies to; None: nowhere in particular."""
+    goal_height_m: float | None = None
+    arrived: bool = False
+    """At the last goal."""
+    takeover: str | None = None
+    """`land` or `return`: what the autopilot is to be asked for, as the mission is over; None: nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +209,7 @@ class Neighbour:
 
 @dataclass(frozen=True, eq=False)
 class VelocityCommand:
-    """What the flock law asks of the autopilot; altitude is held elsewhere."""
+    """What the flock law, which is level, and the mission's height ask of the autopilot."""
 
     velocity: Vector2
     """(2,) m/s, north and east: the law's after limits, and the trim."""
@@ -181,6 +219,8 @@ class VelocityCommand:
     """Heading, clockwise from north."""
     trim: Vector2 | None = None
     """(2,) m/s, north and east: what of the velocity corrects the autopilot's own estimate; None: nothing."""
+    height_m: float | None = None
+    """As in `VehicleState`, up positive: the height that the mission wants; None: the one that the flight began at."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,3 +258,5 @@ class PilotOutput:
     """Estimates refused in this step, by reason."""
     stages_ms: Mapping[str, float] = field(default_factory=dict)
     """Time each stage took, as measured by the caller's clock; empty without one."""
+    mission: MissionStatus | None = None
+    """None for the paper's circle and tangent, which has no goal and no end."""

@@ -11,14 +11,16 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "flockd"
 
-BASE = {"choices", "messages", "config", "errors", "data"}
-"""Under everything: choices, nouns, the typed configuration, the error types, and where the shipped files are."""
+BASE = {"choices", "messages", "config", "errors", "data", "earth"}
+"""Under everything: choices, nouns, the typed configuration, the error types, where the shipped files are, and how large
+a degree is."""
 
 MAY_IMPORT = {
     "choices": set(),
     "messages": set(),
     "errors": set(),
     "data": {"errors"},
+    "earth": set(),
     "image_header": set(),
     "zenoh_session": {"errors"},
     "config": {"choices", "messages", "errors"},
@@ -28,13 +30,14 @@ MAY_IMPORT = {
     "tracking": BASE | {"geometry"},
     "flocking": BASE,
     "safety": BASE,
-    "pilot": BASE | {"geometry", "inference", "perception", "tracking", "flocking", "safety"},
+    "mission": BASE | {"safety"},  # for the fence
+    "pilot": BASE | {"geometry", "inference", "perception", "tracking", "flocking", "safety", "mission"},
     "sources": BASE | {"zenoh_session", "image_header"},
     "autopilot": BASE,
     "telemetry": BASE | {"zenoh_session"},
     "recording": BASE
     | {"geometry", "telemetry", "image_header"},  # telemetry for the table of topics, which says what is recorded
-    "flight_log": BASE | {"flocking", "perception", "pilot", "recording"},
+    "flight_log": BASE | {"flocking", "mission", "perception", "pilot", "recording"},
     "calibration": BASE | {"geometry", "recording", "datasets", "sources"},
     "datasets": BASE | {"geometry"},
     "replay": BASE | {"geometry", "inference", "perception", "pilot", "recording", "datasets"},
@@ -45,6 +48,7 @@ MAY_IMPORT = {
         "perception",
         "tracking",
         "flocking",
+        "mission",
         "safety",
         "pilot",
         "telemetry",
@@ -55,7 +59,8 @@ MAY_IMPORT = {
     "report": BASE | {"flocking", "flight_log"},
     "view": BASE | {"geometry", "perception", "pilot", "recording"},
     "daemon": BASE
-    | {"geometry", "inference", "perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"},
+    | {"geometry", "inference", "perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"}
+    | {"mission"},
     "doctor": BASE | {"geometry", "inference", "perception", "pilot", "sources", "autopilot", "telemetry", "daemon"},
     "cli": BASE
     | {
@@ -77,7 +82,7 @@ MAY_IMPORT = {
 }
 """What each folder may import of the others."""
 
-PURE = ("choices", "messages", "geometry", "inference", "perception", "tracking", "flocking", "safety", "pilot")
+PURE = ("choices", "messages", "geometry", "inference", "perception", "tracking", "flocking", "safety", "pilot", "mission")
 """No clock, no socket, no thread, no environment: what is tested is what flies."""
 IMPURE_MODULES = {
     "asyncio",
@@ -229,7 +234,7 @@ def test_no_drone_gets_the_truth() -> None:
     for path in MODULES:
         if _folder(path) not in {"sim", "recording", "flight_log", "view"}:
             assert "flockd.recording.truth" not in _imports(path), path
-    assert list(inspect.signature(FlockPilot.step).parameters) == ["self", "frames", "vehicle", "trace"]
+    assert list(inspect.signature(FlockPilot.step).parameters) == ["self", "frames", "vehicle", "trace", "order"]
 
 
 def test_the_doctor_sees_of_the_daemon_what_everybody_sees() -> None:

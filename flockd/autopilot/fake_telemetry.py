@@ -11,7 +11,7 @@ import numpy as np
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import development as mavlink
 
-from flockd.autopilot.earth import metres_a_degree
+from flockd.earth import metres_a_degree
 from flockd.autopilot.fake_vehicle import MotionState
 from flockd.messages import FloatArray
 

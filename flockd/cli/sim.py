@@ -36,8 +36,8 @@ OPTIONS = {
     "flow": "drone.perception.flow",
     "scale": "drone.perception.scale",
     "wind": "vehicle.wind_m_s",
-    "speed": "drone.desired.speed_m_s",
-    "radius": "drone.desired.radius_m",
+    "speed": "drone.mission.speed_m_s",
+    "radius": "drone.mission.radius_m",
 }
 """Which key of the configuration an option sets."""
 
@@ -192,13 +192,15 @@ def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespac
 
 def _settings(scenario: ScenarioConfig, directory: Path, args: argparse.Namespace) -> list[str]:
     """What is flown, for --verbose."""
+    from flockd.config.mission import describe
+
     drone, wind = scenario.drone, scenario.vehicle.wind_m_s
+    missions = ", ".join(dict.fromkeys(describe(vehicle.mission or drone.mission) for vehicle in scenario.vehicles))
     networks = ", ".join(f"{role} {name}" for role, name in drone.perception.networks.items())
     lines = [
         f"scenario: {scenario.scenario}, seed {scenario.seed}, {scenario.duration_s:g} s, "
         f"{len(scenario.vehicles)} drones, a step every {drone.step_s:g} s",
-        f"desired: {drone.desired.speed_m_s:g} m/s on a circle of {drone.desired.radius_m:g} m until "
-        f"{drone.desired.circle_until_s:g} s; wind {wind[0]:g} m/s north, {wind[1]:g} m/s east",
+        f"mission: {missions}; wind {wind[0]:g} m/s north, {wind[1]:g} m/s east",
         f"folder: {directory}",
     ]
     return lines if args.perception == "truth" else [*lines, f"networks: {networks}"]
@@ -207,7 +209,7 @@ def _settings(scenario: ScenarioConfig, directory: Path, args: argparse.Namespac
 def _recorders(
     scenario: ScenarioConfig, swap: frozenset[str], directory: Path, stack: ExitStack
 ) -> tuple[Recorder, ...]:
-    """A recorder for each drone."""
+    """A recorder for each drone that flockd flies."""
     from flockd.inference.hashes import model_hashes
     from flockd.recording import Recorder
 
@@ -218,13 +220,14 @@ def _recorders(
             Recorder(
                 directory / f"drone{i + 1}.mcap",
                 drone=f"drone{i + 1}",
-                config=scenario.drone,
+                config=scenario.drone_of(i),
                 models=model_hashes(scenario.drone.perception),
                 facts=facts,
                 on_event=complain,
             )
         )
-        for i in range(len(scenario.vehicles))
+        for i, vehicle in enumerate(scenario.vehicles)
+        if not vehicle.by_hand
     )
 
 

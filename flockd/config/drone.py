@@ -12,10 +12,10 @@ from pydantic import Field, model_validator
 
 from flockd.choices import OwnVelocitySource
 from flockd.config.autopilot import AutopilotParameters
-from flockd.config.base import Positive, Section
+from flockd.config.base import Positive, Section, refuse
 from flockd.config.flocking import FlockingParameters
 from flockd.config.geometry import GeometryParameters
-from flockd.config.mission import DesiredVelocityParameters
+from flockd.config.mission import MissionParameters, mission_faults
 from flockd.config.perception import PerceptionConfig
 from flockd.config.recording import RecordingConfig
 from flockd.config.rig import RigConfig
@@ -38,11 +38,17 @@ class DroneConfig(Section):
     geometry: GeometryParameters = GeometryParameters()
     tracking: TrackingParameters = TrackingParameters()
     flocking: FlockingParameters = FlockingParameters()
-    desired: DesiredVelocityParameters = DesiredVelocityParameters()
+    mission: MissionParameters = MissionParameters()
     safety: SafetyParameters = SafetyParameters()
     own_velocity: OwnVelocitySource = "vision"
     yaw: Literal["hold", "course"] = "course"
     """Heading: kept as it is, or along the desired velocity."""
+
+    @model_validator(mode="after")
+    def _the_mission_can_be_flown(self) -> Self:
+        faults = mission_faults(self.mission, self.safety.gate, self.flocking.max_speed_m_s)
+        refuse(self, {("mission", *key): text for key, text in faults.items()})
+        return self
 
     @model_validator(mode="after")
     def _the_gate_lets_the_law_through(self) -> Self:

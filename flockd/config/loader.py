@@ -66,6 +66,8 @@ def schema_of(kind: Literal["drone", "scenario"]) -> dict[str, Any]:
     drone = schema["properties"]["drone"]
     inline = {"$ref": drone.pop("$ref")}
     schema["properties"]["drone"] = {"title": "Drone", **drone, "anyOf": [{"type": "string"}, inline]}
+    of_all = "Of all vehicles without one of their own, instead of that in `drone`."
+    schema["properties"]["mission"] = {"$ref": "#/$defs/MissionParameters", "description": of_all}
     return schema
 
 
@@ -93,6 +95,7 @@ def _scenario_document(path: Path, overrides: Overrides) -> Document:
         fault = "is a drone's own file, and a scenario is needed here; name one with the keys `vehicles` and `drone`"
         raise ConfigError([ConfigProblem(str(path), 0, "", fault)])
     _merge_drone(document, path.parent)
+    _merge_mission(document)
     _override(document, overrides)
     return document
 
@@ -125,6 +128,22 @@ def _merge_drone(document: Document, folder: Path) -> None:
     document.places.update({(*key, *path): place for path, place in drone.places.items()})
     document.problems.extend(drone.problems)
     document.spoiled.update((*key, *path) for path in drone.spoiled)
+
+
+def _merge_mission(document: Document) -> None:
+    """Puts a scenario's `mission` in place of its drone's, with its places: one file flies many missions."""
+    drone = document.values.get("drone")
+    if not isinstance(drone, dict) or "mission" not in document.values:
+        return
+    mission = document.values.pop("mission")
+    old = [path for path in document.places if path[:2] == ("drone", "mission")]
+    for path in old:
+        del document.places[path]
+    document.spoiled -= {path for path in document.spoiled if path[:2] == ("drone", "mission")}
+    of_scenario = [path for path in document.places if path[:1] == ("mission",)]
+    document.places.update({("drone", *path): document.places.pop(path) for path in of_scenario})
+    document.spoiled |= {("drone", *path) for path in document.spoiled if path[:1] == ("mission",)}
+    document.values["drone"] = {**drone, "mission": mission}
 
 
 def _anchor(document: Document) -> None:

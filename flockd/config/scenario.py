@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 
 from flockd.config.base import NonNegative, Positive, Section, Vector3, refuse
 from flockd.config.drone import DroneConfig
+from flockd.config.mission import MissionParameters, mission_faults
 
 MAX_DRONES = 100
 """More would take days and all memory."""
@@ -30,6 +31,10 @@ class StartConfig(Section):
     """North, east, down: a height of 4.5 m is -4.5."""
     velocity_m_s: tuple[float, float] = (0.0, 0.0)
     """North, east."""
+    mission: MissionParameters | None = None
+    """Its own; null: that of `drone`. Places count from the world's origin."""
+    by_hand: bool = False
+    """A person flies it along its mission, in Position mode and without flockd; the others see it as one of them."""
 
 
 class VehicleConfig(Section):
@@ -57,6 +62,8 @@ class SensorConfig(Section):
     """Standard deviation of the slow roll and pitch error."""
     velocity_error_m_s: NonNegative = 0.1
     """Standard deviation of the slow error of the autopilot's own velocity."""
+    position_error_m: NonNegative = 0.5
+    """Standard deviation of the slow error of the autopilot's own position, each axis."""
     image_noise: NonNegative = 2.0
     """Standard deviation in grey levels of 0-255."""
 
@@ -84,7 +91,24 @@ class ScenarioConfig(Section):
     sensors: SensorConfig = SensorConfig()
     world: WorldConfig = WorldConfig()
     drone: DroneConfig
-    """In the file: the path of the drone's own configuration, relative to the scenario's; or that configuration."""
+    """In the file: the path of the drone's own configuration, relative to the scenario's; or that configuration. A key
+    `mission` beside it is flown instead of its own."""
+
+    def drone_of(self, vehicle: int) -> DroneConfig:
+        """The configuration that one vehicle's pilot flies with."""
+        mission = self.vehicles[vehicle].mission
+        return self.drone if mission is None else self.drone.model_copy(update={"mission": mission})
+
+    @model_validator(mode="after")
+    def _the_missions_can_be_flown(self) -> Self:
+        faults: dict[tuple[str | int, ...], str] = {}
+        for number, vehicle in enumerate(self.vehicles):
+            if vehicle.mission is not None:
+                limits = self.drone.safety.gate, self.drone.flocking.max_speed_m_s
+                of_mission = mission_faults(vehicle.mission, *limits)
+                faults |= {("vehicles", number, "mission", *key): text for key, text in of_mission.items()}
+        refuse(self, faults)
+        return self
 
     @model_validator(mode="after")
     def _lasts_a_step(self) -> Self:

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from flockd.flight_log.log import FlightLog
 from flockd.flight_log.metadata import FlightMetadata
 from flockd.flight_log.truth_matching import match_neighbours
-from flockd.messages import BoolArray, FloatArray, PilotOutput
+from flockd.messages import BoolArray, FloatArray, MissionStatus, PilotOutput
 
 _BY_STEP = (
     "_times", "_position", "_velocity", "_attitude", "_desired", "_command_velocity", "_command_acceleration",
     "_ego_rotation", "_ego_translation", "_ego_inlier_ratio", "_own_velocity", "_neighbour_position",
-    "_neighbour_velocity", "_detection_position", "_false_tracks",
+    "_neighbour_velocity", "_detection_position", "_false_tracks", "_goal",
 )  # fmt: skip
 """Arrays with a row for each step."""
 
@@ -28,6 +28,7 @@ class FlightLogBuilder:
         self._position, self._velocity = np.full((steps, n, 3), nan), np.full((steps, n, 3), nan)
         self._attitude = np.full((steps, n, 3, 3), nan)
         self._desired = np.full((steps, 2), nan)
+        self._goal = np.full((steps, 2), nan)
         self._command_velocity, self._command_acceleration = np.full((steps, n, 2), nan), np.full((steps, n, 2), nan)
         self._ego_rotation, self._ego_translation = np.full((steps, n, 3, 3), nan), np.full((steps, n, 3), nan)
         self._ego_inlier_ratio = np.full((steps, n), nan)
@@ -46,9 +47,22 @@ class FlightLogBuilder:
         """
         self._position[step], self._velocity[step], self._attitude[step] = position, velocity, R_ned_body
 
-    def add_desired(self, step: int, velocity: FloatArray) -> None:
-        """The flock's desired velocity, (2,) m/s north and east."""
-        self._desired[step] = velocity
+    def add_missions(
+        self, step: int, desired: FloatArray, missions: Sequence[MissionStatus | None], homes: FloatArray | None = None
+    ) -> None:
+        """What each drone's mission wants, (n, 2) m/s, and how far it is.
+
+        `homes` (n, 2) are metres north and east from which the drones' goals count; None: all from the origin.
+        """
+        same = (desired == desired[0]).all()
+        self._desired[step] = desired[0] if same else desired.mean(axis=0)
+        goals = [
+            mission.goal + (0.0 if homes is None else homes[i])
+            for i, mission in enumerate(missions)
+            if mission is not None and mission.goal is not None
+        ]
+        if goals:
+            self._goal[step] = np.mean(goals, axis=0)
 
     def add_exact_states(
         self, step: int, i: int, others: BoolArray, relative: FloatArray, velocities: FloatArray,
@@ -120,5 +134,5 @@ class FlightLogBuilder:
             neighbour_velocity=self._neighbour_velocity, detection_position=self._detection_position,
             false_tracks=self._false_tracks, truth_position=truth_position, truth_velocity=truth_velocity,
             stages_ms={stage: np.array(ms) for stage, ms in self._stages.items()}, metadata=metadata,
-            tracked=np.array(self._tracked).reshape(-1, 6),
+            tracked=np.array(self._tracked).reshape(-1, 6), goal=self._goal,
         )  # fmt: skip

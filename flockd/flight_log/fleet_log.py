@@ -18,7 +18,6 @@ from flockd.flight_log.capture import capture, key_frame_steps
 from flockd.flight_log.key_frames import KeyFrame
 from flockd.flight_log.log import FlightLog
 from flockd.flight_log.metadata import FleetMetadata, FlightMetadata, Percentiles
-from flockd.flocking import desired_velocity
 from flockd.flocking.metrics import order, union
 from flockd.messages import FloatArray, PilotOutput
 from flockd.perception import load_networks
@@ -89,8 +88,9 @@ def fleet_log(
     builder = FlightLogBuilder(times, len(configs))
     for row, frame in enumerate(frames):
         builder.add_truth(row, frame.position, frame.velocity, frame.R_ned_body)
-        builder.add_desired(row, desired_velocity(drone.desired, float(times[row])))
     rows = {frame.time_s: row for row, frame in enumerate(frames)}
+    missions: dict[int, MissionStatus] = {}
+    statuses = [dict(missions) for _ in frames]
     processed: dict[str, int] = {}
     longest_s, spanning = 0.0, 0
     for i, config in enumerate(configs):

@@ -14,8 +14,8 @@ from flockd.flight_log.capture import capture, key_frame_steps
 from flockd.flight_log.key_frames import KeyFrame
 from flockd.flight_log.log import FlightLog
 from flockd.flight_log.metadata import FlightMetadata
-from flockd.flocking import desired_velocity
 from flockd.messages import FloatArray, PilotOutput
+from flockd.mission.circle_then_tangent import desired_of
 from flockd.pilot import FlockPilot, StepTrace
 from flockd.recording import RecordingError
 from flockd.recording.codec import from_json, to_json
@@ -55,8 +55,10 @@ def flight_log(recordings: Sequence[Recording], progress: Progress = lambda done
     for row, step in enumerate(steps):
         if step.truth is not None:
             _add_truth(builder, row, step.truth, companion)
-        if began_s is not None:
-            builder.add_desired(row, desired_velocity(recordings[0].config.desired, step.time_s - began_s))
+        if began_s is not None and step.outputs:
+            elapsed_s, statuses = step.time_s - began_s, [output.mission for _, output, _ in step.outputs]
+            mission = recordings[0].config.mission
+            builder.add_missions(row, np.array([desired_of(mission, elapsed_s, s) for s in statuses]), statuses)
         for drone, output, R_ned_body in step.outputs:
             builder.add_output(row, drone, output, R_ned_body, output.stages_ms)
     metadata = _metadata(recordings, names, steps[-1].time_s - steps[0].time_s, zero_s)

@@ -31,7 +31,7 @@ class FlightLog:
     attitude: FloatArray
     """(S, N, 3, 3) R_ned_body, true."""
     desired: FloatArray
-    """(S, 2) m/s, the flock's desired velocity."""
+    """(S, 2) m/s, the flock's desired velocity: the mean of its drones', each times its pull."""
     command_velocity: FloatArray
     """(S, N, 2) m/s, the setpoint of each step."""
     command_acceleration: FloatArray
@@ -62,6 +62,10 @@ class FlightLog:
     metadata: FlightMetadata
     tracked: FloatArray = field(default_factory=lambda: np.zeros((0, 6)))
     """(K, 6) each confirmed track at each step: step, observer, track, and metres north, east and down of it."""
+
+    goal: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    """(S, 2) m north and east: where the drones that have a goal want to go, their mean; NaN without one; (0, 2) in
+    logs from before there were goals."""
 
     @property
     def has_truth(self) -> bool:
@@ -103,6 +107,7 @@ class FlightLog:
             "neighbour_velocity": seen,
             "detection_position": seen,
             "false_tracks": (steps, drones),
+            "goal": (steps if len(self.goal) else 0, 2),
             "truth_position": (companion, drones, 3),
             "truth_velocity": (companion, drones, 3),
         }

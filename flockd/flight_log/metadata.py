@@ -53,6 +53,17 @@ class FleetMetadata(BaseModel):
     notes: list[str]
 
 
+class MissionMetadata(BaseModel):
+    """Where the drones of a flight wanted to go."""
+
+    model_config = _FROZEN
+
+    kind: str
+    """Of the missions, by name, each once."""
+    reached_m: float
+    """How near to a goal the flock's middle has to come."""
+
+
 class FlightMetadata(BaseModel):
     """What was flown. A key that a flight log has no value for is left out of its file."""
 
@@ -90,6 +101,8 @@ class FlightMetadata(BaseModel):
     """Of flockd."""
     interrupted: bool = False
     """It was ended before its time; `duration_s` is what was flown."""
+    mission: MissionMetadata | None = None
+    """None in logs from before there were missions."""
     clock_at_start_s: float | None = None
     """Time of the recordings' clock at the log's 0 s."""
 
@@ -103,7 +116,8 @@ class FlightMetadata(BaseModel):
             "flow": config.perception.flow,
             "scale": config.perception.scale,
             "step_s": config.step_s,
-            "circle_until_s": config.desired.circle_until_s,
+            "circle_until_s": config.mission.circle_until_s if config.mission.kind == "circle_then_tangent" else 0.0,
+            "mission": MissionMetadata(kind=config.mission.kind, reached_m=config.mission.reached_m),
             "desired_distance_m": config.flocking.desired_distance_m,
             "observation_distance_m": config.flocking.observation_distance_m,
             "separation_distance_m": config.flocking.separation_distance_m,

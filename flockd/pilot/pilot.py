@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flockd.config.drone import DroneConfig
-from flockd.flocking import FlockingLaw, course, desired_velocity, level_offsets
+from flockd.flocking import FlockingLaw, level_offsets
 from flockd.geometry import build_rig
 from flockd.messages import (
     BoolArray,
@@ -18,12 +18,16 @@ from flockd.messages import (
     EgoMotion,
     FloatArray,
     FrameSet,
+    MissionOrder,
+    MissionStatus,
     Neighbour,
     NeighbourMotion,
     PilotOutput,
     VehicleState,
     VelocityCommand,
 )
+from flockd.mission import Moment, Navigator
+from flockd.mission.navigator import middle_of
 from flockd.perception import Networks, Observation, Perception, load_networks
 from flockd.perception.detection.detector import DetectionTrace
 from flockd.pilot.motions import ego_motion, neighbour_motions
@@ -60,6 +64,7 @@ class FlockPilot:
         self._perception = Perception(self._rig, networks or load_networks(config.perception), config.perception)
         self._tracker = Tracker(config.tracking)
         self._law = FlockingLaw(config.flocking)
+        self._navigator = Navigator(config.mission, config.safety.gate)
         limit_m_s, memory = 0.0, 0.0
         if config.autopilot is not None and config.own_velocity == "vision":
             limit_m_s, memory = config.autopilot.max_velocity_trim_m_s, config.autopilot.velocity_trim_memory
@@ -70,17 +75,27 @@ class FlockPilot:
         self._velocity: FloatArray | None = None
         self._yaw_rad = 0.0
         self._refused_in_a_row = 0
+        self._order: MissionOrder | None = None
 
-    def step(self, frames: FrameSet, vehicle: VehicleState, trace: StepTrace | None = None) -> PilotOutput:
+    def step(
+        self,
+        frames: FrameSet,
+        vehicle: VehicleState,
+        trace: StepTrace | None = None,
+        order: MissionOrder | None = None,
+    ) -> PilotOutput:
         """One step of the pure line.
 
         Args:
             frames: the newest image of every camera that has one.
             vehicle: what the own autopilot says, at the frames' time.
             trace: filled with what was seen; changes nothing.
+            order: an operator's to the mission, in the first step after it came.
 
-        Input that cannot be is refused with a reason: the command is standstill, and nothing of it is remembered.
+        Input that cannot be is refused with a reason: the command is standstill, and nothing of it is remembered but
+        the order.
         """
+        self._order = self._order if order is None else order
         refusal = _why_refused(frames, vehicle)
         if refusal is not None:
             return self._refused(frames, refusal)
@@ -98,7 +113,7 @@ class FlockPilot:
         tracks = self._track(observation, ego, motions, velocity)
         neighbours = self._tracker.neighbours()
         laps.end("tracking")
-        command = self._command(observation, neighbours, velocity)
+        command, mission = self._command(observation, neighbours, velocity)
         laps.end("flocking")
         self._last_time_s = observation.time_s
         reasons = (*observation.reasons, *why_no_ego, *why_no_motion)
@@ -114,6 +129,7 @@ class FlockPilot:
             reasons=reasons,
             counts=Counter(reasons),
             stages_ms=laps.stages_ms,
+            mission=mission,
         )
 
     def _refused(self, frames: FrameSet, reason: str) -> PilotOutput:
@@ -210,21 +226,41 @@ class FlockPilot:
 
     def _command(
         self, observation: Observation, neighbours: Sequence[Neighbour], velocity: FloatArray | None
-    ) -> VelocityCommand:
+    ) -> tuple[VelocityCommand, MissionStatus | None]:
         if self._first_time_s is None:
             self._first_time_s = observation.time_s
-        elapsed_s = max(observation.time_s - self._first_time_s, 0.0)
-        desired = desired_velocity(self._config.desired, elapsed_s)
         seen = [n for n in neighbours if n.confirmed]
-        positions = level_offsets(np.array([n.position for n in seen]).reshape(-1, 3))
+        places = np.array([n.position for n in seen]).reshape(-1, 3)
         velocities = np.array([n.velocity[:2] for n in seen]).reshape(-1, 2)
-        own = desired if velocity is None else velocity[:2]  # before the first pair: as desired
-        command, acceleration = self._law.command(own, positions, velocities, desired, self._config.step_s)
-        R = observation.vehicle.R_ned_body
-        heading = math.atan2(R[1, 0], R[0, 0])
-        self._yaw_rad = course(self._config.desired, elapsed_s) if self._config.yaw == "course" else heading
+        vehicle = observation.vehicle
+        guidance = self._navigator.step(
+            Moment(
+                time_s=max(observation.time_s - self._first_time_s, 0.0),
+                position=vehicle.position,
+                middle=middle_of(places[:, :2]),
+                home_deg=vehicle.home_deg,
+                order=self._order,
+            )
+        )
+        self._order = None
+        desired = self._navigator.pull(guidance)
+        own = guidance.velocity if velocity is None else velocity[:2]  # before the first pair: as desired
+        command, acceleration = self._law.command(own, level_offsets(places), velocities, desired, self._config.step_s)
+        self._yaw_rad = self._heading(vehicle, guidance.course_rad)
         trim = self._trim.velocity
-        return VelocityCommand(command + trim, acceleration, self._yaw_rad, trim if trim.any() else None)
+        return VelocityCommand(
+            command + trim, acceleration, self._yaw_rad, trim if trim.any() else None, guidance.height_m
+        ), self._navigator.status(guidance)
+
+    def _heading(self, vehicle: VehicleState, course_rad: float | None) -> float:
+        """The mission's course; without one the heading that the drone was asked for last, or has."""
+        R = vehicle.R_ned_body
+        heading_rad = math.atan2(R[1, 0], R[0, 0])
+        if self._config.yaw == "hold":
+            return heading_rad
+        if course_rad is not None:
+            return course_rad
+        return heading_rad if self._last_time_s is None else self._yaw_rad
 
 
 def _why_refused(frames: FrameSet, vehicle: VehicleState) -> str | None:
@@ -238,6 +274,9 @@ def _why_refused(frames: FrameSet, vehicle: VehicleState) -> str | None:
         return "input refused: the height is not finite"
     if velocity is not None and not np.isfinite(velocity).all():
         return "input refused: the autopilot's velocity is not finite"
+    for place in (vehicle.position, vehicle.home_deg):
+        if place is not None and not np.isfinite(place).all():
+            return "input refused: the autopilot's position is not finite"
     return None
 
 

@@ -27,7 +27,7 @@ DROPPED: Final[Mapping[str, str]] = {
 }
 """Keys of 0.1.0 without a successor: the reason, for people."""
 
-RENAMED: Final[Mapping[str, str]] = {}
+RENAMED: Final[Mapping[str, str]] = {"desired": "mission"}
 """Keys of 0.1.0, or whole sections, that only have another name or place now: the new one."""
 
 

@@ -39,9 +39,6 @@ PARAMETERS = {
     "SDLOG_BACKEND": "0",
 }
 """Of all instances."""
-MAX_CLIMB_M_S = 1.5
-CLIMB_TIME_S = 1.0
-"""From a height error to the climb that is asked for; that one is answered in a quarter of it: no overshoot."""
 
 
 @dataclass(frozen=True)
@@ -175,26 +172,18 @@ def px4_folder(environment: Mapping[str, str]) -> Path:
 
 
 class _Flown:
-    """One of the simulator's vehicles, from its home on the ground; climbs as a critically damped one."""
+    """One of the simulator's vehicles, from its home on the ground."""
 
     def __init__(self, config: VehicleConfig, seed: int) -> None:
         self._vehicles = Vehicles([StartConfig(position_m=(0.0, 0.0, 0.0))], config, seed=seed)
-        self._down_m, self._sink_m_s = 0.0, 0.0
 
     def __call__(self, demand: Demand, interval_s: float) -> MotionState:
         """Flies on."""
+        vehicles = self._vehicles
         if interval_s > 0.0:
-            self._vehicles.step(demand.velocity[None], np.array([demand.yaw_rad]), interval_s)
-            wanted = min(max((demand.down_m - self._down_m) / CLIMB_TIME_S, -MAX_CLIMB_M_S), MAX_CLIMB_M_S)
-            self._sink_m_s += (wanted - self._sink_m_s) * min(1.0, 4.0 * interval_s / CLIMB_TIME_S)
-            self._down_m += self._sink_m_s * interval_s
-        if self._down_m >= 0.0:
-            self._down_m, self._sink_m_s = 0.0, min(0.0, self._sink_m_s)
-        return MotionState(
-            np.array([*self._vehicles.position[0, :2], self._down_m]),
-            np.array([*self._vehicles.velocity[0, :2], self._sink_m_s]),
-            self._vehicles.R_ned_body[0],
-        )
+            heading = np.array([demand.yaw_rad])
+            vehicles.step(demand.velocity[None], heading, interval_s, heights=np.array([-demand.down_m]))
+        return MotionState(vehicles.position[0], vehicles.velocity[0], vehicles.R_ned_body[0])
 
 
 def _free_port() -> int:

@@ -7,14 +7,16 @@ from typing import Protocol
 import cv2
 import numpy as np
 
+from flockd.config.mission import MissionParameters
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import UsageError
-from flockd.flocking import desired_velocity
 from flockd.geometry import PinholeCamera, build_rig
 from flockd.messages import FloatArray, Frame, FrameSet, UInt8Array
+from flockd.mission import Moment, Navigator
 from flockd.sim.drone_models import FAMILIES, drone_model
 from flockd.sim.renderer import Renderer
 from flockd.sim.truth_perception import RenderTruth
+from flockd.sim.vehicles import REFERENCE_DEG
 from flockd.sim.world import World
 
 
@@ -91,11 +93,23 @@ class _ImageNoise:
 
 
 def planned_path(scenario: ScenarioConfig) -> FloatArray:
-    """(n, 2) north and east of the flock's middle if it flies exactly as desired, and on for a few metres."""
-    times = np.arange(0.0, scenario.duration_s + 5.0, 0.5)
-    steps = np.array([desired_velocity(scenario.drone.desired, float(t)) * 0.5 for t in times])
+    """(n, 2) north and east of the flock's middle if it flies exactly as each of its missions wants, one after the
+    other, and on for a few metres."""
+    missions = {vehicle.mission or scenario.drone.mission for vehicle in scenario.vehicles}
+    ordered = sorted(missions, key=lambda mission: mission.model_dump_json())
+    return np.concatenate([_path_of(scenario, mission) for mission in ordered])
+
+
+def _path_of(scenario: ScenarioConfig, mission: MissionParameters) -> FloatArray:
+    """The same of one mission."""
+    navigator = Navigator(mission, scenario.drone.safety.gate)
     start = np.mean([vehicle.position_m[:2] for vehicle in scenario.vehicles], axis=0)
-    return np.asarray(start + np.cumsum(steps, axis=0))
+    flown, path = np.zeros(2), []
+    for time_s in np.arange(0.0, scenario.duration_s + 5.0, 0.5):
+        moment = Moment(float(time_s), start + flown, home_deg=np.array(REFERENCE_DEG))
+        flown = flown + navigator.step(moment).velocity * 0.5
+        path.append(start + flown)
+    return np.array(path)
 
 
 def _spread(scenario: ScenarioConfig) -> float:

@@ -2,12 +2,123 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
 import numpy as np
 
 from flockd.config.scenario import ScenarioConfig
-from flockd.flocking import FlockingLaw, course, desired_velocity
-from flockd.messages import FloatArray
-from flockd.sim.vehicles import Vehicles
+from flockd.flocking import FlockingLaw
+from flockd.messages import BoolArray, FloatArray, MissionStatus
+from flockd.mission import Moment, Navigator
+from flockd.mission.navigator import middle_of
+from flockd.sim.handover import Handover
+from flockd.sim.vehicles import REFERENCE_DEG, Vehicles
+
+
+@dataclass(frozen=True, eq=False)
+class Commands:
+    """What n drones are asked for in one step."""
+
+    velocity: FloatArray
+    """(n, 2) m/s, north and east."""
+    acceleration: FloatArray
+    """(n, 2) m/s^2; 0 of a drone that is flown by hand."""
+    yaw_rad: FloatArray
+    """(n,)"""
+    height_m: FloatArray
+    """(n,), up positive; NaN: as high as now."""
+    missions: tuple[MissionStatus | None, ...]
+    """See `PilotOutput.mission`."""
+    desired: FloatArray
+    """(n, 2) m/s: what each mission wants, times its pull."""
+
+    @classmethod
+    def of(cls, n: int) -> Self:
+        """Standstill of n drones, to be filled."""
+        still = (np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n), np.full(n, np.nan))
+        return cls(*still, missions=(None,) * n, desired=np.zeros((n, 2)))
+
+    @property
+    def takeovers(self) -> list[str | None]:
+        """Which autopilots take over, and how."""
+        return [None if mission is None else mission.takeover for mission in self.missions]
+
+
+class ExactFlock:
+    """The flocking law and each drone's mission on the exact states of all drones."""
+
+    def __init__(self, scenario: ScenarioConfig) -> None:
+        drone = scenario.drone
+        self._law, self._step_s = FlockingLaw(drone.flocking), drone.step_s
+        self._pilots = [
+            HandPilot(scenario, i) if vehicle.by_hand else Navigator(scenario.drone_of(i).mission, drone.safety.gate)
+            for i, vehicle in enumerate(scenario.vehicles)
+        ]
+        self._yaw_rad = np.full(len(self._pilots), start_yaw(scenario))
+
+    def step(self, time_s: float, positions: FloatArray, velocities: FloatArray) -> Commands:
+        """Of drones at (n, 3) m and (n, 3) m/s in NED; called in order of time."""
+        found = [self._of(i, time_s, positions, velocities) for i in range(len(self._pilots))]
+        velocity, acceleration, yaw_rad, height_m, missions, desired = zip(*found, strict=True)
+        self._yaw_rad = np.array(yaw_rad)
+        return Commands(
+            np.array(velocity), np.array(acceleration), self._yaw_rad, np.array(height_m), missions, np.array(desired)
+        )
+
+    def _of(
+        self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray
+    ) -> tuple[FloatArray, FloatArray, float, float, MissionStatus | None, FloatArray]:
+        here, moving = positions[:, :2], velocities[:, :2]
+        pilot = self._pilots[i]
+        if isinstance(pilot, HandPilot):
+            flown = pilot.step(time_s, here[i])
+            return flown.velocity, np.zeros(2), float(self._yaw_rad[i]), flown.height_m, flown.status, flown.velocity
+        others = np.arange(len(here)) != i
+        offsets = here[others] - here[i]
+        moment = Moment(time_s, here[i], middle_of(offsets[self._sees(offsets)]), np.array(REFERENCE_DEG))
+        guidance = pilot.step(moment)
+        desired = pilot.pull(guidance)
+        command, acceleration = self._law.command(moving[i], offsets, moving[others], desired, self._step_s)
+        yaw_rad = float(self._yaw_rad[i]) if guidance.course_rad is None else guidance.course_rad
+        height_m = np.nan if guidance.height_m is None else guidance.height_m
+        return command, acceleration, yaw_rad, height_m, pilot.status(guidance), desired
+
+    def _sees(self, offsets: FloatArray) -> BoolArray:
+        near: BoolArray = np.hypot(offsets[:, 0], offsets[:, 1]) <= self._law.parameters.observation_distance_m
+        return near
+
+
+class FlownByHand(NamedTuple):
+    """What a person wants of a drone."""
+
+    velocity: FloatArray
+    """(2,) m/s, north and east."""
+    height_m: float
+    """Up positive; NaN: as high as now."""
+    status: MissionStatus | None
+
+
+class HandPilot:
+    """A person who flies one drone along its mission in Position mode, without flockd; sees nothing of the flock."""
+
+    def __init__(self, scenario: ScenarioConfig, vehicle: int) -> None:
+        drone = scenario.drone_of(vehicle)
+        self._navigator = Navigator(drone.mission, drone.safety.gate)
+
+    def step(self, time_s: float, position: FloatArray) -> FlownByHand:
+        """At `position` (2,) m from the world's origin; called in order of time."""
+        guidance = self._navigator.step(Moment(time_s, position, home_deg=np.array(REFERENCE_DEG)))
+        height_m = np.nan if guidance.height_m is None else guidance.height_m
+        return FlownByHand(guidance.velocity, height_m, self._navigator.status(guidance))
+
+
+def start_yaw(scenario: ScenarioConfig) -> float:
+    """The heading with which all begin: the course of the scenario's own mission; else north."""
+    mission = scenario.drone.mission
+    start = np.mean([vehicle.position_m[:2] for vehicle in scenario.vehicles], axis=0)
+    moment = Moment(0.0, start, home_deg=np.array(REFERENCE_DEG))
+    return Navigator(mission, scenario.drone.safety.gate).step(moment).course_rad or 0.0
 
 
 def fly_exact_states(scenario: ScenarioConfig) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -17,23 +128,17 @@ def fly_exact_states(scenario: ScenarioConfig) -> tuple[FloatArray, FloatArray, 
     the true positions and velocities of all.
     """
     times = step_times(scenario)
-    drone = scenario.drone
-    law = FlockingLaw(drone.flocking)
-    vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=course(drone.desired, 0.0), seed=scenario.seed)
+    flock, handover = ExactFlock(scenario), Handover(scenario)
+    vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=start_yaw(scenario), seed=scenario.seed)
     positions, velocities = [], []
     for time_s in times:
         positions.append(vehicles.position)
         velocities.append(vehicles.velocity)
-        here, moving = vehicles.position[:, :2], vehicles.velocity[:, :2]
-        desired = desired_velocity(drone.desired, float(time_s))
-        setpoints = [
-            law.command(
-                moving[i], np.delete(here, i, axis=0) - here[i], np.delete(moving, i, axis=0), desired, drone.step_s
-            )[0]
-            for i in range(len(here))
-        ]
-        yaw_rad = course(drone.desired, float(time_s))
-        vehicles.step(np.array(setpoints), np.full(len(here), yaw_rad), drone.step_s)
+        commands = flock.step(float(time_s), vehicles.position, vehicles.velocity)
+        velocity, height_m = handover.applied(
+            commands.takeovers, vehicles.position, commands.velocity, commands.height_m
+        )
+        vehicles.step(velocity, commands.yaw_rad, scenario.drone.step_s, height_m)
     return times, np.array(positions), np.array(velocities)
 
 

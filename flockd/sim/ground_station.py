@@ -20,10 +20,10 @@ import numpy as np
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import development as mavlink
 
-from flockd.autopilot.earth import metres_a_degree
+from flockd.earth import metres_a_degree
 from flockd.errors import UnavailableError
 from flockd.messages import FloatArray
-from flockd.sim.vehicles import euler_rotation
+from flockd.sim.vehicles import REFERENCE_DEG, euler_rotation
 
 Mode = Literal["LOITER", "TAKEOFF", "LAND", "OFFBOARD"]
 """By pymavlink's names; LOITER is Hold."""
@@ -34,8 +34,6 @@ POLL_S = 0.05
 MODE_HZ = 20.0
 MAX_FORWARD_S = 0.2
 """A pose is extrapolated by no more than this."""
-REFERENCE_DEG = (1.0, 1.0)
-"""The origin of the world. PX4 keeps its home as float32, whose steps are a centimetre here, and 0.4 m in Europe."""
 _RECEIVED = {
     name: int(getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
     for name in (

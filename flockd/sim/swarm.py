@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -20,14 +20,15 @@ from flockd.flight_log.capture import capture, key_frame_steps
 from flockd.flight_log.key_frames import KeyFrame
 from flockd.flight_log.log import FlightLog
 from flockd.flight_log.metadata import FlightMetadata
-from flockd.flocking import FlockingLaw, course, desired_velocity
-from flockd.messages import FloatArray, PilotOutput
+from flockd.messages import FloatArray, MissionStatus, PilotOutput
+from flockd.mission.circle_then_tangent import desired_of
 from flockd.perception import load_networks
 from flockd.pilot import FlockPilot, StepTrace
 from flockd.recording import Recorder
 from flockd.recording.truth import TrueDrone, Truth
 from flockd.sim.camera_simulator import CameraSimulator
-from flockd.sim.exact_states import fly_exact_states, step_times
+from flockd.sim.exact_states import Commands, ExactFlock, HandPilot, fly_exact_states, start_yaw, step_times
+from flockd.sim.handover import Handover
 from flockd.sim.truth_perception import TruthPerception
 from flockd.sim.vehicles import SimulatedAutopilot, Vehicles
 from flockd.telemetry import TelemetrySink, publish_step
@@ -85,19 +86,22 @@ def fly(
         else _VisionPilots(scenario, swap, telemetry, recorders, companion, preparing)
     )
     preparing(_PREPARATIONS, _PREPARATIONS)
-    yaw = course(scenario.drone.desired, 0.0)
-    vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=yaw, seed=scenario.seed)
+    handover = Handover(scenario)
+    vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=start_yaw(scenario), seed=scenario.seed)
     chosen = key_frame_steps(len(times))
     key_frames: list[KeyFrame] = []
     flown = 0
     try:
         for step, time_s in enumerate(times):
             builder.add_truth(step, vehicles.position, vehicles.velocity, vehicles.R_ned_body)
-            builder.add_desired(step, desired_velocity(scenario.drone.desired, float(time_s)))
-            velocity, yaws = pilots.step(step, float(time_s), vehicles, builder)
+            commands = pilots.step(step, float(time_s), vehicles, builder)
+            builder.add_missions(step, commands.desired, commands.missions)
             if step in chosen:
                 key_frames += pilots.key_frames()
-            vehicles.step(velocity, yaws, scenario.drone.step_s)
+            velocity, height_m = handover.applied(
+                commands.takeovers, vehicles.position, commands.velocity, commands.height_m
+            )
+            vehicles.step(velocity, commands.yaw_rad, scenario.drone.step_s, height_m)
             flown = step + 1
             progress(flown, len(times))
     except KeyboardInterrupt:
@@ -130,25 +134,19 @@ class _ExactStatePilots:
     """The flocking law on the exact states of all drones."""
 
     def __init__(self, scenario: ScenarioConfig) -> None:
-        self._config = scenario.drone
-        self._law = FlockingLaw(scenario.drone.flocking)
+        self._flock = ExactFlock(scenario)
+        self._by_hand = [vehicle.by_hand for vehicle in scenario.vehicles]
 
-    def step(
-        self, step: int, time_s: float, vehicles: Vehicles, builder: FlightLogBuilder
-    ) -> tuple[FloatArray, FloatArray]:
-        """Velocity setpoints (n, 2) and headings (n,)."""
+    def step(self, step: int, time_s: float, vehicles: Vehicles, builder: FlightLogBuilder) -> Commands:
+        """Of all drones."""
         positions, velocities = vehicles.position, vehicles.velocity
-        count = len(positions)
-        desired = desired_velocity(self._config.desired, time_s)
-        commands = np.zeros((count, 2))
-        for i in range(count):
-            others = np.arange(count) != i
+        commands = self._flock.step(time_s, positions, velocities)
+        for i in (i for i, by_hand in enumerate(self._by_hand) if not by_hand):
+            others = np.arange(len(positions)) != i
             relative = positions[others] - positions[i]
-            commands[i], acceleration = self._law.command(
-                velocities[i, :2], relative[:, :2], velocities[others, :2], desired, self._config.step_s
-            )
-            builder.add_exact_states(step, i, others, relative, velocities, commands[i], acceleration)
-        return commands, np.full(count, course(self._config.desired, time_s))
+            command, acceleration = commands.velocity[i], commands.acceleration[i]
+            builder.add_exact_states(step, i, others, relative, velocities, command, acceleration)
+        return commands
 
     def key_frames(self) -> list[KeyFrame]:
         """None, as there are no images."""
@@ -172,47 +170,68 @@ class _VisionPilots:
         self._telemetry, self._recorders = telemetry, recorders
         self._cameras = CameraSimulator(scenario)
         preparing(2, _PREPARATIONS)
-        count = len(scenario.vehicles)
         learned = load_networks(scenario.drone.perception)
         preparing(3, _PREPARATIONS)
-        self._truths = [TruthPerception(learned, swap, self._cameras.rig) for _ in range(count)] if swap else []
-        self._pilots = [
-            FlockPilot(scenario.drone, self._truths[i] if swap else learned, stopwatch=time.perf_counter)
-            for i in range(count)
-        ]
-        self._autopilots = [SimulatedAutopilot(scenario.sensors, seed=scenario.seed, drone=i) for i in range(count)]
+        self._scenario, self._yaw_rad = scenario, start_yaw(scenario)
+        vehicles = range(len(scenario.vehicles))
+        self._hands = {i: HandPilot(scenario, i) for i in vehicles if scenario.vehicles[i].by_hand}
+        self._drones = [i for i in vehicles if i not in self._hands]
+        self._truths = {i: TruthPerception(learned, swap, self._cameras.rig) for i in self._drones} if swap else {}
+        self._pilots = {
+            i: FlockPilot(scenario.drone_of(i), self._truths.get(i, learned), stopwatch=time.perf_counter)
+            for i in self._drones
+        }
+        self._autopilots = {i: SimulatedAutopilot(scenario.sensors, seed=scenario.seed, drone=i) for i in self._drones}
         # Pilots share nothing but the networks, so their order does not matter: each steps as soon as its images are
         # rendered, all at a time, for five one after the other on two cores would leave one core idle for the last.
-        self._executor = ThreadPoolExecutor(min(count, 2 * (os.cpu_count() or 1) + 1))
-        self._traces = [StepTrace() for _ in range(count)]
-        self._outputs: list[PilotOutput] = []
+        self._executor = ThreadPoolExecutor(min(len(self._drones), 2 * (os.cpu_count() or 1) + 1))
+        self._traces: dict[int, StepTrace] = {}
+        self._outputs: dict[int, PilotOutput] = {}
 
-    def step(
-        self, step: int, time_s: float, vehicles: Vehicles, builder: FlightLogBuilder
-    ) -> tuple[FloatArray, FloatArray]:
-        """Velocity setpoints (n, 2) and headings (n,)."""
-        steps = []
-        render_ms = []
-        self._traces = [StepTrace() for _ in self._pilots]
-        for i, pilot in enumerate(self._pilots):
+    def step(self, step: int, time_s: float, vehicles: Vehicles, builder: FlightLogBuilder) -> Commands:
+        """Of all drones."""
+        steps = {}
+        render_ms = {}
+        self._traces = {i: StepTrace() for i in self._drones}
+        for i, pilot in self._pilots.items():
             begin = time.perf_counter()
             frames, render_truth = self._cameras.capture(i, step, time_s, vehicles)
             if self._truths:
                 self._truths[i].show(render_truth)
-            render_ms.append(1e3 * (time.perf_counter() - begin))
+            render_ms[i] = 1e3 * (time.perf_counter() - begin)
             state = self._autopilots[i].read(time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i])
-            steps.append((frames, state, self._executor.submit(pilot.step, frames, state, self._traces[i])))
-        self._outputs = [future.result() for _, _, future in steps]
+            steps[i] = frames, state, self._executor.submit(pilot.step, frames, state, self._traces[i])
+        self._outputs = {i: future.result() for i, (_, _, future) in steps.items()}
         truth = self._truth(step, time_s, vehicles)
-        for i, (output, (frames, state, _)) in enumerate(zip(self._outputs, steps, strict=True)):
+        for i, output in self._outputs.items():
+            frames, state, _ = steps[i]
             if self._telemetry is not None:
                 publish_step(self._telemetry, f"drone{i + 1}", state, output)
             if self._recorders:
-                self._recorders[i].drain()  # simulated time stands still, so nothing need ever be dropped
-                self._recorders[i].step(frames, state, output, truth)
+                recorder = self._recorders[self._drones.index(i)]
+                recorder.drain()  # simulated time stands still, so nothing need ever be dropped
+                recorder.step(frames, state, output, truth)
             builder.add_output(step, i, output, state.R_ned_body, {"render": render_ms[i], **output.stages_ms})
-        commands = [output.command for output in self._outputs]
-        return np.array([c.velocity for c in commands]), np.array([c.yaw_rad for c in commands])
+        return self._commands(time_s, vehicles)
+
+    def _commands(self, time_s: float, vehicles: Vehicles) -> Commands:
+        """Of the pilots, and of the people who fly drones by hand."""
+        count = len(self._scenario.vehicles)
+        commands = Commands.of(count)
+        missions: list[MissionStatus | None] = [None] * count
+        for i, output in self._outputs.items():
+            command = output.command
+            commands.velocity[i], commands.acceleration[i] = command.velocity, command.acceleration
+            commands.yaw_rad[i] = command.yaw_rad
+            commands.height_m[i] = np.nan if command.height_m is None else command.height_m
+            missions[i] = output.mission
+            commands.desired[i] = desired_of(self._scenario.drone_of(i).mission, time_s, output.mission)
+        for i, hand in self._hands.items():
+            flown = hand.step(time_s, vehicles.position[i, :2])
+            commands.velocity[i] = commands.desired[i] = flown.velocity
+            commands.height_m[i], missions[i] = flown.height_m, flown.status
+            commands.yaw_rad[i] = self._yaw_rad
+        return replace(commands, missions=tuple(missions))
 
     def _truth(self, step: int, time_s: float, vehicles: Vehicles) -> Truth:
         """For recordings only: no pilot gets it."""
@@ -231,9 +250,8 @@ class _VisionPilots:
 
     def key_frames(self) -> list[KeyFrame]:
         """What the pilots worked with in the last step."""
-        of_drones = zip(self._traces[:_KEY_FRAME_DRONES], self._outputs, strict=False)
         return [
             frame.at_half_size()
-            for drone, (trace, output) in enumerate(of_drones)
-            for frame in capture(trace, output, drone)
+            for drone in self._drones[:_KEY_FRAME_DRONES]
+            for frame in capture(self._traces[drone], self._outputs[drone], drone)
         ]

@@ -14,16 +14,24 @@ GRAVITY_M_S2 = 9.81
 _MAX_SUBSTEP_S = 0.02
 _DRAG_PER_S = 0.3
 """Deceleration by the air for each m/s against it: what a multirotor leans against to hold its speed."""
+MAX_CLIMB_M_S = 1.5
+CLIMB_TIME_S = 1.0
+"""From a height error to the climb that is asked for; that one is answered in a quarter of it: no overshoot."""
 _GUST_TIME_S = 2.0
 _ATTITUDE_ERROR_TIME_S = 30.0
 _VELOCITY_ERROR_TIME_S = 10.0
+_POSITION_ERROR_TIME_S = 60.0
+REFERENCE_DEG = (1.0, 1.0)
+"""Latitude and longitude of the world's origin. PX4 keeps its home as float32, whose steps are a centimetre here, and
+0.4 m in Europe."""
 
 
 class Vehicles:
     """All vehicles of a flight.
 
-    Horizontal velocity follows a setpoint as a first-order lag of limited acceleration; altitude is held; the attitude
-    is the one whose thrust gives that acceleration. The arrays are replaced by `step`, never changed in place:
+    Horizontal velocity follows a setpoint as a first-order lag of limited acceleration; height is held, or changed as
+    by a critically damped controller of limited climb, down to the ground at z = 0; the attitude is the one whose
+    thrust gives the horizontal acceleration. The arrays are replaced by `step`, never changed in place:
     `position` (n, 3) m and `velocity` (n, 3) m/s in NED, `R_ned_body` (n, 3, 3).
     """
 
@@ -40,11 +48,18 @@ class Vehicles:
         self._thrust = self._drag(self.velocity[:, :2])
         self.R_ned_body = attitude(self._thrust, self._yaw)
 
-    def step(self, setpoints: FloatArray, yaw_setpoints: FloatArray, interval_s: float) -> None:
-        """Fly on for `interval_s` towards velocities (n, 2) m/s north and east and headings (n,) rad."""
+    def step(
+        self, setpoints: FloatArray, yaw_setpoints: FloatArray, interval_s: float, heights: FloatArray | None = None
+    ) -> None:
+        """Fly on for `interval_s` towards velocities (n, 2) m/s north and east and headings (n,) rad.
+
+        `heights` (n,) m, up positive, are flown to; NaN, or None for all: as high as now.
+        """
         substeps = math.ceil(interval_s / _MAX_SUBSTEP_S - 1e-9)
         for _ in range(substeps):
             self._substep(setpoints, yaw_setpoints, interval_s / substeps)
+            if heights is not None:
+                self._climb(heights, interval_s / substeps)
         self.R_ned_body = attitude(self._thrust, self._yaw)
 
     def _substep(self, setpoints: FloatArray, yaw_setpoints: FloatArray, dt: float) -> None:
@@ -68,6 +83,15 @@ class Vehicles:
         error = (yaw_setpoints - self._yaw + math.pi) % (2 * math.pi) - math.pi
         limit = math.radians(config.max_yaw_rate_deg_s) * dt
         self._yaw = self._yaw + np.clip(-math.expm1(-dt / config.yaw_time_constant_s) * error, -limit, limit)
+
+    def _climb(self, heights: FloatArray, dt: float) -> None:
+        down, sink = self.position[:, 2], self.velocity[:, 2]
+        wanted = np.clip(np.nan_to_num((-heights - down) / CLIMB_TIME_S), -MAX_CLIMB_M_S, MAX_CLIMB_M_S)
+        sink = sink + (wanted - sink) * min(1.0, 4.0 * dt / CLIMB_TIME_S)
+        down = down + sink * dt
+        sink = np.where(down >= 0.0, np.minimum(sink, 0.0), sink)
+        self.position = np.column_stack([self.position[:, :2], np.minimum(down, 0.0)])
+        self.velocity = np.column_stack([self.velocity[:, :2], sink])
 
     @property
     def _gust_sigma(self) -> float:
@@ -93,11 +117,14 @@ class SimulatedAutopilot:
         self._height_error = np.zeros(1)  # the barometer is set to zero at take-off
         self._tilt_error = math.radians(config.attitude_error_deg) * self._random.normal(size=3)
         self._velocity_error = config.velocity_error_m_s * self._random.normal(size=3)
+        # A generator of its own: the position came later, and the other errors are as they were without it.
+        self._of_position = np.random.default_rng([seed, drone, 1])
+        self._position_error = config.position_error_m * self._of_position.normal(size=2)
 
     def read(self, time_s: float, position: FloatArray, velocity: FloatArray, R_ned_body: FloatArray) -> VehicleState:
         """What it says at `time_s`, not before the last, of a drone at `position` (3,) m NED, ground at z = 0.
 
-        Yaw errs as roll and pitch do.
+        Home is the world's origin. Yaw errs as roll and pitch do.
         """
         config = self._config
         elapsed_s = 0.0 if self._time_s is None else time_s - self._time_s
@@ -111,12 +138,17 @@ class SimulatedAutopilot:
         self._velocity_error = self._drift(
             self._velocity_error, config.velocity_error_m_s, _VELOCITY_ERROR_TIME_S, elapsed_s
         )
+        keep = math.exp(-elapsed_s / _POSITION_ERROR_TIME_S)
+        kick = math.sqrt(1 - keep**2) * config.position_error_m * self._of_position.normal(size=2)
+        self._position_error = keep * self._position_error + kick
         noise = config.barometer_noise_m * self._random.normal()
         return VehicleState(
             time_s=time_s,
             R_ned_body=euler_rotation(*self._tilt_error) @ R_ned_body,
             height_m=float(-position[2] + self._height_error[0] + noise),
             velocity_ned=velocity + self._velocity_error,
+            position=position[:2] + self._position_error,
+            home_deg=np.array(REFERENCE_DEG),
         )
 
     def _drift(self, error: FloatArray, sigma: float, time_constant_s: float, elapsed_s: float) -> FloatArray:

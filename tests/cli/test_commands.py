@@ -408,7 +408,7 @@ def test_wind_speed_and_radius_are_what_is_flown(capsys: pytest.CaptureFixture[s
     args = _parser().parse_args(["sim", "--wind", "2,-1.5", "--speed", "1.5", "--radius", "15"])
     scenario = _scenario(args)
     assert scenario.vehicle.wind_m_s == (2.0, -1.5)
-    assert (scenario.drone.desired.speed_m_s, scenario.drone.desired.radius_m) == (1.5, 15.0)
+    assert (scenario.drone.mission.speed_m_s, scenario.drone.mission.radius_m) == (1.5, 15.0)
     assert "argument --wind: '3' is not two numbers such as 2.0,-1.5" in _usage_error(capsys, "sim", "--wind", "3")
 
 

@@ -20,7 +20,7 @@ from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.config import DroneConfig
 from flockd.config.autopilot import AutopilotParameters
 from flockd.config.geometry import GeometryParameters
-from flockd.config.mission import DesiredVelocityParameters
+from flockd.config.mission import MissionParameters
 from flockd.config.perception import PerceptionConfig
 from flockd.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
 from flockd.config.safety import SafetyParameters
@@ -139,7 +139,7 @@ def config_for(
         ),
         autopilot=AutopilotParameters(address=f"udpin://127.0.0.1:{port}", **autopilot),
         telemetry=TelemetryParameters(fleet="test", listen=(telemetry,), commands=("resume", "land")),
-        desired=DesiredVelocityParameters(speed_m_s=SPEED_M_S, circle_until_s=0.0),
+        mission=MissionParameters(speed_m_s=SPEED_M_S, circle_until_s=0.0),
         own_velocity=own_velocity,
         yaw="hold",
     )

@@ -8,17 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flockd.flocking import (
-    DesiredVelocityParameters,
-    FlockingLaw,
-    FlockingParameters,
-    WeightParameters,
-    course,
-    desired_velocity,
-    level_offsets,
-    limit_norm,
-)
+from flockd.flocking import FlockingLaw, FlockingParameters, WeightParameters, level_offsets, limit_norm
 from flockd.flocking.metrics import min_distance, obj1, obj2, pair_distances
+from flockd.mission import MissionParameters
+from flockd.mission.circle_then_tangent import course, desired_velocity
 
 Array = NDArray[np.float64]
 NOBODY = np.empty((0, 2))
@@ -30,7 +23,7 @@ TABLE_1 = np.array([[-0.5, 0.9], [0.5, -2.8], [1.2, 4.5], [3.9, 0.5], [4.5, 1.4]
 
 def _flight(law: FlockingLaw, start: Array, *, duration_s: float, step_s: float = 0.5) -> list[tuple[Array, Array]]:
     """Eq. 38-43 with exact states, everybody at once: position by the new velocity."""
-    desired = DesiredVelocityParameters()
+    desired = MissionParameters()
     positions, velocities = start.copy(), np.tile([1.0, 0.0], (len(start), 1))
     states = []
     for step in range(round(duration_s / step_s)):
@@ -182,13 +175,13 @@ def test_a_step_that_is_no_step_is_refused(step_s: float) -> None:
 
 
 def test_the_desired_velocity_goes_round_at_a_tenth_of_a_radian_a_second_until_66_s() -> None:
-    parameters = DesiredVelocityParameters()
+    parameters = MissionParameters()
     np.testing.assert_allclose(desired_velocity(parameters, 0.0), [1.0, 0.0])
     np.testing.assert_allclose(desired_velocity(parameters, 5 * math.pi), [0.0, 1.0], atol=1e-12)  # east: clockwise
     assert course(parameters, 30.0) == pytest.approx(3.0)
     assert course(parameters, 66.0) == pytest.approx(6.6 - 2 * math.pi)
     assert course(parameters, 109.5) == course(parameters, 66.0)
-    twice = DesiredVelocityParameters(speed_m_s=2.0, radius_m=5.0)
+    twice = MissionParameters(speed_m_s=2.0, radius_m=5.0)
     assert course(twice, 1.0) == pytest.approx(0.4)
     np.testing.assert_allclose(np.linalg.norm(desired_velocity(twice, 1.0)), 2.0)
     for nonsense in (-0.1, math.nan, math.inf):
@@ -204,7 +197,7 @@ def test_five_from_table_1_become_the_pentagon() -> None:
     distances = np.sort(pair_distances(positions)[np.triu_indices(5, 1)])
     np.testing.assert_allclose(distances[:5], 2.47, atol=0.005)
     np.testing.assert_allclose(distances[5:], 4.00, atol=0.005)
-    efv = desired_velocity(DesiredVelocityParameters(), 110.0)
+    efv = desired_velocity(MissionParameters(), 110.0)
     tail = states[-20:]
     sums_1 = np.array([obj1(v, efv, circling=False).sum() for _, v in tail])
     sums_2 = np.array([obj2(p, v, parameters).sum() for p, v in tail])

@@ -1,0 +1,82 @@
+"""A mission from place to place."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flockd.config.mission import MissionParameters
+from flockd.config.safety import GateParameters
+from flockd.messages import FloatArray
+from flockd.mission.guidance import Guidance, Moment, course_of, towards
+from flockd.mission.places import place_of_waypoint
+from flockd.safety.fence import outside_fence
+
+
+class Waypoints:
+    """Leads the middle of the flock to one waypoint after the other, and stays at the last one.
+
+    The middle is of the drone and of the neighbours that it sees. Drones that fly the same waypoints see nearly the same
+    middle and so want the same velocity, as on the paper's circle, instead of all wanting to be at one spot.
+    """
+
+    def __init__(self, parameters: MissionParameters, gate: GateParameters) -> None:
+        self._parameters, self._gate = parameters, gate
+        self._origin = np.array(parameters.origin_m)
+        self._next = 0
+        self._height_m: float | None = None
+        self._arrived = False
+
+    def step(self, moment: Moment) -> Guidance:
+        """See `Mission`."""
+        here = moment.flock
+        if here is None:
+            return self._stands("waits for the autopilot's position")
+        goal = self._goal(moment)
+        while goal is not None and not self._arrived and math.dist(here, goal) <= self._parameters.reached_m:
+            self._height_m = self._height(self._next)
+            if self._next + 1 < len(self._parameters.waypoints):
+                self._next += 1
+                goal = self._goal(moment)
+            else:
+                self._arrived = True
+        if goal is None:
+            return self._stands("waits for home in degrees, which the autopilot has not sent")
+        if outside_fence(self._gate, goal):
+            return self._stands(f"{self._name} is outside the fence")
+        return self._towards(goal, here)
+
+    def _towards(self, goal: FloatArray, here: FloatArray) -> Guidance:
+        p, waypoint = self._parameters, self._parameters.waypoints[self._next]
+        last = self._next + 1 == len(p.waypoints)
+        speed_m_s = p.speed_m_s if waypoint.speed_m_s is None else waypoint.speed_m_s
+        velocity = towards(goal, here, speed_m_s, stops=last)
+        left_m = math.dist(here, goal)
+        takeover = p.at_end if self._arrived and p.at_end != "hold" else None
+        sentence = f"at {self._name}" if self._arrived else f"{left_m:.0f} m to {self._name}"
+        return Guidance(
+            velocity=np.zeros(2) if takeover else velocity,
+            sentence=sentence,
+            course_rad=None if last and left_m < 2 * p.reached_m else course_of(velocity),
+            height_m=self._height(self._next),
+            goal=goal,
+            arrived=self._arrived,
+            takeover=takeover,
+        )
+
+    @property
+    def _name(self) -> str:
+        count = len(self._parameters.waypoints)
+        return "the goal" if count == 1 else f"waypoint {self._next + 1} of {count}"
+
+    def _goal(self, moment: Moment) -> FloatArray | None:
+        return place_of_waypoint(self._parameters.waypoints[self._next], self._origin, moment.home_deg)
+
+    def _height(self, number: int) -> float | None:
+        """That of a waypoint, or of the one before it."""
+        height_m = self._parameters.waypoints[number].height_m
+        return self._height_m if height_m is None else height_m
+
+    def _stands(self, why: str) -> Guidance:
+        return Guidance(np.zeros(2), why, height_m=self._height_m)
