@@ -12,8 +12,8 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "flockd"
 
 BASE = {"choices", "messages", "config", "errors", "data", "earth"}
-"""Under everything: choices, nouns, the typed configuration, the error types, where the shipped files are, and how large
-a degree is."""
+"""Under everything: choices, nouns, the typed configuration, the error types, where the shipped files are, and how
+large a degree is."""
 
 MAY_IMPORT = {
     "choices": set(),
@@ -82,7 +82,18 @@ MAY_IMPORT = {
 }
 """What each folder may import of the others."""
 
-PURE = ("choices", "messages", "geometry", "inference", "perception", "tracking", "flocking", "safety", "pilot", "mission")
+PURE = (
+    "choices",
+    "messages",
+    "geometry",
+    "inference",
+    "perception",
+    "tracking",
+    "flocking",
+    "safety",
+    "pilot",
+    "mission",
+)
 """No clock, no socket, no thread, no environment: what is tested is what flies."""
 IMPURE_MODULES = {
     "asyncio",

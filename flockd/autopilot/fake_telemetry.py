@@ -11,8 +11,8 @@ import numpy as np
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import development as mavlink
 
-from flockd.earth import metres_a_degree
 from flockd.autopilot.fake_vehicle import MotionState
+from flockd.earth import metres_a_degree
 from flockd.messages import FloatArray
 
 Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "RTL", "OFFBOARD"]

@@ -83,6 +83,7 @@ class ReceivedMessages:
         self._newest: dict[str, ReceivedMessage] = {}
         self._unknown_values: Counter[str] = Counter()
         self._home: FloatArray | None = None
+        self._home_deg: FloatArray | None = None
         self._flies = False
         """In the air, or seen there and not disarmed since: a landed state alone does not end a flight."""
         self._home_moved = False
@@ -101,19 +102,20 @@ class ReceivedMessages:
             self._flies = status.in_air or (self._flies and status.armed)
             self._home_moved = self._home_moved and self._flies
         elif name == "HOME_POSITION":
-            self._take_home(_vector(fields, "x", "y", "z"))
+            self._take_home(_vector(fields, "x", "y", "z"), _vector(fields, "latitude", "longitude"))
 
     @property
     def home_down_m(self) -> float | None:
         """Down from the estimator's origin; None: not known yet."""
         return None if self._home is None else float(self._home[2])
 
-    def _take_home(self, home: FloatArray | None) -> None:
+    def _take_home(self, home: FloatArray | None, home_e7: FloatArray | None) -> None:
         """Home as it is until the next flight: one that moves in flight would move the height band and the fence."""
         if home is None:
             return
         if self._home is None or not self._flies:
             self._home = home
+            self._home_deg = None if home_e7 is None else home_e7 * 1e-7
         elif not self._home_moved and np.linalg.norm(home - self._home) > HOME_TOLERANCE_M:
             self._home_moved = True
             self._log_unknown(
@@ -168,6 +170,8 @@ class ReceivedMessages:
             R_ned_body=rotation_from_quaternion(quaternion),
             height_m=float((self.home_down_m or 0.0) - place[2]),
             velocity_ned=velocity,
+            position=None if self._home is None else (place - self._home)[:2],
+            home_deg=self._home_deg,
         )
 
     def flight_mode(self) -> FlightMode:

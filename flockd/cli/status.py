@@ -77,7 +77,17 @@ def _table(rows: list[dict[str, Any]]) -> Table:
     from rich.table import Table
 
     table = Table(
-        "drone", "state", "mode", "height", "battery", "sees", "load", "what is the matter", box=None, pad_edge=False
+        "drone",
+        "state",
+        "mode",
+        "height",
+        "battery",
+        "sees",
+        "load",
+        "mission",
+        "what is the matter",
+        box=None,
+        pad_edge=False,
     )
     for row in rows:
         table.add_row(
@@ -88,6 +98,7 @@ def _table(rows: list[dict[str, Any]]) -> Table:
             _number(row["battery_share"], ".0%", ""),
             _number(row["neighbours"], "d", ""),
             _number(row["load"], ".0%", ""),
+            row["mission"] or "",
             "; ".join(row["matters"]),
         )
     return table

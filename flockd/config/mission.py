@@ -45,7 +45,9 @@ class WaypointParameters(Section):
     def _is_one_place(self) -> Self:
         missing = [(self.north_m, self.east_m).count(None), (self.latitude_deg, self.longitude_deg).count(None)]
         if sorted(missing) != [0, 2]:
-            raise ValueError("a waypoint needs `north_m` and `east_m`, or `latitude_deg` and `longitude_deg`; write two")
+            raise ValueError(
+                "a waypoint needs `north_m` and `east_m`, or `latitude_deg` and `longitude_deg`; write two"
+            )
         return self
 
 
@@ -53,9 +55,9 @@ class MissionParameters(Section):
     """Where this drone wants to go. Places count from its home, the ground that it takes off from."""
 
     kind: MissionKind = "circle_then_tangent"
-    """The paper's circle and its tangent (Eq. 43); `hover` at a standstill; a constant `velocity`; `waypoints` one after
-    the other; `follow` the others without a goal of its own (W_i = 0 of Eq. 42); `operator`: what an operator sends over
-    telemetry, as `telemetry.commands` allows."""
+    """The paper's circle and its tangent (Eq. 43); `hover` at a standstill; a constant `velocity`; `waypoints` one
+    after the other; `follow` the others without a goal of its own (W_i = 0 of Eq. 42); `operator`: what an operator
+    sends over telemetry, as `telemetry.commands` allows."""
     speed_m_s: NonNegative = 1.0
     """Desired speed: V of Eq. 43, and on the way to goals."""
     radius_m: Positive = 10.0
@@ -100,9 +102,7 @@ def describe(mission: MissionParameters) -> str:
     """The mission in a few words."""
     match mission.kind:
         case "circle_then_tangent":
-            return (
-                f"{mission.speed_m_s:g} m/s on a circle of {mission.radius_m:g} m until {mission.circle_until_s:g} s"
-            )
+            return f"{mission.speed_m_s:g} m/s on a circle of {mission.radius_m:g} m until {mission.circle_until_s:g} s"
         case "waypoints":
             count = len(mission.waypoints)
             return f"{mission.speed_m_s:g} m/s to {count} {'waypoint' if count == 1 else 'waypoints'}"
@@ -125,7 +125,8 @@ def mission_faults(mission: MissionParameters, gate: GateParameters, law_speed_m
     for i, waypoint in enumerate(mission.waypoints):
         if waypoint.north_m is None or waypoint.east_m is None:
             continue  # in degrees: not before home is known
-        if outside := fault_of_place(gate, waypoint.north_m + mission.origin_m[0], waypoint.east_m + mission.origin_m[1]):
+        place = waypoint.north_m + mission.origin_m[0], waypoint.east_m + mission.origin_m[1]
+        if outside := fault_of_place(gate, *place):
             faults["waypoints", i] = outside
     return faults
 
@@ -155,8 +156,8 @@ def fault_of_height(gate: GateParameters, height_m: float) -> str | None:
     if gate.min_height_m <= height_m <= gate.max_height_m:
         return None
     return (
-        f"leads to a height of {height_m:g} m, and safety.gate allows {gate.min_height_m:g} to {gate.max_height_m:g} m; "
-        "write another"
+        f"leads to a height of {height_m:g} m, and safety.gate allows {gate.min_height_m:g} to "
+        f"{gate.max_height_m:g} m; write another"
     )
 
 

@@ -31,6 +31,12 @@ class GateParameters(Section):
     """Nearer than this to a neighbour, no velocity towards it."""
     degraded_separation_m: Annotated[float, Field(ge=0, le=1000)] = 1.5
     """Instead, while the drone is degraded."""
+    vertical_separation_m: Annotated[float, Field(ge=0, le=1000)] = 3.0
+    """A neighbour that is above or below by less than this counts as one at the drone's height, and no change of height
+    leads nearer to one whose level distance is within one and a half times `degraded_separation_m`: the lower flies in
+    the other's downwash."""
+    max_climb_m_s: Annotated[float, Field(gt=0, le=20)] = 1.5
+    """The height that is asked for changes no faster, up or down."""
     braking_m_s2: Annotated[float, Field(gt=0, le=20)] = 1.5
     """How hard every drone of the flock can brake: none flies faster towards a neighbour than it can stop in time."""
     reaction_s: Annotated[float, Field(ge=0, le=5)] = 0.5

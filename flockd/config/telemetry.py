@@ -8,7 +8,7 @@ from pydantic import Field
 
 from flockd.config.base import Section
 
-OperatorCommand = Literal["hold", "land", "resume"]
+OperatorCommand = Literal["hold", "land", "resume", "goto", "velocity"]
 
 
 class TelemetryParameters(Section):
@@ -23,4 +23,5 @@ class TelemetryParameters(Section):
     """A file of zenoh's own settings to begin with, for TLS and access control; see `config/zenoh_tls.json5`. A
     relative path counts from the folder of the configuration file."""
     commands: tuple[OperatorCommand, ...] = ()
-    """What operators may ask over telemetry; by default nothing."""
+    """What operators may ask over telemetry; by default nothing. `goto` and `velocity` change the drone's mission until
+    the flight ends."""

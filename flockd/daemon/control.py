@@ -24,6 +24,7 @@ from flockd.safety import (
     Action,
     Decision,
     Event,
+    MissionEnd,
     Permission,
     State,
     Supervisor,
@@ -79,7 +80,7 @@ class Control:
         status, vehicle = self._link.status(), self._link.vehicle_state()
         if vehicle is not None:
             self._history.add(vehicle)
-        inputs = self._input_collector.collect(status, vehicle, self._operator)
+        inputs = self._input_collector.collect(status, vehicle, self._operator, self._mission_over())
         before, now = self.decision, self._clock()
         self.decision = self._supervisor.step(now, inputs)
         self._begin_or_end_flight(before, vehicle)
@@ -92,6 +93,14 @@ class Control:
         if self._stream_gate.clearance is not None:
             permission = Permission(Action.ASK_HOLD, self._clock())
             self._stream_gate.clearance = replace(self._stream_gate.clearance, permission=permission)
+
+    def _mission_over(self) -> MissionEnd | None:
+        """What the mission of this flight asks of the autopilot; None while nothing flies, as its mission is past."""
+        result = self._pilot_loop.newest
+        if self.decision.state not in FLYING or result is None or result.flight != self._flight:
+            return None
+        mission = result.output.mission
+        return None if mission is None or mission.takeover is None else MissionEnd(mission.takeover)
 
     def _begin_or_end_flight(self, before: Decision, vehicle: VehicleState | None) -> None:
         """A flight begins with a new pilot, and holds the height and the heading that the drone has then."""
@@ -112,21 +121,23 @@ class Control:
             return
         if before.action is Action.SILENCE:
             self._streamer.begin()
-        velocity, yaw_rad, made_s = self._command(now)
+        velocity, height_m, yaw_rad, made_s = self._command(now)
         around = self._around(now, status, vehicle)
         self._stream_gate.clearance = Clearance(Permission(action, now), around, made_s)
-        self._streamer.offer(Setpoint(now, velocity, self._height_m, yaw_rad))
+        self._streamer.offer(Setpoint(now, velocity, height_m, yaw_rad))
         self._streamer.beat()
 
-    def _command(self, now: float) -> tuple[FloatArray, float, float]:
-        """Velocity, heading, and when they were computed; standstill during the pilot's first steps of a flight.
+    def _command(self, now: float) -> tuple[FloatArray, float, float, float]:
+        """Velocity, height, heading, and when they were computed; standstill during a flight's first steps.
 
         Before those it knows neither its ego-motion nor its neighbours.
         """
         result = self._pilot_loop.newest
         if result is None or result.flight != self._flight or result.number < self._first_steps:
-            return np.zeros(2), self._yaw_rad, now
-        return result.output.command.velocity, result.output.command.yaw_rad, result.time_s
+            return np.zeros(2), self._height_m, self._yaw_rad, now
+        command = result.output.command
+        height_m = self._height_m if command.height_m is None else command.height_m
+        return command.velocity, height_m, command.yaw_rad, result.time_s
 
     def _around(self, now: float, status: AutopilotStatus, vehicle: VehicleState | None) -> Surroundings:
         known = vehicle is not None and vehicle.velocity_ned is not None
@@ -141,6 +152,7 @@ class Control:
             position=position_from_home(status),
             velocity=velocity[:2],
             yaw_rad=math.nan if vehicle is None else _yaw(vehicle),
+            height_m=math.nan if vehicle is None else vehicle.height_m,
             neighbours=np.reshape(places, (len(places), 3)),
             neighbour_velocities=np.reshape([n.velocity[:2] for n in confirmed], (len(confirmed), 2)),
         )

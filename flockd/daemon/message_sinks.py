@@ -9,7 +9,7 @@ from pathlib import Path
 
 from flockd.config import DroneConfig
 from flockd.daemon.worker import BusyError, Worker
-from flockd.messages import FrameSet, PilotOutput, VehicleState
+from flockd.messages import FrameSet, MissionOrder, PilotOutput, VehicleState
 from flockd.recording import Recorder
 from flockd.telemetry import TelemetrySink, publish_step
 from flockd.telemetry.topics import EventMessage
@@ -51,11 +51,11 @@ class MessageSinks:
         if self._recorder is not None:
             self._recorder.publish(self._config.name, topic, message)
 
-    def step(self, frames: FrameSet, vehicle: VehicleState, output: PilotOutput) -> None:
+    def step(self, frames: FrameSet, vehicle: VehicleState, output: PilotOutput, order: MissionOrder | None) -> None:
         """Publishes and records one step of the pilot."""
         self._submit(publish_step, self._telemetry, self._config.name, vehicle, output)
         if self._recorder is not None:
-            self._recorder.step(frames, vehicle, output)
+            self._recorder.step(frames, vehicle, output, order=order)
 
     @property
     def recording(self) -> str | None:

@@ -5,8 +5,14 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from typing import Protocol
 
+from flockd.messages import MissionOrder
+from flockd.telemetry.order_messages import parse_order
 from flockd.telemetry.topics import AnswerMessage
+
+ORDERS = frozenset({"goto", "velocity"})
+"""Commands that change the mission."""
 
 
 @dataclass
@@ -27,20 +33,43 @@ class OperatorRequests:
         self.resume = command == "resume"
 
 
+class Missions(Protocol):
+    """What takes an operator's orders to the mission."""
+
+    def fault(self, order: MissionOrder) -> str | None:
+        """Why it is refused; None: it is not. On any thread."""
+
+    def apply(self, order: MissionOrder) -> None:
+        """Has the pilot take it in its next step. On the event loop."""
+
+
 def command_handler(
     allowed: Collection[str],
     requests: OperatorRequests,
+    missions: Missions,
     loop: asyncio.AbstractEventLoop,
     log_event: Callable[[str], None],
-) -> Callable[[str], AnswerMessage]:
+) -> Callable[[str, bytes], AnswerMessage]:
     """A function that accepts or refuses a command on any thread, and applies it on the event loop."""
 
-    def handle(command: str) -> AnswerMessage:
+    def refused(sentence: str) -> AnswerMessage:
+        log_event(f"an operator's command was refused: {sentence}")
+        return AnswerMessage(accepted=False, sentence=sentence)
+
+    def handle(command: str, payload: bytes) -> AnswerMessage:
         if command not in allowed:
-            sentence = f"{command!r} is not allowed here; telemetry.commands allows {', '.join(allowed) or 'none'}"
-            log_event(f"an operator's command was refused: {sentence}")
-            return AnswerMessage(accepted=False, sentence=sentence)
-        loop.call_soon_threadsafe(requests.apply, command)
+            return refused(f"{command!r} is not allowed here; telemetry.commands allows {', '.join(allowed) or 'none'}")
+        if command in ORDERS:
+            try:
+                order = parse_order(command, payload)
+            except ValueError as error:
+                return refused(str(error))
+            fault = missions.fault(order)
+            if fault is not None:
+                return refused(fault)
+            loop.call_soon_threadsafe(missions.apply, order)
+        else:
+            loop.call_soon_threadsafe(requests.apply, command)
         log_event(f"an operator asked for {command}")
         return AnswerMessage(accepted=True, sentence=f"{command} is being tried; the topic `flight` shows the result")
 

@@ -14,7 +14,7 @@ import numpy as np
 from flockd.config import DroneConfig
 from flockd.daemon.watched_networks import NetworkStuckError, WatchedNetworks
 from flockd.daemon.worker import Worker
-from flockd.messages import FrameSet, PilotOutput, VehicleState
+from flockd.messages import FrameSet, MissionOrder, PilotOutput, VehicleState
 from flockd.pilot import FlockPilot
 from flockd.sources import FrameSource
 
@@ -39,7 +39,7 @@ class StepResult:
     """Of the step, from 1 for the first of its pilot."""
 
 
-OnStep = Callable[[FrameSet, VehicleState, PilotOutput], None]
+OnStep = Callable[[FrameSet, VehicleState, PilotOutput, MissionOrder | None], None]
 
 
 class PilotLoop:
@@ -74,10 +74,12 @@ class PilotLoop:
         """In a row."""
         self.neighbour_seen_s = -math.inf
         """When a confirmed neighbour was last seen."""
+        self.order: MissionOrder | None = None
+        """An operator's that no finished step has taken yet."""
 
     def begin_flight(self, number: int) -> None:
         """Uses a new pilot from the next step on: its time begins there, so that a recording can be replayed."""
-        self._flight, self._pilot = number, None
+        self._flight, self._pilot, self.order = number, None, None
 
     def load(self) -> float:
         """How long the steps take, 95th percentile of the last ones, over how long they may."""
@@ -106,13 +108,13 @@ class PilotLoop:
         self._decoding.leave(LEAVE_S)
 
     async def _step(self, taken_s: float, frames: FrameSet, vehicle: VehicleState) -> None:
-        flight = self._flight
+        flight, order = self._flight, self.order
         self.steps += 1
         try:
             pilot = self._pilot
             if pilot is None:
                 pilot = await self._geometry.do(STEP_DEADLINE_S, self._new_pilot)
-            output = await self._geometry.do(STEP_DEADLINE_S, pilot.step, frames, vehicle)
+            output = await self._geometry.do(STEP_DEADLINE_S, pilot.step, frames, vehicle, None, order)
         except (FloatingPointError, NetworkStuckError) as error:
             self._note_failure(str(error))
             return
@@ -120,12 +122,14 @@ class PilotLoop:
             self._took_s.append(self._clock() - taken_s)
         if flight != self._flight:
             return  # a flight began meanwhile; this result is the old pilot's
+        if self.order is order:
+            self.order = None  # a step that fails is not recorded, so that the next takes the order again
         self._failure = None
         number = 1 if self._pilot is None or self.newest is None else self.newest.number + 1
         self._pilot = pilot
         self.newest = StepResult(taken_s, output, flight, number)
         self._count(self.newest)
-        self._on_step(frames, vehicle, output)
+        self._on_step(frames, vehicle, output, order)
 
     def _new_pilot(self) -> FlockPilot:
         return FlockPilot(self._config, self._networks, stopwatch=time.perf_counter)

@@ -19,6 +19,7 @@ from flockd.daemon.components import Components
 from flockd.daemon.control import Control
 from flockd.daemon.host_monitors import LoopLag, Thermometer, WallClock
 from flockd.daemon.message_sinks import MessageSinks
+from flockd.daemon.mission_orders import MissionOrders
 from flockd.daemon.operator_commands import OperatorRequests, command_handler
 from flockd.daemon.pilot_loop import PilotLoop
 from flockd.daemon.preview import preview
@@ -86,7 +87,9 @@ async def open_components(
         config, link, streamer, stream_gate, pilot_loop, collector, requests, history, operator, on_tick, clock
     )  # fmt: skip
     take_off = TakeOff(link, streamer, operator, lambda: control.decision, sinks.event)
-    handle = command_handler(config.telemetry.commands, operator, asyncio.get_running_loop(), sinks.event)
+    missions = MissionOrders(config, pilot_loop, link.vehicle_state, lambda: control.decision.state)
+    loop = asyncio.get_running_loop()
+    handle = command_handler(config.telemetry.commands, operator, missions, loop, sinks.event)
     telemetry.announce(config.name, _about(config), handle, functools.partial(_preview, pilot_loop))
     return Components(
         link=link, streamer=streamer, source=source, pilot_loop=pilot_loop, networks=networks, control=control,

@@ -16,7 +16,7 @@ from flockd.daemon.operator_commands import OperatorRequests
 from flockd.daemon.pilot_loop import PilotLoop
 from flockd.daemon.watched_networks import WatchedNetworks
 from flockd.messages import FloatArray, VehicleState
-from flockd.safety import CameraHealth, Gate, Inputs, Objection, outside_fence, outside_heights
+from flockd.safety import CameraHealth, Gate, Inputs, MissionEnd, Objection, outside_fence, outside_heights
 from flockd.sources import CameraStatus, Count, FrameSource
 
 DROPS_WINDOW_S = 5.0
@@ -48,7 +48,13 @@ class InputCollector:
         self._refused_before = 0
         self._had_satellites = False
 
-    def collect(self, status: AutopilotStatus, vehicle: VehicleState | None, operator: OperatorRequests) -> Inputs:
+    def collect(
+        self,
+        status: AutopilotStatus,
+        vehicle: VehicleState | None,
+        operator: OperatorRequests,
+        mission_over: MissionEnd | None,
+    ) -> Inputs:
         """All inputs as of now; requests that count once are reset in ``operator``."""
         now = self._clock()
         pilot_loop, result = self._pilot_loop, self._pilot_loop.newest
@@ -84,6 +90,7 @@ class InputCollector:
             hold_asked=operator.hold,
             land_asked=operator.land,
             resume_asked=operator.resume,
+            mission_over=mission_over,
         )
         self._faults_before += inputs.network_faults
         self._refused_before += inputs.refused_commands

@@ -8,7 +8,7 @@ from collections import deque
 import cv2
 import numpy as np
 
-from flockd.messages import VehicleState
+from flockd.messages import FloatArray, VehicleState
 
 HISTORY_S = 2.0
 
@@ -43,12 +43,16 @@ def _between(before: VehicleState, after: VehicleState, time_s: float) -> Vehicl
     share = (time_s - before.time_s) / (after.time_s - before.time_s)
     turn, _ = cv2.Rodrigues(before.R_ned_body.T @ after.R_ned_body)
     part, _ = cv2.Rodrigues(share * np.asarray(turn, np.float64))
-    velocity = after.velocity_ned
-    if velocity is not None and before.velocity_ned is not None:
-        velocity = before.velocity_ned + share * (velocity - before.velocity_ned)
     return VehicleState(
         time_s=time_s,
         R_ned_body=before.R_ned_body @ np.asarray(part, np.float64),
         height_m=before.height_m + share * (after.height_m - before.height_m),
-        velocity_ned=velocity,
+        velocity_ned=_between_vectors(before.velocity_ned, after.velocity_ned, share),
+        position=_between_vectors(before.position, after.position, share),
+        home_deg=after.home_deg,
     )
+
+
+def _between_vectors(before: FloatArray | None, after: FloatArray | None, share: float) -> FloatArray | None:
+    """The later one where only that is known."""
+    return after if before is None or after is None else before + share * (after - before)

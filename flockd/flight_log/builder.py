@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -57,12 +58,12 @@ class FlightLogBuilder:
         same = (desired == desired[0]).all()
         self._desired[step] = desired[0] if same else desired.mean(axis=0)
         goals = [
-            mission.goal + (0.0 if homes is None else homes[i])
+            tuple(np.round(mission.goal + (0.0 if homes is None else homes[i]), 3).tolist())
             for i, mission in enumerate(missions)
             if mission is not None and mission.goal is not None
         ]
         if goals:
-            self._goal[step] = np.mean(goals, axis=0)
+            self._goal[step] = Counter(goals).most_common(1)[0][0]
 
     def add_exact_states(
         self, step: int, i: int, others: BoolArray, relative: FloatArray, velocities: FloatArray,

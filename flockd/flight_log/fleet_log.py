@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -17,9 +17,10 @@ from flockd.flight_log.builder import FlightLogBuilder
 from flockd.flight_log.capture import capture, key_frame_steps
 from flockd.flight_log.key_frames import KeyFrame
 from flockd.flight_log.log import FlightLog
-from flockd.flight_log.metadata import FleetMetadata, FlightMetadata, Percentiles
+from flockd.flight_log.metadata import FleetMetadata, FlightMetadata, MissionMetadata, Percentiles
 from flockd.flocking.metrics import order, union
-from flockd.messages import FloatArray, PilotOutput
+from flockd.messages import FloatArray, MissionStatus, PilotOutput
+from flockd.mission.circle_then_tangent import desired_of
 from flockd.perception import load_networks
 from flockd.pilot import FlockPilot, StepTrace
 from flockd.recording.codec import from_json
@@ -85,15 +86,16 @@ def fleet_log(
     frames, drone = run.frames, configs[0]
     begin_s = frames[0].time_s
     times = np.array([frame.time_s - begin_s for frame in frames])
-    builder = FlightLogBuilder(times, len(configs))
+    builder = FlightLogBuilder(times, len(scenario.vehicles))
     for row, frame in enumerate(frames):
         builder.add_truth(row, frame.position, frame.velocity, frame.R_ned_body)
     rows = {frame.time_s: row for row, frame in enumerate(frames)}
-    missions: dict[int, MissionStatus] = {}
-    statuses = [dict(missions) for _ in frames]
+    numbers = {f"drone{i + 1}": i for i in range(len(scenario.vehicles))}
+    statuses: list[dict[int, MissionStatus | None]] = [{} for _ in frames]
     processed: dict[str, int] = {}
     longest_s, spanning = 0.0, 0
-    for i, config in enumerate(configs):
+    for config in configs:
+        i = numbers[config.name]
         steps = [(rows[o.time_s], o, R) for o, R in _outputs(recordings, config.name) if o.time_s in rows]
         for before, (row, output, R_ned_body) in zip([None, *steps], steps, strict=False):
             spans_more = False
@@ -104,11 +106,14 @@ def fleet_log(
             # The log compares a motion with the truth of one frame set before: it cannot take one that spans more.
             kept = replace(output, ego_motion=None) if spans_more else output
             builder.add_output(row, i, kept, R_ned_body, output.stages_ms)
+            statuses[row][i] = output.mission
         processed[config.name] = len(steps)
+    _add_missions(builder, scenario, frames, times, statuses)
     metadata = FlightMetadata.of_configuration(
         drone,
         scenario=scenario.scenario,
-        drones=len(configs),
+        drones=len(scenario.vehicles),
+        mission=MissionMetadata.of(scenario),
         duration_s=float(times[-1]) + drone.step_s if run.interrupted else scenario.duration_s,
         interrupted=run.interrupted,
         began=run.began or None,
@@ -120,6 +125,31 @@ def fleet_log(
         fleet=_metadata(run, times, drone.flocking, speed_factor, processed, longest_s, spanning),
     )
     return builder.build(metadata, companion)
+
+
+def _add_missions(
+    builder: FlightLogBuilder, scenario: ScenarioConfig, frames: Sequence[FleetFrame], times: FloatArray,
+    statuses: Sequence[Mapping[int, MissionStatus | None]],
+) -> None:  # fmt: skip
+    """What each drone wanted at each frame; where its pilot left one out, what it wanted before.
+
+    Of one that is flown by hand nobody knows more than how it flew.
+    """
+    vehicles = range(len(scenario.vehicles))
+    homes = np.array([vehicle.position_m[:2] for vehicle in scenario.vehicles])
+    missions = [scenario.drone_of(i).mission for i in vehicles]
+    newest: dict[int, MissionStatus | None] = {}
+    for row, (frame, found) in enumerate(zip(frames, statuses, strict=True)):
+        newest |= found
+        desired = [
+            frame.velocity[i, :2]
+            if scenario.vehicles[i].by_hand
+            else desired_of(missions[i], float(times[row]), newest[i])
+            if i in newest
+            else np.zeros(2)
+            for i in vehicles
+        ]
+        builder.add_missions(row, np.array(desired), [newest.get(i) for i in vehicles], homes)
 
 
 def _metadata(
@@ -174,7 +204,7 @@ def fleet_key_frames(recordings: Path, run: FleetRun) -> tuple[KeyFrame, ...]:
         pilot = FlockPilot(recording.config, networks)
         for step in recording.steps(times[max(index - 1, 0)], times[index]):
             trace = StepTrace()
-            output = pilot.step(step.frames, step.vehicle, trace)
+            output = pilot.step(step.frames, step.vehicle, trace, step.order)
         begin_s = run.frames[0].time_s
         key_frames += (replace(one, time_s=one.time_s - begin_s) for one in capture(trace, output, KEY_FRAME_DRONE))
     return tuple(key_frames)

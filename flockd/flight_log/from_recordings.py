@@ -80,7 +80,7 @@ def key_frames(
     frames: list[KeyFrame] = []
     for index, step in enumerate(recording.steps()):
         trace = StepTrace()
-        output = pilot.step(step.frames, step.vehicle, trace)
+        output = pilot.step(step.frames, step.vehicle, trace, step.order)
         if index in chosen:
             captured = capture(trace, output, names.index(recording.drone), "" if log.has_truth else recording.drone)
             frames += (replace(one, time_s=one.time_s - zero_s) for one in captured)

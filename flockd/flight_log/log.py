@@ -64,8 +64,8 @@ class FlightLog:
     """(K, 6) each confirmed track at each step: step, observer, track, and metres north, east and down of it."""
 
     goal: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-    """(S, 2) m north and east: where the drones that have a goal want to go, their mean; NaN without one; (0, 2) in
-    logs from before there were goals."""
+    """(S, 2) m north and east: where most drones that have a goal want to go, to the millimetre; NaN without
+    one; (0, 2) in logs from before there were goals."""
 
     @property
     def has_truth(self) -> bool:
@@ -121,6 +121,8 @@ class FlightLog:
         arrays: dict[str, Any] = {
             part.name: getattr(self, part.name) for part in fields(self) if part.name not in ("stages_ms", "metadata")
         }
+        if not len(self.goal):
+            del arrays["goal"]
         arrays |= {_STAGE_PREFIX + stage: samples for stage, samples in self.stages_ms.items()}
         with path.open("wb") as file:
             np.savez_compressed(file, **arrays, meta=self.metadata.model_dump_json(exclude_unset=True))

@@ -7,6 +7,7 @@ from typing import Any, Final, Self
 from pydantic import BaseModel, ConfigDict
 
 from flockd.config import DroneConfig
+from flockd.config.scenario import ScenarioConfig
 
 EXACT_STATES: Final = "truth"
 """`FlightMetadata.perception` of a flight whose drones were given the others' true states."""
@@ -62,6 +63,16 @@ class MissionMetadata(BaseModel):
     """Of the missions, by name, each once."""
     reached_m: float
     """How near to a goal the flock's middle has to come."""
+
+    @classmethod
+    def of(cls, scenario: ScenarioConfig) -> Self:
+        """Of all vehicles of a scenario."""
+        vehicles = range(len(scenario.vehicles))
+        kinds = [
+            f"{scenario.drone_of(i).mission.kind}{' by hand' if scenario.vehicles[i].by_hand else ''}" for i in vehicles
+        ]
+        reached_m = max(scenario.drone_of(i).mission.reached_m for i in vehicles)
+        return cls(kind=", ".join(dict.fromkeys(kinds)), reached_m=reached_m)
 
 
 class FlightMetadata(BaseModel):

@@ -17,8 +17,8 @@ from flockd.safety.fence import outside_fence
 class Waypoints:
     """Leads the middle of the flock to one waypoint after the other, and stays at the last one.
 
-    The middle is of the drone and of the neighbours that it sees. Drones that fly the same waypoints see nearly the same
-    middle and so want the same velocity, as on the paper's circle, instead of all wanting to be at one spot.
+    The middle is of the drone and of the neighbours that it sees. Drones that fly the same waypoints see nearly the
+    same middle and so want the same velocity, as on the paper's circle, instead of all wanting to be at one spot.
     """
 
     def __init__(self, parameters: MissionParameters, gate: GateParameters) -> None:

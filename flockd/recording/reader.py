@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from flockd.config import DroneConfig
 from flockd.image_header import MAX_IMAGE_PIXELS, image_size
-from flockd.messages import Frame, FrameSet, UInt8Array, VehicleState
+from flockd.messages import Frame, FrameSet, MissionOrder, UInt8Array, VehicleState
 from flockd.recording import foxglove
 from flockd.recording.codec import from_json
 from flockd.recording.mcap_file import Damage, Entry, Inclosure, Note, Record, RecordingError, read_records
@@ -28,6 +28,7 @@ from flockd.recording.streams import (
     FORMAT,
     FRAMES,
     MODELS_NOTE,
+    ORDER,
     OUTPUT,
     PILOT_BEGAN,
     TRUTH,
@@ -54,6 +55,8 @@ class RecordedStep:
     `migrate_output` converts it."""
     truth: Truth | None
     """Of a simulated flight."""
+    order: MissionOrder | None = None
+    """An operator's that the step took."""
 
 
 @dataclass
@@ -173,6 +176,7 @@ class Recording:
             vehicle: VehicleState = from_json(VehicleState, json.loads(messages[VEHICLE.topic]))
             output = migrate_output(json.loads(messages[OUTPUT.topic])) if OUTPUT.topic in messages else None
             truth = from_json(Truth, json.loads(messages[TRUTH.topic])) if TRUTH.topic in messages else None
+            order = from_json(MissionOrder, json.loads(messages[ORDER.topic])) if ORDER.topic in messages else None
             frames = {}
             for entry in listed.frames:
                 image = _image(messages[foxglove.image_stream(entry.camera).topic])
@@ -181,7 +185,7 @@ class Recording:
             raise RecordingError(f"{self.path}: step {number} lost its message {error}; {_WHAT_TO_DO}") from error
         except (ValueError, RecordingError) as error:
             raise RecordingError(f"{self.path}: step {number} cannot be read ({error}); {_WHAT_TO_DO}") from error
-        yield RecordedStep(number, FrameSet(listed.time_s, frames), vehicle, output, truth)
+        yield RecordedStep(number, FrameSet(listed.time_s, frames), vehicle, output, truth, order)
 
 
 def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
@@ -317,7 +321,7 @@ def is_calibration(topic: str) -> bool:
 
 def makes_steps(topic: str) -> bool:
     """Whether this stream's messages are parts of steps, numbered by their sequence."""
-    return topic in {FRAMES.topic, VEHICLE.topic, OUTPUT.topic, TRUTH.topic} or is_image(topic)
+    return topic in {FRAMES.topic, VEHICLE.topic, ORDER.topic, OUTPUT.topic, TRUTH.topic} or is_image(topic)
 
 
 def _image(message: bytes) -> UInt8Array:

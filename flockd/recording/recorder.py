@@ -22,7 +22,7 @@ from flockd import __version__
 from flockd.config import DroneConfig
 from flockd.config.recording import RecordingConfig
 from flockd.config.rig import RigConfig
-from flockd.messages import Frame, FrameSet, PilotOutput, VehicleState
+from flockd.messages import Frame, FrameSet, MissionOrder, PilotOutput, VehicleState
 from flockd.recording import foxglove
 from flockd.recording.codec import to_json
 from flockd.recording.mcap_file import Entry, Inclosure, McapFile, Note, RecordingError
@@ -36,6 +36,7 @@ from flockd.recording.streams import (
     FORMAT,
     FRAMES,
     MODELS_NOTE,
+    ORDER,
     OUTPUT,
     TABLE,
     TRUTH,
@@ -68,6 +69,7 @@ class _Step:
     vehicle: VehicleState
     output: PilotOutput
     truth: Truth | None
+    order: MissionOrder | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,14 +146,21 @@ class Recorder:
         """Why the recording ended before the flight; None while all is well."""
         return self._failure
 
-    def step(self, frames: FrameSet, vehicle: VehicleState, output: PilotOutput, truth: Truth | None = None) -> None:
+    def step(
+        self,
+        frames: FrameSet,
+        vehicle: VehicleState,
+        output: PilotOutput,
+        truth: Truth | None = None,
+        order: MissionOrder | None = None,
+    ) -> None:
         """Takes one step of the pilot: what went in and what came out, and all telemetry that follows from it.
 
-        A simulator adds the ``truth``, which no pilot knows.
+        A simulator adds the ``truth``, which no pilot knows. ``order`` is the operator's that the step took.
         """
         number, self._steps = self._steps, self._steps + 1
         size = sum(frame.image.nbytes for frame in frames.frames.values())
-        self._put(_Step(number, frames, vehicle, output, truth), size + _SMALL_BYTES)
+        self._put(_Step(number, frames, vehicle, output, truth, order), size + _SMALL_BYTES)
 
     def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
         """Takes one telemetry message, if the table of topics wants it recorded; a `TelemetrySink`.
@@ -430,6 +439,8 @@ def _step_entries(
         yield Entry(foxglove.image_stream(camera), stamp, step.number, message)
     yield _json_entry(FRAMES, time_s, step.number, StepFrames(step.number, time_s, tuple(kept)))
     yield _json_entry(VEHICLE, time_s, step.number, step.vehicle)
+    if step.order is not None:
+        yield _json_entry(ORDER, time_s, step.number, step.order)
     yield from track.entries(step)
     if step.truth is not None:
         yield _json_entry(TRUTH, time_s, step.number, step.truth)

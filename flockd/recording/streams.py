@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flockd.messages import PilotOutput, VehicleState
+from flockd.messages import MissionOrder, PilotOutput, VehicleState
 from flockd.recording.codec import json_schema
 from flockd.recording.mcap_file import Stream
 from flockd.recording.truth import Truth
@@ -51,6 +51,8 @@ def _json_stream(topic: str, kind: Any) -> Stream:
 
 FRAMES = _json_stream("/frames", StepFrames)
 VEHICLE = _json_stream("/vehicle", VehicleState)
+ORDER = _json_stream("/order", MissionOrder)
+"""Of steps in which the pilot took an operator's order."""
 OUTPUT = _json_stream("/output", PilotOutput)
 TRUTH = _json_stream("/truth", Truth)
 """Of simulated flights."""

@@ -67,7 +67,7 @@ def replay_flight(
         recorder = None if out is None else stack.enter_context(_recording_to(out, recording, config))
         for step, read_s in _paced(recording.steps(start_s, end_s), speed):
             begin_s = time.perf_counter()
-            output = pilot.step(step.frames, step.vehicle)
+            output = pilot.step(step.frames, step.vehicle, order=step.order)
             replay.computing_s += time.perf_counter() - begin_s
             replay.reading_s += read_s
             replay.times_s.append(step.frames.time_s)
@@ -78,7 +78,7 @@ def replay_flight(
                 replay.stages_ms.setdefault(stage, []).append(ms)
             if recorder is not None:
                 recorder.drain()  # nothing waits for a replay, so nothing need be dropped
-                recorder.step(step.frames, step.vehicle, output, step.truth)
+                recorder.step(step.frames, step.vehicle, output, step.truth, step.order)
             progress(len(replay.outputs), total)
     return replay
 

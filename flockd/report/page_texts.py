@@ -156,6 +156,12 @@ def _facts(summary: Summary, log: FlightLog) -> list[dict[str, str]]:
     if summary["has_truth"]:
         heights = -log.position[..., 2]
         facts.append(_fact("Heights", f"{heights.min():.1f}–{heights.max():.1f}", "above the start’s ground", "m"))
+    mission = summary["mission"]
+    if mission["arrived"] is not None:
+        when = "never reached" if mission["time_s"] is None else f"reached at {mission['time_s']:g} s"
+        facts.append(
+            _fact("From the last goal", _number(mission["final_error_m"], 2), f"the middle, at the end; {when}", "m")
+        )
     if neighbours["recall_within_10m"] is not None:
         facts += [
             _fact("Neighbours known", _number(100 * neighbours["recall_within_10m"], 1), "of those within 10 m", "%"),
@@ -197,7 +203,8 @@ def _table2(summary: Summary) -> list[dict[str, Any]]:
     """Ours beside the paper's maxima; only the windows in which something was estimated."""
     until = f"{summary['circle_until_s']:g}"
     windows = []
-    for window, name in (("before", f"On the circle, t < {until} s"), ("after", f"Straight on, t ≥ {until} s")):
+    after = f"Straight on, t ≥ {until} s" if summary["circle_until_s"] > 0 else "The whole flight"
+    for window, name in (("before", f"On the circle, t < {until} s"), ("after", after)):
         columns = summary["table2"][window]
         if all(columns[key]["max"] is None for key in _TABLE_2_COLUMNS):
             continue

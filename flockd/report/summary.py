@@ -18,6 +18,7 @@ TAIL_S = 10.0
 CONVERGENCE_BAND = {"obj1": 0.05, "obj2": 0.2}
 """How near to its tail mean a sum must stay to have converged."""
 RECALL_RANGE_M = 10.0
+SAME_GOAL_M = 1e-6
 
 Json = dict[str, Any]
 
@@ -32,8 +33,9 @@ def summarise(log: FlightLog) -> Json:
     interaction distance. `neighbours`: the share of all drones within 10 m, at all steps, of which there was a
     confirmed track, and new false tracks; of drones and steps that were recorded. A flight whose perception is "truth"
     has no perception: its `neighbours` are null and it is itself Table 3's "truth". Of a recording without truth
-    (`has_truth`) all of these are null. `own_account` needs no truth: the recorded drones' own estimates. `autopilot`
-    names what real daemons flew, and `fleet` holds their figures; null where the simulator ran the pilots.
+    (`has_truth`) all of these are null. `mission` is `mission_figures`. `own_account` needs no truth: the recorded
+    drones' own estimates. `autopilot` names what real daemons flew, and `fleet` holds their figures; null where the
+    simulator ran the pilots.
     """
     metadata, value = log.metadata, log.metadata.model_dump()
     return {
@@ -43,6 +45,7 @@ def summarise(log: FlightLog) -> Json:
         "table2": _table_2(log),
         "table3": _table_3(log),
         "flock": _flock(log),
+        "mission": mission_figures(log),
         "neighbours": _neighbours(log),
         "own_account": _own_account(log),
         "stages_ms": {
@@ -97,6 +100,30 @@ def objective_sums(log: FlightLog, position: FloatArray, velocity: FloatArray) -
     return {
         "obj1": np.array([obj1(speed[s], log.desired[s], circling=bool(circling[s])).sum() for s in steps]),
         "obj2": np.array([obj2(plan[s], speed[s], parameters).sum() for s in steps]),
+    }
+
+
+def mission_figures(log: FlightLog) -> Json:
+    """Whether the flock's true middle is at its last goal at the end, since when, and how far away; null without one.
+
+    `time_s`: the first time that it was there, once that goal was the one to fly to.
+    """
+    mission = log.metadata.mission
+    figures: Json = {"kind": None if mission is None else mission.kind, "arrived": None, "time_s": None}
+    goals = np.flatnonzero(np.isfinite(log.goal).all(axis=1))
+    if mission is None or not len(goals) or not log.has_truth:
+        return {**figures, "final_error_m": None}
+    last = log.goal[goals[-1]]
+    away_m = np.linalg.norm(log.position[..., :2].mean(axis=1) - last, axis=1)
+    same = np.linalg.norm(log.goal - last, axis=1) <= SAME_GOAL_M
+    others = goals[~same[goals]]
+    since = others[-1] + 1 if len(others) else 0
+    there = np.flatnonzero((away_m <= mission.reached_m) & (np.arange(len(away_m)) >= since))
+    return {
+        **figures,
+        "arrived": bool(away_m[-1] <= mission.reached_m),
+        "time_s": float(log.time_s[there[0]]) if len(there) else None,
+        "final_error_m": float(away_m[-1]),
     }
 
 

@@ -15,7 +15,8 @@ from flockd.flight_log.log import FlightLog
 from flockd.flocking.metrics import pair_distances
 from flockd.messages import BoolArray, FloatArray
 from flockd.report.curves import NARROW_IN
-from flockd.report.style import FEW, MUTED, NAMED, ON_COLOUR, PAPER, STYLE, colour_of, drone_name
+from flockd.report.style import FEW, INK, MUTED, NAMED, ON_COLOUR, PAPER, STYLE, colour_of, drone_name
+from flockd.report.summary import SAME_GOAL_M
 
 
 def trajectories(log: FlightLog, *, narrow: bool = False) -> Figure:
@@ -46,9 +47,11 @@ def trajectories(log: FlightLog, *, narrow: bool = False) -> Figure:
             _plan(paths, track, color=colour, linewidth=1.4 if drones <= FEW else 0.8)
             _plan(paths, track[:1], color=colour, marker="o", markersize=5, markerfacecolor=PAPER, zorder=4)
             _plan(paths, track[-1:], color=colour, marker="o", markersize=6, markeredgecolor=PAPER, zorder=5)
+        goals = _goals(log)
+        paths.plot(goals[:, 1], goals[:, 0], **_GOAL)
         paths.set_aspect("equal", adjustable="datalim")
         paths.set(xlabel="east, m", ylabel="north, m", title="Paths")
-        paths.legend(handles=_path_handles(drones, exact=exact is not None), loc="best")
+        paths.legend(handles=_path_handles(drones, exact=exact is not None, goals=len(goals) > 0), loc="best")
 
         reach = 1.15 * max(np.abs(_centred(log.position[step])).max() for step in (0, -1)) + 1.2
         for axes, step, name in zip(formations, (0, -1), ("start", "end"), strict=False):
@@ -72,11 +75,22 @@ def trajectories(log: FlightLog, *, narrow: bool = False) -> Figure:
 _COMPANION: Final[dict[str, Any]] = {"color": MUTED, "linestyle": (0, (3, 2)), "linewidth": 0.9, "alpha": 0.8}
 
 
+_GOAL: Final[dict[str, Any]] = {"color": INK, "marker": "x", "markersize": 8, "linestyle": "", "zorder": 6}
+
+
+def _goals(log: FlightLog) -> FloatArray:
+    """(n, 2) metres north and east: each place that the mission led to, in order."""
+    known = log.goal[np.isfinite(log.goal).all(axis=1)]
+    changes = np.linalg.norm(np.diff(known, axis=0), axis=1) > SAME_GOAL_M
+    places: FloatArray = known[np.concatenate([[True], changes])] if len(known) else known
+    return places
+
+
 def _plan(axes: Axes, track: FloatArray, **style: object) -> None:
     axes.plot(track[:, 1], track[:, 0], **style)  # type: ignore[arg-type]
 
 
-def _path_handles(drones: int, *, exact: bool) -> list[Line2D]:
+def _path_handles(drones: int, *, exact: bool, goals: bool) -> list[Line2D]:
     handles = []
     if drones <= FEW:
         handles += [Line2D([], [], color=colour_of(i, drones), label=drone_name(i)) for i in range(drones)]
@@ -90,6 +104,8 @@ def _path_handles(drones: int, *, exact: bool) -> list[Line2D]:
     handles.append(Line2D([], [], color=MUTED, marker="o", linestyle="", label="end"))
     if exact:
         handles.append(Line2D([], [], label="with exact states", **_COMPANION))
+    if goals:
+        handles.append(Line2D([], [], label="goal", **_GOAL))
     return handles
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from flockd.config.safety import GateParameters, SafetyParameters
-from flockd.safety.events import OFFBOARD, CameraHealth, Event, Inputs
+from flockd.safety.events import OFFBOARD, CameraHealth, Event, Inputs, MissionEnd
 from flockd.safety.fence import outside_fence, outside_heights
 from flockd.safety.gate import (
     Gate,
@@ -25,6 +25,7 @@ __all__ = [
     "Gate",
     "GateParameters",
     "Inputs",
+    "MissionEnd",
     "Objection",
     "Permission",
     "Reaction",

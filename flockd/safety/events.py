@@ -27,6 +27,13 @@ class CameraHealth:
     """It keeps sending the same image or the same sequence number."""
 
 
+class MissionEnd(StrEnum):
+    """What a mission that is over wants of the autopilot."""
+
+    LAND = "land"
+    RETURN = "return"
+
+
 @dataclass(frozen=True)
 class Inputs:
     """All that the supervisor goes by, as of one instant. A number that is NaN counts as bad."""
@@ -80,6 +87,8 @@ class Inputs:
     land_asked: bool
     resume_asked: bool
     """By an operator, since the last call: may be ready again, after a flight that was ended in the air."""
+    mission_over: MissionEnd | None = None
+    """The mission of this flight has come to its end, and how it ends; None: it has not, or ends in the air."""
 
 
 class Event(StrEnum):
@@ -114,6 +123,8 @@ class Event(StrEnum):
     SHUTDOWN_ASKED = "shutdown_asked"
     HOLD_ASKED = "hold_asked"
     LAND_ASKED = "land_asked"
+    MISSION_LANDS = "mission_lands"
+    MISSION_RETURNS = "mission_returns"
     # The supervisor's own, not noticed in the inputs:
     STARTED = "started"
     NO_ANSWER = "no_answer"
@@ -199,6 +210,8 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         (Event.SHUTDOWN_ASKED, inputs.shutdown_asked, "asked to end"),
         (Event.HOLD_ASKED, inputs.hold_asked, "an operator asked for Hold"),
         (Event.LAND_ASKED, inputs.land_asked, "an operator asked for Land"),
+        (Event.MISSION_LANDS, inputs.mission_over is MissionEnd.LAND, "the mission is over and ends with Land"),
+        (Event.MISSION_RETURNS, inputs.mission_over is MissionEnd.RETURN, "the mission is over and ends with Return"),
     )
     return {event: sentence for event, holds, sentence in table if holds}
 

@@ -51,6 +51,8 @@ class Surroundings:
     """(n, 3) metres, NED, relative to the drone."""
     neighbour_velocities: FloatArray
     """(n, 2) m/s over ground, north and east."""
+    height_m: float
+    """Of the drone, as in `VehicleState`; NaN: not known."""
 
 
 class Objection(StrEnum):
@@ -81,6 +83,12 @@ class Verdict:
 _ROUNDING_M_S = 1e-9
 _PARALLEL = 1e-6
 """Sine of the angle between two directions below which their limits are not combined."""
+
+_COLUMN = 1.5
+"""A neighbour is above or below where its level range is less than this many times the degraded separation: downwash
+widens on its way down, and neither drone stays exactly where it is."""
+_HEIGHT_NOISE_M = 0.3
+"""Of a height over a few seconds: a difference this small between asked and own height is no climb."""
 
 SAME_SPOT_M = 0.1
 """A neighbour whose level range is smaller is above or below, in no direction: cameras do not measure one that well."""
@@ -136,14 +144,19 @@ class Gate:
         if not np.isfinite([*velocity, wanted.height_m, yaw_rad]).all():
             objections.append(Objection.SETPOINT_NOT_FINITE)
             return None
-        return Setpoint(now_s, velocity, self._within_heights(wanted.height_m, objections), yaw_rad)
+        height_m = self._within_climb(now_s, permission.action, wanted, around, objections)
+        return Setpoint(now_s, velocity, self._within_heights(height_m, objections), yaw_rad)
 
     def _slowed(self, velocity: FloatArray, age_s: float, action: Action) -> FloatArray:
         """A command's velocity: slower once a newer command is missed, nothing when it is too old, slow if degraded."""
         p = self._parameters
-        share = min((p.command_timeout_s - age_s) / (p.command_timeout_s - p.command_fresh_s), 1.0)
         limit_m_s = p.degraded_speed_m_s if action is Action.FLY_DEGRADED else p.max_speed_m_s
-        return _limited(share * velocity, limit_m_s)
+        return _limited(self._share(age_s) * velocity, limit_m_s)
+
+    def _share(self, age_s: float) -> float:
+        """How much of a command is flown at its age: all while it is fresh, nothing at the time-out."""
+        p = self._parameters
+        return min((p.command_timeout_s - age_s) / (p.command_timeout_s - p.command_fresh_s), 1.0)
 
     def _accepts(self, command: VelocityCommand, around: Surroundings, objections: list[Objection]) -> bool:
         """Whether the command may move the drone at all."""
@@ -192,7 +205,7 @@ class Gate:
         return _within(velocity, np.concatenate([outward, towards]), limits)
 
     def _approaches(self, around: Surroundings, separation_m: float) -> tuple[FloatArray, FloatArray]:
-        """For each neighbour at the drone's height the direction to it, (n, 2), and how fast to fly there, (n,) m/s.
+        """For each neighbour about at the drone's height its direction, (n, 2), and how fast to fly there, (n,) m/s.
 
         Nearer than the separation: not at all. Farther, so fast that the distance left suffices if both brake, as in
         Shalev-Shwartz et al. 2017, "On a formal model of safe and scalable self-driving cars": with v towards a
@@ -203,18 +216,61 @@ class Gate:
         p = self._parameters
         offsets = around.neighbours
         ranges = np.hypot(offsets[:, 0], offsets[:, 1])
-        meets = (ranges >= SAME_SPOT_M) & (ranges < math.inf) & (np.abs(offsets[:, 2]) < separation_m)
+        about_m = max(separation_m, p.vertical_separation_m)
+        meets = (ranges >= SAME_SPOT_M) & (ranges < math.inf) & (np.abs(offsets[:, 2]) < about_m)
         offsets, ranges = offsets[meets], ranges[meets]
         towards = offsets[:, :2] / ranges[:, None]
         velocities = np.nan_to_num(around.neighbour_velocities[meets], posinf=0.0, neginf=0.0)
         comes = -np.clip(np.sum(velocities * towards, axis=1), -p.max_speed_m_s, p.max_speed_m_s)
-        left_m = ranges - np.sqrt(separation_m**2 - offsets[:, 2] ** 2)
+        left_m = ranges - separation_m
         lag = p.braking_m_s2 * p.reaction_s
         square = lag**2 + 2 * p.braking_m_s2 * (left_m - comes * p.reaction_s) - comes * np.abs(comes)
         most_m_s = np.sqrt(np.maximum(square, lag**2)) - lag
         if_both_come = np.sqrt(lag**2 + p.braking_m_s2 * np.maximum(left_m, 0.0)) - lag
         most_m_s = np.minimum(most_m_s, np.maximum(if_both_come, -comes))
         return towards, np.where(left_m > 0, most_m_s, 0.0)
+
+    def _within_climb(
+        self, now_s: float, action: Action, wanted: Wanted, around: Surroundings, objections: list[Objection]
+    ) -> float:
+        """The height nearest to the one to hold that may be asked for now.
+
+        It changes no faster than the limit, as much slower as the velocity of an old command, and not at all where the
+        drone is to stand still in flight. It leads no nearer to a neighbour that is near above or below.
+        """
+        p = self._parameters
+        if self._last is not None and now_s - self._last.time_s <= p.permission_timeout_s:
+            start_m, elapsed_s = self._last.height_m, max(now_s - self._last.time_s, 0.0)
+        else:
+            start_m, elapsed_s = (around.height_m if math.isfinite(around.height_m) else wanted.height_m), 0.0
+        most_m = 0.0
+        if action in _MOVES:
+            most_m = p.max_climb_m_s * elapsed_s * max(self._share(now_s - wanted.time_s), 0.0)
+        if action is Action.OFFER:  # on the ground, or flown by the pilot: as high as the control loop says
+            return wanted.height_m
+        height_m = start_m + min(max(wanted.height_m - start_m, -most_m), most_m)
+        lowest_m, highest_m = self._between_neighbours(start_m, around)
+        between_m = min(max(height_m, lowest_m), highest_m)
+        if between_m != height_m:
+            objections.append(Objection.SEPARATION)
+        return between_m
+
+    def _between_neighbours(self, start_m: float, around: Surroundings) -> tuple[float, float]:
+        """From which height to which one may be asked for, from `start_m` on, where neighbours are above or below.
+
+        A height that was asked for already, and from which the drone's own differs by noise only, stays.
+        """
+        p, own_m = self._parameters, around.height_m
+        if not math.isfinite(own_m):
+            return -math.inf, math.inf
+        offsets = around.neighbours[np.isfinite(around.neighbours).all(axis=1)]
+        near = np.hypot(offsets[:, 0], offsets[:, 1]) < _COLUMN * p.degraded_separation_m
+        up = -offsets[near, 2]
+        room_up = np.maximum(up[up > 0] - p.vertical_separation_m, 0.0).min(initial=math.inf)
+        room_down = np.maximum(-up[up < 0] - p.vertical_separation_m, 0.0).min(initial=math.inf)
+        highest_m = max(own_m + float(room_up), min(start_m, own_m + _HEIGHT_NOISE_M))
+        lowest_m = min(own_m - float(room_down), max(start_m, own_m - _HEIGHT_NOISE_M))
+        return lowest_m, highest_m
 
     def _within_heights(self, height_m: float, objections: list[Objection]) -> float:
         within = min(max(height_m, self._parameters.min_height_m), self._parameters.max_height_m)

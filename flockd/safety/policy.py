@@ -113,4 +113,6 @@ def rules(p: SafetyParameters) -> dict[Event, Rule]:
         Event.SHUTDOWN_ASKED: Rule(Barrier.LATCH, Reaction.HOLD),
         Event.HOLD_ASKED: Rule(Barrier.LATCH, Reaction.HOLD),
         Event.LAND_ASKED: Rule(Barrier.LATCH, Reaction.LAND),
+        Event.MISSION_LANDS: Rule(Barrier.NONE, Reaction.LAND),
+        Event.MISSION_RETURNS: Rule(Barrier.NONE, Reaction.RETURN),
     }

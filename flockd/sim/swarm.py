@@ -19,7 +19,7 @@ from flockd.flight_log.builder import FlightLogBuilder
 from flockd.flight_log.capture import capture, key_frame_steps
 from flockd.flight_log.key_frames import KeyFrame
 from flockd.flight_log.log import FlightLog
-from flockd.flight_log.metadata import FlightMetadata
+from flockd.flight_log.metadata import FlightMetadata, MissionMetadata
 from flockd.messages import FloatArray, MissionStatus, PilotOutput
 from flockd.mission.circle_then_tangent import desired_of
 from flockd.perception import load_networks
@@ -113,6 +113,7 @@ def fly(
         scenario.drone,
         scenario=scenario.scenario,
         drones=len(scenario.vehicles),
+        mission=MissionMetadata.of(scenario),
         duration_s=scenario.duration_s if flown == len(times) else flown * scenario.drone.step_s,
         interrupted=flown < len(times),
         began=began.isoformat(timespec="seconds"),

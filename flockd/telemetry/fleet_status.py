@@ -40,6 +40,7 @@ def _row(drone: Watched, now_s: float) -> dict[str, Any]:
         if neighbours is None
         else sum(1 for neighbour in neighbours["neighbours"] if neighbour["confirmed"]),
         "load": computer.get("load"),
+        "mission": (drone.message("mission", now_s) or {}).get("sentence"),
         "matters": [reason["sentence"] for reason in flight.get("reasons", ())]
         + [str(reason) for reason in (health.get("reasons", ()) if simulated else ())]
         + blind,

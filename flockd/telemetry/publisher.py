@@ -15,8 +15,8 @@ from flockd.zenoh_session import SessionOwner, open_session
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
-Ask = Callable[[str], AnswerMessage]
-"""Takes an operator's command by name, on a thread of zenoh's; returns at once."""
+Ask = Callable[[str, bytes], AnswerMessage]
+"""Takes an operator's command by name, with what its query carries, on a thread of zenoh's; returns at once."""
 NewestImage = Callable[[str], bytes | None]
 """Gives a camera's newest image as JPEG, on a thread of zenoh's; None where there is none."""
 
@@ -73,7 +73,8 @@ class ZenohTelemetry(SessionOwner):
             self._session.liveliness().declare_token(f"{key}/alive"),
             self._session.declare_queryable(f"{key}/about", lambda query: _reply(query, about)),
             self._session.declare_queryable(
-                f"{key}/ask/*", lambda query: _reply(query, ask(str(query.key_expr).rpartition("/")[2]))
+                f"{key}/ask/*",
+                lambda query: _reply(query, ask(str(query.key_expr).rpartition("/")[2], _payload(query))),
             ),
             self._session.declare_queryable(f"{key}/image/*", lambda query: _send_image(query, newest_image)),
         ]
@@ -90,6 +91,11 @@ class ZenohTelemetry(SessionOwner):
             )
             self._publishers[drone, topic] = publisher
         return publisher
+
+
+def _payload(query: zenoh.Query) -> bytes:
+    """What the query carries; empty where it is nothing."""
+    return b"" if query.payload is None else query.payload.to_bytes()
 
 
 def _reply(query: zenoh.Query, message: Mapping[str, object]) -> None:

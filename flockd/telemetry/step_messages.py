@@ -6,10 +6,11 @@ import math
 from collections.abc import Mapping
 from typing import Protocol
 
-from flockd.messages import Neighbour, PilotOutput, VehicleState
+from flockd.messages import MissionStatus, Neighbour, PilotOutput, VehicleState
 from flockd.telemetry.topics import (
     CommandMessage,
     HealthMessage,
+    MissionMessage,
     NeighbourMessage,
     NeighboursMessage,
     StateMessage,
@@ -29,6 +30,8 @@ def publish_step(sink: TelemetrySink, drone: str, vehicle: VehicleState, output:
     sink.publish(drone, "state", _state(vehicle, output))
     sink.publish(drone, "neighbours", _neighbours(output))
     sink.publish(drone, "command", _command(output))
+    if output.mission is not None:
+        sink.publish(drone, "mission", _mission(output.time_s, vehicle, output.mission))
     sink.publish(drone, "health", _health(output))
     sink.publish(drone, "timings", TimingsMessage(time_s=output.time_s, stages_ms=dict(output.stages_ms)))
 
@@ -70,6 +73,18 @@ def _command(output: PilotOutput) -> CommandMessage:
         velocity_ne=output.command.velocity.tolist(),
         acceleration_ne=output.command.acceleration.tolist(),
         yaw_deg=math.degrees(output.command.yaw_rad),
+    )
+
+
+def _mission(time_s: float, vehicle: VehicleState, mission: MissionStatus) -> MissionMessage:
+    return MissionMessage(
+        time_s=time_s,
+        kind=mission.kind,
+        sentence=mission.sentence,
+        goal_ne=None if mission.goal is None else mission.goal.tolist(),
+        goal_height_m=mission.goal_height_m,
+        position_ne=None if vehicle.position is None else vehicle.position.tolist(),
+        arrived=mission.arrived,
     )
 
 

@@ -5,8 +5,9 @@ Vectors are lists: NED is north, east, down. Times are seconds on the drone's mo
 
 `state` to `timings` follow from each step of the pilot; `flight` and `computer` come from the daemon, at all times.
 Beside the topics, a drone's daemon has a liveliness token `.../alive`, replies to a query for `.../about` with an
-`AboutMessage`, one for `.../ask/hold`, `land` or `resume` with an `AnswerMessage`, and one for `.../image/<camera>`
-with a small JPEG of what that camera sees.
+`AboutMessage`, one for `.../ask/hold`, `land`, `resume`, `goto` or `velocity` with an `AnswerMessage`, and one for
+`.../image/<camera>` with a small JPEG of what that camera sees. A query for `goto` or `velocity` carries an
+`OrderMessage`.
 """
 
 from __future__ import annotations
@@ -71,6 +72,23 @@ class CommandMessage(TypedDict):
     acceleration_ne: list[float]
     """m/s^2, north and east, after limits."""
     yaw_deg: float
+
+
+class MissionMessage(TypedDict):
+    """How far the drone is with its mission; not sent on the paper's circle."""
+
+    time_s: float
+    kind: str
+    sentence: str
+    """What it does now, for people."""
+    goal_ne: list[float] | None
+    """Metres from home; null where there is no goal."""
+    goal_height_m: float | None
+    """null: as high as when the flight began."""
+    position_ne: list[float] | None
+    """Metres from home, as the autopilot has it."""
+    arrived: bool
+    """At the last goal."""
 
 
 class HealthMessage(TypedDict):
@@ -175,6 +193,22 @@ class AboutMessage(TypedDict):
     """What operators may ask of it."""
 
 
+class OrderMessage(TypedDict, total=False):
+    """What `goto` and `velocity` ask: a goal in metres or degrees, or a velocity; what is left out stays as it is."""
+
+    north_m: float
+    """From the mission's origin; so `east_m`."""
+    east_m: float
+    latitude_deg: float
+    longitude_deg: float
+    velocity_ne: list[float]
+    """m/s, north and east."""
+    height_m: float
+    """Above the ground at home."""
+    speed_m_s: float
+    """On the way to a goal."""
+
+
 class AnswerMessage(TypedDict):
     """What became of an operator's command."""
 
@@ -203,6 +237,7 @@ TOPICS = {
         Topic("state", StateMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
         Topic("neighbours", NeighboursMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
         Topic("command", CommandMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
+        Topic("mission", MissionMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
         Topic("health", HealthMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
         Topic("events", EventMessage, rate_hz=None, stale_after_s=None, recorded=True),
         Topic("timings", TimingsMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),

@@ -104,7 +104,7 @@ class Scenes:
 
     def _maps(self, pilot: FlockPilot, step: RecordedStep, places: tuple[Place | None, Place]) -> Maps | None:
         trace = StepTrace()
-        output = pilot.step(step.frames, step.vehicle, trace)
+        output = pilot.step(step.frames, step.vehicle, trace, step.order)
         if step.output is not None:
             self.compared += 1
             self.equal += _without_times(to_json(output)) == _without_times(step.output)

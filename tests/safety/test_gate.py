@@ -16,7 +16,14 @@ STILL = np.zeros(2)
 NOBODY = np.empty((0, 3))
 DRAG_FREE = GateParameters().model_copy(update={"max_acceleration_m_s2": 1e6})
 """So that a step shows the limit it is about at once."""
-HOME = Surroundings(position=STILL, velocity=STILL, yaw_rad=0.5, neighbours=NOBODY, neighbour_velocities=NOBODY[:, :2])
+HOME = Surroundings(
+    position=STILL,
+    velocity=STILL,
+    yaw_rad=0.5,
+    neighbours=NOBODY,
+    neighbour_velocities=NOBODY[:, :2],
+    height_m=5.0,
+)
 
 
 def wanted(velocity: ArrayLike, *, time_s: float = 0.0, height_m: float = 5.0, yaw_rad: float = 1.0) -> Wanted:
@@ -353,12 +360,86 @@ def test_beyond_the_corner_of_a_fence_only_the_way_back_is_left() -> None:
 def test_the_height_is_brought_into_the_band() -> None:
     heights = GateParameters(min_height_m=2.0, max_height_m=20.0)
     for asked_m, sent_m in ((1.0, 2.0), (2.0, 2.0), (20.0, 20.0), (25.0, 20.0)):
-        verdict = Stream(heights).step([0.0, 0.0], height_m=asked_m)
+        verdict = Stream(heights).step([0.0, 0.0], around=replace(HOME, height_m=math.nan), height_m=asked_m)
         assert sent(verdict).height_m == sent_m
         assert verdict.objections == (() if asked_m == sent_m else (Objection.HEIGHT,))
 
 
+def test_the_height_changes_at_the_limit_and_not_at_all_while_the_drone_stands_still() -> None:
+    stream = Stream(GateParameters(max_climb_m_s=1.0))
+    climbed = [sent(stream.step(STILL, height_m=9.0)).height_m for _ in range(41)]
+    np.testing.assert_allclose(climbed, 5.0 + 0.05 * np.arange(41))  # from the drone's own height, at 1 m/s
+    assert sent(stream.step(STILL, Action.HOVER, height_m=9.0)).height_m == pytest.approx(7.0)
+    assert sent(stream.step(STILL, Action.ASK_HOLD, height_m=5.0)).height_m == pytest.approx(7.0)
+    assert sent(stream.step(STILL, Action.FLY_DEGRADED, height_m=5.0)).height_m == pytest.approx(6.95)
+    assert sent(stream.step(STILL, height_m=6.94)).height_m == pytest.approx(6.94)
+    assert sent(stream.step(STILL, Action.OFFER, height_m=9.0)).height_m == 9.0
+
+
+def test_an_old_command_climbs_ever_slower() -> None:
+    gate = Gate(GateParameters(max_climb_m_s=1.0, command_fresh_s=0.9, command_timeout_s=1.5))
+    heights = []
+    for step in range(31):
+        now_s = 0.05 * step
+        verdict = gate.step(now_s, Permission(Action.FLY, now_s), wanted(STILL, time_s=0.0, height_m=9.0), HOME)
+        heights.append(sent(verdict).height_m)
+    climbs = np.diff(heights) / 0.05
+    np.testing.assert_allclose(climbs[:18], 1.0)
+    np.testing.assert_allclose(climbs[23], 0.5)  # at 1.2 s, half way from 0.9 s to 1.5 s
+    np.testing.assert_allclose(climbs[-1], 0.0, atol=1e-12)
+
+
+def test_after_silence_the_height_starts_again_from_the_drones_own() -> None:
+    stream = Stream()
+    stream.step(STILL, height_m=5.0)
+    stream.now_s += 0.31
+    assert sent(stream.step(STILL, around=replace(HOME, height_m=7.0), height_m=5.0)).height_m == 7.0
+
+
 # Separation.
+
+
+@pytest.mark.parametrize(
+    ("above_m", "asked_m", "sent_m"),
+    [
+        (1.5, 6.0, 5.0),  # 1.5 m above is not free
+        (2.9, 6.0, 5.0),
+        (3.4, 6.0, 5.4),
+        (1.5, 4.0, 4.0),  # away
+        (-1.5, 4.0, 5.0),
+        (-3.4, 4.0, 4.6),
+        (-1.5, 6.0, 6.0),
+        (4.0, 6.0, 6.0),
+    ],
+)
+def test_no_change_of_height_leads_into_or_over_the_downwash_of_a_neighbour(
+    above_m: float, asked_m: float, sent_m: float
+) -> None:
+    around = near([2.2, 0.0, -above_m])
+    stream = Stream(DRAG_FREE.model_copy(update={"max_climb_m_s": 20.0}))
+    stream.step(STILL, around=around)
+    verdict = stream.step(STILL, around=around, height_m=asked_m)
+    assert sent(verdict).height_m == pytest.approx(sent_m)
+    assert verdict.objections == (() if sent_m == asked_m else (Objection.SEPARATION,))
+    beside = near([2.3, 0.0, -above_m])
+    assert sent(stream.step(STILL, around=beside, height_m=asked_m)).height_m == pytest.approx(asked_m)
+
+
+def test_between_one_above_and_one_below_the_height_stays_and_does_not_creep() -> None:
+    stream = Stream()
+    for step in range(200):
+        noise_m = 0.25 * math.sin(step)
+        both = replace(near([0.5, 0.0, -2.0], [0.0, 0.5, 2.0]), height_m=5.0 + noise_m)
+        assert sent(stream.step(STILL, around=both, height_m=5.0)).height_m == pytest.approx(5.0, abs=0.25)
+    drifted = replace(both, height_m=4.0)  # it is below what was asked for by more than noise: no climb back
+    assert sent(stream.step(STILL, around=drifted, height_m=5.0)).height_m == pytest.approx(4.3)
+
+
+def test_a_neighbour_1_5_m_below_counts_as_one_at_the_drones_height() -> None:
+    for down_m in (1.5, 2.9, -1.5, -2.9):
+        verdict = Stream().second([1.0, 0.5], around=near([0.9, 0.0, down_m]))
+        np.testing.assert_allclose(sent(verdict).velocity, [0.0, 0.5])
+        assert verdict.objections == (Objection.SEPARATION,)
 
 
 def test_no_velocity_towards_a_neighbour_that_is_too_near() -> None:
@@ -368,7 +449,7 @@ def test_no_velocity_towards_a_neighbour_that_is_too_near() -> None:
 
 
 def test_away_from_it_and_below_or_far_from_another_the_drone_may_fly() -> None:
-    for around in (near([-0.9, 0.0, 0.0]), near([3.0, 0.0, 0.0]), near([0.7, 0.0, 1.1])):
+    for around in (near([-0.9, 0.0, 0.0]), near([3.0, 0.0, 0.0]), near([0.7, 0.0, 3.0]), near([0.7, 0.0, -3.0])):
         verdict = Stream().second([1.0, 0.5], around=around)
         np.testing.assert_allclose(sent(verdict).velocity, [1.0, 0.5])
         assert verdict.objections == ()
@@ -435,6 +516,7 @@ def test_two_that_fly_at_each_other_at_3_m_s_stop_before_the_minimum_distance(
                 yaw_rad=0.0,
                 neighbours=np.array([[*offset, 0.0]]),
                 neighbour_velocities=seen_velocities[[other]],
+                height_m=5.0,
             )
             setpoints[me] = sent(gates[me].step([3.0 - 6.0 * me, 0.0], around=around)).velocity
         for _ in range(5):
@@ -503,7 +585,7 @@ def _vector(rng: np.random.Generator, size: int, scale: float, odd: float) -> Fl
 def test_whatever_is_asked_for_what_is_sent_is_safe(seed: int, odd: float) -> None:
     rng = np.random.default_rng(seed)
     gate, last, now_s = Gate(PARAMETERS), None, 0.0
-    total = {"sent": 0, "moving": 0, "near": 0, "outside": 0}
+    total = {"sent": 0, "moving": 0, "near": 0, "outside": 0, "climbing": 0, "stacked": 0}
     for _ in range(1000):
         now_s += float(rng.choice([0.0, 0.05, 0.05, 0.05, 0.2]))
         action = Action(rng.choice([Action.FLY, Action.FLY, Action.FLY_DEGRADED, *Action]))
@@ -521,6 +603,7 @@ def test_whatever_is_asked_for_what_is_sent_is_safe(seed: int, odd: float) -> No
             yaw_rad=_number(rng, 2.0, odd),
             neighbours=np.array([_vector(rng, 3, 1.0, odd) for _ in range(number)]).reshape(-1, 3),
             neighbour_velocities=np.array([_vector(rng, 2, 1.0, odd) for _ in range(number)]).reshape(-1, 2),
+            height_m=10.0 + _number(rng, 3.0, odd),
         )
         verdict = gate.step(now_s, permission, want, around)
         setpoint = verdict.setpoint
@@ -541,10 +624,18 @@ def test_whatever_is_asked_for_what_is_sent_is_safe(seed: int, odd: float) -> No
                 assert change <= 4.0 * (now_s - last.time_s) + 1e-9
             total["near"] += _assert_not_towards_a_near_one(setpoint, around, 1.0 if action is Action.FLY else 1.5)
             total["outside"] += _assert_not_outward(setpoint, around)
+            if last is not None and action not in (Action.OFFER, Action.SILENCE):
+                climb = setpoint.height_m - last.height_m
+                spent_m = 1.5 * (now_s - last.time_s) if action in (Action.FLY, Action.FLY_DEGRADED) else 0.0
+                total["climbing"] += abs(climb) > 0.01
+                assert Objection.SEPARATION in verdict.objections or abs(climb) <= spent_m + 1e-9
+            total["stacked"] += action is not Action.OFFER and _assert_not_into_a_stack(setpoint, around)
         last = setpoint
     assert total["moving"] > 20
     assert total["near"] > 20
     assert total["outside"] > 20
+    assert total["climbing"] > 20
+    assert total["stacked"] > 20
 
 
 def _assert_not_towards_a_near_one(setpoint: Setpoint, around: Surroundings, separation_m: float) -> bool:
@@ -557,6 +648,19 @@ def _assert_not_towards_a_near_one(setpoint: Setpoint, around: Surroundings, sep
         soon = neighbour[:2] - 1e-6 * setpoint.velocity
         assert math.hypot(*soon) >= math.hypot(*neighbour[:2]) - 1e-14
     return bool(near_ones)
+
+
+def _assert_not_into_a_stack(setpoint: Setpoint, around: Surroundings) -> bool:
+    """No climb of more than noise towards a neighbour less than 3 m above, and no sinking towards one below."""
+    if not math.isfinite(around.height_m):
+        return False
+    stacked = False
+    for north, east, down in around.neighbours:
+        if np.isfinite([north, east, down]).all() and math.hypot(north, east) < 2.25 and 0 < abs(down) < 3.0:
+            stacked = True
+            over = (setpoint.height_m - around.height_m) * (-1 if down > 0 else 1)
+            assert over <= 0.3 + 1e-9 or setpoint.height_m in (PARAMETERS.min_height_m, PARAMETERS.max_height_m)
+    return stacked
 
 
 def _assert_not_outward(setpoint: Setpoint, around: Surroundings) -> bool:

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 import pytest
 
-from flockd.safety import OFFBOARD, Action, Event, Inputs, SafetyParameters, State
+from flockd.safety import OFFBOARD, Action, Event, Inputs, MissionEnd, SafetyParameters, State
 from flockd.safety.events import notice
 from tests.safety.flights import (
     ALL_SEE,
@@ -66,6 +66,8 @@ FAULTS = {
     Event.SHUTDOWN_ASKED: Fault({"shutdown_asked": True}, "latch", Action.ASK_HOLD),
     Event.HOLD_ASKED: Fault({"hold_asked": True}, "latch", Action.ASK_HOLD),
     Event.LAND_ASKED: Fault({"land_asked": True}, "latch", Action.ASK_LAND),
+    Event.MISSION_LANDS: Fault({"mission_over": MissionEnd.LAND}, "ready", Action.ASK_LAND),
+    Event.MISSION_RETURNS: Fault({"mission_over": MissionEnd.RETURN}, "ready", Action.ASK_RETURN),
 }
 """faults.md, fault by fault."""
 
@@ -84,6 +86,7 @@ STATE_OF = {
     Action.FLY_DEGRADED: State.DEGRADED,
     Action.HOVER: State.HOVER,
     Action.ASK_HOLD: State.ASKING,
+    Action.ASK_RETURN: State.ASKING,
     Action.ASK_LAND: State.ASKING,
     Action.SILENCE: State.SILENT,
 }
