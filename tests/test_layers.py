@@ -219,6 +219,8 @@ def test_no_drone_reads_telemetry_to_fly() -> None:
             assert word not in text or path in allowed, path
         if _folder(path) not in {"cli", "doctor"} and path != FLEET_STATUS:
             assert "flockd.telemetry.watcher" not in _imports(path), path
+        if _folder(path) != "cli":
+            assert "flockd.telemetry.operator_client" not in _imports(path), path
 
 
 def test_one_file_opens_and_closes_sessions() -> None:

@@ -14,6 +14,7 @@ import yaml
 
 import flockd
 from flockd.config import DroneConfig
+from flockd.config.mission import MissionParameters
 from flockd.config.recording import RecordingConfig
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import ConfigError, ConfigProblem
@@ -34,8 +35,8 @@ def fleet_configs(
 ) -> tuple[DroneConfig, ...]:
     """What each drone of a scenario flies with.
 
-    The pilot is the scenario's; source, autopilot, safety and telemetry are those of ``sitl``. Raises ConfigError
-    where ``sitl`` lacks one of them.
+    The pilot is the scenario's, with the mission's places counted from the drone's own home, which is below its start;
+    source, autopilot, safety and telemetry are those of ``sitl``. Raises ConfigError where ``sitl`` lacks one of them.
     """
     if sitl.source is None or sitl.source.kind != "shared_memory":
         raise ConfigError(
@@ -53,6 +54,7 @@ def fleet_configs(
             "name": name,
             "source": sitl.source.model_copy(update={"shared_memory": shared_memory}),
             "autopilot": sitl.autopilot.model_copy(update=address),
+            "mission": _from_home(scenario, i),
             "safety": sitl.safety,
             "telemetry": sitl.telemetry.model_copy(
                 update={"fleet": re.sub(r"[^A-Za-z0-9_.-]+", "-", scenario.scenario)}
@@ -61,6 +63,13 @@ def fleet_configs(
         }
         configs.append(scenario.drone.model_copy(update=parts))
     return tuple(configs)
+
+
+def _from_home(scenario: ScenarioConfig, vehicle: int) -> MissionParameters:
+    """A vehicle's mission, whose places count from the world's origin in the scenario."""
+    mission = scenario.drone_of(vehicle).mission
+    north_m, east_m, _ = scenario.vehicles[vehicle].position_m
+    return mission.model_copy(update={"origin_m": (mission.origin_m[0] - north_m, mission.origin_m[1] - east_m)})
 
 
 class Daemons:

@@ -1,0 +1,194 @@
+"""`flockd fleet`: asks drones of a fleet to fly somewhere else, to hold, to land, or to go on."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flockd.cli.output import complain, say, say_json
+from flockd.cli.parser import Commands, Parser, add_commands, positive_number
+from flockd.cli.status import ENDPOINT
+from flockd.errors import ExitCode, UnavailableError, UsageError
+
+if TYPE_CHECKING:
+    from flockd.messages import MissionOrder
+    from flockd.telemetry.operator_client import FleetOperator
+
+ALL = "all"
+REPEAT_S = 1.0
+"""Half of the time for which an operator's velocity holds."""
+PLAIN = {
+    "hold": "Have the autopilots of drones hold: they stop, and flockd hands over.",
+    "land": "Have the autopilots of drones land where they are.",
+    "resume": "Let drones be ready again whose flight was ended in the air; their pilots then select offboard.",
+}
+
+
+def add(commands: Commands) -> None:
+    """Adds the command."""
+    examples = (
+        "flockd fleet goto all 20 -5 --height 4",
+        "flockd fleet velocity drone1 0.5 0 --seconds 10",
+        "flockd fleet hold all",
+    )
+    parser = commands("fleet", "Ask drones to fly somewhere else, to hold, to land, or to go on.", examples, _NOTES)
+    add_commands(parser, (_add_goto, _add_velocity, *(_plain(command) for command in PLAIN)))
+
+
+_NOTES = """\
+A drone takes only what its `telemetry.commands` allows, and no goal outside its fence. Its answer says that it tries;
+`flockd status` shows what becomes of it. Exit code 1: a drone refused, or did not answer."""
+
+
+def _add_goto(commands: Commands) -> None:
+    examples = (
+        "flockd fleet goto all 20 -5",
+        "flockd fleet goto drone1,drone2 20 -5 --height 4 --speed 0.5",
+        "flockd fleet goto drone1 47.3977 8.5456 --degrees",
+        "flockd fleet goto all 20 -5 --repeat",
+    )
+    notes = (
+        "The goal takes the place of the mission until the flight ends. A drone whose mission is `operator` hovers\n"
+        "two seconds after the last one: send it with --repeat, and Ctrl-C stops it."
+    )
+    parser = commands("goto", "Send drones to a place, which they lead the middle of their flock to.", examples, notes)
+    _add_drones(parser)
+    parser.add_argument("north", metavar="NORTH", type=_number, help="metres north of the mission's origin")
+    parser.add_argument("east", metavar="EAST", type=_number, help="metres east of it")
+    parser.add_argument("--degrees", action="store_true", help="NORTH and EAST are latitude and longitude")
+    parser.add_argument("--height", metavar="M", type=_number, help="above the ground at home (default: as now)")
+    parser.add_argument("--speed", metavar="V", type=positive_number, help="in m/s (default: the mission's)")
+    parser.add_argument("--repeat", action="store_true", help="send it every second until Ctrl-C")
+    _add_connection(parser)
+    parser.set_defaults(run=_goto)
+
+
+def _add_velocity(commands: Commands) -> None:
+    examples = ("flockd fleet velocity drone1 0.5 0 --seconds 10", "flockd fleet velocity all 0 -1 --height 6")
+    parser = commands("velocity", "Have drones fly at a velocity for as long as it is sent.", examples)
+    _add_drones(parser)
+    parser.add_argument("north", metavar="NORTH", type=_number, help="m/s to the north")
+    parser.add_argument("east", metavar="EAST", type=_number, help="m/s to the east")
+    parser.add_argument("--height", metavar="M", type=_number, help="above the ground at home (default: as now)")
+    parser.add_argument(
+        "--seconds", metavar="S", type=positive_number, help="send it again every second for so long (default: once)"
+    )
+    _add_connection(parser)
+    parser.set_defaults(run=_velocity)
+
+
+def _plain(command: str) -> Callable[[Commands], None]:
+    def add(commands: Commands) -> None:
+        parser = commands(command, PLAIN[command], (f"flockd fleet {command} all", f"flockd fleet {command} drone1"))
+        _add_drones(parser)
+        _add_connection(parser)
+        parser.set_defaults(run=lambda args: _ask(args, command, None))
+
+    return add
+
+
+def _add_drones(parser: Parser) -> None:
+    parser.add_argument("drones", metavar="DRONES", help=f"names with commas between them, or `{ALL}`")
+
+
+def _add_connection(parser: Parser) -> None:
+    parser.add_argument("--fleet", metavar="NAME", help="only drones of this one; by default every fleet that is heard")
+    parser.add_argument(
+        "--connect", metavar="ENDPOINT", action="append", help=f"of a drone or a router; by default {ENDPOINT}"
+    )
+    parser.add_argument("--listen", metavar="ENDPOINT", action="append", help="where drones connect to")
+    parser.add_argument("--zenoh-config", metavar="FILE", type=Path, help="zenoh's own settings, as for TLS")
+    parser.add_argument("--json", action="store_true", help="print the answers as JSON, by drone")
+
+
+def _number(text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number")
+    return number
+
+
+def _goto(args: argparse.Namespace) -> int:
+    import numpy as np
+
+    from flockd.messages import MissionOrder
+
+    place = np.array([args.north, args.east])
+    if args.degrees and not (abs(args.north) <= 90 and abs(args.east) <= 180):
+        raise UsageError(f"{args.north:g} {args.east:g} is no latitude and longitude; swap them, or drop --degrees")
+    where = {"place_deg": place} if args.degrees else {"place": place}
+    order = MissionOrder(height_m=args.height, speed_m_s=args.speed, **where)
+    return _ask(args, "goto", order, repeat_s=math.inf if args.repeat else 0.0)
+
+
+def _velocity(args: argparse.Namespace) -> int:
+    import numpy as np
+
+    from flockd.messages import MissionOrder
+
+    order = MissionOrder(velocity=np.array([args.north, args.east]), height_m=args.height)
+    return _ask(args, "velocity", order, repeat_s=args.seconds or 0.0)
+
+
+def _ask(args: argparse.Namespace, command: str, order: MissionOrder | None, repeat_s: float = 0.0) -> int:
+    """Asks all, again and again for ``repeat_s``; says what each answered, later only what has changed."""
+    from flockd.telemetry.operator_client import FleetOperator
+
+    connect, listen = args.connect or [], args.listen or []
+    if not connect and not listen:
+        connect = [ENDPOINT]
+    with FleetOperator(args.fleet, listen=listen, connect=connect, settings=args.zenoh_config) as operator:
+        drones = _drones(operator, args.drones, ", ".join([*listen, *connect]))
+        began_s = time.monotonic()
+        answers = _answers(operator, drones, command, order)
+        _show(answers, as_json=args.json)
+        with suppress(KeyboardInterrupt):
+            while time.monotonic() + REPEAT_S <= began_s + repeat_s:
+                time.sleep(REPEAT_S)
+                before, answers = answers, _answers(operator, drones, command, order)
+                _show(
+                    {drone: answer for drone, answer in answers.items() if answer != before[drone]}, as_json=args.json
+                )
+    refused = any(not answer["accepted"] for answer in answers.values())
+    return ExitCode.CHECK_FAILED if refused else ExitCode.DONE
+
+
+def _drones(operator: FleetOperator, wanted: str, places: str) -> tuple[str, ...]:
+    names = None if wanted == ALL else wanted.split(",")
+    found = operator.drones(names)
+    missing = [name for name in names or () if name not in {key.split("/")[1] for key in found}]
+    if missing or not found:
+        raise UnavailableError(
+            f"{' and '.join(missing) or 'no drone'} was not found at {places}; nothing was asked of any; check "
+            "`flockd status`"
+        )
+    return found
+
+
+def _answers(
+    operator: FleetOperator, drones: tuple[str, ...], command: str, order: MissionOrder | None
+) -> dict[str, dict[str, object]]:
+    from flockd.telemetry.order_messages import order_message
+
+    answers: dict[str, dict[str, object]] = {}
+    for drone in drones:
+        answer = operator.ask(drone, command, None if order is None else order_message(order))
+        answers[drone] = {"accepted": False, "sentence": "did not answer"} if answer is None else {**answer}
+    return answers
+
+
+def _show(answers: dict[str, dict[str, object]], *, as_json: bool) -> None:
+    if as_json and answers:
+        say_json(answers)
+        return
+    for drone, answer in answers.items():
+        tell = say if answer["accepted"] else complain
+        tell(f"{drone}: {answer['sentence']}")

@@ -1,0 +1,111 @@
+"""Flies a scenario's missions on exact states over many seeds, and prints how the flock kept to them.
+
+    python -m tools.measure_missions config/square.yaml --seeds 10
+    python -m tools.measure_missions config/one_knows.yaml --seeds 10 --gust 0.3
+
+Each seed moves every start by up to half a metre and draws other gusts; seed 0 of --jitter 0 is the scenario as it is.
+A waypoint's distance is the nearest that the true middle of the flock came to it, in order of the waypoints.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flockd.config import ScenarioConfig, load_scenario
+from flockd.flocking.metrics import min_distance, order, union
+from flockd.messages import FloatArray
+from flockd.sim.exact_states import fly_exact_states
+
+TAIL_S = 10.0
+FLYING_M_S = 0.2
+"""Order is of steps in which the middle flies faster than this: at a standstill directions are noise."""
+
+
+def main() -> None:
+    """Prints a JSON object a seed, and one of all."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenario", type=Path)
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--gust", type=float, default=0.0, metavar="M_S", help="deviation of the gusts' velocity")
+    parser.add_argument("--jitter", type=float, default=0.5, metavar="M", help="of each start, north and east")
+    args = parser.parse_args()
+    rows = [measured(varied(load_scenario(args.scenario), seed, args.jitter, args.gust)) for seed in range(args.seeds)]
+    for row in rows:
+        print(json.dumps(row))
+    print(
+        json.dumps(
+            {
+                "seeds": args.seeds,
+                "farthest_from_a_waypoint_m": max((max(row["waypoints_m"], default=0.0) for row in rows), default=0.0),
+                "widest_at_the_end_m": max(row["widest_at_the_end_m"] for row in rows),
+                "closest_m": min(row["closest_m"] for row in rows),
+                "least_order_flying": min(row["order_flying"] for row in rows),
+                "least_union": min(row["union_tail"] for row in rows),
+            }
+        )
+    )
+
+
+def varied(scenario: ScenarioConfig, seed: int, jitter_m: float, gust_m_s: float) -> ScenarioConfig:
+    """The scenario with other starts and gusts."""
+    rng = np.random.default_rng([seed, 7])
+    vehicles = []
+    for start in scenario.vehicles:
+        north_m, east_m = rng.uniform(-jitter_m, jitter_m, 2)
+        position_m = (start.position_m[0] + float(north_m), start.position_m[1] + float(east_m), start.position_m[2])
+        vehicles.append(start.model_copy(update={"position_m": position_m}))
+    vehicle = scenario.vehicle.model_copy(update={"gust_m_s": gust_m_s})
+    return scenario.model_copy(update={"vehicles": tuple(vehicles), "vehicle": vehicle, "seed": seed})
+
+
+def measured(scenario: ScenarioConfig) -> dict[str, Any]:
+    """How one flight on exact states went."""
+    times, position, velocity = fly_exact_states(scenario)
+    middle = position[..., :2].mean(axis=1)
+    tail = np.flatnonzero(times >= times[-1] - TAIL_S)
+    flying = np.flatnonzero(np.linalg.norm(velocity[..., :2].mean(axis=1), axis=1) > FLYING_M_S)
+    reach_m = scenario.drone.flocking.observation_distance_m
+    return {
+        "seed": scenario.seed,
+        "waypoints_m": _passed(middle, _waypoints(scenario)),
+        "final_error_m": round(float(np.linalg.norm(middle[-1] - _waypoints(scenario)[-1])), 3),
+        "widest_at_the_end_m": round(_widest(position[-1]), 3),
+        "widest_m": round(max(_widest(places) for places in position), 3),
+        "closest_m": round(min(min_distance(places) for places in position), 3),
+        "order_flying": round(float(np.mean([order(velocity[s, :, :2]) for s in flying])), 4),
+        "union_tail": round(float(np.mean([union(position[s, :, :2], reach_m) for s in tail])), 4),
+    }
+
+
+def _waypoints(scenario: ScenarioConfig) -> FloatArray:
+    """(n, 2) metres, of the first drone that has any."""
+    missions = [scenario.drone_of(i).mission for i in range(len(scenario.vehicles))]
+    waypoints = next(mission.waypoints for mission in missions if mission.waypoints)
+    return np.array([(waypoint.north_m, waypoint.east_m) for waypoint in waypoints], dtype=float)
+
+
+def _passed(middle: FloatArray, waypoints: FloatArray) -> list[float]:
+    """The nearest that the middle (S, 2) came to each waypoint, each after it was nearest to the one before."""
+    nearest, since = [], 0
+    for waypoint in waypoints:
+        away_m = np.linalg.norm(middle[since:] - waypoint, axis=1)
+        within = np.flatnonzero(away_m <= 2.0)
+        first = int(within[0]) if len(within) else int(np.argmin(away_m))
+        since += first
+        nearest.append(round(float(away_m[first : first + 10].min()), 3))
+    return nearest
+
+
+def _widest(places: FloatArray) -> float:
+    """The largest level distance of two drones at (n, 3) m."""
+    plan = places[:, :2]
+    return float(np.linalg.norm(plan[:, None] - plan, axis=-1).max())
+
+
+if __name__ == "__main__":
+    main()
