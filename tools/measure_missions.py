@@ -73,7 +73,6 @@ def measured(scenario: ScenarioConfig) -> dict[str, Any]:
     return {
         "seed": scenario.seed,
         "waypoints_m": _passed(middle, _waypoints(scenario)),
-        "final_error_m": round(float(np.linalg.norm(middle[-1] - _waypoints(scenario)[-1])), 3),
         "widest_at_the_end_m": round(_widest(position[-1]), 3),
         "widest_m": round(max(_widest(places) for places in position), 3),
         "closest_m": round(min(min_distance(places) for places in position), 3),
@@ -85,8 +84,8 @@ def measured(scenario: ScenarioConfig) -> dict[str, Any]:
 def _waypoints(scenario: ScenarioConfig) -> FloatArray:
     """(n, 2) metres, of the first drone that has any."""
     missions = [scenario.drone_of(i).mission for i in range(len(scenario.vehicles))]
-    waypoints = next(mission.waypoints for mission in missions if mission.waypoints)
-    return np.array([(waypoint.north_m, waypoint.east_m) for waypoint in waypoints], dtype=float)
+    waypoints = next((mission.waypoints for mission in missions if mission.waypoints), ())
+    return np.array([(waypoint.north_m, waypoint.east_m) for waypoint in waypoints], dtype=float).reshape(-1, 2)
 
 
 def _passed(middle: FloatArray, waypoints: FloatArray) -> list[float]:

@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flockd.cli import config_new
 from flockd.cli.output import say, say_json
 from flockd.cli.parser import Commands, add_commands
 from flockd.errors import ConfigError, ConfigProblem, ExitCode, ModelError
@@ -17,9 +18,13 @@ if TYPE_CHECKING:
 
 def add(commands: Commands) -> None:
     """Adds the command."""
-    examples = ("flockd config check config/paper_flight.yaml", "flockd config show config/simulator.yaml")
-    parser = commands("config", "Check, show and describe configuration files.", examples)
-    add_commands(parser, (_add_check, _add_show, _add_schema))
+    examples = (
+        "flockd config check config/paper_flight.yaml",
+        "flockd config show config/simulator.yaml",
+        "flockd config new scenario my_flight.yaml --drones 3 --mission waypoints",
+    )
+    parser = commands("config", "Check, show, describe and begin configuration files.", examples)
+    add_commands(parser, (_add_check, _add_show, _add_schema, config_new.add))
 
 
 def _add_check(commands: Commands) -> None:

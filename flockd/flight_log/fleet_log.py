@@ -90,12 +90,11 @@ def fleet_log(
     for row, frame in enumerate(frames):
         builder.add_truth(row, frame.position, frame.velocity, frame.R_ned_body)
     rows = {frame.time_s: row for row, frame in enumerate(frames)}
-    numbers = {f"drone{i + 1}": i for i in range(len(scenario.vehicles))}
+    flown = [i for i, vehicle in enumerate(scenario.vehicles) if not vehicle.by_hand]
     statuses: list[dict[int, MissionStatus | None]] = [{} for _ in frames]
     processed: dict[str, int] = {}
     longest_s, spanning = 0.0, 0
-    for config in configs:
-        i = numbers[config.name]
+    for i, config in zip(flown, configs, strict=True):
         steps = [(rows[o.time_s], o, R) for o, R in _outputs(recordings, config.name) if o.time_s in rows]
         for before, (row, output, R_ned_body) in zip([None, *steps], steps, strict=False):
             spans_more = False

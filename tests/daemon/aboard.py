@@ -7,7 +7,7 @@ import json
 import socket
 import threading
 import time
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +17,7 @@ import numpy as np
 import zenoh
 
 from flockd.autopilot.fake_autopilot import FakeAutopilot
+from flockd.cli import main
 from flockd.config import DroneConfig
 from flockd.config.autopilot import AutopilotParameters
 from flockd.config.geometry import GeometryParameters
@@ -25,7 +26,7 @@ from flockd.config.perception import PerceptionConfig
 from flockd.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
 from flockd.config.safety import SafetyParameters
 from flockd.config.source import SharedMemoryParameters, SourceParameters
-from flockd.config.telemetry import TelemetryParameters
+from flockd.config.telemetry import OperatorCommand, TelemetryParameters
 from flockd.daemon import Daemon, Ending, ServiceManager
 from flockd.geometry import RigCamera
 from flockd.messages import Float32Array, Frame, UInt8Array
@@ -40,6 +41,7 @@ CAMERAS = ("front", "back")
 FRAMES_HZ = 10.0
 STEP_S = 0.25
 SPEED_M_S = 1.0
+COMMANDS: tuple[OperatorCommand, ...] = ("resume", "land", "goto", "velocity")
 SECONDS_TO_FAIL = 20.0
 PATIENT = SafetyParameters(degraded_load=50.0, max_load=100.0, max_loop_lag_s=2.0, recovery_s=0.5)
 """These stories are not about how fast the computer is that tells them."""
@@ -138,7 +140,7 @@ def config_for(
             shared_memory=SharedMemoryParameters(drone="tiny", connect=(frames,), rate_hz=FRAMES_HZ / 2),
         ),
         autopilot=AutopilotParameters(address=f"udpin://127.0.0.1:{port}", **autopilot),
-        telemetry=TelemetryParameters(fleet="test", listen=(telemetry,), commands=("resume", "land")),
+        telemetry=TelemetryParameters(fleet="test", listen=(telemetry,), commands=COMMANDS),
         mission=MissionParameters(speed_m_s=SPEED_M_S, circle_until_s=0.0),
         own_velocity=own_velocity,
         yaw="hold",
@@ -167,6 +169,11 @@ class Aboard:
         flight = self.heard().get("flight")
         return "" if flight is None else str(flight.message["state"])
 
+    def mission(self, key: str) -> object:
+        """Of the newest message on its mission; None before the first."""
+        heard = self.heard().get("mission")
+        return None if heard is None else heard.message[key]
+
     def matters(self) -> set[str]:
         return {reason["event"] for reason in self.heard()["flight"].message["reasons"]}
 
@@ -180,6 +187,11 @@ class Aboard:
         """The answer to a query, with zenoh alone as any other program would put it."""
         answer: dict[str, Any] = json.loads(await self._query(what))
         return answer
+
+    async def fleet(self, *arguments: str) -> int:
+        """The exit code of `flockd fleet`, as a person runs it."""
+        endpoint = self.config.telemetry.listen[0]
+        return await asyncio.to_thread(main, ["fleet", *arguments, "--connect", endpoint])
 
     async def picture(self, camera: str) -> bytes:
         return await self._query(f"image/{camera}")
@@ -221,15 +233,20 @@ async def aboard(
     *,
     recordings: Path | None = None,
     own_velocity: Literal["vision", "autopilot"] = "autopilot",
+    changes: Mapping[str, object] | None = None,
     **autopilot: Any,
 ) -> AsyncIterator[Aboard]:
-    """A daemon that runs, watched. The story ends it, or else it is asked to end."""
+    """A daemon that runs, watched. The story ends it, or else it is asked to end.
+
+    ``changes`` are sections of its configuration.
+    """
     frames, telemetry = free_endpoint(), free_endpoint()
     perceiver, cameras = TinyPerceiver(), Cameras(frames)
     manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     manager.bind(str(tmp_path / "notify"))
     manager.setblocking(False)
     config = config_for(port, frames, telemetry, own_velocity, **autopilot)
+    config = config.model_copy(update=dict(changes or {}))
     environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "1000000"}
     daemon = Daemon(
         config,

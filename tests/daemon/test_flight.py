@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 
 from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.config import DroneConfig
+from flockd.config.mission import MissionParameters, WaypointParameters
 from flockd.daemon import DaemonError, Ending
 from flockd.errors import ConfigError, ConfigProblem
 from flockd.pilot import FlockPilot
@@ -19,8 +21,11 @@ from flockd.recording.codec import to_json
 from flockd.recording.reader import Recording
 from tests.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
 from tests.autopilot.flight import until
-from tests.daemon.aboard import CAMERAS, SECONDS_TO_FAIL, SPEED_M_S, STEP_S, TinyPerceiver, aboard
+from tests.daemon.aboard import CAMERAS, PATIENT, SECONDS_TO_FAIL, SPEED_M_S, STEP_S, TinyPerceiver, aboard
 from tests.starvation import tell
+
+ALONE = PATIENT.model_copy(update={"alone_s": None})
+"""Flies on without neighbours, however long this computer takes."""
 
 
 def test_from_the_ground_into_the_air_and_back_into_the_pilots_hands(tmp_path: Path) -> None:
@@ -177,8 +182,62 @@ def _replays_to_the_last_bit(recording: Recording) -> None:
     pilot = FlockPilot(recording.config, TinyPerceiver())
     for step in steps:
         assert step.output is not None
-        again = to_json(pilot.step(step.frames, step.vehicle))
+        again = to_json(pilot.step(step.frames, step.vehicle, order=step.order))
         assert {**again, "stages_ms": None} == {**step.output, "stages_ms": None}
+
+
+def test_an_operator_sends_it_somewhere_and_the_recording_replays(
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def story() -> None:
+        async with aboard(fake_autopilot, port, tmp_path, recordings=tmp_path, changes={"safety": ALONE}) as ship:
+            await ship.is_ready_in_the_air()
+            assert await ship.fleet("goto", "tiny", "1", "0") == 1, "flockd does not fly it yet"
+            assert await ship.fleet("goto", "nobody", "1", "0") == 69
+            await ship.flies()
+            assert await ship.fleet("goto", "tiny", "300", "0") == 1
+            assert await ship.fleet("hold", "tiny") == 1, "not among telemetry.commands"
+            assert "mission" not in ship.heard(), "nothing has changed: it flies the paper's tangent"
+            north, east = fake_autopilot.state.position[:2] - [0.0, 2.0]
+            command = ("goto", "tiny", f"{north:.3f}", f"{east:.3f}", "--height", f"{HOVER_M + 1.0}", "--speed", "1")
+            assert await ship.fleet(*command) == 0
+            await until(lambda: ship.mission("arrived") is True, SECONDS_TO_FAIL)
+            await until(lambda: -fake_autopilot.state.position[2] > HOVER_M + 0.8, SECONDS_TO_FAIL)
+            away = fake_autopilot.state.position[:2] - [north, east]
+            assert float(np.linalg.norm(away)) < 1.5
+            assert fake_autopilot.mode == "OFFBOARD"
+            assert await ship.fleet("velocity", "tiny", "0.3", "0") == 0
+            await until(lambda: ship.mission("sentence") == "flies an operator's velocity", SECONDS_TO_FAIL)
+            await until(lambda: str(ship.mission("sentence")).startswith("hovers"), SECONDS_TO_FAIL)
+
+    tell(story)
+    told = capsys.readouterr()
+    assert "m from home, outside the fence of 100 m" in told.err
+    assert "flockd does not fly the drone now" in told.err
+    (path,) = tmp_path.glob("tiny-*.mcap")
+    recording = Recording(path)
+    _replays_to_the_last_bit(recording)
+    orders = [step.order for step in recording.steps() if step.order is not None]
+    assert [order.speed_m_s for order in orders] == [1.0, None]
+
+
+@pytest.mark.parametrize(("end", "mode"), [("land", "LAND"), ("return", "RTL")])
+def test_at_its_end_a_mission_hands_over_to_the_autopilot(
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, end: Literal["land", "return"], mode: str
+) -> None:
+    goal = WaypointParameters(north_m=2.0, east_m=0.0)
+    mission = MissionParameters(kind="waypoints", waypoints=(goal,), speed_m_s=1.0, at_end=end)
+
+    async def story() -> None:
+        async with aboard(fake_autopilot, port, tmp_path, changes={"mission": mission}) as ship:
+            await ship.is_ready_in_the_air()
+            fake_autopilot.pilot_selects("OFFBOARD")
+            await until(lambda: fake_autopilot.mode == mode, SECONDS_TO_FAIL)
+            assert not fake_autopilot.failsafe
+            await ship.until_event(f"asking: the mission is over and ends with {end.capitalize()}")
+            await ship.until_state("silent", "idle")
+
+    tell(story)
 
 
 def test_a_dead_control_task_is_held_by_the_last_resort(

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from flockd.flight_log.log import FlightLog
-from flockd.flight_log.metadata import FlightMetadata
+from flockd.flight_log.metadata import FlightMetadata, MissionMetadata
 from flockd.flight_log.truth_matching import match_neighbours
 from flockd.report.paper_results import TABLE_2, TABLE_3
 from flockd.report.summary import summarise, write_summary
@@ -233,7 +233,7 @@ def test_a_single_drone_has_no_distances() -> None:
         value = getattr(log, name)
         if name in ("neighbour_position", "neighbour_velocity", "detection_position"):
             alone[name] = value[:, :1, :1]
-        elif name not in ("time_s", "desired", "stages_ms", "metadata"):
+        elif name not in ("time_s", "desired", "goal", "stages_ms", "metadata"):
             alone[name] = value[:, :1]
     summary = summarise(replace(log, **alone, metadata=log.metadata.model_copy(update={"drones": 1})))
     assert summary["flock"]["min_distance_m"] is None
@@ -296,3 +296,25 @@ def test_the_papers_figures_have_the_summarys_shape() -> None:
     for row, sums in TABLE_3.items():
         for name, figures in sums.items():
             assert set(figures) < set(summary["table3"][row][name])
+
+
+def test_a_mission_has_arrived_where_the_middle_is_at_the_last_goal() -> None:
+    goal = np.full((STEPS, 2), np.nan)
+    goal[2:10], goal[10:] = [5.0, 2.0], [12.0, 2.0]
+    log = _hand_made()
+    mission = MissionMetadata(kind="waypoints", reached_m=1.2)
+    log = replace(log, goal=goal, metadata=log.metadata.model_copy(update={"mission": mission}))
+    # The middle flies north along 2 m east: at 11 s it is 1 m from the goal, and at 14.5 s, the end, 2.5 m beyond it.
+    figures = summarise(log)["mission"]
+    assert figures == {
+        "kind": "waypoints",
+        "arrived": False,
+        "time_s": 11.0,
+        "final_error_m": pytest.approx(2.5, abs=0.01),
+    }
+    arrived = summarise(_first(log, 26))["mission"]  # to 12.5 s
+    assert (arrived["arrived"], arrived["time_s"]) == (True, 11.0)
+    before = summarise(_first(log, 12))["mission"]
+    assert (before["arrived"], before["time_s"]) == (False, None)
+    nowhere = summarise(_hand_made())["mission"]
+    assert nowhere == {"kind": None, "arrived": None, "time_s": None, "final_error_m": None}

@@ -1,0 +1,57 @@
+"""`flockd config new` writes files that check, and nothing over what is there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flockd.cli import main
+from flockd.config import load_drone, load_scenario
+
+
+def test_a_scenario_of_each_mission_checks_and_keeps_its_drones_apart(tmp_path: Path) -> None:
+    for drones, mission in ((1, "hover"), (2, "velocity"), (5, "waypoints"), (12, "follow"), (100, "operator")):
+        file = tmp_path / f"{mission}.yaml"
+        options = ["--drones", f"{drones}", "--mission", mission, "--duration", "30", "--defaults"]
+        assert main(["config", "new", "scenario", str(file), *options]) == 0
+        scenario = load_scenario(file)
+        assert (scenario.scenario, scenario.duration_s, len(scenario.vehicles)) == (mission, 30.0, drones)
+        assert scenario.drone.mission.kind == mission
+        assert len(scenario.drone.rig.cameras) == 4
+
+
+def test_a_drone_has_its_cameras_evenly_around(tmp_path: Path) -> None:
+    file = tmp_path / "kite.yaml"
+    options = ["--name", "kite", "--cameras", "3", "--size", "1280x720", "--field-of-view", "90", "--mission", "follow"]
+    assert main(["config", "new", "drone", str(file), *options, "--defaults"]) == 0
+    drone = load_drone(file)
+    assert [camera.extrinsics.yaw_deg for camera in drone.rig.cameras] == [0.0, 120.0, 240.0]
+    # 640 px at 45 degrees of an equidistant lens: r = f theta.
+    assert drone.rig.cameras[0].intrinsics.fx == pytest.approx(640 / 0.7853982, abs=0.05)
+    assert (drone.name, drone.mission.kind) == ("kite", "follow")
+
+
+def test_on_a_terminal_it_asks_until_the_answer_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = iter(["", "a hundred", "3", "", "waypoints", ""])
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    monkeypatch.setattr("builtins.input", lambda _: next(answers))
+    file = tmp_path / "asked.yaml"
+    assert main(["config", "new", "scenario", str(file)]) == 0
+    assert len(load_scenario(file).vehicles) == 3
+    assert next(answers, None) is None
+
+
+def test_nothing_is_overwritten_without_force_nor_written_that_does_not_check(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text("mine", encoding="utf-8")
+    assert main(["config", "new", "drone", str(file), "--defaults"]) == 2
+    assert "is there already; name another file, or write over it with --force" in capsys.readouterr().err
+    assert main(["config", "new", "drone", str(file), "--defaults", "--force", "--autopilot", "nowhere"]) == 2
+    assert "was not written, as it would not check (autopilot.address" in capsys.readouterr().err
+    assert file.read_text(encoding="utf-8") == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.yaml"]
+    assert main(["config", "new", "drone", str(file), "--defaults", "--force"]) == 0
+    assert load_drone(file).name == "drone1"
