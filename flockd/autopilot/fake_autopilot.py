@@ -25,7 +25,7 @@ from pymavlink.dialects.v20 import development as mavlink
 
 from flockd.autopilot.fake_telemetry import ON_GROUND_M, Mode, TelemetryStreams, VehicleSnapshot
 from flockd.autopilot.fake_vehicle import Demand, Motion, MotionState, PointMass
-from flockd.messages import Setpoint
+from flockd.messages import FloatArray, Setpoint
 
 TICK_S = 0.02
 MAX_STEP_S = 0.2
@@ -34,6 +34,7 @@ TYPE_MASK = 2531
 """The one kind of setpoint it takes: horizontal velocity, height and yaw."""
 DISARM_AFTER_LANDING_S = 2.0
 ARRIVED_M = 0.3
+STICKS_FRESH_S = 0.5
 OFFBOARD_LOSS_MODES: dict[int, Mode] = {0: "RTL", 3: "RTL", 4: "LAND", 5: "LOITER"}
 """By COM_OBL_RC_ACT, no others; 0 would be position mode, which needs a remote control, which there is none of."""
 HOME_DEG = (47.3977, 8.5456)
@@ -89,6 +90,7 @@ class FakeAutopilot:
             "GF_MAX_HOR_DIST": 0.0,
             "GF_MAX_VER_DIST": 0.0,
             "MIS_TAKEOFF_ALT": 2.5,
+            "MPC_VEL_MANUAL": 10.0,
         }
         """An int is an INT32 parameter, a float a REAL32 one."""
         self.setpoints: deque[tuple[float, Setpoint]] = deque(maxlen=MAX_SETPOINTS_KEPT)
@@ -111,6 +113,8 @@ class FakeAutopilot:
         self._hold_down_m = -height_m
         self._hold_yaw_rad = yaw_rad
         self._landed_s: float | None = None
+        self._sticks = -math.inf, np.zeros(2)
+        """When a person last moved them, and forward and right from -1 to 1."""
         self._streams = TelemetryStreams(self._mav, truth, heartbeat_s, home_deg, self._clock())
         self._lock = threading.RLock()
         self._closing = threading.Event()
@@ -271,6 +275,8 @@ class FakeAutopilot:
             case "OFFBOARD" if self.setpoints:
                 setpoint = self.setpoints[-1][1]
                 return Demand(setpoint.velocity, -setpoint.height_m, setpoint.yaw_rad)
+            case "POSCTL":
+                return Demand(self._by_hand(), self._hold_down_m, self._hold_yaw_rad)
             case "TAKEOFF":
                 return Demand(np.zeros(2), -self.parameters["MIS_TAKEOFF_ALT"], self._hold_yaw_rad)
             case "LAND":
@@ -282,6 +288,14 @@ class FakeAutopilot:
                 )
             case _:
                 return Demand(np.zeros(2), self._hold_down_m, self._hold_yaw_rad)
+
+    def _by_hand(self) -> FloatArray:
+        """(2,) m/s north and east that the sticks ask for; level, and at rest once they are not heard any more."""
+        moved_s, (forward, right) = self._sticks
+        if self._clock() - moved_s > STICKS_FRESH_S:
+            return np.zeros(2)
+        cos, sin = math.cos(self._hold_yaw_rad), math.sin(self._hold_yaw_rad)
+        return self.parameters["MPC_VEL_MANUAL"] * np.array([cos * forward - sin * right, sin * forward + cos * right])
 
     # MAVLink, in
 
@@ -299,6 +313,8 @@ class FakeAutopilot:
                     target_system=message.get_srcSystem(),
                     target_component=message.get_srcComponent(),
                 )
+            case "MANUAL_CONTROL" if message.target == self._mav.srcSystem:
+                self._sticks = arrived_s, np.clip([message.x, message.y], -1000, 1000) / 1000
             case "PARAM_REQUEST_READ":
                 self._send_parameter(message.param_id)
             case _:

@@ -17,7 +17,7 @@ from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.autopilot.fake_vehicle import Demand, MotionState
 from flockd.config.scenario import ScenarioConfig, StartConfig, VehicleConfig
 from flockd.errors import UnavailableError, UsageError
-from flockd.sim.ground_station import home_deg
+from flockd.sim.ground_station import FULL_STICK_M_S, home_deg
 from flockd.sim.processes import Program, Programs
 from flockd.sim.vehicles import Vehicles
 
@@ -39,6 +39,13 @@ PARAMETERS = {
     "SDLOG_BACKEND": "0",
 }
 """Of all instances."""
+BY_HAND = {
+    "COM_RC_IN_MODE": "1",  # sticks come over MAVLink
+    "MPC_VEL_MANUAL": f"{FULL_STICK_M_S:g}",
+    "MPC_XY_MAN_EXPO": "0",  # twice the stick is twice the speed
+    "MPC_HOLD_DZ": "0.02",
+}
+"""Of an instance that a person flies in Position mode, too."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +109,7 @@ class SimulatedAutopilots:
                 speed_factor=self._speed_factor,
             )
             fake.parameters["MIS_TAKEOFF_ALT"] = -float(position[2])
+            fake.parameters["MPC_VEL_MANUAL"] = FULL_STICK_M_S
             self._stack.enter_context(fake)
 
     def programs(self) -> Sequence[Program]:
@@ -139,6 +147,7 @@ class Px4s:
         for i, vehicle in enumerate(self._scenario.vehicles):
             position = np.array(vehicle.position_m)
             latitude_deg, longitude_deg = home_deg(position)
+            parameters = PARAMETERS | BY_HAND if vehicle.by_hand else PARAMETERS
             working = self._folder / f"px4_{i}"
             working.mkdir(parents=True)
             settings = {
@@ -148,7 +157,7 @@ class Px4s:
                 "PX4_HOME_LON": f"{longitude_deg:.9f}",
                 "PX4_HOME_ALT": "0",
                 "PX4_PARAM_MIS_TAKEOFF_ALT": f"{-position[2]:g}",
-                **{f"PX4_PARAM_{name}": value for name, value in PARAMETERS.items()},
+                **{f"PX4_PARAM_{name}": value for name, value in parameters.items()},
             }
             command = [str(self._build / "bin/px4"), "-i", f"{i}", "-d", str(self._build / "etc"), "-w", str(working)]
             log = self._folder / f"px4_{i}.log"

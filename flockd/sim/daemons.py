@@ -33,7 +33,7 @@ _RUN = "import sys; from flockd.cli import main; sys.exit(main())"
 def fleet_configs(
     scenario: ScenarioConfig, sitl: DroneConfig, *, ports: Sequence[Ports], endpoint: str, speed_factor: float
 ) -> tuple[DroneConfig, ...]:
-    """What each drone of a scenario flies with.
+    """What each drone of a scenario that is not flown by hand flies with.
 
     The pilot is the scenario's, with the mission's places counted from the drone's own home, which is below its start;
     source, autopilot, safety and telemetry are those of ``sitl``. Raises ConfigError where ``sitl`` lacks one of them.
@@ -46,6 +46,8 @@ def fleet_configs(
         raise ConfigError([ConfigProblem("px4_sitl.yaml", 0, "autopilot", "is missing; add it")])
     configs = []
     for i, port in enumerate(ports):
+        if scenario.vehicles[i].by_hand:
+            continue
         name = f"drone{i + 1}"
         frames = {"drone": name, "connect": (endpoint,), "speed_factor": speed_factor}
         shared_memory = sitl.source.shared_memory.model_copy(update=frames)

@@ -21,9 +21,9 @@ from flockd.errors import UnavailableError
 from flockd.flight_log.fleet_log import FleetFrame, FleetRun, fleet_key_frames, fleet_log
 from flockd.sim.autopilots import Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.daemons import Daemons, fleet_configs
-from flockd.sim.exact_states import exact_states_at
+from flockd.sim.exact_states import HandPilot, exact_states_at
 from flockd.sim.frame_server import FrameServer
-from flockd.sim.ground_station import GroundStation
+from flockd.sim.ground_station import GroundStation, Mode
 from flockd.sim.processes import Program
 from flockd.sim.swarm import Flight
 from flockd.sources import clock_at
@@ -76,7 +76,7 @@ def fly_fleet(
         autopilots = stack.enter_context(_autopilots(scenario, kind, speed_factor, environment, folder))
         ports, endpoint = autopilots.ports, _free_endpoint()
         configs = fleet_configs(scenario, sitl, ports=ports, endpoint=endpoint, speed_factor=speed_factor)
-        names = [config.name for config in configs]
+        names = [None if vehicle.by_hand else f"drone{i + 1}" for i, vehicle in enumerate(scenario.vehicles)]
         assert configs[0].source is not None
         station = stack.enter_context(GroundStation([port.truth for port in ports], clock))
         server = stack.enter_context(
@@ -107,6 +107,9 @@ class _Fleet:
         self._scenario, self._speed_factor, self._clock = scenario, speed_factor, clock
         self._autopilots, self._station, self._server, self._daemons = autopilots, station, server, daemons
         self._all = range(len(scenario.vehicles))
+        self._hands = {i: HandPilot(scenario, i) for i in self._all if scenario.vehicles[i].by_hand}
+        self._drones = [i for i in self._all if i not in self._hands]
+        """Those with a daemon, in the order of the daemons."""
         self._needed: Sequence[Program] = ()
         """Programs that have to run now; `_poll` raises when one has ended."""
 
@@ -124,9 +127,10 @@ class _Fleet:
         self._daemons.start()
         self._needed = (*self._autopilots.programs(), *self._daemons.programs())
         self._wait_for(
-            self._daemons.is_ready,
+            lambda i: self._daemons.is_ready(self._drones.index(i)),
             DAEMON_START_S * self._speed_factor,
             lambda i: f"the daemon of drone{i + 1} was not ready after {DAEMON_START_S:g} s ({self._last_messages(i)})",
+            of=self._drones,
         )
 
     def take_off(self) -> None:
@@ -135,15 +139,17 @@ class _Fleet:
         self._request(station.is_armed, station.arm, ARM_S, "could not be armed")
         self._request(self._is_up, self._request_climb, CLIMB_S, "did not reach its height")
         self._wait_for(
-            lambda i: self._daemons.status(i).startswith("ready") and station.mode_is(i, "LOITER"),
+            lambda i: self._status(i).startswith("ready") and station.mode_is(i, "LOITER"),
             READY_S,
             lambda i: f"flockd was not ready to fly drone{i + 1} after {READY_S:g} s ({self._last_messages(i)})",
+            of=self._drones,
         )
+        modes: dict[int, Mode] = {i: "POSCTL" if i in self._hands else "OFFBOARD" for i in self._all}
         self._request(
-            lambda i: station.mode_is(i, "OFFBOARD"),
-            lambda i: station.select(i, "OFFBOARD"),
+            lambda i: station.mode_is(i, modes[i]),
+            lambda i: station.select(i, modes[i]),
             OFFBOARD_S,
-            "did not go into offboard",
+            "did not go into offboard, or one that is flown by hand into Position mode",
         )
 
     def fly(self, progress: Progress) -> FleetRun:
@@ -155,6 +161,7 @@ class _Fleet:
             while (flying_s := self._clock() - run.began_s) < total_s:
                 progress(int(flying_s), int(total_s))
                 self._note_handovers(run, flying_s)
+                self._fly_by_hand(flying_s)
                 self._server.frames()
                 time.sleep(POLL_S)
             progress(int(total_s), int(total_s))
@@ -187,10 +194,22 @@ class _Fleet:
         except UnavailableError as error:  # the flight is over, and worth its report
             run.notes.append(str(error))
 
+    def _status(self, i: int) -> str:
+        """What a drone's daemon said of itself last."""
+        return self._daemons.status(self._drones.index(i))
+
+    def _fly_by_hand(self, flying_s: float | None) -> None:
+        """Moves the sticks of who is flown by hand: along their missions, or, before the flight, not at all."""
+        for i, hand in self._hands.items():
+            velocity = np.zeros(2)
+            if flying_s is not None:
+                velocity = hand.step(flying_s, self._station.poses().position[i, :2]).velocity
+            self._station.steer(i, velocity)
+
     def _note_handovers(self, run: FleetRun, flying_s: float) -> None:
         """Notes a drone that is not in offboard any more, or of which a program has ended."""
         autopilots = self._autopilots.programs()
-        for i, program in zip(self._all, self._daemons.programs(), strict=True):
+        for i, program in zip(self._drones, self._daemons.programs(), strict=True):
             if program.name in run.handed_over:
                 continue
             if program.ended is not None:
@@ -217,7 +236,10 @@ class _Fleet:
 
     def _last_messages(self, i: int) -> str:
         """The last messages of a drone's daemon and autopilot."""
-        messages = [f"flockd: {self._daemons.status(i) or self._daemons.programs()[i].last_output()}"]
+        messages = []
+        if i in self._drones:
+            output = self._daemons.programs()[self._drones.index(i)].last_output
+            messages.append(f"flockd: {self._status(i) or output()}")
         if self._station.last_text(i):
             messages.append(f"autopilot: {self._station.last_text(i)}")
         return "; ".join(messages)
@@ -239,9 +261,15 @@ class _Fleet:
                 f"drone{first + 1} {otherwise} within {timeout_s:g} s ({self._last_messages(first)})"
             )
 
-    def _wait_for(self, done: Callable[[int], bool], timeout_s: float, otherwise: Callable[[int], str]) -> None:
+    def _wait_for(
+        self,
+        done: Callable[[int], bool],
+        timeout_s: float,
+        otherwise: Callable[[int], str],
+        of: Sequence[int] | None = None,
+    ) -> None:
         until_s = self._clock() + timeout_s
-        while pending := [i for i in self._all if not done(i)]:
+        while pending := [i for i in (self._all if of is None else of) if not done(i)]:
             if self._clock() >= until_s:
                 raise UnavailableError(f"{otherwise(pending[0])}; see its log")
             self._poll()
@@ -249,6 +277,7 @@ class _Fleet:
     def _poll(self) -> None:
         """Waits for `POLL_S`. Raises UnavailableError when a program that the flight needs has ended."""
         self._server.frames()
+        self._fly_by_hand(None)
         for program in self._needed:
             if program.ended is not None:
                 raise UnavailableError(f"{program.name} ended with exit code {program.ended} ({program.last_output()})")

@@ -20,7 +20,7 @@ class FrameServer:
     def __init__(
         self,
         scenario: ScenarioConfig,
-        drones: Sequence[str],
+        drones: Sequence[str | None],
         *,
         endpoint: str,
         rate_hz: float,
@@ -28,7 +28,8 @@ class FrameServer:
         clock: Callable[[], float],
         speed_factor: float,
     ) -> None:
-        """Generates the world, which takes seconds. ``drones`` are names in the order of ``poses``.
+        """Generates the world, which takes seconds. ``drones`` are names in the order of ``poses``; None: without
+        cameras.
 
         Raises UnavailableError for an endpoint that cannot be used.
         """
@@ -78,6 +79,8 @@ class FrameServer:
     def _publish(self, number: int) -> None:
         poses, time_s = self._poses(), self._clock()
         for i, drone in enumerate(self._drones):
+            if drone is None:
+                continue
             frames, _ = self._cameras.capture(i, number, time_s, poses)
             for frame in frames.frames.values():
                 self._publisher.publish(drone, frame)

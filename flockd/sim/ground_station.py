@@ -25,13 +25,17 @@ from flockd.errors import UnavailableError
 from flockd.messages import FloatArray
 from flockd.sim.vehicles import REFERENCE_DEG, euler_rotation
 
-Mode = Literal["LOITER", "TAKEOFF", "LAND", "OFFBOARD"]
+Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "OFFBOARD"]
 """By pymavlink's names; LOITER is Hold."""
 
 SYSTEM_ID = 255
 HEARTBEAT_S = 1.0
 POLL_S = 0.05
 MODE_HZ = 20.0
+FULL_STICK_M_S = 3.0
+"""MPC_VEL_MANUAL of vehicles that are flown by hand: what a stick at its end asks for."""
+_STICK = 1000
+_NEUTRAL_THROTTLE = 500
 MAX_FORWARD_S = 0.2
 """A pose is extrapolated by no more than this."""
 _RECEIVED = {
@@ -168,6 +172,20 @@ class GroundStation:
         """Sends the request for a mode; see `mode_is`."""
         _, main, sub = mavutil.px4_map[mode]
         self._command(self._vehicles[number], mavlink.MAV_CMD_DO_SET_MODE, 1, main, sub)
+
+    def steer(self, number: int, velocity: FloatArray) -> None:
+        """Moves the sticks of a vehicle in Position mode, for a velocity (2,) m/s north and east at its height.
+
+        It stops half a second after the last call.
+        """
+        vehicle = self._vehicles[number]
+        R = np.eye(3) if vehicle.pose is None else vehicle.pose.R_ned_body
+        yaw_rad = math.atan2(R[1, 0], R[0, 0])
+        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+        ahead = np.array([cos * velocity[0] + sin * velocity[1], -sin * velocity[0] + cos * velocity[1]])
+        x, y = (int(stick) for stick in np.round(np.clip(ahead / FULL_STICK_M_S, -1.0, 1.0) * _STICK))
+        with self._lock:
+            vehicle.mav.manual_control_send(number + 1, x, y, _NEUTRAL_THROTTLE, 0, 0)
 
     def _command(self, vehicle: _Vehicle, command: int, *numbers: float) -> None:
         values = (*numbers, *[0.0] * (7 - len(numbers)))

@@ -18,7 +18,7 @@ from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.cli import main
 from flockd.data import data_path
 from flockd.flight_log.log import FlightLog
-from flockd.sim.ground_station import GroundStation, home_deg
+from flockd.sim.ground_station import FULL_STICK_M_S, GroundStation, home_deg
 from tests.autopilot.conftest import free_port
 
 SECONDS_TO_START = 120.0
@@ -177,6 +177,29 @@ def test_the_ground_station_knows_where_everybody_truly_is() -> None:
             assert time.monotonic() < until_s
             time.sleep(0.01)
         assert fake_autopilot.mode == "LAND"
+
+
+def test_a_person_flies_one_drone_by_its_sticks_in_position_mode() -> None:
+    port = free_port()
+    with (
+        GroundStation([port], time.monotonic) as station,
+        FakeAutopilot(free_port(), height_m=2.0, yaw_rad=0.7, truth_port=port) as fake_autopilot,
+    ):
+        fake_autopilot.parameters["MPC_VEL_MANUAL"] = FULL_STICK_M_S
+        until_s = time.monotonic() + 10.0
+        while not station.is_connected(0):
+            assert time.monotonic() < until_s
+            time.sleep(0.01)
+        station.select(0, "POSCTL")
+        east = np.array([0.0, 1.0])
+        while np.linalg.norm(fake_autopilot.state.velocity[:2] - east) > 0.05:
+            assert time.monotonic() < until_s
+            station.steer(0, east)
+            time.sleep(0.02)
+        while np.linalg.norm(fake_autopilot.state.velocity) > 0.05:  # nobody moves the sticks any more
+            assert time.monotonic() < until_s
+            time.sleep(0.02)
+        assert fake_autopilot.state.position[2] == pytest.approx(-2.0, abs=0.05)
 
 
 @PX4
