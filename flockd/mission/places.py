@@ -12,7 +12,8 @@ from flockd.messages import FloatArray, MissionOrder
 def place_of_order(order: MissionOrder, origin: FloatArray, home_deg: FloatArray | None) -> FloatArray | None:
     """(2,) metres north and east of home; None where the order names no place, or home is not known."""
     if order.place is not None:
-        return origin + order.place
+        place: FloatArray = origin + order.place
+        return place
     return None if order.place_deg is None else _from_degrees(order.place_deg, home_deg)
 
 

@@ -23,6 +23,7 @@ def test_a_motion_over_a_skipped_frame_set_is_not_in_the_log(tmp_path: Path) -> 
     )
     run = FleetRun(began_s=times[0], wall_s=9.0, frames=frames, autopilot="PX4 1.18.0", clock_rates=[0.50004])
     scenario = load_scenario(data_path("config") / "paper_flight.yaml")
+    scenario = scenario.model_copy(update={"vehicles": scenario.vehicles[:1]})
     companion = (np.zeros((5, 1, 3)), np.zeros((5, 1, 3)))
     log = fleet_log(scenario, [config], run, tmp_path, 0.5, companion)
     np.testing.assert_allclose(log.time_s, np.array(times) - times[0])

@@ -76,7 +76,8 @@ def test_who_may_watch_hears_and_who_may_command_commands(settings: dict[str, Pa
         endpoint = f"tls/localhost:{probe.getsockname()[1]}"
     asked: list[str] = []
 
-    def ask(command: str) -> AnswerMessage:
+    def ask(command: str, payload: bytes) -> AnswerMessage:
+        assert payload == b""
         asked.append(command)
         return AnswerMessage(accepted=True, sentence="tried")
 

@@ -14,7 +14,7 @@ import pytest
 import zenoh
 
 from flockd.errors import UnavailableError
-from flockd.messages import Neighbour, PilotOutput, VehicleState, VelocityCommand
+from flockd.messages import MissionStatus, Neighbour, PilotOutput, VehicleState, VelocityCommand
 from flockd.telemetry import TOPICS, publish_step
 from flockd.telemetry.publisher import ZenohTelemetry
 
@@ -76,13 +76,14 @@ def _output(velocity: np.ndarray | None) -> PilotOutput:
         time_s=12.5, ego_motion=None, velocity=velocity, detections=(), detection_tracks=(), neighbour_motions={},
         neighbours=(neighbour,), command=command,
         reasons=("no ego-motion: 12 pairs are too few",), counts={"ego": 1}, stages_ms={"flow": 14.0},
+        mission=MissionStatus("waypoints", np.array([1.0, 0.0]), "9 m to the goal", goal=np.array([9.0, 2.0])),
     )  # fmt: skip
 
 
 def test_a_step_arrives_under_the_documented_keys_and_fields(watched: tuple[ZenohTelemetry, Received]) -> None:
     telemetry, received = watched
     publish_step(telemetry, "1", _yawed(-90.0), _output(np.array([1.0, 0.0, np.nan])))
-    messages = dict(received.get(timeout=10) for _ in range(5))
+    messages = dict(received.get(timeout=10) for _ in range(6))
 
     of_a_step = set(TOPICS) - {"events", "flight", "computer"}
     assert set(messages) == {f"flockd/v1/meadow/1/{topic}" for topic in of_a_step}
