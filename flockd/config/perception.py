@@ -68,7 +68,7 @@ class PerceptionConfig(Section):
     distance: str = "distance_int8"
     """Second stage: a drone's range from its crop alone. `none`: the depth map decides."""
     verification: str = "verification_int8"
-    """Whether a crop of the second stage shows a drone at all. `none`: the distance network's own probability."""
+    """Whether a crop of the second stage shows a drone at all. `none`: the distance network alone says so."""
     models_dir: str | None = None
     """Folder of the manifests; by default the one that comes with flockd."""
     threads: Annotated[int, Field(ge=1, le=64)] = 2

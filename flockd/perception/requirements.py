@@ -100,7 +100,12 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
         inputs=("crop",),
         outputs=("drone",),
         columns={"drone": ("drone_logit",)},
-        thresholds=_PROBABILITIES,
+        thresholds={
+            **_PROBABILITIES,
+            "distance_logit_limit": Threshold(
+                "The distance network's logit counts as well, up to this much for or against a drone.", 0.0, 50.0
+            ),
+        },
     ),
 }
 """The table that a manifest is checked against. A distance model may give a `mask` (n, h, w) of logits as well."""
