@@ -137,6 +137,30 @@ def test_one_camera_gone_is_a_slower_flight_and_all_gone_a_hover_and_then_hold(
     tell(story)
 
 
+def test_a_noisy_camera_is_lost_and_said_so_until_it_is_good_again(
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
+) -> None:
+    async def story() -> None:
+        async with aboard(fake_autopilot, port, tmp_path) as ship:
+            await ship.is_ready_in_the_air()
+            await ship.flies()
+            ship.cameras.noisy.add("back")
+            await ship.until_event("degraded: a camera is lost: back noisy")
+            assert fake_autopilot.mode == "OFFBOARD"
+            await until(lambda: "frames_dropped" in ship.matters(), SECONDS_TO_FAIL)  # of two cameras' images a half
+            assert ship.heard()["computer"].message["cameras"]["back"]["counts"]["noisy"] > 0
+            assert "camera back: its image is noise" in ship.heard()["health"].message["reasons"]
+            ship.cameras.noisy.clear()
+            await ship.until_state("normal")
+            assert fake_autopilot.mode == "OFFBOARD"
+            ship.cameras.noisy |= set(CAMERAS)
+            await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+            await ship.until_event("hover: too few cameras deliver images: front noisy, back noisy")
+            assert not fake_autopilot.failsafe, "it was asked for Hold, not left to its failsafe"
+
+    tell(story)
+
+
 def test_networks_not_finite_or_stuck_degrade_and_sigterm_ends_in_hold(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:

@@ -231,7 +231,7 @@ def test_what_only_the_decoder_notices_leaves_its_camera_out_of_the_set(start: S
     _received(source, front=1, back=1)
     assert _next(source).frames.keys() == {"back"}
     counts = source.status()["front"].counts
-    assert counts == {"received": 1, "corrupt": 1, "missing": 1, "opened": 1}
+    assert counts == {"received": 1, "corrupt": 1, "undecodable": 1, "missing": 1, "opened": 1}
 
 
 def test_a_stamp_that_does_not_increase_is_dropped(start: Start) -> None:
