@@ -52,13 +52,17 @@ class NoiseParameters(Section):
     """When an image counts as noise, and is not used. Lengths are of the image, and noise of its luminance."""
 
     level: Positive = 12.0
-    """Standard deviation, in grey levels of 0-255, of noise that matters; a camera at night has less."""
+    """Standard deviation, in grey levels of 0-255, of white noise that matters; a camera at night has less."""
     whiteness: Share = 0.8
-    """Noise is at least so strong at the finest scale as a share of the next; photographs have 0.3 to 0.6."""
-    max_share: Share = 0.25
-    """The image is not used where more of it than this is noise. 1, here and next: all images are used."""
-    max_rise: Share = 0.08
-    """Nor is it where this much more of it is noise than of the camera's last images."""
+    """White noise is at the finest scale at least this strong as a share of the next; photographs have 0.3 to 0.6."""
+    max_white: Share = 0.25
+    """The image is not used where more of it than this is white noise. 1, here and in the next two: all are used."""
+    max_white_rise: Share = 0.08
+    """Nor is it where this much more of it is white noise than of any of the camera's last five images, ..."""
+    rough_level: Positive = 20.0
+    """... or where details at one of the finest scales are stronger than this, in grey levels, ..."""
+    max_rough_rise: Share = 0.4
+    """... in this much more of it than in any of the last five."""
     clean_images: Annotated[int, Field(ge=1, le=100)] = 2
     """So many clean images in a row before a camera that was noisy is used again."""
 

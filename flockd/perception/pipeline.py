@@ -79,7 +79,7 @@ class Perception:
             elif frame.image.shape != (height, width, 3):
                 found = f"{frame.image.shape[1]}x{frame.image.shape[0]}"
                 reasons.append(f"camera {name}: its image is {found} and not {width}x{height}")
-            elif self._noise.is_noisy(name, frame.image):
+            elif self._noise.is_noisy(name, frame.image, frames.time_s):
                 noisy.append(name)
                 reasons.append(f"camera {name}: its image is noise")
             else:

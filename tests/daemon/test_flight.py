@@ -151,7 +151,7 @@ def test_a_noisy_camera_is_lost_and_said_so_until_it_is_good_again(
             assert ship.heard()["computer"].message["cameras"]["back"]["counts"]["noisy"] > 0
             assert "camera back: its image is noise" in ship.heard()["health"].message["reasons"]
             ship.cameras.noisy.clear()
-            await ship.until_state("normal")
+            await until(lambda: "camera_lost" not in ship.matters(), SECONDS_TO_FAIL)
             assert fake_autopilot.mode == "OFFBOARD"
             ship.cameras.noisy |= set(CAMERAS)
             await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
