@@ -79,7 +79,7 @@ def _run(args: argparse.Namespace) -> int:
     pictures = find_pictures(args.pictures)
     labels = None if args.labels is None else read_labels(args.labels, pictures)
     more = {} if args.drone_size is None else {"drone_size_m": args.drone_size}
-    config = perception_of(args, cameras, **more)
+    config = perception_of(args, cameras.config, **more)
     with ExitStack() as stack:
         copies = None
         if args.out is not None:

@@ -11,6 +11,7 @@ from flockd.cli.parser import Parser, positive_number
 from flockd.errors import UsageError
 
 if TYPE_CHECKING:
+    from flockd.config import DroneConfig
     from flockd.config.perception import PerceptionConfig
     from flockd.geometry import Camera
     from flockd.pictures import PictureDetector
@@ -94,8 +95,8 @@ class PictureCameras:
         return cameras[name].camera
 
 
-def perception_of(args: argparse.Namespace, cameras: PictureCameras, **more: Any) -> PerceptionConfig:
-    """The settings of --config or the defaults, with what the options and ``more`` ask for.
+def perception_of(args: argparse.Namespace, drone: DroneConfig | None, **more: Any) -> PerceptionConfig:
+    """The settings of a drone or the defaults, with what the options and ``more`` ask for.
 
     No flow network, as single pictures have no flow. Raises UsageError for values that cannot be.
     """
@@ -103,7 +104,7 @@ def perception_of(args: argparse.Namespace, cameras: PictureCameras, **more: Any
 
     from flockd.config.perception import DIS, PerceptionConfig
 
-    values = {} if cameras.config is None else cameras.config.perception.model_dump()
+    values = {} if drone is None else drone.perception.model_dump()
     values |= {"flow": DIS, "scale": "network", **more}
     if args.models is not None:
         values["models_dir"] = str(args.models)
