@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from flockd.choices import ROLES, FlowRefinement, Provider, Role, ScaleSource
-from flockd.config.base import NonNegative, Positive, Section, Share
+from flockd.config.base import NonNegative, Positive, Section, Share, refuse
 
 DIS, NO_MODEL = "dis", "none"
 """What stands where else a model's name does: OpenCV's DIS flow, and no second stage."""
+
+MIN_DRONE_SIZE_M, MAX_DRONE_SIZE_M = 0.05, 5.0
+"""Of a drone from tip to tip: less is a toy's that the networks do not find, more is an aircraft."""
+MAX_SIZE_SIGMA = 0.3
+"""Standard deviation of a known size as a share of it: with more, the networks' own judgement is better."""
 
 
 class DetectionParameters(Section):
@@ -34,8 +39,12 @@ class DetectionParameters(Section):
     deviation: with the gate, two drones are never nearer to each other than 0.6 of their size."""
     occlusion: Share = 0.25
     """Nothing is seen of what lies behind a drone within this share of its angular size from its centre."""
+    max_proposals: Annotated[int, Field(ge=1)] = 12
+    """Regions of one image that the first stage segments and the second stage is given, with the residuals: those of
+    the highest score, for a cluttered image not to cost the deadline. More than the drones that one camera sees."""
     max_residuals: Annotated[int, Field(ge=0)] = 6
-    """Residuals of one image that are proposed, the largest: one full of false ones must not cost the deadline."""
+    """Residuals of one image that are proposed, the largest: one full of false ones must not cost the deadline. They
+    count among `max_proposals`."""
     residual_px: Annotated[int, Field(ge=1)] = 24
     """Image pixels that a residual has at least."""
     residual_distance_px: Annotated[int, Field(ge=0)] = 4
@@ -99,9 +108,31 @@ class PerceptionConfig(Section):
     """In flight, a network that has not finished one call by then is stuck, and is ended."""
     detection: DetectionParameters = DetectionParameters()
     noise: NoiseParameters = NoiseParameters()
+    drone_size_m: Annotated[float, Field(ge=MIN_DRONE_SIZE_M, le=MAX_DRONE_SIZE_M)] | None = None
+    """Size of every drone of the fleet, from tip to tip with propellers, where it is known: a drone's range is then
+    this over its apparent size. `flockd calibrate drone` measures it. By default the network judges each drone's
+    size."""
+    drone_size_sigma_m: NonNegative = 0.01
+    """Standard deviation of `drone_size_m`: by default of a tape measure. It adds to the deviation of every range."""
     scale: ScaleSource = "height"
     """The background's metric scale: `network` (pure RGB, as in the paper), `height` (attitude and height above ground
     from the autopilot) or `velocity` (attitude and velocity from the autopilot; the drone has to move)."""
+
+    @model_validator(mode="after")
+    def _a_known_size_is_of_use(self) -> Self:
+        size = self.drone_size_m
+        if size is None:
+            return self
+        faults: dict[tuple[str | int, ...], str] = {}
+        if self.distance == NO_MODEL:
+            faults["drone_size_m",] = "needs the apparent size, which a second stage gives; name one in `distance`"
+        if self.drone_size_sigma_m > MAX_SIZE_SIGMA * size:
+            faults["drone_size_sigma_m",] = (
+                f"{self.drone_size_sigma_m:g} m is more than {MAX_SIZE_SIGMA:.0%} of drone_size_m, {size:g} m; "
+                "measure it better, or delete both"
+            )
+        refuse(self, faults)
+        return self
 
     @property
     def networks(self) -> dict[Role, str]:

@@ -130,7 +130,10 @@ class OnnxNetworks:
         labels, instances = group_instances(logit - np.float32(proposal), offset, scale=self.map_stride)
         labels = np.asarray(cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
         low = cv2.resize((logit < certain).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
-        scene = SceneMaps(np.full_like(depth, np.nan), labels, instances, uncertain=low & (labels > 0), logit=logit)
+        peak = self._segmentation.manifest.thresholds.get("proposal_peak_logit", proposal) - proposal
+        scene = SceneMaps(
+            np.full_like(depth, np.nan), labels, instances, uncertain=low & (labels > 0), logit=logit, min_score=peak
+        )
         return self._with_depth(scene, depth, camera)
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:

@@ -14,7 +14,7 @@ from flockd.perception.depth import VelocityScale, fix_by_height
 from flockd.perception.detection.detector import DetectionTrace, Detector
 from flockd.perception.detection.masks import depth_of_drones, without_borders
 from flockd.perception.image_noise import NoiseMonitor
-from flockd.perception.maps import SceneMaps
+from flockd.perception.maps import KnownSize, SceneMaps
 from flockd.perception.networks import Networks, OnnxNetworks
 from flockd.perception.observation import CameraObservation, Observation
 from flockd.tracking import Prediction
@@ -27,7 +27,9 @@ class Perception:
 
     def __init__(self, rig: Rig, networks: Networks, config: PerceptionConfig) -> None:
         self._rig, self._networks, self._config = rig, networks, config
-        self._detector = Detector(rig, networks, config.detection)
+        size_m = config.drone_size_m
+        known_size = None if size_m is None else KnownSize(size_m, config.drone_size_sigma_m)
+        self._detector = Detector(rig, networks, config.detection, known_size)
         self._velocity_scale = VelocityScale(rig) if config.scale == "velocity" else None
         self._noise = NoiseMonitor(config.noise)
         self._last: Observation | None = None
