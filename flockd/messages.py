@@ -260,3 +260,5 @@ class PilotOutput:
     """Time each stage took, as measured by the caller's clock; empty without one."""
     mission: MissionStatus | None = None
     """None for the paper's circle and tangent, which has no goal and no end."""
+    noisy_cameras: tuple[str, ...] | None = None
+    """Whose images were noise, and were not used; None: no camera's."""

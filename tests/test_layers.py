@@ -38,8 +38,9 @@ MAY_IMPORT = {
     "recording": BASE
     | {"geometry", "telemetry", "image_header"},  # telemetry for the table of topics, which says what is recorded
     "flight_log": BASE | {"flocking", "mission", "perception", "pilot", "recording"},
-    "calibration": BASE | {"geometry", "recording", "datasets", "sources"},
-    "datasets": BASE | {"geometry"},
+    "pictures": BASE | {"geometry", "inference", "perception", "datasets", "image_header"},
+    "calibration": BASE | {"geometry", "recording", "datasets", "sources", "perception", "pictures"},
+    "datasets": BASE | {"geometry", "image_header"},
     "replay": BASE | {"geometry", "inference", "perception", "pilot", "recording", "datasets"},
     "sim": BASE
     | {
@@ -78,7 +79,7 @@ MAY_IMPORT = {
         "daemon",
         "doctor",
     }
-    | {"calibration", "geometry", "sources"},
+    | {"calibration", "geometry", "sources", "pictures"},
 }
 """What each folder may import of the others."""
 

@@ -26,8 +26,8 @@ BEGUN_WITH_SHARE = 0.35
 DATA = "Rendered by tools.render_training_data from seeded worlds; no foreign data."
 REAL_DATA = (
     "Rendered by tools.render_drone_crops from seeded worlds. Real pictures, none of a held-out scene: "
-    "data set of Drone Detection and Classification using Machine Learning and Sensor Fusion, clips 11-20, 51-60, 71-80 "
-    "and from 111 of each kind (F. Svanstroem, CC0 1.0); HoloLens sample data of deep-video-mvs, first 73 frames "
+    "data set of Drone Detection and Classification using Machine Learning and Sensor Fusion, clips 11-20, 51-60, "
+    "71-80 and from 111 of each kind (F. Svanstroem, CC0 1.0); HoloLens sample data of deep-video-mvs, first 73 frames "
     "(A. Duzceker, MIT); BoofCV-Data@cc6d8adf (P. Abeles, CC BY 4.0; without "
     "what others made and without mvs and triple); DoorDetect-Dataset@1db107fe, openimages-personcar@3b7ac13b and "
     "Machine-Learning-with-Apache-Spark-Quick-Start-Guide@d001ad4b (parts of Open Images, listed as CC BY 2.0); "
@@ -119,6 +119,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
             "drone_probability": 0.9,
             "expected_drone_probability": 0.8,
             "another_crop_probability": 0.2,
+            "distance_logit_limit": 2.0,
         },
         "inputs": {"crop": {**IMAGE, "shape": ["n", 96, 96, 3]}},
         "outputs": {"drone": (["n", 1], "logit of a drone being there", "1")},

@@ -35,6 +35,8 @@ SOFTENED_SHARE = 0.5
 """Of the rendered ones."""
 PLACES_SHARE = 0.15
 """Of the negatives: cut anywhere, not where the first stage proposed a drone."""
+NOISE_SHARE = 0.05
+"""Of the negatives: what a failing sensor delivers."""
 NEGATIVE_WEIGHTS = {"skyothers": 130.0, "rendered": 80.0}
 """What flies besides drones, and what the first stage proposes in the worlds of the test flights, are drawn more often
 than the number of their patches says."""
@@ -81,6 +83,9 @@ class VerificationTask(Task):
 
     def _negative(self, rng: np.random.Generator) -> Sample:
         """Often one that was taken for a drone when it was shown before."""
+        if rng.random() < NOISE_SHARE:
+            self._shown.append(None)
+            return real_samples.noise(*self.places.draw(rng)[:2], rng)
         if rng.random() < PLACES_SHARE:
             self._shown.append(None)
             return real_samples.negative(*self.places.draw(rng)[:2], rng)

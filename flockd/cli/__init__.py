@@ -8,7 +8,21 @@ import sys
 from collections.abc import Sequence
 
 from flockd import __version__
-from flockd.cli import calibrate, config, doctor, fleet, models, record, replay, report, run, sim, status, view
+from flockd.cli import (
+    calibrate,
+    config,
+    detect,
+    doctor,
+    fleet,
+    models,
+    record,
+    replay,
+    report,
+    run,
+    sim,
+    status,
+    view,
+)  # fmt: skip
 from flockd.cli.parser import Parser, add_commands
 from flockd.errors import ExitCode, FlockdError, UnavailableError
 
@@ -73,6 +87,6 @@ def _parser() -> Parser:
         notes=EXIT_CODES,
     )
     parser.add_argument("--version", action="version", version=f"flockd {__version__}")
-    commands = (run, status, fleet, doctor, sim, report, record, replay, view, calibrate, config, models)
+    commands = (run, status, fleet, doctor, sim, report, record, replay, view, detect, calibrate, config, models)
     add_commands(parser, [command.add for command in commands])
     return parser

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from flockd.choices import ROLES, FlowRefinement, Provider, Role, ScaleSource
-from flockd.config.base import NonNegative, Positive, Section, Share
+from flockd.config.base import NonNegative, Positive, Section, Share, refuse
 
 DIS, NO_MODEL = "dis", "none"
 """What stands where else a model's name does: OpenCV's DIS flow, and no second stage."""
+
+MIN_DRONE_SIZE_M, MAX_DRONE_SIZE_M = 0.05, 5.0
+"""Of a drone from tip to tip: less is a toy's that the networks do not find, more is an aircraft."""
+MAX_SIZE_SIGMA = 0.3
+"""Standard deviation of a known size as a share of it: with more, the networks' own judgement is better."""
 
 
 class DetectionParameters(Section):
@@ -34,8 +39,12 @@ class DetectionParameters(Section):
     deviation: with the gate, two drones are never nearer to each other than 0.6 of their size."""
     occlusion: Share = 0.25
     """Nothing is seen of what lies behind a drone within this share of its angular size from its centre."""
+    max_proposals: Annotated[int, Field(ge=1)] = 12
+    """Regions of one image that the first stage segments and the second stage is given, with the residuals: those of
+    the highest score, for a cluttered image not to cost the deadline. More than the drones that one camera sees."""
     max_residuals: Annotated[int, Field(ge=0)] = 6
-    """Residuals of one image that are proposed, the largest: one full of false ones must not cost the deadline."""
+    """Residuals of one image that are proposed, the largest: one full of false ones must not cost the deadline. They
+    count among `max_proposals`."""
     residual_px: Annotated[int, Field(ge=1)] = 24
     """Image pixels that a residual has at least."""
     residual_distance_px: Annotated[int, Field(ge=0)] = 4
@@ -46,6 +55,25 @@ class DetectionParameters(Section):
     """Of a pixel's colour against the networks' logits, in a mask. 0: masks are the networks' alone."""
     depth_map_sigma: Positive = 0.08
     """Standard deviation of a drone's log range where the depth map alone gives it (`perception.distance: none`)."""
+
+
+class NoiseParameters(Section):
+    """When an image counts as noise, and is not used. Lengths are of the image, and noise of its luminance."""
+
+    level: Positive = 12.0
+    """Standard deviation, in grey levels of 0-255, of white noise that matters; a camera at night has less."""
+    whiteness: Share = 0.8
+    """White noise is at the finest scale at least this strong as a share of the next; photographs have 0.3 to 0.6."""
+    max_white: Share = 0.25
+    """The image is not used where more of it than this is white noise. 1, here and in the next two: all are used."""
+    max_white_rise: Share = 0.08
+    """Nor is it where this much more of it is white noise than of any of the camera's last five images, ..."""
+    rough_level: Positive = 20.0
+    """... or where details at one of the finest scales are stronger than this, in grey levels, ..."""
+    max_rough_rise: Share = 0.4
+    """... in this much more of it than in any of the last five."""
+    clean_images: Annotated[int, Field(ge=1, le=100)] = 2
+    """So many clean images in a row before a camera that was noisy is used again."""
 
 
 class PerceptionConfig(Section):
@@ -68,7 +96,7 @@ class PerceptionConfig(Section):
     distance: str = "distance_int8"
     """Second stage: a drone's range from its crop alone. `none`: the depth map decides."""
     verification: str = "verification_int8"
-    """Whether a crop of the second stage shows a drone at all. `none`: the distance network's own probability."""
+    """Whether a crop of the second stage shows a drone at all. `none`: the distance network alone says so."""
     models_dir: str | None = None
     """Folder of the manifests; by default the one that comes with flockd."""
     threads: Annotated[int, Field(ge=1, le=64)] = 2
@@ -79,9 +107,32 @@ class PerceptionConfig(Section):
     deadline_s: Positive = 1.0
     """In flight, a network that has not finished one call by then is stuck, and is ended."""
     detection: DetectionParameters = DetectionParameters()
+    noise: NoiseParameters = NoiseParameters()
+    drone_size_m: Annotated[float, Field(ge=MIN_DRONE_SIZE_M, le=MAX_DRONE_SIZE_M)] | None = None
+    """Size of every drone of the fleet, from tip to tip with propellers, where it is known: a drone's range is then
+    this over its apparent size. `flockd calibrate drone` measures it. By default the network judges each drone's
+    size."""
+    drone_size_sigma_m: NonNegative = 0.01
+    """Standard deviation of `drone_size_m`: by default of a tape measure. It adds to the deviation of every range."""
     scale: ScaleSource = "height"
     """The background's metric scale: `network` (pure RGB, as in the paper), `height` (attitude and height above ground
     from the autopilot) or `velocity` (attitude and velocity from the autopilot; the drone has to move)."""
+
+    @model_validator(mode="after")
+    def _a_known_size_is_of_use(self) -> Self:
+        size = self.drone_size_m
+        if size is None:
+            return self
+        faults: dict[tuple[str | int, ...], str] = {}
+        if self.distance == NO_MODEL:
+            faults["drone_size_m",] = "needs the apparent size, which a second stage gives; name one in `distance`"
+        if self.drone_size_sigma_m > MAX_SIZE_SIGMA * size:
+            faults["drone_size_sigma_m",] = (
+                f"{self.drone_size_sigma_m:g} m is more than {MAX_SIZE_SIGMA:.0%} of drone_size_m, {size:g} m; "
+                "measure it better, or delete both"
+            )
+        refuse(self, faults)
+        return self
 
     @property
     def networks(self) -> dict[Role, str]:

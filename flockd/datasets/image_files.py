@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from flockd.datasets.errors import DatasetError
+from flockd.image_header import MAX_IMAGE_PIXELS, image_size
 from flockd.messages import Float32Array, UInt8Array
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff"})
@@ -18,9 +19,12 @@ _CHUNK_FRAME = 12
 """Bytes of a PNG chunk beside its data: length, name and checksum."""
 
 
-def read_image(path: Path, size: tuple[int, int] | None = None) -> UInt8Array:
-    """(h, w, 3) RGB; grey images have three equal channels. Raises DatasetError, also for another ``size``."""
-    image = _decoded(path, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool = False) -> UInt8Array:
+    """(h, w, 3) RGB; grey images have three equal channels. Raises DatasetError, also for another ``size``.
+
+    ``upright``: turned as the file's orientation says, as a phone writes it; else as the sensor gave it.
+    """
+    image = _decoded(path, cv2.IMREAD_COLOR_RGB | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION))
     if size is not None:
         _check_size(path, image.shape[1::-1], size)
     return np.asarray(image, np.uint8)
@@ -51,6 +55,9 @@ def _decoded(path: Path, flags: int) -> cv2.typing.MatLike:
 
 def _fault(data: bytes) -> str | None:
     """What is wrong with a file before it is decoded."""
+    size = image_size(data)
+    if size is not None and size[0] * size[1] > MAX_IMAGE_PIXELS:
+        return f"claims {size[0]} x {size[1]} pixels, more than any camera has"
     if data.startswith(_PNG):
         return _png_fault(data)
     if data.startswith(_JPEG) and _JPEG_END not in data[-64:]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 from flockd.geometry import PinholeCamera, RigidTransform
 from flockd.messages import BoolArray, Float32Array, FloatArray, UInt8Array
@@ -34,6 +35,8 @@ class SceneMaps:
     """(h, w) pixels of the drones that may just as well be background; None: no such."""
     logit: Float32Array | None = None
     """(h, w) / `Networks.map_stride`, of each pixel being any drone's; None: the labels are all that is known."""
+    min_score: float = 0.0
+    """Instances of a lower score are not proposed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +49,14 @@ class Crop:
     T_body_camera: RigidTransform
     mirrored: bool = False
     """Whether the network is to be given the mirror image, on which it errs differently. The estimate is as if not."""
+
+
+@dataclass(frozen=True)
+class KnownSize:
+    """Of every drone of the fleet, from tip to tip, and its standard deviation."""
+
+    size_m: float
+    sigma_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,3 +75,19 @@ class RangeEstimate:
     """Of there being a drone at all."""
     mask: Float32Array | None = None
     """(size, size) logit of each pixel of the crop being that drone's; None: the model does not say."""
+
+    def of_size(self, known: KnownSize) -> RangeEstimate:
+        """With the range at which a drone of a known size has this apparent size.
+
+        The network says one deviation, that of its range; as it judges most drones' size well, that is what its
+        apparent size errs by. The known size's own deviation adds to it, as the two are independent.
+        """
+        if not (self.size_m > 0 and math.isfinite(self.size_m)):
+            return replace(self, log_range=math.nan)
+        log_apparent_size = math.log(self.size_m) - self.log_range
+        return replace(
+            self,
+            log_range=math.log(known.size_m) - log_apparent_size,
+            log_range_sigma=math.hypot(self.log_range_sigma, known.sigma_m / known.size_m),
+            size_m=known.size_m,
+        )

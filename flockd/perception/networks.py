@@ -16,12 +16,13 @@ from flockd.choices import Role
 from flockd.config.perception import NO_MODEL, PerceptionConfig
 from flockd.errors import ModelError
 from flockd.geometry import RigCamera
+from flockd.inference.checks import Deadline, no_deadline
 from flockd.inference.fitting import fit
 from flockd.inference.manifest import Unknown
 from flockd.inference.manifest_file import manifest_path
 from flockd.inference.providers import engines_folder
 from flockd.inference.session import OnnxModel
-from flockd.messages import Float32Array, Frame, UInt8Array
+from flockd.messages import Float32Array, FloatArray, Frame, UInt8Array
 from flockd.perception.detection.instances import group_instances
 from flockd.perception.detection.second_stage import SecondStage
 from flockd.perception.flow import DisFlow, Flow, OnnxFlow, background_flow, object_flow
@@ -75,11 +76,12 @@ class Networks(Protocol):
 class OnnxNetworks:
     """The networks that a configuration names. Stateless: may serve several pilots."""
 
-    def __init__(self, config: PerceptionConfig, models_dir: Path) -> None:
-        """Raises ModelError."""
+    def __init__(self, config: PerceptionConfig, models_dir: Path, deadline: Deadline = no_deadline) -> None:
+        """``deadline`` is for each network's run on its golden input. Raises ModelError."""
         self._models: dict[str, OnnxModel] = {}
         self._dir = models_dir
         self._config = config
+        self._deadline = deadline
         cv2.setNumThreads(config.threads)
         self._flow = self._build_flow(config)
         self._depth = self._model(config.depth, "depth")
@@ -128,7 +130,10 @@ class OnnxNetworks:
         labels, instances = group_instances(logit - np.float32(proposal), offset, scale=self.map_stride)
         labels = np.asarray(cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
         low = cv2.resize((logit < certain).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
-        scene = SceneMaps(np.full_like(depth, np.nan), labels, instances, uncertain=low & (labels > 0), logit=logit)
+        peak = self._segmentation.manifest.thresholds.get("proposal_peak_logit", proposal) - proposal
+        scene = SceneMaps(
+            np.full_like(depth, np.nan), labels, instances, uncertain=low & (labels > 0), logit=logit, min_score=peak
+        )
         return self._with_depth(scene, depth, camera)
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
@@ -140,30 +145,43 @@ class OnnxNetworks:
         images = [np.ascontiguousarray(c.image[:, ::-1]) if c.mirrored else c.image for c in crops]
         size = self.second_stage.crop_size
         if self._verification is None:
-            return self._ranges(self._distance, crops, images, size)
+            return self._ranges(self._distance, crops, images, np.zeros(len(crops)), limit=math.inf)
         outputs = _in_batches(self._verification, images)
-        logits = self._verification.manifest.results["drone"].by_column(outputs["drone"])["drone_logit"]
-        probabilities = [float(1.0 / (1.0 + np.exp(-logit))) for logit in logits.astype(float)]
+        logits = self._verification.manifest.results["drone"].by_column(outputs["drone"])["drone_logit"].astype(float)
+        limit = self._verification.manifest.threshold("distance_logit_limit")
         # Where there is no drone, there is no range to ask for: most crops of a cluttered image end here.
-        rest = [k for k, p in enumerate(probabilities) if p > self.second_stage.thresholds.another_crop]
-        ranged = self._ranges(self._distance, [crops[k] for k in rest], [images[k] for k in rest], size)
-        estimates = [_no_range(p, size) for p in probabilities]
+        most = _probability(logits + limit)
+        rest = np.flatnonzero(most > self.second_stage.thresholds.another_crop)
+        ranged = self._ranges(
+            self._distance, [crops[k] for k in rest], [images[k] for k in rest], logits[rest], limit=limit
+        )
+        estimates = [_no_range(p, size) for p in most]
         for k, estimate in zip(rest, ranged, strict=True):
-            estimates[k] = replace(estimate, drone_probability=probabilities[k])
+            estimates[k] = estimate
         return tuple(estimates)
 
     @staticmethod
     def _ranges(
-        distance: OnnxModel, crops: Sequence[Crop], images: Sequence[UInt8Array], size: int
+        distance: OnnxModel,
+        crops: Sequence[Crop],
+        images: Sequence[UInt8Array],
+        logits: FloatArray,
+        *,
+        limit: float,
     ) -> tuple[RangeEstimate, ...]:
-        """What the distance network says of crops, given their images as they enter."""
+        """What the distance network says of crops, given their images as they enter.
+
+        Of there being a drone, what it says is added to ``logits`` (n,), up to ``limit``: log odds of independent
+        evidence add.
+        """
         if not crops:
             return ()
         outputs = _in_batches(distance, images)
-        columns = distance.manifest.results["range"].by_column(outputs["range"])
+        columns = dict(distance.manifest.results["range"].by_column(outputs["range"]))
+        columns["drone_logit"] = logits + np.clip(columns["drone_logit"], -limit, limit)
         masks = list(outputs["mask"][:, 0]) if "mask" in outputs else [None] * len(crops)
         return tuple(
-            _estimate({name: float(column[k]) for name, column in columns.items()}, crop, masks[k], size)
+            _estimate({name: float(column[k]) for name, column in columns.items()}, crop, masks[k])
             for k, crop in enumerate(crops)
         )
 
@@ -236,6 +254,7 @@ class OnnxNetworks:
                 provider=self._config.provider,
                 engines=engines_folder(self._config),
                 check=check_roles,
+                deadline=self._deadline,
             )
         model = self._models[key]
         if role not in model.manifest.roles:
@@ -259,8 +278,13 @@ def _no_range(drone_probability: float, size: int) -> RangeEstimate:
     return RangeEstimate(math.nan, math.nan, middle, math.nan, drone_probability=drone_probability)
 
 
-def _estimate(columns: Mapping[str, float], crop: Crop, mask: Float32Array | None, size: int) -> RangeEstimate:
+def _probability(logit: FloatArray) -> FloatArray:
+    return np.asarray(1.0 / (1.0 + np.exp(-logit)))
+
+
+def _estimate(columns: Mapping[str, float], crop: Crop, mask: Float32Array | None) -> RangeEstimate:
     """Of one crop's output, with a mirror image's turned back."""
+    size = crop.camera.size[0]
     right = columns["right_px"]
     if crop.mirrored:
         right = -right
@@ -270,7 +294,7 @@ def _estimate(columns: Mapping[str, float], crop: Crop, mask: Float32Array | Non
         log_range_sigma=float(np.exp(columns["log_relative_sigma"])),
         centre=np.array([size / 2 + right, size / 2 + columns["down_px"]]),
         size_m=float(np.exp(columns["log_range_per_focal"] + columns["log_apparent_size"])),
-        drone_probability=float(1.0 / (1.0 + np.exp(-columns["drone_logit"]))),
+        drone_probability=float(_probability(np.array(columns["drone_logit"]))),
         mask=mask,
     )
 

@@ -17,6 +17,8 @@ class Threshold:
     low: float
     high: float
     """It lies between these, both included."""
+    optional: bool = False
+    """Whether a manifest may leave it out."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,11 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
                 "little too wide.",
                 *_LOGIT,
             ),
+            "proposal_peak_logit": Threshold(
+                "Highest logit of its pixels from which a proposal goes to the second stage; by default any does.",
+                *_LOGIT,
+                optional=True,
+            ),
             "proposal_logit_alone": Threshold(
                 "Logit from which pixels are a drone's where there is no second stage.", *_LOGIT
             ),
@@ -100,7 +107,12 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
         inputs=("crop",),
         outputs=("drone",),
         columns={"drone": ("drone_logit",)},
-        thresholds=_PROBABILITIES,
+        thresholds={
+            **_PROBABILITIES,
+            "distance_logit_limit": Threshold(
+                "The distance network's logit counts as well, up to this much for or against a drone.", 0.0, 50.0
+            ),
+        },
     ),
 }
 """The table that a manifest is checked against. A distance model may give a `mask` (n, h, w) of logits as well."""
@@ -144,7 +156,8 @@ def _faults_of_numbers(manifest: Manifest, role: Role, needed: Requirements) -> 
         value = manifest.thresholds.get(name)
         limits = f"a number from {threshold.low:g} to {threshold.high:g}"
         if value is None:
-            yield Fault(("thresholds", name), f"is missing for the role {role}; add it with {limits}")
+            if not threshold.optional:
+                yield Fault(("thresholds", name), f"is missing for the role {role}; add it with {limits}")
         elif not threshold.low <= value <= threshold.high:
             yield Fault(("thresholds", name), f"{value:g} is out of range; write {limits}")
     if needed.crop and manifest.crop is None:

@@ -130,6 +130,7 @@ class FlockPilot:
             counts=Counter(reasons),
             stages_ms=laps.stages_ms,
             mission=mission,
+            noisy_cameras=observation.noisy_cameras or None,
         )
 
     def _refused(self, frames: FrameSet, reason: str) -> PilotOutput:

@@ -24,6 +24,7 @@ WIDTHS_PX = (6.0, 60.0)
 _NEGATIVE_SCALES = (0.4, 1.0)
 _LEAST_SCALE = 0.07
 _TRIES = 6
+_NOISE_SIGMA = (40.0, 120.0)
 _SENSOR_SIGMA = 6.0
 """Grey levels that noise and compression hide at least."""
 _TEXTURE_SIGMA = 30.0
@@ -104,6 +105,21 @@ def negative(patch: Image, half_px: float, rng: np.random.Generator) -> Sample:
         scale = min(1.0, camera_px) * float(rng.uniform(*_NEGATIVE_SCALES))
         picture = through_camera(picture, drawn_effects(max(scale, _LEAST_SCALE), rng), rng)
     return _sample(picture, drone=0.0)
+
+
+def noise(patch: Image, half_px: float, rng: np.random.Generator) -> Sample:
+    """A real crop without a drone under so much noise that no drone could be seen, now and then noise alone."""
+    picture, _ = crop_of_negative(patch, half_px, rng)
+    side = int(rng.integers(CROP_PX // 4, CROP_PX + 1))
+    channels = 3 if rng.random() < 0.7 else 1
+    if rng.random() < 0.3:
+        grain = rng.uniform(-255, 255, (side, side, channels))
+        picture = np.full_like(picture, 128)
+    else:
+        grain = rng.normal(0, rng.uniform(*_NOISE_SIGMA), (side, side, channels))
+    enlarged = cv2.resize(grain.astype(np.float32), (CROP_PX, CROP_PX), interpolation=cv2.INTER_LINEAR)
+    spoilt = picture + enlarged.reshape(CROP_PX, CROP_PX, channels)
+    return _sample(np.clip(np.round(spoilt), 0, 255).astype(np.uint8), drone=0.0)
 
 
 def real_drone(drones: RealPatches, rng: np.random.Generator, *, backgrounds: RealPatches | None = None) -> Sample:

@@ -19,7 +19,7 @@ from flockd.perception.detection.proposals import (
     propose_residuals,
 )
 from flockd.perception.detection.refinement import Candidate, Cascade
-from flockd.perception.maps import SceneMaps
+from flockd.perception.maps import KnownSize, SceneMaps
 from flockd.perception.networks import Networks
 from flockd.tracking import Prediction
 
@@ -35,10 +35,12 @@ class DetectionTrace:
 class Detector:
     """Finds drones in the images of a rig."""
 
-    def __init__(self, rig: Rig, networks: Networks, parameters: DetectionParameters) -> None:
+    def __init__(
+        self, rig: Rig, networks: Networks, parameters: DetectionParameters, known_size: KnownSize | None = None
+    ) -> None:
         self._rig, self._networks, self._parameters = rig, networks, parameters
         stage = networks.second_stage
-        self._refining = None if stage is None else (stage.rules, Cascade(networks, stage, parameters))
+        self._refining = None if stage is None else (stage.rules, Cascade(networks, stage, parameters, known_size))
         self._renderers = {name: MaskRenderer(c, networks.map_stride) for name, c in rig.cameras.items()}
 
     def detect(
@@ -65,7 +67,7 @@ class Detector:
             trace.candidates += candidates_from_depth(rig, scenes, self._parameters)
             return self._masked(suppress(trace.candidates, self._parameters), images, scenes, ())
         rules, cascade = self._refining
-        proposals = propose_instances(rig, scenes, rules)
+        proposals = propose_instances(rig, scenes, rules, self._parameters)
         candidates, rejected = cascade.refine(rig, images, proposals)
         predicted = propose_predictions(rig, vehicle, predictions, [c.bearing for c in candidates], rules)
         candidates += cascade.refine(rig, images, predicted)[0]

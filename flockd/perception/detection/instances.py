@@ -26,6 +26,8 @@ class Instance:
     box: FloatArray
     """(4,) left, top, right, bottom of its pixels."""
     area_px: float
+    score: float = 0.0
+    """By how much the highest logit of its pixels exceeds the threshold of a pixel; the more, the likelier a drone."""
 
 
 def group_instances(
@@ -59,12 +61,13 @@ def group_instances(
             continue
         u, v = columns[mine], rows[mine]
         box = scale * np.array([u.min(), v.min(), u.max() + 1, v.max() + 1], np.float64)
-        found.append((area, scale * np.median(votes[mine], axis=0), box, mine))
+        score = float(drone_logit[v, u].max())
+        found.append((area, scale * np.median(votes[mine], axis=0), box, mine, score))
     found.sort(key=lambda item: -item[0])
     instances = []
-    for label, (area, centre, box, mine) in enumerate(found, start=1):
+    for label, (area, centre, box, mine, score) in enumerate(found, start=1):
         labels[rows[mine], columns[mine]] = label
-        instances.append(Instance(label, centre, box, area))
+        instances.append(Instance(label, centre, box, area, score))
     return labels, tuple(instances)
 
 

@@ -50,13 +50,22 @@ class Proposal:
         return self.instance.area_px if self.instance else 0.0
 
 
-def propose_instances(rig: Rig, scenes: Mapping[str, SceneMaps], rules: CropRules) -> list[Proposal]:
-    """What the first stage segments."""
+def propose_instances(
+    rig: Rig, scenes: Mapping[str, SceneMaps], rules: CropRules, parameters: DetectionParameters
+) -> list[Proposal]:
+    """What the first stage segments, of each image those of the highest score, in the order of the instances."""
     return [
         Proposal((name,), roi_of_instance(rig.cameras[name], instance, rules), instance)
         for name, scene in scenes.items()
-        for instance in scene.instances
+        for instance in best_instances(scene, parameters.max_proposals)
     ]
+
+
+def best_instances(scene: SceneMaps, most: int) -> list[Instance]:
+    """At most so many, and none below the score that the first stage asks for; of equal scores the larger."""
+    good = [one for one in scene.instances if one.score >= scene.min_score]
+    kept = {one.label for one in sorted(good, key=lambda one: (-one.score, -one.area_px))[:most]}
+    return [one for one in good if one.label in kept]
 
 
 def propose_predictions(
@@ -99,8 +108,9 @@ def propose_residuals(
 ) -> list[Proposal]:
     """Where the first stage is certain of a drone and no mask of the second explains it.
 
-    A drone that another hides in part, or passes close by, is often segmented as a part of it. ``masks`` are the
-    networks' alone: by colours, one drone's would take more of another that is painted alike.
+    A drone that another hides in part, or passes close by, is often segmented as a part of it. Instances of too low a
+    score to be proposed are no residuals. ``masks`` are the networks' alone: by colours, one drone's would take more of
+    another that is painted alike.
     """
     proposals = []
     for name, scene in scenes.items():
@@ -108,12 +118,16 @@ def propose_residuals(
             continue
         mask = masks[name]
         residual = (mask == UNCLASSED) & (scene.labels > 0) & ~scene.uncertain
+        proposed = best_instances(scene, parameters.max_proposals)
+        if len(proposed) < len(scene.instances):
+            residual &= np.isin(scene.labels, [one.label for one in proposed])
         if residual.any():
             masked = ((mask > 0) & (mask != UNCLASSED)).astype(np.uint8)
             width = 2 * parameters.residual_distance_px + 1
             residual &= cv2.dilate(masked, np.ones((width, width), np.uint8)) == 0
             camera = rig.cameras[name]
-            blobs = largest_blobs(residual, parameters.max_residuals, parameters.residual_px)
+            most = min(parameters.max_residuals, parameters.max_proposals - len(proposed))
+            blobs = largest_blobs(residual, most, parameters.residual_px)
             proposals += [Proposal((name,), roi_of_instance(camera, blob, rules), blob) for blob in blobs]
     return proposals
 

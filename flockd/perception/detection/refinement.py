@@ -16,7 +16,7 @@ from flockd.perception.detection.masks import CropMask
 from flockd.perception.detection.proposals import Proposal
 from flockd.perception.detection.roi import Roi, take_crops
 from flockd.perception.detection.second_stage import SecondStage
-from flockd.perception.maps import Crop, RangeEstimate
+from flockd.perception.maps import Crop, KnownSize, RangeEstimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +71,15 @@ class _Stage:
 class Cascade:
     """Refines proposals with the network of the second stage."""
 
-    def __init__(self, network: RangeNetwork, second_stage: SecondStage, parameters: DetectionParameters) -> None:
-        self._network, self._crop_size = network, second_stage.crop_size
+    def __init__(
+        self,
+        network: RangeNetwork,
+        second_stage: SecondStage,
+        parameters: DetectionParameters,
+        known_size: KnownSize | None = None,
+    ) -> None:
+        """``known_size``: of every drone; None: the network judges each one's."""
+        self._network, self._crop_size, self._known_size = network, second_stage.crop_size, known_size
         self._rules, self._thresholds, self._parameters = second_stage.rules, second_stage.thresholds, parameters
 
     def refine(
@@ -129,6 +136,8 @@ class Cascade:
 
     def _candidate(self, stage: _Stage, view: VirtualCrop, estimate: RangeEstimate) -> Candidate:
         """The camera sits beside the body's origin, so that bearing and range change a little."""
+        if self._known_size is not None:
+            estimate = estimate.of_size(self._known_size)
         ray = view.camera.rays(estimate.centre[None])[0]
         bearing, log_range = ray, estimate.log_range
         if math.isfinite(log_range) and log_range < math.log(2 * self._parameters.max_range_m):

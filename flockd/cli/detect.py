@@ -1,0 +1,195 @@
+"""`flockd detect`: drones in pictures of any origin, by the code that flies."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from flockd.cli.output import PIPED_COLUMNS, complain, progress, say, say_json
+from flockd.cli.parser import Commands, positive_count, positive_number
+from flockd.cli.picture_options import PictureCameras, add_picture_options, detector_of, perception_of
+from flockd.errors import ExitCode, UsageError
+
+if TYPE_CHECKING:
+    from flockd.pictures import DetectedDrone, PictureDetector, PictureFile, PictureLabels, PictureResult
+    from flockd.pictures.copies import Copies
+
+NOTES = """\
+Larger pictures are resized to 1280 pixels for the networks; boxes are in pixels of the picture.
+--labels: a drone is found when the centre of a detection lies in its box, each box once; any other detection is false.
+A picture or a label file that cannot be read ends the command with exit code 1, before anything is printed."""
+
+
+def add(commands: Commands) -> None:
+    """Adds the command."""
+    examples = (
+        "flockd detect photograph.jpg --fov 70 --out drawn",
+        "flockd detect pictures/ clip.mp4 --every 10 --fov 70 --json",
+        "flockd detect front/ --config my_drone.yaml --camera front",
+        "flockd detect pictures/ --fov 70 --labels drones.json",
+        "flockd detect photograph.jpg --fov 70 --drone-size 0.35",
+    )
+    parser = commands("detect", "Detect drones in pictures, with the code that flies.", examples, NOTES)
+    parser.add_argument("pictures", metavar="PICTURES", nargs="+", type=Path, help="images, folders of them, videos")
+    parser.add_argument("--out", metavar="FOLDER", type=Path, help="draw what is found into copies there")
+    parser.add_argument("--force", action="store_true", help="overwrite what is there")
+    parser.add_argument("--labels", metavar="FILE", type=Path, help="COCO boxes of category `drone`, to measure with")
+    parser.add_argument("--min-probability", metavar="P", type=_probability, default=0.0, help="leave out less (0)")
+    parser.add_argument("--drone-size", metavar="M", type=positive_number, help="of every drone, tip to tip, if known")
+    parser.add_argument("--every", metavar="N", type=positive_count, default=1, help="every Nth frame of a video (1)")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    add_picture_options(parser)
+    parser.set_defaults(run=_run)
+
+
+def _probability(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a probability, 0 to 1")
+    return value
+
+
+@dataclass(frozen=True)
+class _Detected:
+    """One picture with what was found in it."""
+
+    name: str
+    result: PictureResult
+    labels: PictureLabels | None
+    seconds: float
+
+
+def _run(args: argparse.Namespace) -> int:
+    from flockd.pictures import find_pictures, read_labels
+    from flockd.pictures.copies import Copies
+
+    if args.force and args.out is None:
+        raise UsageError("--force has no meaning without --out; add it")
+    cameras = PictureCameras(args)
+    pictures = find_pictures(args.pictures)
+    labels = None if args.labels is None else read_labels(args.labels, pictures)
+    more = {} if args.drone_size is None else {"drone_size_m": args.drone_size}
+    config = perception_of(args, cameras.config, **more)
+    with ExitStack() as stack:
+        copies = None
+        if args.out is not None:
+            copies = stack.enter_context(Copies(args.out, pictures, args.every, overwrite=args.force))
+        detector = detector_of(config)
+        detected = list(_detected(args, pictures, labels, detector, cameras, copies))
+    result = _result(detected, measure=labels is not None)
+    if args.json:
+        say_json(result)
+    else:
+        _say(detected, result)
+    unlabelled = 0 if labels is None else sum(one.labels is None for one in detected)
+    if unlabelled:
+        complain(f"{args.labels}: does not list {unlabelled} of the {len(detected)} pictures; they are not measured")
+    if args.out is not None:
+        complain(f"written: {len(pictures)} {'copies' if len(pictures) > 1 else 'copy'} in {args.out}")
+    return ExitCode.DONE
+
+
+def _detected(
+    args: argparse.Namespace,
+    pictures: Sequence[PictureFile],
+    labels: Mapping[PictureFile, PictureLabels] | None,
+    detector: PictureDetector,
+    cameras: PictureCameras,
+    copies: Copies | None,
+) -> Iterator[_Detected]:
+    from flockd.pictures.coco_labels import check_size
+    from flockd.pictures.drawing import annotated
+
+    count = sum(picture.count(args.every) for picture in pictures)
+    with progress("detecting", "pictures") as tell:
+        done = 0
+        for picture in pictures:
+            known = None if labels is None else labels.get(picture)
+            for name, image in picture.images(args.every):
+                size = (image.shape[1], image.shape[0])
+                if known is not None:
+                    check_size(args.labels, name, known, size)
+                camera = cameras.of(name, size)
+                begin = time.perf_counter()
+                result = detector.detect(image, camera).at_least(args.min_probability)
+                seconds = time.perf_counter() - begin
+                if copies is not None:
+                    copies.write(picture, annotated(image, result, known.boxes if known else ()))
+                yield _Detected(name, result, known, seconds)
+                done += 1
+                tell(done, max(done, count))
+
+
+def _result(detected: Sequence[_Detected], *, measure: bool) -> dict[str, Any]:
+    from flockd.pictures import Labelled, summary
+
+    count = max(len(detected), 1)
+    result: dict[str, Any] = {
+        "images": len(detected),
+        "pictures": [
+            {
+                "file": one.name,
+                "detections": [
+                    {
+                        "box": [round(value, 2) for value in found.box],
+                        "probability": round(found.probability, 4),
+                        "range_m": round(found.range_m, 4),
+                        "range_sigma_m": round(found.range_sigma_m, 4),
+                        "size_m": round(found.size_m, 4),
+                    }
+                    for found in one.result.detections
+                ],
+            }
+            for one in detected
+        ],
+        "proposals_per_image": round(sum(one.result.proposals for one in detected) / count, 2),
+        "ms_per_image": round(1000 * sum(one.seconds for one in detected) / count, 2),
+    }
+    if measure:
+        labelled = [Labelled(o.result.detections, o.labels.boxes) for o in detected if o.labels is not None]
+        result |= summary(labelled)
+    return result
+
+
+def _say(detected: Sequence[_Detected], result: Mapping[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(markup=False, highlight=False, width=None if sys.stdout.isatty() else PIPED_COLUMNS)
+    table = Table("picture", "box, px", "probability", "range, m", "size, m", box=None, pad_edge=False)
+    for one in detected:
+        for found in one.result.detections:
+            box = " ".join(f"{value:.0f}" for value in found.box)
+            range_m, size_m = (f"{v:.2f} +- {s:.2f}" for v, s in _values(found))
+            table.add_row(one.name, box, f"{found.probability:.2f}", range_m, size_m)
+    if table.row_count:
+        console.print(table)
+    drones = sum(len(one.result.detections) for one in detected)
+    cost = f"{result['proposals_per_image']:g} proposals and {result['ms_per_image']:g} ms a picture"
+    say(f"{drones} detections in {result['images']} pictures; {cost}")
+    if "boxes" not in result:
+        return
+    widths = Table("box width, px", "boxes", "found", "found, IoU 0.3", box=None, pad_edge=False)
+    for width, counts in result["by_width"].items():
+        widths.add_row(width, str(counts["boxes"]), *(_share(counts, key) for key in ("found", "found_iou30")))
+    console.print(widths)
+    ap50 = "unknown" if result["ap50"] is None else f"{100 * result['ap50']:.1f} %"
+    say(f"{result['boxes']} boxes; AP50 {ap50}; {result['false_per_500_images']:g} false detections in 500 pictures")
+
+
+def _values(found: DetectedDrone) -> tuple[tuple[float, float], tuple[float, float]]:
+    return (found.range_m, found.range_sigma_m), (found.size_m, found.size_sigma_m)
+
+
+def _share(counts: Mapping[str, int], key: str) -> str:
+    return f"{counts[key]} ({100 * counts[key] / counts['boxes']:.0f} %)" if counts["boxes"] else "-"

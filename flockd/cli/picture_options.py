@@ -1,0 +1,129 @@
+"""What commands that detect drones in pictures have in common: the networks, and the camera of a picture."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from flockd.cli.config import loaded
+from flockd.cli.parser import Parser, positive_number
+from flockd.errors import UsageError
+
+if TYPE_CHECKING:
+    from flockd.config import DroneConfig
+    from flockd.config.perception import PerceptionConfig
+    from flockd.geometry import Camera
+    from flockd.pictures import PictureDetector
+
+MAX_FOV_DEG = 170.0
+
+
+def add_picture_options(parser: Parser) -> None:
+    """Adds the camera and the networks."""
+    camera = parser.add_argument_group("the camera of the pictures, one of")
+    camera.add_argument(
+        "--fov", metavar="DEG", type=_fov, help="field of view across the longer side, of a lens without distortion"
+    )
+    camera.add_argument("--config", metavar="FILE", type=Path, help="this drone's camera, networks and settings")
+    camera.add_argument("--camera", metavar="NAME", help="which of --config's cameras, where it has several")
+    networks = parser.add_argument_group("the networks", "by default those of --config, else those that fly")
+    networks.add_argument("--models", metavar="FOLDER", type=Path, help="folder of the manifests")
+    networks.add_argument("--segmentation", metavar="NAME", help="first stage: the model for depth and segmentation")
+    networks.add_argument("--distance", metavar="NAME", help="second stage: the model for the distance")
+    networks.add_argument("--threads", metavar="N", type=_threads, help="processor threads (2)")
+
+
+def _fov(text: str) -> float:
+    angle = positive_number(text)
+    if angle > MAX_FOV_DEG:
+        raise argparse.ArgumentTypeError(f"{text} degrees are more than {MAX_FOV_DEG:g}; a pinhole camera has less")
+    return angle
+
+
+def _threads(text: str) -> int:
+    if not (text.isdecimal() and 1 <= int(text) <= 64):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of threads, 1 to 64")
+    return int(text)
+
+
+class PictureCameras:
+    """The camera of each picture, by its size."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        """Raises UsageError where the options give none or two, and ConfigError."""
+        if args.config is None and args.fov is None:
+            raise UsageError(
+                "the pictures' camera is not known; give its field of view with --fov (a phone's main camera has 65 to "
+                "75 degrees, its data sheet says), or a drone with --config"
+            )
+        if args.config is not None and args.fov is not None:
+            raise UsageError("--fov and --config exclude each other; give one of them")
+        if args.camera is not None and args.config is None:
+            raise UsageError("--camera is one of --config's; name the drone's file with --config")
+        self.config = loaded(args.config)
+        self._file, self._fov = args.config, args.fov
+        self._cameras: dict[tuple[int, int], Camera] = {}
+        self._mine = None if self.config is None else self._of_rig(args)
+
+    def of(self, name: str, size: tuple[int, int]) -> Camera:
+        """Of a picture of this width and height. Raises UsageError where it is not of --config's camera."""
+        if self._mine is not None:
+            if self._mine.size != size:
+                wanted = " x ".join(map(str, self._mine.size))
+                raise UsageError(
+                    f"{name}: is {size[0]} x {size[1]} pixels, and the camera of {self._file} {wanted}; give pictures "
+                    "of that camera, or --fov instead of --config"
+                )
+            return self._mine
+        if size not in self._cameras:
+            from flockd.pictures import camera_with_fov
+
+            self._cameras[size] = camera_with_fov(size, self._fov)
+        return self._cameras[size]
+
+    def _of_rig(self, args: argparse.Namespace) -> Camera:
+        from flockd.geometry import build_rig
+
+        assert self.config is not None
+        cameras = build_rig(self.config.rig).cameras
+        if args.camera is None and len(cameras) > 1:
+            raise UsageError(f"{args.config}: has cameras {', '.join(cameras)}; choose one with --camera")
+        name = args.camera or next(iter(cameras))
+        if name not in cameras:
+            raise UsageError(f"{args.config}: has no camera {name!r}; choose --camera from {', '.join(cameras)}")
+        return cameras[name].camera
+
+
+def perception_of(args: argparse.Namespace, drone: DroneConfig | None, **more: Any) -> PerceptionConfig:
+    """The settings of a drone or the defaults, with what the options and ``more`` ask for.
+
+    No flow network, as single pictures have no flow. Raises UsageError for values that cannot be.
+    """
+    from pydantic import ValidationError
+
+    from flockd.config.perception import DIS, PerceptionConfig
+
+    values = {} if drone is None else drone.perception.model_dump()
+    values |= {"flow": DIS, "scale": "network", **more}
+    if args.models is not None:
+        values["models_dir"] = str(args.models)
+    if args.segmentation is not None:
+        values |= {"depth": args.segmentation, "segmentation": args.segmentation}
+    if args.distance is not None:
+        values["distance"] = args.distance
+    if args.threads is not None:
+        values["threads"] = args.threads
+    try:
+        return PerceptionConfig.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise UsageError(f"perception.{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+
+
+def detector_of(config: PerceptionConfig) -> PictureDetector:
+    """With the networks loaded. Raises ModelError."""
+    from flockd.perception import load_networks
+    from flockd.pictures import PictureDetector
+
+    return PictureDetector(load_networks(config), config)
