@@ -178,20 +178,19 @@ class Gate:
 
     def _within_acceleration(self, target: FloatArray, now_s: float, around: Surroundings) -> FloatArray:
         """The velocity nearest to the target that can be reached from the last one sent, or else from the true one."""
-        p, elapsed_s = self._parameters, self._elapsed_s(now_s)
-        if self._last is not None and elapsed_s is not None:
-            start = self._last.velocity
+        p, last = self._parameters, self._recent(now_s)
+        if last is not None:
+            start, elapsed_s = last.velocity, max(now_s - last.time_s, 0.0)
         elif np.isfinite(around.velocity).all():
-            start = _limited(around.velocity, p.max_speed_m_s)
+            start, elapsed_s = _limited(around.velocity, p.max_speed_m_s), 0.0
         else:
-            start = np.zeros(2)
-        return start + _limited(target - start, p.max_acceleration_m_s2 * (elapsed_s or 0.0))
+            start, elapsed_s = np.zeros(2), 0.0
+        return start + _limited(target - start, p.max_acceleration_m_s2 * elapsed_s)
 
-    def _elapsed_s(self, now_s: float) -> float | None:
-        """Since the last setpoint; None where that is too long ago to go on from it."""
-        if self._last is None or now_s - self._last.time_s > self._parameters.permission_timeout_s:
-            return None
-        return max(now_s - self._last.time_s, 0.0)
+    def _recent(self, now_s: float) -> Setpoint | None:
+        """The last setpoint; None where that is too long ago to go on from it."""
+        last = self._last
+        return None if last is None or now_s - last.time_s > self._parameters.permission_timeout_s else last
 
     def _within_space(
         self, velocity: FloatArray, action: Action, around: Surroundings, objections: list[Objection]
@@ -246,14 +245,14 @@ class Gate:
         """
         if action is Action.OFFER:  # on the ground, or flown by the pilot: as high as the control loop says
             return wanted.height_m
-        elapsed_s = self._elapsed_s(now_s)
-        if self._last is not None and elapsed_s is not None:
-            start_m = self._last.height_m
+        last = self._recent(now_s)
+        if last is not None:
+            start_m, elapsed_s = last.height_m, max(now_s - last.time_s, 0.0)
         else:
-            start_m = around.height_m if math.isfinite(around.height_m) else wanted.height_m
+            start_m, elapsed_s = (around.height_m if math.isfinite(around.height_m) else wanted.height_m), 0.0
         most_m = 0.0
         if action in _MOVES:
-            most_m = self._parameters.max_climb_m_s * (elapsed_s or 0.0) * self._share(now_s - wanted.time_s)
+            most_m = self._parameters.max_climb_m_s * elapsed_s * self._share(now_s - wanted.time_s)
         height_m = start_m + min(max(wanted.height_m - start_m, -most_m), most_m)
         lowest_m, highest_m = self._between_neighbours(start_m, around)
         between_m = min(max(height_m, lowest_m), highest_m)
