@@ -252,7 +252,11 @@ def _scenario(args: argparse.Namespace) -> ScenarioConfig:
         scenario = load_scenario(args.scenario or data_path("config") / SCENARIO, overrides)
     except ConfigError as error:
         raise ConfigError([_of_option(problem) for problem in error.problems]) from error
-    return scenario if args.drones is None else with_drones(scenario, args.drones)
+    if args.drones is not None:
+        scenario = with_drones(scenario, args.drones)
+    if all(vehicle.by_hand for vehicle in scenario.vehicles):
+        raise UsageError(f"--drones {args.drones} leaves only drones that are flown by hand; fly more")
+    return scenario
 
 
 def _of_option(problem: ConfigProblem) -> ConfigProblem:

@@ -122,6 +122,8 @@ class ScenarioConfig(Section):
     def _the_missions_can_be_flown(self) -> Self:
         faults: dict[tuple[str | int, ...], str] = {}
         for number, vehicle in enumerate(self.vehicles):
+            if vehicle.by_hand and all(other.by_hand for other in self.vehicles):
+                faults["vehicles", number, "by_hand"] = "flies the last drone by hand too; leave one to flockd"
             if vehicle.mission is not None:
                 limits = self.drone.safety.gate, self.drone.flocking.max_speed_m_s
                 of_mission = mission_faults(vehicle.mission, *limits)

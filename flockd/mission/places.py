@@ -22,7 +22,8 @@ def place_of_waypoint(
 ) -> FloatArray | None:
     """(2,) metres north and east of home; None where the waypoint is in degrees and home is not known."""
     if waypoint.north_m is not None and waypoint.east_m is not None:
-        return origin + np.array([waypoint.north_m, waypoint.east_m])
+        place: FloatArray = origin + np.array([waypoint.north_m, waypoint.east_m])
+        return place
     assert waypoint.latitude_deg is not None and waypoint.longitude_deg is not None  # its own check asks for a pair
     return _from_degrees(np.array([waypoint.latitude_deg, waypoint.longitude_deg]), home_deg)
 

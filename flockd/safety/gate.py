@@ -178,14 +178,19 @@ class Gate:
 
     def _within_acceleration(self, target: FloatArray, now_s: float, around: Surroundings) -> FloatArray:
         """The velocity nearest to the target that can be reached from the last one sent, or else from the true one."""
-        p = self._parameters
-        if self._last is not None and now_s - self._last.time_s <= p.permission_timeout_s:
-            start, elapsed_s = self._last.velocity, max(now_s - self._last.time_s, 0.0)
+        p, last = self._parameters, self._recent(now_s)
+        if last is not None:
+            start, elapsed_s = last.velocity, max(now_s - last.time_s, 0.0)
         elif np.isfinite(around.velocity).all():
             start, elapsed_s = _limited(around.velocity, p.max_speed_m_s), 0.0
         else:
             start, elapsed_s = np.zeros(2), 0.0
         return start + _limited(target - start, p.max_acceleration_m_s2 * elapsed_s)
+
+    def _recent(self, now_s: float) -> Setpoint | None:
+        """The last setpoint; None where that is too long ago to go on from it."""
+        last = self._last
+        return None if last is None or now_s - last.time_s > self._parameters.permission_timeout_s else last
 
     def _within_space(
         self, velocity: FloatArray, action: Action, around: Surroundings, objections: list[Objection]
@@ -238,16 +243,16 @@ class Gate:
         It changes no faster than the limit, as much slower as the velocity of an old command, and not at all where the
         drone is to stand still in flight. It leads no nearer to a neighbour that is near above or below.
         """
-        p = self._parameters
-        if self._last is not None and now_s - self._last.time_s <= p.permission_timeout_s:
-            start_m, elapsed_s = self._last.height_m, max(now_s - self._last.time_s, 0.0)
+        if action is Action.OFFER:  # on the ground, or flown by the pilot: as high as the control loop says
+            return wanted.height_m
+        last = self._recent(now_s)
+        if last is not None:
+            start_m, elapsed_s = last.height_m, max(now_s - last.time_s, 0.0)
         else:
             start_m, elapsed_s = (around.height_m if math.isfinite(around.height_m) else wanted.height_m), 0.0
         most_m = 0.0
         if action in _MOVES:
-            most_m = p.max_climb_m_s * elapsed_s * max(self._share(now_s - wanted.time_s), 0.0)
-        if action is Action.OFFER:  # on the ground, or flown by the pilot: as high as the control loop says
-            return wanted.height_m
+            most_m = self._parameters.max_climb_m_s * elapsed_s * self._share(now_s - wanted.time_s)
         height_m = start_m + min(max(wanted.height_m - start_m, -most_m), most_m)
         lowest_m, highest_m = self._between_neighbours(start_m, around)
         between_m = min(max(height_m, lowest_m), highest_m)
@@ -258,12 +263,11 @@ class Gate:
     def _between_neighbours(self, start_m: float, around: Surroundings) -> tuple[float, float]:
         """From which height to which one may be asked for, from `start_m` on, where neighbours are above or below.
 
-        A height that was asked for already, and from which the drone's own differs by noise only, stays.
+        A height that was asked for already, and from which the drone's own differs by noise only, stays. A drone that
+        does not know its height counts as where it was asked to be.
         """
-        p, own_m = self._parameters, around.height_m
-        if not math.isfinite(own_m):
-            return -math.inf, math.inf
-        offsets = around.neighbours[np.isfinite(around.neighbours).all(axis=1)]
+        p, offsets = self._parameters, around.neighbours
+        own_m = around.height_m if math.isfinite(around.height_m) else start_m
         near = np.hypot(offsets[:, 0], offsets[:, 1]) < _COLUMN * p.degraded_separation_m
         up = -offsets[near, 2]
         room_up = np.maximum(up[up > 0] - p.vertical_separation_m, 0.0).min(initial=math.inf)

@@ -18,7 +18,7 @@ from flockd.config import Overrides, ScenarioConfig, load_scenario
 from flockd.data import data_path
 from flockd.flight_log.from_recordings import flight_log, recordings_in
 from flockd.flight_log.log import FlightLog
-from flockd.messages import FrameSet, PilotOutput, VehicleState
+from flockd.messages import FrameSet, MissionOrder, PilotOutput, VehicleState
 from flockd.recording import Recorder
 from flockd.recording.reader import Recording
 from flockd.sim.start import with_drones
@@ -43,8 +43,8 @@ class Nudged(MadeUpPilot):
 
     nudge = 1e-9
 
-    def step(self, frames: FrameSet, vehicle: VehicleState) -> PilotOutput:
-        output = super().step(frames, vehicle)
+    def step(self, frames: FrameSet, vehicle: VehicleState, *, order: MissionOrder | None = None) -> PilotOutput:
+        output = super().step(frames, vehicle, order=order)
         if frames.time_s > 1000.25:
             output.command.velocity[1] += self.nudge
         return output
@@ -132,7 +132,7 @@ def test_a_replay_that_breaks_off_leaves_no_recording(
     path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     class Broken(MadeUpPilot):
-        def step(self, frames: FrameSet, vehicle: VehicleState) -> PilotOutput:
+        def step(self, frames: FrameSet, vehicle: VehicleState, *, order: MissionOrder | None = None) -> PilotOutput:
             raise KeyboardInterrupt
 
     monkeypatch.setattr("flockd.replay.recorded_flight.FlockPilot", Broken)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flockd.cli import main
 from flockd.config import load_drone, load_scenario
 from flockd.config.mission import fault_of_place
 from flockd.config.safety import GateParameters
@@ -238,6 +239,15 @@ def test_in_a_scenario_the_mission_is_of_all_and_one_drone_may_have_its_own(tmp_
     path.write_text(f"{SCENARIO}{own.replace('[1, 0]', '[9, 0]')}", encoding="utf-8")
     with pytest.raises(ConfigError, match=r"scenario.yaml:6: vehicles\[2\].mission.velocity_m_s: 9 m/s is above"):
         load_scenario(path)
+
+
+def test_one_drone_at_least_is_left_to_flockd(tmp_path: Path) -> None:
+    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
+    path = tmp_path / "scenario.yaml"
+    path.write_text(SCENARIO.replace("4]}", "4], by_hand: true}"), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"scenario.yaml:4: vehicles\[0\].by_hand: flies the last drone by hand too"):
+        load_scenario(path)
+    assert main(["sim", str(CONFIG / "led_by_hand.yaml"), "--drones", "1", "--perception", "truth"]) == 2
 
 
 def test_the_configuration_and_the_gate_agree_on_what_is_outside() -> None:

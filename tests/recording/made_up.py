@@ -18,6 +18,7 @@ from flockd.messages import (
     EgoMotion,
     Frame,
     FrameSet,
+    MissionOrder,
     Neighbour,
     PilotOutput,
     VehicleState,
@@ -49,7 +50,7 @@ class MadeUpPilot:
         self._memory = 0.1
         self.gain = config.flocking.cohesion
 
-    def step(self, frames: FrameSet, vehicle: VehicleState) -> PilotOutput:
+    def step(self, frames: FrameSet, vehicle: VehicleState, *, order: MissionOrder | None = None) -> PilotOutput:
         seen = sum(float((frame.image * np.arange(1.0, 4.0)).sum()) for frame in frames.frames.values()) / 1e6
         felt = float(vehicle.R_ned_body.sum()) + vehicle.height_m / 3.0
         felt += 0.0 if vehicle.velocity_ned is None else float(vehicle.velocity_ned.sum())

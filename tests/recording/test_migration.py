@@ -20,7 +20,7 @@ from flockd.messages import PilotOutput
 from flockd.recording import RecordingError, reader
 from flockd.recording.codec import from_json
 from flockd.recording.mcap_file import Entry, read_records
-from flockd.recording.migration import DROPPED, Migrated, migrate_configuration, migrate_output
+from flockd.recording.migration import ADDED, DROPPED, Migrated, migrate_configuration, migrate_output
 from flockd.recording.reader import Recording, head_of
 from flockd.recording.streams import OUTPUT
 from flockd.replay.fidelity import replay_warnings
@@ -101,8 +101,11 @@ def test_settings_of_0_1_0_are_read_and_what_is_dropped_is_said(path: Path, caps
     assert set(DROPPED) <= {f"tracking.{key}" for key in document["tracking"]}
     recording = Recording(path)
     gone = [key for key in DROPPED if key.split(".")[1] not in type(recording.config.tracking).model_fields]
-    assert [note.split(" ")[0] for note in recording.migrations] == [*gone, "perception.verification"]
+    assert [note.split(" ")[0] for note in recording.migrations] == ["desired", *gone, *ADDED]
     assert recording.config.perception.verification == "none", "it flew without"
+    assert recording.config.mission.kind == "circle_then_tangent"
+    flown = document["desired"]
+    assert {key: getattr(recording.config.mission, key) for key in flown} == flown
     kept = document["tracking"].keys() & type(recording.config.tracking).model_fields.keys()
     assert {key: getattr(recording.config.tracking, key) for key in kept} == {
         key: document["tracking"][key] for key in kept

@@ -21,6 +21,7 @@ from flockd.messages import (
     EgoMotion,
     Frame,
     FrameSet,
+    MissionOrder,
     Neighbour,
     PilotOutput,
     VehicleState,
@@ -312,7 +313,9 @@ class Looking:
 
     config: DroneConfig
 
-    def step(self, frames: FrameSet, vehicle: VehicleState, trace: StepTrace) -> PilotOutput:
+    def step(
+        self, frames: FrameSet, vehicle: VehicleState, trace: StepTrace, order: MissionOrder | None = None
+    ) -> PilotOutput:
         cameras = {
             name: CameraObservation(
                 frame.image,

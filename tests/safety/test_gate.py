@@ -403,6 +403,12 @@ def test_after_silence_the_height_starts_again_from_the_drones_own() -> None:
     ("above_m", "asked_m", "sent_m"),
     [
         (1.5, 6.0, 5.0),  # 1.5 m above is not free
+        (0.5, 6.0, 5.0),
+        (0.5, 4.0, 4.0),
+        (-0.5, 4.0, 5.0),
+        (-0.5, 6.0, 6.0),
+        (0.0, 6.0, 6.0),
+        (0.0, 4.0, 4.0),
         (2.9, 6.0, 5.0),
         (3.4, 6.0, 5.4),
         (1.5, 4.0, 4.0),  # away
@@ -421,7 +427,7 @@ def test_no_change_of_height_leads_into_or_over_the_downwash_of_a_neighbour(
     verdict = stream.step(STILL, around=around, height_m=asked_m)
     assert sent(verdict).height_m == pytest.approx(sent_m)
     assert verdict.objections == (() if sent_m == asked_m else (Objection.SEPARATION,))
-    beside = near([2.3, 0.0, -above_m])
+    beside = near([2.25, 0.0, -above_m])
     assert sent(stream.step(STILL, around=beside, height_m=asked_m)).height_m == pytest.approx(asked_m)
 
 
@@ -430,9 +436,20 @@ def test_between_one_above_and_one_below_the_height_stays_and_does_not_creep() -
     for step in range(200):
         noise_m = 0.25 * math.sin(step)
         both = replace(near([0.5, 0.0, -2.0], [0.0, 0.5, 2.0]), height_m=5.0 + noise_m)
-        assert sent(stream.step(STILL, around=both, height_m=5.0)).height_m == pytest.approx(5.0, abs=0.25)
+        assert sent(stream.step(STILL, around=both, height_m=5.0)).height_m == pytest.approx(5.0, abs=1e-9)
     drifted = replace(both, height_m=4.0)  # it is below what was asked for by more than noise: no climb back
     assert sent(stream.step(STILL, around=drifted, height_m=5.0)).height_m == pytest.approx(4.3)
+    stream = Stream()
+    stream.step(STILL, around=replace(both, height_m=5.0), height_m=5.0)
+    assert sent(stream.step(STILL, around=replace(both, height_m=6.0), height_m=5.0)).height_m == pytest.approx(5.7)
+
+
+def test_without_a_height_of_its_own_a_drone_counts_as_where_it_was_asked_to_be() -> None:
+    unknown = replace(near([1.0, 0.0, -1.5]), height_m=math.nan)
+    stream = Stream()
+    assert sent(stream.step(STILL, around=unknown, height_m=5.0)).height_m == 5.0
+    assert sent(stream.step(STILL, around=unknown, height_m=6.0)).height_m == 5.0
+    assert sent(stream.step(STILL, around=unknown, height_m=4.9)).height_m == pytest.approx(4.925)
 
 
 def test_a_neighbour_1_5_m_below_counts_as_one_at_the_drones_height() -> None:
