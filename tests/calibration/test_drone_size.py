@@ -14,8 +14,14 @@ import yaml
 from flockd.calibration.drone_size import DroneSize, Photograph, SizeCandidate, fit_size
 from flockd.calibration.errors import CalibrationError
 from flockd.cli import main
+from flockd.config import DroneConfig
 from flockd.config.perception import PerceptionConfig
-from tests.pictures.photographs import DRONE_SIZE_M, FOV_DEG, RENDERED, truth
+from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.datasets.image_files import read_image
+from flockd.messages import Frame, FrameSet, PilotOutput, VehicleState
+from flockd.recording import Recorder
+from tests.pictures.photographs import DRONE_SIZE_M, FOCAL_PX, FOV_DEG, RENDERED, SIZE, truth
+from tests.recording.made_up import filled
 
 Capture = pytest.CaptureFixture[str]
 FOV = ("--fov", f"{FOV_DEG:g}")
@@ -126,6 +132,24 @@ def test_rendered_photographs_give_the_drones_size(capsys: Capture, tmp_path: Pa
     # Nothing that is there is lost by accident.
     assert main(["calibrate", "drone", *by_distance(), *FOV, "--out", str(out)]) == 2
     assert "exists; name another file, or overwrite it with --force" in capsys.readouterr().err
+
+
+def test_a_recording_at_one_distance_gives_it_too(capsys: Capture, tmp_path: Path) -> None:
+    """By the recorded rig's camera; four steps, of which every one shows the drone at 2.5 m or so."""
+    lens = IntrinsicsConfig(fx=FOCAL_PX, fy=FOCAL_PX, cx=SIZE[0] / 2, cy=SIZE[1] / 2)
+    config = DroneConfig(rig=RigConfig(cameras=(CameraConfig(name="front", size_px=SIZE, intrinsics=lens),)))
+    flight = tmp_path / "hover.mcap"
+    with Recorder(flight, drone="drone1", config=config) as recorder:
+        for step in range(5):
+            image = read_image(RENDERED / f"2.5_m_{2 * (step % 2)}.jpg")
+            frames = FrameSet(10.0 + step, {"front": Frame("front", image, 10.0 + step, step)})
+            recorder.step(frames, VehicleState(10.0 + step, np.eye(3), 1.0), filled(PilotOutput, 0.5))
+            recorder.drain()
+    out = tmp_path / "size.yaml"
+    assert main(["calibrate", "drone", "--distance", "2.5", str(flight), "--out", str(out), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["drone_size_m"] == pytest.approx(DRONE_SIZE_M, rel=0.06)
+    assert [one["file"] for one in result["pictures"]] == [f"{flight} {step:.2f} s, front" for step in range(5)]
 
 
 def test_a_list_of_distances_with_mistakes_is_refused(capsys: Capture, tmp_path: Path) -> None:
