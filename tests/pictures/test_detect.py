@@ -83,9 +83,12 @@ def test_a_known_size_gives_the_range(capsys: Capture) -> None:
 
 def test_copies_show_what_was_found_and_nothing_is_lost(capsys: Capture, tmp_path: Path) -> None:
     shutil.copy(NEAR, tmp_path / "a.jpg")
+    (tmp_path / "._a.jpg").write_bytes(b"a note of another program")
     out = tmp_path / "drawn"
-    text = told(capsys, 0, "detect", tmp_path, *FOV, "--out", out)
-    assert "1 detections in 1 pictures" in text
+    for force in ((), ("--force",)):  # the second time, copies of before lie in the folder
+        text = told(capsys, 0, "detect", tmp_path, *FOV, "--out", out, *force)
+        assert "1 detections in 1 pictures" in text
+    assert [path.name for path in out.rglob("*")] == ["a.jpg"]
     before, after = (cv2.imread(str(path)) for path in (tmp_path / "a.jpg", out / "a.jpg"))
     assert before is not None
     assert after is not None
@@ -191,8 +194,10 @@ def huge_png() -> bytes:
         (b"", "is empty"),
         (b"no picture", "is no image"),
         (NEAR.read_bytes()[:9000], "the JPEG ends too early"),
+        (b"P6\n60000 60000\n255\n", "cannot be decoded"),
+        (b"P6\n600 600\n255\n", "is no image"),
     ],
-    ids=["huge", "empty", "text", "cut"],
+    ids=["huge", "empty", "text", "cut", "huge PPM", "cut PPM"],
 )
 def test_a_picture_that_cannot_be_read_ends_it(capsys: Capture, tmp_path: Path, content: bytes, sentence: str) -> None:
     (tmp_path / "a.jpg").write_bytes(content)
