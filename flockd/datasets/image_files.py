@@ -47,7 +47,14 @@ def _decoded(path: Path, flags: int) -> cv2.typing.MatLike:
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror}); restore it, or leave its frame out") from None
     fault = _fault(data)
-    image = None if fault else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    logging = cv2.utils.logging
+    before = logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # the sentence below says it
+    try:
+        image = None if fault else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:  # of a header that claims more pixels than OpenCV takes
+        image, fault = None, "cannot be decoded"
+    finally:
+        logging.setLogLevel(before)
     if image is None:
         raise DatasetError(f"{path}: {fault or 'is no image'}; restore it, or leave its frame out")
     return image
