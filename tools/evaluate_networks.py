@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from flockd.choices import ROLES
 from flockd.config import load_scenario
 from flockd.config.perception import PerceptionConfig
 from flockd.data import data_path
@@ -112,8 +113,7 @@ def main() -> None:
     arguments = parser.parse_args()
     config = PerceptionConfig(threads=arguments.threads)
     if arguments.float:
-        roles = ("flow", "depth", "segmentation", "distance")
-        config = config.model_copy(update={role: getattr(config, role).removesuffix("_int8") for role in roles})
+        config = config.model_copy(update={role: getattr(config, role).removesuffix("_int8") for role in ROLES})
     perception = OnnxNetworks(config, arguments.models)
 
     def findings(folder: Path) -> Findings:

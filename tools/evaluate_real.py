@@ -49,6 +49,7 @@ def main() -> None:
     parser.add_argument("--without-drones", action="append", default=[], metavar="NAME=FOLDER")
     parser.add_argument("--models", type=Path, default=data_path("models"), help="folder of the networks")
     parser.add_argument("--distance", default="distance_int8")
+    parser.add_argument("--verification", default="verification_int8")
     parser.add_argument("--neighbours", default="neighbours_int8")
     parser.add_argument("--fov", type=float, default=90.0, metavar="DEG", help="across the longer side")
     parser.add_argument("--scale", type=float, default=1.0, help="resize every picture first")
@@ -66,8 +67,8 @@ def main() -> None:
     if not sets:
         parser.error("give --data, --without-drones or both")
     config = PerceptionConfig(
-        depth=arguments.neighbours, segmentation=arguments.neighbours, distance=arguments.distance, flow="dis",
-        threads=arguments.threads,
+        depth=arguments.neighbours, segmentation=arguments.neighbours, distance=arguments.distance,
+        verification=arguments.verification, flow="dis", threads=arguments.threads,
     )  # fmt: skip
     detector = PictureDetector(OnnxNetworks(config, arguments.models), config)
     results: dict[str, dict[str, object]] = {}

@@ -48,7 +48,7 @@ def main() -> None:
     parser.add_argument("--accuracy", action="append", default=[], metavar="WHAT=FIGURE", help="measured accuracy")
     arguments = parser.parse_args()
     manifest, file = load_manifest(arguments.manifest)
-    draw = _images if manifest.crop is None else _crops
+    draw = _crops if "crop" in manifest.contents else _images
     feeds = list(draw(manifest, arguments.data, IMAGES + COMPARED))
     name = f"{manifest.name}_int8"
     arguments.out.mkdir(parents=True, exist_ok=True)

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
-from flockd.choices import ROLES, AutopilotKind, ScaleSource, SimulatedPerception
+from flockd.choices import TRUTH_ROLES, AutopilotKind, ScaleSource, SimulatedPerception
 from flockd.cli import sim_fleet
 from flockd.cli.flight_summary import report_flight
 from flockd.cli.output import Phases, complain
@@ -89,7 +89,7 @@ def add(commands: Commands) -> None:
         metavar="ROLE,...",
         type=_roles,
         default=frozenset(),
-        help=f"use the exact values of these roles instead of a network's: {', '.join(ROLES)}",
+        help=f"use the exact values of these roles instead of a network's: {', '.join(TRUTH_ROLES)}",
     )
     parser.add_argument(
         "--out",
@@ -132,9 +132,9 @@ def _flock_size(text: str) -> int:
 
 def _roles(text: str) -> frozenset[str]:
     roles = frozenset(text.split(","))
-    unknown = sorted(roles - set(ROLES))
+    unknown = sorted(roles - set(TRUTH_ROLES))
     if unknown:
-        raise argparse.ArgumentTypeError(f"{unknown[0]!r} is not a role; the roles are {', '.join(ROLES)}")
+        raise argparse.ArgumentTypeError(f"{unknown[0]!r} is not a role; the roles are {', '.join(TRUTH_ROLES)}")
     return roles
 
 

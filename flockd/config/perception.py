@@ -57,6 +57,25 @@ class DetectionParameters(Section):
     """Standard deviation of a drone's log range where the depth map alone gives it (`perception.distance: none`)."""
 
 
+class NoiseParameters(Section):
+    """When an image counts as noise, and is not used. Lengths are of the image, and noise of its luminance."""
+
+    level: Positive = 12.0
+    """Standard deviation, in grey levels of 0-255, of white noise that matters; a camera at night has less."""
+    whiteness: Share = 0.8
+    """White noise is at the finest scale at least this strong as a share of the next; photographs have 0.3 to 0.6."""
+    max_white: Share = 0.25
+    """The image is not used where more of it than this is white noise. 1, here and in the next two: all are used."""
+    max_white_rise: Share = 0.08
+    """Nor is it where this much more of it is white noise than of any of the camera's last five images, ..."""
+    rough_level: Positive = 20.0
+    """... or where details at one of the finest scales are stronger than this, in grey levels, ..."""
+    max_rough_rise: Share = 0.4
+    """... in this much more of it than in any of the last five."""
+    clean_images: Annotated[int, Field(ge=1, le=100)] = 2
+    """So many clean images in a row before a camera that was noisy is used again."""
+
+
 class PerceptionConfig(Section):
     """Which model fills which role. A name is a manifest in `models_dir`, or a path to one that ends in `.yaml`.
 
@@ -76,6 +95,8 @@ class PerceptionConfig(Section):
     segmentation: str = "neighbours_int8"
     distance: str = "distance_int8"
     """Second stage: a drone's range from its crop alone. `none`: the depth map decides."""
+    verification: str = "verification_int8"
+    """Whether a crop of the second stage shows a drone at all. `none`: the distance network alone says so."""
     models_dir: str | None = None
     """Folder of the manifests; by default the one that comes with flockd."""
     threads: Annotated[int, Field(ge=1, le=64)] = 2
@@ -86,6 +107,7 @@ class PerceptionConfig(Section):
     deadline_s: Positive = 1.0
     """In flight, a network that has not finished one call by then is stuck, and is ended."""
     detection: DetectionParameters = DetectionParameters()
+    noise: NoiseParameters = NoiseParameters()
     drone_size_m: Annotated[float, Field(ge=MIN_DRONE_SIZE_M, le=MAX_DRONE_SIZE_M)] | None = None
     """Size of every drone of the fleet, from tip to tip with propellers, where it is known: a drone's range is then
     this over its apparent size. `flockd calibrate drone` measures it. By default the network judges each drone's
@@ -115,4 +137,6 @@ class PerceptionConfig(Section):
     @property
     def networks(self) -> dict[Role, str]:
         """The model's name, or its manifest's path, of each role that a network fills."""
-        return {role: name for role in ROLES if (name := getattr(self, role)) not in {DIS, NO_MODEL}}
+        unused = {"verification"} if self.distance == NO_MODEL else set()
+        names = {role: getattr(self, role) for role in ROLES if role not in unused}
+        return {role: name for role, name in names.items() if name not in {DIS, NO_MODEL}}

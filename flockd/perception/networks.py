@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -12,15 +13,16 @@ import cv2
 import numpy as np
 
 from flockd.choices import Role
-from flockd.config.perception import PerceptionConfig
+from flockd.config.perception import NO_MODEL, PerceptionConfig
 from flockd.errors import ModelError
 from flockd.geometry import RigCamera
+from flockd.inference.checks import Deadline, no_deadline
 from flockd.inference.fitting import fit
 from flockd.inference.manifest import Unknown
 from flockd.inference.manifest_file import manifest_path
 from flockd.inference.providers import engines_folder
 from flockd.inference.session import OnnxModel
-from flockd.messages import Float32Array, Frame, UInt8Array
+from flockd.messages import Float32Array, FloatArray, Frame, UInt8Array
 from flockd.perception.detection.instances import group_instances
 from flockd.perception.detection.second_stage import SecondStage
 from flockd.perception.flow import DisFlow, Flow, OnnxFlow, background_flow, object_flow
@@ -28,7 +30,7 @@ from flockd.perception.maps import Crop, OpenDepth, RangeEstimate, SceneMaps
 from flockd.perception.requirements import check_roles
 
 CROPS_PER_RUN = 24
-"""Crops in one run of the distance network, so that an image full of false proposals does not take more memory."""
+"""Crops in one run of a network, so that an image full of false proposals does not take more memory."""
 _MIN_DEPTH_M, _MAX_DEPTH_M = 1e-3, 1e3
 """Where a reciprocal of depth is taken: nearer than the lens, and where flow and height measure nothing any more."""
 _MIN_RAY_Z = 0.1
@@ -64,26 +66,35 @@ class Networks(Protocol):
         ...
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
-        """Range and centre of the drone in the middle of each crop."""
+        """Range and centre of the drone in the middle of each crop.
+
+        The range may be NaN where the probability is no more than `second_stage` asks for another crop.
+        """
         ...
 
 
 class OnnxNetworks:
     """The networks that a configuration names. Stateless: may serve several pilots."""
 
-    def __init__(self, config: PerceptionConfig, models_dir: Path) -> None:
-        """Raises ModelError."""
+    def __init__(self, config: PerceptionConfig, models_dir: Path, deadline: Deadline = no_deadline) -> None:
+        """``deadline`` is for each network's run on its golden input. Raises ModelError."""
         self._models: dict[str, OnnxModel] = {}
         self._dir = models_dir
         self._config = config
+        self._deadline = deadline
         cv2.setNumThreads(config.threads)
         self._flow = self._build_flow(config)
         self._depth = self._model(config.depth, "depth")
         self._segmentation = self._model(config.segmentation, "segmentation")
         self._unknown = self._what_is_unknown(config)
-        self._distance = None if config.distance == "none" else self._model(config.distance, "distance")
+        self._distance = None if config.distance == NO_MODEL else self._model(config.distance, "distance")
+        has_verification = self._distance is not None and config.verification != NO_MODEL
+        self._verification = self._model(config.verification, "verification") if has_verification else None
         self.map_stride = self._segmentation.manifest.map_stride or 1
-        self.second_stage = None if self._distance is None else SecondStage.of(self._distance.manifest)
+        self.second_stage = None
+        if self._distance is not None:
+            verification = None if self._verification is None else self._verification.manifest
+            self.second_stage = SecondStage.of(self._distance.manifest, verification)
 
     def terminate(self) -> None:
         """Ends every run of a network that is under way; whoever called it gets an error."""
@@ -132,15 +143,45 @@ class OnnxNetworks:
         if not crops:
             return ()
         images = [np.ascontiguousarray(c.image[:, ::-1]) if c.mirrored else c.image for c in crops]
-        batches = [images[i : i + CROPS_PER_RUN] for i in range(0, len(images), CROPS_PER_RUN)]
-        outputs = [self._distance.infer({"crop": batch}) for batch in batches]
-        columns = self._distance.manifest.results["range"].by_column(np.concatenate([o["range"] for o in outputs]))
-        masks: Sequence[Float32Array | None] = [None] * len(crops)
-        if "mask" in outputs[0]:
-            masks = list(np.concatenate([output["mask"][:, 0] for output in outputs]))
         size = self.second_stage.crop_size
+        if self._verification is None:
+            return self._ranges(self._distance, crops, images, np.zeros(len(crops)), limit=math.inf)
+        outputs = _in_batches(self._verification, images)
+        logits = self._verification.manifest.results["drone"].by_column(outputs["drone"])["drone_logit"].astype(float)
+        limit = self._verification.manifest.threshold("distance_logit_limit")
+        # Where there is no drone, there is no range to ask for: most crops of a cluttered image end here.
+        most = _probability(logits + limit)
+        rest = np.flatnonzero(most > self.second_stage.thresholds.another_crop)
+        ranged = self._ranges(
+            self._distance, [crops[k] for k in rest], [images[k] for k in rest], logits[rest], limit=limit
+        )
+        estimates = [_no_range(p, size) for p in most]
+        for k, estimate in zip(rest, ranged, strict=True):
+            estimates[k] = estimate
+        return tuple(estimates)
+
+    @staticmethod
+    def _ranges(
+        distance: OnnxModel,
+        crops: Sequence[Crop],
+        images: Sequence[UInt8Array],
+        logits: FloatArray,
+        *,
+        limit: float,
+    ) -> tuple[RangeEstimate, ...]:
+        """What the distance network says of crops, given their images as they enter.
+
+        Of there being a drone, what it says is added to ``logits`` (n,), up to ``limit``: log odds of independent
+        evidence add.
+        """
+        if not crops:
+            return ()
+        outputs = _in_batches(distance, images)
+        columns = dict(distance.manifest.results["range"].by_column(outputs["range"]))
+        columns["drone_logit"] = logits + np.clip(columns["drone_logit"], -limit, limit)
+        masks = list(outputs["mask"][:, 0]) if "mask" in outputs else [None] * len(crops)
         return tuple(
-            _estimate({name: float(column[k]) for name, column in columns.items()}, crop, masks[k], size)
+            _estimate({name: float(column[k]) for name, column in columns.items()}, crop, masks[k])
             for k, crop in enumerate(crops)
         )
 
@@ -213,6 +254,7 @@ class OnnxNetworks:
                 provider=self._config.provider,
                 engines=engines_folder(self._config),
                 check=check_roles,
+                deadline=self._deadline,
             )
         model = self._models[key]
         if role not in model.manifest.roles:
@@ -223,8 +265,26 @@ class OnnxNetworks:
         return model
 
 
-def _estimate(columns: Mapping[str, float], crop: Crop, mask: Float32Array | None, size: int) -> RangeEstimate:
+def _in_batches(model: OnnxModel, images: Sequence[UInt8Array]) -> dict[str, Float32Array]:
+    """A model's outputs for all crops, (n, ...) each."""
+    batches = [images[i : i + CROPS_PER_RUN] for i in range(0, len(images), CROPS_PER_RUN)]
+    outputs = [model.infer({"crop": batch}) for batch in batches]
+    return {name: np.concatenate([output[name] for output in outputs]) for name in outputs[0]}
+
+
+def _no_range(drone_probability: float, size: int) -> RangeEstimate:
+    """Of a crop that shows no drone."""
+    middle = np.full(2, size / 2)
+    return RangeEstimate(math.nan, math.nan, middle, math.nan, drone_probability=drone_probability)
+
+
+def _probability(logit: FloatArray) -> FloatArray:
+    return np.asarray(1.0 / (1.0 + np.exp(-logit)))
+
+
+def _estimate(columns: Mapping[str, float], crop: Crop, mask: Float32Array | None) -> RangeEstimate:
     """Of one crop's output, with a mirror image's turned back."""
+    size = crop.camera.size[0]
     right = columns["right_px"]
     if crop.mirrored:
         right = -right
@@ -234,7 +294,7 @@ def _estimate(columns: Mapping[str, float], crop: Crop, mask: Float32Array | Non
         log_range_sigma=float(np.exp(columns["log_relative_sigma"])),
         centre=np.array([size / 2 + right, size / 2 + columns["down_px"]]),
         size_m=float(np.exp(columns["log_range_per_focal"] + columns["log_apparent_size"])),
-        drone_probability=float(1.0 / (1.0 + np.exp(-columns["drone_logit"]))),
+        drone_probability=float(_probability(np.array(columns["drone_logit"]))),
         mask=mask,
     )
 

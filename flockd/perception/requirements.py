@@ -38,6 +38,13 @@ class Requirements:
     map_stride: bool = False
 
 
+_PROBABILITIES = {
+    "drone_probability": Threshold("A refined proposal below this probability is no drone.", 0.0, 1.0),
+    "expected_drone_probability": Threshold("The same where a track predicts a drone.", 0.0, 1.0),
+    "another_crop_probability": Threshold(
+        "A proposal up to this probability is refused without another crop.", 0.0, 1.0
+    ),
+}
 _LOGIT = (-50.0, 50.0)
 """The bounds of a threshold that is a logit: beyond, a float32 probability is 0 or 1."""
 _GEOMETRY = ("geometry",)
@@ -84,11 +91,7 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
             )
         },
         thresholds={
-            "drone_probability": Threshold("A refined proposal below this probability is no drone.", 0.0, 1.0),
-            "expected_drone_probability": Threshold("The same where a track predicts a drone.", 0.0, 1.0),
-            "another_crop_probability": Threshold(
-                "A proposal up to this probability is refused without another crop.", 0.0, 1.0
-            ),
+            **_PROBABILITIES,
             "bearing_sigma_rad": Threshold("Standard deviation of a refined bearing, each way.", 1e-6, 1.0),
             "min_relative_sigma": Threshold("Least standard deviation of a range, as a share of it.", 0.0, 1.0),
             "mean_sigma_factor": Threshold(
@@ -99,6 +102,17 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
             ),
         },
         crop=True,
+    ),
+    "verification": Requirements(
+        inputs=("crop",),
+        outputs=("drone",),
+        columns={"drone": ("drone_logit",)},
+        thresholds={
+            **_PROBABILITIES,
+            "distance_logit_limit": Threshold(
+                "The distance network's logit counts as well, up to this much for or against a drone.", 0.0, 50.0
+            ),
+        },
     ),
 }
 """The table that a manifest is checked against. A distance model may give a `mask` (n, h, w) of logits as well."""

@@ -31,6 +31,10 @@ RENAMED: Final[Mapping[str, str]] = {}
 """Keys of 0.1.0, or whole sections, that only have another name or place now: the new one."""
 
 
+ADDED: Final[Mapping[str, Json]] = {"perception.verification": "none"}
+"""Keys that came later, with the value that does what was done before them, where the recording has their section."""
+
+
 @dataclass(frozen=True)
 class Migrated:
     """A recorded configuration, as this flockd reads it."""
@@ -59,6 +63,11 @@ def migrate_configuration(
         if not _knows(model, key) and _holds(migrated, key):
             value = _take(migrated, key)
             notes.append(f"{key} ({json.dumps(value)}) was dropped: {reason}")
+    for key, value in ADDED.items():
+        section = key.rpartition(".")[0]
+        if _knows(model, key) and _holds(migrated, section) and not _holds(migrated, key):
+            _put(migrated, key, value)
+            notes.append(f"{key} is {json.dumps(value)}, as before there was this key")
     return Migrated(migrated, tuple(notes))
 
 

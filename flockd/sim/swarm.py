@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from flockd import __version__
-from flockd.choices import ROLES, SimulatedPerception
+from flockd.choices import TRUTH_ROLES, SimulatedPerception
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import UsageError
 from flockd.flight_log.builder import FlightLogBuilder
@@ -69,9 +69,11 @@ def fly(
         progress: called with (steps done, steps in all).
         preparing: the same, of what is done before the first step: the companion, the networks, the world.
     """
-    unknown = swap - set(ROLES)
+    unknown = swap - set(TRUTH_ROLES)
     if unknown:
-        raise UsageError(f"there is no role {sorted(unknown)[0]!r} to swap for truth; choose from {', '.join(ROLES)}")
+        raise UsageError(
+            f"there is no role {sorted(unknown)[0]!r} to swap for truth; choose from {', '.join(TRUTH_ROLES)}"
+        )
     begin, began = time.perf_counter(), datetime.now(UTC)
     times = step_times(scenario)
     builder = FlightLogBuilder(times, len(scenario.vehicles))

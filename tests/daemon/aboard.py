@@ -36,6 +36,7 @@ from tests.autopilot.flight import until
 from tests.perception.shipped import SECOND_STAGE
 
 WIDTH, HEIGHT = 64, 48
+COARSE_PX = 8
 CAMERAS = ("front", "back")
 FRAMES_HZ = 10.0
 STEP_S = 0.25
@@ -83,10 +84,11 @@ class TinyPerceiver:
 
 
 class Cameras:
-    """Publishes noise as the pictures of all cameras until told otherwise."""
+    """Publishes coarse patterns, different in each frame, as the pictures of all cameras until told otherwise."""
 
     def __init__(self, endpoint: str) -> None:
         self.silent: set[str] = set()
+        self.noisy: set[str] = set()
         self._publisher = FramePublisher(listen=[endpoint])
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -104,7 +106,9 @@ class Cameras:
             number += 1
             for camera in CAMERAS:
                 if camera not in self.silent:
-                    image = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+                    grain = 1 if camera in self.noisy else COARSE_PX
+                    pattern = rng.integers(0, 256, (HEIGHT // grain, WIDTH // grain, 3), dtype=np.uint8)
+                    image = pattern.repeat(grain, axis=0).repeat(grain, axis=1)
                     self._publisher.publish("tiny", Frame(camera, image, time.monotonic(), number))
 
 

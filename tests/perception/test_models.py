@@ -12,6 +12,7 @@ import numpy as np
 import onnxruntime as ort
 import pytest
 
+from flockd.choices import ROLES
 from flockd.cli import main
 from flockd.config.perception import PerceptionConfig
 from flockd.data import data_path
@@ -27,16 +28,17 @@ from flockd.sim.world import World
 from tests.perception.cameras import camera_of, crop_of
 
 MODELS = data_path("models")
-NAMES = ["distance", "distance_int8", "flow", "flow_int8", "neighbours", "neighbours_int8"]
+NETWORKS = ("distance", "flow", "neighbours", "verification")
+NAMES = [f"{network}{twin}" for network in NETWORKS for twin in ("", "_int8")]
 ROOT = Path(__file__).parents[2]
 
 
-def test_three_models_and_their_twins_fill_the_four_roles() -> None:
+def test_four_models_and_their_twins_fill_the_five_roles() -> None:
     manifests = [load_manifest(path)[0] for path in find_manifests(MODELS)]
     assert [m.name for m in manifests] == NAMES
     for twins in (False, True):
         roles = [role for m in manifests if m.name.endswith("_int8") == twins for role in m.roles]
-        assert sorted(roles) == ["depth", "distance", "flow", "segmentation"]
+        assert sorted(roles) == sorted(ROLES)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -179,7 +181,8 @@ def test_the_twins_in_8_bits_say_what_the_float_networks_say() -> None:
         drone_positions=np.array([[1.5, -0.5, -4.2], [1.5, 0.5, -3.8]]),
     )  # fmt: skip
     image = np.ascontiguousarray(view.rgb)
-    roles = {"flow": "flow", "depth": "neighbours", "segmentation": "neighbours", "distance": "distance"}
+    roles = {"depth": "neighbours", "segmentation": "neighbours"}
+    roles |= {name: name for name in ("flow", "distance", "verification")}
     twins = PerceptionConfig.model_validate({role: f"{name}_int8" for role, name in roles.items()})
     ours, theirs = (OnnxNetworks(config, MODELS) for config in (twins, PerceptionConfig.model_validate(roles)))
     camera, frame = camera_of(222.0, (320, 320)), Frame("camera", image, 0.0, 0)
@@ -218,7 +221,8 @@ def test_many_images_go_in_batches_no_larger_than_what_is_prepared(monkeypatch: 
     rng = np.random.default_rng(0)
     images = rng.integers(0, 256, (31, 96, 96, 3), dtype=np.uint8)
     pictures = [crop_of(image, 100.0) for image in images]
-    perception, answer, batches = OnnxNetworks(PerceptionConfig(), MODELS), OnnxModel.infer, []
+    config = PerceptionConfig(verification="none")
+    perception, answer, batches = OnnxNetworks(config, MODELS), OnnxModel.infer, []
 
     def noted(model: OnnxModel, contents: dict[Any, Any]) -> dict[Any, Float32Array]:
         batches.append(len(contents["crop"]))

@@ -89,6 +89,14 @@ def without(section: str, key: str) -> Change:
             r"yaml:\d+: outputs\.range\.columns: has no 'down_px'; name the model's columns in their order",
         ),
         ("distance", lambda d: d["inputs"]["picture"].pop("carries"), r"inputs: the role distance needs one .* 'crop'"),
+        (
+            "verification", without("thresholds", "distance_logit_limit"),
+            r"thresholds\.distance_logit_limit: is missing for the role verification; add it with",
+        ),
+        (
+            "verification", lambda d: d["outputs"]["drone"].update(columns=["sure"]),
+            r"yaml:\d+: outputs\.drone\.columns: has no 'drone_logit'",
+        ),
         ("neighbours", lambda d: d.pop("map_stride"), r"map_stride: is missing; write how many image pixels"),
         ("neighbours", lambda d: d["inputs"]["geometry"].pop("kind"), r"inputs\.geometry\.shape\[3\]: w/2 is not the"),
         (

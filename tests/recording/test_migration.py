@@ -101,7 +101,8 @@ def test_settings_of_0_1_0_are_read_and_what_is_dropped_is_said(path: Path, caps
     assert set(DROPPED) <= {f"tracking.{key}" for key in document["tracking"]}
     recording = Recording(path)
     gone = [key for key in DROPPED if key.split(".")[1] not in type(recording.config.tracking).model_fields]
-    assert [note.split(" ")[0] for note in recording.migrations] == gone
+    assert [note.split(" ")[0] for note in recording.migrations] == [*gone, "perception.verification"]
+    assert recording.config.perception.verification == "none", "it flew without"
     kept = document["tracking"].keys() & type(recording.config.tracking).model_fields.keys()
     assert {key: getattr(recording.config.tracking, key) for key in kept} == {
         key: document["tracking"][key] for key in kept

@@ -15,7 +15,7 @@ from torch import nn
 
 from flockd.data import data_path
 from tools.training.from_onnx import begin_with_onnx
-from tools.training.networks import DistanceNet, FlowNet, NeighboursNet
+from tools.training.networks import DistanceNet, FlowNet, NeighboursNet, VerificationNet
 
 MODELS = data_path("models")
 Feeds = dict[str, NDArray[Any]]
@@ -31,6 +31,7 @@ def flow_as_exported() -> FlowNet:
 
 NETWORKS: dict[str, tuple[Callable[[], nn.Module], Feeds]] = {
     "distance": (DistanceNet, {"picture": picture_of_nothing(8, 96, 96, 3)}),
+    "verification": (VerificationNet, {"crop": picture_of_nothing(8, 96, 96, 3)}),
     "neighbours": (
         NeighboursNet,
         {

@@ -1,4 +1,6 @@
-"""Training samples of the second stage that look like a real camera's: softened renderings, composites, real crops.
+"""Training samples for verification that look like a real camera's: softened renderings, composites, real crops.
+
+Each has a ``picture`` (96, 96, 3), ``drone`` (1: there is one) and ``exists_weight``, how much it counts.
 
 Positives and negatives pass through the same cameras: else a network learns that what is soft is a drone.
 """
@@ -19,12 +21,10 @@ Sample = dict[str, NDArray[Any]]
 Image = NDArray[np.uint8]
 WIDTHS_PX = (6.0, 60.0)
 """How wide a softened drone is in the camera's image, evenly by its logarithm."""
-_SURELY_RANGED_PX = 30.0
-"""A drone so wide counts fully where the range is learnt, smaller ones less: their error cannot be learnt away."""
-_LEAST_RANGE_WEIGHT = 0.15
 _NEGATIVE_SCALES = (0.4, 1.0)
 _LEAST_SCALE = 0.07
 _TRIES = 6
+_NOISE_SIGMA = (40.0, 120.0)
 _SENSOR_SIGMA = 6.0
 """Grey levels that noise and compression hide at least."""
 _TEXTURE_SIGMA = 30.0
@@ -35,22 +35,22 @@ proportion: who is taught drones that cannot be seen learns to see them everywhe
 
 
 def softened(sample: Sample, rng: np.random.Generator) -> Sample:
-    """A rendered sample as a real camera shows a drone 6 to 60 px wide; ``picture`` (96, 96, 3) and the truth."""
+    """A rendered sample as a real camera shows a drone 6 to 60 px wide."""
     width_px = _drawn_width(rng)
     scale = _scale(sample, width_px)
     seen = visibility(sample["picture"], sample["mask"], scale) if sample["drone"] > 0.5 else 1.0
     picture = through_camera(sample["picture"], drawn_effects(scale, rng), rng)
-    return {**sample, "picture": picture, **_weights(range_=seen * _range_weight(width_px), exists=seen)}
+    return _sample(picture, drone=float(sample["drone"]), weight=seen)
 
 
 def sharp(sample: Sample) -> Sample:
-    """A rendered sample with the weights that the loss asks for."""
-    return {**sample, **_weights(range_=1.0)}
+    """A rendered sample as it is."""
+    return _sample(sample["picture"], drone=float(sample["drone"]))
 
 
 def composite(sample: Sample, backgrounds: RealPatches, rng: np.random.Generator) -> Sample:
     """A rendered drone, repainted, in front of a real background, through a real camera."""
-    image, seen, scale, width_px = sample["picture"], 0.0, 1.0, WIDTHS_PX[1]
+    image, seen, scale = sample["picture"], 0.0, 1.0
     share = sample["mask"][:, :, None].astype(np.float32) / 255
     for _ in range(_TRIES):
         patch, half_px, _ = backgrounds.draw(rng)
@@ -65,7 +65,7 @@ def composite(sample: Sample, backgrounds: RealPatches, rng: np.random.Generator
         if seen >= 1.0:
             break
     picture = through_camera(image, drawn_effects(scale, rng), rng)
-    return {**sample, "picture": picture, **_weights(range_=seen * _range_weight(width_px), exists=seen)}
+    return _sample(picture, drone=1.0, weight=seen)
 
 
 def visibility(picture: Image, mask: Image, scale: float, behind: Image | None = None) -> float:
@@ -104,11 +104,26 @@ def negative(patch: Image, half_px: float, rng: np.random.Generator) -> Sample:
     if rng.random() < 0.5:
         scale = min(1.0, camera_px) * float(rng.uniform(*_NEGATIVE_SCALES))
         picture = through_camera(picture, drawn_effects(max(scale, _LEAST_SCALE), rng), rng)
-    return _sample(picture, drone=0.0, centre=np.zeros(2), mask=np.zeros((CROP_PX, CROP_PX), np.uint8))
+    return _sample(picture, drone=0.0)
+
+
+def noise(patch: Image, half_px: float, rng: np.random.Generator) -> Sample:
+    """A real crop without a drone under so much noise that no drone could be seen, now and then noise alone."""
+    picture, _ = crop_of_negative(patch, half_px, rng)
+    side = int(rng.integers(CROP_PX // 4, CROP_PX + 1))
+    channels = 3 if rng.random() < 0.7 else 1
+    if rng.random() < 0.3:
+        grain = rng.uniform(-255, 255, (side, side, channels))
+        picture = np.full_like(picture, 128)
+    else:
+        grain = rng.normal(0, rng.uniform(*_NOISE_SIGMA), (side, side, channels))
+    enlarged = cv2.resize(grain.astype(np.float32), (CROP_PX, CROP_PX), interpolation=cv2.INTER_LINEAR)
+    spoilt = picture + enlarged.reshape(CROP_PX, CROP_PX, channels)
+    return _sample(np.clip(np.round(spoilt), 0, 255).astype(np.uint8), drone=0.0)
 
 
 def real_drone(drones: RealPatches, rng: np.random.Generator, *, backgrounds: RealPatches | None = None) -> Sample:
-    """A real drone before the sky; with ``backgrounds`` cut out and put before one of them. Its range is not known."""
+    """A real drone before the sky; with ``backgrounds`` cut out and put before one of them."""
     patch, half_px, box = drones.draw(rng)
     picture, inside, camera_px = crop_of_drone(patch, half_px, box, rng)
     share, seen = matte(picture, inside), 1.0
@@ -122,13 +137,7 @@ def real_drone(drones: RealPatches, rng: np.random.Generator, *, backgrounds: Re
         seen = visibility(picture, np.asarray(255 * share, np.uint8), scale, behind)
     if backgrounds is not None or rng.random() < 0.5:
         picture = through_camera(picture, drawn_effects(scale, rng), rng)
-    centre = (inside[:2] + inside[2:]) / 2 - CROP_PX / 2
-    sample = _sample(picture, drone=1.0, centre=centre, mask=np.asarray(np.round(255 * share), np.uint8))
-    return sample | {
-        "exists_weight": np.array(seen, np.float32),
-        "centre_weight": np.array(0.3, np.float32),
-        "mask_weight": np.array(0.5, np.float32),
-    }
+    return _sample(picture, drone=1.0, weight=seen)
 
 
 def matte(picture: Image, box: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -171,27 +180,9 @@ def _scale(sample: Sample, width_px: float) -> float:
     return min(1.0, width_px / _shown_px(sample))
 
 
-def _range_weight(width_px: float) -> float:
-    return min(1.0, max(_LEAST_RANGE_WEIGHT, width_px / _SURELY_RANGED_PX))
-
-
-def _weights(*, range_: float, exists: float = 1.0) -> Sample:
-    return {
-        "exists_weight": np.array(exists, np.float32),
-        "range_weight": np.array(range_, np.float32),
-        "centre_weight": np.array(1.0, np.float32),
-        "mask_weight": np.array(1.0, np.float32),
-    }
-
-
-def _sample(picture: Image, *, drone: float, centre: NDArray[Any], mask: Image) -> Sample:
+def _sample(picture: Image, *, drone: float, weight: float = 1.0) -> Sample:
     return {
         "picture": picture,
-        "mask": mask,
-        "target": np.array([0.0, *centre], np.float32),
-        "motors": np.zeros((4, 2), np.float32),
-        "family": np.array(0),
-        "apparent": np.array(0.0, np.float32),
         "drone": np.array(drone, np.float32),
-        **_weights(range_=0.0),
+        "exists_weight": np.array(weight, np.float32),
     }

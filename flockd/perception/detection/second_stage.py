@@ -36,8 +36,18 @@ class SecondStage:
     thresholds: Thresholds
 
     @classmethod
-    def of(cls, manifest: Manifest) -> SecondStage:
-        """Raises ModelError where the manifest does not say how crops are cut or outputs are judged."""
+    def of(cls, manifest: Manifest, verification: Manifest | None = None) -> SecondStage:
+        """Of a distance network, and of the verification network whose probability counts instead of its own.
+
+        Raises ModelError where a manifest does not say how crops are cut or outputs are judged, or where the two take
+        crops of different sizes.
+        """
+        judge = verification or manifest
+        if judge.fixed_size != manifest.fixed_size:
+            raise ModelError(
+                f"perception.verification: model {judge.name} takes crops of another size than {manifest.name}; "
+                "choose one that takes the same"
+            )
         crop = manifest.crop
         if crop is None:
             raise ModelError(f"model {manifest.name} takes no crops; choose one whose manifest has a section `crop`")
@@ -54,9 +64,9 @@ class SecondStage:
                 max_crops=crop.max_crops,
             ),
             thresholds=Thresholds(
-                drone=manifest.threshold("drone_probability"),
-                predicted_drone=manifest.threshold("expected_drone_probability"),
-                another_crop=manifest.threshold("another_crop_probability"),
+                drone=judge.threshold("drone_probability"),
+                predicted_drone=judge.threshold("expected_drone_probability"),
+                another_crop=judge.threshold("another_crop_probability"),
                 mean_sigma=manifest.threshold("mean_sigma_factor"),
                 min_log_range_sigma=manifest.threshold("min_relative_sigma"),
                 bearing_sigma_rad=manifest.threshold("bearing_sigma_rad"),

@@ -1,15 +1,16 @@
-"""Go on training the second stage so that it works on real pictures.
+"""Train the network that says whether a crop shows a drone, on rendered and real pictures.
 
-    python -m tools.train_real --rendered PICTURES --patches PATCHES --start models/distance.onnx --out RUN --minutes 60
+    python -m tools.train_verification --rendered CROPS --patches PATCHES --start models/distance.onnx --out RUN
 
-PICTURES is the folder of tools/render_drone_crops.py, PATCHES that of tools/mine_pictures.py. Resumes like
-tools/train.py, and writes the same files.
+CROPS is the folder of tools.render_drone_crops, PATCHES that of tools.mine_pictures. Resumes like tools.train, and
+writes the same files.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -18,32 +19,38 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from tools.train import Batch, Task, _flipped, _motor_maps, _start, train
+from tools.train import Batch, Task, begin_with, train
 from tools.training import real_samples
 from tools.training.augment import photometric
 from tools.training.crop_files import CropFiles
-from tools.training.networks import DistanceNet
+from tools.training.from_onnx import begin_with_onnx
+from tools.training.networks import DistanceNet, VerificationNet
 from tools.training.real_patches import RealPatches
 from tools.training.samples import Sample
 
-MIX = {"rendered": 30, "composite": 18, "real drone": 8, "cut out": 4, "negative": 36}
+MIX = {"rendered": 34, "composite": 16, "real drone": 8, "cut out": 4, "negative": 34}
 """Samples of a batch."""
 KINDS = tuple(MIX)
-SOFTENED_SHARE = 0.65
+SOFTENED_SHARE = 0.5
 """Of the rendered ones."""
 PLACES_SHARE = 0.15
 """Of the negatives: cut anywhere, not where the first stage proposed a drone."""
+NOISE_SHARE = 0.05
+"""Of the negatives: what a failing sensor delivers."""
+NEGATIVE_WEIGHTS = {"skyothers": 130.0, "rendered": 80.0}
+"""What flies besides drones, and what the first stage proposes in the worlds of the test flights, are drawn more often
+than the number of their patches says."""
 HARD_PROBABILITY, HARD_SHARE, HARD_ONES, FEWEST_HARD = 0.3, 0.35, 4000, 200
 """A negative of more than this probability is remembered, the last so many are, and drawn so often."""
 
 
-class RealTask(Task):
-    """Like `tools.train.DistanceTask`, with real negatives, composites and real drones whose range is not known."""
+class VerificationTask(Task):
+    """Drones and what is none: rendered, rendered before real backgrounds, and real."""
 
     def __init__(self, rendered: Path, patches: Path) -> None:
-        super().__init__(DistanceNet(), sum(MIX.values()), 5e-4)
+        super().__init__(VerificationNet(), sum(MIX.values()), 6e-4)
         self.rendered = CropFiles(rendered)
-        self.negatives = RealPatches(patches, "negative")
+        self.negatives = RealPatches(patches, "negative", weights=NEGATIVE_WEIGHTS)
         self.places = RealPatches(patches, "place", weights={"skydrones": 8.0, "skyothers": 8.0})
         self.drones = RealPatches(patches, "drone")
         self.hard: deque[tuple[int, int]] = deque(maxlen=HARD_ONES)
@@ -76,6 +83,9 @@ class RealTask(Task):
 
     def _negative(self, rng: np.random.Generator) -> Sample:
         """Often one that was taken for a drone when it was shown before."""
+        if rng.random() < NOISE_SHARE:
+            self._shown.append(None)
+            return real_samples.noise(*self.places.draw(rng)[:2], rng)
         if rng.random() < PLACES_SHARE:
             self._shown.append(None)
             return real_samples.negative(*self.places.draw(rng)[:2], rng)
@@ -85,46 +95,30 @@ class RealTask(Task):
         return real_samples.negative(*self.negatives.at(place)[:2], rng)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
-        """See ``Task``; what is not known of a sample has no weight."""
-        batch = _flipped(batch)
-        out, masks, families, motors = self.net(batch["picture"])
-        there, ranged = batch["drone"], batch["drone"] * batch["range_weight"]
-        error = (out[:, 0] - batch["target"][:, 0]).abs()
-        nll = error / torch.exp(out[:, 3]) * 1.414 + out[:, 3]
-        centre = (out[:, 1:3] - batch["target"][:, 1:3]).abs().clamp(max=30).sum(1)
-        family = F.cross_entropy(families, batch["family"], reduction="none")
-        apparent = (out[:, 5] - batch["apparent"]).abs()
-        where = -(_motor_maps(batch["motors"]) * motors).sum(2).mean(1)
-        has_range = (ranged > 0).float()
-        # The deviation is learnt from all of them: it has to know which ranges are poor.
-        each = ranged * (2.0 * error + 0.1 * family + 2.0 * apparent + 0.2 * where) + has_range * 0.3 * nll
-        ranges = each.sum() / has_range.sum().clamp(min=1)
-        centres = (0.05 * centre * there * batch["centre_weight"]).sum() / there.sum().clamp(min=1)
-        exists = F.binary_cross_entropy_with_logits(out[:, 4], there, weight=batch["exists_weight"])
-        masks_loss = _mask_loss(masks.float(), batch["mask"].float() / 255, there, batch["mask_weight"])
-        sharp = batch["range_weight"] >= 1.0
-        sharp &= there > 0.5
-        figures = {"median": float(error[sharp].median().detach()), "p95": float(error[sharp].quantile(0.95).detach())}
-        kind, sure = batch["kind"], torch.sigmoid(out[:, 4].detach())
-        shown = sure[kind == KINDS.index("negative")].tolist()
+        """See ``Task``. A drone that can hardly be seen has little weight."""
+        crops = batch["picture"]
+        crops = torch.where(torch.rand(len(crops))[:, None, None, None] < 0.5, crops.flip(2), crops)
+        logits, there, kind = self.net(crops)[:, 0], batch["drone"], batch["kind"]
+        loss = F.binary_cross_entropy_with_logits(logits, there, weight=batch["exists_weight"])
+        probability = torch.sigmoid(logits.detach())
+        shown = probability[kind == KINDS.index("negative")].tolist()
         if len(shown) == len(self._shown):
             self.hard.extend(
                 p for p, s in zip(self._shown, shown, strict=True) if p is not None and s > HARD_PROBABILITY
             )
+        figures = {"rendered none": float((probability[(kind == 0) & (there < 0.5)] > 0.8).float().mean())}
         for number, name in enumerate(KINDS):
             mine = (kind == number) & (there > 0.5) if name != "negative" else kind == number
-            right = sure[mine] > 0.8
-            figures[name] = float(right.float().mean())
-        return ranges + centres + exists + masks_loss, figures
+            figures[name] = float((probability[mine] > 0.8).float().mean())
+        return loss, figures
 
 
-def _mask_loss(logits: Tensor, mask: Tensor, drone: Tensor, weight: Tensor) -> Tensor:
-    """Of (n, ., .) masks; ``drone`` (n,) is 0 where there is none."""
-    bce = F.binary_cross_entropy_with_logits(logits, mask, reduction="none").mean((1, 2))
-    probability = torch.sigmoid(logits)
-    both, either = (probability * mask).sum((1, 2)), (probability + mask).sum((1, 2))
-    dice = 1 - (2 * both + 20) / (either + 20)
-    return 2.0 * (bce * weight).mean() + 0.3 * (dice * drone * weight).sum() / drone.sum().clamp(min=1)
+def begin_with_encoder(net: VerificationNet, distance: Path, run: Callable[[DistanceNet], object]) -> None:
+    """The encoder of an exported ``DistanceNet``; ``run`` calls that on a batch of crops. Raises ValueError."""
+    other = DistanceNet()
+    begin_with_onnx(other, distance, lambda: run(other))
+    layers = ("stem.", "down.", "body.", "more.")
+    begin_with(net, {name: value for name, value in other.state_dict().items() if name.startswith(layers)})
 
 
 def main() -> None:
@@ -133,7 +127,7 @@ def main() -> None:
     parser.add_argument("--rendered", type=Path, required=True)
     parser.add_argument("--patches", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--start", type=Path, help="checkpoint.pt of another run, or an exported network")
+    parser.add_argument("--start", type=Path, help="checkpoint.pt of another run, or models/distance.onnx")
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--rate", type=float, help="learning rate to begin with")
     parser.add_argument("--threads", type=int, default=2)
@@ -142,13 +136,26 @@ def main() -> None:
     torch.manual_seed(arguments.seed)
     torch.set_num_threads(arguments.threads)
     cv2.setNumThreads(1)
-    task = RealTask(arguments.rendered, arguments.patches)
+    task = VerificationTask(arguments.rendered, arguments.patches)
     task.rate = arguments.rate or task.rate
     arguments.out.mkdir(parents=True, exist_ok=True)
     if arguments.start and not (arguments.out / "checkpoint.pt").is_file():
         _start(task, arguments.start, arguments.seed)
-        torch.save({"net": task.net.state_dict()}, arguments.out / "start.pt")
     train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed)
+
+
+def _start(task: VerificationTask, weights: Path, seed: int) -> None:
+    net = task.net
+    assert isinstance(net, VerificationNet)
+    if weights.suffix != ".onnx":
+        begin_with(net, torch.load(weights, map_location="cpu")["net"])
+        return
+    samples = task.batch_samples(np.random.default_rng(seed))
+    crops = torch.from_numpy(np.stack([sample["picture"] for sample in samples]))
+    try:
+        begin_with_encoder(net, weights, lambda other: other(crops))
+    except ValueError as error:
+        raise SystemExit(f"--start: {error}") from None
 
 
 if __name__ == "__main__":
