@@ -41,7 +41,9 @@ def add(commands: Commands) -> None:
     parser.add_argument("--out", metavar="FOLDER", type=Path, help="draw what is found into copies there")
     parser.add_argument("--force", action="store_true", help="overwrite what is there")
     parser.add_argument("--labels", metavar="FILE", type=Path, help="COCO boxes of category `drone`, to measure with")
-    parser.add_argument("--min-probability", metavar="P", type=_probability, default=0.0, help="leave out less (0)")
+    parser.add_argument(
+        "--min-probability", metavar="P", type=_probability, default=0.0, help="leave out what is less probable (0)"
+    )
     parser.add_argument("--drone-size", metavar="M", type=positive_number, help="of every drone, tip to tip, if known")
     parser.add_argument("--every", metavar="N", type=positive_count, default=1, help="every Nth frame of a video (1)")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")

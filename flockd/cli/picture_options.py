@@ -31,6 +31,7 @@ def add_picture_options(parser: Parser) -> None:
     networks.add_argument("--models", metavar="FOLDER", type=Path, help="folder of the manifests")
     networks.add_argument("--first-stage", metavar="NAME", help="the model for depth and segmentation")
     networks.add_argument("--second-stage", metavar="NAME", help="the model for the distance")
+    networks.add_argument("--verification", metavar="NAME", help="the model that tells drones from all else, or `none`")
     networks.add_argument("--threads", metavar="N", type=_threads, help="processor threads (2)")
 
 
@@ -112,6 +113,8 @@ def perception_of(args: argparse.Namespace, drone: DroneConfig | None, **more: A
         values |= {"depth": args.first_stage, "segmentation": args.first_stage}
     if args.second_stage is not None:
         values["distance"] = args.second_stage
+    if args.verification is not None:
+        values["verification"] = args.verification
     if args.threads is not None:
         values["threads"] = args.threads
     try:
