@@ -82,9 +82,7 @@ def judge_heartbeat(system_id: int, status: AutopilotStatus, parameters: Autopil
 def judge_signing(responds: bool, heartbeat_age_s: float, parameters: AutopilotParameters) -> Finding:
     """Whether it accepts messages that are not signed (MAVLink 2): flockd's are not, and others' need not be either."""
     if responds:
-        return passed(
-            "signing", "it accepts unsigned messages, flockd's and anybody's: let nobody else reach it"
-        )
+        return passed("signing", "it accepts unsigned messages, flockd's and anybody's: let nobody else reach it")
     if heartbeat_age_s > parameters.max_heartbeat_age_s:
         return warned("signing", "not known: it is not heard any more", "see to the link first")
     measured = "it is heard and does not respond: nothing reaches it, or it accepts signed messages only"

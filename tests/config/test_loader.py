@@ -338,6 +338,21 @@ def test_the_schema_describes_the_file_and_not_the_merged_model() -> None:
         ),
         (
             "scenario: two",
+            "scenario: two\nfaults: [{drone: 3, camera: front, kind: uniform}]",
+            "scenario.yaml:2: faults[0].drone: is 3, but there are 2 vehicles; write one of theirs",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nfaults: [{drone: 1, camera: top, kind: uniform}]",
+            "scenario.yaml:2: faults[0].camera: is not in the rig; write one of front",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nfaults: [{drone: 1, camera: front, kind: gaussian, begin_s: 5.0, end_s: 4.0}]",
+            "scenario.yaml:2: faults[0].end_s: is not after begin_s 5; write a larger one",
+        ),
+        (
+            "scenario: two",
             "scenario: two\nworld: {drone_family: 99}",
             "scenario.yaml:2: world.drone_family: 99 is not at most 13; write a whole number from 0 to 13 or `any`",
         ),
