@@ -126,7 +126,9 @@ def _line(found: Outcome) -> str:
     limit_s = found.fault.within_s
     measured = "" if found.reaction_s is None else f"{found.reaction_s:.2f} s"
     allowed = "" if limit_s is None else f"of {limit_s:g} s"
-    return f"{found.result.upper():4s} {found.fault.row:3d} {found.fault.name:28s} {measured:>8s} {allowed:8s} {found.why}"
+    return (
+        f"{found.result.upper():4s} {found.fault.row:3d} {found.fault.name:28s} {measured:>8s} {allowed:8s} {found.why}"
+    )
 
 
 if __name__ == "__main__":

@@ -50,7 +50,11 @@ class Process(Watched):
 
     @property
     def program(self) -> Program:
-        return self.daemons.programs()[0]
+        return self.daemons.programs()[-1]
+
+    def log(self) -> str:
+        """All that it has printed."""
+        return self.program.log.read_text(encoding="utf-8")
 
     def signal(self, number: signal.Signals) -> float:
         """Sends a signal; when, on the monotonic clock."""

@@ -61,6 +61,79 @@ def test_all_cameras_freeze(tmp_path: Path, record_property: RecordProperty) -> 
     tell(story)
 
 
+def test_time_stamps_are_repeated_and_run_backwards(tmp_path: Path, record_property: RecordProperty) -> None:
+    """Half of the frames: they are dropped and counted, and the drone flies on, slower, by the others."""
+
+    def stamped_badly(frame: Frame) -> Frame:
+        return frame if frame.sequence % 2 else replace(frame, time_s=frame.time_s - 3.0)
+
+    async def story() -> None:
+        async with flying(tmp_path) as process:
+            process.cameras.spoil = stamped_badly
+            fault_s = time.monotonic()
+            await until(lambda: "frames_dropped" in process.matters(), SECONDS_TO_FAIL)
+            reacted(record_property, "time-stamps-backwards", time.monotonic() - fault_s)
+            assert process.fake_autopilot.mode == "OFFBOARD"
+            steps = process.heard()["computer"].message["steps"]
+            await until(lambda: process.heard()["computer"].message["steps"] > steps + 3, SECONDS_TO_FAIL)
+            assert process.heard()["computer"].message["cameras"]["front"]["counts"]["time_stamp"] > 1
+            _good_again(process)
+            await until(lambda: "frames_dropped" not in process.matters(), SECONDS_TO_FAIL)
+            await process.until_state("normal")
+
+    tell(story)
+
+
+def test_one_of_two_cameras_is_gone_and_comes_back(tmp_path: Path, record_property: RecordProperty) -> None:
+    async def story() -> None:
+        async with flying(tmp_path) as process:
+            process.cameras.silent.add("back")
+            fault_s = time.monotonic()
+            await process.until_event("degraded: a camera is lost: back silent")
+            reacted(record_property, "one-camera-gone", time.monotonic() - fault_s)
+            steps = process.heard()["computer"].message["steps"]
+            await until(lambda: process.heard()["computer"].message["steps"] > steps + 3, SECONDS_TO_FAIL)
+            assert process.fake_autopilot.mode == "OFFBOARD"
+            assert "camera_lost" in process.matters(), "the blind sector stays reported"
+            process.cameras.silent.clear()
+            await until(lambda: "camera_lost" not in process.matters(), SECONDS_TO_FAIL)
+            await process.until_state("normal")
+
+    tell(story)
+
+
+@pytest.mark.parametrize("ahead_s", [3.0, 86_400.0, -86_400.0, 1e300], ids=["3 s", "a day", "a day ago", "absurd"])
+def test_a_frame_of_another_time_silences_nobody(
+    ahead_s: float, tmp_path: Path, record_property: RecordProperty
+) -> None:
+    """Three frames of one camera; all good ones after it are used at once."""
+    spoiled = []
+
+    def of_another_time(frame: Frame) -> Frame:
+        if frame.camera != "front" or len(spoiled) >= 3:
+            return frame
+        spoiled.append(time.monotonic())
+        return replace(frame, time_s=frame.time_s + ahead_s)
+
+    async def story() -> None:
+        async with flying(tmp_path) as process:
+            steps = process.heard()["computer"].message["steps"]
+            process.cameras.spoil = of_another_time
+            await until(lambda: len(spoiled) == 3, SECONDS_TO_FAIL)
+            await until(lambda: _counted(process, "front", "time_stamp") == 3, SECONDS_TO_FAIL)
+            await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
+            await until(lambda: _all_see(process), SECONDS_TO_FAIL)
+            reacted(record_property, "time-stamps-jump", time.monotonic() - spoiled[-1])
+            assert process.fake_autopilot.mode == "OFFBOARD"
+            await process.until_state("normal")
+
+    tell(story)
+
+
+def _counted(process: Process, camera: str, what: str) -> int:
+    return int(process.heard()["computer"].message["cameras"][camera]["counts"].get(what, 0))
+
+
 def _all_see(process: Process) -> bool:
     cameras = process.heard()["computer"].message["cameras"].values()
     return all(camera["fault"] is None and camera["age_s"] < NOTICED_S for camera in cameras)
