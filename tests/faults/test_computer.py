@@ -99,7 +99,7 @@ def test_steps_take_three_times_as_long_as_they_may(
 ) -> None:  # fmt: skip
     """Frames are not queued: each step takes the newest; the drone hovers and asks for Hold."""
     autopilot, port = in_the_air
-    change = functools.partial(_alone, degraded_load=1.0, max_load=2.0)
+    change = functools.partial(_alone, degraded_load=1.0, max_load=2.0, estimate_timeout_s=20.0)
 
     async def story() -> None:
         with autopilot:
