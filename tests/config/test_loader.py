@@ -242,6 +242,28 @@ def test_paths_that_are_no_files_get_one_sentence(tmp_path: Path) -> None:
     assert _problems(Path("/dev/zero")) == ["zero: is not an ordinary file; copy the configuration to one"]
 
 
+def test_of_very_many_problems_the_first_are_told_and_the_others_counted(tmp_path: Path) -> None:
+    path = tmp_path / "drone.yaml"
+    path.write_text("rig:\n  cameras:\n" + "  - {lens: wide, colour: red}\n" * 300, encoding="utf-8")
+    with pytest.raises(ConfigError) as refused:
+        load_drone(path)
+    *told, last = str(refused.value).splitlines()
+    assert len(told) == 20
+    assert all("is not a known key" in line or "is missing; add it" in line for line in told)
+    assert told[0].startswith(f"{path}:3: rig.cameras[0]")
+    found = len(refused.value.problems)
+    assert found >= 300 * 4, "two unknown keys and two missing ones each"
+    assert last == f"and {found - 20} more problems; correct these first"
+
+
+def test_a_file_of_a_hundred_thousand_values_is_refused_before_it_is_read_through(tmp_path: Path) -> None:
+    """The first of them are enough: the rest took 48 s to complain about."""
+    path = tmp_path / "drone.yaml"
+    path.write_text("rig:\n  cameras:\n" + "  - {a: 1, b: 2}\n" * 50_000, encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"holds more than 30000 values, which no configuration does"):
+        load_drone(path)
+
+
 def test_a_windows_file_is_read_as_any_other(tmp_path: Path) -> None:
     path = tmp_path / "drone.yaml"
     path.write_bytes(b"\xef\xbb\xbf" + DRONE.replace("\n", "\r\n").encode())
