@@ -113,7 +113,7 @@ def test_words_that_old_yaml_takes_for_truth_values_stay_words(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("line", "told"),
     [
-        ("step_s: -0.5", "step_s: -0.5 is not greater than 0; write a positive number of seconds"),
+        ("step_s: -0.5", "step_s: -0.5 is not greater than 0; write a number of seconds above 0 and up to 60"),
         ("step_s: .nan", "step_s: .nan is not finite; write a positive number of seconds"),
         ("step_s: 1e999", "step_s: 1e999 is not finite; write a positive number of seconds"),
         ("step_s: true", "step_s: true is not a positive number of seconds; write a positive number of seconds"),
