@@ -63,13 +63,14 @@ async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceMa
     """With SIGTERM and Ctrl-C for standstill, Hold and the end, and SIGHUP for the configuration."""
     from flockd.config import load_drone
     from flockd.daemon import Daemon, clock_at
+    from flockd.doctor.deadline import GOLDEN_S, within
     from flockd.inference.hashes import model_hashes
     from flockd.perception import load_networks
 
     daemon = Daemon(
         config,
         str(args.config),
-        load_networks=lambda: load_networks(config.perception),
+        load_networks=lambda: load_networks(config.perception, within(GOLDEN_S)),
         models=model_hashes(config.perception),
         recordings=args.record,
         service=service,

@@ -20,6 +20,7 @@ from flockd.cli import main
 from flockd.data import data_path
 from tests.autopilot.conftest import HEARTBEAT_S, free_port
 from tests.daemon.aboard import Cameras, config_for, free_endpoint
+from tests.inference.test_deadline import endless
 
 RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
 ROOT = Path(__file__).parents[2]
@@ -166,3 +167,18 @@ def test_without_an_autopilot_it_is_unavailable_and_not_aborted(tmp_path: Path) 
     assert recordings.is_dir(), "it is made"
     assert f"waits for the autopilot at serial://{tmp_path / 'none'}:921600, and for the networks to load" in err
     assert f"autopilot.address: serial://{tmp_path / 'none'}:921600 cannot be opened" in err.splitlines()[-1]
+
+
+def test_a_network_that_never_ends_is_bad_configuration_within_ten_seconds(tmp_path: Path) -> None:
+    """The daemon waits for an autopilot meanwhile, and none is there."""
+    config = _written(tmp_path / "tiny.yaml", free_port(), free_endpoint(), free_endpoint())
+    values = yaml.safe_load(config.read_text(encoding="utf-8"))
+    values["perception"]["flow"] = str(endless(tmp_path))
+    config.write_text(yaml.safe_dump(values), encoding="utf-8")
+    with _run(config, tmp_path) as process:
+        _, err = process.communicate(timeout=SECONDS_TO_FAIL)
+    assert process.returncode == 78, err
+    assert err.splitlines()[-1].endswith(
+        "endless.onnx did not finish the golden input in time (more than 8 s); restore the model file or choose "
+        "another perception.provider"
+    )
