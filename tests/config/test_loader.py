@@ -118,7 +118,8 @@ def test_words_that_old_yaml_takes_for_truth_values_stay_words(tmp_path: Path) -
         ("step_s: 1e999", "step_s: 1e999 is not finite; write a number of seconds above 0 and up to 60"),
         (
             "step_s: true",
-            "step_s: true is not a number of seconds above 0 and up to 60; write a number of seconds above 0 and up to 60",
+            "step_s: true is not a number of seconds above 0 and up to 60; "
+            "write a number of seconds above 0 and up to 60",
         ),
         ("step_s: '0.5'", "step_s: '0.5' is not a number of seconds above 0 and up to 60; write 0.5"),
         ("step_s: 1_000", "step_s: 1_000 is not a number of seconds above 0 and up to 60; write 1000"),
