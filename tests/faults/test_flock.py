@@ -168,9 +168,9 @@ def test_the_fence_is_left(tmp_path: Path, record_property: RecordProperty) -> N
 def test_two_drones_at_one_spot_part(
     tmp_path: Path, in_the_air: tuple[FakeAutopilot, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One hovers 5 cm from this one, 0.8 m above: this one leaves, to its own right, and the other's right is another.
+    """One hovers above this one: this one leaves to its own right, and the other's right is another.
 
-    It faces north, so that its right is the east.
+    It faces north and looks up, so that its right is the west.
     """
     autopilot, port = in_the_air
 
@@ -192,7 +192,7 @@ def test_two_drones_at_one_spot_part(
             await ship.until_state("ready")
             await until(lambda: len(autopilot.setpoints) > 5, SECONDS_TO_FAIL)
             autopilot.pilot_selects("OFFBOARD")
-            await until(lambda: float(autopilot.state.position[1]) > 0.5, SECONDS_TO_FAIL)
+            await until(lambda: float(autopilot.state.position[1]) < -0.5, SECONDS_TO_FAIL)
             assert abs(float(autopilot.state.position[0])) < 0.5
 
     tell(story)
