@@ -14,7 +14,7 @@ from pathlib import Path
 
 import yaml
 
-from flockd.errors import ConfigError, ConfigProblem
+from flockd.errors import ConfigError, ConfigProblem, shortage_of
 
 KeyPath = tuple[str | int, ...]
 Value = str | int | float | bool | None | tuple["Value", ...] | dict[str, "Value"]
@@ -91,6 +91,8 @@ def _read_text(path: Path, what: str) -> str:
     except FileNotFoundError as error:
         raise fault("does not exist; check the path") from error
     except OSError as error:
+        if shortage_of(error):
+            raise
         raise fault(f"cannot be read ({error.strerror}); check the path and its permissions") from error
     except ValueError as error:
         raise fault(f"is not a path ({error}); check it") from error
