@@ -31,7 +31,7 @@ async def _is_held_and_stays_so(process: Process, fault_s: float, *, repair: Cal
     before = len(process.fake_autopilot.setpoints)
     repair()
     await until(lambda: _all_see(process), SECONDS_TO_FAIL)
-    assert process.state() == "silent"
+    await process.until_state("silent")
     assert len(process.fake_autopilot.setpoints) == before
     assert (await process.ask("ask/resume"))["accepted"] is True
     await process.until_state("ready")
@@ -108,7 +108,7 @@ def test_a_frame_of_another_time_silences_nobody(
     ahead_s: float, tmp_path: Path, record_property: RecordProperty
 ) -> None:
     """Three frames of one camera; all good ones after it are used at once."""
-    spoiled = []
+    spoiled: list[float] = []
 
     def of_another_time(frame: Frame) -> Frame:
         if frame.camera != "front" or len(spoiled) >= 3:

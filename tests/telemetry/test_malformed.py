@@ -70,7 +70,7 @@ def test_every_topic_can_be_checked() -> None:
 
 def test_a_drone_is_shown_with_what_is_wrong_until_its_message_is_right_again() -> None:
     good, malformed = json.dumps(FLIGHT).encode(), "its message `flight` is malformed: "
-    published = (
+    published: tuple[tuple[bytes, list[str]], ...] = (
         (good, []),
         (b"[" * 100_000, [f"{malformed}it is not JSON"]),
         (json.dumps({**FLIGHT, "reasons": 7}).encode(), [f"{malformed}reasons is no list"]),
