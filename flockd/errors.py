@@ -59,14 +59,21 @@ class ConfigProblem:
         return f"{place}: {self.key}: {self.message}" if self.key else f"{place}: {self.message}"
 
 
+MAX_PROBLEMS_TOLD = 20
+
+
 class ConfigError(FlockdError):
-    """Everything wrong with a configuration at once; its text has one line for each problem."""
+    """Everything wrong with a configuration at once; its text has one line for each of the first problems."""
 
     exit_code = ExitCode.BAD_CONFIGURATION
 
     def __init__(self, problems: Sequence[ConfigProblem]) -> None:
         self.problems = tuple(sorted(problems))
-        super().__init__("\n".join(str(problem) for problem in self.problems))
+        told = [str(problem) for problem in self.problems[:MAX_PROBLEMS_TOLD]]
+        more = len(self.problems) - len(told)
+        if more:
+            told.append(f"and {more} more {'problem' if more == 1 else 'problems'}; correct these first")
+        super().__init__("\n".join(told))
 
 
 _SHORTAGES = {
