@@ -11,8 +11,8 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "flockd"
 
-BASE = {"choices", "messages", "config", "errors", "data"}
-"""Under everything: choices, nouns, the typed configuration, the error types, and where the shipped files are."""
+BASE = {"choices", "messages", "config", "errors", "data", "printable"}
+"""Under everything: choices, nouns, the typed configuration, error types, the shipped files, texts for a terminal."""
 
 MAY_IMPORT = {
     "choices": set(),
@@ -20,6 +20,7 @@ MAY_IMPORT = {
     "errors": set(),
     "data": {"errors"},
     "image_header": set(),
+    "printable": set(),
     "zenoh_session": {"errors"},
     "config": {"choices", "messages", "errors"},
     "geometry": BASE,

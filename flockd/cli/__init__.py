@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from flockd import __version__
 from flockd.cli import calibrate, config, doctor, models, record, replay, report, run, sim, status, view
+from flockd.cli.output import complain
 from flockd.cli.parser import Parser, add_commands
 from flockd.errors import ExitCode, FlockdError, UnavailableError
 
@@ -61,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _failed(sentence: str, code: int) -> int:
-    sys.stderr.write(f"{sentence}\n")
+    complain(sentence)
     return code
 
 

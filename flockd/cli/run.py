@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.parser import Commands
 from flockd.errors import ExitCode, UsageError
+from flockd.printable import printable
 
 if TYPE_CHECKING:
     from flockd.config import DroneConfig
@@ -92,8 +93,17 @@ async def _say_what_it_waits_for(daemon: Daemon, every_s: float) -> None:
         await asyncio.sleep(every_s)
 
 
+class _Printable(logging.Formatter):
+    """A log goes to terminals, and texts in it come from the autopilot and from operators."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))
+
+
 def _log_to_stderr() -> None:
     """The journal dates its lines itself."""
     dated = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
-    logging.basicConfig(level=logging.INFO, format=f"{dated}%(message)s")
+    handler = logging.StreamHandler()
+    handler.setFormatter(_Printable(f"{dated}%(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
     logging.getLogger("flockd.autopilot").setLevel(logging.WARNING)  # MAVSDK tells a lot of itself
