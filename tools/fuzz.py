@@ -8,7 +8,8 @@ python -m tools.fuzz --only manifests --seed 3 --first 1234 --count 1   # one in
 Inputs are valid ones (config/, models/, tools/fuzzing/corpus/, or made up) changed where it hurts most: lines, JSON
 values, records behind correct checksums, bytes. Each is made of the seed, the target's name and its number alone. A
 finding is an error that is not one of flockd's own, a text that no terminal should get, a process that ends, an input
-that takes 5 s, memory over 1 GiB, or a command or setpoint that is not finite or outside the limits. Exit code 1 if there is one.
+that takes 5 s, memory over 1 GiB, or a command or setpoint that is not finite or outside the limits. Exit code 1 if
+there is one.
 """
 
 from __future__ import annotations

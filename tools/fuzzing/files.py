@@ -19,7 +19,7 @@ from flockd.geometry import build_rig
 from flockd.inference import read_manifest
 from flockd.perception.requirements import check_roles
 from flockd.recording.editing import recover
-from flockd.recording.export import export_tables
+from flockd.recording.export import export_images, export_tables
 from flockd.recording.info import recording_info
 from flockd.recording.mcap_file import Damage, Entry, Inclosure, McapFile, Note, Record, read_records
 from flockd.recording.reader import Recording
@@ -74,7 +74,7 @@ def _recordings(folder: Path) -> Check:
     whole = (CORPUS / "recording.mcap").read_bytes()
     records = [record for record in read_records(CORPUS / "recording.mcap") if not isinstance(record, Damage)]
     file, copied, tables = folder / "mutated.mcap", folder / "copied.mcap", folder / "tables"
-    tables.mkdir()
+    (tables / "csv").mkdir(parents=True)
 
     def check(random: Random) -> None:
         if random.random() < 0.3:
@@ -90,7 +90,10 @@ def _recordings(folder: Path) -> Check:
                 pass
         with own_errors():
             recover(Recording(file), copied)
-            export_tables(Recording(copied), tables, "csv")
+            export_tables(Recording(copied), tables / "csv", "csv")
+            export_images(Recording(copied), tables / "images")
+        assert {path.name for path in tables.iterdir()} <= {"csv", "images"}, "written outside of its folder"
+        assert {path.name for path in folder.iterdir()} <= {file.name, copied.name, tables.name}, "written outside"
 
     return check
 
@@ -120,6 +123,9 @@ def _changed_inside(random: Random, record: Record) -> Record:
             return dataclasses.replace(record, data=_changed_json(random, record.data))
         case Entry() if random.random() < 0.2:
             return dataclasses.replace(record, sequence=random.choice((0, 1, 2, 2**32 - 1)))
+        case Entry() if random.random() < 0.1:
+            topic = random.choice(("/../../x", "/x/../image", "/camera/../image", "", "/", "/\x1b/image", "/frames"))
+            return dataclasses.replace(record, stream=dataclasses.replace(record.stream, topic=topic))
         case Entry() if record.stream.encoding == "json":
             return dataclasses.replace(record, data=_changed_json(random, record.data))
     return dataclasses.replace(record, data=mutated_bytes(random, record.data))
@@ -134,7 +140,10 @@ def _changed_json(random: Random, data: bytes) -> bytes:
         return mutated_bytes(random, data)
     if random.random() < 0.02:
         return b"[" * 100_000
-    changed = mutated_json(random, json.loads(data))
+    try:
+        changed = mutated_json(random, json.loads(data))
+    except (ValueError, RecursionError):  # changed before
+        return data
     return json.dumps(changed).encode("utf-8", "surrogatepass")
 
 
@@ -206,8 +215,8 @@ def _rgbd(root: Path) -> Path:
 
 
 TARGETS = (
-    Target("configurations", 2, _configurations),
-    Target("manifests", 2, _manifests),
-    Target("recordings", 2, _recordings),
-    Target("datasets", 4, _datasets),
+    Target("configurations", 4, _configurations),
+    Target("manifests", 10, _manifests),
+    Target("recordings", 10, _recordings),
+    Target("datasets", 40, _datasets),
 )

@@ -58,7 +58,10 @@ def _networks(folder: Path) -> Check:
             pixels = np.random.default_rng(random.getrandbits(32)).integers(0, 256, (size[1], size[0], 3), np.uint8)
             stamp = time_s if random.random() < 0.97 else any_float(random)
             frames = FrameSet(stamp, {"front": Frame("front", pixels, stamp, number)})
-            output = pilot.step(frames, _vehicle(random, stamp))
+            try:
+                output = pilot.step(frames, _vehicle(random, stamp))
+            except FloatingPointError:  # of a network; the daemon discards the step and counts it
+                continue
             _assert_within_limits(output, config)
             _through_gate(random, gate, config.safety.gate, output, time_s)
 
@@ -260,6 +263,6 @@ def _changes(random: Random) -> dict[str, Any]:
 
 TARGETS = (
     Target("networks", 1, _networks),
-    Target("gate", 20, _gate),
-    Target("supervisor", 25, _supervisor),
+    Target("gate", 200, _gate),
+    Target("supervisor", 500, _supervisor),
 )

@@ -10,6 +10,7 @@ from pathlib import Path
 from random import Random
 
 from flockd.errors import FlockdError
+from flockd.printable import printable
 
 ROOT = Path(__file__).resolve().parents[2]
 CORPUS = Path(__file__).parent / "corpus"
@@ -42,6 +43,7 @@ def own_errors() -> Iterator[None]:
 
 def assert_readable(text: str) -> None:
     """Raises AssertionError for a text that is no good on a terminal."""
-    odd = {char for char in text if char != "\n" and unicodedata.category(char) in ("Cc", "Cf", "Cs")}
+    shown = printable(text)  # as every command does
+    odd = {char for char in shown if char not in "\n\t" and unicodedata.category(char) in ("Cc", "Cf", "Cs")}
     assert not odd, f"control characters {sorted(odd)!a} reach the terminal"
     assert 0 < len(text) <= LONGEST_ERROR, f"an error has {len(text)} characters"
