@@ -20,7 +20,8 @@ import sys
 from dataclasses import asdict
 from typing import Any
 
-from tools.fuzzing.campaign import TARGETS, Result, run
+from tools.fuzzing.campaign import Result, run
+from tools.fuzzing.table import TARGETS
 
 
 def shares(names: list[str], count: int) -> dict[str, int]:

@@ -16,20 +16,21 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from tools.fuzzing.files import TARGETS as FILES
-from tools.fuzzing.flight import TARGETS as FLIGHT
-from tools.fuzzing.messages import TARGETS as MESSAGES
 from tools.fuzzing.target import ROOT, Target
 
-TARGETS = {target.name: target for target in (*FILES, *MESSAGES, *FLIGHT)}
-CPU_DEADLINE_S = 5.0
-"""Of the processor's time that one input may take."""
-WALL_DEADLINE_S = 60.0
-"""For one that waits instead; generous, as the computer may be busy."""
-MEMORY_BYTES = 1 << 30
-"""Above what the process had before its first input."""
 LISTED = 5
 """Inputs of each kind of finding that are listed."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What one input may take."""
+
+    cpu_s: float = 5.0
+    wall_s: float = 60.0
+    """For one that waits instead of computing; generous, as the computer may be busy."""
+    memory_bytes: int = 1 << 30
+    """Above what the process had before its first input."""
 
 
 class HangError(BaseException):
@@ -73,22 +74,22 @@ def randomness(seed: int, target: str, number: int) -> Random:
     return Random(f"{seed}/{target}/{number}")
 
 
-def run(target: Target, seed: int, first: int, count: int) -> Result:
+def run(target: Target, seed: int, first: int, count: int, bounds: Bounds | None = None) -> Result:
     """Gives a target its inputs from number ``first`` on; a process that dies or hangs is a finding, and replaced."""
     result, begun_s = Result(target.name), time.monotonic()
     at = first
     while at < first + count:
-        at = _run_process(result, target, seed, at, first + count)
+        at = _run_process(result, target, bounds or Bounds(), seed, at, first + count)
     result.inputs, result.seconds = count, time.monotonic() - begun_s
     return result
 
 
-def _run_process(result: Result, target: Target, seed: int, first: int, end: int) -> int:
+def _run_process(result: Result, target: Target, bounds: Bounds, seed: int, first: int, end: int) -> int:
     """One process; gives the number of the next input that has to be tried."""
     context = multiprocessing.get_context("spawn")
     progress = context.RawValue(ctypes.c_int64, first - 1)
     here, there = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(target.name, seed, first, end, progress, there), daemon=True)
+    process = context.Process(target=_work, args=(target, bounds, seed, first, end, progress, there), daemon=True)
     process.start()
     there.close()
     moved = (first - 1, time.monotonic())
@@ -100,10 +101,10 @@ def _run_process(result: Result, target: Target, seed: int, first: int, end: int
             break
         if progress.value != moved[0]:
             moved = (progress.value, time.monotonic())
-        elif time.monotonic() - moved[1] > WALL_DEADLINE_S:
+        elif time.monotonic() - moved[1] > bounds.wall_s:
             process.kill()
             process.join()
-            result.note(moved[0], f"HangError: waits for more than {WALL_DEADLINE_S:g} s", "")
+            result.note(moved[0], f"HangError: waits for more than {bounds.wall_s:g} s", "")
             return max(moved[0], first) + 1
     process.join()
     if process.exitcode == 0:
@@ -122,14 +123,14 @@ def _take(result: Result, message: Any) -> None:
         result.note(*message)
 
 
-def _work(name: str, seed: int, first: int, end: int, progress: Any, there: Connection) -> None:
+def _work(target: Target, bounds: Bounds, seed: int, first: int, end: int, progress: Any, there: Connection) -> None:
     """In a process of its own."""
     os.chdir(ROOT)
     signal.signal(signal.SIGPROF, _hang)
     shared = Path("/dev/shm")
     with tempfile.TemporaryDirectory(dir=shared if shared.is_dir() else None) as folder:
-        check = TARGETS[name].prepare(Path(folder))
-        _bound_memory()
+        check = target.prepare(Path(folder))
+        _bound_memory(bounds.memory_bytes)
         with Path(os.devnull).open("w") as nowhere:  # what decoders write about damaged images
             os.dup2(nowhere.fileno(), 2)
         usual_mb = 0.0
@@ -138,8 +139,8 @@ def _work(name: str, seed: int, first: int, end: int, progress: Any, there: Conn
             if number == first + 100:
                 usual_mb = _peak_mb()
             try:
-                signal.setitimer(signal.ITIMER_PROF, CPU_DEADLINE_S)
-                check(randomness(seed, name, number))
+                signal.setitimer(signal.ITIMER_PROF, bounds.cpu_s)
+                check(randomness(seed, target.name, number))
             except (Exception, HangError) as error:  # noqa: BLE001 - every one of them is a finding
                 there.send((number, _kind(error), traceback.format_exc(limit=-8)))
             finally:
@@ -149,12 +150,12 @@ def _work(name: str, seed: int, first: int, end: int, progress: Any, there: Conn
 
 
 def _hang(number: int, frame: object) -> None:
-    raise HangError(f"takes more than {CPU_DEADLINE_S:g} s")
+    raise HangError("takes too long")
 
 
-def _bound_memory() -> None:
+def _bound_memory(extra_bytes: int) -> None:
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    limit = pages * resource.getpagesize() + MEMORY_BYTES
+    limit = pages * resource.getpagesize() + extra_bytes
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
 
