@@ -218,3 +218,5 @@ class PilotOutput:
     """Estimates refused in this step, by reason."""
     stages_ms: Mapping[str, float] = field(default_factory=dict)
     """Time each stage took, as measured by the caller's clock; empty without one."""
+    noisy_cameras: tuple[str, ...] | None = None
+    """Whose images were noise, and were not used; None: no camera's."""

@@ -37,7 +37,7 @@ MAY_IMPORT = {
     | {"geometry", "telemetry", "image_header"},  # telemetry for the table of topics, which says what is recorded
     "flight_log": BASE | {"flocking", "perception", "pilot", "recording"},
     "calibration": BASE | {"geometry", "recording", "datasets", "sources"},
-    "datasets": BASE | {"geometry"},
+    "datasets": BASE | {"geometry", "image_header"},
     "replay": BASE | {"geometry", "inference", "perception", "pilot", "recording", "datasets"},
     "sim": BASE
     | {

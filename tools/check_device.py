@@ -9,7 +9,8 @@ runs `flockd run` with the shipped networks. The autopilot is flockd's fake; as 
 images are small and the steps far apart. The machine's clock counts instructions, a nanosecond each: how busy this
 computer is changes how long the check takes, and nothing of what it measures.
 
-Exit code 0, 1 a check failed, 69 something needed is not there.
+Exit code 0, 1 a check failed, 69 something needed is not there. A check that is a row of the catalogue of faults
+(`python -m tools.faults --list`) says which.
 """
 
 from __future__ import annotations
@@ -286,7 +287,8 @@ def _lines(file: Path, machine: subprocess.Popen[bytes]) -> Iterator[dict[str, A
 
 def _row(line: dict[str, Any]) -> str:
     verdict = "PASS" if line["passed"] else "FAIL"
-    return f"{verdict}  {line['check']:32s} {line['measured']}  (wanted: {line['wanted']})"
+    row = f" (row {line['row']} of the faults)" if line.get("row") else ""
+    return f"{verdict}  {line['check']:32s} {line['measured']}  (wanted: {line['wanted']}){row}"
 
 
 def _command(*command: str) -> None:

@@ -81,15 +81,17 @@ class ReceivedMessage:
 class ReceivedMessages:
     """The newest message of each kind. `add` is for one thread, everything else for any."""
 
-    def __init__(self, log_unknown: Callable[[str], None]) -> None:
-        """``log_unknown`` is called with one sentence the first time that an unknown value arrives, or home moves."""
-        self._log_unknown = log_unknown
+    def __init__(self, report: Callable[[str], None]) -> None:
+        """``report`` is called by `add` with one sentence on the first of each unknown value, of a home that moves in
+        flight, and of a landing."""
+        self._report = report
         self._newest: dict[str, ReceivedMessage] = {}
         self._unknown_values: Counter[str] = Counter()
         self._home: FloatArray | None = None
         self._flies = False
         """In the air, or seen there and not disarmed since: a landed state alone does not end a flight."""
         self._home_moved = False
+        self._landed = False
         self._text = _Text()
 
     def add(self, name: str, fields: Fields, time_s: float) -> None:
@@ -104,6 +106,7 @@ class ReceivedMessages:
             status = self.status(time_s)
             self._flies = status.in_air or (self._flies and status.armed)
             self._home_moved = self._home_moved and self._flies
+            self._take_landing(status.landed_state)
         elif name == "HOME_POSITION":
             self._take_home(_vector(fields, "x", "y", "z"))
 
@@ -120,10 +123,16 @@ class ReceivedMessages:
             self._home = home
         elif not self._home_moved and np.linalg.norm(home - self._home) > HOME_TOLERANCE_M:
             self._home_moved = True
-            self._log_unknown(
+            self._report(
                 f"the autopilot's home moved by {np.linalg.norm(home - self._home):.1f} m in flight; "
                 "height band and fence stay where they were until it is disarmed"
             )
+
+    def _take_landing(self, landed_state: LandedState) -> None:
+        landed = self._flies and (self._landed or landed_state == "ground")
+        if landed and not self._landed:
+            self._report("the autopilot reports that the drone is on the ground, still armed")
+        self._landed = landed
 
     def newest(self, name: str) -> ReceivedMessage | None:
         """The newest of a kind; None before the first."""
@@ -199,7 +208,7 @@ class ReceivedMessages:
         for field in unknown:
             value = f"{name}.{field} = {fields[field]}"
             if value not in self._unknown_values:
-                self._log_unknown(f"the autopilot sends {value}, which flockd does not know; it counts as unknown")
+                self._report(f"the autopilot sends {value}, which flockd does not know; it counts as unknown")
             self._unknown_values[value] += 1
         return {**fields, **dict.fromkeys(unknown)} if unknown else fields
 

@@ -12,6 +12,7 @@ import logging
 import math
 import socket
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Self, TypeVar
@@ -26,6 +27,7 @@ from mavsdk.system import System
 
 from flockd.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware, FlightMode
 from flockd.autopilot.mavlink_messages import MODES, Fields, ReceivedMessages, result_text
+from flockd.autopilot.throttled_log import ThrottledLog
 from flockd.config.autopilot import AutopilotParameters
 from flockd.messages import Setpoint, VehicleState
 
@@ -55,8 +57,11 @@ STREAMS_HZ = {
 most; its heartbeat comes once a second whatever one asks."""
 RECEIVED = (*STREAMS_HZ, "HEARTBEAT", "AUTOPILOT_VERSION", "STATUSTEXT")
 TEXT_MEMORY_S = 2.0
+MOST_REPORTS = 100
 
 _log = logging.getLogger(__name__)
+_throttled = ThrottledLog(_log)
+"""MAVSDK sends a heartbeat a second, and complains of each that an autopilot which is gone does not take."""
 _LOG_LEVELS = {
     LogLevel.DEBUG: logging.DEBUG,
     LogLevel.INFO: logging.INFO,
@@ -74,7 +79,8 @@ class AutopilotLink:
         self._executor = executor
         self._clock = clock
         self._system_id = int(system.get_system_id())
-        self._received = ReceivedMessages(_log.warning)
+        self._reports: deque[str] = deque(maxlen=MOST_REPORTS)
+        self._received = ReceivedMessages(self._reports.append)
         self._param = Param(system)
         self._direct = MavlinkDirect(system)
         for name in RECEIVED:
@@ -127,6 +133,10 @@ class AutopilotLink:
     def unknown_values(self) -> Mapping[str, int]:
         """See `ReceivedMessages.unknown_values`."""
         return self._received.unknown_values()
+
+    def take_reports(self) -> list[str]:
+        """What happened to the messages since the last call that people should know, each in one sentence."""
+        return [self._reports.popleft() for _ in range(len(self._reports))]
 
     def send_setpoint(self, setpoint: Setpoint) -> None:
         """Sends it, once. Raises AutopilotError when it is not finite or MAVSDK cannot send it."""
@@ -311,5 +321,5 @@ def _settle(answer: asyncio.Future[T], value: T) -> None:
 
 def _to_logging(level: LogLevel, message: str, *_: object) -> bool:
     """MAVSDK would print; this says that it is taken care of."""
-    _log.log(_LOG_LEVELS[level], "%s", message)
+    _throttled(_LOG_LEVELS[level], message)
     return True

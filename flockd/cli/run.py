@@ -7,12 +7,13 @@ import asyncio
 import functools
 import logging
 import os
+import resource
 import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli.parser import Commands
-from flockd.errors import ExitCode, UsageError
+from flockd.errors import ExitCode, UnavailableError, UsageError
 from flockd.printable import printable
 
 if TYPE_CHECKING:
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
     from flockd.daemon import Daemon, Ending, ServiceManager
 
 WAITING_EVERY_S = 5.0
+FILES_NEEDED = 128
+ADDRESSES_NEEDED_MB = 3072
+"""What a flight takes, with some to spare. With less, libraries end the process on their own, some by an abort."""
 
 
 def add(commands: Commands) -> None:
@@ -41,6 +45,7 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
+    _check_limits()
     from flockd.config import load_drone
     from flockd.daemon import ServiceManager, event_loop_at, only_instance
 
@@ -59,17 +64,36 @@ def _run(args: argparse.Namespace) -> int:
     return ExitCode.DONE
 
 
+def _check_limits() -> None:
+    """Takes as many file descriptors as it may have. Raises UnavailableError where a limit is too low for a flight."""
+    files, most_files = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if files != resource.RLIM_INFINITY and files < FILES_NEEDED:
+        if most_files != resource.RLIM_INFINITY and most_files < FILES_NEEDED:
+            raise UnavailableError(
+                f"this process may open {most_files} files, and a flight needs {FILES_NEEDED}; raise the limit "
+                "(LimitNOFILE= of the service, or ulimit -n)"
+            )
+        resource.setrlimit(resource.RLIMIT_NOFILE, (FILES_NEEDED, most_files))
+    addresses, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if addresses != resource.RLIM_INFINITY and addresses < ADDRESSES_NEEDED_MB << 20:
+        raise UnavailableError(
+            f"this process may use {addresses >> 20} MiB of addresses, and a flight needs {ADDRESSES_NEEDED_MB}; raise "
+            "the limit (LimitAS= of the service, or ulimit -v); to bound memory, use MemoryMax="
+        )
+
+
 async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceManager) -> Ending:
     """With SIGTERM and Ctrl-C for standstill, Hold and the end, and SIGHUP for the configuration."""
     from flockd.config import load_drone
     from flockd.daemon import Daemon, clock_at
+    from flockd.doctor.deadline import GOLDEN_S, within
     from flockd.inference.hashes import model_hashes
     from flockd.perception import load_networks
 
     daemon = Daemon(
         config,
         str(args.config),
-        load_networks=lambda: load_networks(config.perception),
+        load_networks=lambda: load_networks(config.perception, within(GOLDEN_S)),
         models=model_hashes(config.perception),
         recordings=args.record,
         service=service,

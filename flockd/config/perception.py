@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from flockd.choices import ROLES, FlowRefinement, Provider, Role, ScaleSource
-from flockd.config.base import NonNegative, Positive, Section, Share
+from flockd.config.base import Distance, NonNegative, Positive, Section, Share
 
 DIS, NO_MODEL = "dis", "none"
 """What stands where else a model's name does: OpenCV's DIS flow, and no second stage."""
@@ -16,9 +16,9 @@ DIS, NO_MODEL = "dis", "none"
 class DetectionParameters(Section):
     """How networks' outputs become detections. What belongs to a network's weights stands in its manifest instead."""
 
-    min_range_m: Positive = 0.2
+    min_range_m: Distance = 0.2
     """Nearer than this, nothing is a drone: it would touch the own one."""
-    max_range_m: Positive = 60.0
+    max_range_m: Distance = 60.0
     """Farther than this, nothing is a drone: it would be smaller than a pixel or two."""
     crop_shift: Share = 0.03
     """A further crop is not worth it when it would be moved by less than this share of half its width, ..."""
@@ -48,6 +48,25 @@ class DetectionParameters(Section):
     """Standard deviation of a drone's log range where the depth map alone gives it (`perception.distance: none`)."""
 
 
+class NoiseParameters(Section):
+    """When an image counts as noise, and is not used. Lengths are of the image, and noise of its luminance."""
+
+    level: Positive = 12.0
+    """Standard deviation, in grey levels of 0-255, of white noise that matters; a camera at night has less."""
+    whiteness: Share = 0.8
+    """White noise is at the finest scale at least this strong as a share of the next; photographs have 0.3 to 0.6."""
+    max_white: Share = 0.25
+    """The image is not used where more of it than this is white noise. 1, here and in the next two: all are used."""
+    max_white_rise: Share = 0.08
+    """Nor is it where this much more of it is white noise than of any of the camera's last five images, ..."""
+    rough_level: Positive = 20.0
+    """... or where details at one of the finest scales are stronger than this, in grey levels, ..."""
+    max_rough_rise: Share = 0.4
+    """... in this much more of it than in any of the last five."""
+    clean_images: Annotated[int, Field(ge=1, le=100)] = 2
+    """So many clean images in a row before a camera that was noisy is used again."""
+
+
 class PerceptionConfig(Section):
     """Which model fills which role. A name is a manifest in `models_dir`, or a path to one that ends in `.yaml`.
 
@@ -74,9 +93,10 @@ class PerceptionConfig(Section):
     """What ONNX Runtime computes with. Another one than this is never used in its place."""
     engines_dir: str | None = None
     """Where `flockd models prepare` keeps what a provider has built; by default `engines` beside the manifests."""
-    deadline_s: Positive = 1.0
+    deadline_s: Annotated[float, Field(gt=0, le=60)] = 1.0
     """In flight, a network that has not finished one call by then is stuck, and is ended."""
     detection: DetectionParameters = DetectionParameters()
+    noise: NoiseParameters = NoiseParameters()
     scale: ScaleSource = "height"
     """The background's metric scale: `network` (pure RGB, as in the paper), `height` (attitude and height above ground
     from the autopilot) or `velocity` (attitude and velocity from the autopilot; the drone has to move)."""

@@ -72,6 +72,23 @@ class WorldConfig(Section):
     """Which mesh the drones wear; `any`: drawn from the seed, the same for the whole flock."""
 
 
+class CameraFaultConfig(Section):
+    """What goes wrong with one simulated camera."""
+
+    drone: Annotated[int, Field(ge=1)]
+    """Whose: the number of its entry in `vehicles`, from 1."""
+    camera: str
+    """Its name in the rig."""
+    kind: Literal["uniform", "gaussian", "interference"]
+    """`uniform`: nothing but noise; `gaussian`: noise of `sigma` on the image; `interference`: bands of noise, at other
+    places in each image."""
+    sigma: Annotated[float, Field(gt=0, le=255)] = 50.0
+    """Standard deviation in grey levels of 0-255, for `gaussian`."""
+    begin_s: NonNegative = 0.0
+    """Counted from the first image of the flight; with PX4, that is before the take-off."""
+    end_s: Positive = MAX_DURATION_S
+
+
 class ScenarioConfig(Section):
     """One simulated flight."""
 
@@ -83,6 +100,8 @@ class ScenarioConfig(Section):
     vehicle: VehicleConfig = VehicleConfig()
     sensors: SensorConfig = SensorConfig()
     world: WorldConfig = WorldConfig()
+    faults: tuple[CameraFaultConfig, ...] = ()
+    """None, unless a flight is to show what flockd does about them."""
     drone: DroneConfig
     """In the file: the path of the drone's own configuration, relative to the scenario's; or that configuration."""
 
@@ -92,6 +111,21 @@ class ScenarioConfig(Section):
         if round(self.duration_s / step_s) < 1:
             text = f"{self.duration_s:g} s is shorter than a step of {step_s:g} s; write {step_s:g} or more"
             refuse(self, {("duration_s",): text})
+        return self
+
+    @model_validator(mode="after")
+    def _faults_have_their_cameras(self) -> Self:
+        cameras = [camera.name for camera in self.drone.rig.cameras]
+        faults: dict[tuple[str | int, ...], str] = {}
+        for number, fault in enumerate(self.faults):
+            if fault.drone > len(self.vehicles):
+                text = f"is {fault.drone}, but there are {len(self.vehicles)} vehicles; write one of theirs"
+                faults["faults", number, "drone"] = text
+            if fault.camera not in cameras:
+                faults["faults", number, "camera"] = f"is not in the rig; write one of {', '.join(cameras)}"
+            if fault.end_s <= fault.begin_s:
+                faults["faults", number, "end_s"] = f"is not after begin_s {fault.begin_s:g}; write a larger one"
+        refuse(self, faults)
         return self
 
     @model_validator(mode="after")

@@ -207,6 +207,8 @@ class Daemon:
         assert components is not None
         if not components.networks.hopeless:
             self._service.alive()
+        for report in components.link.take_reports():
+            components.sinks.event(report)
         if now.state is not before.state:
             why = "; ".join(reason.sentence for reason in now.reasons)
             components.sinks.event(f"{now.state}: {why}" if why else str(now.state))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -72,6 +72,8 @@ class PilotLoop:
         """Steps without a result, because a network failed or was late."""
         self.ego_motion_failures = 0
         """In a row."""
+        self.noisy_images: Counter[str] = Counter()
+        """That were not used, by camera."""
         self.neighbour_seen_s = -math.inf
         """When a confirmed neighbour was last seen."""
 
@@ -140,6 +142,7 @@ class PilotLoop:
     def _count(self, result: StepResult) -> None:
         if result.number > 1:  # the first has nothing to compare with
             self.ego_motion_failures = 0 if result.output.ego_motion is not None else self.ego_motion_failures + 1
+        self.noisy_images.update(result.output.noisy_cameras or ())
         seen = [result.time_s - neighbour.unseen_s for neighbour in result.output.neighbours if neighbour.confirmed]
         self.neighbour_seen_s = max([self.neighbour_seen_s, *seen])
 

@@ -85,11 +85,12 @@ def _velocity_trim(components: Components) -> list[float]:
 
 
 def _computer_message(components: Components, now: float) -> ComputerMessage:
+    noisy_images = components.pilot_loop.noisy_images
     cameras = {
         name: CameraMessage(
             age_s=camera.age_s,
             fault=camera.fault,
-            counts={str(what): number for what, number in camera.counts.items()},
+            counts={**camera.counts, **({"noisy": noisy_images[name]} if noisy_images[name] else {})},
         )
         for name, camera in components.source.status().items()
     }

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -54,7 +55,8 @@ class InputCollector:
         pilot_loop, result = self._pilot_loop, self._pilot_loop.newest
         neighbours = result.output.neighbours if result else ()
         ranges = [float(np.linalg.norm(n.position)) for n in neighbours if n.confirmed]
-        summary = self._camera_monitor.update(now, self._source.status())
+        noisy = (result.output.noisy_cameras or ()) if result else ()
+        summary = self._camera_monitor.update(now, self._source.status(), noisy, pilot_loop.noisy_images.total())
         position = position_from_home(status)
         self._had_satellites = self._had_satellites or status.gps_ok is True
         inputs = Inputs(
@@ -123,25 +125,67 @@ class CameraMonitor:
         common_hz = source.shared_memory.rate_hz
         rates = {camera.name: camera.rate_hz for camera in source.cameras}
         self._periods_s = {camera.name: 1.0 / rates.get(camera.name, common_hz) for camera in config.rig.cameras}
+        self._timeout_periods = config.safety.camera_timeout_periods
         self._frozen_before = dict.fromkeys(self._periods_s, 0)
-        self._window: deque[tuple[float, int, int]] = deque()
+        self._clean_s: dict[str, float] = {}
+        """When each camera's images were last not noise."""
+        self._window: deque[tuple[float, _Tally]] = deque()
 
-    def update(self, now: float, status: Mapping[str, CameraStatus]) -> CameraSummary:
-        """As of now; to be called at each tick."""
-        cameras = {name: self._health(name, camera) for name, camera in status.items()}
-        received = sum(camera.counts.get("received", 0) for camera in status.values())
-        bad = sum(camera.counts.get(what, 0) for camera in status.values() for what in _BAD)
+    def update(
+        self, now: float, status: Mapping[str, CameraStatus], noisy: Collection[str] = (), noisy_images: int = 0
+    ) -> CameraSummary:
+        """As of now; to be called at each tick.
+
+        ``noisy``: the cameras whose newest images the pilot found to be noise; ``noisy_images``: how many since the
+        start, of all cameras.
+        """
+        for name in status.keys() - set(noisy):
+            self._clean_s[name] = now
+        cameras = {name: self._health(name, camera, now) for name, camera in status.items()}
         while self._window and now - self._window[0][0] > DROPS_WINDOW_S:
             self._window.popleft()
-        self._window.append((now, received, bad))
-        _, received_before, bad_before = self._window[0]
-        return CameraSummary(cameras, (bad - bad_before) / max(received - received_before, 1))
+        tally = _Tally.of(status, noisy_images)
+        self._window.append((now, tally))
+        return CameraSummary(cameras, tally.dropped_share(since=self._window[0][1]))
 
-    def _health(self, name: str, camera: CameraStatus) -> CameraHealth:
+    def _health(self, name: str, camera: CameraStatus, now: float) -> CameraHealth:
         """A fault with frozen images counted since the last good state means that the camera is frozen."""
         frozen = camera.counts.get("frozen", 0)
         if camera.fault is None:
             self._frozen_before[name] = frozen
         is_frozen = camera.fault is not None and frozen > self._frozen_before[name]
         unplugged = camera.fault is not None and not is_frozen
-        return CameraHealth(camera.age_s, self._periods_s[name], unplugged=unplugged, frozen=is_frozen)
+        period_s = self._periods_s[name]
+        noisy = now - self._clean_s.setdefault(name, now) > self._timeout_periods * period_s
+        return CameraHealth(camera.age_s, period_s, unplugged=unplugged, frozen=is_frozen, noisy=noisy)
+
+
+class _Tally(NamedTuple):
+    """Frames of all cameras since the start. Few are decoded, so that these are a tally of their own."""
+
+    received: int
+    refused: int
+    """When they came."""
+    decoded: int
+    useless: int
+    """Of the decoded: they show nothing, or noise."""
+
+    @classmethod
+    def of(cls, status: Mapping[str, CameraStatus], noisy_images: int) -> Self:
+        """As of now."""
+
+        def count(*what: Count) -> int:
+            return sum(camera.counts.get(one, 0) for camera in status.values() for one in what)
+
+        undecodable = count("undecodable")
+        return cls(
+            received=count("received"),
+            refused=count(*_BAD) - undecodable,
+            decoded=count("used") + undecodable,
+            useless=undecodable + noisy_images,
+        )
+
+    def dropped_share(self, since: Self) -> float:
+        """The larger of the shares of those refused and of those useless, since another time."""
+        refused = (self.refused - since.refused) / max(self.received - since.received, 1)
+        return max(refused, (self.useless - since.useless) / max(self.decoded - since.decoded, 1))

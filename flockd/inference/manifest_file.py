@@ -14,7 +14,7 @@ from flockd.config.document import Place, key_text, read_document
 from flockd.config.perception import PerceptionConfig
 from flockd.config.validation_messages import problems_of
 from flockd.data import data_path
-from flockd.errors import ConfigError, ConfigProblem, ModelError
+from flockd.errors import ConfigError, ConfigProblem, ModelError, shortage_of
 from flockd.inference.manifest import Fault, Key, Manifest
 
 Check = Callable[[Manifest], Iterable[Fault]]
@@ -53,6 +53,8 @@ class ManifestFile:
                 raise self.error(("file",), f"{model} is larger than 2 GiB, which no ONNX file is; name the right one")
             content = model.read_bytes()
         except OSError as error:
+            if shortage_of(error):
+                raise
             reason = f"cannot read {model} ({error.strerror})"
             raise self.error(("file",), f"{reason}; put the model file back or name the right one") from None
         digest = hashlib.sha256(content).hexdigest()

@@ -15,6 +15,7 @@ from flockd.choices import Role
 from flockd.config.perception import PerceptionConfig
 from flockd.errors import ModelError
 from flockd.geometry import RigCamera
+from flockd.inference.checks import Deadline, no_deadline
 from flockd.inference.fitting import fit
 from flockd.inference.manifest import Unknown
 from flockd.inference.manifest_file import manifest_path
@@ -71,11 +72,12 @@ class Networks(Protocol):
 class OnnxNetworks:
     """The networks that a configuration names. Stateless: may serve several pilots."""
 
-    def __init__(self, config: PerceptionConfig, models_dir: Path) -> None:
-        """Raises ModelError."""
+    def __init__(self, config: PerceptionConfig, models_dir: Path, deadline: Deadline = no_deadline) -> None:
+        """``deadline`` is for each network's run on its golden input. Raises ModelError."""
         self._models: dict[str, OnnxModel] = {}
         self._dir = models_dir
         self._config = config
+        self._deadline = deadline
         cv2.setNumThreads(config.threads)
         self._flow = self._build_flow(config)
         self._depth = self._model(config.depth, "depth")
@@ -210,6 +212,7 @@ class OnnxNetworks:
                 provider=self._config.provider,
                 engines=engines_folder(self._config),
                 check=check_roles,
+                deadline=self._deadline,
             )
         model = self._models[key]
         if role not in model.manifest.roles:

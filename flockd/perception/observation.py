@@ -34,6 +34,8 @@ class Observation:
     """What the flow comes from; its own previous one is None. None where the pair starts anew."""
     reasons: tuple[str, ...] = ()
     """Why something is missing: each is one short sentence."""
+    noisy_cameras: tuple[str, ...] = ()
+    """Whose images were noise, and were not used."""
 
     @property
     def flows(self) -> dict[str, Float32Array]:

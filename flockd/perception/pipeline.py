@@ -8,10 +8,12 @@ from dataclasses import replace
 from flockd.config.perception import PerceptionConfig
 from flockd.geometry import Rig, ground_inverse_depth
 from flockd.inference import models_folder
+from flockd.inference.checks import Deadline, no_deadline
 from flockd.messages import Float32Array, Frame, FrameSet, VehicleState
 from flockd.perception.depth import VelocityScale, fix_by_height
 from flockd.perception.detection.detector import DetectionTrace, Detector
 from flockd.perception.detection.masks import depth_of_drones, without_borders
+from flockd.perception.image_noise import NoiseMonitor
 from flockd.perception.maps import SceneMaps
 from flockd.perception.networks import Networks, OnnxNetworks
 from flockd.perception.observation import CameraObservation, Observation
@@ -27,6 +29,7 @@ class Perception:
         self._rig, self._networks, self._config = rig, networks, config
         self._detector = Detector(rig, networks, config.detection)
         self._velocity_scale = VelocityScale(rig) if config.scale == "velocity" else None
+        self._noise = NoiseMonitor(config.noise)
         self._last: Observation | None = None
 
     def observe(
@@ -46,7 +49,7 @@ class Perception:
             trace: filled with what the detector went through, where a caller wants to see it.
             lap: called at the end of each stage with its name, to time it.
         """
-        usable, unusable = self._usable(frames)
+        usable, noisy, unusable = self._usable(frames)
         scenes, failed = self._scenes(usable, vehicle)
         lap("scene")
         previous, restarted = self._pair(frames)
@@ -61,13 +64,13 @@ class Perception:
             labels = without_borders(masks[name], self._config.detection.mask_border_px)
             cameras[name] = CameraObservation(images[name], depth, labels, flows.get(name))
         reasons = (*unusable, *failed, *restarted, *unscaled)
-        self._last = Observation(frames.time_s, vehicle, cameras, detections, previous, reasons)
+        self._last = Observation(frames.time_s, vehicle, cameras, detections, previous, reasons, noisy)
         lap("detection")
         return self._last
 
-    def _usable(self, frames: FrameSet) -> tuple[dict[str, Frame], Reasons]:
-        """The frames of the rig's cameras that have the right size."""
-        usable, reasons = {}, []
+    def _usable(self, frames: FrameSet) -> tuple[dict[str, Frame], tuple[str, ...], Reasons]:
+        """The frames of the rig's cameras that have the right size and show a scene, and whose show noise."""
+        usable, noisy, reasons = {}, [], []
         for name, camera in self._rig.cameras.items():
             width, height = camera.camera.size
             frame = frames.frames.get(name)
@@ -76,9 +79,12 @@ class Perception:
             elif frame.image.shape != (height, width, 3):
                 found = f"{frame.image.shape[1]}x{frame.image.shape[0]}"
                 reasons.append(f"camera {name}: its image is {found} and not {width}x{height}")
+            elif self._noise.is_noisy(name, frame.image, frames.time_s):
+                noisy.append(name)
+                reasons.append(f"camera {name}: its image is noise")
             else:
                 usable[name] = frame
-        return usable, reasons
+        return usable, tuple(noisy), reasons
 
     def _scenes(self, frames: Mapping[str, Frame], vehicle: VehicleState) -> tuple[dict[str, SceneMaps], Reasons]:
         """The networks' maps of every camera, with the scale that the height gives where it is to give it."""
@@ -131,6 +137,6 @@ class Perception:
         return self._velocity_scale.fix(before, vehicle, labels, scenes, flows)
 
 
-def load_networks(config: PerceptionConfig) -> OnnxNetworks:
-    """The networks that a configuration names. Raises ModelError."""
-    return OnnxNetworks(config, models_folder(config))
+def load_networks(config: PerceptionConfig, deadline: Deadline = no_deadline) -> OnnxNetworks:
+    """The networks that a configuration names; `deadline` is for the golden input of each. Raises ModelError."""
+    return OnnxNetworks(config, models_folder(config), deadline)

@@ -114,6 +114,7 @@ class FlockPilot:
             reasons=reasons,
             counts=Counter(reasons),
             stages_ms=laps.stages_ms,
+            noisy_cameras=observation.noisy_cameras or None,
         )
 
     def _refused(self, frames: FrameSet, reason: str) -> PilotOutput:

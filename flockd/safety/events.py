@@ -25,6 +25,8 @@ class CameraHealth:
     """Its device reported an error or is gone, and is not open again yet."""
     frozen: bool
     """It keeps sending the same image or the same sequence number."""
+    noisy: bool
+    """Its images have been noise for too long."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class Inputs:
     cameras: Mapping[str, CameraHealth]
     """Every camera of the rig, by name."""
     dropped_share: float
-    """Of the frames of the last seconds: corrupt, truncated, or stamped out of order."""
+    """Of the frames of the last seconds: corrupt, truncated, stamped out of order, or noise."""
     estimate_age_s: float
     """Of the pilot's newest output; infinite before the first."""
     ego_motion_failures: int
@@ -213,4 +215,6 @@ def _fault(camera: CameraHealth, p: SafetyParameters) -> str:
         return "unplugged"
     if camera.frozen:
         return "frozen"
+    if camera.noisy:
+        return "noisy"
     return "" if camera.age_s <= p.camera_timeout_periods * camera.period_s else "silent"

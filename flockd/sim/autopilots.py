@@ -18,6 +18,7 @@ from flockd.autopilot.fake_vehicle import Demand, MotionState
 from flockd.config.scenario import ScenarioConfig, StartConfig, VehicleConfig
 from flockd.errors import UnavailableError, UsageError
 from flockd.sim.ground_station import home_deg
+from flockd.sim.leftovers import described, px4_instance, user_of_port
 from flockd.sim.processes import Program, Programs
 from flockd.sim.vehicles import Vehicles
 
@@ -120,10 +121,14 @@ class Px4s:
     def __init__(
         self, scenario: ScenarioConfig, speed_factor: float, environment: Mapping[str, str], folder: Path
     ) -> None:
-        """Each works in a folder under ``folder``. Raises UnavailableError where there is no PX4."""
+        """Each works in a folder under ``folder``.
+
+        Raises UnavailableError where there is no PX4, or where an instance or a daemon of another flight still runs.
+        """
         if len(scenario.vehicles) > MAX_INSTANCES:
             raise UsageError(f"PX4 gives ports to {MAX_INSTANCES} vehicles, not {len(scenario.vehicles)}; fly fewer")
         self._build = px4_folder(environment)
+        _refuse_leftovers(len(scenario.vehicles))
         self._scenario, self._speed_factor, self._folder = scenario, speed_factor, folder
         self._environment = dict(environment)
         self.ports = tuple(Ports(OFFBOARD_PORT + i, TRUTH_PORT + i) for i in range(len(scenario.vehicles)))
@@ -160,6 +165,16 @@ class Px4s:
     def programs(self) -> Sequence[Program]:
         """See `Autopilots`."""
         return tuple(self._programs)
+
+
+def _refuse_leftovers(count: int) -> None:
+    for i in range(count):
+        instance = px4_instance(i)
+        if instance is not None:
+            raise UnavailableError(f"PX4 instance {i} runs already: {described(instance)}")
+        user = user_of_port(OFFBOARD_PORT + i)
+        if user is not None:
+            raise UnavailableError(f"UDP port {OFFBOARD_PORT + i} of PX4 instance {i} is used by {described(user)}")
 
 
 def px4_folder(environment: Mapping[str, str]) -> Path:

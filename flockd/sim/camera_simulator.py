@@ -12,6 +12,7 @@ from flockd.errors import UsageError
 from flockd.flocking import desired_velocity
 from flockd.geometry import PinholeCamera, build_rig
 from flockd.messages import FloatArray, Frame, FrameSet, UInt8Array
+from flockd.sim.camera_faults import CameraFaults
 from flockd.sim.drone_models import FAMILIES, drone_model
 from flockd.sim.renderer import Renderer
 from flockd.sim.truth_perception import RenderTruth
@@ -55,6 +56,7 @@ class CameraSimulator:
         models = [drone_model(family, int(rng.integers(1 << 31))) for _ in range(self._count)]
         self._renderer = Renderer(world, models)
         self._noise = _ImageNoise(scenario.sensors.image_noise, scenario.seed)
+        self._faults = CameraFaults(scenario.faults, scenario.seed)
 
     def capture(self, drone: int, step: int, time_s: float, vehicles: FlockPoses) -> tuple[FrameSet, RenderTruth]:
         """The frame set of one drone, and the truth behind it."""
@@ -68,7 +70,8 @@ class CameraSimulator:
                 mounted.camera.matrix, mounted.camera.size, turns[name], places[name],
                 drone_rotations=vehicles.R_ned_body, drone_positions=vehicles.position, shown=others,
             )  # fmt: skip
-            frames[name] = Frame(name, self._noise.add(views[name].rgb), time_s, step)
+            image = self._faults.applied(drone, name, time_s, self._noise.add(views[name].rgb))
+            frames[name] = Frame(name, image, time_s, step)
         truth = RenderTruth(views, turns, places, R_ned_body, position, vehicles.R_ned_body, vehicles.position, others)
         return FrameSet(time_s, frames), truth
 

@@ -12,7 +12,6 @@ from typing import Self
 
 import yaml
 
-import flockd
 from flockd.config import DroneConfig
 from flockd.config.recording import RecordingConfig
 from flockd.config.scenario import ScenarioConfig
@@ -78,15 +77,7 @@ class Daemons:
             environment: this process's own.
         """
         self._configs, self._folder, self._recordings = configs, folder, recordings
-        package = str(Path(flockd.__file__).parents[1])
-        known = environment.get("PYTHONPATH")
-        self._environment = {
-            **environment,
-            **ONE_THREAD,
-            **SMALL,
-            "PYTHONPATH": f"{package}:{known}" if known else package,
-            "XDG_RUNTIME_DIR": str(folder),
-        }
+        self._environment = {**environment, **ONE_THREAD, **SMALL, "XDG_RUNTIME_DIR": str(folder)}
         self._programs = Programs()
         self._listeners = [_Listener(folder / config.name) for config in configs]
 

@@ -23,6 +23,7 @@ from pymavlink.dialects.v20 import development as mavlink
 from flockd.autopilot.earth import metres_a_degree
 from flockd.errors import UnavailableError
 from flockd.messages import FloatArray
+from flockd.sim.leftovers import described, user_of_port
 from flockd.sim.vehicles import euler_rotation
 
 Mode = Literal["LOITER", "TAKEOFF", "LAND", "OFFBOARD"]
@@ -275,7 +276,7 @@ def _bound(port: int) -> socket.socket:
         bound.bind(("127.0.0.1", port))
     except OSError as error:
         bound.close()
-        raise UnavailableError(
-            f"UDP port {port} cannot be used ({error.strerror}); end the other simulation that uses it"
-        ) from error
+        user = user_of_port(port)
+        advice = "end the other simulation that uses it" if user is None else f"it is used by {described(user)}"
+        raise UnavailableError(f"UDP port {port} cannot be used ({error.strerror}); {advice}") from error
     return bound

@@ -95,7 +95,7 @@ class Assembler:
 
     def spoil(self, camera: str) -> None:
         """A frame of the last set turned out to be no image: the set is without this camera."""
-        self._lines[camera].counts.update({"corrupt": 1, "missing": 1, "used": -1})
+        self._lines[camera].counts.update({"corrupt": 1, "undecodable": 1, "missing": 1, "used": -1})
 
     def counts(self, camera: str) -> dict[Count, int]:
         """What happened to a camera's frames so far; what never happened is absent."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 
 from flockd.config.source import SourceParameters
@@ -14,6 +15,9 @@ from flockd.sources.image_formats import CorruptImageError
 
 _TICK_S = 0.01
 """How often a waiting reader checks whether a set that is not complete has waited long enough."""
+
+_USELESS_AFTER = 3
+"""So many images in a row that cannot be decoded, or show nothing, are a fault of their camera."""
 
 MAX_AHEAD_S = 0.02
 """Drivers that work out time stamps from the camera's own clock may be this much ahead."""
@@ -28,6 +32,8 @@ class FrameReceiver:
         self._clock = clock
         self._assembler = Assembler(cameras, parameters)
         self._faults: dict[str, str | None] = dict.fromkeys(cameras)
+        self._useless: Counter[str] = Counter()
+        """Images in a row, by camera."""
         self._changed = threading.Condition()
         self._stopped = False
 
@@ -75,8 +81,10 @@ class FrameReceiver:
         with self._changed:
             now_s = self._clock()
             return {
-                camera: CameraStatus(self._assembler.age_s(camera, now_s), fault, self._assembler.counts(camera))
-                for camera, fault in self._faults.items()
+                camera: CameraStatus(
+                    self._assembler.age_s(camera, now_s), self._fault(camera), self._assembler.counts(camera)
+                )
+                for camera in self._faults
             }
 
     def stop(self) -> None:
@@ -84,6 +92,10 @@ class FrameReceiver:
         with self._changed:
             self._stopped = True
             self._changed.notify_all()
+
+    def _fault(self, camera: str) -> str | None:
+        useless = self._useless[camera] >= _USELESS_AFTER
+        return f"{camera}: its images show nothing; check its lens and cable" if useless else self._faults[camera]
 
     def _next(self, until_s: float) -> RawFrameSet | None:
         with self._changed:
@@ -101,5 +113,7 @@ class FrameReceiver:
         except CorruptImageError:
             with self._changed:
                 self._assembler.spoil(raw.camera)
+                self._useless[raw.camera] += 1
             return None
+        self._useless[raw.camera] = 0
         return Frame(raw.camera, image, raw.time_s, raw.sequence)

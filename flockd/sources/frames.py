@@ -20,6 +20,7 @@ Count = Literal[
     "frozen",  # the same image or sequence number again and again
     "flagged",  # the driver itself says that the data are damaged
     "corrupt",  # wrong size, cannot be decoded, or decodes into what no camera sees
+    "undecodable",  # those of the corrupt that were found so only when decoded, as few frames are
     "malformed",  # a message that is not a frame
     "opened",  # times the device was opened
 ]

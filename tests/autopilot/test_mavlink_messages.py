@@ -116,8 +116,11 @@ def test_home_stays_while_armed_whatever_landed_state_and_home_say_and_moves_aft
     assert status.home_ned is not None and vehicle is not None
     assert list(status.home_ned) == [1.0, 0.0, -0.2]
     assert vehicle.height_m == pytest.approx(4.8)  # -0.2 + 5.0
-    assert len(log) == 1
-    assert "home moved by 53.0 m in flight" in log[0]  # sqrt(49^2 + 20.2^2)
+    assert log == [
+        "the autopilot reports that the drone is on the ground, still armed",
+        "the autopilot's home moved by 53.0 m in flight; "  # sqrt(49^2 + 20.2^2)
+        "height band and fence stay where they were until it is disarmed",
+    ]
     received.add("HEARTBEAT", DISARMED, 12.0)
     received.add(*_home(2.0, -0.1), 13.0)
     assert received.home_down_m == -0.1

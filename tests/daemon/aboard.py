@@ -36,6 +36,7 @@ from tests.autopilot.flight import until
 from tests.perception.shipped import SECOND_STAGE
 
 WIDTH, HEIGHT = 64, 48
+COARSE_PX = 8
 CAMERAS = ("front", "back")
 FRAMES_HZ = 10.0
 STEP_S = 0.25
@@ -86,20 +87,27 @@ Image = Callable[[str, int], UInt8Array]
 """What a camera sees, by its name and the number of the frame."""
 
 
-def noise(camera: str, number: int) -> UInt8Array:
-    """(HEIGHT, WIDTH, 3): enough where `TinyPerceiver` stands in for networks."""
+def noise(camera: str, number: int, grain_px: int = 1) -> UInt8Array:
+    """(HEIGHT, WIDTH, 3), different in each frame."""
     rng = np.random.default_rng([CAMERAS.index(camera), number])
-    return rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    pattern = rng.integers(0, 256, (HEIGHT // grain_px, WIDTH // grain_px, 3), dtype=np.uint8)
+    return pattern.repeat(grain_px, axis=0).repeat(grain_px, axis=1)
+
+
+def coarse(camera: str, number: int) -> UInt8Array:
+    """The same in patches, which is no noise: enough where `TinyPerceiver` stands in for networks."""
+    return noise(camera, number, COARSE_PX)
 
 
 class Cameras:
     """Publishes pictures of all cameras until told otherwise."""
 
-    def __init__(self, endpoint: str, image: Image = noise) -> None:
+    def __init__(self, endpoint: str, image: Image = coarse) -> None:
         self.silent: set[str] = set()
         self.spoil: Callable[[Frame], Frame] = lambda frame: frame
         """What a story does to each frame before it is sent."""
         self._image = image
+        self.noisy: set[str] = set()
         self._publisher = FramePublisher(listen=[endpoint])
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -116,7 +124,8 @@ class Cameras:
             number += 1
             for camera in CAMERAS:
                 if camera not in self.silent:
-                    frame = Frame(camera, self._image(camera, number), time.monotonic(), number)
+                    show = noise if camera in self.noisy else self._image
+                    frame = Frame(camera, show(camera, number), time.monotonic(), number)
                     self._publisher.publish("tiny", self.spoil(frame))
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import development as mavlink
 
 from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.config import DroneConfig
@@ -135,6 +137,66 @@ def test_one_camera_gone_is_a_slower_flight_and_all_gone_a_hover_and_then_hold(
             assert ship.state() == "silent", "no re-entry by itself"
 
     tell(story)
+
+
+def test_a_noisy_camera_is_lost_and_said_so_until_it_is_good_again(
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
+) -> None:
+    async def story() -> None:
+        async with aboard(fake_autopilot, port, tmp_path) as ship:
+            await ship.is_ready_in_the_air()
+            await ship.flies()
+            ship.cameras.noisy.add("back")
+            await ship.until_event("degraded: a camera is lost: back noisy")
+            assert fake_autopilot.mode == "OFFBOARD"
+            await until(lambda: "frames_dropped" in ship.matters(), SECONDS_TO_FAIL)  # of two cameras' images a half
+            assert ship.heard()["computer"].message["cameras"]["back"]["counts"]["noisy"] > 0
+            assert "camera back: its image is noise" in ship.heard()["health"].message["reasons"]
+            ship.cameras.noisy.clear()
+            await until(lambda: "camera_lost" not in ship.matters(), SECONDS_TO_FAIL)
+            assert fake_autopilot.mode == "OFFBOARD"
+            ship.cameras.noisy |= set(CAMERAS)
+            await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+            await ship.until_event("hover: too few cameras deliver images: front noisy, back noisy")
+            assert not fake_autopilot.failsafe, "it was asked for Hold, not left to its failsafe"
+
+    tell(story)
+
+
+def test_a_second_sender_with_the_autopilots_ids_moves_neither_height_band_nor_fence(
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
+) -> None:
+    """Home half a kilometre away and 20 m deeper, and the drone on the ground: outside of both, if it were believed."""
+
+    async def story() -> None:
+        async with aboard(fake_autopilot, port, tmp_path) as ship:
+            await ship.is_ready_in_the_air()
+            await ship.flies()
+            held_m = fake_autopilot.setpoints[-1][1].height_m
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
+                forged = mavlink.MAVLink(_Sender(wire, port), srcSystem=1, srcComponent=1)
+                for _ in range(10):
+                    forged.extended_sys_state_send(0, mavlink.MAV_LANDED_STATE_ON_GROUND)
+                    forged.home_position_send(0, 0, 0, 500.0, 0.0, 20.0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0)
+                    await asyncio.sleep(0.1)
+            await ship.until_event("the autopilot's home moved by 500.4 m in flight")  # sqrt(500^2 + 20^2)
+            await ship.until_event("the autopilot reports that the drone is on the ground")
+            assert not {"fence_left", "heights_left"} & ship.matters()
+            assert ship.state() in {"normal", "degraded"}
+            assert fake_autopilot.mode == "OFFBOARD"
+            assert fake_autopilot.setpoints[-1][1].height_m == pytest.approx(held_m, abs=0.01)
+
+    tell(story)
+
+
+class _Sender:
+    """In a file's place, for pymavlink: sends to the daemon's port."""
+
+    def __init__(self, wire: socket.socket, port: int) -> None:
+        self._wire, self._port = wire, port
+
+    def write(self, data: bytes) -> None:
+        self._wire.sendto(data, ("127.0.0.1", self._port))
 
 
 def test_networks_not_finite_or_stuck_degrade_and_sigterm_ends_in_hold(

@@ -207,11 +207,7 @@ def _status(fault: str | None, **counts: int) -> dict[str, CameraStatus]:
 
 
 def test_monitor_tell_frozen_from_unplugged_and_count_bad_frames_of_late() -> None:
-    camera = CameraConfig(
-        name="front", size_px=(64, 48), intrinsics=IntrinsicsConfig(fx=32.0, fy=32.0, cx=32.0, cy=24.0)
-    )
-    config = DroneConfig(rig=RigConfig(cameras=(camera,)), source=SourceParameters(kind="shared_memory"))
-    monitor = CameraMonitor(config)
+    monitor = CameraMonitor(_flyable("front"))
     fine = monitor.update(0.0, _status(None, received=100, frozen=3)).cameras["front"]
     assert (fine.unplugged, fine.frozen, fine.period_s) == (False, False, 0.1)
     gone = monitor.update(1.0, _status("front: no such device", received=100, frozen=3)).cameras["front"]
@@ -222,6 +218,34 @@ def test_monitor_tell_frozen_from_unplugged_and_count_bad_frames_of_late() -> No
     late = monitor.update(4.0, _status(None, received=140, corrupt=10))
     assert late.dropped_share == 10 / 40
     assert monitor.update(12.0, _status(None, received=150, corrupt=10)).dropped_share == 0.0
+
+
+def _flyable(*cameras: str) -> DroneConfig:
+    lens = IntrinsicsConfig(fx=32.0, fy=32.0, cx=32.0, cy=24.0)
+    rig = RigConfig(cameras=tuple(CameraConfig(name=name, size_px=(64, 48), intrinsics=lens) for name in cameras))
+    return DroneConfig(rig=rig, source=SourceParameters(kind="shared_memory"))
+
+
+def test_images_found_useless_when_decoded_count_against_the_few_that_are_decoded() -> None:
+    """A camera at 30 Hz of which every fifteenth image is used: 20 of 300, and yet all that anybody saw of it."""
+    monitor = CameraMonitor(_flyable("front"))
+    monitor.update(0.0, _status(None, received=0, used=0))
+    assert monitor.update(1.0, _status(None, received=300, used=15, corrupt=5, undecodable=5)).dropped_share == 5 / 20
+    assert monitor.update(2.0, _status(None, received=600, used=40), noisy_images=10).dropped_share == 10 / 40
+    assert monitor.update(3.0, _status(None, received=900, used=40, corrupt=600)).dropped_share == 600 / 900
+
+
+def test_a_camera_whose_images_are_noise_for_three_of_its_periods_is_lost() -> None:
+    monitor = CameraMonitor(_flyable("front", "back"))
+    status = {**_status(None), "back": _status(None)["front"]}
+
+    def lost(now: float, *noisy: str) -> list[str]:
+        return [name for name, health in monitor.update(now, status, noisy).cameras.items() if health.noisy]
+
+    assert lost(10.0) == []
+    assert lost(10.25, "front") == []  # at 10 Hz, 0.3 s are allowed
+    assert lost(10.35, "front") == ["front"]
+    assert lost(10.4) == []
 
 
 def test_frames_get_the_vehicle_state_of_their_time() -> None:

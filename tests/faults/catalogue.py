@@ -76,6 +76,17 @@ CATALOGUE = (
         within_s=3.0,
     ),
     Fault(
+        3,
+        "damaged-images",
+        "corrupt or truncated images",
+        "dropped and counted; degraded above a fifth",
+        (
+            *_here("cameras.py::test_images_are_damaged"),
+            "tests/sources/test_v4l2.py::test_what_is_worth_nothing_is_dropped_and_counted_and_the_next_is_fine",
+        ),
+        within_s=6.0,
+    ),
+    Fault(
         4,
         "time-stamps-backwards",
         "time stamps are repeated or run backwards",
@@ -133,7 +144,7 @@ CATALOGUE = (
         "overrun",
         "steps take too long, or the computer is too hot",
         "newest frame only, slower, then Hold",
-        _here("computer.py::test_steps_take_three_times_as_long_as_they_may", "computer.py::test_it_gets_too_hot"),
+        _here("computer.py::test_steps_take_longer_than_they_may", "computer.py::test_it_gets_too_hot"),
         within_s=8.0,
     ),
     Fault(
@@ -211,6 +222,16 @@ CATALOGUE = (
         within_s=6.0,
     ),
     Fault(
+        18,
+        "false-neighbour",
+        "a drone is detected where there is none",
+        "not confirmed before several hits; bounded influence",
+        (
+            "tests/tracking/test_tracker.py::test_false_detections_of_one_frame_are_never_confirmed",
+            "tests/tracking/test_tracker.py::test_one_frame_three_metres_off_moves_a_confirmed_track_little",
+        ),
+    ),
+    Fault(
         19,
         "command-not-finite",
         "a command that is not finite, or far too large",
@@ -268,7 +289,7 @@ CATALOGUE = (
         "the configuration is wrong",
         "refuse to start with exit code 78: line, key, value, what to do",
         _here("start.py::test_the_configuration_is_wrong"),
-        within_s=10.0,
+        within_s=30.0,
     ),
     Fault(
         26,
@@ -305,6 +326,18 @@ CATALOGUE = (
         ),
     ),
     Fault(
+        30,
+        "noisy-camera",
+        "a camera shows noise",
+        "it counts as lost; no neighbour from it alone; the command stays within 0.1 m/s",
+        (
+            *_here("cameras.py::test_a_camera_shows_noise"),
+            f"{_FLIGHT}test_a_noisy_camera_is_lost_and_said_so_until_it_is_good_again",
+            "tests/pilot/test_noisy_camera.py",
+        ),
+        within_s=4.0,
+    ),
+    Fault(
         31,
         "absurd-mavlink",
         "a MAVLink message with unknown or absurd values",
@@ -312,6 +345,17 @@ CATALOGUE = (
         (
             *_here("autopilot.py::test_messages_with_absurd_values"),
             "tests/autopilot/test_link.py::test_a_landed_state_that_mavlink_does_not_have_is_unknown_and_counted",
+        ),
+    ),
+    Fault(
+        32,
+        "home-moved",
+        "home or the ground state changes in flight, by a second sender",
+        "height band and fence stay until it is disarmed; reported",
+        (
+            f"{_FLIGHT}test_a_second_sender_with_the_autopilots_ids_moves_neither_height_band_nor_fence",
+            "tests/autopilot/test_mavlink_messages.py::"
+            "test_home_stays_while_armed_whatever_landed_state_and_home_say_and_moves_after",
         ),
     ),
     Fault(
@@ -330,6 +374,16 @@ CATALOGUE = (
         (
             *_here("recording.py::test_foreign_things_lie_among_the_recordings"),
             "tests/recording/test_recorder.py::test_what_is_no_readable_file_in_the_folder_is_skipped_with_a_warning",
+        ),
+    ),
+    Fault(
+        35,
+        "endless-network",
+        "a network that never ends",
+        "refuse to start with exit code 78 within 10 s",
+        (
+            "tests/cli/test_run.py::test_a_network_that_never_ends_is_bad_configuration_within_ten_seconds",
+            "tests/inference/test_deadline.py::test_an_endless_network_is_refused_in_one_sentence",
         ),
     ),
     Fault(
@@ -376,7 +430,7 @@ CATALOGUE = (
         "simulator-killed",
         "the simulator, or who started a daemon in simulation, is killed",
         "its daemons and autopilots end with it",
-        ("tests/sim/test_orphans.py",),
+        (*_here("simulator.py::test_the_simulator_is_killed_in_flight"), "tests/sim/test_orphans.py"),
         within_s=5.0,
     ),
     Fault(
@@ -388,6 +442,13 @@ CATALOGUE = (
             *_here("autopilot.py::test_offboard_is_refused_and_the_whole_reason_reported"),
             "tests/autopilot/test_mavlink_messages.py::test_a_text_in_chunks_is_seen_whole_and_not_before",
         ),
+    ),
+    Fault(
+        42,
+        "nothing-left-at-start",
+        "no file descriptors or memory are left at the start",
+        "one sentence, exit code 69; never an abort",
+        _here("computer.py::test_no_descriptors_are_left_at_the_start"),
     ),
     Fault(
         43,
@@ -408,5 +469,21 @@ CATALOGUE = (
             *_here("flock.py::test_two_drones_at_one_spot_part"),
             "tests/flocking/test_law.py::test_two_drones_at_one_level_spot_part_each_to_its_own_right",
         ),
+    ),
+    Fault(
+        45,
+        "computer-stalls",
+        "the computer stalls for seconds",
+        "the autopilot's failsafe; no return by itself; the event names the stall",
+        _here("computer.py::test_the_computer_stalls_for_seconds"),
+        within_s=0.5,
+    ),
+    Fault(
+        46,
+        "ground-reached",
+        "the ground is reached in flight",
+        "no depth scale, no exception; landing is recorded and reported",
+        _here("autopilot.py::test_the_ground_is_reached_in_flight"),
+        within_s=6.0,
     ),
 )

@@ -8,10 +8,12 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.autopilot.fake_telemetry import Mode
+from flockd.autopilot.fake_vehicle import Demand
 from flockd.config import DroneConfig
 from tests.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
 from tests.autopilot.flight import until
@@ -155,5 +157,26 @@ def test_messages_with_absurd_values(tmp_path: Path) -> None:
             assert process.program.ended is None
             assert "landed_state = 5" in process.log(), "counted and logged"
             assert "\x1b" not in process.log()
+
+    tell(story)
+
+
+def test_the_ground_is_reached_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
+    """The vehicle sinks whatever it is told; its barometer says zero and less. Landing is reported and recorded."""
+
+    async def story() -> None:
+        async with flying(tmp_path) as process:
+            autopilot = process.fake_autopilot
+            autopilot._demand = lambda: Demand(np.zeros(2), 0.4, 0.0)  # type: ignore[method-assign]
+            await until(lambda: float(autopilot.state.position[2]) > -0.1, SECONDS_TO_FAIL)
+            fault_s = time.monotonic()
+            await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+            reacted(record_property, "ground-reached", time.monotonic() - fault_s)
+            await until(lambda: process.heard()["flight"].message["in_air"] is False, SECONDS_TO_FAIL)
+            assert any("land" in event or "ground" in event for event in process.events), process.events
+            steps = process.heard()["computer"].message["steps"]
+            await until(lambda: process.heard()["computer"].message["steps"] > steps + 3, SECONDS_TO_FAIL)
+            assert process.program.ended is None
+            assert "Traceback" not in process.log()
 
     tell(story)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -128,6 +129,55 @@ def test_a_frame_of_another_time_silences_nobody(
             await process.until_state("normal")
 
     tell(story)
+
+
+def test_images_are_damaged(tmp_path: Path, record_property: RecordProperty) -> None:
+    """Every second image is cut off: dropped and counted; the drone flies on by the others."""
+
+    def cut_off(frame: Frame) -> Frame:
+        return frame if frame.sequence % 2 else replace(frame, image=frame.image[:7])
+
+    async def story() -> None:
+        async with flying(tmp_path) as process:
+            process.cameras.spoil = cut_off
+            fault_s = time.monotonic()
+            await until(lambda: "frames_dropped" in process.matters(), SECONDS_TO_FAIL)
+            reacted(record_property, "damaged-images", time.monotonic() - fault_s)
+            assert sum(_counted(process, "front", what) for what in ("malformed", "corrupt")) > 0
+            assert process.fake_autopilot.mode == "OFFBOARD"
+            _good_again(process)
+            await until(lambda: "frames_dropped" not in process.matters(), SECONDS_TO_FAIL)
+            await process.until_state("normal")
+
+    tell(story)
+
+
+def test_a_camera_shows_noise(tmp_path: Path, record_property: RecordProperty) -> None:
+    """It counts as lost, invents no neighbour, and the command stays what the other camera gives: 1 m/s north."""
+
+    async def story() -> None:
+        async with flying(tmp_path) as process:
+            await until(lambda: _speed_north(process) > 0.97, SECONDS_TO_FAIL)
+            process.cameras.noisy.add("back")
+            fault_s = time.monotonic()
+            lost = False
+            while not lost or time.monotonic() < fault_s + 5.0:
+                assert not any(n["confirmed"] for n in process.heard()["neighbours"].message["neighbours"])
+                assert abs(_speed_north(process) - 1.0) < 0.1
+                if not lost and any(event.startswith("degraded: a camera is lost: back") for event in process.events):
+                    lost = True
+                    reacted(record_property, "noisy-camera", time.monotonic() - fault_s)
+                assert time.monotonic() < fault_s + SECONDS_TO_FAIL
+                await asyncio.sleep(0.05)
+            assert process.fake_autopilot.mode == "OFFBOARD"
+            process.cameras.noisy.clear()
+            await until(lambda: "camera_lost" not in process.matters(), SECONDS_TO_FAIL)
+
+    tell(story)
+
+
+def _speed_north(process: Process) -> float:
+    return float(process.heard()["command"].message["velocity_ne"][0])
 
 
 def _counted(process: Process, camera: str, what: str) -> int:

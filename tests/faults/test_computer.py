@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import os
 import resource
+import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
 import pytest
+import yaml
 
 from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.config import DroneConfig
@@ -16,12 +21,13 @@ from flockd.daemon import DaemonError
 from flockd.daemon.host_monitors import WallClock
 from tests.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
 from tests.autopilot.flight import until
-from tests.daemon.aboard import SECONDS_TO_FAIL, Aboard, TinyPerceiver, aboard
+from tests.daemon.aboard import SECONDS_TO_FAIL, Aboard, TinyPerceiver, aboard, config_for, free_endpoint
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import flying
 from tests.starvation import tell
 
 pytestmark = pytest.mark.slow
+ROOT = Path(__file__).parents[2]
 
 
 async def _flies(ship: Aboard) -> None:
@@ -93,13 +99,13 @@ def _is_not_fed(ship: Aboard) -> bool:
     return components is not None and components.networks.hopeless
 
 
-def test_steps_take_three_times_as_long_as_they_may(
+def test_steps_take_longer_than_they_may(
     tmp_path: Path, in_the_air: tuple[FakeAutopilot, int], record_property: RecordProperty,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """Frames are not queued: each step takes the newest; the drone hovers and asks for Hold."""
     autopilot, port = in_the_air
-    change = functools.partial(_alone, degraded_load=1.0, max_load=2.0)
+    change = functools.partial(_alone, degraded_load=1.05, max_load=1.1)
 
     async def story() -> None:
         with autopilot:
@@ -108,7 +114,7 @@ def test_steps_take_three_times_as_long_as_they_may(
                 flow = TinyPerceiver.flow
 
                 def slow(*arguments: object) -> object:
-                    time.sleep(0.4)
+                    time.sleep(0.15)
                     return flow(*arguments)  # type: ignore[arg-type]
 
                 monkeypatch.setattr(TinyPerceiver, "flow", slow)
@@ -221,16 +227,16 @@ def test_the_wall_clock_is_set(
 
 
 def test_the_memory_is_used_up_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
-    """Nothing more can be had: the process ends or asks for Hold, and a new one beside the same drone is idle."""
+    """No more can be had, so nothing is commanded; then Linux kills the process, and a new one is idle."""
 
     async def story() -> None:
         async with flying(tmp_path) as process:
-            pid = process.program.process.pid
             fault_s = time.monotonic()
-            resource.prlimit(pid, resource.RLIMIT_AS, (1, 1))
+            resource.prlimit(process.program.process.pid, resource.RLIMIT_AS, (1, 1))
             await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
             reacted(record_property, "out-of-memory", time.monotonic() - fault_s)
-            assert await process.ended() != 0
+            process.signal(signal.SIGKILL)
+            assert await process.ended() == -signal.SIGKILL
             sent = len(process.fake_autopilot.setpoints)
             process.fake_autopilot.pilot_selects("LOITER")
             process.daemons.start()
@@ -240,3 +246,38 @@ def test_the_memory_is_used_up_in_flight(tmp_path: Path, record_property: Record
             assert len(process.fake_autopilot.setpoints) == sent
 
     tell(story)
+
+
+def test_the_computer_stalls_for_seconds(tmp_path: Path, record_property: RecordProperty) -> None:
+    """Stopped for 3 s: the failsafe acts, and when it goes on it stays silent and says what happened."""
+
+    async def story() -> None:
+        async with flying(tmp_path) as process:
+            stopped_s = process.signal(signal.SIGSTOP)
+            await asyncio.sleep(3.0)
+            process.signal(signal.SIGCONT)
+            reacted(record_property, "computer-stalls", max(0.0, process.last_setpoint_s() - stopped_s))
+            assert process.fake_autopilot.failsafe
+            await process.until_event("silent: ")
+            sent = len(process.fake_autopilot.setpoints)
+            await asyncio.sleep(1.5)
+            assert len(process.fake_autopilot.setpoints) == sent, "one more, and PX4 would be in offboard again"
+            assert any("stall" in event or "stopped" in event or "late" in event for event in process.events)
+
+    tell(story)
+
+
+def test_no_descriptors_are_left_at_the_start(tmp_path: Path) -> None:
+    """One sentence and exit code 69, however few there are; never an abort."""
+    config = config_for(free_port(), free_endpoint(), free_endpoint())
+    path = tmp_path / "drone.yaml"
+    path.write_text(yaml.safe_dump(config.model_dump(mode="json", exclude_defaults=True)), encoding="utf-8")
+    run = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
+    for limit, count in ((resource.RLIMIT_NOFILE, 24), (resource.RLIMIT_NOFILE, 40), (resource.RLIMIT_AS, 450 << 20)):
+        ended = subprocess.run(
+            [sys.executable, "-c", run, "run", "--config", str(path)], cwd=ROOT, capture_output=True, text=True,
+            check=False, timeout=60.0, env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)},
+            preexec_fn=functools.partial(resource.setrlimit, limit, (count, count)),
+        )  # fmt: skip
+        assert ended.returncode == 69, ended.stderr[-1000:]
+        assert "Traceback" not in ended.stderr

@@ -18,9 +18,9 @@ from tests.inference.foreign import SIZE, image_input, map_output, write_model
 
 
 def endless(folder: Path) -> Path:
-    """A network that adds 0 to its image, 2^62 times."""
+    """A flow network that adds 0 to the difference of its images, 2^62 times."""
     width, height = SIZE
-    shape = [1, 3, height, width]
+    image, flow = [1, height, width, 1], [1, height, width, 2]
     body = helper.make_graph(
         [
             helper.make_node("Add", ["carried", "nothing"], ["next"]),
@@ -30,19 +30,24 @@ def endless(folder: Path) -> Path:
         [
             helper.make_tensor_value_info("number", TensorProto.INT64, []),
             helper.make_tensor_value_info("go", TensorProto.BOOL, []),
-            helper.make_tensor_value_info("carried", TensorProto.FLOAT, shape),
+            helper.make_tensor_value_info("carried", TensorProto.FLOAT, flow),
         ],
         [
             helper.make_tensor_value_info("go_on", TensorProto.BOOL, []),
-            helper.make_tensor_value_info("next", TensorProto.FLOAT, shape),
+            helper.make_tensor_value_info("next", TensorProto.FLOAT, flow),
         ],
     )
+    nodes = [
+        helper.make_node("Sub", ["a", "b"], ["difference"]),
+        helper.make_node("Add", ["difference", "nothing"], ["begin"]),
+        helper.make_node("Loop", ["count", "true", "begin"], ["motion"], body=body),
+    ]
+    spec = image_input(shape=image, layout="nhwc", colour="grey", white=255.0)
     return write_model(
-        folder, "endless", "anything", [helper.make_node("Loop", ["count", "true", "image"], ["map"], body=body)],
-        inputs={"image": image_input()}, outputs={"map": map_output(shape)}, golden=False,
-        weights={
-            "count": np.array(2**62, np.int64), "true": np.array(True), "nothing": np.zeros(1, np.float32),
-        },
+        folder, "endless", "flow", nodes,
+        inputs={"a": {**spec, "carries": "first"}, "b": {**spec, "carries": "second"}},
+        outputs={"motion": map_output(flow, layout="nhwc", gives="flow", unit="px")}, golden=False,
+        weights={"count": np.array(2**62, np.int64), "true": np.array(True), "nothing": np.zeros(2, np.float32)},
     )  # fmt: skip
 
 

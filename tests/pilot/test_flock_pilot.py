@@ -133,6 +133,23 @@ def test_blind_cameras_still_give_a_finite_command() -> None:
     assert math.isfinite(output.command.yaw_rad)
 
 
+@pytest.mark.parametrize(("height_m", "blind"), [(0.0, 2), (-0.5, 4), (-2.0, 4)], ids=["at", "below", "far below"])
+def test_at_the_ground_or_below_there_is_no_depth_and_the_flight_goes_on_above(height_m: float, blind: int) -> None:
+    """At a height of 0, a tilted drone has cameras on one side below the ground."""
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+    flyer.step()
+    flyer.move()
+    frames, state = flyer.take_frames()
+    output = flyer.pilot.step(frames, replace(state, height_m=height_m))
+    assert sum("is not above the ground" in reason for reason in output.reasons) >= blind
+    assert output.ego_motion is None or blind < len(frames.frames)
+    assert np.isfinite(output.command.velocity).all()
+    flyer.move()
+    flyer.step()
+    flyer.move()
+    assert flyer.step().ego_motion is not None
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [

@@ -10,7 +10,7 @@ from flockd.safety import OFFBOARD, Action, CameraHealth, Decision, Event, Input
 STEP_S = 1 / 16
 """Of the supervisor. A power of two, so that the clock adds up without rounding."""
 
-SEES = CameraHealth(age_s=0.02, period_s=0.033, unplugged=False, frozen=False)
+SEES = CameraHealth(age_s=0.02, period_s=0.033, unplugged=False, frozen=False, noisy=False)
 UNPLUGGED = replace(SEES, unplugged=True)
 ALL_SEE = {"front": SEES, "right": SEES, "back": SEES, "left": SEES}
 ONE_LOST = ALL_SEE | {"back": UNPLUGGED}

@@ -231,7 +231,22 @@ def test_what_only_the_decoder_notices_leaves_its_camera_out_of_the_set(start: S
     _received(source, front=1, back=1)
     assert _next(source).frames.keys() == {"back"}
     counts = source.status()["front"].counts
-    assert counts == {"received": 1, "corrupt": 1, "missing": 1, "opened": 1}
+    assert counts == {"received": 1, "corrupt": 1, "undecodable": 1, "missing": 1, "opened": 1}
+
+
+def test_a_camera_whose_images_show_nothing_has_a_fault_until_one_shows_something(start: Start) -> None:
+    kernel = FakeKernel(front=FakeCamera(), back=FakeCamera())
+    source = start(kernel, _camera("front"), _camera("back"))
+    plain = [jpeg(np.full_like(scene(), level)) for level in (60, 61, 62)]
+    for number, data in enumerate([*plain, JPEGS[0]]):
+        kernel.send("front", data)
+        kernel.send("back", JPEGS[number + 1])
+        _received(source, front=number + 1, back=number + 1)
+        fault = source.status()["front"].fault
+        assert fault == (None if number < 3 else "front: its images show nothing; check its lens and cable")
+        assert _next(source).frames.keys() == ({"back"} if number < 3 else {"front", "back"})
+    assert source.status()["front"].fault is None
+    assert source.status()["front"].counts["undecodable"] == 3
 
 
 def test_a_stamp_that_does_not_increase_is_dropped(start: Start) -> None:
