@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
 from flockd.recording import RecordingError, foxglove
 from flockd.recording.codec import from_json, parsed
@@ -94,7 +95,7 @@ def test_no_name_in_a_recording_leads_out_of_the_folder_of_an_export(tmp_path: P
 @pytest.mark.parametrize(("camera", "kind"), [("..", "png"), ("front", "/../../../out")])
 def test_no_image_is_written_outside_either(tmp_path: Path, whole: Path, camera: str, kind: str) -> None:
     def renamed(entry: Entry) -> Entry:
-        message = foxglove.CompressedImage(frame_id=camera, data=b"x", format=kind).SerializeToString()
+        message = CompressedImage(frame_id=camera, data=b"x", format=kind).SerializeToString()
         return replace(entry, stream=replace(entry.stream, topic=f"/camera/{camera}/image"), data=message)
 
     folder = tmp_path / "a" / "images"

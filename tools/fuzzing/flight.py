@@ -233,7 +233,7 @@ def _supervisor(folder: Path) -> Check:
 
 def _quiet() -> Inputs:
     """An undisturbed flight, on the ground or in the air by what is changed."""
-    sees = CameraHealth(age_s=0.02, period_s=0.033, unplugged=False, frozen=False)
+    sees = CameraHealth(age_s=0.02, period_s=0.033, unplugged=False, frozen=False, noisy=False)
     fine: dict[str, Any] = dict.fromkeys(_NUMBERS, 0.01) | dict.fromkeys(_FLAGS, False) | dict.fromkeys(_COUNTS, 0)
     fine |= {"nearest_neighbour_m": 3.0, "cameras": {"front": sees, "back": sees}, "temperature_c": 50.0}
     return Inputs(**fine, dead_tasks=(), flight_mode=OFFBOARD, armed=True, in_air=True)
@@ -254,7 +254,8 @@ def _changes(random: Random) -> dict[str, Any]:
             case 4:
                 changes["flight_mode"] = random.choice((OFFBOARD, "hold", "", None))
             case 5:
-                one = CameraHealth(any_float(random), any_float(random), random.random() < 0.5, random.random() < 0.5)
+                flags = [random.random() < 0.5 for _ in range(3)]
+                one = CameraHealth(any_float(random), any_float(random), *flags)
                 changes["cameras"] = {} if random.random() < 0.1 else {"front": one, "back": one}
             case 6:
                 changes |= {"armed": False, "in_air": False, "resume_asked": random.random() < 0.5}
