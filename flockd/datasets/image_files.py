@@ -50,8 +50,9 @@ def _decoded(path: Path, flags: int) -> cv2.typing.MatLike:
         data = _read(path)
         fault = _fault(data)
         image = None if fault else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror}); restore it, or leave its frame out") from None
+    except (OSError, ValueError) as error:  # ValueError: what a list names cannot be a path
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise DatasetError(f"{path}: cannot be read ({reason}); restore it, or leave its frame out") from None
     except cv2.error:  # of a header that claims more pixels than OpenCV takes
         image, fault = None, "cannot be decoded"
     finally:
