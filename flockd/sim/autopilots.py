@@ -34,7 +34,7 @@ PARAMETERS = {
     "EKF2_GYR_NOISE": "0.1",
     "EKF2_ACC_NOISE": "1.0",
     "EKF2_MAG_NOISE": "0.02",
-    "COM_OF_LOSS_T": "1.0",  # PX4 shortens it by the speed factor, as if it counted in real seconds
+    "COM_OF_LOSS_T": "1.0",  # simulated seconds; PX4's start script would multiply its default by the speed factor
     "COM_OBL_RC_ACT": "5",
     "SDLOG_BACKEND": "0",
 }

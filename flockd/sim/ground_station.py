@@ -12,7 +12,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Literal, Self
 
@@ -21,6 +21,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import development as mavlink
 
 from flockd.autopilot.earth import metres_a_degree
+from flockd.autopilot.mavlink_messages import StatusText
 from flockd.errors import UnavailableError
 from flockd.messages import FloatArray
 from flockd.sim.vehicles import euler_rotation
@@ -85,6 +86,7 @@ class _Vehicle:
     """On its clock, and then on ours."""
     version: str | None = None
     text: str = ""
+    chunks: StatusText = field(default_factory=StatusText)
 
     def write(self, data: bytes) -> None:
         if self.address is not None:
@@ -151,7 +153,7 @@ class GroundStation:
         return self._vehicles[number].armed
 
     def last_text(self, number: int) -> str:
-        """Its last STATUSTEXT; empty if there was none."""
+        """Its last STATUSTEXT, whole; empty if there was none."""
         return self._vehicles[number].text
 
     def version(self, number: int) -> str | None:
@@ -219,7 +221,9 @@ def _update(vehicle: _Vehicle, message: Any, now: float) -> None:
         case "SYSTEM_TIME":
             vehicle.booted_s = message.time_boot_ms * 1e-3, now
         case "STATUSTEXT":
-            vehicle.text = message.text.strip()
+            text = vehicle.chunks.joined(message.to_dict())
+            if text is not None:
+                vehicle.text = text.strip()
         case "AUTOPILOT_VERSION":
             vehicle.version = ".".join(str(message.flight_sw_version >> shift & 0xFF) for shift in (24, 16, 8))
         case _:
