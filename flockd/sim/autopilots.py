@@ -118,14 +118,23 @@ class Px4s:
     name = "PX4 SITL"
 
     def __init__(
-        self, scenario: ScenarioConfig, speed_factor: float, environment: Mapping[str, str], folder: Path
+        self,
+        scenario: ScenarioConfig,
+        speed_factor: float,
+        environment: Mapping[str, str],
+        folder: Path,
+        parameters: Mapping[str, str] | None = None,
     ) -> None:
-        """Each works in a folder under ``folder``. Raises UnavailableError where there is no PX4."""
+        """Each works in a folder under ``folder``; ``parameters`` win over `PARAMETERS`.
+
+        Raises UnavailableError where there is no PX4.
+        """
         if len(scenario.vehicles) > MAX_INSTANCES:
             raise UsageError(f"PX4 gives ports to {MAX_INSTANCES} vehicles, not {len(scenario.vehicles)}; fly fewer")
         self._build = px4_folder(environment)
         self._scenario, self._speed_factor, self._folder = scenario, speed_factor, folder
         self._environment = dict(environment)
+        self._parameters = {**PARAMETERS, **(parameters or {})}
         self.ports = tuple(Ports(OFFBOARD_PORT + i, TRUTH_PORT + i) for i in range(len(scenario.vehicles)))
         self._programs = Programs()
 
@@ -151,7 +160,7 @@ class Px4s:
                 "PX4_HOME_LON": f"{longitude_deg:.9f}",
                 "PX4_HOME_ALT": "0",
                 "PX4_PARAM_MIS_TAKEOFF_ALT": f"{-position[2]:g}",
-                **{f"PX4_PARAM_{name}": value for name, value in PARAMETERS.items()},
+                **{f"PX4_PARAM_{name}": value for name, value in self._parameters.items()},
             }
             command = [str(self._build / "bin/px4"), "-i", f"{i}", "-d", str(self._build / "etc"), "-w", str(working)]
             log = self._folder / f"px4_{i}.log"

@@ -37,6 +37,8 @@ MAX_FORWARD_S = 0.2
 """A pose is extrapolated by no more than this."""
 REFERENCE_DEG = (1.0, 1.0)
 """The origin of the world. PX4 keeps its home as float32, whose steps are a centimetre here, and 0.4 m in Europe."""
+FURTHER_MODES = {10 << 16: "TERMINATION"}
+"""Of PX4's modes by number, those that pymavlink has no name for."""
 _RECEIVED = {
     name: int(getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
     for name in (
@@ -148,6 +150,12 @@ class GroundStation:
         _, main, sub = mavutil.px4_map[mode]
         return bool(self._vehicles[number].mode == main << 16 | sub << 24)
 
+    def mode(self, number: int) -> str:
+        """The mode it flies in, by pymavlink's name or PX4's number."""
+        flown = self._vehicles[number].mode
+        names = {main << 16 | sub << 24: name for name, (_, main, sub) in mavutil.px4_map.items()}
+        return names.get(flown, FURTHER_MODES.get(flown, str(flown)))
+
     def is_armed(self, number: int) -> bool:
         """Its motors run."""
         return self._vehicles[number].armed
@@ -172,6 +180,12 @@ class GroundStation:
         """Sends the request for a mode; see `mode_is`."""
         _, main, sub = mavutil.px4_map[mode]
         self._command(self._vehicles[number], mavlink.MAV_CMD_DO_SET_MODE, 1, main, sub)
+
+    def push_sticks(self, number: int, *, forward: int) -> None:
+        """Sends the position of a joystick's sticks once: in the middle but for `forward`, -1000 to 1000."""
+        vehicle = self._vehicles[number]
+        with self._lock:
+            vehicle.mav.manual_control_send(vehicle.number + 1, forward, 0, 500, 0, 0)
 
     def _command(self, vehicle: _Vehicle, command: int, *numbers: float) -> None:
         values = (*numbers, *[0.0] * (7 - len(numbers)))
