@@ -175,7 +175,7 @@ class Px4Flight:
         options = ["--companion", str(self._speed_factor), str(self._fault.north_m_s)]
         log = folder / "companion.log"
         command = [sys.executable, "-m", "tools.px4_modes", *options]
-        self._companion = self._companions.start("companion", command, os.environ, Path.cwd(), log)
+        self._companion = self._companions.start("companion", command, os.environ, Path(__file__).parents[1], log)
         self._until(lambda: "streaming" in log.read_text(), START_S * self._speed_factor, "no setpoints")
         station = self.station
         self._request(lambda: station.is_armed(0), lambda: station.arm(0), "was not armed")
