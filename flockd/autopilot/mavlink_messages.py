@@ -92,7 +92,7 @@ class ReceivedMessages:
         """In the air, or seen there and not disarmed since: a landed state alone does not end a flight."""
         self._home_moved = False
         self._landed = False
-        self._text = _Text()
+        self._text = StatusText()
 
     def add(self, name: str, fields: Fields, time_s: float) -> None:
         """Takes a message by its name and fields, NaN as null, as MAVSDK decodes them to JSON."""
@@ -213,7 +213,7 @@ class ReceivedMessages:
         return {**fields, **dict.fromkeys(unknown)} if unknown else fields
 
 
-class _Text:
+class StatusText:
     """Joins the chunks of a STATUSTEXT, which carry an id and number themselves from 0."""
 
     def __init__(self) -> None:

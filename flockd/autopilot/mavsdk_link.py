@@ -1,7 +1,7 @@
 """The link to the autopilot: the one file that knows MAVSDK.
 
 Everything goes through MAVSDK's raw MAVLink path. Its offboard plugin repeats the last setpoint for ever, also when
-whoever gave it is long dead; here a setpoint is sent once. What received messages mean is in `mavlink_messages`.
+the program that gave it has ended; here a setpoint is sent once. What received messages mean is in `mavlink_messages`.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ def add(commands: Commands) -> None:
         "flockd status --json --seconds 2",
     )
     parser = commands("status", "Show how each drone of a fleet is doing, the worst first.", examples)
-    parser.add_argument("--fleet", metavar="NAME", help="only this one; by default every fleet that is heard")
+    parser.add_argument("--fleet", metavar="NAME", help="only this one; by default every fleet that publishes")
     parser.add_argument(
         "--connect", metavar="ENDPOINT", action="append", help=f"of a drone or a router; by default {ENDPOINT}"
     )

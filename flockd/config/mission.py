@@ -1,4 +1,4 @@
-"""Where the flock wants to go."""
+"""The velocity that the flock should have."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The autopilot: heard, known, and set up so that it acts when flockd falls silent. Nothing here changes it."""
+"""The autopilot: connected, of a known version, and set up to act when setpoints stop. Nothing here changes it."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from flockd.errors import ConfigError, ConfigProblem, ModelError, shortage_of
 from flockd.inference.manifest import Fault, Key, Manifest
 
 Check = Callable[[Manifest], Iterable[Fault]]
-"""What is wrong with a manifest for whoever wants to use the model."""
+"""What is wrong with a manifest, for a caller that uses the model."""
 MAX_MODEL_BYTES = 2 << 30
 """A protobuf, and so an ONNX file without weights outside it, cannot be larger."""
 
@@ -68,7 +68,7 @@ class ManifestFile:
 
 
 def nothing_more(manifest: Manifest) -> Iterable[Fault]:
-    """The check of who only wants to know what a model is."""
+    """The check for a caller that only describes a model."""
     return ()
 
 

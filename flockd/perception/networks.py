@@ -97,7 +97,7 @@ class OnnxNetworks:
             self.second_stage = SecondStage.of(self._distance.manifest, verification)
 
     def terminate(self) -> None:
-        """Ends every run of a network that is under way; whoever called it gets an error."""
+        """Ends every run of a network that is under way; its caller gets an error."""
         for model in self._models.values():
             model.terminate()
 

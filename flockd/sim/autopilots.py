@@ -35,7 +35,7 @@ PARAMETERS = {
     "EKF2_GYR_NOISE": "0.1",
     "EKF2_ACC_NOISE": "1.0",
     "EKF2_MAG_NOISE": "0.02",
-    "COM_OF_LOSS_T": "1.0",  # PX4 shortens it by the speed factor, as if it counted in real seconds
+    "COM_OF_LOSS_T": "1.0",  # simulated seconds; PX4's start script would multiply its default by the speed factor
     "COM_OBL_RC_ACT": "5",
     "SDLOG_BACKEND": "0",
 }
@@ -119,9 +119,14 @@ class Px4s:
     name = "PX4 SITL"
 
     def __init__(
-        self, scenario: ScenarioConfig, speed_factor: float, environment: Mapping[str, str], folder: Path
+        self,
+        scenario: ScenarioConfig,
+        speed_factor: float,
+        environment: Mapping[str, str],
+        folder: Path,
+        parameters: Mapping[str, str] | None = None,
     ) -> None:
-        """Each works in a folder under ``folder``.
+        """Each works in a folder under ``folder``; ``parameters`` win over `PARAMETERS`.
 
         Raises UnavailableError where there is no PX4, or where an instance or a daemon of another flight still runs.
         """
@@ -131,6 +136,7 @@ class Px4s:
         _refuse_leftovers(len(scenario.vehicles))
         self._scenario, self._speed_factor, self._folder = scenario, speed_factor, folder
         self._environment = dict(environment)
+        self._parameters = {**PARAMETERS, **(parameters or {})}
         self.ports = tuple(Ports(OFFBOARD_PORT + i, TRUTH_PORT + i) for i in range(len(scenario.vehicles)))
         self._programs = Programs()
 
@@ -156,7 +162,7 @@ class Px4s:
                 "PX4_HOME_LON": f"{longitude_deg:.9f}",
                 "PX4_HOME_ALT": "0",
                 "PX4_PARAM_MIS_TAKEOFF_ALT": f"{-position[2]:g}",
-                **{f"PX4_PARAM_{name}": value for name, value in PARAMETERS.items()},
+                **{f"PX4_PARAM_{name}": value for name, value in self._parameters.items()},
             }
             command = [str(self._build / "bin/px4"), "-i", f"{i}", "-d", str(self._build / "etc"), "-w", str(working)]
             log = self._folder / f"px4_{i}.log"

@@ -111,7 +111,7 @@ class Daemons:
         return tuple(self._programs)
 
     def status(self, number: int) -> str:
-        """What one said of itself last; empty before it has started."""
+        """Its last status line; empty before it has started."""
         return self._listeners[number].listen().status
 
     def is_ready(self, number: int) -> bool:

@@ -12,7 +12,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Literal, Self
 
@@ -21,6 +21,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import development as mavlink
 
 from flockd.autopilot.earth import metres_a_degree
+from flockd.autopilot.mavlink_messages import StatusText
 from flockd.errors import UnavailableError
 from flockd.messages import FloatArray
 from flockd.sim.leftovers import described, user_of_port
@@ -37,6 +38,8 @@ MAX_FORWARD_S = 0.2
 """A pose is extrapolated by no more than this."""
 REFERENCE_DEG = (1.0, 1.0)
 """The origin of the world. PX4 keeps its home as float32, whose steps are a centimetre here, and 0.4 m in Europe."""
+FURTHER_MODES = {10 << 16: "TERMINATION"}
+"""Of PX4's modes by number, those that pymavlink has no name for."""
 _RECEIVED = {
     name: int(getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
     for name in (
@@ -86,6 +89,7 @@ class _Vehicle:
     """On its clock, and then on ours."""
     version: str | None = None
     text: str = ""
+    chunks: StatusText = field(default_factory=StatusText)
 
     def write(self, data: bytes) -> None:
         if self.address is not None:
@@ -147,12 +151,18 @@ class GroundStation:
         _, main, sub = mavutil.px4_map[mode]
         return bool(self._vehicles[number].mode == main << 16 | sub << 24)
 
+    def mode(self, number: int) -> str:
+        """The mode it flies in, by pymavlink's name or PX4's number."""
+        flown = self._vehicles[number].mode
+        names = {main << 16 | sub << 24: name for name, (_, main, sub) in mavutil.px4_map.items()}
+        return names.get(flown, FURTHER_MODES.get(flown, str(flown)))
+
     def is_armed(self, number: int) -> bool:
         """Its motors run."""
         return self._vehicles[number].armed
 
     def last_text(self, number: int) -> str:
-        """Its last STATUSTEXT; empty if there was none."""
+        """Its last STATUSTEXT, whole; empty if there was none."""
         return self._vehicles[number].text
 
     def version(self, number: int) -> str | None:
@@ -171,6 +181,12 @@ class GroundStation:
         """Sends the request for a mode; see `mode_is`."""
         _, main, sub = mavutil.px4_map[mode]
         self._command(self._vehicles[number], mavlink.MAV_CMD_DO_SET_MODE, 1, main, sub)
+
+    def push_sticks(self, number: int, *, forward: int) -> None:
+        """Sends the position of a joystick's sticks once: in the middle but for `forward`, -1000 to 1000."""
+        vehicle = self._vehicles[number]
+        with self._lock:
+            vehicle.mav.manual_control_send(vehicle.number + 1, forward, 0, 500, 0, 0)
 
     def _command(self, vehicle: _Vehicle, command: int, *numbers: float) -> None:
         values = (*numbers, *[0.0] * (7 - len(numbers)))
@@ -220,7 +236,9 @@ def _update(vehicle: _Vehicle, message: Any, now: float) -> None:
         case "SYSTEM_TIME":
             vehicle.booted_s = message.time_boot_ms * 1e-3, now
         case "STATUSTEXT":
-            vehicle.text = message.text.strip()
+            text = vehicle.chunks.joined(message.to_dict())
+            if text is not None:
+                vehicle.text = text.strip()
         case "AUTOPILOT_VERSION":
             vehicle.version = ".".join(str(message.flight_sw_version >> shift & 0xFF) for shift in (24, 16, 8))
         case _:

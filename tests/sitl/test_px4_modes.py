@@ -1,0 +1,40 @@
+"""The mode that PX4 itself ends in after faults, beside what its parameters promise; and the tool without PX4."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from tools.px4_modes import FAULTS, Fault, Result, _line, main, run
+
+PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
+
+
+@PX4
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+def test_px4_ends_in_the_mode_that_its_parameters_promise(fault: Fault) -> None:
+    (result,) = run([fault], 1.0, lambda result: None)
+    assert result.kept, result
+    if fault.name == "wind":
+        assert result.drift_m_s < 0.5
+
+
+def test_without_px4_it_says_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("FLOCKD_PX4", str(tmp_path))
+    monkeypatch.setattr("sys.argv", ["px4_modes"])
+    assert main() == 69
+    assert capsys.readouterr().err.startswith(f"there is no PX4 in {tmp_path}, which FLOCKD_PX4 names; set it to")
+
+
+def test_a_mode_that_was_not_promised_is_shown_as_such() -> None:
+    result = Result("link_lost", "LOITER", "COM_OBL_RC_ACT 5: Hold", "RTL", 1.26, ("OFFBOARD", "LOITER", "RTL"), 0.104)
+    assert not result.kept
+    line = _line(result)
+    assert "RTL after 1.3 s" in line
+    assert "NOT AS PROMISED" in line
+    assert "OFFBOARD > LOITER > RTL; COM_OBL_RC_ACT 5: Hold; velocity off by 0.10 m/s" in line
