@@ -32,7 +32,7 @@ from flockd.config.autopilot import AutopilotParameters
 from flockd.data import data_path
 from flockd.errors import FlockdError, UnavailableError
 from flockd.messages import Setpoint
-from flockd.sim.autopilots import OFFBOARD_PORT, Px4s, px4_folder
+from flockd.sim.autopilots import Px4s, px4_folder
 from flockd.sim.ground_station import GroundStation
 from flockd.sim.processes import Programs
 from flockd.sim.start import with_drones
@@ -172,7 +172,7 @@ class Px4Flight:
         self._until(lambda: self.station.is_connected(0), START_S * self._speed_factor, "PX4 sends nothing")
         self.station.request_messages()
         self._companions = self._stack.enter_context(Programs())
-        options = ["--companion", str(self._speed_factor), str(self._fault.north_m_s)]
+        options = ["--companion", *map(str, (port.offboard, self._speed_factor, self._fault.north_m_s))]
         log = folder / "companion.log"
         command = [sys.executable, "-m", "tools.px4_modes", *options]
         self._companion = self._companions.start("companion", command, os.environ, Path(__file__).parents[1], log)
@@ -277,9 +277,9 @@ class Px4Flight:
             self.wait(POLL_S * self._speed_factor)
 
 
-async def _send_setpoints(speed_factor: float, north_m_s: float) -> None:
+async def _send_setpoints(port: str, speed_factor: float, north_m_s: float) -> None:
     """What the process of the companion computer does until it is killed."""
-    address = f"udpin://127.0.0.1:{OFFBOARD_PORT}"
+    address = f"udpin://127.0.0.1:{port}"
     clock = clock_at(speed_factor)
     link = await AutopilotLink.connect(AutopilotParameters(address=address), timeout_s=START_S, clock=clock)
     velocity = np.array([north_m_s, 0.0])
@@ -316,7 +316,7 @@ def _line(result: Result) -> str:
 def main() -> int:
     """Prints a table, or JSON."""
     if sys.argv[1:2] == ["--companion"]:
-        asyncio.run(_send_setpoints(*map(float, sys.argv[2:4])))
+        asyncio.run(_send_setpoints(sys.argv[2], float(sys.argv[3]), float(sys.argv[4])))
     parser = argparse.ArgumentParser(description="Which modes PX4 SITL ends in after faults.")
     parser.add_argument("--only", nargs="+", choices=[fault.name for fault in FAULTS], help="these faults alone")
     parser.add_argument("--speed-factor", type=float, default=1.0, help="how fast simulated time passes (1)")

@@ -152,10 +152,10 @@ class GroundStation:
         return bool(self._vehicles[number].mode == main << 16 | sub << 24)
 
     def mode(self, number: int) -> str:
-        """The mode it flies in, by pymavlink's name or PX4's number."""
+        """The mode it flies in, by pymavlink's name or PX4's number; empty while it is not known."""
         flown = self._vehicles[number].mode
-        names = {main << 16 | sub << 24: name for name, (_, main, sub) in mavutil.px4_map.items()}
-        return names.get(flown, FURTHER_MODES.get(flown, str(flown)))
+        named: dict[int, str] = {main << 16 | sub << 24: name for name, (_, main, sub) in mavutil.px4_map.items()}
+        return "" if flown is None else {**named, **FURTHER_MODES}.get(flown, str(flown))
 
     def is_armed(self, number: int) -> bool:
         """Its motors run."""
