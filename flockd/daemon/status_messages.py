@@ -52,6 +52,11 @@ async def publish_status(components: Components, clock: Callable[[], float]) -> 
         await asyncio.sleep(max(0.0, min(due_s.values()) - clock()))
 
 
+def _noisy(images: int) -> dict[str, int]:
+    """Their count, absent where there are none, as all counts."""
+    return {"noisy": images} if images else {}
+
+
 def _status_line(decision: Decision) -> str:
     reasons = "; ".join(reason.sentence for reason in decision.reasons)
     return f"{decision.state}: {reasons}" if reasons else str(decision.state)
@@ -90,7 +95,7 @@ def _computer_message(components: Components, now: float) -> ComputerMessage:
         name: CameraMessage(
             age_s=camera.age_s,
             fault=camera.fault,
-            counts={**camera.counts, **({"noisy": noisy_images[name]} if noisy_images[name] else {})},
+            counts={str(what): n for what, n in camera.counts.items()} | _noisy(noisy_images[name]),
         )
         for name, camera in components.source.status().items()
     }
