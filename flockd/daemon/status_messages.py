@@ -64,6 +64,11 @@ def _matters(decision: Decision) -> tuple[State, tuple[Event, ...]]:
     return decision.state, tuple(reason.event for reason in decision.reasons)
 
 
+def _noisy(images: int) -> dict[str, int]:
+    """Their count, absent where there are none, as all counts."""
+    return {"noisy": images} if images else {}
+
+
 def _status_line(decision: Decision) -> str:
     reasons = "; ".join(reason.sentence for reason in decision.reasons)
     return f"{decision.state}: {reasons}" if reasons else str(decision.state)
@@ -102,7 +107,7 @@ def _computer_message(components: Components, now: float) -> ComputerMessage:
         name: CameraMessage(
             age_s=camera.age_s,
             fault=camera.fault,
-            counts={**camera.counts, **({"noisy": noisy_images[name]} if noisy_images[name] else {})},
+            counts={str(what): n for what, n in camera.counts.items()} | _noisy(noisy_images[name]),
         )
         for name, camera in components.source.status().items()
     }

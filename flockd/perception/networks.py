@@ -151,7 +151,7 @@ class OnnxNetworks:
         limit = self._verification.manifest.threshold("distance_logit_limit")
         # Where there is no drone, there is no range to ask for: most crops of a cluttered image end here.
         most = _probability(logits + limit)
-        rest = np.flatnonzero(most > self.second_stage.thresholds.another_crop)
+        rest = [k for k, p in enumerate(most) if p > self.second_stage.thresholds.another_crop]
         ranged = self._ranges(
             self._distance, [crops[k] for k in rest], [images[k] for k in rest], logits[rest], limit=limit
         )
@@ -177,7 +177,7 @@ class OnnxNetworks:
         if not crops:
             return ()
         outputs = _in_batches(distance, images)
-        columns = dict(distance.manifest.results["range"].by_column(outputs["range"]))
+        columns: dict[str, FloatArray] = {**distance.manifest.results["range"].by_column(outputs["range"])}
         columns["drone_logit"] = logits + np.clip(columns["drone_logit"], -limit, limit)
         masks = list(outputs["mask"][:, 0]) if "mask" in outputs else [None] * len(crops)
         return tuple(

@@ -149,7 +149,7 @@ def test_a_stall_of_the_computer_ends_in_the_autopilots_failsafe_and_is_named(tm
                 _stall(process, 0.3)
                 before = len(autopilot.setpoints)
                 manager.until(lambda: len(autopilot.setpoints) > before + 20, process)
-                assert autopilot.mode == "OFFBOARD"
+                assert str(autopilot.mode) == "OFFBOARD"
 
                 _stall(process, 3.0)
                 assert autopilot.mode == "LOITER"
