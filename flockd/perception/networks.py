@@ -155,7 +155,7 @@ class OnnxNetworks:
         ranged = self._ranges(
             self._distance, [crops[k] for k in rest], [images[k] for k in rest], logits[rest], limit=limit
         )
-        estimates = [_no_range(p, size) for p in most]
+        estimates = [_no_range(float(p), size) for p in most]
         for k, estimate in zip(rest, ranged, strict=True):
             estimates[k] = estimate
         return tuple(estimates)
@@ -177,11 +177,11 @@ class OnnxNetworks:
         if not crops:
             return ()
         outputs = _in_batches(distance, images)
-        columns: dict[str, FloatArray] = {**distance.manifest.results["range"].by_column(outputs["range"])}
-        columns["drone_logit"] = logits + np.clip(columns["drone_logit"], -limit, limit)
+        columns = distance.manifest.results["range"].by_column(outputs["range"])
+        evidence = logits + np.clip(columns["drone_logit"], -limit, limit)
         masks = list(outputs["mask"][:, 0]) if "mask" in outputs else [None] * len(crops)
         return tuple(
-            _estimate({name: float(column[k]) for name, column in columns.items()}, crop, masks[k])
+            _estimate({name: float(column[k]) for name, column in columns.items()}, float(evidence[k]), crop, masks[k])
             for k, crop in enumerate(crops)
         )
 
@@ -282,7 +282,7 @@ def _probability(logit: FloatArray) -> FloatArray:
     return np.asarray(1.0 / (1.0 + np.exp(-logit)))
 
 
-def _estimate(columns: Mapping[str, float], crop: Crop, mask: Float32Array | None) -> RangeEstimate:
+def _estimate(columns: Mapping[str, float], drone_logit: float, crop: Crop, mask: Float32Array | None) -> RangeEstimate:
     """Of one crop's output, with a mirror image's turned back."""
     size = crop.camera.size[0]
     right = columns["right_px"]
@@ -294,7 +294,7 @@ def _estimate(columns: Mapping[str, float], crop: Crop, mask: Float32Array | Non
         log_range_sigma=float(np.exp(columns["log_relative_sigma"])),
         centre=np.array([size / 2 + right, size / 2 + columns["down_px"]]),
         size_m=float(np.exp(columns["log_range_per_focal"] + columns["log_apparent_size"])),
-        drone_probability=float(_probability(np.array(columns["drone_logit"]))),
+        drone_probability=float(_probability(np.array(drone_logit))),
         mask=mask,
     )
 
