@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help demo docs lint test test-all mutate mutate-all references clean
+.PHONY: help demo docs lint test test-all mutate mutate-all references lock sbom clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -36,6 +36,13 @@ mutate-all: $(VENV)/test.installed ## try them on every mutant, in about a quart
 
 references: $(VENV)/test.installed ## write what the recorded flights of tests/replay are expected to give again
 	$(BIN)/python -m tools.record_regressions --only references
+
+lock: $(VENV)/release.installed ## write requirements/service.txt again, with the newest versions that pyproject.toml permits
+	$(BIN)/python -m tools.lock
+
+sbom: $(VENV)/test.installed ## write the software bill of materials to out/flockd.cdx.json
+	$(BIN)/python -m tools.licences
+	$(BIN)/python -m tools.sbom
 
 clean: ## delete the virtual environment and what was built
 	rm -rf $(VENV) build dist *.egg-info

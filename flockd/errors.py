@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -58,11 +59,48 @@ class ConfigProblem:
         return f"{place}: {self.key}: {self.message}" if self.key else f"{place}: {self.message}"
 
 
+MAX_PROBLEMS_TOLD = 20
+
+
 class ConfigError(FlockdError):
-    """Everything wrong with a configuration at once; its text has one line for each problem."""
+    """Everything wrong with a configuration at once; its text has one line for each of the first problems."""
 
     exit_code = ExitCode.BAD_CONFIGURATION
 
     def __init__(self, problems: Sequence[ConfigProblem]) -> None:
         self.problems = tuple(sorted(problems))
-        super().__init__("\n".join(str(problem) for problem in self.problems))
+        told = [str(problem) for problem in self.problems[:MAX_PROBLEMS_TOLD]]
+        more = len(self.problems) - len(told)
+        if more:
+            told.append(f"and {more} more {'problem' if more == 1 else 'problems'}; correct these first")
+        super().__init__("\n".join(told))
+
+
+_SHORTAGES = {
+    errno.EMFILE: "file descriptors",
+    errno.ENFILE: "file descriptors",
+    errno.ENOMEM: "memory",
+}
+_SHORTAGE_TEXTS = {
+    "too many open files": "file descriptors",
+    "bad_alloc": "memory",
+    "cannot allocate memory": "memory",
+    "failed to allocate memory": "memory",
+    "failed to map segment": "memory",
+    "insufficient memory": "memory",
+    "can't start new thread": "threads or memory",
+    "resource temporarily unavailable": "threads or memory",
+}
+"""By what libraries say, in lower case, that have no error of their own for it."""
+
+
+def shortage_of(error: BaseException) -> str | None:
+    """What the process or the computer has run out of, by the error that this led to; None for any other error."""
+    if isinstance(error, BaseExceptionGroup):
+        return next(filter(None, map(shortage_of, error.exceptions)), None)
+    if isinstance(error, MemoryError):
+        return "memory"
+    if isinstance(error, OSError):
+        return _SHORTAGES.get(error.errno or 0)
+    text = str(error).lower()
+    return next((lacking for part, lacking in _SHORTAGE_TEXTS.items() if part in text), None)

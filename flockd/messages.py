@@ -1,4 +1,4 @@
-"""The nouns that flow from pixels to command. Frozen; arrays are never changed by whoever receives them.
+"""The data types that pass from images to command. Frozen; a receiver never changes an array.
 
 Frames: camera optical (RDF), body (FRD), world (NED). ``R_a_b`` takes coordinates from b to a: ``p_a = R_a_b @ p_b``.
 Pixels are (u, v) with pixel centres at +0.5. Times are seconds on a monotonic clock, never wall time.

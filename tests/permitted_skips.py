@@ -42,6 +42,7 @@ PERMITTED = (
         "tests/recording/*", "a small file system cannot be mounted", "run as root, where `mount -t tmpfs` is allowed"
     ),
     PermittedSkip("tests/d*", "systemd-analyze is not here", "install systemd (tests of units in daemon and doctor)"),
+    PermittedSkip("tests/report/*", "chromium is not here", "install chromium"),
     PermittedSkip("tests/telemetry/*", "openssl is not here", "install the openssl command"),
     PermittedSkip(
         "tests/training/*",

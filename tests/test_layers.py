@@ -11,9 +11,9 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "flockd"
 
-BASE = {"choices", "messages", "config", "errors", "data", "earth"}
-"""Under everything: choices, nouns, the typed configuration, the error types, where the shipped files are, and how
-large a degree is."""
+BASE = {"choices", "messages", "config", "errors", "data", "earth", "printable"}
+"""Under everything: choices, nouns, the typed configuration, error types, the shipped files, how large a degree is,
+texts for a terminal."""
 
 MAY_IMPORT = {
     "choices": set(),
@@ -22,6 +22,7 @@ MAY_IMPORT = {
     "data": {"errors"},
     "earth": set(),
     "image_header": set(),
+    "printable": set(),
     "zenoh_session": {"errors"},
     "config": {"choices", "messages", "errors"},
     "geometry": BASE,

@@ -9,7 +9,8 @@ runs `flockd run` with the shipped networks. The autopilot is flockd's fake; as 
 images are small and the steps far apart. The machine's clock counts instructions, a nanosecond each: how busy this
 computer is changes how long the check takes, and nothing of what it measures.
 
-Exit code 0, 1 a check failed, 69 something needed is not there.
+Exit code 0, 1 a check failed, 69 something needed is not there. A check that is a row of the catalogue of faults
+(`python -m tools.faults --list`) says which.
 """
 
 from __future__ import annotations
@@ -26,7 +27,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import tomllib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -42,7 +42,7 @@ PACKAGES = (
 )
 BOOT_MODULES = ("virtio_pci", "virtio_blk", "ext4")
 SOURCES = (
-    *("flockd", "models", "config", "systemd"),
+    *("flockd", "models", "config", "systemd", "requirements"),
     *("pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE"),
 )
 """What the documentation's lines need of this folder."""
@@ -184,16 +184,17 @@ def _debian(system: Path) -> None:
 
 
 def _wheels(folder: Path) -> Path:
-    """What flockd and the fake autopilot need from the package index, for the machine's Python."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    wanted = [*project["build-system"]["requires"], *project["project"]["dependencies"], FAKE_AUTOPILOT]
-    wheels = folder / f"wheels-{hashlib.sha256(' '.join(wanted).encode()).hexdigest()[:8]}"
+    """What the lock names and the fake autopilot needs, from the package index, for the machine's Python."""
+    lock = ROOT / "requirements/service.txt"
+    wheels = folder / f"wheels-{hashlib.sha256(lock.read_bytes() + FAKE_AUTOPILOT.encode()).hexdigest()[:8]}"
     if wheels.exists():
         return wheels
     with tempfile.TemporaryDirectory(dir=folder) as fresh:
         kinds = [f"--platform=manylinux_2_{minor}_x86_64" for minor in range(17, 37)]
         options = ["--quiet", "--only-binary=:all:", f"--python-version={PYTHON}", "--platform=manylinux2014_x86_64"]
-        _command(sys.executable, "-m", "pip", "download", *options, *kinds, f"--dest={fresh}", *wanted)
+        download = (sys.executable, "-m", "pip", "download", *options, *kinds, f"--dest={fresh}")
+        _command(*download, "--require-hashes", f"--requirement={lock}")
+        _command(*download, FAKE_AUTOPILOT)
         Path(fresh).rename(wheels)
         Path(fresh).mkdir()
     return wheels
@@ -286,7 +287,8 @@ def _lines(file: Path, machine: subprocess.Popen[bytes]) -> Iterator[dict[str, A
 
 def _row(line: dict[str, Any]) -> str:
     verdict = "PASS" if line["passed"] else "FAIL"
-    return f"{verdict}  {line['check']:32s} {line['measured']}  (wanted: {line['wanted']})"
+    row = f" (row {line['row']} of the faults)" if line.get("row") else ""
+    return f"{verdict}  {line['check']:32s} {line['measured']}  (wanted: {line['wanted']}){row}"
 
 
 def _command(*command: str) -> None:

@@ -6,7 +6,7 @@
     python -m tools.docs_pictures seen SHORT docs/pictures/seen.webp         # what a drone sees
     python -m tools.docs_pictures law docs/pictures/law_curve.svg            # Eq. 39 and 41 over distance
 
-The other pictures in docs/pictures are drawn by hand.
+detected.webp is what `flockd detect` draws; the other pictures in docs/pictures are drawn by hand.
 """
 
 from __future__ import annotations

@@ -232,10 +232,11 @@ def _command(parser: argparse.ArgumentParser) -> list[str]:
         lines += ["| option | meaning |", "|---|---|"]
         lines += [f"| {_named(action)} | {_help(parser, action)} |" for action in shown]
         lines.append("")
-    examples = [line.strip() for line in (parser.epilog or "").splitlines()[1:] if line.strip()]
-    if examples:
-        lines += ["```sh", *examples, "```", ""]
-    return lines
+    examples, _, notes = (parser.epilog or "").partition("\n\n")
+    commands = [line.strip() for line in examples.splitlines()[1:]]
+    if commands:
+        lines += ["```sh", *commands, "```", ""]
+    return [*lines, *notes.splitlines(), ""] if notes else lines
 
 
 def _positional(action: argparse.Action) -> str:

@@ -26,8 +26,11 @@ from rich.table import Table
 
 from flockd.config.perception import PerceptionConfig
 from flockd.data import data_path
+from flockd.geometry import Camera
 from flockd.perception import OnnxNetworks
-from tools.evaluation.on_pictures import WIDTHS_PX, Box, Labelled, detect, summary
+from flockd.pictures import Labelled, PictureDetector, PictureFile, camera_with_fov, find_pictures, summary
+from flockd.pictures.scoring import WIDTH_CLASSES
+from flockd.pictures.single_frame import Box
 
 Image = NDArray[np.uint8]
 Picture = tuple[str, Callable[[], Image], tuple[Box, ...]]
@@ -35,7 +38,6 @@ Picture = tuple[str, Callable[[], Image], tuple[Box, ...]]
 
 VALIDATION_BLOCKS = (3, 9)
 """Of ten clips each; neighbouring clips show the same scene."""
-ENDINGS = {".jpg", ".jpeg", ".png"}
 PROBABILITIES = (0.0, 0.9, 0.95, 0.98, 0.99)
 """What is counted when only detections at least so probable count; 0: all that the pipeline reports."""
 
@@ -49,7 +51,7 @@ def main() -> None:
     parser.add_argument("--distance", default="distance_int8")
     parser.add_argument("--verification", default="verification_int8")
     parser.add_argument("--neighbours", default="neighbours_int8")
-    parser.add_argument("--fov", type=float, default=90.0, metavar="DEG", help="horizontal, of every camera")
+    parser.add_argument("--fov", type=float, default=90.0, metavar="DEG", help="across the longer side")
     parser.add_argument("--scale", type=float, default=1.0, help="resize every picture first")
     parser.add_argument("--split", choices=("validation", "training"), default="validation", help="of the clips")
     parser.add_argument("--threads", type=int, default=1)
@@ -68,26 +70,35 @@ def main() -> None:
         depth=arguments.neighbours, segmentation=arguments.neighbours, distance=arguments.distance,
         verification=arguments.verification, flow="dis", threads=arguments.threads,
     )  # fmt: skip
-    networks = OnnxNetworks(config, arguments.models)
+    detector = PictureDetector(OnnxNetworks(config, arguments.models), config)
     results: dict[str, dict[str, object]] = {}
     written: dict[str, list[dict[str, object]]] = {}
+    cameras: dict[tuple[int, int], Camera] = {}
     for name, pictures in sets.items():
         begin = time.monotonic()
-        measured = []
+        measured, proposals = [], 0
         shown = track(pictures, name, console=Console(stderr=True), disable=not sys.stderr.isatty())
         for _, read, boxes in shown:
             image, scale = read(), arguments.scale
             if scale != 1.0:
                 image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
             resized = tuple((scale * a, scale * b, scale * c, scale * d) for a, b, c, d in boxes)
-            measured.append(Labelled(detect(networks, image, arguments.fov), resized))
+            size = (image.shape[1], image.shape[0])
+            if size not in cameras:
+                cameras[size] = camera_with_fov(size, arguments.fov)
+            found = detector.detect(image, cameras[size])
+            measured.append(Labelled(found.detections, resized))
+            proposals += found.proposals
         ms = 1e3 * (time.monotonic() - begin) / max(len(pictures), 1)
-        results[name] = summary(measured) | {
+        results[name] = {
+            "images": len(pictures),
+            **summary(measured),
+            "proposals_per_image": round(proposals / max(len(pictures), 1), 2),
             "ms_per_image": round(ms, 1),
             "at_probability": {str(p): summary(measured, p) for p in PROBABILITIES[1:]},
         }
         written[name] = [
-            {"picture": picture, "boxes": one.boxes, **asdict(one.result)}
+            {"picture": picture, "boxes": one.boxes, "found": [asdict(drone) for drone in one.detections]}
             for (picture, _, _), one in zip(pictures, measured, strict=True)
         ]
     if arguments.detections:
@@ -115,16 +126,14 @@ def sky_pictures(folder: Path, *, is_validation: bool) -> dict[str, list[Picture
 
 def free_pictures(folder: Path) -> Iterator[Picture]:
     """Every picture in a folder and those below it, in which no drone is."""
-    for path in sorted(folder.rglob("*")):
-        if path.suffix.lower() in ENDINGS:
-            yield str(path.relative_to(folder)), partial(_picture, path), ()
+    for picture in find_pictures([folder]):
+        if not picture.is_video:
+            yield str(picture.relative), partial(_image, picture), ()
 
 
-def _picture(path: Path) -> Image:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise SystemExit(f"{path}: not a picture that can be read")
-    return np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
+def _image(picture: PictureFile) -> Image:
+    (_, image) = next(picture.images(1))
+    return image
 
 
 class _Clips:
@@ -148,18 +157,17 @@ class _Clips:
 
 
 def _print_table(results: dict[str, dict[str, object]]) -> None:
-    widths = [f"{a}-{b}" for a, b in zip(WIDTHS_PX, [*map(str, WIDTHS_PX[1:]), ""], strict=True)]
-    table = Table("set", "images", *(f"{w} px" for w in widths), "false in 500", "proposals", "ms")
+    table = Table("set", "images", *(f"{w} px" for w in WIDTH_CLASSES), "AP50", "false in 500", "proposals", "ms")
     for name, all_of in results.items():
         rows = {"": all_of, **{f" p >= {p}": one for p, one in all_of["at_probability"].items()}}  # type: ignore[attr-defined]
         for note, one in rows.items():
             cells = [
-                f"{100 * c['found'] / c['boxes']:.0f} % of {c['boxes']}" if (c := one["by_width"].get(w)) else ""
-                for w in widths
+                f"{100 * c['found'] / c['boxes']:.0f} % of {c['boxes']}" if (c := one["by_width"][w])["boxes"] else ""
+                for w in WIDTH_CLASSES
             ]
             table.add_row(
-                name + note, str(one["images"]), *cells, str(one["false_per_500_images"]),
-                str(one["proposals_per_image"]), str(all_of["ms_per_image"]),
+                name + note, str(all_of["images"]), *cells, "" if one["ap50"] is None else f"{one['ap50']:.3f}",
+                str(one["false_per_500_images"]), str(all_of["proposals_per_image"]), str(all_of["ms_per_image"]),
             )  # fmt: skip
     Console(width=200).print(table)
 

@@ -116,7 +116,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
         "size_multiple": 1,
         "golden_size": [96, 96],
         "thresholds": {
-            "drone_probability": 0.9,
+            "drone_probability": 0.95,
             "expected_drone_probability": 0.8,
             "another_crop_probability": 0.2,
             "distance_logit_limit": 2.0,

@@ -60,6 +60,10 @@ ENUMERATIONS: Mapping[tuple[str, str], int] = {
     ("HEARTBEAT", "system_status"): 9,  # MAV_STATE
 }
 """How many values each field's enumeration has, from 0, by message and field: of the MAVLink dialect `common`."""
+RANGES: Mapping[tuple[str, str], range] = {("SYS_STATUS", "battery_remaining"): range(-1, 101)}
+"""What other fields may be, likewise; -1 is MAVLink's own word for unknown."""
+QUATERNION_TOLERANCE = 0.1
+"""Of its norm from 1; one that is farther off is no attitude."""
 HOME_TOLERANCE_M = 0.5
 """A home that moves less in flight is not reported: estimators drift."""
 TEXT_CHUNK = 50
@@ -89,7 +93,7 @@ class ReceivedMessages:
         """In the air, or seen there and not disarmed since: a landed state alone does not end a flight."""
         self._home_moved = False
         self._landed = False
-        self._text = _Text()
+        self._text = StatusText()
 
     def add(self, name: str, fields: Fields, time_s: float) -> None:
         """Takes a message by its name and fields, NaN as null, as MAVSDK decodes them to JSON."""
@@ -174,6 +178,8 @@ class ReceivedMessages:
         quaternion = _vector(attitude.fields, "q1", "q2", "q3", "q4")
         if place is None or velocity is None or quaternion is None:
             return None
+        if abs(float(np.linalg.norm(quaternion)) - 1.0) > QUATERNION_TOLERANCE:
+            return None
         return VehicleState(
             time_s=min(attitude.time_s, position.time_s),
             R_ned_body=rotation_from_quaternion(quaternion),
@@ -196,11 +202,12 @@ class ReceivedMessages:
         return {} if message is None else message.fields
 
     def _checked(self, name: str, fields: Fields) -> Fields:
-        """The same fields with None for values that their enumeration does not have."""
+        """The same fields with None for values that their enumeration or range does not have."""
+        allowed = {**{field: range(count) for field, count in ENUMERATIONS.items()}, **RANGES}
         unknown = [
             field
-            for (message, field), count in ENUMERATIONS.items()
-            if message == name and fields.get(field) is not None and not 0 <= fields[field] < count
+            for (message, field), values in allowed.items()
+            if message == name and fields.get(field) is not None and fields[field] not in values
         ]
         for field in unknown:
             value = f"{name}.{field} = {fields[field]}"
@@ -210,7 +217,7 @@ class ReceivedMessages:
         return {**fields, **dict.fromkeys(unknown)} if unknown else fields
 
 
-class _Text:
+class StatusText:
     """Joins the chunks of a STATUSTEXT, which carry an id and number themselves from 0."""
 
     def __init__(self) -> None:
@@ -254,8 +261,8 @@ def _vector(fields: Fields, *names: str) -> FloatArray | None:
     return vector if np.isfinite(vector).all() else None
 
 
-def _known(value: float, *, scale: float, unknown: tuple[float, ...] = (-1,)) -> float | None:
-    return None if value in unknown else value * scale
+def _known(value: float | None, *, scale: float, unknown: tuple[float, ...] = (-1,)) -> float | None:
+    return None if value is None or value in unknown else value * scale
 
 
 def _estimate_ok(message: ReceivedMessage | None) -> bool | None:

@@ -1,7 +1,7 @@
 """The link to the autopilot: the one file that knows MAVSDK.
 
 Everything goes through MAVSDK's raw MAVLink path. Its offboard plugin repeats the last setpoint for ever, also when
-whoever gave it is long dead; here a setpoint is sent once. What received messages mean is in `mavlink_messages`.
+the program that gave it has ended; here a setpoint is sent once. What received messages mean is in `mavlink_messages`.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from mavsdk.system import System
 
 from flockd.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware, FlightMode
 from flockd.autopilot.mavlink_messages import MODES, Fields, ReceivedMessages, result_text
+from flockd.autopilot.throttled_log import ThrottledLog
 from flockd.config.autopilot import AutopilotParameters
 from flockd.messages import Setpoint, VehicleState
 
@@ -59,6 +60,8 @@ TEXT_MEMORY_S = 2.0
 MOST_REPORTS = 100
 
 _log = logging.getLogger(__name__)
+_throttled = ThrottledLog(_log)
+"""MAVSDK sends a heartbeat a second, and complains of each that an autopilot which is gone does not take."""
 _LOG_LEVELS = {
     LogLevel.DEBUG: logging.DEBUG,
     LogLevel.INFO: logging.INFO,
@@ -318,5 +321,5 @@ def _settle(answer: asyncio.Future[T], value: T) -> None:
 
 def _to_logging(level: LogLevel, message: str, *_: object) -> bool:
     """MAVSDK would print; this says that it is taken care of."""
-    _log.log(_LOG_LEVELS[level], "%s", message)
+    _throttled(_LOG_LEVELS[level], message)
     return True

@@ -1,7 +1,7 @@
 """Streams setpoints to the autopilot, and falls silent when anything is wrong: silence is what stops a drone.
 
 It runs on its own thread with its own deadlines, so that neither busy cores nor a stuck event loop make it stutter, and
-sends only while the control loop shows that it lives. PX4 goes back to offboard by itself when setpoints return after
+sends only while the control loop runs. PX4 goes back to offboard by itself when setpoints return after
 its failsafe; so a stream that was interrupted in flight never resumes unless it is begun anew.
 """
 
@@ -22,7 +22,7 @@ Gate = Callable[[Setpoint], Setpoint | None]
 """What may be sent in a setpoint's place; None: nothing."""
 
 CLOSE_TIMEOUT_S = 1.0
-"""A cable that takes no more bytes may hold the thread for ever; it dies with the process."""
+"""A cable that takes no more bytes may hold the thread for ever; it ends with the process."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class SetpointStreamer:
         self._setpoint = setpoint
 
     def beat(self) -> None:
-        """The control loop lives. To be called by the control loop itself, several times in `max_control_age_s`."""
+        """The control loop runs. To be called by the control loop itself, several times in `max_control_age_s`."""
         self._beat_s = self._clock()
 
     def report(self) -> StreamReport:

@@ -23,8 +23,9 @@ from flockd.cli import (
     status,
     view,
 )  # fmt: skip
+from flockd.cli.output import complain
 from flockd.cli.parser import Parser, add_commands
-from flockd.errors import ExitCode, FlockdError, UnavailableError
+from flockd.errors import ExitCode, FlockdError, UnavailableError, shortage_of
 
 # Packages of an extra: without them a command is unavailable, not broken.
 EXTRAS = {
@@ -67,15 +68,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output has gone; Python would complain once more at its end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ExitCode.DONE
-    except OSError as error:
-        return _failed(f"{error.filename or 'the system'}: {error.strerror or error}", ExitCode.UNAVAILABLE)
     except KeyboardInterrupt:
         return _failed("interrupted", ExitCode.INTERRUPTED)
+    except Exception as error:
+        lacking = shortage_of(error)
+        if lacking is not None:
+            return _failed(f"out of {lacking}; raise the limits, or close other programs", ExitCode.UNAVAILABLE)
+        if isinstance(error, OSError):
+            return _failed(f"{error.filename or 'the system'}: {error.strerror or error}", ExitCode.UNAVAILABLE)
+        raise
     return code
 
 
 def _failed(sentence: str, code: int) -> int:
-    sys.stderr.write(f"{sentence}\n")
+    complain(sentence)
     return code
 
 

@@ -18,7 +18,7 @@ from flockd.cli.picture_options import PictureCameras, add_picture_options, dete
 from flockd.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.pictures import DetectedDrone, PictureDetector, PictureFile, PictureLabels, PictureResult
+    from flockd.pictures import DetectedDrone, PictureDetector, PictureFile, PictureLabels
     from flockd.pictures.copies import Copies
 
 NOTES = """\
@@ -41,7 +41,9 @@ def add(commands: Commands) -> None:
     parser.add_argument("--out", metavar="FOLDER", type=Path, help="draw what is found into copies there")
     parser.add_argument("--force", action="store_true", help="overwrite what is there")
     parser.add_argument("--labels", metavar="FILE", type=Path, help="COCO boxes of category `drone`, to measure with")
-    parser.add_argument("--min-probability", metavar="P", type=_probability, default=0.0, help="leave out less (0)")
+    parser.add_argument(
+        "--min-probability", metavar="P", type=_probability, default=0.0, help="leave out what is less probable (0)"
+    )
     parser.add_argument("--drone-size", metavar="M", type=positive_number, help="of every drone, tip to tip, if known")
     parser.add_argument("--every", metavar="N", type=positive_count, default=1, help="every Nth frame of a video (1)")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
@@ -64,7 +66,8 @@ class _Detected:
     """One picture with what was found in it."""
 
     name: str
-    result: PictureResult
+    detections: tuple[DetectedDrone, ...]
+    proposals: int
     labels: PictureLabels | None
     seconds: float
 
@@ -76,7 +79,7 @@ def _run(args: argparse.Namespace) -> int:
     if args.force and args.out is None:
         raise UsageError("--force has no meaning without --out; add it")
     cameras = PictureCameras(args)
-    pictures = find_pictures(args.pictures)
+    pictures = find_pictures(args.pictures, but_not=args.out)
     labels = None if args.labels is None else read_labels(args.labels, pictures)
     more = {} if args.drone_size is None else {"drone_size_m": args.drone_size}
     config = perception_of(args, cameras.config, **more)
@@ -125,7 +128,7 @@ def _detected(
                 seconds = time.perf_counter() - begin
                 if copies is not None:
                     copies.write(picture, annotated(image, result, known.boxes if known else ()))
-                yield _Detected(name, result, known, seconds)
+                yield _Detected(name, result.detections, result.proposals, known, seconds)
                 done += 1
                 tell(done, max(done, count))
 
@@ -147,16 +150,16 @@ def _result(detected: Sequence[_Detected], *, measure: bool) -> dict[str, Any]:
                         "range_sigma_m": round(found.range_sigma_m, 4),
                         "size_m": round(found.size_m, 4),
                     }
-                    for found in one.result.detections
+                    for found in one.detections
                 ],
             }
             for one in detected
         ],
-        "proposals_per_image": round(sum(one.result.proposals for one in detected) / count, 2),
+        "proposals_per_image": round(sum(one.proposals for one in detected) / count, 2),
         "ms_per_image": round(1000 * sum(one.seconds for one in detected) / count, 2),
     }
     if measure:
-        labelled = [Labelled(o.result.detections, o.labels.boxes) for o in detected if o.labels is not None]
+        labelled = [Labelled(o.detections, o.labels.boxes) for o in detected if o.labels is not None]
         result |= summary(labelled)
     return result
 
@@ -168,13 +171,13 @@ def _say(detected: Sequence[_Detected], result: Mapping[str, Any]) -> None:
     console = Console(markup=False, highlight=False, width=None if sys.stdout.isatty() else PIPED_COLUMNS)
     table = Table("picture", "box, px", "probability", "range, m", "size, m", box=None, pad_edge=False)
     for one in detected:
-        for found in one.result.detections:
+        for found in one.detections:
             box = " ".join(f"{value:.0f}" for value in found.box)
             range_m, size_m = (f"{v:.2f} +- {s:.2f}" for v, s in _values(found))
             table.add_row(one.name, box, f"{found.probability:.2f}", range_m, size_m)
     if table.row_count:
         console.print(table)
-    drones = sum(len(one.result.detections) for one in detected)
+    drones = sum(len(one.detections) for one in detected)
     cost = f"{result['proposals_per_image']:g} proposals and {result['ms_per_image']:g} ms a picture"
     say(f"{drones} detections in {result['images']} pictures; {cost}")
     if "boxes" not in result:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from flockd.cli.output import progress, say, say_json
 from flockd.cli.parser import Commands, positive_number
 from flockd.errors import ExitCode, UsageError
+from flockd.printable import printable
 
 if TYPE_CHECKING:
     from flockd.doctor import Finding
@@ -100,9 +101,9 @@ def _print(drone: str, found: Mapping[str, Sequence[Finding]]) -> None:
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
     for finding in findings:
-        told = Text(finding.measured)
+        told = Text(printable(finding.measured))
         if finding.fix:
-            told.append(f"\nfix: {finding.fix}", style="italic")
+            told.append(f"\nfix: {printable(finding.fix)}", style="italic")
         table.add_row(Text(finding.level, STYLES[finding.level]), finding.about, told)
     Console(markup=False, highlight=False).print(table)
     counts = {level: sum(finding.level == level for finding in findings) for level in STYLES}

@@ -22,19 +22,28 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from flockd.printable import printable
+
 PLAIN_LINE_EVERY_S = 10.0
+CELL_CHARACTERS = 300
 PIPED_COLUMNS = 1000
 """Width of tables that are not on a terminal, which has none: no column is cut."""
 
 
 def say(text: str) -> None:
-    """Writes lines on stdout."""
-    sys.stdout.write(f"{text}\n")
+    """Writes lines on stdout; what would steer a terminal is escaped, as in all that these functions write."""
+    sys.stdout.write(f"{printable(text)}\n")
 
 
 def complain(text: str) -> None:
     """Writes lines on stderr."""
-    sys.stderr.write(f"{text}\n")
+    sys.stderr.write(f"{printable(text)}\n")
+
+
+def cell(text: str) -> str:
+    """A text from outside as it may stand in a table: one line that is not endless."""
+    shown = printable(text, lines=False)
+    return shown if len(shown) <= CELL_CHARACTERS else f"{shown[:CELL_CHARACTERS]}..."
 
 
 def say_json(value: object) -> None:

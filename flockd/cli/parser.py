@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import NoReturn, Protocol
 
+from flockd.cli.output import complain
 from flockd.errors import ExitCode
 
 
@@ -35,7 +36,7 @@ class Parser(argparse.ArgumentParser):
             close = difflib.get_close_matches(unknown[1], self.commands, n=1)
             hint = f"; did you mean `{self.prog} {close[0]}`?" if close else f", of {', '.join(self.commands)}"
             message = f"{unknown[1]!r} is not a command{hint}"
-        sys.stderr.write(f"{self.prog}: {message}; see {self.prog} --help\n")
+        complain(f"{self.prog}: {message}; see {self.prog} --help")
         raise SystemExit(ExitCode.USAGE)
 
 

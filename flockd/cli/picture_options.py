@@ -29,8 +29,9 @@ def add_picture_options(parser: Parser) -> None:
     camera.add_argument("--camera", metavar="NAME", help="which of --config's cameras, where it has several")
     networks = parser.add_argument_group("the networks", "by default those of --config, else those that fly")
     networks.add_argument("--models", metavar="FOLDER", type=Path, help="folder of the manifests")
-    networks.add_argument("--segmentation", metavar="NAME", help="first stage: the model for depth and segmentation")
-    networks.add_argument("--distance", metavar="NAME", help="second stage: the model for the distance")
+    networks.add_argument("--first-stage", metavar="NAME", help="the model for depth and segmentation")
+    networks.add_argument("--second-stage", metavar="NAME", help="the model for the distance")
+    networks.add_argument("--verification", metavar="NAME", help="the model that tells drones from all else, or `none`")
     networks.add_argument("--threads", metavar="N", type=_threads, help="processor threads (2)")
 
 
@@ -108,10 +109,12 @@ def perception_of(args: argparse.Namespace, drone: DroneConfig | None, **more: A
     values |= {"flow": DIS, "scale": "network", **more}
     if args.models is not None:
         values["models_dir"] = str(args.models)
-    if args.segmentation is not None:
-        values |= {"depth": args.segmentation, "segmentation": args.segmentation}
-    if args.distance is not None:
-        values["distance"] = args.distance
+    if args.first_stage is not None:
+        values |= {"depth": args.first_stage, "segmentation": args.first_stage}
+    if args.second_stage is not None:
+        values["distance"] = args.second_stage
+    if args.verification is not None:
+        values["verification"] = args.verification
     if args.threads is not None:
         values["threads"] = args.threads
     try:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.output import say, say_json
+from flockd.cli.output import cell, say, say_json
 from flockd.cli.parser import Commands, Parser, add_commands
 from flockd.cli.recording_options import add_stretch, opened, refuse_existing, stretch
 from flockd.errors import ExitCode, UsageError
@@ -88,7 +88,7 @@ def _info(args: argparse.Namespace) -> int:
     table = Table("stream", "schema", "messages", "rate", box=None, pad_edge=False)
     for stream in facts["streams"]:
         rate = "" if stream["rate_hz"] is None else f"{stream['rate_hz']:.2f} Hz"
-        table.add_row(stream["topic"], stream["schema"], f"{stream['messages']}", rate)
+        table.add_row(cell(stream["topic"]), cell(stream["schema"]), f"{stream['messages']}", rate)
     Console(markup=False, highlight=False).print(table)
     return ExitCode.DONE
 

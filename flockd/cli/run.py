@@ -7,18 +7,23 @@ import asyncio
 import functools
 import logging
 import os
+import resource
 import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli.parser import Commands
-from flockd.errors import ExitCode, UsageError
+from flockd.errors import ExitCode, UnavailableError, UsageError
+from flockd.printable import printable
 
 if TYPE_CHECKING:
     from flockd.config import DroneConfig
     from flockd.daemon import Daemon, Ending, ServiceManager
 
 WAITING_EVERY_S = 5.0
+FILES_NEEDED = 128
+ADDRESSES_NEEDED_MB = 3072
+"""What a flight takes, with some to spare. With less, libraries end the process on their own, some by an abort."""
 
 
 def add(commands: Commands) -> None:
@@ -40,6 +45,7 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
+    _check_limits()
     from flockd.config import load_drone
     from flockd.daemon import ServiceManager, event_loop_at, only_instance
 
@@ -56,6 +62,24 @@ def _run(args: argparse.Namespace) -> int:
         with only_instance(config.name, os.environ), asyncio.Runner(loop_factory=event_loop) as runner:
             config = runner.run(_fly(config, args, service)).reload
     return ExitCode.DONE
+
+
+def _check_limits() -> None:
+    """Takes as many file descriptors as it may have. Raises UnavailableError where a limit is too low for a flight."""
+    files, most_files = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if files != resource.RLIM_INFINITY and files < FILES_NEEDED:
+        if most_files != resource.RLIM_INFINITY and most_files < FILES_NEEDED:
+            raise UnavailableError(
+                f"this process may open {most_files} files, and a flight needs {FILES_NEEDED}; raise the limit "
+                "(LimitNOFILE= of the service, or ulimit -n)"
+            )
+        resource.setrlimit(resource.RLIMIT_NOFILE, (FILES_NEEDED, most_files))
+    addresses, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if addresses != resource.RLIM_INFINITY and addresses < ADDRESSES_NEEDED_MB << 20:
+        raise UnavailableError(
+            f"this process may use {addresses >> 20} MiB of addresses, and a flight needs {ADDRESSES_NEEDED_MB}; raise "
+            "the limit (LimitAS= of the service, or ulimit -v); to bound memory, use MemoryMax="
+        )
 
 
 async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceManager) -> Ending:
@@ -93,8 +117,17 @@ async def _say_what_it_waits_for(daemon: Daemon, every_s: float) -> None:
         await asyncio.sleep(every_s)
 
 
+class _Printable(logging.Formatter):
+    """A log goes to terminals, and texts in it come from the autopilot and from operators."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))
+
+
 def _log_to_stderr() -> None:
     """The journal dates its lines itself."""
     dated = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
-    logging.basicConfig(level=logging.INFO, format=f"{dated}%(message)s")
+    handler = logging.StreamHandler()
+    handler.setFormatter(_Printable(f"{dated}%(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
     logging.getLogger("flockd.autopilot").setLevel(logging.WARNING)  # MAVSDK tells a lot of itself

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.output import PIPED_COLUMNS, say_json
+from flockd.cli.output import PIPED_COLUMNS, cell, say_json
 from flockd.cli.parser import Commands, positive_number
 from flockd.errors import ExitCode, UnavailableError
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 ENDPOINT = "tcp/127.0.0.1:7447"
 LISTEN_S = 3.0
 REFRESH_S = 0.5
+MAX_SHOWN = 1e6
+"""Larger numbers, which only a faulty peer sends, are shown by their exponent."""
 
 
 def add(commands: Commands) -> None:
@@ -33,7 +35,7 @@ def add(commands: Commands) -> None:
         "flockd status --json --seconds 2",
     )
     parser = commands("status", "Show how each drone of a fleet is doing, the worst first.", examples)
-    parser.add_argument("--fleet", metavar="NAME", help="only this one; by default every fleet that is heard")
+    parser.add_argument("--fleet", metavar="NAME", help="only this one; by default every fleet that publishes")
     parser.add_argument(
         "--connect", metavar="ENDPOINT", action="append", help=f"of a drone or a router; by default {ENDPOINT}"
     )
@@ -91,21 +93,23 @@ def _table(rows: list[dict[str, Any]]) -> Table:
     )
     for row in rows:
         table.add_row(
-            f"{row['fleet']}/{row['drone']}",
+            cell(f"{row['fleet']}/{row['drone']}"),
             row["state"],
-            row["flight_mode"] or "",
+            cell(row["flight_mode"] or ""),
             _number(row["height_m"], ".1f", " m"),
             _number(row["battery_share"], ".0%", ""),
             _number(row["neighbours"], "d", ""),
             _number(row["load"], ".0%", ""),
-            row["mission"] or "",
-            "; ".join(row["matters"]),
+            cell(row["mission"] or ""),
+            cell("; ".join(row["matters"])),
         )
     return table
 
 
 def _number(value: float | None, form: str, unit: str) -> str:
-    return "" if value is None else f"{value:{form}}{unit}"
+    if value is None:
+        return ""
+    return f"{value:{form}}{unit}" if abs(value) < MAX_SHOWN else f"{value:.2g}"
 
 
 def _show_live(drones: Callable[[], Iterable[Watched]]) -> int:

@@ -10,6 +10,12 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
+Duration = Annotated[float, Field(gt=0, le=3600)]
+"""Seconds; an hour is longer than any of these flights."""
+Distance = Annotated[float, Field(gt=0, le=10_000)]
+"""Metres; farther than any of these radios and cameras reach."""
+Speed = Annotated[float, Field(ge=0, le=50)]
+"""m/s; faster than any of these vehicles."""
 Share = Annotated[float, Field(ge=0, le=1)]
 Vector3 = tuple[float, float, float]
 

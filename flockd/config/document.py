@@ -14,13 +14,15 @@ from pathlib import Path
 
 import yaml
 
-from flockd.errors import ConfigError, ConfigProblem
+from flockd.errors import ConfigError, ConfigProblem, shortage_of
 
 KeyPath = tuple[str | int, ...]
 Value = str | int | float | bool | None | tuple["Value", ...] | dict[str, "Value"]
 
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 32
+MAX_VALUES = 30_000
+"""A hundred times what any of ours holds; reading more takes longer than anyone would wait for an error."""
 LARGEST_INT = 2**63 - 1
 
 
@@ -89,6 +91,8 @@ def _read_text(path: Path, what: str) -> str:
     except FileNotFoundError as error:
         raise fault("does not exist; check the path") from error
     except OSError as error:
+        if shortage_of(error):
+            raise
         raise fault(f"cannot be read ({error.strerror}); check the path and its permissions") from error
     except ValueError as error:
         raise fault(f"is not a path ({error}); check it") from error
@@ -107,6 +111,7 @@ class _Builder:
     def __init__(self, document: Document, text: str, what: str) -> None:
         self._document, self._what = document, what
         self._events: Iterator[yaml.Event] = yaml.parse(text, Loader=yaml.SafeLoader)
+        self._count = 0
 
     def build(self) -> None:
         """Fills the document."""
@@ -130,6 +135,9 @@ class _Builder:
 
     def _value(self, event: yaml.Event, path: KeyPath, line: int) -> Value:
         """The value that begins with this event; its place is the line of its key or its dash."""
+        self._count += 1
+        if self._count > MAX_VALUES:
+            raise self._fatal(line, f"holds more than {MAX_VALUES} values, which no {self._what} does; check the path")
         if len(path) > MAX_DEPTH:
             raise self._fatal(line, f"is nested more than {MAX_DEPTH} levels deep; flatten it")
         if isinstance(event, yaml.AliasEvent):

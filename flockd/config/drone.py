@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from flockd.choices import OwnVelocitySource
 from flockd.config.autopilot import AutopilotParameters
-from flockd.config.base import Positive, Section, refuse
+from flockd.config.base import Section, refuse
 from flockd.config.flocking import FlockingParameters
 from flockd.config.geometry import GeometryParameters
 from flockd.config.mission import MissionParameters, mission_faults
@@ -30,7 +30,7 @@ class DroneConfig(Section):
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")] = "drone"
     """By which it is known in telemetry and recordings; different for each drone of a fleet."""
-    step_s: Positive = 0.5
+    step_s: Annotated[float, Field(gt=0, le=60)] = 0.5
     rig: RigConfig
     source: SourceParameters | None = None
     """Where the frames come from; needed to fly, not to simulate."""

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from flockd.config.base import NonNegative, Positive, Section
+from flockd.config.base import Distance, NonNegative, Section
 
 
 class WeightParameters(Section):
@@ -28,11 +28,11 @@ class FlockingParameters(Section):
     """C_c"""
     velocity: NonNegative = 1.0
     """C_vf"""
-    observation_distance_m: Positive = 20.0
+    observation_distance_m: Distance = 20.0
     """D_c"""
-    desired_distance_m: Positive = 3.5
+    desired_distance_m: Distance = 3.5
     """D_d"""
-    separation_distance_m: Positive = 1.5
+    separation_distance_m: Distance = 1.5
     """D_II"""
     weight: WeightParameters = WeightParameters()
     own_weight: NonNegative = 1.0

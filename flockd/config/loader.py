@@ -44,7 +44,7 @@ def load_scenario(path: Path | str, overrides: Overrides | None = None) -> Scena
 
 
 def load(path: Path | str) -> DroneConfig | ScenarioConfig:
-    """A drone's or a scenario's configuration, whichever the file's keys speak for. Raises ConfigError."""
+    """A drone's or a scenario's configuration, whichever the file's keys belong to. Raises ConfigError."""
     return load_with_places(path)[0]
 
 
@@ -72,7 +72,7 @@ def schema_of(kind: Literal["drone", "scenario"]) -> dict[str, Any]:
 
 
 def _kind(document: Document) -> Literal["drone", "scenario"]:
-    """Whichever the keys speak for."""
+    """Whichever the keys belong to."""
     keys = document.values.keys()
     is_drone = len(keys & DroneConfig.model_fields.keys()) > len(keys & ScenarioConfig.model_fields.keys())
     return "drone" if is_drone else "scenario"

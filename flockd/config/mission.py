@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from flockd.config.base import NonNegative, Positive, Section, refuse
+from flockd.config.base import Distance, NonNegative, Section, Speed, refuse
 from flockd.config.safety import GateParameters
 
 MissionKind = Literal["circle_then_tangent", "hover", "velocity", "waypoints", "follow", "operator"]
@@ -38,7 +38,7 @@ class WaypointParameters(Section):
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] | None = None
     height_m: Annotated[float, Field(ge=-1000, le=10_000)] | None = None
     """Above the ground at home, flown to on the way there. null: as before."""
-    speed_m_s: Positive | None = None
+    speed_m_s: Speed | None = None
     """On the way there. null: the mission's."""
 
     @model_validator(mode="after")
@@ -58,9 +58,9 @@ class MissionParameters(Section):
     """The paper's circle and its tangent (Eq. 43); `hover` at a standstill; a constant `velocity`; `waypoints` one
     after the other; `follow` the others without a goal of its own (W_i = 0 of Eq. 42); `operator`: what an operator
     sends over telemetry, as `telemetry.commands` allows."""
-    speed_m_s: NonNegative = 1.0
+    speed_m_s: Speed = 1.0
     """Desired speed: V of Eq. 43, and on the way to goals."""
-    radius_m: Positive = 10.0
+    radius_m: Distance = 10.0
     """Of `circle_then_tangent`."""
     circle_until_s: NonNegative = 66.0
     """Of `circle_then_tangent`: from then on straight."""
@@ -69,7 +69,7 @@ class MissionParameters(Section):
     waypoints: Annotated[tuple[WaypointParameters, ...], Field(max_length=1000)] = ()
     at_end: AtEnd = "hold"
     """After the last of the `waypoints`: hold the flock there, or have the autopilot land, or return home."""
-    reached_m: Positive = 1.0
+    reached_m: Distance = 1.0
     """A goal is reached when the middle of the flock, of this drone and of the neighbours that it sees, is as near."""
     timeout_s: Annotated[float, Field(gt=0, le=60)] = 2.0
     """An operator's velocity holds for this long, and with kind `operator` a goal does too; then the drone hovers."""

@@ -7,7 +7,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from flockd.choices import ROLES, FlowRefinement, Provider, Role, ScaleSource
-from flockd.config.base import NonNegative, Positive, Section, Share, refuse
+from flockd.config.base import Distance, NonNegative, Positive, Section, Share, refuse
 
 DIS, NO_MODEL = "dis", "none"
 """What stands where else a model's name does: OpenCV's DIS flow, and no second stage."""
@@ -21,9 +21,9 @@ MAX_SIZE_SIGMA = 0.3
 class DetectionParameters(Section):
     """How networks' outputs become detections. What belongs to a network's weights stands in its manifest instead."""
 
-    min_range_m: Positive = 0.2
+    min_range_m: Distance = 0.2
     """Nearer than this, nothing is a drone: it would touch the own one."""
-    max_range_m: Positive = 60.0
+    max_range_m: Distance = 60.0
     """Farther than this, nothing is a drone: it would be smaller than a pixel or two."""
     crop_shift: Share = 0.03
     """A further crop is not worth it when it would be moved by less than this share of half its width, ..."""
@@ -104,7 +104,7 @@ class PerceptionConfig(Section):
     """What ONNX Runtime computes with. Another one than this is never used in its place."""
     engines_dir: str | None = None
     """Where `flockd models prepare` keeps what a provider has built; by default `engines` beside the manifests."""
-    deadline_s: Positive = 1.0
+    deadline_s: Annotated[float, Field(gt=0, le=60)] = 1.0
     """In flight, a network that has not finished one call by then is stuck, and is ended."""
     detection: DetectionParameters = DetectionParameters()
     noise: NoiseParameters = NoiseParameters()

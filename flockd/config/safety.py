@@ -7,7 +7,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from flockd.choices import AutopilotMode
-from flockd.config.base import Positive, Section, Share
+from flockd.config.base import Duration, Positive, Section, Share
 
 _Metres = Annotated[float, Field(ge=-100_000, le=100_000)]
 
@@ -97,7 +97,7 @@ class SafetyParameters(Section):
     """The link to the autopilot counts as lost, and flockd falls silent for good."""
     neighbours_timeout_s: Annotated[float, Field(gt=0, le=60)] = 2.0
     """No confirmed neighbour seen for this long: the drone is alone."""
-    alone_s: Positive | None = 10.0
+    alone_s: Duration | None = 10.0
     """How long it flies on alone before it asks for Hold. null: for ever."""
     outside_s: Annotated[float, Field(gt=0, le=60)] = 3.0
     """How long it may take to come back into the fence and the heights before it asks for Hold."""

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from flockd.choices import PixelFormat
-from flockd.config.base import Positive, Section
+from flockd.config.base import Section
 
 
 class ControlParameters(Section):
@@ -53,11 +53,11 @@ class SourceParameters(Section):
     """Of kind `v4l2`: one for each camera of the rig."""
     shared_memory: SharedMemoryParameters = SharedMemoryParameters()
     """Of kind `shared_memory`."""
-    set_tolerance_s: Positive = 0.02
+    set_tolerance_s: Annotated[float, Field(gt=0, le=60)] = 0.02
     """How far the time stamp of a frame may be from that of its set; half a frame period or more."""
-    set_wait_s: Positive = 0.1
+    set_wait_s: Annotated[float, Field(gt=0, le=60)] = 0.1
     """How long a set waits for a camera that is late, or gone."""
-    silence_s: Positive = 0.5
+    silence_s: Annotated[float, Field(gt=0, le=60)] = 0.5
     """A camera without a usable frame for this long is closed and opened again."""
     frozen_after: Annotated[int, Field(ge=0)] = 5
     """An image that repeats itself this many times is frozen, and counts as no image; 0: may repeat for ever."""

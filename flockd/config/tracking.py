@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from flockd.config.base import Positive, Section
+from flockd.config.base import Duration, Positive, Section
 
 Probability = Annotated[float, Field(gt=0, lt=1)]
 
@@ -16,7 +16,7 @@ class TrackingParameters(Section):
 
     acceleration_sigma_m_s2: Positive = 0.2
     """How hard a neighbour may manoeuvre, standard deviation an axis."""
-    manoeuvre_time_s: Positive = 0.5
+    manoeuvre_time_s: Duration = 0.5
     """How long an acceleration lasts. The white acceleration noise of the motion model has the spectral density
     acceleration_sigma_m_s2^2 * manoeuvre_time_s (Bar-Shalom, Li & Kirubarajan 2001, section 6.2)."""
     relative_speed_sigma_m_s: Positive = 0.7
@@ -38,13 +38,13 @@ class TrackingParameters(Section):
     clutter_density: Positive = 0.01
     """False detections in one frame set, per steradian and unit of log range. The shipped networks give 18 in 500
     images (docs/networks.md), each of about 1.5 sr and 0.5 to 20 m, thus 0.0065; rounded up."""
-    survival_time_s: Positive = 60.0
+    survival_time_s: Duration = 60.0
     """Mean time that a neighbour stays within sight: existence probability decays with this time constant."""
     birth_probability: Probability = 0.5
     """Existence probability of a new track from a detection that is certainly of a drone."""
-    evidence_interval_s: Positive = 0.5
+    evidence_interval_s: Duration = 0.5
     """Frame sets nearer to each other in time are not independent evidence of existence: they count in proportion."""
-    drone_probability_memory_s: Positive = 5.0
+    drone_probability_memory_s: Duration = 5.0
     """Time constant of the average of the network's drone probabilities over a track; its existence probability is
     multiplied by it."""
     confirm_hits: Annotated[int, Field(ge=1)] = 3
@@ -55,7 +55,7 @@ class TrackingParameters(Section):
     """It stays confirmed while its existence probability is above this."""
     drop_probability: Probability = 0.1
     """A track is dropped when its existence probability falls below this."""
-    max_unseen_s: Positive = 1.5
+    max_unseen_s: Duration = 1.5
     """A track without a detection for longer is dropped whatever its existence probability."""
 
     @model_validator(mode="after")

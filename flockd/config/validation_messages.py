@@ -10,7 +10,7 @@ from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
 from flockd.config.document import KeyPath, Place, core_scalar
-from flockd.errors import ConfigProblem
+from flockd.errors import MAX_PROBLEMS_TOLD, ConfigProblem
 
 Schema = dict[str, Any]
 
@@ -39,14 +39,27 @@ _LIMITS = {
 def problems_of(
     errors: Sequence[ErrorDetails], model: type[BaseModel], places: Mapping[KeyPath, Place]
 ) -> list[ConfigProblem]:
-    """One problem for each place of which the validation of `model` complained."""
+    """One problem for each place of which the validation of `model` complained.
+
+    Only the first ones by line, which are all that a person is shown, say what to do.
+    """
     root: Schema = model.model_json_schema()
     grouped: dict[KeyPath, list[ErrorDetails]] = {}
     for error in errors:
         if error["type"] == "too_short" and len(error["input"]) >= error["ctx"]["min_length"]:
             continue  # only because entries were refused, which is told of each
         grouped.setdefault(path_in_file(error, places), []).append(error)
-    return [_problem(path, group, root, places) for path, group in grouped.items()]
+    in_order = sorted(grouped.items(), key=lambda one: _order(_place(one[0], places)))
+    told, others = in_order[:MAX_PROBLEMS_TOLD], in_order[MAX_PROBLEMS_TOLD:]
+    return [
+        *(_problem(path, group, root, places) for path, group in told),
+        *(_place(path, places).problem("cannot be so; correct the problems before it first") for path, _ in others),
+    ]
+
+
+def _order(place: Place) -> tuple[str, int, str]:
+    """As problems are sorted."""
+    return place.file, place.line, place.key
 
 
 def path_in_file(error: ErrorDetails, places: Mapping[KeyPath, Place]) -> KeyPath:

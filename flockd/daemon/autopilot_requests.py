@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Awaitable, Callable
 from typing import Literal
 
@@ -16,6 +17,8 @@ REPLY_S = 1.0
 """How long the autopilot may take to answer one request; its own repetitions are within."""
 RETRY_S = 0.3
 """Between two requests for the same, where the first changed nothing."""
+SAME_AGAIN_S = 30.0
+"""Until the same answer is logged again: an autopilot that has died is asked about once a second, for ever."""
 
 
 class AutopilotRequests:
@@ -23,6 +26,7 @@ class AutopilotRequests:
 
     def __init__(self, link: AutopilotLink, log_event: Callable[[str], None]) -> None:
         self._link, self._log_event = link, log_event
+        self._logged, self._logged_s = "", -math.inf
         self.takeover: Takeover | None = None
         """The mode to request, set by the control loop; None: none."""
         self.asking = False
@@ -38,6 +42,7 @@ class AutopilotRequests:
         while True:
             takeover = self.takeover
             if takeover is None:
+                self._logged = ""
                 await asyncio.sleep(POLL_S)
                 continue
             await self._ask(takeover, asks[takeover])
@@ -49,13 +54,20 @@ class AutopilotRequests:
             async with asyncio.timeout(REPLY_S):
                 await ask()
         except AutopilotError as error:
-            self._log_event(str(error))
+            self._log(str(error))
         except TimeoutError:
-            self._log_event(f"the autopilot was asked for {takeover} and has not responded yet")
+            self._log(f"the autopilot was asked for {takeover} and has not responded yet")
         else:
-            self._log_event(f"the autopilot was asked for {takeover}, and agreed")
+            self._log(f"the autopilot was asked for {takeover}, and agreed")
         finally:
             self.asking = False
+
+    def _log(self, answer: str) -> None:
+        """An event for an answer, unless it is the last one's repetition."""
+        now_s = asyncio.get_running_loop().time()
+        if answer != self._logged or now_s - self._logged_s >= SAME_AGAIN_S:
+            self._logged, self._logged_s = answer, now_s
+            self._log_event(answer)
 
     async def _wait_for_another(self, takeover: Takeover) -> None:
         loop = asyncio.get_running_loop()

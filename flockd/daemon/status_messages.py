@@ -8,13 +8,15 @@ from collections.abc import Callable, Mapping
 
 from flockd.daemon.components import Components
 from flockd.daemon.service_manager import ServiceManager
-from flockd.safety import Decision
+from flockd.safety import Decision, Event, State
 from flockd.telemetry import TOPICS
 from flockd.telemetry.topics import CameraMessage, ComputerMessage, FlightMessage, ReasonMessage
 
 START_POLL_S = 0.1
 START_MORE_S = 10.0
 STATUS_EVERY_S = 2.0
+STATUS_POLL_S = 0.05
+"""A new status is sent after this long at most, so that whoever reads the lines has them in the order of events."""
 
 
 async def notify_service_manager(components: Components, service: ServiceManager) -> None:
@@ -23,15 +25,20 @@ async def notify_service_manager(components: Components, service: ServiceManager
         faults = [status.fault for status in components.source.status().values() if status.fault]
         service.starting(f"waits for frames: {'; '.join(faults) or 'none came yet'}", START_MORE_S)
         await asyncio.sleep(START_POLL_S)
-    service.ready(_status_line(components.control.decision))
+    sent = components.control.decision
+    service.ready(_status_line(sent))
     components.sinks.event("ready: models loaded, autopilot heard, first frames seen")
     reported: set[str] = set()
+    loop = asyncio.get_running_loop()
     while True:
         for note in set(components.source.notes()) - reported:
             components.sinks.event(note)
             reported.add(note)
-        await asyncio.sleep(STATUS_EVERY_S)
-        service.status(_status_line(components.control.decision))
+        until = loop.time() + STATUS_EVERY_S
+        while _matters(components.control.decision) == _matters(sent) and loop.time() < until:
+            await asyncio.sleep(STATUS_POLL_S)
+        sent = components.control.decision
+        service.status(_status_line(sent))
 
 
 async def publish_status(components: Components, clock: Callable[[], float]) -> None:
@@ -50,6 +57,16 @@ async def publish_status(components: Components, clock: Callable[[], float]) -> 
                 due_s[topic] = now + 1.0 / rate_hz
                 components.sinks.publish(topic, message(now))
         await asyncio.sleep(max(0.0, min(due_s.values()) - clock()))
+
+
+def _matters(decision: Decision) -> tuple[State, tuple[Event, ...]]:
+    """What changes a status line, but for the numbers in it."""
+    return decision.state, tuple(reason.event for reason in decision.reasons)
+
+
+def _noisy(images: int) -> dict[str, int]:
+    """Their count, absent where there are none, as all counts."""
+    return {"noisy": images} if images else {}
 
 
 def _status_line(decision: Decision) -> str:
@@ -90,7 +107,7 @@ def _computer_message(components: Components, now: float) -> ComputerMessage:
         name: CameraMessage(
             age_s=camera.age_s,
             fault=camera.fault,
-            counts={**camera.counts, **({"noisy": noisy_images[name]} if noisy_images[name] else {})},
+            counts={str(what): n for what, n in camera.counts.items()} | _noisy(noisy_images[name]),
         )
         for name, camera in components.source.status().items()
     }

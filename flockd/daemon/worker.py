@@ -50,7 +50,7 @@ class Worker:
             raise LateError(f"{self._name}: not done within {deadline_s:g} s") from error
 
     def leave(self, timeout_s: float = 0.0) -> None:
-        """Lets the thread end after what it does now, and waits so long for it; if it hangs, it dies with the process.
+        """Lets the thread end after what it does now, and waits so long for it; if it hangs, it ends with the process.
 
         To wait is for threads that run foreign code, which a process had better not end under.
         """

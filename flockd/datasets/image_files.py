@@ -15,6 +15,8 @@ from flockd.messages import Float32Array, UInt8Array
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff"})
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
 _JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+MAX_FILE_BYTES = 1 << 29
+"""Of an image with the most pixels that are read, and a depth of 16 bits, uncompressed, and some."""
 _CHUNK_FRAME = 12
 """Bytes of a PNG chunk beside its data: length, name and checksum."""
 
@@ -42,27 +44,47 @@ def read_depth(path: Path, size: tuple[int, int], units_per_m: float) -> Float32
 
 
 def _decoded(path: Path, flags: int) -> cv2.typing.MatLike:
+    logging = cv2.utils.logging
+    before = logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # the sentence below says it
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror}); restore it, or leave its frame out") from None
-    fault = _fault(data)
-    image = None if fault else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        data = _read(path)
+        fault = _fault(data)
+        image = None if fault else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except (OSError, ValueError) as error:  # ValueError: what a list names cannot be a path
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise DatasetError(f"{path}: cannot be read ({reason}); restore it, or leave its frame out") from None
+    except cv2.error:  # of a header that claims more pixels than OpenCV takes
+        image, fault = None, "cannot be decoded"
+    finally:
+        logging.setLogLevel(before)
     if image is None:
         raise DatasetError(f"{path}: {fault or 'is no image'}; restore it, or leave its frame out")
     return image
 
 
+def _read(path: Path) -> bytes:
+    """Of an ordinary file: a pipe or a device may never end."""
+    if path.exists() and not path.is_file():
+        raise DatasetError(f"{path}: is not an ordinary file; restore it, or leave its frame out")
+    if path.exists() and path.stat().st_size > MAX_FILE_BYTES:
+        raise DatasetError(f"{path}: is larger than {MAX_FILE_BYTES >> 20} MiB; give it the dataset's size")
+    return path.read_bytes()
+
+
 def _fault(data: bytes) -> str | None:
-    """What is wrong with a file before it is decoded."""
+    """What is wrong with a file before it is decoded, and memory taken for what it claims to hold."""
+    if not data:
+        return "is empty"
     size = image_size(data)
-    if size is not None and size[0] * size[1] > MAX_IMAGE_PIXELS:
-        return f"claims {size[0]} x {size[1]} pixels, more than any camera has"
+    if size is None:
+        return "is no image"
+    if size[0] * size[1] > MAX_IMAGE_PIXELS:
+        return f"claims to be {size[0]} x {size[1]} pixels, more than any camera has"
     if data.startswith(_PNG):
         return _png_fault(data)
     if data.startswith(_JPEG) and _JPEG_END not in data[-64:]:
         return "the JPEG ends too early"
-    return None if data else "is empty"
+    return None
 
 
 def _png_fault(data: bytes) -> str | None:

@@ -68,7 +68,7 @@ def open_video(path: Path, calibration: Path | None) -> VideoDataset:
 @contextmanager
 def opened_video(path: Path) -> Iterator[cv2.VideoCapture]:
     """A video for OpenCV, unrotated whatever orientation the file asks for; closed at the end."""
-    # What the decoder thinks of a damaged file would stand on stderr, beside our own sentence.
+    # The decoder's own messages about a damaged file would go to stderr, beside our own sentence.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     logging = cv2.utils.logging
     before = logging.setLogLevel(logging.LOG_LEVEL_SILENT)

@@ -1,4 +1,4 @@
-"""The autopilot: heard, known, and set up so that it acts when flockd falls silent. Nothing here changes it."""
+"""The autopilot: connected, of a known version, and set up to act when setpoints stop. Nothing here changes it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from flockd.autopilot.mavsdk_link import AutopilotLink
 from flockd.config import DroneConfig
 from flockd.config.autopilot import AutopilotParameters
 from flockd.config.safety import GateParameters
-from flockd.doctor.finding import Finding, failed, failed_from_error, passed, warned
+from flockd.doctor.finding import Finding, Level, failed, failed_from_error, passed, warned
 
 HEARD_S = 10.0
 OLDEST_TRIED = (1, 14)
@@ -30,29 +30,43 @@ def check_autopilot(config: DroneConfig) -> Iterator[Finding]:
 async def _ask(config: DroneConfig, parameters: AutopilotParameters) -> list[Finding]:
     link = await AutopilotLink.connect(parameters, timeout_s=HEARD_S)
     try:
-        found = [judge_heartbeat(link.system_id, link.status(), parameters), await _firmware(link)]
-        for name, kind in KINDS.items():
-            try:
-                value = await link.parameter(name, kind)
-            except AutopilotError as error:
-                fix = f"see whether this firmware has {name}, and whether the link loses much"
-                found.append(failed(name, str(error), fix))
-                if link.status().heartbeat_age_s > parameters.max_heartbeat_age_s:
-                    found.append(judge_heartbeat(link.system_id, link.status(), parameters))
-                    break
-            else:
-                found.append(JUDGES[name](value, config))
+        heard = link.status()
+        firmware = await _firmware(link)
+        found = [judge_heartbeat(link.system_id, heard, parameters)]
+        signing = judge_signing(isinstance(firmware, Firmware), link.status().heartbeat_age_s, parameters)
+        if isinstance(firmware, Firmware):
+            found += [judge_firmware(firmware), signing, *await _parameters(link, config, parameters)]
+        elif signing.level is Level.FAILURE:
+            found += [failed_from_error("firmware", str(firmware)), signing]
+        else:
+            found += [failed_from_error("firmware", str(firmware)), *await _parameters(link, config, parameters)]
         found += judge_messages(link.unknown_values())
     finally:
         await link.close()
     return found
 
 
-async def _firmware(link: AutopilotLink) -> Finding:
+async def _firmware(link: AutopilotLink) -> Firmware | AutopilotError:
     try:
-        return judge_firmware(await link.firmware())
+        return await link.firmware()
     except AutopilotError as error:
-        return failed_from_error("firmware", str(error))
+        return error
+
+
+async def _parameters(link: AutopilotLink, config: DroneConfig, parameters: AutopilotParameters) -> list[Finding]:
+    found = []
+    for name, kind in KINDS.items():
+        try:
+            value = await link.parameter(name, kind)
+        except AutopilotError as error:
+            fix = f"see whether this firmware has {name}, and whether the link loses much"
+            found.append(failed(name, str(error), fix))
+            if link.status().heartbeat_age_s > parameters.max_heartbeat_age_s:
+                found.append(judge_heartbeat(link.system_id, link.status(), parameters))
+                break
+        else:
+            found.append(JUDGES[name](value, config))
+    return found
 
 
 def judge_heartbeat(system_id: int, status: AutopilotStatus, parameters: AutopilotParameters) -> Finding:
@@ -63,6 +77,16 @@ def judge_heartbeat(system_id: int, status: AutopilotStatus, parameters: Autopil
     if status.armed:
         return warned("heartbeat", f"{measured}, and armed", "disarm it on the ground before you examine it")
     return passed("heartbeat", f"{measured}, disarmed, in flight mode {status.flight_mode}")
+
+
+def judge_signing(responds: bool, heartbeat_age_s: float, parameters: AutopilotParameters) -> Finding:
+    """Whether it accepts messages that are not signed (MAVLink 2): flockd's are not, and others' need not be either."""
+    if responds:
+        return passed("signing", "it accepts unsigned messages, flockd's and anybody's: let nobody else reach it")
+    if heartbeat_age_s > parameters.max_heartbeat_age_s:
+        return warned("signing", "not known: it is not heard any more", "see to the link first")
+    measured = "it is heard and does not respond: nothing reaches it, or it accepts signed messages only"
+    return failed("signing", measured, "see to the cable's other direction; remove the signing key from its SD card")
 
 
 def judge_messages(unknown_values: Mapping[str, int]) -> list[Finding]:

@@ -8,14 +8,16 @@ from flockd.flight_log.key_frames import KeyFrame
 from flockd.messages import PilotOutput
 from flockd.pilot import StepTrace
 
-_KEY_FRAMES = 6
+_KEY_FRAMES, _KEY_FRAMES_APART = 6, 6
+"""In a flight, and at least how many steps apart: each costs a second of the report's time and 0.2 MB of its size."""
 _SKY_M = 75.0
 """Estimated depth beyond this is shown as sky."""
 
 
 def key_frame_steps(steps: int) -> set[int]:
     """Which of a flight's steps, counted from 0, are key frames: evenly spread from the first that has optical flow."""
-    return set(np.linspace(1, steps - 1, _KEY_FRAMES).astype(int).tolist())
+    count = min(max(steps // _KEY_FRAMES_APART, 2), _KEY_FRAMES)
+    return set(np.linspace(1, steps - 1, count).astype(int).tolist())
 
 
 def capture(trace: StepTrace, output: PilotOutput, drone: int, name: str = "") -> list[KeyFrame]:

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
-from flockd.errors import ModelError
+from flockd.errors import FlockdError, UnavailableError, shortage_of
 from flockd.inference.manifest import Fault, InputSpec, Manifest, OutputSpec, golden_deviates, listed
 from flockd.inference.manifest_file import ManifestFile
 from flockd.inference.weights import fault_of_weights
@@ -90,8 +90,10 @@ def check_golden(file: ManifestFile, outputs: Mapping[str, NDArray[Any]]) -> Non
             raise file.error(("outputs", name), f"{difference}; export the model and its manifest together")
 
 
-def cannot_run(file: ManifestFile, provider: str, error: Exception) -> ModelError:
+def cannot_run(file: ManifestFile, provider: str, error: Exception) -> FlockdError:
     """The error that a model does not run on the golden input."""
+    if (lacking := shortage_of(error)) is not None:
+        return UnavailableError(f"{file.model} cannot be run: out of {lacking}; raise the limits")
     if isinstance(error, TimeoutError):
         return file.error(
             ("file",),

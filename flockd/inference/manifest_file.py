@@ -14,11 +14,11 @@ from flockd.config.document import Place, key_text, read_document
 from flockd.config.perception import PerceptionConfig
 from flockd.config.validation_messages import problems_of
 from flockd.data import data_path
-from flockd.errors import ConfigError, ConfigProblem, ModelError
+from flockd.errors import ConfigError, ConfigProblem, ModelError, shortage_of
 from flockd.inference.manifest import Fault, Key, Manifest
 
 Check = Callable[[Manifest], Iterable[Fault]]
-"""What is wrong with a manifest for whoever wants to use the model."""
+"""What is wrong with a manifest, for a caller that uses the model."""
 MAX_MODEL_BYTES = 2 << 30
 """A protobuf, and so an ONNX file without weights outside it, cannot be larger."""
 
@@ -53,6 +53,8 @@ class ManifestFile:
                 raise self.error(("file",), f"{model} is larger than 2 GiB, which no ONNX file is; name the right one")
             content = model.read_bytes()
         except OSError as error:
+            if shortage_of(error):
+                raise
             reason = f"cannot read {model} ({error.strerror})"
             raise self.error(("file",), f"{reason}; put the model file back or name the right one") from None
         digest = hashlib.sha256(content).hexdigest()
@@ -66,7 +68,7 @@ class ManifestFile:
 
 
 def nothing_more(manifest: Manifest) -> Iterable[Fault]:
-    """The check of who only wants to know what a model is."""
+    """The check for a caller that only describes a model."""
     return ()
 
 

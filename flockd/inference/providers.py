@@ -11,7 +11,7 @@ import onnxruntime as ort
 
 from flockd.choices import Provider
 from flockd.config.perception import PerceptionConfig
-from flockd.errors import ModelError
+from flockd.errors import ModelError, UnavailableError, shortage_of
 from flockd.inference.manifest_file import ManifestFile, models_folder
 
 EXECUTION_PROVIDERS: dict[Provider, str] = {
@@ -71,6 +71,8 @@ def open_session(file: ManifestFile, *, threads: int, provider: Provider, folder
             str(file.model), options, providers=_providers(provider, threads, folder), enable_fallback=0
         )
     except Exception as error:  # noqa: BLE001 - ONNX Runtime's own exception types are private
+        if (lacking := shortage_of(error)) is not None:
+            raise UnavailableError(f"{file.model} cannot be loaded: out of {lacking}; raise the limits") from None
         reason = str(error).splitlines()[0]
         if provider == "cpu":
             raise file.error(("file",), f"{file.model} cannot be loaded ({reason}); restore it") from None

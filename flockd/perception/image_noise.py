@@ -109,9 +109,8 @@ def _haar(image: Float32Array) -> tuple[Float32Array, Float32Array]:
     """The diagonal details (h/2, w/2) of one level of the orthonormal Haar transform, and what is left for the next."""
     upper, lower = image[0::2], image[1::2]
     difference, total = upper - lower, upper + lower
-    details: Float32Array = (difference[:, 0::2] - difference[:, 1::2]) / 2
-    rest: Float32Array = (total[:, 0::2] + total[:, 1::2]) / 2
-    return details, rest
+    half = np.float32(0.5)
+    return half * (difference[:, 0::2] - difference[:, 1::2]), half * (total[:, 0::2] + total[:, 1::2])
 
 
 def _sigmas(details: Float32Array, side: int) -> Float32Array:

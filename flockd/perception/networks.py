@@ -97,7 +97,7 @@ class OnnxNetworks:
             self.second_stage = SecondStage.of(self._distance.manifest, verification)
 
     def terminate(self) -> None:
-        """Ends every run of a network that is under way; whoever called it gets an error."""
+        """Ends every run of a network that is under way; its caller gets an error."""
         for model in self._models.values():
             model.terminate()
 
@@ -151,11 +151,11 @@ class OnnxNetworks:
         limit = self._verification.manifest.threshold("distance_logit_limit")
         # Where there is no drone, there is no range to ask for: most crops of a cluttered image end here.
         most = _probability(logits + limit)
-        rest = np.flatnonzero(most > self.second_stage.thresholds.another_crop)
+        rest = [k for k, p in enumerate(most) if p > self.second_stage.thresholds.another_crop]
         ranged = self._ranges(
             self._distance, [crops[k] for k in rest], [images[k] for k in rest], logits[rest], limit=limit
         )
-        estimates = [_no_range(p, size) for p in most]
+        estimates = [_no_range(float(p), size) for p in most]
         for k, estimate in zip(rest, ranged, strict=True):
             estimates[k] = estimate
         return tuple(estimates)
@@ -177,11 +177,11 @@ class OnnxNetworks:
         if not crops:
             return ()
         outputs = _in_batches(distance, images)
-        columns = dict(distance.manifest.results["range"].by_column(outputs["range"]))
-        columns["drone_logit"] = logits + np.clip(columns["drone_logit"], -limit, limit)
+        columns = distance.manifest.results["range"].by_column(outputs["range"])
+        evidence = logits + np.clip(columns["drone_logit"], -limit, limit)
         masks = list(outputs["mask"][:, 0]) if "mask" in outputs else [None] * len(crops)
         return tuple(
-            _estimate({name: float(column[k]) for name, column in columns.items()}, crop, masks[k])
+            _estimate({name: float(column[k]) for name, column in columns.items()}, float(evidence[k]), crop, masks[k])
             for k, crop in enumerate(crops)
         )
 
@@ -282,7 +282,7 @@ def _probability(logit: FloatArray) -> FloatArray:
     return np.asarray(1.0 / (1.0 + np.exp(-logit)))
 
 
-def _estimate(columns: Mapping[str, float], crop: Crop, mask: Float32Array | None) -> RangeEstimate:
+def _estimate(columns: Mapping[str, float], drone_logit: float, crop: Crop, mask: Float32Array | None) -> RangeEstimate:
     """Of one crop's output, with a mirror image's turned back."""
     size = crop.camera.size[0]
     right = columns["right_px"]
@@ -294,7 +294,7 @@ def _estimate(columns: Mapping[str, float], crop: Crop, mask: Float32Array | Non
         log_range_sigma=float(np.exp(columns["log_relative_sigma"])),
         centre=np.array([size / 2 + right, size / 2 + columns["down_px"]]),
         size_m=float(np.exp(columns["log_range_per_focal"] + columns["log_apparent_size"])),
-        drone_probability=float(_probability(np.array(columns["drone_logit"]))),
+        drone_probability=float(_probability(np.array(drone_logit))),
         mask=mask,
     )
 

@@ -74,16 +74,21 @@ class PictureFile:
         return rate if np.isfinite(rate) and rate > 0 else 30.0
 
 
-def find_pictures(paths: Sequence[Path]) -> list[PictureFile]:
+def find_pictures(paths: Sequence[Path], but_not: Path | None = None) -> list[PictureFile]:
     """The images and videos that are named, and those in the folders that are named and below; each once.
 
+    Files whose name begins with a dot are other programs' notes, and count only where they are named. Nor
+    does what lies in ``but_not``, a folder of copies inside one that is named.
     Raises UsageError for what is not there, is neither, or is a folder without any.
     """
     endings = image_files.SUFFIXES | video.SUFFIXES
+    copies = None if but_not is None else but_not.resolve()
     found: dict[Path, PictureFile] = {}
     for path in paths:
         if path.is_dir():
-            inside = sorted(one for one in path.rglob("*") if one.suffix.lower() in endings and one.is_file())
+            inside = sorted(one for one in path.rglob("[!.]*") if one.suffix.lower() in endings and one.is_file())
+            if copies is not None and path.resolve() in copies.parents:
+                inside = [one for one in inside if copies not in one.resolve().parents]
             if not inside:
                 raise UsageError(f"{path}: has no images or videos; name the folder that they are in")
             for one in inside:

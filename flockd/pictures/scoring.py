@@ -27,7 +27,6 @@ class Labelled:
 
     detections: tuple[DetectedDrone, ...]
     boxes: tuple[Box, ...] = ()
-    proposals: int = 0
 
 
 def width_class(box: Box) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -13,11 +14,16 @@ from flockd.geometry import Camera, PinholeCamera, Rig, RigCamera, RigidTransfor
 from flockd.messages import Detection, FloatArray, Frame, FrameSet, UInt8Array, VehicleState
 from flockd.perception import Networks, Perception
 from flockd.perception.detection.detector import DetectionTrace
+from flockd.perception.detection.refinement import Candidate
+from flockd.perception.detection.roi import angle_between
 
 MAX_SIDE_PX = 1280
 """Larger pictures are resized to this before the networks: they were trained on cameras of 640 pixels."""
 _R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """Of a camera that faces forward: optical right-down-forward axes to the body's forward-right-down."""
+_MAX_INSTANCE = 2.0
+"""An instance's longer side over the drone's apparent size, for it to be of this drone alone: masks of soft pictures
+lack thin arms and propellers, which the first stage has, but it may take several drones for one."""
 _UNKNOWN_HEIGHT_M = 5.0
 """Not used: the networks give the scale. A vehicle state has to hold some height."""
 
@@ -30,7 +36,7 @@ class DetectedDrone:
     """One detection in one picture."""
 
     box: Box
-    """Of its mask."""
+    """Around its mask and the first stage's instances of it."""
     centre_px: tuple[float, float]
     """Right and down, of the detection's bearing."""
     probability: float
@@ -87,16 +93,24 @@ class PictureDetector:
             return PictureResult((), 0, np.zeros(image.shape[:2], np.uint8))
         seen = observation.cameras["camera"].labels
         mask = np.where(np.isin(seen, [one.label for one in observation.detections]), seen, np.uint8(0))
-        found = tuple(self._drone(one, camera, mask, scale) for one in observation.detections)
+        found = tuple(self._drone(one, camera, mask, trace.candidates, scale) for one in observation.detections)
         return PictureResult(found, sum(proposal.instance is not None for proposal in trace.proposals), mask)
 
-    def _drone(self, one: Detection, camera: Camera, mask: UInt8Array, scale: FloatArray) -> DetectedDrone:
+    def _drone(
+        self, one: Detection, camera: Camera, mask: UInt8Array, candidates: Sequence[Candidate], scale: FloatArray
+    ) -> DetectedDrone:
         """With pixels of the picture before it was resized by ``scale`` (2,)."""
         centre = camera.project(one.position[None] @ _R_BODY_CAMERA)[0]
-        box = _box_of(mask == one.label)
-        if box is None:  # the second stage gives no mask, or a nearer drone's covers it
-            reach = one.size_m / one.range_m * camera.focal_px / 2
-            box = np.clip([*(centre - reach), *(centre + reach)], 0, np.tile(camera.size, 2))
+        size_px = one.size_m / one.range_m * camera.focal_px
+        mine = [c for c in candidates if angle_between(c.bearing, one.bearing) < one.size_m / one.range_m / 2]
+        boxes = [c.proposal.instance.box for c in mine if c.proposal.instance is not None]
+        boxes = [box for box in boxes if (box[2:] - box[:2]).max() <= _MAX_INSTANCE * size_px]
+        masked = _box_of(mask == one.label)
+        if masked is not None:
+            boxes.append(masked)
+        if not boxes:  # no mask, or a nearer drone's covers it
+            boxes.append(np.clip([*(centre - size_px / 2), *(centre + size_px / 2)], 0, np.tile(camera.size, 2)))
+        box = np.concatenate([np.min(boxes, axis=0)[:2], np.max(boxes, axis=0)[2:]])
         left, top, right, bottom = (float(value) for value in box / np.tile(scale, 2))
         u, v = (float(value) for value in centre / scale)
         sigma = one.range_sigma_m

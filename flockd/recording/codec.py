@@ -8,6 +8,7 @@ its annotation is a flat list of numbers, row by row, as viewers do not take lis
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import types
 from collections.abc import Mapping
@@ -19,6 +20,14 @@ from flockd.messages import Shape
 
 Json = Any
 """What `json` writes and reads: text, numbers, booleans, lists, and mappings by text."""
+
+
+def parsed(data: bytes) -> Json:
+    """What stands in JSON from outside. Raises ValueError for what is none, or nested deeper than can be followed."""
+    try:
+        return json.loads(data)
+    except RecursionError as error:
+        raise ValueError("it is nested too deep") from error
 
 
 def to_json(value: object) -> Json:
@@ -128,7 +137,10 @@ def _field_from(kind: Any, name: str, hint: Any, value: Json) -> Any:
 def _number(value: Json) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise ValueError(f"{value!r} is not a number")  # noqa: TRY004 - of the file, not of the caller
-    return float(value)
+    try:
+        return float(value)
+    except OverflowError as error:
+        raise ValueError(f"a number has {len(str(value))} digits") from error
 
 
 def _expect(kind: Any, value: Json) -> Any:

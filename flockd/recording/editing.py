@@ -2,28 +2,42 @@
 
 from __future__ import annotations
 
-import json
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 
+from flockd.messages import VehicleState
 from flockd.recording import foxglove
-from flockd.recording.codec import from_json
+from flockd.recording.codec import from_json, parsed
 from flockd.recording.mcap_file import Entry, McapFile, Note, RecordingError, read_records
-from flockd.recording.reader import Contents, Recording, head_of, is_calibration, makes_steps
+from flockd.recording.migration import migrate_output
+from flockd.recording.reader import (
+    Contents,
+    Recording,
+    decoded_image,
+    head_of,
+    is_calibration,
+    is_image,
+    makes_steps,
+)
 from flockd.recording.streams import (
     CUT,
     END_NOTE,
     FLIGHT_NOTE,
     FRAMES,
+    OUTPUT,
     PILOT_BEGAN,
     RECOVERED,
+    TRUTH,
     VEHICLE,
     StepFrames,
 )
+from flockd.recording.truth import Truth
+
+_KINDS = {VEHICLE.topic: VehicleState, TRUTH.topic: Truth}
 
 
 def recover(recording: Recording, target: Path) -> int:
@@ -55,7 +69,7 @@ def written_whole(target: Path) -> Iterator[Path]:
 
 def _copy(recording: Recording, target: Path, start_s: float, end_s: float, how: str) -> int:
     contents, began_s = recording.contents, recording.pilot_began_s
-    whole = _whole_steps(contents, start_s, end_s)
+    whole = _whole_steps(contents, start_s, end_s, images=how == RECOVERED)
     if not whole:
         raise RecordingError(f"{contents.paths[0]}: holds no whole step there; nothing was written")
     flight, models, configuration = head_of(contents.paths[0])
@@ -83,21 +97,40 @@ def _kept(contents: Contents, whole: set[int], in_time: Callable[[int], bool]) -
             yield entry
 
 
-def _whole_steps(contents: Contents, start_s: float, end_s: float) -> set[int]:
-    """Steps with their vehicle's state and all the images that they list."""
+def _whole_steps(contents: Contents, start_s: float, end_s: float, *, images: bool) -> set[int]:
+    """Steps with their vehicle's state and all the images that they list; ``images``: only if those decode."""
     seen: dict[int, set[str]] = {}
     listed: dict[int, StepFrames] = {}
+    damaged: set[int] = set()
     for entry in _entries(contents):
         if makes_steps(entry.stream.topic):
             seen.setdefault(entry.sequence, set()).add(entry.stream.topic)
         if entry.stream.topic == FRAMES.topic:
-            listed[entry.sequence] = from_json(StepFrames, json.loads(entry.data))
+            with suppress(ValueError):
+                listed[entry.sequence] = from_json(StepFrames, parsed(entry.data))
+        elif not _can_be_read(entry, images):
+            damaged.add(entry.sequence)
     return {
         number
         for number, step in listed.items()
-        if start_s <= step.time_s <= end_s
+        if number not in damaged
+        and start_s <= step.time_s <= end_s
         and {VEHICLE.topic, *(foxglove.image_stream(f.camera).topic for f in step.frames)} <= seen[number]
     }
+
+
+def _can_be_read(entry: Entry, images: bool) -> bool:
+    """Whether a step with this message can be replayed."""
+    try:
+        if entry.stream.topic in _KINDS:
+            from_json(_KINDS[entry.stream.topic], parsed(entry.data))
+        elif entry.stream.topic == OUTPUT.topic:
+            migrate_output(parsed(entry.data))
+        elif images and is_image(entry.stream.topic):
+            decoded_image(entry.data)
+    except (ValueError, RecordingError):
+        return False
+    return True
 
 
 def _entries(contents: Contents) -> Iterator[Entry]:

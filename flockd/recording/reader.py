@@ -18,7 +18,7 @@ from flockd.config import DroneConfig
 from flockd.image_header import MAX_IMAGE_PIXELS, image_size
 from flockd.messages import Frame, FrameSet, MissionOrder, UInt8Array, VehicleState
 from flockd.recording import foxglove
-from flockd.recording.codec import from_json
+from flockd.recording.codec import from_json, parsed
 from flockd.recording.mcap_file import Damage, Entry, Inclosure, Note, Record, RecordingError, read_records
 from flockd.recording.migration import Migrated, migrate_configuration, migrate_output
 from flockd.recording.streams import (
@@ -170,16 +170,16 @@ class Recording:
         if VEHICLE.topic not in messages and not self.contents.finished and number == self.contents.steps[-1][0]:
             return  # killed within this step
         try:
-            listed: StepFrames = from_json(StepFrames, json.loads(messages[FRAMES.topic]))
+            listed: StepFrames = from_json(StepFrames, parsed(messages[FRAMES.topic]))
             if not start_s <= listed.time_s <= end_s:
                 return
-            vehicle: VehicleState = from_json(VehicleState, json.loads(messages[VEHICLE.topic]))
-            output = migrate_output(json.loads(messages[OUTPUT.topic])) if OUTPUT.topic in messages else None
-            truth = from_json(Truth, json.loads(messages[TRUTH.topic])) if TRUTH.topic in messages else None
-            order = from_json(MissionOrder, json.loads(messages[ORDER.topic])) if ORDER.topic in messages else None
+            vehicle: VehicleState = from_json(VehicleState, parsed(messages[VEHICLE.topic]))
+            output = migrate_output(parsed(messages[OUTPUT.topic])) if OUTPUT.topic in messages else None
+            truth = from_json(Truth, parsed(messages[TRUTH.topic])) if TRUTH.topic in messages else None
+            order = from_json(MissionOrder, parsed(messages[ORDER.topic])) if ORDER.topic in messages else None
             frames = {}
             for entry in listed.frames:
-                image = _image(messages[foxglove.image_stream(entry.camera).topic])
+                image = decoded_image(messages[foxglove.image_stream(entry.camera).topic])
                 frames[entry.camera] = Frame(entry.camera, image, entry.time_s, entry.sequence)
         except KeyError as error:
             raise RecordingError(f"{self.path}: step {number} lost its message {error}; {_WHAT_TO_DO}") from error
@@ -281,8 +281,8 @@ def _count(path: Path, facts: Mapping[str, str], name: str) -> int:
 
 def _time_of(path: Path, data: bytes) -> float:
     try:
-        time_s = float(json.loads(data)["time_s"])
-    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        time_s = float(parsed(data)["time_s"])
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise RecordingError(f"{path}: holds a frame set without a time; use another copy") from error
     if not math.isfinite(time_s):
         raise RecordingError(f"{path}: holds a frame set without a time; use another copy")
@@ -291,7 +291,7 @@ def _time_of(path: Path, data: bytes) -> float:
 
 def _migrated(path: Path, text: bytes) -> Migrated:
     try:
-        return migrate_configuration(json.loads(text))
+        return migrate_configuration(parsed(text))
     except ValueError as error:
         raise RecordingError(f"{path}: the configuration in it is not JSON ({error}); use another copy") from error
 
@@ -324,7 +324,8 @@ def makes_steps(topic: str) -> bool:
     return topic in {FRAMES.topic, VEHICLE.topic, ORDER.topic, OUTPUT.topic, TRUTH.topic} or is_image(topic)
 
 
-def _image(message: bytes) -> UInt8Array:
+def decoded_image(message: bytes) -> UInt8Array:
+    """(h, w, 3) RGB of an image's message. Raises ValueError and RecordingError."""
     data, kind = foxglove.image_data(message)
     width, height = image_size(data) or (0, 0)
     if width * height > MAX_IMAGE_PIXELS:

@@ -163,7 +163,7 @@ class Recorder:
         self._put(_Step(number, frames, vehicle, output, truth, order), size + _SMALL_BYTES)
 
     def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
-        """Takes one telemetry message, if the table of topics wants it recorded; a `TelemetrySink`.
+        """Takes one telemetry message, if the table of topics marks it as recorded; a `TelemetrySink`.
 
         For what does not follow from a step, such as events: all that does is written with the step.
         """
@@ -210,7 +210,7 @@ class Recorder:
             self._tell("recording: the disk is too slow, so that steps are dropped; record smaller or fewer images")
 
     def _tell(self, event: str) -> None:
-        """Into the file and to whoever listens."""
+        """Into the file and to the subscribers."""
         with self._lock:
             self._held_bytes += _SMALL_BYTES
             self._queue.put(_Message("events", {"event": event}))

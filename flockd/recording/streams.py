@@ -57,7 +57,7 @@ OUTPUT = _json_stream("/output", PilotOutput)
 TRUTH = _json_stream("/truth", Truth)
 """Of simulated flights."""
 TABLE = {key: _json_stream(f"/{key}", topic.type) for key, topic in TOPICS.items() if topic.recorded}
-"""The telemetry that the table of topics wants recorded."""
+"""The telemetry that the table of topics marks as recorded."""
 
 
 def part_path(first: Path, number: int) -> Path:

@@ -13,7 +13,7 @@ def integrate(pairs: Iterable[Pair], stride: int) -> tuple[list[tuple[float, Rig
     """Times and camera poses (``T_world_camera``) by one motion after the other, every ``stride``-th frame.
 
     It begins at the first frame's true pose, or at the origin. It ends before the first motion that is not known,
-    which is given too: where the camera went then, nobody saw.
+    which is given too: where the camera went then is not known.
     """
     path: list[tuple[float, RigidTransform]] = []
     for pair in pairs:

@@ -119,14 +119,17 @@ def _embed(log: FlightLog, draw: _Draw, path: Path, description: str) -> Markup 
         figure = draw(log, narrow=narrow)
         if figure is None:
             return None
-        image = io.BytesIO()
-        figure.savefig(image, format="png")
-        if not narrow:
-            path.write_bytes(image.getvalue())
         kind = "narrow" if narrow else "wide"
         element = inline_svg(figure, f"{path.stem}-{kind}", description)
-        if len(element) > _MAX_SVG_BYTES:
-            element = f'<img src="{_data_url("image/png", image.getvalue())}" alt="{description}">'
+        figure.set_layout_engine("none")  # everything has its place now, and finding it again takes as long as drawing
+        large = len(element) > _MAX_SVG_BYTES
+        if large or not narrow:
+            image = io.BytesIO()
+            figure.savefig(image, format="png")
+            if not narrow:
+                path.write_bytes(image.getvalue())
+            if large:
+                element = f'<img src="{_data_url("image/png", image.getvalue())}" alt="{description}">'
         parts.append(f'<div class="{kind}">{element}</div>')
     return Markup("\n".join(parts))  # drawn here, from numbers
 

@@ -1,6 +1,6 @@
 """The last gate: of what is asked for, what may be sent to the autopilot. Silent until allowed.
 
-It stands apart from all that is clever: it trusts neither the pilot nor the networks, and limits what both can do.
+It is independent of pilot and networks: it checks every command, whatever produced it, and limits what it can do.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ from flockd.autopilot.fake_vehicle import Demand, MotionState
 from flockd.config.scenario import ScenarioConfig, StartConfig, VehicleConfig
 from flockd.errors import UnavailableError, UsageError
 from flockd.sim.ground_station import FULL_STICK_M_S, home_deg
+from flockd.sim.leftovers import described, px4_instance, user_of_port
 from flockd.sim.processes import Program, Programs
 from flockd.sim.vehicles import Vehicles
 
@@ -34,7 +35,7 @@ PARAMETERS = {
     "EKF2_GYR_NOISE": "0.1",
     "EKF2_ACC_NOISE": "1.0",
     "EKF2_MAG_NOISE": "0.02",
-    "COM_OF_LOSS_T": "1.0",  # PX4 shortens it by the speed factor, as if it counted in real seconds
+    "COM_OF_LOSS_T": "1.0",  # simulated seconds; PX4's start script would multiply its default by the speed factor
     "COM_OBL_RC_ACT": "5",
     "SDLOG_BACKEND": "0",
 }
@@ -123,14 +124,24 @@ class Px4s:
     name = "PX4 SITL"
 
     def __init__(
-        self, scenario: ScenarioConfig, speed_factor: float, environment: Mapping[str, str], folder: Path
+        self,
+        scenario: ScenarioConfig,
+        speed_factor: float,
+        environment: Mapping[str, str],
+        folder: Path,
+        parameters: Mapping[str, str] | None = None,
     ) -> None:
-        """Each works in a folder under ``folder``. Raises UnavailableError where there is no PX4."""
+        """Each works in a folder under ``folder``; ``parameters`` win over `PARAMETERS`.
+
+        Raises UnavailableError where there is no PX4, or where an instance or a daemon of another flight still runs.
+        """
         if len(scenario.vehicles) > MAX_INSTANCES:
             raise UsageError(f"PX4 gives ports to {MAX_INSTANCES} vehicles, not {len(scenario.vehicles)}; fly fewer")
         self._build = px4_folder(environment)
+        _refuse_leftovers(len(scenario.vehicles))
         self._scenario, self._speed_factor, self._folder = scenario, speed_factor, folder
         self._environment = dict(environment)
+        self._parameters = {**PARAMETERS, **(parameters or {})}
         self.ports = tuple(Ports(OFFBOARD_PORT + i, TRUTH_PORT + i) for i in range(len(scenario.vehicles)))
         self._programs = Programs()
 
@@ -147,7 +158,7 @@ class Px4s:
         for i, vehicle in enumerate(self._scenario.vehicles):
             position = np.array(vehicle.position_m)
             latitude_deg, longitude_deg = home_deg(position)
-            parameters = PARAMETERS | BY_HAND if vehicle.by_hand else PARAMETERS
+            parameters = BY_HAND | self._parameters if vehicle.by_hand else self._parameters
             working = self._folder / f"px4_{i}"
             working.mkdir(parents=True)
             settings = {
@@ -166,6 +177,16 @@ class Px4s:
     def programs(self) -> Sequence[Program]:
         """See `Autopilots`."""
         return tuple(self._programs)
+
+
+def _refuse_leftovers(count: int) -> None:
+    for i in range(count):
+        instance = px4_instance(i)
+        if instance is not None:
+            raise UnavailableError(f"PX4 instance {i} runs already: {described(instance)}")
+        user = user_of_port(OFFBOARD_PORT + i)
+        if user is not None:
+            raise UnavailableError(f"UDP port {OFFBOARD_PORT + i} of PX4 instance {i} is used by {described(user)}")
 
 
 def px4_folder(environment: Mapping[str, str]) -> Path:

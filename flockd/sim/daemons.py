@@ -12,7 +12,6 @@ from typing import Self
 
 import yaml
 
-import flockd
 from flockd.config import DroneConfig
 from flockd.config.mission import MissionParameters
 from flockd.config.recording import RecordingConfig
@@ -89,15 +88,7 @@ class Daemons:
             environment: this process's own.
         """
         self._configs, self._folder, self._recordings = configs, folder, recordings
-        package = str(Path(flockd.__file__).parents[1])
-        known = environment.get("PYTHONPATH")
-        self._environment = {
-            **environment,
-            **ONE_THREAD,
-            **SMALL,
-            "PYTHONPATH": f"{package}:{known}" if known else package,
-            "XDG_RUNTIME_DIR": str(folder),
-        }
+        self._environment = {**environment, **ONE_THREAD, **SMALL, "XDG_RUNTIME_DIR": str(folder)}
         self._programs = Programs()
         self._listeners = [_Listener(folder / config.name) for config in configs]
 
@@ -131,7 +122,7 @@ class Daemons:
         return tuple(self._programs)
 
     def status(self, number: int) -> str:
-        """What one said of itself last; empty before it has started."""
+        """Its last status line; empty before it has started."""
         return self._listeners[number].listen().status
 
     def is_ready(self, number: int) -> bool:

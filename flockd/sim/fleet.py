@@ -37,6 +37,10 @@ ARM_S, CLIMB_S, READY_S, OFFBOARD_S, LAND_S = 60.0, 60.0, 60.0, 10.0, 60.0
 POLL_S = 0.05
 REQUEST_AGAIN_S = 1.0
 ON_GROUND_M, AT_HEIGHT_M = 0.5, 1.0
+LEVEL_M_S, LEVEL_S = 0.1, 1.0
+"""PX4 says that it has climbed while it still climbs: a drone is at its height when it rises no more for so long."""
+REASON_S = 0.5
+"""Real seconds after a drone has left offboard, within which its daemon and its autopilot say why."""
 LEAST_FRAME_SETS = 2
 """A flight interrupted before has nothing to report."""
 
@@ -112,6 +116,10 @@ class _Fleet:
         """Those with a daemon, in the order of the daemons."""
         self._needed: Sequence[Program] = ()
         """Programs that have to run now; `_poll` raises when one has ended."""
+        self._left_s: dict[int, float] = {}
+        """When a drone was first seen out of offboard, in seconds of the flight."""
+        self._climbed_s = dict.fromkeys(self._all, -np.inf)
+        """When a drone rose or sank last."""
 
     def come_up(self) -> None:
         """Starts all programs and waits until they are connected."""
@@ -169,6 +177,7 @@ class _Fleet:
             if len(self._frames_of(run, self._clock())) < LEAST_FRAME_SETS:
                 raise
             run.interrupted = True
+        self._note_handovers(run, np.inf)
         run.ended_s, run.wall_s = self._clock(), time.monotonic() - wall_s
         run.cores = {kind: (after - cpu_s[kind]) / run.wall_s for kind, after in self._cpu_s().items()}
         run.clock_rates = [rate for i in self._all if (rate := _rate(booted[i], self._station.uptime_s(i))) is not None]
@@ -182,14 +191,16 @@ class _Fleet:
         return tuple(s for s in self._server.frames() if run.began_s <= s.time_s < until_s)
 
     def land(self, run: FleetRun) -> None:
-        """Ends the daemons, which leaves the drones in Hold, and lands them."""
+        """Ends the daemons, which leaves the drones in Hold, and lands all whose autopilot still runs."""
         run.notes += self._server.notes()
-        self._needed = self._autopilots.programs()
         run.exit_codes = self._daemons.end()
+        ended = [program.name for program in self._autopilots.programs() if program.ended is not None]
+        run.notes += [f"{name} had ended, so that its drone was not landed" for name in ended]
+        self._needed = ()
         try:
             self._request(
-                lambda i: not self._station.is_armed(i), lambda i: self._station.select(i, "LAND"), LAND_S,
-                "did not land",
+                lambda i: self._autopilot_ended(i) or not self._station.is_armed(i),
+                lambda i: self._station.select(i, "LAND"), LAND_S, "did not land",
             )  # fmt: skip
         except UnavailableError as error:  # the flight is over, and worth its report
             run.notes.append(str(error))
@@ -206,28 +217,44 @@ class _Fleet:
                 velocity = hand.step(flying_s, self._station.poses().position[i, :2]).velocity
             self._station.steer(i, velocity)
 
-    def _note_handovers(self, run: FleetRun, flying_s: float) -> None:
-        """Notes a drone that is not in offboard any more, or of which a program has ended."""
+    def _autopilot_ended(self, i: int) -> bool:
         autopilots = self._autopilots.programs()
+        return bool(autopilots) and autopilots[i].ended is not None
+
+    def _note_handovers(self, run: FleetRun, flying_s: float) -> None:
+        """Notes each drone that is not in offboard any more, or of which a program has ended.
+
+        The reason is read when its daemon and its autopilot have had time to tell it.
+        """
         for i, program in zip(self._drones, self._daemons.programs(), strict=True):
             if program.name in run.handed_over:
                 continue
-            if program.ended is not None:
-                why = f"its daemon ended with exit code {program.ended} ({program.last_output()})"
-            elif autopilots and autopilots[i].ended is not None:
-                why = f"its autopilot ended with exit code {autopilots[i].ended} ({autopilots[i].last_output()})"
-            elif not self._station.mode_is(i, "OFFBOARD"):
-                why = f"it left offboard ({self._last_messages(i)})"
-            else:
-                continue
-            run.handed_over[program.name] = f"after {flying_s:.1f} s {why}"
+            if program.ended is None and not self._autopilot_ended(i) and self._station.mode_is(i, "OFFBOARD"):
+                if i not in self._left_s:
+                    continue
+            elif i not in self._left_s:
+                self._left_s[i] = min(flying_s, self._clock() - run.began_s)
+            if flying_s - self._left_s[i] >= REASON_S * self._speed_factor:
+                run.handed_over[program.name] = f"after {self._left_s[i]:.1f} s {self._why(i, program)}"
+
+    def _why(self, i: int, program: Program) -> str:
+        if program.ended is not None:
+            return f"its daemon ended with exit code {program.ended} ({program.last_output()})"
+        if self._autopilot_ended(i):
+            autopilot = self._autopilots.programs()[i]
+            return f"its autopilot ended with exit code {autopilot.ended} ({autopilot.last_output()})"
+        return f"it left offboard ({self._last_messages(i)})"
 
     def _height_m(self, i: int) -> float:
         return -float(self._station.poses().position[i, 2])
 
     def _is_up(self, i: int) -> bool:
+        now = self._clock()
+        if abs(float(self._station.poses().velocity[i, 2])) > LEVEL_M_S:
+            self._climbed_s[i] = now
         error_m = self._height_m(i) + self._scenario.vehicles[i].position_m[2]
-        return abs(error_m) < AT_HEIGHT_M and self._station.mode_is(i, "LOITER")
+        level = now - self._climbed_s[i] >= LEVEL_S
+        return level and abs(error_m) < AT_HEIGHT_M and self._station.mode_is(i, "LOITER")
 
     def _request_climb(self, i: int) -> None:
         """Once it has left the ground, another take-off would lead higher."""

@@ -12,7 +12,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Literal, Self
 
@@ -20,9 +20,11 @@ import numpy as np
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import development as mavlink
 
+from flockd.autopilot.mavlink_messages import StatusText
 from flockd.earth import metres_a_degree
 from flockd.errors import UnavailableError
 from flockd.messages import FloatArray
+from flockd.sim.leftovers import described, user_of_port
 from flockd.sim.vehicles import REFERENCE_DEG, euler_rotation
 
 Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "OFFBOARD"]
@@ -38,6 +40,8 @@ _STICK = 1000
 _NEUTRAL_THROTTLE = 500
 MAX_FORWARD_S = 0.2
 """A pose is extrapolated by no more than this."""
+FURTHER_MODES = {10 << 16: "TERMINATION"}
+"""Of PX4's modes by number, those that pymavlink has no name for."""
 _RECEIVED = {
     name: int(getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
     for name in (
@@ -87,6 +91,7 @@ class _Vehicle:
     """On its clock, and then on ours."""
     version: str | None = None
     text: str = ""
+    chunks: StatusText = field(default_factory=StatusText)
 
     def write(self, data: bytes) -> None:
         if self.address is not None:
@@ -148,12 +153,18 @@ class GroundStation:
         _, main, sub = mavutil.px4_map[mode]
         return bool(self._vehicles[number].mode == main << 16 | sub << 24)
 
+    def mode(self, number: int) -> str:
+        """The mode it flies in, by pymavlink's name or PX4's number; empty while it is not known."""
+        flown = self._vehicles[number].mode
+        named: dict[int, str] = {main << 16 | sub << 24: name for name, (_, main, sub) in mavutil.px4_map.items()}
+        return "" if flown is None else {**named, **FURTHER_MODES}.get(flown, str(flown))
+
     def is_armed(self, number: int) -> bool:
         """Its motors run."""
         return self._vehicles[number].armed
 
     def last_text(self, number: int) -> str:
-        """Its last STATUSTEXT; empty if there was none."""
+        """Its last STATUSTEXT, whole; empty if there was none."""
         return self._vehicles[number].text
 
     def version(self, number: int) -> str | None:
@@ -186,6 +197,12 @@ class GroundStation:
         x, y = (int(stick) for stick in np.round(np.clip(ahead / FULL_STICK_M_S, -1.0, 1.0) * _STICK))
         with self._lock:
             vehicle.mav.manual_control_send(number + 1, x, y, _NEUTRAL_THROTTLE, 0, 0)
+
+    def push_sticks(self, number: int, *, forward: int) -> None:
+        """Sends the position of a joystick's sticks once: in the middle but for `forward`, -1000 to 1000."""
+        vehicle = self._vehicles[number]
+        with self._lock:
+            vehicle.mav.manual_control_send(vehicle.number + 1, forward, 0, 500, 0, 0)
 
     def _command(self, vehicle: _Vehicle, command: int, *numbers: float) -> None:
         values = (*numbers, *[0.0] * (7 - len(numbers)))
@@ -235,7 +252,9 @@ def _update(vehicle: _Vehicle, message: Any, now: float) -> None:
         case "SYSTEM_TIME":
             vehicle.booted_s = message.time_boot_ms * 1e-3, now
         case "STATUSTEXT":
-            vehicle.text = message.text.strip()
+            text = vehicle.chunks.joined(message.to_dict())
+            if text is not None:
+                vehicle.text = text.strip()
         case "AUTOPILOT_VERSION":
             vehicle.version = ".".join(str(message.flight_sw_version >> shift & 0xFF) for shift in (24, 16, 8))
         case _:
@@ -291,7 +310,7 @@ def _bound(port: int) -> socket.socket:
         bound.bind(("127.0.0.1", port))
     except OSError as error:
         bound.close()
-        raise UnavailableError(
-            f"UDP port {port} cannot be used ({error.strerror}); end the other simulation that uses it"
-        ) from error
+        user = user_of_port(port)
+        advice = "end the other simulation that uses it" if user is None else f"it is used by {described(user)}"
+        raise UnavailableError(f"UDP port {port} cannot be used ({error.strerror}); {advice}") from error
     return bound

@@ -13,6 +13,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
 
+import flockd
+from flockd.sim.bound_to_parent import bound
+
 END_S = 30.0
 """To end after SIGTERM, before it is killed."""
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -52,7 +55,8 @@ class Program:
 class Programs:
     """All of one kind, between ``__enter__`` and ``__exit__``.
 
-    Each has a session of its own, so that Ctrl-C reaches the simulator alone, which then ends them in order.
+    Each has a session of its own, so that Ctrl-C reaches the simulator alone, which then ends them in order. One whose
+    simulator was killed gets SIGTERM from Linux.
     """
 
     def __init__(self) -> None:
@@ -80,9 +84,9 @@ class Programs:
             file = log.open("wb")
             self._files.append(file)
             process = subprocess.Popen(
-                command,
+                bound(list(command)),
                 cwd=folder,
-                env=dict(environment),
+                env=with_package(environment),
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
@@ -104,6 +108,14 @@ class Programs:
                 except subprocess.TimeoutExpired:
                     os.killpg(program.process.pid, signal.SIGKILL)
                     program.process.wait()
+
+
+def with_package(environment: Mapping[str, str]) -> dict[str, str]:
+    """The environment, in which Python finds this package wherever it runs."""
+    package, known = str(Path(flockd.__file__).parents[1]), environment.get("PYTHONPATH")
+    if known and package in known.split(os.pathsep):
+        return dict(environment)
+    return {**environment, "PYTHONPATH": f"{package}{os.pathsep}{known}" if known else package}
 
 
 @contextmanager

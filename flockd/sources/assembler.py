@@ -1,4 +1,4 @@
-"""Puts the frames of several cameras together into sets by time stamp. Pure: whoever calls says what time it is."""
+"""Puts the frames of several cameras together into sets by time stamp. Pure: the caller gives the time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames as a camera sent them, and the camera's state as everybody else sees it."""
+"""Frames as a camera sent them, and the camera's state as other parts see it."""
 
 from __future__ import annotations
 

@@ -28,6 +28,7 @@ def _row(drone: Watched, now_s: float) -> dict[str, Any]:
     simulated = drone.alive and "flight" not in drone.topics and bool(health)  # the simulator's own pilot: no daemon
     if simulated:
         state = "normal" if health["ok"] else "degraded"
+    malformed = [f"its message `{topic}` is malformed: {why}" for topic, why in sorted(drone.malformed.items())]
     blind = [camera["fault"] for camera in computer.get("cameras", {}).values() if camera["fault"]]
     return {
         "fleet": drone.fleet,
@@ -41,7 +42,8 @@ def _row(drone: Watched, now_s: float) -> dict[str, Any]:
         else sum(1 for neighbour in neighbours["neighbours"] if neighbour["confirmed"]),
         "load": computer.get("load"),
         "mission": (drone.message("mission", now_s) or {}).get("sentence"),
-        "matters": [reason["sentence"] for reason in flight.get("reasons", ())]
+        "matters": malformed
+        + [reason["sentence"] for reason in flight.get("reasons", ())]
         + [str(reason) for reason in (health.get("reasons", ()) if simulated else ())]
         + blind,
     }

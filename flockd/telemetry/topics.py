@@ -20,9 +20,14 @@ PREFIX = "flockd/v1"
 _NAME = re.compile(r"[A-Za-z0-9_.-]+")
 
 
+def is_name(name: str) -> bool:
+    """Whether it fits into a key."""
+    return _NAME.fullmatch(name) is not None
+
+
 def checked_name(name: str) -> str:
     """The name; raises ValueError for one that does not fit into a key."""
-    if not _NAME.fullmatch(name):
+    if not is_name(name):
         raise ValueError(f"{name!r} does not fit into a key; use letters, digits, '_', '.' and '-'")
     return name
 

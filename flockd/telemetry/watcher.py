@@ -12,9 +12,14 @@ from typing import Any
 
 import zenoh
 
-from flockd.telemetry.topics import PREFIX, TOPICS, checked_name
+from flockd.telemetry.schema import fault
+from flockd.telemetry.topics import PREFIX, TOPICS, checked_name, is_name
 from flockd.zenoh_session import SessionOwner, open_session
 
+MAX_BYTES = 1 << 20
+"""Of a message; one with every field at its longest has a hundredth of it."""
+MAX_DRONES = 1000
+"""Of a bus on which somebody invents drones, so many are remembered."""
 _SLOWEST = 10.0
 """The smallest speed factor that a daemon's configuration allows is 0.1."""
 
@@ -48,6 +53,10 @@ class Watched:
     alive: bool = False
     """Its liveliness token is there: its process runs and can be reached."""
     topics: Mapping[str, Heard] = field(default_factory=dict)
+    malformed: Mapping[str, str] = field(default_factory=dict)
+    """What is wrong with the newest message of a topic, by topic; one that is well formed again is not here."""
+    seen: bool = False
+    """Something of it was well formed, or its token was there: it is a drone."""
 
     def message(self, topic: str, now_s: float) -> Mapping[str, Any] | None:
         """The newest of a topic; None where there is none, or one too old to say anything of now."""
@@ -74,7 +83,7 @@ class FleetWatcher(SessionOwner):
         self._lock = threading.Lock()
         self._drones: dict[tuple[str, str], Watched] = {}
         self.malformed = 0
-        """Messages that are none."""
+        """Messages that are none, and those of drones that cannot be."""
         self._session = open_session("telemetry", listen, connect, settings=settings)
         drones = f"{PREFIX}/{'*' if fleet is None else checked_name(fleet)}/*"
         self._subscribers = [
@@ -85,30 +94,58 @@ class FleetWatcher(SessionOwner):
     def drones(self) -> tuple[Watched, ...]:
         """All that were ever heard of."""
         with self._lock:
-            return tuple(self._drones.values())
+            return tuple(drone for drone in self._drones.values() if drone.seen)
 
     def reached(self) -> int:
         """How many peers and routers it is connected to."""
         return len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
 
     def _take_message(self, sample: zenoh.Sample) -> None:
-        """On a thread of zenoh's."""
+        """On a thread of zenoh's. What is malformed is kept as such, for a drone that is known otherwise."""
         fleet, drone, topic = str(sample.key_expr).split("/")[2:5]
-        try:
-            message = json.loads(sample.payload.to_bytes())
-        except ValueError:
-            message = None
-        if not isinstance(message, dict) or not TOPICS[topic].type.__annotations__.keys() <= message.keys():
-            self.malformed += 1
-            return
+        message, wrong = _parsed(sample.payload, topic)
         with self._lock:
-            watched = self._drones.get((fleet, drone), Watched(fleet, drone))
+            watched = self._watched(fleet, drone)
+            if watched is None or wrong is not None:
+                self.malformed += 1
+            if watched is None:
+                return
+            if wrong is not None:
+                malformed = {**watched.malformed, topic: wrong}
+                self._drones[fleet, drone] = replace(watched, malformed=malformed)
+                return
             heard = _heard(watched.topics.get(topic), self._clock(), message)
-            topics = {**watched.topics, topic: heard}
-            self._drones[fleet, drone] = replace(watched, topics=topics)
+            malformed = {name: why for name, why in watched.malformed.items() if name != topic}
+            self._drones[fleet, drone] = replace(
+                watched, topics={**watched.topics, topic: heard}, malformed=malformed, seen=True
+            )
 
     def _take_token(self, sample: zenoh.Sample) -> None:
         fleet, drone = str(sample.key_expr).split("/")[2:4]
         with self._lock:
-            watched = self._drones.get((fleet, drone), Watched(fleet, drone))
-            self._drones[fleet, drone] = replace(watched, alive=sample.kind == zenoh.SampleKind.PUT)
+            watched = self._watched(fleet, drone)
+            if watched is None:
+                self.malformed += 1
+                return
+            self._drones[fleet, drone] = replace(watched, alive=sample.kind == zenoh.SampleKind.PUT, seen=True)
+
+    def _watched(self, fleet: str, drone: str) -> Watched | None:
+        """What is known of a drone so far; None for one that cannot be, or is one too many."""
+        known = self._drones.get((fleet, drone))
+        if known is not None:
+            return known
+        if len(self._drones) >= MAX_DRONES or not (is_name(fleet) and is_name(drone)):
+            return None
+        return Watched(fleet, drone)
+
+
+def _parsed(payload: zenoh.ZBytes, topic: str) -> tuple[dict[str, Any], str | None]:
+    """A message, and what is wrong with it."""
+    raw = payload.to_bytes()
+    if len(raw) > MAX_BYTES:
+        return {}, f"it is longer than {MAX_BYTES >> 10} KiB"
+    try:
+        message = json.loads(raw)
+    except (ValueError, RecursionError):
+        return {}, "it is not JSON"
+    return message, fault(message, TOPICS[topic].type)

@@ -49,6 +49,24 @@ def test_an_unknown_fix_or_system_status_says_nothing() -> None:
     assert sum(received.unknown_values().values()) == 2
 
 
+@pytest.mark.parametrize("percent", [-128, -2, 101, 127])
+def test_a_battery_that_cannot_be_is_unknown_and_not_empty(percent: int) -> None:
+    received, log = _received(("SYS_STATUS", {"battery_remaining": percent}))
+    assert received.status(now_s=2.0).battery_share is None
+    assert received.unknown_values() == {f"SYS_STATUS.battery_remaining = {percent}": 1}
+    assert len(log) == 1
+
+
+@pytest.mark.parametrize("quaternion", [(0.0, 0.0, 0.0, 0.0), (1e30, 0.0, 0.0, 0.0), (0.5, 0.5, 0.5, 0.0)])
+def test_a_quaternion_without_direction_is_no_attitude(quaternion: tuple[float, ...]) -> None:
+    place = dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 0.0)
+    fields = dict(zip(("q1", "q2", "q3", "q4"), quaternion, strict=True))
+    received, _ = _received(("LOCAL_POSITION_NED", place), ("ATTITUDE_QUATERNION", fields))
+    assert received.vehicle_state() is None
+    received.add("ATTITUDE_QUATERNION", {"q1": 1.0, "q2": 0.0, "q3": 0.0, "q4": 0.0}, 3.0)
+    assert received.vehicle_state() is not None
+
+
 def test_known_values_are_not_counted() -> None:
     received, log = _received(
         ("EXTENDED_SYS_STATE", {"landed_state": 4}),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import re
 import shutil
 import signal
 import socket
@@ -21,8 +23,13 @@ from flockd.data import data_path
 from tests.autopilot.conftest import HEARTBEAT_S, free_port
 from tests.daemon.aboard import Cameras, config_for, free_endpoint
 from tests.inference.test_deadline import endless
+from tests.starvation import tell
 
 RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
+WITHOUT_NETWORKS = (
+    "import flockd.perception; from tests.daemon.aboard import TinyPerceiver; "
+    f"flockd.perception.load_networks = lambda *_: TinyPerceiver(); {RUN}"
+)
 ROOT = Path(__file__).parents[2]
 SECONDS_TO_FAIL = 60.0
 """To load three networks on a computer that is busy with other things."""
@@ -48,6 +55,10 @@ class Manager:
             except TimeoutError:
                 continue
 
+    @property
+    def last_status(self) -> str:
+        return next((line.removeprefix("STATUS=") for line in reversed(self.told) if line.startswith("STATUS=")), "")
+
     def close(self) -> None:
         self._socket.close()
 
@@ -65,12 +76,13 @@ def _written(path: Path, port: int, frames: str, telemetry: str) -> Path:
     return path
 
 
-def _run(config: Path, folder: Path, *options: str) -> subprocess.Popen[str]:
+def _run(
+    config: Path, folder: Path, *options: str, program: str = RUN, log: Path | None = None
+) -> subprocess.Popen[str]:
     environment = {"NOTIFY_SOCKET": str(folder / "notify"), "XDG_RUNTIME_DIR": str(folder), "PATH": "/usr/bin"}
-    command = [sys.executable, "-c", RUN, "run", "--config", str(config), *options]
-    return subprocess.Popen(
-        command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    command = [sys.executable, "-c", program, "run", "--config", str(config), *options]
+    stderr = subprocess.PIPE if log is None else log.open("w")
+    return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=stderr, text=True)
 
 
 def test_it_gets_ready_alone_reads_its_file_again_and_ends_when_told(
@@ -108,6 +120,56 @@ def test_it_gets_ready_alone_reads_its_file_again_and_ends_when_told(
         finally:
             process.kill()
             cameras.close()
+
+
+def test_a_stall_of_the_computer_ends_in_the_autopilots_failsafe_and_is_named(tmp_path: Path, manager: Manager) -> None:
+    """Stopped for 0.3 s, setpoints keep PX4's 2 Hz and it flies on; for 3 s, the autopilot has taken over meanwhile."""
+
+    async def story() -> None:
+        port, frames = free_port(), free_endpoint()
+        config = _written(tmp_path / "tiny.yaml", port, frames, free_endpoint())
+        values = yaml.safe_load(config.read_text(encoding="utf-8"))
+        values["telemetry"]["commands"] = []
+        config.write_text(yaml.safe_dump(values), encoding="utf-8")
+        cameras = Cameras(frames)
+        log = tmp_path / "log"
+        with (
+            FakeAutopilot(port, heartbeat_s=HEARTBEAT_S) as autopilot,
+            _run(config, tmp_path, program=WITHOUT_NETWORKS, log=log) as process,
+        ):
+            try:
+                manager.until(lambda: "READY=1" in manager.told, process)
+                manager.until(lambda: "not armed" in manager.last_status, process)
+                autopilot.pilot_arms()
+                autopilot.pilot_selects("TAKEOFF")
+                manager.until(lambda: len(autopilot.setpoints) > 5 and autopilot.mode == "LOITER", process)
+                autopilot.pilot_selects("OFFBOARD")
+                manager.until(lambda: manager.last_status.startswith(("normal", "degraded")), process)
+
+                _stall(process, 0.3)
+                before = len(autopilot.setpoints)
+                manager.until(lambda: len(autopilot.setpoints) > before + 20, process)
+                assert str(autopilot.mode) == "OFFBOARD"
+
+                _stall(process, 3.0)
+                assert autopilot.mode == "LOITER"
+                manager.until(lambda: manager.last_status.startswith("silent"), process)
+                before = len(autopilot.setpoints)
+                time.sleep(1.0)
+                assert (autopilot.mode, len(autopilot.setpoints)) == ("LOITER", before), "no resumption by itself"
+                told = log.read_text(encoding="utf-8")
+                assert re.search(r"silent: .*the event loop is [23]\.\d+ s late", told), told
+            finally:
+                process.kill()
+                cameras.close()
+
+    tell(story)
+
+
+def _stall(process: subprocess.Popen[str], duration_s: float) -> None:
+    process.send_signal(signal.SIGSTOP)
+    time.sleep(duration_s)
+    process.send_signal(signal.SIGCONT)
 
 
 def test_a_changed_model_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -182,3 +244,56 @@ def test_a_network_that_never_ends_is_bad_configuration_within_ten_seconds(tmp_p
         "endless.onnx did not finish the golden input in time (more than 8 s); restore the model file or choose "
         "another perception.provider"
     )
+
+
+@pytest.mark.parametrize(
+    ("limit", "value", "told"),
+    [
+        ("RLIMIT_NOFILE", 20, "this process may open 20 files, and a flight needs 128; "),
+        ("RLIMIT_AS", 700 << 20, "this process may use 700 MiB of addresses, and a flight needs 3072; "),
+        ("RLIMIT_AS", 200 << 20, "this process may use 200 MiB of addresses, and a flight needs 3072; "),
+    ],
+)
+def test_without_files_or_memory_it_is_unavailable_and_not_aborted(
+    limit: str, value: int, told: str, tmp_path: Path
+) -> None:
+    """Unchecked, the second is ended by glibc (127), the third by an ImportError; 24 files make a model look bad."""
+    config = _written(tmp_path / "tiny.yaml", free_port(), free_endpoint(), free_endpoint())
+    limited = f"import resource; resource.setrlimit(resource.{limit}, ({value}, {value})); {RUN}"
+    command = [sys.executable, "-c", limited, "run", "--config", str(config)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=SECONDS_TO_FAIL, check=False)
+    assert done.returncode == 69, done.stderr
+    assert done.stderr.startswith(told)
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_low_limit_that_may_be_raised_is_raised(tmp_path: Path) -> None:
+    config = _written(tmp_path / "tiny.yaml", free_port(), free_endpoint(), free_endpoint())
+    values = yaml.safe_load(config.read_text(encoding="utf-8"))
+    del values["source"]
+    config.write_text(yaml.safe_dump(values), encoding="utf-8")
+    limited = f"import resource as r; r.setrlimit(r.RLIMIT_NOFILE, (20, 256)); {RUN}"
+    command = [sys.executable, "-c", limited, "run", "--config", str(config)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=SECONDS_TO_FAIL, check=False)
+    assert done.returncode == 78, done.stderr
+    assert "source: is missing" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (MemoryError("std::bad_alloc"), "out of memory"),
+        (RuntimeError("pthread_create failed, error code: 11 error msg: Resource temporarily unavailable"), "threads"),
+        (OSError(errno.EMFILE, "Too many open files"), "out of file descriptors"),
+    ],
+)
+def test_what_runs_out_while_networks_load_is_unavailable_and_no_damaged_model(
+    error: Exception, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def lacks(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr("onnxruntime.InferenceSession", lacks)
+    config = _written(tmp_path / "tiny.yaml", free_port(), free_endpoint(), free_endpoint())
+    assert main(["run", "--config", str(config)]) == 69
+    assert told in capsys.readouterr().err.splitlines()[-1]

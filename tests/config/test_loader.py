@@ -113,13 +113,17 @@ def test_words_that_old_yaml_takes_for_truth_values_stay_words(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("line", "told"),
     [
-        ("step_s: -0.5", "step_s: -0.5 is not greater than 0; write a positive number of seconds"),
-        ("step_s: .nan", "step_s: .nan is not finite; write a positive number of seconds"),
-        ("step_s: 1e999", "step_s: 1e999 is not finite; write a positive number of seconds"),
-        ("step_s: true", "step_s: true is not a positive number of seconds; write a positive number of seconds"),
-        ("step_s: '0.5'", "step_s: '0.5' is not a positive number of seconds; write 0.5"),
-        ("step_s: 1_000", "step_s: 1_000 is not a positive number of seconds; write 1000"),
-        ("step_s:", "step_s: has no value; write a positive number of seconds"),
+        ("step_s: -0.5", "step_s: -0.5 is not greater than 0; write a number of seconds above 0 and up to 60"),
+        ("step_s: .nan", "step_s: .nan is not finite; write a number of seconds above 0 and up to 60"),
+        ("step_s: 1e999", "step_s: 1e999 is not finite; write a number of seconds above 0 and up to 60"),
+        (
+            "step_s: true",
+            "step_s: true is not a number of seconds above 0 and up to 60; "
+            "write a number of seconds above 0 and up to 60",
+        ),
+        ("step_s: '0.5'", "step_s: '0.5' is not a number of seconds above 0 and up to 60; write 0.5"),
+        ("step_s: 1_000", "step_s: 1_000 is not a number of seconds above 0 and up to 60; write 1000"),
+        ("step_s:", "step_s: has no value; write a number of seconds above 0 and up to 60"),
         ("stepp_s: 1", "stepp_s: is not a known key; did you mean `step_s`?"),
         ("yaw: corse", "yaw: corse is not known; did you mean `course`?"),
         ("yaw: 5", "yaw: 5 is not known; write `hold` or `course`"),
@@ -247,6 +251,28 @@ def test_paths_that_are_no_files_get_one_sentence(tmp_path: Path) -> None:
     assert _problems(Path("/dev/zero")) == ["zero: is not an ordinary file; copy the configuration to one"]
 
 
+def test_of_very_many_problems_the_first_are_told_and_the_others_counted(tmp_path: Path) -> None:
+    path = tmp_path / "drone.yaml"
+    path.write_text("rig:\n  cameras:\n" + "  - {lens: wide, colour: red}\n" * 300, encoding="utf-8")
+    with pytest.raises(ConfigError) as refused:
+        load_drone(path)
+    *told, last = str(refused.value).splitlines()
+    assert len(told) == 20
+    assert all("is not a known key" in line or "is missing; add it" in line for line in told)
+    assert told[0].startswith(f"{path}:3: rig.cameras[0]")
+    found = len(refused.value.problems)
+    assert found >= 300 * 4, "two unknown keys and two missing ones each"
+    assert last == f"and {found - 20} more problems; correct these first"
+
+
+def test_a_file_of_a_hundred_thousand_values_is_refused_before_it_is_read_through(tmp_path: Path) -> None:
+    """The first of them are enough: the rest took 48 s to complain about."""
+    path = tmp_path / "drone.yaml"
+    path.write_text("rig:\n  cameras:\n" + "  - {a: 1, b: 2}\n" * 50_000, encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"holds more than 30000 values, which no configuration does"):
+        load_drone(path)
+
+
 def test_a_windows_file_is_read_as_any_other(tmp_path: Path) -> None:
     path = tmp_path / "drone.yaml"
     path.write_bytes(b"\xef\xbb\xbf" + DRONE.replace("\n", "\r\n").encode())
@@ -340,6 +366,21 @@ def test_the_schema_describes_the_file_and_not_the_merged_model() -> None:
             "[0, 0, -4]",
             "scenario.yaml:5: vehicles[1].position_m: is 0 m from vehicles[0], and drones touch below 0.7 m; move one "
             "of them",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nfaults: [{drone: 3, camera: front, kind: uniform}]",
+            "scenario.yaml:2: faults[0].drone: is 3, but there are 2 vehicles; write one of theirs",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nfaults: [{drone: 1, camera: top, kind: uniform}]",
+            "scenario.yaml:2: faults[0].camera: is not in the rig; write one of front",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nfaults: [{drone: 1, camera: front, kind: gaussian, begin_s: 5.0, end_s: 4.0}]",
+            "scenario.yaml:2: faults[0].end_s: is not after begin_s 5; write a larger one",
         ),
         (
             "scenario: two",

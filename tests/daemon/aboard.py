@@ -7,8 +7,8 @@ import json
 import socket
 import threading
 import time
-from collections.abc import AsyncIterator, Mapping, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -85,11 +85,30 @@ class TinyPerceiver:
         return ()
 
 
-class Cameras:
-    """Publishes coarse patterns, different in each frame, as the pictures of all cameras until told otherwise."""
+Image = Callable[[str, int], UInt8Array]
+"""What a camera sees, by its name and the number of the frame."""
 
-    def __init__(self, endpoint: str) -> None:
+
+def noise(camera: str, number: int, grain_px: int = 1) -> UInt8Array:
+    """(HEIGHT, WIDTH, 3), different in each frame."""
+    rng = np.random.default_rng([CAMERAS.index(camera), number])
+    pattern = rng.integers(0, 256, (HEIGHT // grain_px, WIDTH // grain_px, 3), dtype=np.uint8)
+    return pattern.repeat(grain_px, axis=0).repeat(grain_px, axis=1)
+
+
+def coarse(camera: str, number: int) -> UInt8Array:
+    """The same in patches, which is no noise: enough where `TinyPerceiver` stands in for networks."""
+    return noise(camera, number, COARSE_PX)
+
+
+class Cameras:
+    """Publishes pictures of all cameras until told otherwise."""
+
+    def __init__(self, endpoint: str, image: Image = coarse) -> None:
         self.silent: set[str] = set()
+        self.spoil: Callable[[Frame], Frame] = lambda frame: frame
+        """What a story does to each frame before it is sent."""
+        self._image = image
         self.noisy: set[str] = set()
         self._publisher = FramePublisher(listen=[endpoint])
         self._closing = threading.Event()
@@ -102,16 +121,14 @@ class Cameras:
         self._publisher.close()
 
     def _run(self) -> None:
-        rng = np.random.default_rng(0)
         number = 0
         while not self._closing.wait(1.0 / FRAMES_HZ):
             number += 1
             for camera in CAMERAS:
                 if camera not in self.silent:
-                    grain = 1 if camera in self.noisy else COARSE_PX
-                    pattern = rng.integers(0, 256, (HEIGHT // grain, WIDTH // grain, 3), dtype=np.uint8)
-                    image = pattern.repeat(grain, axis=0).repeat(grain, axis=1)
-                    self._publisher.publish("tiny", Frame(camera, image, time.monotonic(), number))
+                    show = noise if camera in self.noisy else self._image
+                    frame = Frame(camera, show(camera, number), time.monotonic(), number)
+                    self._publisher.publish("tiny", self.spoil(frame))
 
 
 def free_endpoint() -> str:
@@ -152,18 +169,14 @@ def config_for(
 
 
 @dataclass
-class Aboard:
-    """What a story can touch."""
+class Watched:
+    """A daemon that is watched from outside, and its world, which a story can touch."""
 
     config: DroneConfig
     fake_autopilot: FakeAutopilot
     cameras: Cameras
-    perceiver: TinyPerceiver
-    daemon: Daemon
-    ending: asyncio.Task[Ending]
     watcher: FleetWatcher
     session: zenoh.Session
-    service: list[str]
     events: list[str]
 
     def heard(self) -> dict[str, Heard]:
@@ -202,7 +215,7 @@ class Aboard:
 
     async def _query(self, what: str) -> bytes:
         key = f"flockd/v1/test/tiny/{what}"
-        for _ in range(20):  # until the two have found each other
+        for _ in range(100):  # until the two have found each other; zenoh tries again ever less often
             replies = await asyncio.to_thread(lambda: list(self.session.get(key, timeout=3.0)))
             if replies:
                 break
@@ -229,6 +242,16 @@ class Aboard:
         return float(np.linalg.norm(self.fake_autopilot.state.velocity[:2]))
 
 
+@dataclass
+class Aboard(Watched):
+    """A daemon in this process, so that a story can touch its inside too."""
+
+    perceiver: TinyPerceiver
+    daemon: Daemon
+    ending: asyncio.Task[Ending]
+    service: list[str]
+
+
 @asynccontextmanager
 async def aboard(
     fake_autopilot: FakeAutopilot,
@@ -237,20 +260,19 @@ async def aboard(
     *,
     recordings: Path | None = None,
     own_velocity: Literal["vision", "autopilot"] = "autopilot",
-    changes: Mapping[str, object] | None = None,
+    change: Callable[[DroneConfig], DroneConfig] = lambda config: config,
     **autopilot: Any,
 ) -> AsyncIterator[Aboard]:
     """A daemon that runs, watched. The story ends it, or else it is asked to end.
 
-    ``changes`` are sections of its configuration.
+    ``change`` makes another configuration of the usual one.
     """
     frames, telemetry = free_endpoint(), free_endpoint()
     perceiver, cameras = TinyPerceiver(), Cameras(frames)
     manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     manager.bind(str(tmp_path / "notify"))
     manager.setblocking(False)
-    config = config_for(port, frames, telemetry, own_velocity, **autopilot)
-    config = config.model_copy(update=dict(changes or {}))
+    config = change(config_for(port, frames, telemetry, own_velocity, **autopilot))
     environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "1000000"}
     daemon = Daemon(
         config,
@@ -261,25 +283,34 @@ async def aboard(
         service=ServiceManager(environment),
     )
     ending = asyncio.create_task(daemon.run())
-    watcher = FleetWatcher("test", listen=[], connect=[telemetry])
-    session = zenoh.open(_client(telemetry))
     told: list[str] = []
+    listening = asyncio.create_task(_listen(manager, told))
+    with watched(telemetry) as (watcher, session, events):
+        try:
+            yield Aboard(config, fake_autopilot, cameras, watcher, session, events, perceiver, daemon, ending, told)
+        finally:
+            perceiver.hangs.clear()
+            listening.cancel()
+            daemon.ask_to_stop()
+            await asyncio.wait({ending})
+            cameras.close()
+            manager.close()
+
+
+@contextmanager
+def watched(telemetry: str) -> Iterator[tuple[FleetWatcher, zenoh.Session, list[str]]]:
+    """A watcher of a daemon's telemetry, a session to ask it with, and the events that it has published."""
+    watcher = FleetWatcher("test", listen=[], connect=[telemetry])
+    session = zenoh.open(client(telemetry))
     events: list[str] = []
     session.declare_subscriber(
         "flockd/v1/test/tiny/events", lambda sample: events.append(json.loads(sample.payload.to_bytes())["event"])
     )
-    listening = asyncio.create_task(_listen(manager, told))
     try:
-        yield Aboard(config, fake_autopilot, cameras, perceiver, daemon, ending, watcher, session, told, events)
+        yield watcher, session, events
     finally:
-        perceiver.hangs.clear()
-        listening.cancel()
-        daemon.ask_to_stop()
-        await asyncio.wait({ending})
         session.close()  # type: ignore[no-untyped-call]
         watcher.close()
-        cameras.close()
-        manager.close()
 
 
 async def _listen(manager: socket.socket, told: list[str]) -> None:
@@ -287,7 +318,7 @@ async def _listen(manager: socket.socket, told: list[str]) -> None:
         told += (await asyncio.get_running_loop().sock_recv(manager, 4096)).decode().splitlines()
 
 
-def _client(endpoint: str) -> zenoh.Config:
+def client(endpoint: str) -> zenoh.Config:
     config = zenoh.Config()
     config.insert_json5("mode", '"peer"')
     config.insert_json5("scouting/multicast/enabled", "false")

@@ -34,11 +34,13 @@ def test_the_documentation_installs_what_the_unit_starts() -> None:
     command = re.search(r"^ExecStart=(\S+)/bin/flockd run --config (\S+)", unit, re.MULTILINE)
     assert command is not None
     environment, config = command.groups()
-    assert f"sudo python3 -m venv {environment}\n" in install
-    assert f"sudo {environment}/bin/pip install .\n" in install
+    assert f"\npython3 -m venv {environment}\n" in install
+    assert f"\n{environment}/bin/pip install --require-hashes -r requirements/service.txt\n" in install
+    assert f"\n{environment}/bin/pip install --no-deps --no-build-isolation .\n" in install
+    assert re.findall(r"sudo.*(?:pip|venv)", install) == [], "no code of a package runs as root"
     assert config in install
     assert start == "sudo systemctl enable --now flockd\n"
-    for name in re.findall(r" ((?:config|systemd)/\S+)", install):
+    for name in re.findall(r" ((?:config|systemd|requirements)/\S+)", install):
         assert (ROOT / name).is_file(), name
 
 

@@ -252,7 +252,13 @@ def test_an_operator_sends_it_somewhere_and_the_recording_replays(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, capsys: pytest.CaptureFixture[str]
 ) -> None:
     async def story() -> None:
-        async with aboard(fake_autopilot, port, tmp_path, recordings=tmp_path, changes={"safety": ALONE}) as ship:
+        async with aboard(
+            fake_autopilot,
+            port,
+            tmp_path,
+            recordings=tmp_path,
+            change=lambda config: config.model_copy(update={"safety": ALONE}),
+        ) as ship:
             await ship.is_ready_in_the_air()
             assert await ship.fleet("goto", "tiny", "1", "0") == 1, "flockd does not fly it yet"
             assert await ship.fleet("goto", "nobody", "1", "0") == 69
@@ -291,7 +297,9 @@ def test_at_its_end_a_mission_hands_over_to_the_autopilot(
     mission = MissionParameters(kind="waypoints", waypoints=(goal,), speed_m_s=1.0, at_end=end)
 
     async def story() -> None:
-        async with aboard(fake_autopilot, port, tmp_path, changes={"mission": mission}) as ship:
+        async with aboard(
+            fake_autopilot, port, tmp_path, change=lambda config: config.model_copy(update={"mission": mission})
+        ) as ship:
             await ship.is_ready_in_the_air()
             fake_autopilot.pilot_selects("OFFBOARD")
             await until(lambda: fake_autopilot.mode == mode, SECONDS_TO_FAIL)

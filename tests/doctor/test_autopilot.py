@@ -14,7 +14,7 @@ from flockd.config.autopilot import AutopilotParameters
 from flockd.config.safety import GateParameters, SafetyParameters
 from flockd.data import data_path
 from flockd.doctor import Check, Finding, Level, autopilot_checks, run_checks
-from flockd.doctor.autopilot_checks import JUDGES, check_autopilot, judge_firmware, judge_messages
+from flockd.doctor.autopilot_checks import JUDGES, check_autopilot, judge_firmware, judge_messages, judge_signing
 from tests.autopilot.conftest import HEARTBEAT_S, free_port
 
 GOOD: dict[str, float | int] = {
@@ -57,7 +57,7 @@ def test_an_autopilot_that_is_set_up_well_and_left_as_it_is(monkeypatch: pytest.
         assert fake_autopilot.refused_setpoints == 0
         assert fake_autopilot.parameters == {**fake_autopilot.parameters, **GOOD}
     assert set(asked) <= {LISTENS, REQUESTS_MESSAGE}, "it listens and asks, and commands nothing"
-    assert found.keys() == {"heartbeat", "firmware", *GOOD}
+    assert found.keys() == {"heartbeat", "firmware", "signing", *GOOD}
     assert {about for about, finding in found.items() if finding.level is not Level.PASS} == {"firmware"}
     assert found["firmware"].measured.startswith("PX4 0.0.1 is older than 1.14"), "the fake autopilot is not PX4"
     assert "system 1 at udpin://127.0.0.1" in found["heartbeat"].measured
@@ -108,6 +108,7 @@ def test_an_autopilot_that_falls_silent_under_examination_is_a_failure(monkeypat
     assert [(finding.about, finding.level) for finding in found] == [
         ("heartbeat", Level.PASS),
         ("firmware", Level.WARNING),
+        ("signing", Level.PASS),
         ("COM_OF_LOSS_T", Level.PASS),
         ("COM_OBL_RC_ACT", Level.FAILURE),
         ("heartbeat", Level.FAILURE),
@@ -165,6 +166,16 @@ def test_other_firmware() -> None:
     assert judge_firmware(Firmware("PX4", "1.16.0")).level is Level.PASS
     assert judge_firmware(Firmware("PX4", "1.13.3")).level is Level.WARNING
     assert judge_firmware(Firmware("autopilot 3", "4.5.7")).level is Level.FAILURE
+
+
+def test_an_autopilot_that_is_heard_and_never_responds_may_accept_signed_messages_only() -> None:
+    parameters = AutopilotParameters(address="serial:///dev/ttyACM0:921600")
+    assert judge_signing(True, 0.2, parameters).level is Level.PASS
+    deaf = judge_signing(False, 0.2, parameters)
+    assert deaf.level is Level.FAILURE
+    assert "signed messages only" in deaf.measured
+    assert "signing key" in deaf.fix
+    assert judge_signing(False, 30.0, parameters).level is Level.WARNING, "a link that was cut says nothing of keys"
 
 
 def test_unknown_values_in_messages_are_a_warning() -> None:

@@ -15,7 +15,8 @@ RECORDING = Path(__file__).parents[1] / "replay" / "normal.mcap"
 
 
 def test_key_frames_are_spread_from_the_first_step_with_flow() -> None:
-    assert sorted(key_frame_steps(11)) == [1, 2, 4, 6, 8, 10]
+    assert sorted(key_frame_steps(221)) == [1, 44, 88, 132, 176, 220]
+    assert sorted(key_frame_steps(20)) == [1, 10, 19], "three are enough of ten seconds"
     assert sorted(key_frame_steps(3)) == [1, 2]
 
 

@@ -6,6 +6,4 @@ from flockd.data import data_path
 from flockd.inference import load_manifest
 from flockd.perception.detection.second_stage import SecondStage
 
-SECOND_STAGE = SecondStage.of(
-    *(load_manifest(data_path("models") / f"{name}.yaml")[0] for name in ("distance_int8", "verification_int8"))
-)
+SECOND_STAGE = SecondStage.of(load_manifest(data_path("models") / "distance_int8.yaml")[0])

@@ -28,7 +28,8 @@ def scene(slope: float, contrast: float, seed: int = 0, size: tuple[int, int] = 
     frequency[0, 0] = np.inf
     texture = np.fft.irfft2(spectrum * frequency**-slope, s=size)
     grey = 128 + contrast * texture / texture.std()
-    return np.clip(grey, 0, 255).astype(np.uint8)[..., None].repeat(3, axis=2)
+    image: UInt8Array = np.clip(grey, 0, 255).astype(np.uint8)[..., None].repeat(3, axis=2)
+    return image
 
 
 def noisy(image: UInt8Array, sigma: float, share: float = 1.0, seed: int = 1) -> UInt8Array:

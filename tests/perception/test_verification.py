@@ -57,7 +57,7 @@ def test_a_drone_keeps_the_range_that_the_distance_network_gives_and_what_is_non
         assert (ours.log_range, ours.log_range_sigma, ours.size_m) == pytest.approx(
             (theirs.log_range, theirs.log_range_sigma, theirs.size_m), rel=1e-5
         )
-    assert with_it[2].drone_probability < 0.1
+    assert with_it[2].drone_probability <= 0.2, "the least for another crop"
     assert math.isnan(with_it[2].log_range)
 
 

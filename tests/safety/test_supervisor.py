@@ -543,13 +543,14 @@ def test_the_reason_names_the_cameras_and_their_faults() -> None:
         "front": UNPLUGGED,
         "right": replace(SEES, frozen=True),
         "back": replace(SEES, age_s=0.2),
-        "left": SEES,
+        "left": replace(SEES, noisy=True),
+        "top": SEES,
     }
     sentence = notice(replace(QUIET, cameras=cameras), SafetyParameters())[Event.SIGHT_LOST]
-    assert "front unplugged, right frozen, back silent" in sentence
-    assert "left" not in sentence
-    sentence = notice(replace(QUIET, cameras=cameras), SafetyParameters(max_lost_cameras=3))[Event.CAMERA_LOST]
-    assert "front unplugged, right frozen, back silent" in sentence
+    assert "front unplugged, right frozen, back silent, left noisy" in sentence
+    assert "top" not in sentence
+    sentence = notice(replace(QUIET, cameras=cameras), SafetyParameters(max_lost_cameras=4))[Event.CAMERA_LOST]
+    assert "front unplugged, right frozen, back silent, left noisy" in sentence
     assert "there are none" in notice(replace(QUIET, cameras={}), SafetyParameters())[Event.SIGHT_LOST]
 
 

@@ -243,6 +243,7 @@ def test_px4_enters_its_failsafe_when_its_daemon_is_frozen(tmp_path: Path) -> No
     fleet = json.loads((out / "summary.json").read_text(encoding="utf-8"))["fleet"]
     left = re.match(r"after ([\d.]+) s it left offboard .*Failsafe", fleet["handed_over"]["drone1"])
     assert left is not None, fleet
-    assert 0.2 < float(left[1]) - frozen_s < 2.0, "COM_OF_LOSS_T is a second of real time, a quarter of simulated time"
+    # The progress line is in whole seconds, and up to 2.5 s old: the freeze was up to 3.5 s after it.
+    assert 1.0 <= float(left[1]) - frozen_s < 5.5, "COM_OF_LOSS_T is a second of simulated time"
     assert set(fleet["handed_over"]) == {"drone1"}
     assert fleet["exit_codes"] == {"drone1": -signal.SIGKILL, "drone2": 0}

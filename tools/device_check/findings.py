@@ -18,6 +18,8 @@ class Finding:
     passed: bool
     measured: str
     wanted: str
+    row: int | None = None
+    """Of the catalogue of faults (`tests/faults/catalogue.py`), where it is one of those."""
 
 
 Check = Callable[[], Iterator[Finding]]

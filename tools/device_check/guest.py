@@ -41,6 +41,7 @@ def main() -> None:
             service.runs,
             service.flies,
             service.hangs,
+            service.runs_out_of_memory,
             service.stops,
         ),
     }

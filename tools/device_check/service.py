@@ -43,6 +43,9 @@ SETPOINTS_STOP_S, RESTARTED_S = 0.5, 8.0
 WATCHDOG_S, STOPPED_S = 2.0, 20.0
 """The unit's WatchdogSec and TimeoutStopSec."""
 WATCHED_S = 10.0
+CONFIG = "/etc/flockd/drone.yaml"
+LITTLE_MEMORY, OUT_OF_MEMORY_S = "32M", 5.0
+"""For the process, which has a few hundred megabytes; until Linux has killed it and the autopilot has noticed."""
 LOOK_S = 0.5
 """To ask systemd keeps an emulated processor busy for a while; when things happened it knows exactly."""
 
@@ -137,6 +140,7 @@ class Service:
             "flies", hz > 19.0, f"{hz:.1f} setpoints a second, at most {worst_ms:.0f} ms apart", "20 a second"
         )
         yield self._is_refused_to_others()
+        yield _second_instance()
         yield from self._is_unplugged()
         yield from self._falls_silent()
 
@@ -145,10 +149,10 @@ class Service:
         stopped_s = time.monotonic()
         os.kill(int(_shown("MainPID")), signal.SIGSTOP)
         until(lambda: self._autopilot.mode != "OFFBOARD", "the autopilot to see that setpoints stopped")
-        yield _soon("setpoints stop", max(self._autopilot.setpoints[-1][0] - stopped_s, 0.0), SETPOINTS_STOP_S)
+        yield _soon("setpoints stop", max(self._autopilot.setpoints[-1][0] - stopped_s, 0.0), SETPOINTS_STOP_S, row=45)
         until(lambda: _shown("NRestarts") == "1" and _shown("MainPID") != "0", "the unit to start again", look_s=LOOK_S)
         began_s = 1e-6 * int(_shown("ExecMainStartTimestampMonotonic"))
-        yield _soon("a hang is restarted", began_s - stopped_s, RESTARTED_S)
+        yield _soon("a hang is restarted", began_s - stopped_s, RESTARTED_S, row=10)
         ready_s = until(lambda: _shown("ActiveState") == "active", "the unit to be ready again", look_s=LOOK_S)
         time.sleep(WATCHED_S)
         state = self._message("flight", ready_s)["state"]
@@ -159,7 +163,28 @@ class Service:
             f"{state}; {sent} setpoints in {time.monotonic() - began_s:.0f} s, {ready_s - began_s:.0f} s of them to "
             "be ready; the autopilot holds by its failsafe",
             "idle, no setpoint",
+            row=28,
         )
+
+    def runs_out_of_memory(self) -> Iterator[Finding]:
+        """The pilot lands, it flies again, and in the air the unit's memory is cut to less than it has."""
+        self._autopilot.pilot_selects("LAND")
+        until(lambda: not self._autopilot.armed, "the landing")
+        self._wait_for_flight()
+        restarts, cut_s = int(_shown("NRestarts")), time.monotonic()
+        run("systemctl", "set-property", "--runtime", UNIT, f"MemoryMax={LITTLE_MEMORY}")
+        until(lambda: self._autopilot.mode != "OFFBOARD", "the autopilot to see that setpoints stopped")
+        yield _soon("out of memory in flight", time.monotonic() - cut_s, OUT_OF_MEMORY_S, row=28)
+        run("systemctl", "set-property", "--runtime", UNIT, "MemoryMax=1G")
+        until(lambda: int(_shown("NRestarts")) > restarts, "the unit to start again", look_s=LOOK_S)
+        ready_s = until(lambda: _shown("ActiveState") == "active", "the unit to be ready again", look_s=LOOK_S)
+        sent = len(self._autopilot.setpoints)
+        time.sleep(WATCHED_S)
+        state, more = self._message("flight", ready_s)["state"], len(self._autopilot.setpoints) - sent
+        yield Finding(
+            "idle after it ran out of memory", (state, more) == ("idle", 0), f"{state}; {more} setpoints",
+            "idle, no setpoint", row=28,
+        )  # fmt: skip
 
     def stops(self) -> Iterator[Finding]:
         """The pilot lands; flockd, which saw it on the ground, flies again, and is stopped in the air."""
@@ -177,6 +202,7 @@ class Service:
             (result, status) == ("success", "0") and holds and took_s < STOPPED_S,
             f"{result}, exit {status} after {took_s:.1f} s; the autopilot {'holds' if holds else 'fails safe'}",
             f"exit 0 within {STOPPED_S:g} s, the autopilot holds",
+            row=27,
         )
         yield _recorded()
 
@@ -198,7 +224,7 @@ class Service:
         opened = self._counts("back")["opened"]
         pulled_s = control(WEBCAM, "disconnect")
         lost_s = _told_since(pulled_s, "a camera is lost: back unplugged")
-        yield _soon("unplugged in flight", lost_s - pulled_s, NOTICED_S)
+        yield _soon("unplugged in flight", lost_s - pulled_s, NOTICED_S, row=5)
         back_s = _told_since(lost_s, "normal")
         again = self._counts("back")["opened"] - opened
         yield Finding(
@@ -212,7 +238,7 @@ class Service:
         assert self._front is not None
         silent_s = self._front.fall_silent()
         lost_s = _told_since(silent_s, "a camera is lost: front")
-        yield _soon("silent in flight", lost_s - silent_s, SILENCE_S + 0.1)
+        yield _soon("silent in flight", lost_s - silent_s, SILENCE_S + 0.1, row=5)
         spoke_s = self._front.go_on()
         back_s = _told_since(spoke_s, "normal")
         yield Finding(
@@ -242,6 +268,17 @@ class Service:
 
         until(lambda: bool(newest()), f"telemetry of {topic}")
         return newest()[0]
+
+
+def _second_instance() -> Finding:
+    """By hand, as the unit's own user, while the unit flies."""
+    command = ["runuser", "-u", "flockd", "--", "/opt/flockd/bin/flockd", "run", "--config", CONFIG]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
+    last = (ended.stderr.strip().splitlines() or ["nothing"])[-1]
+    refused = ended.returncode == 69 and "another flockd" in last
+    return Finding(
+        "a second instance", refused, f"exit {ended.returncode}, {last!r}", "exit 69, says who flies", row=26
+    )
 
 
 def _recorded() -> Finding:
@@ -281,5 +318,5 @@ def _told_since(time_s: float, what: str) -> float:
     return found[0]
 
 
-def _soon(check: str, took_s: float, limit_s: float) -> Finding:
-    return Finding(check, took_s <= limit_s, f"{took_s:.2f} s", f"within {limit_s:g} s")
+def _soon(check: str, took_s: float, limit_s: float, row: int | None = None) -> Finding:
+    return Finding(check, took_s <= limit_s, f"{took_s:.2f} s", f"within {limit_s:g} s", row)

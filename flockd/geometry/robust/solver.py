@@ -69,7 +69,7 @@ class Problem(ABC, Generic[State]):
         """A state moved by a step (n,)."""
 
     def limited(self, step: FloatArray) -> FloatArray:
-        """The step (n,), or the part of it for which the linearisation can be trusted."""
+        """The step (n,), or the part of it within which the linearisation holds."""
         return step
 
     def step_size(self, step: FloatArray) -> float:

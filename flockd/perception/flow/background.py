@@ -31,7 +31,7 @@ class BackgroundFlowParameters:
     half_texture: float = 1.0
     """With this much texture a cell keeps half of its own flow."""
     drone_margin_px: int = 20
-    """So near to a drone no flow is trusted: the drone's own leaks out."""
+    """So near to a drone no flow is used: it mixes with the drone's own."""
     homography_stride_cells: int = 8
     homography_min_texture: float = 0.5
     homography_min_cells: int = 30

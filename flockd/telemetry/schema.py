@@ -1,0 +1,70 @@
+"""Whether a peer's message is what the table of topics says: checked where it enters."""
+
+from __future__ import annotations
+
+import functools
+import math
+import types
+import typing
+from typing import Any
+
+LARGEST_INT = 2**63
+
+
+def fault(message: object, kind: type) -> str | None:
+    """What is wrong with a message that should be of this TypedDict: a key and a few words; None if nothing is.
+
+    Further keys, as of a later version, are no fault. A number that was not finite is null, which only the message's
+    own time may not be.
+    """
+    found = _fault("", message, kind)
+    if found is None and isinstance(message, dict) and message.get("time_s") is None:
+        return "time_s is null"
+    return found
+
+
+@functools.cache
+def _fields(kind: type) -> dict[str, Any]:
+    return typing.get_type_hints(kind)
+
+
+def _fault(key: str, value: object, kind: Any) -> str | None:
+    if typing.is_typeddict(kind):
+        return _fault_of_section(key, value, kind)
+    origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if origin in {typing.Union, types.UnionType}:
+        branches = [branch for branch in inner if branch is not types.NoneType]
+        return None if value is None else _fault(key, value, branches[0])
+    if origin is list:
+        if not isinstance(value, list):
+            return f"{key} is no list"
+        return next((found for i, one in enumerate(value) if (found := _fault(f"{key}[{i}]", one, inner[0]))), None)
+    if origin is dict:
+        if not isinstance(value, dict):
+            return f"{key} is no object"
+        return next((found for name, one in value.items() if (found := _fault(f"{key}.{name}", one, inner[1]))), None)
+    return None if _is_a(value, kind) else f"{key} is no {_WORDS.get(kind, 'JSON value')}"
+
+
+def _fault_of_section(key: str, value: object, kind: type) -> str | None:
+    if not isinstance(value, dict):
+        return f"{key or 'it'} is no object"
+    for name, of_field in _fields(kind).items():
+        path = f"{key}.{name}" if key else name
+        found = _fault(path, value[name], of_field) if name in value else f"{path} is missing"
+        if found:
+            return found
+    return None
+
+
+_WORDS: dict[Any, str] = {float: "finite number", int: "whole number", bool: "true or false", str: "text"}
+
+
+def _is_a(value: object, kind: Any) -> bool:
+    if kind in {float, int} and isinstance(value, bool):
+        return False
+    if kind is float:
+        return value is None or (isinstance(value, float) and math.isfinite(value)) or _is_a(value, int)
+    if kind is int:
+        return isinstance(value, int) and abs(value) <= LARGEST_INT
+    return kind is object or isinstance(value, kind)

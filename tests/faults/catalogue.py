@@ -1,0 +1,412 @@
+"""The catalogue of faults: each has a row, a name, and the stories that inject it. `python -m tools.faults` runs them.
+
+A story is a test; most start a whole drone (`tests.faults.process`). It notes how long the reaction took with
+`reacted`, and asserts what the row promises beside it: the event that is reported, and how it goes on afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+RecordProperty = Callable[[str, object], None]
+"""pytest's fixture `record_property`."""
+REACTION = "reaction_s of "
+"""A property of a test's report begins with this, and goes on with the fault's name."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One row."""
+
+    row: int
+    name: str
+    """For `--only`."""
+    fault: str
+    reaction: str
+    stories: tuple[str, ...]
+    """Ids of tests."""
+    within_s: float | None = None
+    """The longest reaction; None where the reaction is not a matter of time."""
+
+
+def reacted(record: RecordProperty, name: str, seconds: float) -> None:
+    """Notes how long the reaction to a fault took; an assertion fails when that was too long."""
+    limit_s = fault_named(name).within_s
+    record(f"{REACTION}{name}", round(seconds, 3))
+    assert limit_s is not None, f"{name} is not a matter of time"
+    assert 0.0 <= seconds <= limit_s, f"the reaction to {name} took {seconds:.2f} s"
+
+
+def fault_named(name: str) -> Fault:
+    """The fault of this name. Raises KeyError."""
+    for fault in CATALOGUE:
+        if fault.name == name:
+            return fault
+    raise KeyError(name)
+
+
+_HERE = "tests/faults/test_"
+
+# fmt: off
+CATALOGUE = (
+    Fault(
+        1, "camera-unplugged", "no camera delivers images any more",
+        "hover for a second at most, then Hold; no return by itself",
+        (
+            f"{_HERE}cameras.py::test_no_camera_delivers_any_more",
+            "tests/sources/test_v4l2.py::test_an_unplugged_camera_is_reported_at_once_and_comes_back_when_plugged_in",
+        ),
+        within_s=3.0,
+    ),
+    Fault(
+        2, "frozen-frames", "the same image or number again and again", "as for a camera that is unplugged",
+        (
+            f"{_HERE}cameras.py::test_all_cameras_freeze",
+            "tests/sources/test_v4l2.py::test_a_frozen_camera_counts_as_silent",
+        ),
+        within_s=3.0,
+    ),
+    Fault(
+        3, "damaged-images", "corrupt or truncated images", "dropped and counted; degraded above a fifth",
+        (
+            f"{_HERE}cameras.py::test_images_are_damaged",
+            "tests/sources/test_v4l2.py::test_what_is_worth_nothing_is_dropped_and_counted_and_the_next_is_fine",
+        ),
+        within_s=6.0,
+    ),
+    Fault(
+        4, "time-stamps-backwards", "time stamps are repeated or run backwards", "dropped and counted; degraded",
+        (
+            f"{_HERE}cameras.py::test_time_stamps_are_repeated_and_run_backwards",
+            "tests/pilot/test_flock_pilot.py::test_a_repeated_time_stamp_restarts_the_pair_and_says_so",
+        ),
+        within_s=5.0,
+    ),
+    Fault(
+        5, "one-camera-gone", "one of several cameras is gone", "fly on with the others, degraded, and say so",
+        (
+            f"{_HERE}cameras.py::test_one_of_two_cameras_is_gone_and_comes_back",
+        ),
+        within_s=2.0,
+    ),
+    Fault(
+        6, "network-not-finite", "a network's output is not finite", "its step is discarded and counted; degraded",
+        (
+            "tests/daemon/test_flight.py::test_networks_not_finite_or_stuck_degrade_and_sigterm_ends_in_hold",
+            "tests/pilot/test_flock_pilot.py::test_an_output_that_is_not_finite_costs_its_frame_only",
+            f"{_HERE}computer.py::test_a_networks_output_is_not_finite",
+        ),
+        within_s=2.0,
+    ),
+    Fault(
+        7, "model-changed", "a model file is missing or changed", "refuse to start with exit code 78",
+        (
+            f"{_HERE}start.py::test_a_model_was_changed",
+            "tests/inference/test_refusals.py::test_a_start_with_a_damaged_model_ends_with_one_sentence",
+        ),
+        within_s=15.0,
+    ),
+    Fault(
+        8, "network-stuck", "a network does not return", "end the run, then abandon it, then the watchdog acts",
+        (
+            f"{_HERE}computer.py::test_a_network_never_returns",
+            "tests/daemon/test_parts.py::test_a_stuck_network_is_ended_then_abandoned_then_hopeless",
+        ),
+        within_s=2.0,
+    ),
+    Fault(
+        9, "overrun", "steps take too long, or the computer is too hot", "newest frame only, slower, then Hold",
+        (
+            f"{_HERE}computer.py::test_steps_take_longer_than_they_may",
+            f"{_HERE}computer.py::test_it_gets_too_hot",
+        ),
+        within_s=8.0,
+    ),
+    Fault(
+        10, "event-loop-stuck", "the event loop is stuck", "setpoints stop within 0.5 s; the watchdog is not fed",
+        (
+            f"{_HERE}computer.py::test_the_event_loop_is_stuck",
+            "tests/daemon/test_flight.py::test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe",
+        ),
+        within_s=0.5,
+    ),
+    Fault(
+        11, "task-dies", "a task of the daemon dies", "Hold, and an exit code that is not zero",
+        (
+            f"{_HERE}computer.py::test_a_task_dies",
+            "tests/daemon/test_flight.py::test_a_dead_control_task_is_held_by_the_last_resort",
+            "tests/daemon/test_flight.py::test_any_other_dead_task_is_a_hold_too",
+        ),
+        within_s=2.0,
+    ),
+    Fault(
+        12, "link-lost", "the autopilot is not heard any more",
+        "silence; no offboard flight by itself when it is back",
+        (
+            f"{_HERE}autopilot.py::test_the_link_is_lost_and_comes_back",
+        ),
+        within_s=3.5,
+    ),
+    Fault(
+        13, "pilot-takes-over", "the pilot changes the flight mode", "silence at once; never back by itself",
+        (
+            f"{_HERE}autopilot.py::test_the_pilot_takes_over",
+        ),
+        within_s=0.3,
+    ),
+    Fault(
+        14, "offboard-refused", "offboard mode is refused, or not answered", "idle; the reason is reported",
+        (
+            f"{_HERE}autopilot.py::test_offboard_is_refused_and_the_whole_reason_reported",
+        ),
+        within_s=2.0,
+    ),
+    Fault(
+        15, "battery-or-estimate", "the battery is low, or the estimate or the satellites are lost",
+        "leave the flock: Hold, or as configured",
+        (
+            f"{_HERE}autopilot.py::test_the_battery_is_low_or_the_position_lost",
+        ),
+        within_s=3.0,
+    ),
+    Fault(
+        16, "neighbour-too-near", "a neighbour inside the minimum distance, or closing too fast",
+        "separation wins; never faster than can be braked",
+        (
+            f"{_HERE}flock.py::test_a_neighbour_comes_too_near",
+            "tests/safety/test_gate.py::test_two_that_fly_at_each_other_at_3_m_s_stop_before_the_minimum_distance",
+        ),
+        within_s=1.5,
+    ),
+    Fault(
+        17, "alone", "all neighbours are lost", "fly on as desired for a while, then Hold; no old track is followed",
+        (
+            f"{_HERE}flock.py::test_all_neighbours_are_lost",
+        ),
+        within_s=6.0,
+    ),
+    Fault(
+        18, "false-neighbour", "a drone is detected where there is none",
+        "not confirmed before several hits; bounded influence",
+        (
+            "tests/tracking/test_tracker.py::test_false_detections_of_one_frame_are_never_confirmed",
+            "tests/tracking/test_tracker.py::test_one_frame_three_metres_off_moves_a_confirmed_track_little",
+        ),
+    ),
+    Fault(
+        19, "command-not-finite", "a command that is not finite, or far too large", "refused, standstill, counted",
+        (
+            f"{_HERE}flock.py::test_a_command_that_cannot_be_flown",
+        ),
+        within_s=1.0,
+    ),
+    Fault(
+        20, "fence-left", "the fence or the band of heights is left", "inward velocity only, then Hold",
+        (
+            f"{_HERE}flock.py::test_the_fence_is_left",
+        ),
+        within_s=6.0,
+    ),
+    Fault(
+        21, "telemetry-router-gone", "the router of the telemetry is gone", "fly on; drop",
+        (
+            f"{_HERE}outside.py::test_the_router_of_the_telemetry_goes_and_comes_back",
+        ),
+    ),
+    Fault(
+        22, "disk-full", "the disk is full", "stop recording, say so, fly on",
+        (
+            f"{_HERE}recording.py::test_the_disk_is_full",
+            "tests/recording/test_recorder.py::test_a_full_disk_ends_the_recording_and_not_the_flight",
+        ),
+        within_s=5.0,
+    ),
+    Fault(
+        23, "killed-while-recording", "the power is lost, or the process killed, while it records",
+        "`record recover` brings back all but the last chunk",
+        (
+            f"{_HERE}recording.py::test_it_is_killed_while_it_records",
+            "tests/recording/test_reader.py::test_a_kill_at_any_moment_loses_half_a_second_at_most",
+        ),
+        within_s=2.0,
+    ),
+    Fault(
+        24, "clock-jump", "the wall clock is set", "nothing changes; a note",
+        (
+            f"{_HERE}computer.py::test_the_wall_clock_is_set",
+        ),
+    ),
+    Fault(
+        25, "wrong-configuration", "the configuration is wrong",
+        "refuse to start with exit code 78: line, key, value, what to do",
+        (
+            f"{_HERE}start.py::test_the_configuration_is_wrong",
+        ),
+        within_s=30.0,
+    ),
+    Fault(
+        26, "second-instance", "a second daemon for the same drone", "it refuses to start with exit code 69",
+        (
+            f"{_HERE}start.py::test_a_second_instance_is_started_in_flight",
+        ),
+        within_s=15.0,
+    ),
+    Fault(
+        27, "sigterm", "SIGTERM in flight", "standstill, Hold within 2 s, the recording is closed, exit code 0",
+        (
+            f"{_HERE}recording.py::test_sigterm_in_flight",
+        ),
+        within_s=2.0,
+    ),
+    Fault(
+        28, "out-of-memory", "the memory is used up in flight",
+        "Hold, or the process ends and the autopilot's failsafe acts; a restart is idle",
+        (
+            f"{_HERE}computer.py::test_the_memory_is_used_up_in_flight",
+        ),
+        within_s=6.0,
+    ),
+    Fault(
+        29, "malformed-telemetry", "malformed messages on the telemetry bus",
+        "ignored; commands only where configured",
+        (
+            f"{_HERE}outside.py::test_nonsense_on_the_telemetry_bus",
+            "tests/telemetry/test_access.py::test_what_is_no_message_is_counted_and_not_taken",
+        ),
+    ),
+    Fault(
+        30, "noisy-camera", "a camera shows noise",
+        "it counts as lost; no neighbour from it alone; the command stays within 0.1 m/s",
+        (
+            f"{_HERE}cameras.py::test_a_camera_shows_noise",
+            "tests/daemon/test_flight.py::test_a_noisy_camera_is_lost_and_said_so_until_it_is_good_again",
+            "tests/pilot/test_noisy_camera.py",
+        ),
+        within_s=4.0,
+    ),
+    Fault(
+        31, "absurd-mavlink", "a MAVLink message with unknown or absurd values", "the field is unknown and counted",
+        (
+            f"{_HERE}autopilot.py::test_messages_with_absurd_values",
+            "tests/autopilot/test_link.py::test_a_landed_state_that_mavlink_does_not_have_is_unknown_and_counted",
+        ),
+    ),
+    Fault(
+        32, "home-moved", "home or the ground state changes in flight, by a second sender",
+        "height band and fence stay until it is disarmed; reported",
+        (
+            "tests/daemon/test_flight.py::"
+            "test_a_second_sender_with_the_autopilots_ids_moves_neither_height_band_nor_fence",
+            "tests/autopilot/test_mavlink_messages.py::"
+            "test_home_stays_while_armed_whatever_landed_state_and_home_say_and_moves_after",
+        ),
+    ),
+    Fault(
+        33, "time-stamps-jump", "a camera's time stamps jump ahead, back or to absurd values",
+        "dropped and counted; good frames are used as soon as they return",
+        (
+            f"{_HERE}cameras.py::test_a_frame_of_another_time_silences_nobody",
+        ),
+        within_s=4.0,
+    ),
+    Fault(
+        34, "foreign-recordings", "something foreign in the recordings' folder", "skipped with a warning; it records",
+        (
+            f"{_HERE}recording.py::test_foreign_things_lie_among_the_recordings",
+            "tests/recording/test_recorder.py::test_what_is_no_readable_file_in_the_folder_is_skipped_with_a_warning",
+        ),
+    ),
+    Fault(
+        35, "endless-network", "a network that never ends", "refuse to start with exit code 78 within 10 s",
+        (
+            "tests/cli/test_run.py::test_a_network_that_never_ends_is_bad_configuration_within_ten_seconds",
+            "tests/inference/test_deadline.py::test_an_endless_network_is_refused_in_one_sentence",
+        ),
+    ),
+    Fault(
+        36, "hostile-manifest", "a hostile manifest", "exit code 78 within 2 s: line, key, value, what to do",
+        (
+            f"{_HERE}start.py::test_a_manifest_is_hostile",
+            "tests/inference/test_manifest_file.py",
+        ),
+        within_s=15.0,
+    ),
+    Fault(
+        37, "hostile-recording", "a damaged or hostile recording", "one sentence, exit code 1, bounded memory",
+        (
+            f"{_HERE}files.py::test_a_recording_is_hostile",
+            "tests/recording/test_reader.py::test_a_hostile_chunk_is_damage_and_takes_little_memory",
+            "tests/recording/test_reader.py::test_damage_within_is_reported_and_recovered_from",
+        ),
+    ),
+    Fault(
+        38, "huge-image", "an image that claims to be 60000 x 60000", "one sentence, before memory is taken",
+        (
+            f"{_HERE}files.py::test_an_image_claims_to_be_huge",
+            "tests/recording/test_reader.py::test_an_image_that_claims_to_be_huge_is_not_decoded",
+        ),
+    ),
+    Fault(
+        39, "wrong-types-of-a-peer", "telemetry of a peer with wrong types or control characters",
+        "shown as malformed, escaped; `status` goes on",
+        (
+            f"{_HERE}outside.py::test_status_shows_a_peer_that_publishes_nonsense",
+            "tests/telemetry/test_malformed.py",
+        ),
+    ),
+    Fault(
+        40, "simulator-killed", "the simulator, or who started a daemon in simulation, is killed",
+        "its daemons and autopilots end with it",
+        (
+            f"{_HERE}simulator.py::test_the_simulator_is_killed_in_flight",
+            "tests/sim/test_orphans.py",
+        ),
+        within_s=5.0,
+    ),
+    Fault(
+        41, "text-in-chunks", "the autopilot's text comes in several messages", "joined before anyone sees it",
+        (
+            f"{_HERE}autopilot.py::test_offboard_is_refused_and_the_whole_reason_reported",
+            "tests/autopilot/test_mavlink_messages.py::test_a_text_in_chunks_is_seen_whole_and_not_before",
+        ),
+    ),
+    Fault(
+        42, "nothing-left-at-start", "no file descriptors or memory are left at the start",
+        "one sentence, exit code 69; never an abort",
+        (
+            f"{_HERE}computer.py::test_no_descriptors_are_left_at_the_start",
+        ),
+    ),
+    Fault(
+        43, "absurd-limits", "limits in the configuration beyond physics", "refuse to start with exit code 78",
+        (
+            f"{_HERE}start.py::test_the_configuration_is_wrong",
+            "tests/safety/test_parameters.py::test_limits_beyond_what_any_multirotor_does_are_refused",
+        ),
+    ),
+    Fault(
+        44, "one-spot", "two drones at one horizontal spot", "they part, each to its own right",
+        (
+            f"{_HERE}flock.py::test_two_drones_at_one_spot_part",
+            "tests/flocking/test_law.py::test_two_drones_at_one_level_spot_part_each_to_its_own_right",
+        ),
+    ),
+    Fault(
+        45, "computer-stalls", "the computer stalls for seconds",
+        "the autopilot's failsafe; no return by itself; the event names the stall",
+        (
+            f"{_HERE}computer.py::test_the_computer_stalls_for_seconds",
+        ),
+        within_s=0.5,
+    ),
+    Fault(
+        46, "ground-reached", "the ground is reached in flight",
+        "no depth scale, no exception; landing is recorded and reported",
+        (
+            f"{_HERE}autopilot.py::test_the_ground_is_reached_in_flight",
+        ),
+        within_s=6.0,
+    ),
+)
+# fmt: on

@@ -1,0 +1,131 @@
+"""A whole drone for a fault's story: `flockd run` as a process of its own, a fake autopilot, cameras, a watcher."""
+
+from __future__ import annotations
+
+import functools
+import os
+import signal
+import time
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from flockd.autopilot.fake_autopilot import FakeAutopilot
+from flockd.config import DroneConfig
+from flockd.messages import UInt8Array
+from flockd.sim.daemons import Daemons
+from flockd.sim.processes import Program
+from tests.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
+from tests.autopilot.flight import until
+from tests.daemon.aboard import CAMERAS, HEIGHT, WIDTH, Cameras, Watched, config_for, free_endpoint, watched
+
+SECONDS_TO_START = 60.0
+"""To load three networks on a computer that is busy with other things."""
+
+
+def view(camera: str, number: int) -> UInt8Array:
+    """(HEIGHT, WIDTH, 3): the simulator's meadow from 2.5 m, standing still, with a camera's noise in each image."""
+    noise = np.random.default_rng([7, number]).normal(0.0, 2.0, (HEIGHT, WIDTH, 3))
+    return np.clip(_meadow()[camera] + noise, 0, 255).astype(np.uint8)
+
+
+@functools.cache
+def _meadow() -> dict[str, UInt8Array]:
+    """By camera; rendered once with seed 0 (`CameraSimulator`), front left and back right."""
+    image = cv2.imread(str(Path(__file__).with_name("view.png")), cv2.IMREAD_COLOR_RGB)
+    assert image is not None
+    return {name: np.asarray(image[:, i * WIDTH : (i + 1) * WIDTH], np.uint8) for i, name in enumerate(CAMERAS)}
+
+
+@dataclass
+class Process(Watched):
+    """What a story can touch of a daemon that is a process of its own."""
+
+    daemons: Daemons
+    folder: Path
+
+    @property
+    def program(self) -> Program:
+        return self.daemons.programs()[-1]
+
+    def log(self) -> str:
+        """All that it has printed."""
+        return self.program.log.read_text(encoding="utf-8")
+
+    def signal(self, number: signal.Signals) -> float:
+        """Sends a signal; when, on the monotonic clock."""
+        self.program.process.send_signal(number)
+        return time.monotonic()
+
+    def last_setpoint_s(self) -> float:
+        """When the newest came, on the monotonic clock."""
+        return self.fake_autopilot.setpoints[-1][0]
+
+    def standing_still(self, after_s: float) -> bool:
+        """Setpoints came after this time, and all of them command standstill."""
+        sent = [setpoint for at_s, setpoint in list(self.fake_autopilot.setpoints) if at_s > after_s]
+        return bool(sent) and all(np.linalg.norm(one.velocity) < 0.01 for one in sent)
+
+    async def ended(self, timeout_s: float = SECONDS_TO_START) -> int:
+        """Its exit code, once it has ended."""
+        await until(lambda: self.program.ended is not None, timeout_s)
+        assert self.program.ended is not None
+        return self.program.ended
+
+
+@asynccontextmanager
+async def drone(
+    folder: Path,
+    *,
+    change: Callable[[DroneConfig], DroneConfig] = lambda config: config,
+    height_m: float = HOVER_M,
+    environment: Mapping[str, str] | None = None,
+) -> AsyncIterator[Process]:
+    """A daemon with the shipped networks, started beside a vehicle in the air; its recordings go to ``folder``.
+
+    Flying alone is no fault to it unless ``change`` says so.
+
+    Args:
+        folder: an existing one, whose path is short enough for a socket.
+        change: makes another configuration of the usual one.
+        height_m: of the vehicle at the start; 0 for the ground.
+        environment: beside this process's own.
+    """
+    port, frames, telemetry = free_port(), free_endpoint(), free_endpoint()
+    config = config_for(port, frames, telemetry)
+    config = change(config.model_copy(update={"safety": config.safety.model_copy(update={"alone_s": None})}))
+    cameras = Cameras(frames, view)
+    known = {**os.environ, **(environment or {})}
+    try:
+        with (
+            FakeAutopilot(port, height_m=height_m, heartbeat_s=HEARTBEAT_S) as autopilot,
+            Daemons([config], folder=folder, recordings=folder, environment=known) as daemons,
+            watched(telemetry) as (watcher, session, events),
+        ):
+            daemons.start()
+            process = Process(config, autopilot, cameras, watcher, session, events, daemons, folder)
+            yield process
+    finally:
+        cameras.close()
+
+
+async def started(process: Process) -> None:
+    """It has said that it is ready."""
+    await until(lambda: process.daemons.is_ready(0) or process.program.ended is not None, SECONDS_TO_START)
+    assert process.program.ended is None, process.program.last_output()
+
+
+@asynccontextmanager
+async def flying(
+    folder: Path, *, change: Callable[[DroneConfig], DroneConfig] = lambda config: config
+) -> AsyncIterator[Process]:
+    """The same, in offboard flight at cruise speed."""
+    async with drone(folder, change=change) as process:
+        await started(process)
+        await process.is_ready_in_the_air()
+        await process.flies()
+        yield process

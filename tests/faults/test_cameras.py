@@ -1,0 +1,196 @@
+"""Faults of cameras, while a whole drone flies: `flockd run` as a process of its own, with the shipped networks."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from flockd.messages import Frame
+from tests.autopilot.flight import until
+from tests.daemon.aboard import CAMERAS, SECONDS_TO_FAIL
+from tests.faults.catalogue import RecordProperty, reacted
+from tests.faults.process import Process, flying
+from tests.starvation import tell
+
+pytestmark = pytest.mark.slow
+NOTICED_S = 0.8
+"""Three frame periods at 5 Hz, and some."""
+
+
+async def _is_held_and_stays_so(process: Process, fault_s: float, *, repair: Callable[[], None]) -> None:
+    """Hold is asked for, standstill comes before it, and the drone does not come back by itself; an operator may."""
+    assert not process.fake_autopilot.failsafe, "it was asked for Hold, not left to its failsafe"
+    assert process.standing_still(fault_s + NOTICED_S + 0.3)
+    await process.until_event("silent: ")
+    assert any(event.startswith("hover: too few cameras deliver images") for event in process.events)
+    before = len(process.fake_autopilot.setpoints)
+    repair()
+    await until(lambda: _all_see(process), SECONDS_TO_FAIL)
+    await process.until_state("silent")
+    assert len(process.fake_autopilot.setpoints) == before
+    assert (await process.ask("ask/resume"))["accepted"] is True
+    await process.until_state("ready")
+
+
+def test_no_camera_delivers_any_more(tmp_path: Path, record_property: RecordProperty) -> None:
+    async def story() -> None:
+        async with flying(tmp_path) as process:
+            process.cameras.silent |= set(CAMERAS)
+            fault_s = time.monotonic()
+            await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+            reacted(record_property, "camera-unplugged", time.monotonic() - fault_s)
+            await _is_held_and_stays_so(process, fault_s, repair=process.cameras.silent.clear)
+
+    tell(story)
+
+
+def test_all_cameras_freeze(tmp_path: Path, record_property: RecordProperty) -> None:
+    async def story() -> None:
+        async with flying(tmp_path) as process:
+            process.cameras.spoil = lambda frame: replace(frame, sequence=17)
+            fault_s = time.monotonic()
+            await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+            reacted(record_property, "frozen-frames", time.monotonic() - fault_s)
+            await process.until_event("hover: too few cameras deliver images: front frozen, back frozen")
+            await _is_held_and_stays_so(process, fault_s, repair=lambda: _good_again(process))
+
+    tell(story)
+
+
+def test_time_stamps_are_repeated_and_run_backwards(tmp_path: Path, record_property: RecordProperty) -> None:
+    """Half of the frames: they are dropped and counted, and the drone flies on, slower, by the others."""
+
+    def stamped_badly(frame: Frame) -> Frame:
+        return frame if frame.sequence % 2 else replace(frame, time_s=frame.time_s - 3.0)
+
+    async def story() -> None:
+        async with flying(tmp_path) as process:
+            process.cameras.spoil = stamped_badly
+            fault_s = time.monotonic()
+            await until(lambda: "frames_dropped" in process.matters(), SECONDS_TO_FAIL)
+            reacted(record_property, "time-stamps-backwards", time.monotonic() - fault_s)
+            assert process.fake_autopilot.mode == "OFFBOARD"
+            steps = process.heard()["computer"].message["steps"]
+            await until(lambda: process.heard()["computer"].message["steps"] > steps + 3, SECONDS_TO_FAIL)
+            assert process.heard()["computer"].message["cameras"]["front"]["counts"]["time_stamp"] > 1
+            _good_again(process)
+            await until(lambda: "frames_dropped" not in process.matters(), SECONDS_TO_FAIL)
+            await process.until_state("normal")
+
+    tell(story)
+
+
+def test_one_of_two_cameras_is_gone_and_comes_back(tmp_path: Path, record_property: RecordProperty) -> None:
+    async def story() -> None:
+        async with flying(tmp_path) as process:
+            process.cameras.silent.add("back")
+            fault_s = time.monotonic()
+            await process.until_event("degraded: a camera is lost: back silent")
+            reacted(record_property, "one-camera-gone", time.monotonic() - fault_s)
+            steps = process.heard()["computer"].message["steps"]
+            await until(lambda: process.heard()["computer"].message["steps"] > steps + 3, SECONDS_TO_FAIL)
+            assert process.fake_autopilot.mode == "OFFBOARD"
+            assert "camera_lost" in process.matters(), "the blind sector stays reported"
+            process.cameras.silent.clear()
+            await until(lambda: "camera_lost" not in process.matters(), SECONDS_TO_FAIL)
+            await process.until_state("normal")
+
+    tell(story)
+
+
+@pytest.mark.parametrize("ahead_s", [3.0, 86_400.0, -86_400.0, 1e300], ids=["3 s", "a day", "a day ago", "absurd"])
+def test_a_frame_of_another_time_silences_nobody(
+    ahead_s: float, tmp_path: Path, record_property: RecordProperty
+) -> None:
+    """Three frames of one camera; all good ones after it are used at once."""
+    spoiled: list[float] = []
+
+    def of_another_time(frame: Frame) -> Frame:
+        if frame.camera != "front" or len(spoiled) >= 3:
+            return frame
+        spoiled.append(time.monotonic())
+        return replace(frame, time_s=frame.time_s + ahead_s)
+
+    async def story() -> None:
+        async with flying(tmp_path) as process:
+            steps = process.heard()["computer"].message["steps"]
+            process.cameras.spoil = of_another_time
+            await until(lambda: len(spoiled) == 3, SECONDS_TO_FAIL)
+            await until(lambda: _counted(process, "front", "time_stamp") == 3, SECONDS_TO_FAIL)
+            await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
+            await until(lambda: _all_see(process), SECONDS_TO_FAIL)
+            reacted(record_property, "time-stamps-jump", time.monotonic() - spoiled[-1])
+            assert process.fake_autopilot.mode == "OFFBOARD"
+            await process.until_state("normal")
+
+    tell(story)
+
+
+def test_images_are_damaged(tmp_path: Path, record_property: RecordProperty) -> None:
+    """Every second image is cut off: dropped and counted; the drone flies on by the others."""
+
+    def cut_off(frame: Frame) -> Frame:
+        return frame if frame.sequence % 2 else replace(frame, image=frame.image[:7])
+
+    async def story() -> None:
+        async with flying(tmp_path) as process:
+            process.cameras.spoil = cut_off
+            fault_s = time.monotonic()
+            await until(lambda: "frames_dropped" in process.matters(), SECONDS_TO_FAIL)
+            reacted(record_property, "damaged-images", time.monotonic() - fault_s)
+            assert sum(_counted(process, "front", what) for what in ("malformed", "corrupt")) > 0
+            assert process.fake_autopilot.mode == "OFFBOARD"
+            _good_again(process)
+            await until(lambda: "frames_dropped" not in process.matters(), SECONDS_TO_FAIL)
+            await process.until_state("normal")
+
+    tell(story)
+
+
+def test_a_camera_shows_noise(tmp_path: Path, record_property: RecordProperty) -> None:
+    """It counts as lost, invents no neighbour, and the command stays what the other camera gives: 1 m/s north."""
+
+    async def story() -> None:
+        async with flying(tmp_path) as process:
+            await until(lambda: _speed_north(process) > 0.97, SECONDS_TO_FAIL)
+            process.cameras.noisy.add("back")
+            fault_s = time.monotonic()
+            lost = False
+            while not lost or time.monotonic() < fault_s + 5.0:
+                assert not any(n["confirmed"] for n in process.heard()["neighbours"].message["neighbours"])
+                assert abs(_speed_north(process) - 1.0) < 0.1
+                if not lost and any(event.startswith("degraded: a camera is lost: back") for event in process.events):
+                    lost = True
+                    reacted(record_property, "noisy-camera", time.monotonic() - fault_s)
+                assert time.monotonic() < fault_s + SECONDS_TO_FAIL
+                await asyncio.sleep(0.05)
+            assert process.fake_autopilot.mode == "OFFBOARD"
+            process.cameras.noisy.clear()
+            await until(lambda: "camera_lost" not in process.matters(), SECONDS_TO_FAIL)
+
+    tell(story)
+
+
+def _speed_north(process: Process) -> float:
+    return float(process.heard()["command"].message["velocity_ne"][0])
+
+
+def _counted(process: Process, camera: str, what: str) -> int:
+    return int(process.heard()["computer"].message["cameras"][camera]["counts"].get(what, 0))
+
+
+def _all_see(process: Process) -> bool:
+    cameras = process.heard()["computer"].message["cameras"].values()
+    return all(camera["fault"] is None and camera["age_s"] < NOTICED_S for camera in cameras)
+
+
+def _good_again(process: Process) -> None:
+    def as_it_is(frame: Frame) -> Frame:
+        return frame
+
+    process.cameras.spoil = as_it_is

@@ -1,0 +1,45 @@
+"""The simulator is killed while its daemons fly."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.faults.catalogue import RecordProperty, reacted
+from tests.sitl.test_fleet import _left_behind, _processes, _scenario
+
+pytestmark = pytest.mark.slow
+SECONDS_TO_START = 180.0
+
+
+def test_the_simulator_is_killed_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
+    """SIGKILL: it can end nothing any more. Its two daemons end by themselves, and what they recorded is whole."""
+    scenario = _scenario(tmp_path, drones=2)
+    scenario.write_text(scenario.read_text(encoding="utf-8").replace('"duration_s": 3.0', '"duration_s": 60.0'))
+    run = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
+    options = ["--autopilot", "standin", "--speed-factor", "1", "--out", str(tmp_path / "out"), "--record"]
+    with subprocess.Popen(
+        [sys.executable, "-c", run, "sim", str(scenario), *options], env={**os.environ, "TMPDIR": str(tmp_path)},
+        stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2],
+    ) as simulator:  # fmt: skip
+        until_s = time.monotonic() + SECONDS_TO_START
+        recordings = tmp_path / "out" / "recordings"
+        while len(list(recordings.glob("*.mcap"))) < 2:  # each begins with its flight
+            assert simulator.poll() is None, simulator.communicate()
+            assert time.monotonic() < until_s
+            time.sleep(0.1)
+        daemons = [command for command in _processes(str(tmp_path)).values() if " run --config " in command]
+        assert len(daemons) == 2
+        killed_s = time.monotonic()
+        simulator.send_signal(signal.SIGKILL)
+        simulator.wait()
+    while (left := _left_behind(str(tmp_path))) and time.monotonic() < killed_s + 60.0:
+        time.sleep(0.05)
+    assert left == []
+    reacted(record_property, "simulator-killed", time.monotonic() - killed_s)

@@ -1,0 +1,149 @@
+"""What is wrong at the start is refused in one sentence, by the command as a person or systemd runs it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from flockd.data import data_path
+from tests.autopilot.conftest import free_port
+from tests.autopilot.flight import until
+from tests.daemon.aboard import SECONDS_TO_FAIL, config_for, free_endpoint
+from tests.faults.catalogue import RecordProperty, reacted
+from tests.faults.process import flying
+from tests.starvation import tell
+
+pytestmark = pytest.mark.slow
+RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
+ROOT = Path(__file__).parents[2]
+
+
+@dataclass(frozen=True)
+class Ended:
+    code: int
+    took_s: float
+    last: str
+    """The last line of what it said."""
+
+
+def _run(folder: Path, change: Callable[[dict[str, Any]], object]) -> Ended:
+    """`flockd run` with a configuration that was spoiled."""
+    config = config_for(free_port(), free_endpoint(), free_endpoint())
+    values = config.model_dump(mode="json", exclude_defaults=True)
+    change(values)
+    path = folder / "drone.yaml"
+    path.write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
+    began_s = time.monotonic()
+    ended = subprocess.run(
+        [sys.executable, "-c", RUN, "run", "--config", str(path)], cwd=ROOT, capture_output=True, text=True,
+        check=False, timeout=60.0, env={**os.environ, "XDG_RUNTIME_DIR": str(folder)},
+    )  # fmt: skip
+    assert "Traceback" not in ended.stderr
+    return Ended(ended.returncode, time.monotonic() - began_s, ended.stderr.strip().splitlines()[-1])
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "told"),
+    [
+        ("autopilot", "adress", "udpin://x", "autopilot.adress: is not a known key; did you mean `address`?"),
+        ("safety", "hover_s", 1e9, "safety.hover_s: 1000000000.0 is not at most 3; write "),
+        ("safety", "heartbeat_timeout_s", "2 s", "safety.heartbeat_timeout_s: 2 s is not a number"),
+        ("perception", "deadline_s", 1e9, "perception.deadline_s: 1000000000.0 is not "),
+    ],
+)
+def test_the_configuration_is_wrong(
+    section: str, key: str, value: object, told: str, tmp_path: Path, record_property: RecordProperty
+) -> None:
+    ended = _run(tmp_path, lambda values: values.setdefault(section, {}).update({key: value}))
+    assert ended.code == 78
+    assert told in ended.last
+    assert ended.last.startswith(f"{tmp_path / 'drone.yaml'}:")
+    reacted(record_property, "wrong-configuration", ended.took_s)
+
+
+def _models(folder: Path) -> Path:
+    """Copies of the shipped ones; links for the large files."""
+    models = folder / "models"
+    models.mkdir()
+    for file in data_path("models").iterdir():
+        if file.suffix == ".yaml":
+            (models / file.name).write_bytes(file.read_bytes())
+        else:
+            (models / file.name).symlink_to(file)
+    return models
+
+
+def test_a_model_was_changed(tmp_path: Path, record_property: RecordProperty) -> None:
+    models = _models(tmp_path)
+    flow = bytearray((models / "flow_int8.onnx").read_bytes())
+    flow[len(flow) // 2] ^= 1
+    (models / "flow_int8.onnx").unlink()
+    (models / "flow_int8.onnx").write_bytes(flow)
+    ended = _run(tmp_path, lambda values: values["perception"].update(models_dir=str(models)))
+    assert ended.code == 78
+    assert "flow_int8.yaml:5: sha256: " in ended.last
+    reacted(record_property, "model-changed", ended.took_s)
+
+
+def _aliases(path: Path) -> None:
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12)]
+    path.write_text("\n".join(lines), encoding="utf-8")
+
+
+def _zero(path: Path) -> None:
+    path.unlink()
+    path.symlink_to("/dev/zero")
+
+
+def _fifo(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        _aliases,
+        _zero,
+        _fifo,
+        lambda path: path.write_text("a: " + "[" * 5000, encoding="utf-8"),
+        lambda path: path.write_bytes(b"name: \xff\xfe"),
+    ],
+    ids=["aliases", "zero", "fifo", "depth", "not UTF-8"],
+)
+def test_a_manifest_is_hostile(
+    spoil: Callable[[Path], object], tmp_path: Path, record_property: RecordProperty
+) -> None:
+    models = _models(tmp_path)
+    spoil(models / "flow_int8.yaml")
+    ended = _run(tmp_path, lambda values: values["perception"].update(models_dir=str(models)))
+    assert ended.code == 78
+    assert ended.last.startswith(f"{models / 'flow_int8.yaml'}:")
+    reacted(record_property, "hostile-manifest", ended.took_s)
+
+
+def test_a_second_instance_is_started_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
+    async def story() -> None:
+        async with flying(tmp_path) as process:
+            began_s = time.monotonic()
+            first = process.program
+            process.daemons.start()
+            assert await process.ended() == 69
+            reacted(record_property, "second-instance", time.monotonic() - began_s)
+            assert f"another flockd (process {first.process.pid}) flies drone 'tiny'" in process.log()
+            steps = process.heard()["computer"].message["steps"]
+            await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
+            assert process.fake_autopilot.mode == "OFFBOARD"
+            assert first.ended is None
+
+    tell(story)

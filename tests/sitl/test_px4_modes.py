@@ -1,0 +1,60 @@
+"""The mode that PX4 itself ends in after faults, beside what its parameters promise; and the tool without PX4."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from flockd.config.scenario import ScenarioConfig
+from flockd.sim.autopilots import SimulatedAutopilots
+from tools.px4_modes import FAULTS, Fault, Result, _line, main, run
+
+PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
+
+
+@PX4
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+def test_px4_ends_in_the_mode_that_its_parameters_promise(fault: Fault) -> None:
+    (result,) = run([fault], 1.0, lambda result: None)
+    assert result.kept, result
+    if fault.name == "wind":
+        assert result.drift_m_s < 0.5
+
+
+def test_without_px4_it_says_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("FLOCKD_PX4", str(tmp_path))
+    monkeypatch.setattr("sys.argv", ["px4_modes"])
+    assert main() == 69
+    assert capsys.readouterr().err.startswith(f"there is no PX4 in {tmp_path}, which FLOCKD_PX4 names; set it to")
+
+
+def test_a_killed_companion_ends_a_fake_autopilots_offboard_flight_in_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The whole of a trial, with a fake autopilot in PX4's place: it goes from offboard to Hold a second later."""
+    monkeypatch.setattr("tools.px4_modes.Px4s", _Fake)
+    (killed,) = [fault for fault in FAULTS if fault.name == "daemon_killed"]
+    (result,) = run([killed], 2.0, lambda result: None)
+    assert result.modes == ("OFFBOARD", "LOITER"), result
+    assert result.kept
+    assert result.reaction_s is not None
+    assert 0.9 < result.reaction_s < 5.0, "COM_OF_LOSS_T is a second, and a heartbeat tells the mode"
+
+
+class _Fake(SimulatedAutopilots):
+    """Fake autopilots that are made as PX4s are."""
+
+    def __init__(self, scenario: ScenarioConfig, speed_factor: float, *_: object) -> None:
+        super().__init__(scenario, speed_factor)
+
+
+def test_a_mode_that_was_not_promised_is_shown_as_such() -> None:
+    result = Result("link_lost", "LOITER", "COM_OBL_RC_ACT 5: Hold", "RTL", 1.26, ("OFFBOARD", "LOITER", "RTL"), 0.104)
+    assert not result.kept
+    line = _line(result)
+    assert "RTL after 1.3 s" in line
+    assert "NOT AS PROMISED" in line
+    assert "OFFBOARD > LOITER > RTL; COM_OBL_RC_ACT 5: Hold; velocity off by 0.10 m/s" in line
