@@ -202,9 +202,9 @@ def daemon_config(port: int, frames_at: str, telemetry_at: str) -> DroneConfig:
     """One that flies its circle for ever."""
     config = small(at(port, frames_at))
     telemetry = config.telemetry.model_copy(update={"listen": (telemetry_at,), "connect": ()})
-    desired = config.desired.model_copy(update={"circle_until_s": 1e9})
+    mission = config.mission.model_copy(update={"circle_until_s": 1e9})
     safety = config.safety.model_copy(update={"alone_s": None})
-    return config.model_copy(update={"telemetry": telemetry, "desired": desired, "safety": safety})
+    return config.model_copy(update={"telemetry": telemetry, "mission": mission, "safety": safety})
 
 
 def _wait_for(daemons: Daemons, server: FrameServer) -> None:

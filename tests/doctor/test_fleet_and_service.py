@@ -37,7 +37,9 @@ def _fleet(config: DroneConfig, listen_s: float = 1.5) -> Finding:
 
 def _appears(telemetry: ZenohTelemetry, drone: str) -> None:
     about = AboutMessage(version="1", configuration={}, commands=[])
-    telemetry.announce(drone, about, lambda what: AnswerMessage(accepted=False, sentence=""), lambda camera: None)
+    telemetry.announce(
+        drone, about, lambda what, payload: AnswerMessage(accepted=False, sentence=""), lambda camera: None
+    )
 
 
 def test_another_drone_is_seen_and_one_of_the_same_name_is_a_failure() -> None:

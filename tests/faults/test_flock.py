@@ -181,8 +181,8 @@ def test_two_drones_at_one_spot_part(
     monkeypatch.setattr(Tracker, "neighbours", other)
 
     def still(config: DroneConfig) -> DroneConfig:
-        desired = config.desired.model_copy(update={"speed_m_s": 0.0})
-        return _changed(config).model_copy(update={"desired": desired})
+        mission = config.mission.model_copy(update={"speed_m_s": 0.0})
+        return _changed(config).model_copy(update={"mission": mission})
 
     async def story() -> None:
         async with aboard(autopilot, port, tmp_path, change=still) as ship:

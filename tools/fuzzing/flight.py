@@ -134,6 +134,7 @@ def _through_gate(random: Random, gate: Gate, p: GateParameters, output: PilotOu
         any_float(random),
         np.array([n.position for n in output.neighbours]).reshape(-1, 3),
         np.array([n.velocity[:2] for n in output.neighbours]).reshape(-1, 2),
+        any_float(random),
     )
     last = gate._last
     wanted = Wanted(output.command, now_s, any_float(random))
@@ -199,6 +200,7 @@ def _surroundings(random: Random) -> Surroundings:
         any_float(random),
         np.array([any_float(random) for _ in range(3 * count)]).reshape(count, 3),
         np.array([any_float(random) for _ in range(2 * count)]).reshape(count, 2),
+        any_float(random),
     )
 
 

@@ -23,6 +23,7 @@ from flockd.cli.status import _table
 from flockd.config import load_drone
 from flockd.config.source import SourceParameters
 from flockd.daemon.operator_commands import OperatorRequests, command_handler
+from flockd.messages import MissionOrder
 from flockd.recording import foxglove
 from flockd.recording.mcap_file import RecordingError
 from flockd.recording.reader import decoded_image
@@ -34,7 +35,7 @@ from flockd.telemetry.watcher import FleetWatcher
 from tools.fuzzing.mutation import ABSURD_NUMBERS, ABSURD_TEXTS, absurd, any_float, mutated_bytes, mutated_json
 from tools.fuzzing.target import CORPUS, Check, Target, assert_readable
 
-COMMANDS = ("hold", "land", "resume", "HOLD", "hold ", "hold/land", "__init__")
+COMMANDS = ("hold", "land", "goto", "velocity", "resume", "HOLD", "hold ", "hold/land", "__init__")
 NAMES = ("drone1", "front", "\x1b[2J", "é", " ", "a" * 300)
 
 # ------------------------------------------------------------------------------------------------------------ MAVLink
@@ -134,22 +135,45 @@ def _status(folder: Path) -> Check:
     return check
 
 
+class _Missions:
+    """Takes every order that it is given: what is wrong in itself is not to get here."""
+
+    def __init__(self) -> None:
+        self.orders: list[MissionOrder] = []
+
+    def fault(self, order: MissionOrder) -> None:
+        """None is refused."""
+        values = (order.place, order.place_deg, order.velocity, order.height_m, order.speed_m_s)
+        numbers = [np.atleast_1d(value) for value in values if value is not None]
+        assert np.isfinite(np.concatenate(numbers)).all(), f"{order} is not finite"
+
+    def apply(self, order: MissionOrder) -> None:
+        """Keeps it."""
+        self.orders.append(order)
+
+
 def _commands(folder: Path) -> Check:
     loop = asyncio.new_event_loop()
-    allowed = ("hold", "land")
+    allowed = ("hold", "land", "goto", "velocity")
+    orders = ({"north_m": 3.0, "east_m": 1.0, "speed_m_s": 1.0}, {"velocity_ne": [1.0, 0.5], "height_m": 4.0})
+    seeds = [json.dumps(order).encode() for order in orders]
 
     def check(random: Random) -> None:
         said: list[str] = []
-        requests = OperatorRequests()
+        requests, missions = OperatorRequests(), _Missions()
         command = random.choice(
             (*ABSURD_TEXTS, *NAMES, "hold", "land", "resume", "HOLD", "hold ", "hold/land", "__init__")
         )
         if random.random() < 0.5:
             command = mutated_bytes(random, command.encode("utf-8", "replace")).decode("utf-8", "replace")
-        reply = command_handler(allowed, requests, loop, said.append)(command)
+        payload = random.choice(seeds)
+        if random.random() < 0.7:
+            payload = mutated_bytes(random, payload)
+        reply = command_handler(allowed, requests, missions, loop, said.append)(command, payload)
         loop.call_soon(loop.stop)
         loop.run_forever()
-        assert reply["accepted"] is (command in allowed)
+        assert command in allowed or not reply["accepted"]
+        assert len(missions.orders) == (reply["accepted"] and command in ("goto", "velocity"))
         assert (requests.hold, requests.land, requests.resume) == (command == "hold", command == "land", False)
         for sentence in (*said, reply["sentence"]):
             assert_readable(sentence)
