@@ -161,9 +161,7 @@ def _commands(folder: Path) -> Check:
     def check(random: Random) -> None:
         said: list[str] = []
         requests, missions = OperatorRequests(), _Missions()
-        command = random.choice(
-            (*ABSURD_TEXTS, *NAMES, "hold", "land", "resume", "HOLD", "hold ", "hold/land", "__init__")
-        )
+        command = random.choice((*ABSURD_TEXTS, *NAMES, *COMMANDS, *allowed))
         if random.random() < 0.5:
             command = mutated_bytes(random, command.encode("utf-8", "replace")).decode("utf-8", "replace")
         payload = random.choice(seeds)
