@@ -49,7 +49,7 @@ REQUEST_S, SETTLE_S, WATCH_S, STAY_S = 60.0, 5.0, 30.0, 3.0
 mode; and for which it has to stay in it."""
 POLL_S = 0.05
 STICK = 700
-"""Of 1000: what counts as a pilot who takes over."""
+"""Of 1000: how far a pilot pushes the stick, within 0.3 s."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,8 @@ FAULTS = (
         _shell("failure", "gps", "off"), {"SYS_FAILURE_EN": "1"},
     ),
     Fault(
-        "estimator_lost", "TERMINATION", "no attitude either, so that no mode can run",
-        _shell("ekf2", "stop"),
+        "estimator_lost", "LAND", "no position and no height: Descend, which needs neither",
+        lambda flight: flight.lose_estimates(), {"SYS_FAILURE_EN": "1"},
     ),
     Fault(
         "battery_low", "RTL", "COM_LOW_BAT_ACT 3: Return when critical, Land when at its end",
@@ -89,8 +89,8 @@ FAULTS = (
         _shell("param", "set", "SIM_BAT_MIN_PCT", "6"), {"COM_LOW_BAT_ACT": "0", "SIM_BAT_DRAIN": "10"},
     ),
     Fault(
-        "rc_override", "POSCTL", "COM_RC_OVERRIDE 3: moved sticks take over from offboard",
-        lambda flight: flight.move_sticks(), {"COM_RC_OVERRIDE": "3", "COM_RC_IN_MODE": "1"},
+        "rc_override", "POSCTL", "MAN_OVERRIDE_SPD 1: sticks moved fast take over (before PX4 1.18 COM_RC_OVERRIDE 3)",
+        lambda flight: flight.move_sticks(), {"MAN_OVERRIDE_SPD": "1", "COM_RC_IN_MODE": "1"},
     ),
     Fault(
         "geofence", "LOITER", "GF_ACTION 2: Hold outside GF_MAX_HOR_DIST",
@@ -227,16 +227,20 @@ class Px4Flight:
         if done.returncode != 0:
             raise UnavailableError(f"PX4 refused `{' '.join(command)}`: {(done.stdout + done.stderr).strip()}")
 
+    def lose_estimates(self) -> None:
+        """The estimator has neither position nor height any more. Stopping EKF2 would stop PX4's simulated time."""
+        for sensor in ("gps", "baro"):
+            self.shell("failure", sensor, "off")
+
     def kill_companion(self) -> None:
         """The process that sends the setpoints is gone at once."""
         os.killpg(self._companion.process.pid, signal.SIGKILL)
 
     def move_sticks(self) -> None:
-        """A pilot's joystick: in the middle for two seconds, then pushed forward, from now on."""
-        until_s = self._clock() + 2.0
-        while self._clock() < until_s:
-            self.station.push_sticks(0, forward=0)
-            time.sleep(POLL_S)
+        """A pilot's joystick: in the middle for two seconds, then pushed forward and kept there from now on."""
+        for forward in (*[0] * 40, *range(0, STICK, STICK // 10)):
+            self.station.push_sticks(0, forward=forward)
+            time.sleep((0.05 if forward == 0 else 0.03) / self._speed_factor)
         self._sticks = True
 
     def wait(self, seconds: float) -> None:
