@@ -190,8 +190,8 @@ class Px4Flight:
         if not fault.north_m_s:
             self.wait(SETTLE_S)
         injected_s = self._clock()
-        fault.inject(self)
         modes, since_s, drifts = [self.mode], None, []
+        fault.inject(self)
         while (now := self._clock()) < injected_s + WATCH_S:
             self.wait(POLL_S * self._speed_factor)
             if self.mode != modes[-1]:
