@@ -13,7 +13,7 @@ from flockd.data import data_path
 from flockd.inference import load_manifest
 from tests.inference.foreign import one_channel_depth
 
-FLOAT = ("distance", "flow", "neighbours")
+FLOAT = ("distance", "flow", "neighbours", "verification")
 
 
 def test_the_list_shows_hash_and_licence(capsys: pytest.CaptureFixture[str]) -> None:
@@ -68,6 +68,6 @@ def test_on_the_cpu_there_is_nothing_to_prepare(tmp_path: Path, capsys: pytest.C
     assert load_drone(drone).perception.provider == "cpu"
     assert main(["models", "prepare", "--config", str(drone), "--json"]) == 0
     prepared = json.loads(capsys.readouterr().out)
-    assert [one["model"] for one in prepared] == ["flow_int8", "neighbours_int8", "distance_int8"]
+    assert [one["model"] for one in prepared] == ["flow_int8", "neighbours_int8", "distance_int8", "verification_int8"]
     assert all(one["engines"] is None and one["start_s"] > 0 for one in prepared)
     assert not (tmp_path / "engines").exists()

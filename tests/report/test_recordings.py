@@ -332,7 +332,7 @@ class Looking:
 def test_pictures_are_of_the_recorded_images(alone: Path, flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("flockd.flight_log.from_recordings.FlockPilot", Looking)
     frames = key_frames(Recording(alone), log_of(alone))
-    steps = [1, 3, 5, 7, 9, 11]
+    steps = [1, 11]  # a flight of a few seconds shows its beginning and its end
     assert [frame.time_s for frame in frames] == pytest.approx([STEP_S * step for step in steps])
     assert {frame.title for frame in frames} == {"kestrel"}
     assert [int(frame.images["left"][0, 0, 0]) for frame in frames] == [10 * step for step in steps]

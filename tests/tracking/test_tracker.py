@@ -107,7 +107,7 @@ def test_a_dropout_of_three_frame_sets_keeps_a_confirmed_track() -> None:
 
 @pytest.mark.parametrize("blind_ahead", [False, True])
 def test_a_track_where_the_rig_is_blind_is_as_probable_as_before_but_ages(blind_ahead: bool) -> None:
-    tracker = Tracker(TrackingParameters(max_unseen_s=1.5, survival_time_s=1e6))
+    tracker = Tracker(TrackingParameters(max_unseen_s=1.5, survival_time_s=3600.0))
     for k in range(3):
         _step(tracker, k * STEP_S, AHEAD)
     (before,) = tracker.neighbours()
@@ -124,7 +124,7 @@ def test_a_track_where_the_rig_is_blind_is_as_probable_as_before_but_ages(blind_
         found += [neighbour.existence_probability for neighbour in tracker.neighbours()]
     assert len(found) == 3, "after 1.5 s it is gone, however blind"
     if blind_ahead:
-        assert found == pytest.approx([before.existence_probability] * 3, abs=1e-4)
+        assert found == pytest.approx([before.existence_probability] * 3, abs=5e-4)
     else:
         assert found[2] < found[1] < found[0] < before.existence_probability
 
