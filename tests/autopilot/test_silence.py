@@ -41,11 +41,19 @@ def _becomes_silent_and_fails_safe(
 ) -> None:
     time.sleep(0.3)
     assert fake_autopilot.mode == "OFFBOARD"
+    _wait_for_a_setpoint(fake_autopilot)
     stopped_s = time.monotonic()
     os.kill(child.pid, how)
     asyncio.run(until(lambda: fake_autopilot.mode == "LOITER", FAILSAFE_WITHIN_S))
     assert fake_autopilot.failsafe
     assert fake_autopilot.setpoints[-1][0] - stopped_s < STOPS_WITHIN_S
+
+
+def _wait_for_a_setpoint(fake_autopilot: FakeAutopilot) -> None:
+    """So that the process is stopped between two of them: one that is just being sent cannot be taken back."""
+    sent = len(fake_autopilot.setpoints)
+    asyncio.run(until(lambda: len(fake_autopilot.setpoints) > sent, STOPS_WITHIN_S))
+    time.sleep(0.01)
 
 
 def test_a_killed_process_is_silence_and_failsafe(port: int, fake_autopilot: FakeAutopilot) -> None:
