@@ -33,10 +33,10 @@ PERMITTED = (
         "tests/sources/*", "no virtual camera", "`modprobe vivid`, on a kernel that was built with CONFIG_VIDEO_VIVID"
     ),
     PermittedSkip(
-        "tests/perception/*", "this computer can compute with CUDA", "install onnxruntime in place of onnxruntime-gpu"
+        "tests/inference/*", "this computer can compute with CUDA", "install onnxruntime in place of onnxruntime-gpu"
     ),
     PermittedSkip(
-        "tests/perception/*", "this computer has TensorRT", "install onnxruntime in place of onnxruntime-gpu"
+        "tests/inference/*", "this computer has TensorRT", "install onnxruntime in place of onnxruntime-gpu"
     ),
     PermittedSkip(
         "tests/recording/*", "a small file system cannot be mounted", "run as root, where `mount -t tmpfs` is allowed"

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from pydantic import ValidationError
 
 from flockd.config.drone import DroneConfig
 from flockd.config.mission import fault_of_height, fault_of_place, fault_of_speed
 from flockd.messages import FloatArray, MissionOrder, VehicleState
+from flockd.mission.navigator import ordered_mission
 from flockd.mission.places import place_of_order
 
 
@@ -38,8 +40,13 @@ def order_fault(config: DroneConfig, order: MissionOrder, vehicle: VehicleState 
     goal = place_of_order(order, np.array(mission.origin_m), vehicle.home_deg)
     if goal is None:
         return "the drone does not know its home in degrees; name the goal in metres from there"
-    fault = fault_of_place(gate, float(goal[0]), float(goal[1]))
-    return None if fault is None else f"the goal {fault}"
+    if (fault := fault_of_place(gate, float(goal[0]), float(goal[1]))) is not None:
+        return f"the goal {fault}"
+    try:
+        ordered_mission(mission, order)
+    except ValidationError:  # of the only numbers of an order that are not checked above
+        return "the goal is farther than any mission leads; name one nearer to home"
+    return None
 
 
 def _fault_of_velocity(config: DroneConfig, position: FloatArray, velocity: FloatArray) -> str | None:

@@ -188,6 +188,23 @@ def test_a_velocity_that_leads_out_of_the_fence_is_refused_and_one_back_is_not(t
 
 
 @pytest.mark.parametrize(
+    "message",
+    [{"north_m": 2e5, "east_m": 0.0}, {"latitude_deg": 89.0, "longitude_deg": 8.0}],
+    ids=["metres", "degrees"],
+)
+def test_a_goal_that_no_mission_can_have_is_refused_without_a_fence_too(
+    tmp_path: Path, message: dict[str, float]
+) -> None:
+    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
+    config = load_drone(tmp_path / "drone.yaml")
+    gate = config.safety.gate.model_copy(update={"fence_radius_m": None, "fence_corners_m": ()})
+    config = config.model_copy(update={"safety": config.safety.model_copy(update={"gate": gate})})
+    vehicle = VehicleState(0.0, np.eye(3), 5.0, np.zeros(3), ORIGIN, np.array([47.4, 8.5]))
+    order = parse_order("goto", json.dumps(message).encode())
+    assert "farther than any mission leads" in str(order_fault(config, order, vehicle))
+
+
+@pytest.mark.parametrize(
     "payload",
     [b"", b"[]", b"{", b'{"north_m": 1}', b'{"north_m": 1, "east_m": "2"}', b'{"north_m": NaN, "east_m": 0}',
      b'{"north_m": true, "east_m": 0}', b'{"north_m": 1, "east_m": 0, "latitude_deg": 1}', b'{"colour": 1}',
