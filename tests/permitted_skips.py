@@ -35,9 +35,7 @@ PERMITTED = (
     PermittedSkip(
         "tests/inference/*", "this computer can compute with CUDA", "install onnxruntime in place of onnxruntime-gpu"
     ),
-    PermittedSkip(
-        "tests/inference/*", "this computer has TensorRT", "install onnxruntime in place of onnxruntime-gpu"
-    ),
+    PermittedSkip("tests/inference/*", "this computer has TensorRT", "install onnxruntime in place of onnxruntime-gpu"),
     PermittedSkip(
         "tests/recording/*", "a small file system cannot be mounted", "run as root, where `mount -t tmpfs` is allowed"
     ),

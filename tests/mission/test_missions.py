@@ -190,7 +190,6 @@ def test_a_velocity_that_leads_out_of_the_fence_is_refused_and_one_back_is_not(t
 @pytest.mark.parametrize(
     "message",
     [{"north_m": 2e5, "east_m": 0.0}, {"latitude_deg": 89.0, "longitude_deg": 8.0}],
-    ids=["m", "deg"][{"north_m": 2e5, "east_m": 0.0}, {"latitude_deg": 89.0, "longitude_deg": 8.0}],
     ids=["metres", "degrees"],
 )
 def test_a_goal_that_no_mission_can_have_is_refused_without_a_fence_too(
