@@ -52,6 +52,8 @@ STREAMS_HZ = {
     "ESTIMATOR_STATUS": (230, 2.0),
     "HOME_POSITION": (242, 1.0),
     "CURRENT_MODE": (436, 20.0),
+    "DISTANCE_SENSOR": (132, 30.0),
+    "ALTITUDE": (141, 10.0),
 }
 """What is asked for, by message number and rate. PX4 sends CURRENT_MODE at once when the mode changes, at this rate at
 most; its heartbeat comes once a second whatever one asks."""
