@@ -93,6 +93,11 @@ class WorldConfig(Section):
 
     ground_relief_m: NonNegative = 0.15
     """Standard deviation of the gently uneven ground; 0 is flat."""
+    hills_m: Annotated[float, Field(ge=0, le=20)] = 0.0
+    """From the lowest to the highest point of its hills, where `hills_slope` lets them be so high; level at the
+    origin."""
+    hills_slope: Annotated[float, Field(gt=0, le=0.5)] = 0.15
+    """Rise for each metre where they are steepest."""
     clearance_m: NonNegative = 9.0
     """Free of obstacles on both sides of the planned path."""
     drone_family: Annotated[int, Field(ge=0, le=DRONE_FAMILIES - 1)] | Literal["any"] = "any"

@@ -50,6 +50,8 @@ class CameraSimulator:
             ground_relief_m=scenario.world.ground_relief_m,
             keep_out=planned_path(scenario),
             clearance_m=scenario.world.clearance_m + _spread(scenario),
+            hills_m=scenario.world.hills_m,
+            hills_slope=scenario.world.hills_slope,
         )
         rng = np.random.default_rng([scenario.seed, 1])
         drawn, wanted = int(rng.integers(FAMILIES)), scenario.world.drone_family

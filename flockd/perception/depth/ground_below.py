@@ -16,6 +16,8 @@ from flockd.choices import HeightSource
 from flockd.config.perception import RangeFinderParameters
 from flockd.messages import FloatArray, GroundEstimate, RangeReading, VehicleState
 
+OF_HEIGHT = "height: "
+"""How reasons begin that tell of the height's source."""
 HEIGHT_NOISE_M = 0.03
 """Standard deviation of the autopilot's height from one reading to the next; what changes slowly does not matter."""
 FIRST_SLOPE = 0.1
@@ -59,8 +61,8 @@ class GroundBelow:
             height_m = vehicle.height_m - float(self._state[0])
             return GroundEstimate(height_m, self._state[1:].copy(), "range_finder"), None
         if self._source == "best":
-            return _level(vehicle), f"height: {fault}; the barometer's is used"
-        return NoGround(f"height: {fault}; there is no scale"), None
+            return _level(vehicle), f"{OF_HEIGHT}{fault}; the barometer's is used"
+        return NoGround(f"{OF_HEIGHT}{fault}; there is no scale"), None
 
     def see_slope(self, slope: FloatArray, sigma: float) -> None:
         """Takes the slope (2,) that the images of the newest step show, with its standard deviation on each axis."""
