@@ -131,6 +131,7 @@ class FlockPilot:
             stages_ms=laps.stages_ms,
             mission=mission,
             noisy_cameras=observation.noisy_cameras or None,
+            ground=observation.ground,
         )
 
     def _refused(self, frames: FrameSet, reason: str) -> PilotOutput:
@@ -275,6 +276,9 @@ def _why_refused(frames: FrameSet, vehicle: VehicleState) -> str | None:
         return "input refused: the height is not finite"
     if velocity is not None and not np.isfinite(velocity).all():
         return "input refused: the autopilot's velocity is not finite"
+    reading = vehicle.ground_range
+    if reading is not None and not math.isfinite(reading.time_s):
+        return "input refused: the range finder's time is not finite"
     for place in (vehicle.position, vehicle.home_deg):
         if place is not None and not np.isfinite(place).all():
             return "input refused: the autopilot's position is not finite"

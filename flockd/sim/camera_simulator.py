@@ -52,16 +52,23 @@ class CameraSimulator:
             ground_relief_m=scenario.world.ground_relief_m,
             keep_out=planned_path(scenario),
             clearance_m=scenario.world.clearance_m + _spread(scenario),
+            hills_m=scenario.world.hills_m,
+            hills_slope=scenario.world.hills_slope,
         )
         rng = np.random.default_rng([scenario.seed, 1])
         drawn, wanted = int(rng.integers(FAMILIES)), scenario.world.drone_family
         family = drawn if wanted == "any" else wanted
         self._count = len(scenario.vehicles)
         models = [drone_model(family, int(rng.integers(1 << 31))) for _ in range(self._count)]
+        self._world = world
         self._renderer = Renderer(world, models)
         self._noise = _ImageNoise(scenario.sensors.image_noise, scenario.seed)
         self._faults = CameraFaults(scenario.faults, scenario.seed)
         self._executor = ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="camera")
+
+    def ground_height(self, north: FloatArray, east: FloatArray) -> FloatArray:
+        """(n,) metres above z = 0 of the ground that is drawn, at points (n,) north and east."""
+        return self._world.height_at(north, east)
 
     def capture(self, drone: int, step: int, time_s: float, vehicles: FlockPoses) -> tuple[FrameSet, RenderTruth]:
         """The frame set of one drone, and the truth behind it."""
