@@ -12,6 +12,8 @@ import argparse
 import multiprocessing
 import os
 import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,22 +42,39 @@ def main() -> None:
     arguments = parser.parse_args()
     seeds = {"training": worlds.TRAINING, "validation": worlds.VALIDATION, "test": worlds.TEST}[arguments.split]
     families = {"training": worlds.FAMILIES, "unseen": worlds.UNSEEN_FAMILIES}[arguments.families]
-    os.environ["NUMBA_NUM_THREADS"] = "1"
     wanted = range(arguments.skip, arguments.skip + arguments.worlds)
-    jobs = [(arguments.out / f"part-{i:04d}", seeds[i], arguments.pairs, families) for i in wanted]
-    jobs = [job for job in jobs if not (job[0] / "made.json").is_file()]
+    jobs = [PairJob(arguments.out / f"part-{i:04d}", seeds[i], arguments.pairs, families) for i in wanted]
     begin = time.monotonic()
-    with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
-        for done, _ in enumerate(pool.imap_unordered(_render_world, jobs), start=1):
-            print(f"{done}/{len(jobs)} worlds, {time.monotonic() - begin:.0f} s", flush=True)
+    for done, total in render_pairs(jobs, arguments.processes):
+        print(f"{done}/{total} worlds, {time.monotonic() - begin:.0f} s", flush=True)
 
 
-def _render_world(job: tuple[Path, int, int, range]) -> None:
+@dataclass(frozen=True)
+class PairJob:
+    """One part of a folder of pairs."""
+
+    folder: Path
+    seed: int
+    """Of the world."""
+    pairs: int
+    families: range
+
+
+def render_pairs(jobs: Sequence[PairJob], processes: int | None) -> Iterator[tuple[int, int]]:
+    """Write each job's part that is not there yet; yields how many of how many are done."""
+    missing = [job for job in jobs if not (job.folder / "made.json").is_file()]
+    os.environ["NUMBA_NUM_THREADS"] = "1"
+    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+        for done, _ in enumerate(pool.imap_unordered(_render_world, missing), start=1):
+            yield done, len(missing)
+
+
+def _render_world(job: PairJob) -> None:
     from flockd.sim.drone_models import drone_model  # noqa: PLC0415 - numba starts in the worker
     from flockd.sim.renderer import Renderer  # noqa: PLC0415
     from flockd.sim.world import World  # noqa: PLC0415
 
-    folder, seed, count, allowed = job
+    folder, seed, count, allowed = job.folder, job.seed, job.pairs, job.families
     rng = np.random.Generator(np.random.PCG64(seed))
     world = World.generate(seed, ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])), keep_out=None)
     part = create_part(folder, count)
