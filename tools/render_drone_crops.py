@@ -25,13 +25,14 @@ from flockd.sim.drone_models import drone_model
 from tools.training import worlds
 from tools.training.dataset import FOCAL_PX, HEIGHT, R_BODY_CAMERA, WIDTH
 from tools.training.distractions import drawn_distraction
+from tools.training.drone_generator import generated_drone
 from tools.training.samples import DroneInView, crop_around, crop_at, sample_of, sample_without_drone
 from tools.training.scenes import drawn_attitude, outline_of
 
 Array = NDArray[Any]
 PICTURES_A_SCENE = 3
 PAINTED = 8
-"""Drones of each family in a world, painted differently."""
+"""Drones of each shape in a world, painted differently."""
 MOST_DRONES = 3
 MIN_PIXELS = 8
 """That much of it must be seen: a drone six pixels wide is still to be told from a bird."""
@@ -73,15 +74,26 @@ def main() -> None:
     arguments = parser.parse_args()
     # From the far end of the training worlds: other places than those of whole images.
     seeds = worlds.TRAINING[::-1][arguments.skip :][: arguments.worlds]
-    jobs = [CropJob(arguments.out / f"{seed}.npz", seed, arguments.scenes, families_of_training) for seed in seeds]
+    jobs = [CropJob(arguments.out / f"{seed}.npz", seed, arguments.scenes, drones_of_training) for seed in seeds]
     begin = time.monotonic()
     for done, total in render_crops(jobs, arguments.processes):
         print(f"{done}/{total} worlds, {time.monotonic() - begin:.0f} s", flush=True)
 
 
-def families_of_training(rng: np.random.Generator) -> list[list[DroneModel]]:
-    """Every family of the training."""
-    return [[drone_model(family, int(rng.integers(1 << 31))) for _ in range(PAINTED)] for family in worlds.FAMILIES]
+def drones_of_training(rng: np.random.Generator) -> list[list[DroneModel]]:
+    """Every family of the training, and as many shapes of the generator as the drones of a world are to have."""
+    count = round(len(worlds.FAMILIES) * worlds.SHAPES_SHARE / (1 - worlds.SHAPES_SHARE))
+    return [
+        *([drone_model(family, _paint(rng)) for _ in range(PAINTED)] for family in worlds.FAMILIES),
+        *(
+            [generated_drone(int(shape), _paint(rng)) for _ in range(PAINTED)]
+            for shape in rng.choice(worlds.SHAPES, count)
+        ),
+    ]
+
+
+def _paint(rng: np.random.Generator) -> int:
+    return int(rng.integers(1 << 31))
 
 
 def render_crops(jobs: Sequence[CropJob], processes: int | None) -> Iterator[tuple[int, int]]:

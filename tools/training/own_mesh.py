@@ -133,9 +133,7 @@ def _in_metres(path: Path, vertices: Array, size_m: float, units: dict[str, floa
         )
     if min(across, along) < FLAT * tall:
         shape = " x ".join(f"{fits[0] * side:.2f}" for side in (across, along, tall))
-        raise ValueError(
-            f"{path}: would be {shape} m, the last upright, and a drone is wider than tall; say with --up which axis is up"
-        )
+        raise ValueError(f"{path}: would be {shape} m, the last upright, and a drone is wider than tall; correct --up")
     return (vertices - (low + high) / 2) * fits[0]
 
 
