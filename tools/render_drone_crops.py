@@ -31,8 +31,8 @@ from tools.training.scenes import drawn_attitude, outline_of
 
 Array = NDArray[Any]
 PICTURES_A_SCENE = 3
-PAINTED = 8
-"""Drones of each shape in a world, painted differently."""
+PAINTED, SHAPES_PAINTED = 8, 3
+"""Drones of each family and of each generated shape in a world, painted differently."""
 MOST_DRONES = 3
 MIN_PIXELS = 8
 """That much of it must be seen: a drone six pixels wide is still to be told from a bird."""
@@ -82,14 +82,10 @@ def main() -> None:
 
 def drones_of_training(rng: np.random.Generator) -> list[list[DroneModel]]:
     """Every family of the training, and as many shapes of the generator as the drones of a world are to have."""
-    count = round(len(worlds.FAMILIES) * worlds.SHAPES_SHARE / (1 - worlds.SHAPES_SHARE))
-    return [
-        *([drone_model(family, _paint(rng)) for _ in range(PAINTED)] for family in worlds.FAMILIES),
-        *(
-            [generated_drone(int(shape), _paint(rng)) for _ in range(PAINTED)]
-            for shape in rng.choice(worlds.SHAPES, count)
-        ),
-    ]
+    families = [[drone_model(family, _paint(rng)) for _ in range(PAINTED)] for family in worlds.FAMILIES]
+    drawn = rng.choice(worlds.SHAPES, round(len(families) * worlds.SHAPES_SHARE / (1 - worlds.SHAPES_SHARE)))
+    shapes = [[generated_drone(int(shape), _paint(rng)) for _ in range(SHAPES_PAINTED)] for shape in drawn]
+    return [*families, *shapes]
 
 
 def _paint(rng: np.random.Generator) -> int:

@@ -28,6 +28,8 @@ from tools.training.drone_generator import generated_drone
 from tools.training.scenes import attitude, drawn_attitude
 
 Array = NDArray[Any]
+SHAPES_A_WORLD = 24
+"""Of the generator, where it is drawn from."""
 WITH_DISTRACTORS = 1 / 3
 """Share of the scenes."""
 
@@ -82,10 +84,12 @@ def _render_world(job: PairJob) -> None:
     folder, seed, count = job.folder, job.seed, job.pairs
     rng = np.random.Generator(np.random.PCG64(seed))
     world = World.generate(seed, ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])), keep_out=None)
+    drawn = rng.choice(worlds.SHAPES, SHAPES_A_WORLD) if job.shapes_share else ()
+    shapes = [generated_drone(int(shape), int(rng.integers(1 << 31))) for shape in drawn]
     part = create_part(folder, count)
     places = world.free_points(count, rng, 2.0)
     for index in range(count):
-        drones = [_drawn_drone(job.families, job.shapes_share, rng) for _ in range(MAX_DRONES)]
+        drones = [_drawn_drone(job, shapes, rng) for _ in range(MAX_DRONES)]
         families = np.array([drone.family for drone in drones])
         renderer = Renderer(world, drones)
         _render_pair(renderer, world, places[index], families, part, index, rng)
@@ -94,10 +98,10 @@ def _render_world(job: PairJob) -> None:
     note(folder, seed=seed, pairs=count, families=list(job.families), shapes_share=job.shapes_share)
 
 
-def _drawn_drone(families: range, shapes_share: float, rng: np.random.Generator) -> DroneModel:
-    if rng.random() < shapes_share:
-        return generated_drone(int(rng.choice(worlds.SHAPES)), int(rng.integers(1 << 31)))
-    return drone_model(int(rng.choice(families)), int(rng.integers(1 << 31)))
+def _drawn_drone(job: PairJob, shapes: list[DroneModel], rng: np.random.Generator) -> DroneModel:
+    if rng.random() < job.shapes_share:
+        return shapes[int(rng.integers(len(shapes)))]
+    return drone_model(int(rng.choice(job.families)), int(rng.integers(1 << 31)))
 
 
 def _render_pair(
