@@ -37,7 +37,7 @@ class Observation:
     noisy_cameras: tuple[str, ...] = ()
     """Whose images were noise, and were not used."""
     obstacles: ObstacleRanges | None = None
-    """None: obstacles were not looked for."""
+    """Exact ones, of a simulation; None: they are in the cameras' depth."""
 
     @property
     def flows(self) -> dict[str, Float32Array]:

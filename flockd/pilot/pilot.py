@@ -33,6 +33,7 @@ from flockd.mission.navigator import middle_of
 from flockd.obstacles import Avoidance, LocalMap
 from flockd.perception import Networks, Observation, Perception, load_networks
 from flockd.perception.detection.detector import DetectionTrace
+from flockd.perception.obstacles import ObstacleRanging
 from flockd.pilot.motions import ego_motion, neighbour_motions
 from flockd.pilot.trim import VelocityTrim
 from flockd.tracking import Blind, Measurement, Prediction, Tracker
@@ -88,6 +89,7 @@ class FlockPilot:
         self._tracker = Tracker(config.tracking)
         self._law = FlockingLaw(config.flocking)
         self._map = LocalMap(config.obstacles) if config.obstacles.enabled else None
+        self._ranging = ObstacleRanging(self._rig, config.obstacles) if config.obstacles.enabled else None
         self._avoidance = Avoidance(config.obstacles, config.safety.gate, config.step_s)
         self._navigator = Navigator(config.mission, config.safety.gate)
         limit_m_s, memory = 0.0, 0.0
@@ -241,14 +243,15 @@ class FlockPilot:
         self, observation: Observation, ego: EgoMotion | None, velocity: FloatArray | None
     ) -> ObstacleRanges | None:
         """The local map at this time; None where obstacles are not looked for."""
-        if self._map is None:
+        if self._map is None or self._ranging is None:
             return None
         displacement, sigma_m = None, 0.0
         if ego is not None:
             displacement, sigma_m = _displacement(observation, ego)[:2], self._config.geometry.own_displacement_sigma_m
         elif velocity is not None and self._last_time_s is not None:
             displacement, sigma_m = velocity[:2] * (observation.time_s - self._last_time_s), _BY_VELOCITY_SIGMA_M
-        return self._map.step(observation.time_s, observation.obstacles, displacement, sigma_m)
+        ranges = observation.obstacles or self._ranging.ranges(observation)
+        return self._map.step(observation.time_s, ranges, displacement, sigma_m)
 
     def _blind(self, observation: Observation) -> Blind | None:
         """Where only cameras point that gave nothing in this step; None: they all did."""
