@@ -9,10 +9,12 @@ import numpy as np
 
 from flockd.config.scenario import ScenarioConfig
 from flockd.flocking import FlockingLaw
-from flockd.messages import BoolArray, FloatArray, MissionStatus
+from flockd.messages import BoolArray, FloatArray, MissionStatus, ObstacleRanges
 from flockd.mission import Moment, Navigator
 from flockd.mission.navigator import middle_of
 from flockd.sim.handover import Handover
+from flockd.sim.obstacle_worlds import obstacles_of
+from flockd.sim.obstacles import true_ranges
 from flockd.sim.vehicles import REFERENCE_DEG, Vehicles
 
 
@@ -32,12 +34,14 @@ class Commands:
     """See `PilotOutput.mission`."""
     desired: FloatArray
     """(n, 2) m/s: what each mission wants, times its pull."""
+    obstacles: tuple[ObstacleRanges | None, ...]
+    """What each drone saw of them; None where it does not look for any."""
 
     @classmethod
     def of(cls, n: int) -> Self:
         """Standstill of n drones, to be filled."""
         still = (np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n), np.full(n, np.nan))
-        return cls(*still, missions=(None,) * n, desired=np.zeros((n, 2)))
+        return cls(*still, missions=(None,) * n, desired=np.zeros((n, 2)), obstacles=(None,) * n)
 
     @property
     def takeovers(self) -> list[str | None]:
@@ -46,7 +50,7 @@ class Commands:
 
 
 class ExactFlock:
-    """The flocking law and each drone's mission on the exact states of all drones."""
+    """The flocking law and each drone's mission on the exact states of all drones, and exact ranges to obstacles."""
 
     def __init__(self, scenario: ScenarioConfig) -> None:
         drone = scenario.drone
@@ -56,15 +60,18 @@ class ExactFlock:
             for i, vehicle in enumerate(scenario.vehicles)
         ]
         self._yaw_rad = np.full(len(self._pilots), start_yaw(scenario))
+        self._obstacles = obstacles_of(scenario)
 
     def step(self, time_s: float, positions: FloatArray, velocities: FloatArray) -> Commands:
         """Of drones at (n, 3) m and (n, 3) m/s in NED; called in order of time."""
+        seen = [true_ranges(self._obstacles, time_s, place) if self._obstacles.solids else None for place in positions]
         found = [self._of(i, time_s, positions, velocities) for i in range(len(self._pilots))]
         velocity, acceleration, yaw_rad, height_m, missions, desired = zip(*found, strict=True)
         self._yaw_rad = np.array(yaw_rad)
         return Commands(
-            np.array(velocity), np.array(acceleration), self._yaw_rad, np.array(height_m), missions, np.array(desired)
-        )
+            np.array(velocity), np.array(acceleration), self._yaw_rad, np.array(height_m), missions, np.array(desired),
+            tuple(seen),
+        )  # fmt: skip
 
     def _of(
         self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray
