@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from flockd.config import ScenarioConfig, load_scenario
+from flockd.config.obstacles import ObstaclesConfig
 from flockd.flocking.metrics import min_distance, order, union
 from flockd.messages import Detection, EgoMotion, FloatArray, FrameSet, PilotOutput, VehicleState
 from flockd.obstacles import nearest_points
@@ -30,20 +31,16 @@ from flockd.perception import Observation
 from flockd.perception.detection.detector import DetectionTrace
 from flockd.pilot import FlockPilot
 from flockd.safety import Action, Gate, Permission, Surroundings, Wanted
-from flockd.sim.obstacles import Box, Frustum, Obstacles, Solid, true_ranges
+from flockd.sim.obstacle_worlds import generate_obstacles
+from flockd.sim.obstacles import Box, Obstacles, true_ranges
 from flockd.sim.vehicles import Vehicles
 from flockd.tracking import Prediction
 
 SCENARIO = Path(__file__).resolve().parent.parent / "config" / "square.yaml"
 TICK_S = 0.1
 """Of the gate, which flies at half of that: the rarer it looks, the later it brakes."""
-TRUNKS_M = (0.1, 0.25)
-"""Radii, from the thinnest to the thickest."""
-GAP_M = 2.0
-"""Between two trunks, and around each start: a drone is 0.6 m wide."""
-FREE_START_M = 4.0
-DRONE_RADIUS_M = 0.3
-"""A drone whose middle is nearer to a surface has hit it; two whose middles are nearer than twice that have, too."""
+SOUTH_M, EXTENT_M = -40.0, 60.0
+"""Where the flock begins, and how far the forest reaches from the origin: 90 m of flight end within it."""
 BEARING_SIGMA, LOG_RANGE_SIGMA = 0.005, 0.01
 """Of exact detections: what the tracker is told, though they have no error."""
 
@@ -63,9 +60,8 @@ def main() -> None:
     rows = []
     for seed in range(args.first_seed, args.first_seed + args.seeds):
         scenario = scenario_of(seed, args.duration, args.speed, args.gust, enabled=not args.dark)
-        starts = np.array([vehicle.position_m[:2] for vehicle in scenario.vehicles])
-        solids = wall(seed) if args.wall else forest(seed, args.trees_per_hectare, starts)
-        rows.append({"seed": seed, **Flight(scenario, Obstacles(solids)).fly()})
+        obstacles = wall(seed) if args.wall else forest(scenario, args.trees_per_hectare)
+        rows.append({"seed": seed, **Flight(scenario, obstacles).fly()})
         print(json.dumps(rows[-1]), flush=True)
     print(json.dumps(summary(rows)))
 
@@ -93,7 +89,11 @@ def scenario_of(seed: int, duration_s: float, speed_m_s: float, gust_m_s: float,
     vehicles = []
     for start in scenario.vehicles:
         north_m, east_m = rng.uniform(-0.5, 0.5, 2)
-        position_m = (start.position_m[0] + float(north_m), start.position_m[1] + float(east_m), start.position_m[2])
+        position_m = (
+            start.position_m[0] + SOUTH_M + float(north_m),
+            start.position_m[1] + float(east_m),
+            start.position_m[2],
+        )
         vehicles.append(start.model_copy(update={"position_m": position_m}))
     drone = scenario.drone
     mission = type(drone.mission)(kind="velocity", velocity_m_s=(speed_m_s, 0.0))
@@ -110,26 +110,18 @@ def scenario_of(seed: int, duration_s: float, speed_m_s: float, gust_m_s: float,
     return scenario.model_copy(update={"vehicles": tuple(vehicles), "drone": drone, "vehicle": vehicle})
 
 
-def forest(seed: int, trees_per_hectare: float, starts: FloatArray) -> list[Solid]:
-    """Trunks at random places, in 140 m by 80 m."""
-    rng = np.random.default_rng([seed, 11])
-    low, high = np.array([-20.0, -40.0]), np.array([120.0, 40.0])
-    count = round(trees_per_hectare * float(np.prod(high - low)) / 1e4)
-    taken = np.zeros((0, 3))
-    while len(taken) < count:
-        place, radius = rng.uniform(low, high), rng.uniform(*TRUNKS_M)
-        apart = np.hypot(*(taken[:, :2] - place).T) - taken[:, 2] - radius
-        if (apart >= GAP_M).all() and (np.hypot(*(starts - place).T) >= FREE_START_M + radius).all():
-            taken = np.vstack([taken, (*place, radius)])
-    return [Frustum(north, east, radius, radius, -0.5, 12.0) for north, east, radius in taken.tolist()]
+def forest(scenario: ScenarioConfig, trees_per_hectare: float) -> Obstacles:
+    """As `config/forest.yaml` has it, drawn from the scenario's seed."""
+    config = ObstaclesConfig(kind="forest", trees_per_hectare=trees_per_hectare, extent_m=EXTENT_M)
+    return generate_obstacles(config, scenario.seed, np.array([start.position_m[:2] for start in scenario.vehicles]))
 
 
-def wall(seed: int) -> list[Solid]:
+def wall(seed: int) -> Obstacles:
     """60 m wide and 20 m north of the start, with one gap of 5 m."""
     rng = np.random.default_rng([seed, 13])
     gap = float(rng.uniform(8.0, 20.0) * rng.choice([-1.0, 1.0]))
     ends = (-30.0, gap - 2.5), (gap + 2.5, 30.0)
-    return [Box(20.0, (a + b) / 2, 0.2, (b - a) / 2, 0.0, -0.5, 8.0) for a, b in ends]
+    return Obstacles([Box(SOUTH_M + 20.0, (a + b) / 2, 0.2, (b - a) / 2, 0.0, -0.5, 8.0) for a, b in ends])
 
 
 class ExactObserver:
@@ -195,10 +187,11 @@ class Flight:
                 objections += self._tick(time_s, tick * TICK_S, outputs)
         clearances, ends = np.array(self._clearances), self._vehicles.position
         reach_m = self._scenario.drone.flocking.observation_distance_m
+        radius_m = self._scenario.vehicle.radius_m
         middle = np.mean(self.positions, axis=1)
         return {
-            "hits": int((clearances < DRONE_RADIUS_M).any(axis=0).sum()),
-            "touches": int(min(self._distances) < 2 * DRONE_RADIUS_M),
+            "hits": int((clearances < radius_m).any(axis=0).sum()),
+            "touches": int(min(self._distances) < 2 * radius_m),
             "min_clearance_m": round(float(clearances.min()), 3),
             "min_distance_m": round(min(self._distances), 3),
             "union": union(ends[:, :2], reach_m),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flockd.config.avoidance import ObstacleParameters
-from flockd.messages import SECTORS, BoolArray, FloatArray, ObstacleRanges
+from flockd.messages import SECTORS, BoolArray, FloatArray, IntArray, ObstacleRanges
 
 _CONSISTENT_SIGMAS = 3.0
 """Two ranges that differ by no more may be of one obstacle."""
@@ -141,7 +141,8 @@ NEAREST_M = 0.01
 """No obstacle counts as nearer: it needs a direction."""
 
 
-def _sector_of(places: FloatArray) -> FloatArray:
-    """(m,) integers, of places (m, 2)."""
+def _sector_of(places: FloatArray) -> IntArray:
+    """(m,) of places (m, 2)."""
     azimuths = np.arctan2(places[:, 1], places[:, 0])
-    return np.round(azimuths * SECTORS / (2 * math.pi)).astype(np.int64) % SECTORS
+    sectors: IntArray = np.round(azimuths * SECTORS / (2 * math.pi)).astype(np.int64) % SECTORS
+    return sectors

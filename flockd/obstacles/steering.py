@@ -26,6 +26,8 @@ _RIGHT_RAD = 0.02
 """To the left costs this much more: of two ways alike all drones take the same."""
 _SHORTER = (1.0, 0.6, 0.3)
 """Where no direction is free as far as it should be: shares of that way that do too."""
+_BESIDE_M = 0.02
+"""Beside an obstacle that is nearer than the margin, the margin is smaller by this than what there is."""
 _TURNED_RAD = 0.1
 """A turn smaller than this is not worth remembering."""
 
@@ -50,14 +52,16 @@ class Steering:
         points = nearest_points(ranges, p.sigmas)
         azimuths = wanted_rad + _TURNS
         cost = self._cost(azimuths, flock)
-        for radius_m in (p.clearance_m + p.margin_m, p.clearance_m):
+        nearest_m = float(np.hypot(*points.T).min(initial=np.inf))
+        with_margin_m = min(max(nearest_m - _BESIDE_M, p.clearance_m), p.clearance_m + p.margin_m)
+        for radius_m in (with_margin_m, p.clearance_m):
             free_m = free_way(points, radius_m, azimuths)
             free_m = np.minimum(free_m, seen_way(ranges, azimuths) - radius_m)
             for share in _SHORTER:
                 is_free = free_m >= min(share * speed * p.horizon_s, p.range_m - radius_m)
                 if is_free.any():
-                    return self._taken(int(np.argmin(np.where(is_free, cost, np.inf))), azimuths, speed, free_m)
-        return self._taken(int(np.argmax(free_m - cost)), azimuths, speed, free_m)
+                    return self._taken(int(np.argmin(np.where(is_free, cost, np.inf))), wanted, free_m)
+        return self._taken(int(np.argmax(free_m - cost)), wanted, free_m)
 
     def _cost(self, azimuths: FloatArray, flock: FloatArray) -> FloatArray:
         cost = np.abs(_TURNS) + np.where(_TURNS < 0, _RIGHT_RAD, 0.0)
@@ -67,10 +71,11 @@ class Steering:
             cost = cost + _FLOCK * np.abs(_wrapped(azimuths - math.atan2(flock[1], flock[0])))
         return cost
 
-    def _taken(self, index: int, azimuths: FloatArray, speed: float, free_m: FloatArray) -> tuple[FloatArray, float]:
-        azimuth = float(azimuths[index])
-        self._last_rad = azimuth if abs(_TURNS[index]) > _TURNED_RAD else None
-        return speed * np.array([math.cos(azimuth), math.sin(azimuth)]), max(float(free_m[index]), 0.0)
+    def _taken(self, index: int, wanted: FloatArray, free_m: FloatArray) -> tuple[FloatArray, float]:
+        turn = float(_TURNS[index])
+        velocity: FloatArray = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ wanted
+        self._last_rad = math.atan2(velocity[1], velocity[0]) if abs(turn) > _TURNED_RAD else None
+        return velocity, max(float(free_m[index]), 0.0)
 
 
 def free_way(points: FloatArray, radius_m: float, azimuths: FloatArray) -> FloatArray:

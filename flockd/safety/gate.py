@@ -200,22 +200,18 @@ class Gate:
         p = self._parameters
         separation_m = p.min_separation_m if action is Action.FLY else p.degraded_separation_m
         outward = _units(offsets_outside(p, around.position))
-        limits = (
-            (Objection.FENCE, outward, np.zeros(len(outward))),
-            (
-                Objection.SEPARATION,
-                *towards_neighbours(p, around.neighbours, around.neighbour_velocities, separation_m),
-            ),
-            (
-                Objection.OBSTACLE,
-                *towards_obstacles(around.obstacles, p.obstacle_clearance_m, p.braking_m_s2, p.reaction_s),
-            ),
-        )
-        for objection, directions, most_m_s in limits:
+        to_neighbours = towards_neighbours(p, around.neighbours, around.neighbour_velocities, separation_m)
+        to_obstacles = towards_obstacles(around.obstacles, p.obstacle_clearance_m, p.braking_m_s2, p.reaction_s)
+        limits = {
+            Objection.FENCE: (outward, np.zeros(len(outward))),
+            Objection.SEPARATION: to_neighbours,
+            Objection.OBSTACLE: to_obstacles,
+        }
+        for objection, (directions, most_m_s) in limits.items():
             if (directions @ velocity > most_m_s).any():
                 objections.append(objection)
-        _, directions, most_m_s = zip(*limits, strict=True)
-        return nearest_within(velocity, np.concatenate(directions), np.concatenate(most_m_s))
+        every_direction, every_limit = zip(*limits.values(), strict=True)
+        return nearest_within(velocity, np.concatenate(every_direction), np.concatenate(every_limit))
 
     def _within_climb(
         self, now_s: float, action: Action, wanted: Wanted, around: Surroundings, objections: list[Objection]
