@@ -218,6 +218,28 @@ class Detection:
         return self.range_m * math.sqrt(float(self.bearing @ self.covariance @ self.bearing))
 
 
+SECTORS = 72
+"""Directions of `ObstacleRanges`: one every 5 degrees."""
+
+Sectors = Annotated[FloatArray, Shape((SECTORS,))]
+
+
+@dataclass(frozen=True, eq=False)
+class ObstacleRanges:
+    """Nearest obstacle in each of n equal sectors around the drone, level, over the heights that the drone needs.
+
+    Sector k is centred on the azimuth 2 pi k / n, clockwise from north.
+    """
+
+    time_s: float
+    range_m: Sectors
+    """(n,) metres, level, from the drone's centre; inf where nothing was seen within `seen_m`."""
+    sigma_m: Sectors
+    """(n,) metres: standard deviation of `range_m`; 0 where that is inf."""
+    seen_m: Sectors
+    """(n,) metres: how far the sector is known to be free or measured; 0 where it was not looked at."""
+
+
 @dataclass(frozen=True, eq=False)
 class Neighbour:
     """A tracked drone, in level axes that point north, east and down, relative to the own drone."""
@@ -296,3 +318,5 @@ class PilotOutput:
     """Whose images were noise, and were not used; None: no camera's."""
     ground: GroundEstimate | None = None
     """What the height gave as the ground; None: level ground below the barometer's height, or no scale at all."""
+    obstacles: ObstacleRanges | None = None
+    """The local map; None where obstacles are not looked for."""

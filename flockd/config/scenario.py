@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from flockd.config.base import NonNegative, Positive, Section, Share, Vector3, refuse
 from flockd.config.drone import DroneConfig
 from flockd.config.mission import MissionParameters, mission_faults
+from flockd.config.obstacles import ObstaclesConfig
 
 MAX_DRONES = 100
 """More would take days and all memory."""
@@ -49,6 +50,8 @@ class VehicleConfig(Section):
     """Mean wind, north and east."""
     gust_m_s: NonNegative = 0.0
     """Standard deviation of the velocity that gusts add, each axis."""
+    radius_m: Annotated[float, Field(gt=0, le=5)] = 0.35
+    """Of the sphere around its centre that holds the whole drone: nearer to an obstacle it collides."""
 
 
 class RangeFinderConfig(Section):
@@ -89,7 +92,7 @@ class SensorConfig(Section):
 
 
 class WorldConfig(Section):
-    """The rendered world."""
+    """The world."""
 
     ground_relief_m: NonNegative = 0.15
     """Standard deviation of the gently uneven ground; 0 is flat."""
@@ -102,6 +105,8 @@ class WorldConfig(Section):
     """Free of obstacles on both sides of the planned path."""
     drone_family: Annotated[int, Field(ge=0, le=DRONE_FAMILIES - 1)] | Literal["any"] = "any"
     """Which mesh the drones wear; `any`: drawn from the seed, the same for the whole flock."""
+    obstacles: ObstaclesConfig | None = None
+    """Trees, or houses, walls, poles and wires, for the flock to fly between; null: none within `clearance_m`."""
 
 
 class CameraFaultConfig(Section):
