@@ -15,11 +15,12 @@ from flockd.config.perception import PerceptionConfig
 from flockd.geometry import Rig
 from flockd.messages import UNCLASSED, Detection, Frame, FrameSet, VehicleState
 from flockd.perception import DisFlow, Networks, Perception
-from flockd.sim.drone_models import drone_model
+from flockd.sim.drone_models import FAMILIES, drone_model
 from tools.training.dataset import HEIGHT, R_BODY_CAMERA, WIDTH, PairSet, rig_camera
-from tools.training.samples import SIZES_M
+from tools.training.scenes import outline_of
 
 Array = NDArray[Any]
+SIZES_M = [drone_model(family, 0).size_m for family in range(FAMILIES)]
 MIN_PIXELS = 6
 """Drones of which less is to be seen do not count, neither as found nor as missed."""
 MASK_WITHIN_M = 10.0
@@ -198,11 +199,11 @@ def _hidden_share(pairs: PairSet, index: int, drone: int, depth: Array, ids: Arr
     family = int(pairs["drone_family"][index, drone])
     centre = np.asarray(pairs["drone_centre"][index, 0, drone], np.float64)
     corners = drone_model(family, 0).vertices @ np.asarray(pairs["drone_rotation"][index, 0, drone], np.float64).T
-    corners = (corners + centre)[(corners + centre)[:, 2] > 0.05]
-    half_px = float(pairs["focal"][index]) / 2 * corners[:, :2] / corners[:, 2:] + np.array([WIDTH, HEIGHT]) / 4
-    outline = np.zeros(ids.shape, np.uint8)
-    cv2.fillConvexPoly(outline, cv2.convexHull(np.round(half_px).astype(np.int32)), 1)
+    half = float(pairs["focal"][index]) / 2
+    outline = outline_of(
+        corners + centre, np.array([[half, 0, WIDTH / 4], [0, half, HEIGHT / 4], [0, 0, 1]]), ids.shape
+    )
     nearer = depth < centre[2] - SIZES_M[family] / 2
     others = np.flatnonzero(pairs["drone_centre"][index, 0, :, 2] < centre[2]) + 1
     nearer |= np.isin(ids, others)
-    return float((nearer & (outline > 0)).sum() / max(int(outline.sum()), 1))
+    return float((nearer & outline).sum() / max(int(outline.sum()), 1))
