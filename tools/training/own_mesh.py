@@ -31,8 +31,8 @@ FLAT = 0.7
 MOST_BYTES = 500 << 20
 MOST_TRIANGLES_READ, MOST_TRIANGLES = 4_000_000, 40_000
 CELLS = (320, 160, 80)
-"""A mesh of too many triangles is simplified to so many cells from tip to tip, in turn: at first a fifth of a crop's pixel
-each."""
+"""A mesh of too many triangles is simplified to so many cells from tip to tip, in turn: at first a fifth of a
+crop's pixel each."""
 UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 
 
@@ -55,7 +55,7 @@ def read_mesh(path: Path, size_m: float, up: str | None = None) -> DroneModel:
             colours = None if colours is None else colours[kept]
     if len(triangles) > MOST_TRIANGLES:
         raise ValueError(
-            f"{path}: has {len(triangles)} triangles even without small details, and at most {MOST_TRIANGLES} are drawn; "
+            f"{path}: has {len(triangles)} triangles without small details, and at most {MOST_TRIANGLES} are drawn; "
             "simplify it where it was modelled"
         )
     has_area = np.linalg.norm(face_normals(vertices, triangles), axis=1) > 0.5
