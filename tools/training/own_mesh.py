@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from flockd.config.perception import MAX_DRONE_SIZE_M, MIN_DRONE_SIZE_M
 from flockd.sim.airframe import MACHINE_TEXTURES, Airframe, DroneModel
-from flockd.sim.mesh import Mesh
+from flockd.sim.mesh import Mesh, face_normals
 
 Array = NDArray[Any]
 GLTF = (".glb", ".gltf")
@@ -30,8 +30,9 @@ FLAT = 0.7
 """Of a mesh that stands upright, no level side is less than this share of its height."""
 MOST_BYTES = 500 << 20
 MOST_TRIANGLES_READ, MOST_TRIANGLES = 4_000_000, 40_000
-CELLS = 320
-"""A mesh of too many triangles is simplified to so many cells from tip to tip: a fifth of a crop's pixel each."""
+CELLS = (320, 160, 80)
+"""A mesh of too many triangles is simplified to so many cells from tip to tip, in turn: at first a fifth of a
+crop's pixel each."""
 UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 
 
@@ -48,24 +49,26 @@ def read_mesh(path: Path, size_m: float, up: str | None = None) -> DroneModel:
     vertices = _upright(np.asarray(mesh.vertices, np.float64), up or ("y" if is_gltf else "z"))
     vertices = _in_metres(path, vertices, size_m, {"m": 1.0} if is_gltf else UNITS_M)
     triangles, colours = np.asarray(mesh.faces), _colours(mesh)
-    if len(triangles) > MOST_TRIANGLES:
-        vertices, triangles, kept = _simplified(vertices, triangles, size_m / CELLS)
-        colours = None if colours is None else colours[kept]
+    for cells in CELLS:
+        if len(triangles) > MOST_TRIANGLES:
+            vertices, triangles, kept = _simplified(vertices, triangles, size_m / cells)
+            colours = None if colours is None else colours[kept]
     if len(triangles) > MOST_TRIANGLES:
         raise ValueError(
-            f"{path}: has {len(triangles)} triangles even after details below {1000 * size_m / CELLS:.1f} mm are gone, "
-            f"and {MOST_TRIANGLES} can be drawn in time; simplify it where it was modelled"
+            f"{path}: has {len(triangles)} triangles without small details, and at most {MOST_TRIANGLES} are drawn; "
+            "simplify it where it was modelled"
         )
-    return _model(vertices, triangles, colours, size_m)
+    has_area = np.linalg.norm(face_normals(vertices, triangles), axis=1) > 0.5
+    return _model(vertices, triangles[has_area], None if colours is None else colours[has_area], size_m)
 
 
 def painted(model: DroneModel, seed: int) -> DroneModel:
     """The same drone in another light and wear; one whose file says no colours is painted, each part in one colour."""
     rng = np.random.default_rng([model.family, seed])
     if np.isnan(model.colours).any():
-        parts = trimesh.graph.connected_component_labels(
-            trimesh.graph.face_adjacency(model.triangles), node_count=len(model.triangles)
-        )
+        one_side = model.triangles[: len(model.triangles) // 2]
+        touching = trimesh.graph.face_adjacency(one_side)
+        parts = np.tile(trimesh.graph.connected_component_labels(touching, node_count=len(one_side)), 2)
         craft = Airframe(rng)
         paints = np.array([craft.body, craft.frame, craft.metal, craft.front, craft.rear])
         colours = paints[rng.choice(len(paints), int(parts.max()) + 1, p=_SHARES)][parts]
@@ -146,12 +149,12 @@ def _widest(points: Array) -> float:
 
 def _simplified(vertices: Array, triangles: Array, cell_m: float) -> tuple[Array, Array, Array]:
     """Corners of one cell become one; and the rows of the triangles that remain."""
-    _, which, inverse = np.unique(
-        np.round(vertices / cell_m).astype(np.int64), axis=0, return_index=True, return_inverse=True
-    )
-    coarse = inverse.reshape(-1)[triangles]
+    cells = np.round(vertices / cell_m).astype(np.int64)
+    _, which, inverse = np.unique(cells @ [1 << 40, 1 << 20, 1], return_index=True, return_inverse=True)
+    coarse = inverse[triangles]
     real = (coarse[:, 0] != coarse[:, 1]) & (coarse[:, 1] != coarse[:, 2]) & (coarse[:, 2] != coarse[:, 0])
-    _, first = np.unique(np.sort(coarse, axis=1), axis=0, return_index=True)
+    corners = np.sort(coarse, axis=1)
+    _, first = np.unique((corners[:, 0] * len(which) + corners[:, 1]) * len(which) + corners[:, 2], return_index=True)
     kept = np.intersect1d(np.flatnonzero(real), first)
     return vertices[which], coarse[kept], kept
 
