@@ -17,7 +17,7 @@ _NEAREST_M = 0.3
 _RATIO = 1.1
 """Of a range to that of the bin before it."""
 _GROUND_MARGIN_M = 0.7
-"""What is no higher than this above the ground that the autopilot's height gives counts as ground."""
+"""What is no higher than this above the ground counts as ground."""
 _HORIZON = 0.1
 """Tangent of the elevation up to which a ray shows how far the drone sees at its own height."""
 
@@ -54,7 +54,7 @@ class ObstacleRanging:
             np.round(np.arctan2(points[:, 1], points[:, 0]) * (SECTORS / (2 * math.pi))).astype(np.int64) % SECTORS
         )
         in_band = np.abs(points[:, 2]) <= p.height_band_m
-        above_ground = points[:, 2] <= observation.vehicle.height_m - _GROUND_MARGIN_M
+        above_ground = points[:, 2] <= _ground_down_m(observation, points) - _GROUND_MARGIN_M
         counts = in_band & above_ground & (labels == 0) & (away_m <= p.range_m)  # NaN counts nowhere
         range_m = self._agreed(sectors[counts], away_m[counts].astype(float))
         level = (np.abs(points[:, 2]) <= _HORIZON * away_m) & (labels != UNCLASSED)
@@ -78,6 +78,14 @@ class ObstacleRanging:
         with np.errstate(invalid="ignore"):
             mean_m = total_m[every, first] / count[every, first]
         return np.where(enough.any(axis=1), mean_m, np.inf)
+
+
+def _ground_down_m(observation: Observation, points: Float32Array) -> float | Float32Array:
+    """How far below the drone the ground is under points (n, 3): level, or the plane that ranges to it tell."""
+    ground = observation.ground
+    if ground is None:
+        return observation.vehicle.height_m
+    return np.asarray(ground.height_m - points[:, :2] @ ground.slope, np.float32)
 
 
 def _bin(range_m: FloatArray | float) -> FloatArray:
