@@ -23,14 +23,19 @@ import torch
 from flockd.errors import FlockdError
 from tools.specialising.from_mesh import claim_mesh, specialise_range
 from tools.specialising.from_pictures import claim_pictures, read_pictures, specialise_verification
-from tools.training.own_mesh import UP_AXES, read_mesh
+from tools.training.own_mesh import UP_AXES, read_meshes
 
 
 def main() -> None:
     """From a mesh or pictures to networks that a configuration can name."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     source = parser.add_mutually_exclusive_group(required=True)
-    source.add_argument("--mesh", type=Path, help="of the drone, with propellers: .glb, .gltf, .stl or .obj")
+    source.add_argument(
+        "--mesh",
+        type=Path,
+        nargs="+",
+        help="of the drone, with propellers (.glb, .gltf, .stl, .obj); several: any of them",
+    )
     source.add_argument("--pictures", type=Path, help="photographs of the drone: a folder")
     parser.add_argument("--size-m", type=float, help="of --mesh: widest horizontal distance, propeller tip to tip, m")
     parser.add_argument(
@@ -53,7 +58,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     try:
         if arguments.mesh:
-            drone = read_mesh(arguments.mesh, arguments.size_m, arguments.up)
+            drones = read_meshes(arguments.mesh, arguments.size_m, arguments.up)
             claim_mesh(arguments)
         else:
             pictures = read_pictures(arguments)
@@ -61,7 +66,7 @@ def main() -> None:
     except (ValueError, FlockdError) as error:
         parser.error(str(error))
     if arguments.mesh:
-        specialise_range(arguments, drone, begin)
+        specialise_range(arguments, drones, begin)
     else:
         specialise_verification(arguments, pictures, begin)
 

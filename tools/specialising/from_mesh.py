@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -71,36 +72,36 @@ def claim_mesh(arguments: argparse.Namespace) -> None:
     claim(arguments.out, "distance", _drone_of(arguments))
 
 
-def specialise_range(arguments: argparse.Namespace, drone: DroneModel, begin: float) -> None:
+def specialise_range(arguments: argparse.Namespace, drones: list[DroneModel], begin: float) -> None:
     """Render, train, export and measure; ``begin``: when the command began, monotonic."""
     work = arguments.out / "work"
-    for line in _rendered(work, drone, Workload.of(arguments.minutes), arguments.processes):
+    for line in _rendered(work, drones, Workload.of(arguments.minutes), arguments.processes):
         print(f"{line}, {time.monotonic() - begin:.0f} s", flush=True)
     negatives = _negatives(work / "pairs", work / "negatives.npy")
-    held_out = _held_out(work, drone.size_m)
+    held_out = _held_out(work, arguments.size_m)
     task = DistanceTask(open_pairs(work / "pairs"), negatives, work / "crops")
     task.rate, task.pool_size = RATE, NONE_IN_POOL
     if not (work / "run" / "checkpoint.pt").is_file():
         start(task, data_path("models") / "distance.onnx", arguments.seed)
     (work / "run").mkdir(exist_ok=True)
     train(task, work / "run", training_s(arguments.minutes, begin), arguments.seed)
-    _write(arguments, drone, held_out)
+    _write(arguments, held_out)
 
 
-def _drone_of(arguments: argparse.Namespace) -> dict[str, object]:
+def _drone_of(arguments: argparse.Namespace) -> dict[str, Any]:
     """By what one drone is told from another."""
-    digest = hashlib.sha256(arguments.mesh.read_bytes()).hexdigest()
-    return {"mesh": arguments.mesh.name, "sha256": digest, "size_m": arguments.size_m, "up": arguments.up}
+    meshes = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in arguments.mesh}
+    return {"meshes": meshes, "size_m": arguments.size_m, "up": arguments.up}
 
 
-def own_drone(drone: DroneModel, rng: np.random.Generator) -> list[list[DroneModel]]:
+def own_drone(drones: list[DroneModel], rng: np.random.Generator) -> list[list[DroneModel]]:
     """The only shape that flies in these worlds."""
-    return [[painted(drone, int(rng.integers(1 << 31))) for _ in range(PAINTS)]]
+    return [[painted(drones[k % len(drones)], int(rng.integers(1 << 31))) for k in range(PAINTS)]]
 
 
-def _rendered(work: Path, drone: DroneModel, load: Workload, processes: int) -> Iterator[str]:
+def _rendered(work: Path, drones: list[DroneModel], load: Workload, processes: int) -> Iterator[str]:
     """Training worlds and, to measure on, validation worlds; yields what is done."""
-    draw = partial(own_drone, drone)
+    draw = partial(own_drone, drones)
     seeds = worlds.TRAINING[::-1][: load.crops]
     crops = [CropJob(work / "crops" / f"{seed}.npz", seed, SCENES, draw) for seed in seeds]
     seeds = worlds.VALIDATION[: load.held_out]
@@ -138,19 +139,19 @@ def _without_drones(pairs: PairSet, rows: np.ndarray) -> np.ndarray:
     return np.stack([sample["picture"] for sample in samples])
 
 
-def _write(arguments: argparse.Namespace, drone: DroneModel, held_out: HeldOut) -> None:
+def _write(arguments: argparse.Namespace, held_out: HeldOut) -> None:
     """Both networks with what they are worth."""
     out, work = arguments.out, arguments.out / "work"
     general, _ = load_manifest(data_path("models") / "distance.yaml")
     state = torch.load(work / "run" / "checkpoint.pt", map_location="cpu")
     net = DistanceNet()
     net.load_state_dict(state["net"])
-    mesh = _drone_of(arguments)
+    meshes = ", ".join(f"{name} (SHA-256 {digest})" for name, digest in _drone_of(arguments)["meshes"].items())
     path = export(
         "distance", net, out,
         thresholds=general.thresholds,
-        data=f"Rendered by tools.specialise in seeded worlds: {mesh['mesh']} (SHA-256 {mesh['sha256']}), "
-        f"{drone.size_m:g} m from tip to tip. Begun with {general.name}, SHA-256 {general.sha256[:12]}.",
+        data=f"Rendered by tools.specialise in seeded worlds: {meshes}, "
+        f"{arguments.size_m:g} m from tip to tip. Begun with {general.name}, SHA-256 {general.sha256[:12]}.",
         accuracy={},
         command=command_line(state),
     )  # fmt: skip
