@@ -77,7 +77,8 @@ def painted(model: DroneModel, seed: int) -> DroneModel:
     rng = np.random.default_rng([model.family, seed])
     if np.isnan(model.colours).any():
         one_side = model.triangles[: len(model.triangles) // 2]
-        touching = trimesh.graph.face_adjacency(one_side)
+        _, corner = np.unique(np.round(model.vertices, 5), axis=0, return_inverse=True)
+        touching = trimesh.graph.face_adjacency(corner.reshape(-1)[one_side])
         parts = np.tile(trimesh.graph.connected_component_labels(touching, node_count=len(one_side)), 2)
         craft = Airframe(rng)
         paints = np.array([craft.body, craft.frame, craft.metal, craft.front, craft.rear])
@@ -102,7 +103,7 @@ def _loaded(path: Path) -> Any:
     if path.stat().st_size > MOST_BYTES:
         raise ValueError(f"{path}: is larger than {MOST_BYTES >> 20} MB; simplify it where it was modelled")
     try:
-        mesh: Any = trimesh.load_mesh(path)
+        mesh: Any = trimesh.load_mesh(path, process=False)
         if isinstance(mesh, trimesh.Scene):
             mesh = mesh.to_mesh()
     except Exception as error:  # noqa: BLE001 - whatever a parser of foreign files raises, the file is at fault
