@@ -41,7 +41,8 @@ async def _ask(config: DroneConfig, parameters: AutopilotParameters) -> list[Fin
             found += [failed_from_error("firmware", str(firmware)), signing]
         else:
             found += [failed_from_error("firmware", str(firmware)), *await _parameters(link, config, parameters)]
-        found += await _range_finder(link, config)
+        if link.status().heartbeat_age_s <= parameters.max_heartbeat_age_s:
+            found += await _range_finder(link, config)
         found += judge_messages(link.unknown_values())
     finally:
         await link.close()

@@ -11,7 +11,7 @@ from flockd.config.perception import PerceptionConfig
 from flockd.geometry import Rig, ground_inverse_depth
 from flockd.inference import models_folder
 from flockd.inference.checks import Deadline, no_deadline
-from flockd.messages import Float32Array, Frame, FrameSet, GroundEstimate, VehicleState
+from flockd.messages import Float32Array, FloatArray, Frame, FrameSet, GroundEstimate, VehicleState
 from flockd.perception.depth import GroundBelow, NoGround, VelocityScale, fix_by_height
 from flockd.perception.detection.detector import DetectionTrace, Detector
 from flockd.perception.detection.masks import depth_of_drones, without_borders
@@ -74,6 +74,11 @@ class Perception:
         self._last = Observation(frames.time_s, vehicle, cameras, detections, previous, reasons, noisy, found)
         lap("detection")
         return self._last
+
+    def see_slope(self, slope: FloatArray) -> None:
+        """Takes the ground's slope (2,) at the newest observation, as the own motion showed it, for the next ones."""
+        if self._ground is not None:
+            self._ground.see_slope(slope)
 
     def _usable(self, frames: FrameSet) -> tuple[dict[str, Frame], tuple[str, ...], Reasons]:
         """The frames of the rig's cameras that have the right size and show a scene, and whose show noise."""

@@ -24,6 +24,8 @@ FIRST_SLOPE = 0.1
 """Standard deviation of the ground's slope where nothing is known of it."""
 SLOPE_CHANGE = 0.02
 """Standard deviation of what the slope changes over a metre: a hill of 5 m turns from 15 % up to 15 % down in 100 m."""
+SEEN_SLOPE = 0.04
+"""Standard deviation, each axis, of a slope from images of rough ground, which has bumps around the drone, too."""
 ROUGHNESS_M = 0.03
 """Standard deviation of what the ground departs from its slope over a metre."""
 LONGEST_GAP_S = 5.0
@@ -64,10 +66,10 @@ class GroundBelow:
             return _level(vehicle), f"{OF_HEIGHT}{fault}; the barometer's is used"
         return NoGround(f"{OF_HEIGHT}{fault}; there is no scale"), None
 
-    def see_slope(self, slope: FloatArray, sigma: float) -> None:
-        """Takes the slope (2,) that the images of the newest step show, with its standard deviation on each axis."""
+    def see_slope(self, slope: FloatArray) -> None:
+        """Takes the slope (2,) that the images of the newest step show."""
         if self._state is not None:
-            self._correct(np.eye(3)[1:], slope, np.eye(2) * sigma**2)
+            self._correct(np.eye(3)[1:], slope, np.eye(2) * SEEN_SLOPE**2)
 
     def _follow(self, vehicle: VehicleState) -> str | None:
         """Takes a step and its range; why that one is not used, None: it is."""

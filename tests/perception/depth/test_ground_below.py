@@ -136,7 +136,7 @@ def test_a_slope_that_images_show_counts_with_its_uncertainty() -> None:
     below = follower()
     below.update(state(0.0, 4.0))
     for k in range(1, 20):
-        below.see_slope(np.array([0.0, 0.1]), 0.05)
+        below.see_slope(np.array([0.0, 0.1]))
         ground = known(below.update(state(STEP_S * k, 4.0)))
     assert ground.slope == pytest.approx([0.0, 0.1], abs=0.01)
 
