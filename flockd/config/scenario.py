@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from flockd.config.base import NonNegative, Positive, Section, Vector3, refuse
 from flockd.config.drone import DroneConfig
 from flockd.config.mission import MissionParameters, mission_faults
-from flockd.config.obstacles import ObstaclesConfig
+from flockd.config.obstacle_field import ObstaclesConfig
 
 MAX_DRONES = 100
 """More would take days and all memory."""
