@@ -284,3 +284,5 @@ class PilotOutput:
     """None for the paper's circle and tangent, which has no goal and no end."""
     noisy_cameras: tuple[str, ...] | None = None
     """Whose images were noise, and were not used; None: no camera's."""
+    obstacles: ObstacleRanges | None = None
+    """The local map; None where obstacles are not looked for."""

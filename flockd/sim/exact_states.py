@@ -12,6 +12,7 @@ from flockd.flocking import FlockingLaw
 from flockd.messages import BoolArray, FloatArray, MissionStatus, ObstacleRanges
 from flockd.mission import Moment, Navigator
 from flockd.mission.navigator import middle_of
+from flockd.obstacles import Avoidance
 from flockd.sim.handover import Handover
 from flockd.sim.obstacle_worlds import obstacles_of
 from flockd.sim.obstacles import true_ranges
@@ -61,11 +62,13 @@ class ExactFlock:
         ]
         self._yaw_rad = np.full(len(self._pilots), start_yaw(scenario))
         self._obstacles = obstacles_of(scenario)
+        self._avoids = drone.obstacles.enabled
+        self._avoidances = [Avoidance(drone.obstacles, drone.safety.gate, drone.step_s) for _ in self._pilots]
 
     def step(self, time_s: float, positions: FloatArray, velocities: FloatArray) -> Commands:
         """Of drones at (n, 3) m and (n, 3) m/s in NED; called in order of time."""
         seen = [true_ranges(self._obstacles, time_s, place) if self._obstacles.solids else None for place in positions]
-        found = [self._of(i, time_s, positions, velocities) for i in range(len(self._pilots))]
+        found = [self._of(i, time_s, positions, velocities, ranges) for i, ranges in enumerate(seen)]
         velocity, acceleration, yaw_rad, height_m, missions, desired = zip(*found, strict=True)
         self._yaw_rad = np.array(yaw_rad)
         return Commands(
@@ -74,7 +77,7 @@ class ExactFlock:
         )  # fmt: skip
 
     def _of(
-        self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray
+        self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray, ranges: ObstacleRanges | None
     ) -> tuple[FloatArray, FloatArray, float, float, MissionStatus | None, FloatArray]:
         here, moving = positions[:, :2], velocities[:, :2]
         pilot = self._pilots[i]
@@ -86,7 +89,13 @@ class ExactFlock:
         moment = Moment(time_s, here[i], middle_of(offsets[self._sees(offsets)]), np.array(REFERENCE_DEG))
         guidance = pilot.step(moment)
         desired = pilot.pull(guidance)
-        command, acceleration = self._law.command(moving[i], offsets, moving[others], desired, self._step_s)
+        if ranges is None or not self._avoids:
+            command, acceleration = self._law.command(moving[i], offsets, moving[others], desired, self._step_s)
+        else:
+            places = positions[others] - positions[i]
+            command, acceleration = self._avoidances[i].command(
+                self._law, moving[i], places, moving[others], desired, ranges
+            )
         yaw_rad = float(self._yaw_rad[i]) if guidance.course_rad is None else guidance.course_rad
         height_m = np.nan if guidance.height_m is None else guidance.height_m
         return command, acceleration, yaw_rad, height_m, pilot.status(guidance), desired
