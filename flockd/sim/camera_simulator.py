@@ -15,6 +15,7 @@ from flockd.messages import FloatArray, Frame, FrameSet, UInt8Array
 from flockd.mission import Moment, Navigator
 from flockd.sim.camera_faults import CameraFaults
 from flockd.sim.drone_models import FAMILIES, drone_model
+from flockd.sim.obstacle_worlds import obstacles_of
 from flockd.sim.renderer import Renderer
 from flockd.sim.truth_perception import RenderTruth
 from flockd.sim.vehicles import REFERENCE_DEG
@@ -45,11 +46,15 @@ class CameraSimulator:
                     f"drone.rig: camera {name!r}: the renderer supports only pinhole cameras without distortion; "
                     "change its intrinsics for simulated flights"
                 )
+        obstacles = obstacles_of(scenario)
+        field = scenario.world.obstacles
+        clearance_m = scenario.world.clearance_m + _spread(scenario)
         world = World.generate(
             scenario.seed,
             ground_relief_m=scenario.world.ground_relief_m,
-            keep_out=planned_path(scenario),
-            clearance_m=scenario.world.clearance_m + _spread(scenario),
+            keep_out=planned_path(scenario) if field is None else _field_and_path(field.extent_m, scenario),
+            clearance_m=clearance_m if field is None else max(clearance_m, _FIELD_GRID_M),
+            obstacles=obstacles if obstacles.solids else None,
         )
         rng = np.random.default_rng([scenario.seed, 1])
         drawn, wanted = int(rng.integers(FAMILIES)), scenario.world.drone_family
@@ -76,6 +81,16 @@ class CameraSimulator:
             frames[name] = Frame(name, image, time_s, step)
         truth = RenderTruth(views, turns, places, R_ned_body, position, vehicles.R_ned_body, vehicles.position, others)
         return FrameSet(time_s, frames), truth
+
+
+_FIELD_GRID_M = 3.0
+
+
+def _field_and_path(extent_m: float, scenario: ScenarioConfig) -> FloatArray:
+    """(n, 2) the planned path, and a grid over the obstacles' area, where nothing else is to stand."""
+    axis = np.arange(-extent_m, extent_m + _FIELD_GRID_M, _FIELD_GRID_M)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    return np.concatenate([planned_path(scenario), grid])
 
 
 class _ImageNoise:
