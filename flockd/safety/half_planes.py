@@ -24,7 +24,8 @@ def nearest_within(velocity: FloatArray, directions: FloatArray, limits: FloatAr
     directions, limits, over = directions[binding], limits[binding], over[binding]
     feet = velocity - over[:, None] * directions
     candidates = np.vstack([np.zeros(2), feet, _crossings(directions, limits)])
-    fitting = candidates[np.max(candidates @ directions.T - limits, axis=1) <= _ROUNDING_M_S]
+    fits = np.max(candidates @ directions.T - limits, axis=1, initial=-np.inf) <= _ROUNDING_M_S
+    fitting = candidates[fits]
     nearest: FloatArray = fitting[np.argmin(np.linalg.norm(fitting - velocity, axis=1))]
     return nearest
 
