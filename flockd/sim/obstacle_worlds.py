@@ -131,10 +131,11 @@ def _old_tree(rng: Generator, place: FloatArray, trunk: float, *, conifer: bool)
             Frustum(north, east, 0.75 * crown, 0.0, middle, height, "needles"),
         ]
         return solids
-    for _ in range(int(rng.integers(2, 5))):
+    solids.append(Capsule(north, east, bare + crown, north, east, max(bare + crown, height - crown), crown, "leaves"))
+    for _ in range(int(rng.integers(1, 4))):
         radius = float(rng.uniform(0.5, 0.8)) * crown
-        up = float(rng.uniform(bare + radius, max(bare + radius + 0.1, height - radius)))
-        aside, angle = 0.6 * crown * rng.random(), rng.uniform(0, 2 * math.pi)
+        up = float(rng.uniform(bare + radius, max(bare + radius + 0.1, height - 2 * radius)))
+        aside, angle = 0.8 * crown, rng.uniform(0, 2 * math.pi)
         at = north + aside * math.cos(angle), east + aside * math.sin(angle)
         solids.append(Capsule(*at, up, *at, up + 0.4 * radius, radius, "leaves"))
     return solids
