@@ -10,6 +10,7 @@ from flockd.geometry import Rig, ground_inverse_depth
 from flockd.inference import models_folder
 from flockd.inference.checks import Deadline, no_deadline
 from flockd.messages import Float32Array, Frame, FrameSet, VehicleState
+from flockd.perception.continuity import ContinuityMonitor
 from flockd.perception.depth import VelocityScale, fix_by_height
 from flockd.perception.detection.detector import DetectionTrace, Detector
 from flockd.perception.detection.masks import depth_of_drones, without_borders
@@ -32,6 +33,7 @@ class Perception:
         self._detector = Detector(rig, networks, config.detection, known_size)
         self._velocity_scale = VelocityScale(rig) if config.scale == "velocity" else None
         self._noise = NoiseMonitor(config.noise)
+        self._continuity = ContinuityMonitor(config.noise)
         self._last: Observation | None = None
 
     def observe(
@@ -71,7 +73,7 @@ class Perception:
         return self._last
 
     def _usable(self, frames: FrameSet) -> tuple[dict[str, Frame], tuple[str, ...], Reasons]:
-        """The frames of the rig's cameras that have the right size and show a scene, and whose show noise."""
+        """The frames of the rig's cameras that have the right size and show a scene, and whose show noise or damage."""
         usable, noisy, reasons = {}, [], []
         for name, camera in self._rig.cameras.items():
             width, height = camera.camera.size
@@ -86,6 +88,10 @@ class Perception:
                 reasons.append(f"camera {name}: its image is noise")
             else:
                 usable[name] = frame
+        for name in self._continuity.broken({name: frame.image for name, frame in usable.items()}, frames.time_s):
+            noisy.append(name)
+            reasons.append(f"camera {name}: its image does not follow from the one before")
+            del usable[name]
         return usable, tuple(noisy), reasons
 
     def _scenes(self, frames: Mapping[str, Frame], vehicle: VehicleState) -> tuple[dict[str, SceneMaps], Reasons]:
