@@ -2,8 +2,8 @@
 
 A scene is explained by its last image, moved along the optical flow, whatever its texture is. Noise and damage come
 anew with each image. How much is left unexplained also depends on how the drone moves, but it moves all of its cameras:
-an image counts as broken by comparison with the other cameras' of the same moment. A rig of one camera has none to
-compare with, and is not judged.
+an image counts as broken by comparison with the other cameras' of the same moment, and only while the drone turns
+slowly. A rig of one camera has none to compare with, and is not judged.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from flockd.config.perception import NoiseParameters
-from flockd.messages import BoolArray, Float32Array, UInt8Array
+from flockd.messages import BoolArray, Float32Array, FloatArray, UInt8Array
 
 _LONGER_SIDE_PX = 96
 """Of the small images that are compared: noise of single pixels averages out, and DIS takes a millisecond."""
@@ -28,8 +28,10 @@ _MAX_DIFFERENCE = 10.0
 """Grey levels by which an image may be off on average, ..."""
 _MIN_CORRELATION = 0.7
 """... unless it has the same pattern: light that changes is no damage."""
-_FIT_ROUNDS = 3
+_FIT_ROUNDS, _FIT_STRIDE = 3, 4
 _GAINS = (0.5, 2.0)
+_MAX_TURN = np.deg2rad(10.0)
+"""Of the drone between two images: beyond it the flow is lost, in one camera before the others."""
 _FORGOTTEN_S = 2.0
 """After so long without an image, a camera may see something else entirely."""
 
@@ -41,8 +43,9 @@ class ContinuityMonitor:
         self._parameters = parameters
         self._last: dict[str, _Image] = {}
         self._clean_needed: dict[str, int] = {}
+        self._R_ned_body: FloatArray = np.eye(3)
 
-    def broken(self, images: Mapping[str, UInt8Array], time_s: float) -> list[str]:
+    def broken(self, images: Mapping[str, UInt8Array], time_s: float, R_ned_body: FloatArray) -> list[str]:
         """The cameras whose newest images are not to be used.
 
         After a broken image, so are those that follow until some in a row were not.
@@ -50,12 +53,15 @@ class ContinuityMonitor:
         Args:
             images: RGB images (h, w, 3) of one moment, by camera; a camera that is not among them starts anew.
             time_s: their time.
+            R_ned_body: (3, 3) the drone's attitude then.
         """
+        turned = np.arccos(np.clip((np.trace(self._R_ned_body.T @ R_ned_body) - 1.0) / 2.0, -1.0, 1.0))
+        self._R_ned_body = R_ned_body
         now = {name: _Image(_small_grey(image), time_s) for name, image in images.items()}
         shares = {}
         for name, image in now.items():
             last = self._last.get(name)
-            if last is not None and 0.0 <= time_s - last.time_s <= _FORGOTTEN_S:
+            if last is not None and 0.0 <= time_s - last.time_s <= _FORGOTTEN_S and turned <= _MAX_TURN:
                 shares[name] = unexplained_share(last.grey, image.grey)
         self._last = now
         found = []
@@ -80,7 +86,7 @@ class _Image:
 def unexplained_share(before: UInt8Array, now: UInt8Array) -> float:
     """The share, 0 to 1, of a small grey image (h, w) that the one before does not explain; what came into view is not
     counted."""
-    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     dis.setFinestScale(0)
     dis.setPatchSize(_PATCH_PX)
     if before.shape != now.shape or min(now.shape) < 2 * _PATCH_PX:
@@ -111,7 +117,7 @@ def _differs(moved: Float32Array, now: Float32Array, seen_before: BoolArray) -> 
 
 def _in_the_light_of(moved: Float32Array, now: Float32Array, used: BoolArray) -> Float32Array:
     """With the gain and the offset that fit the half of the image that fits best (least trimmed squares)."""
-    x, y = moved[used], now[used]
+    x, y = moved[used][::_FIT_STRIDE], now[used][::_FIT_STRIDE]
     kept = np.ones(len(x), np.bool_)
     gain = 1.0
     for _ in range(_FIT_ROUNDS):

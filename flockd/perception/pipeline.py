@@ -53,7 +53,7 @@ class Perception:
             trace: filled with what the detector went through, where a caller wants to see it.
             lap: called at the end of each stage with its name, to time it.
         """
-        usable, noisy, unusable = self._usable(frames)
+        usable, noisy, unusable = self._usable(frames, vehicle)
         scenes, failed = self._scenes(usable, vehicle)
         lap("scene")
         previous, restarted = self._pair(frames)
@@ -72,7 +72,7 @@ class Perception:
         lap("detection")
         return self._last
 
-    def _usable(self, frames: FrameSet) -> tuple[dict[str, Frame], tuple[str, ...], Reasons]:
+    def _usable(self, frames: FrameSet, vehicle: VehicleState) -> tuple[dict[str, Frame], tuple[str, ...], Reasons]:
         """The frames of the rig's cameras that have the right size and show a scene, and whose show noise or damage."""
         usable, noisy, reasons = {}, [], []
         for name, camera in self._rig.cameras.items():
@@ -88,7 +88,8 @@ class Perception:
                 reasons.append(f"camera {name}: its image is noise")
             else:
                 usable[name] = frame
-        for name in self._continuity.broken({name: frame.image for name, frame in usable.items()}, frames.time_s):
+        images = {name: frame.image for name, frame in usable.items()}
+        for name in self._continuity.broken(images, frames.time_s, vehicle.R_ned_body):
             noisy.append(name)
             reasons.append(f"camera {name}: its image does not follow from the one before")
             del usable[name]

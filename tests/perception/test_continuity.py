@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from flockd.config.perception import NoiseParameters
+from flockd.geometry.rotations import rotation_from_euler
 from flockd.messages import UInt8Array
 from flockd.perception.continuity import ContinuityMonitor
 from tests.perception.test_image_noise import SIZE, scene
@@ -45,7 +46,7 @@ class Rig:
             self._number += 1
             shown = {name: view(self._number) for name in CAMERAS}
             shown["left"] = shown["left"] if image is None else image
-            broken = self._monitor.broken(shown, 100.0 + after_s * self._number)
+            broken = self._monitor.broken(shown, 100.0 + after_s * self._number, np.eye(3))
             assert set(broken) <= {"left"}
             found.append(bool(broken))
         return found
@@ -78,6 +79,16 @@ def test_all_cameras_at_once_is_a_motion_and_no_damage_and_one_alone_is_not_judg
     monitor = ContinuityMonitor(NoiseParameters())
     for number in range(4):
         turned = scene(1.2, 40.0, seed=number)
-        assert monitor.broken(dict.fromkeys(CAMERAS, turned), STEP_S * number) == []
+        assert monitor.broken(dict.fromkeys(CAMERAS, turned), STEP_S * number, np.eye(3)) == []
     alone = ContinuityMonitor(NoiseParameters())
-    assert [alone.broken({"front": scene(1.2, 40.0, seed=number)}, STEP_S * number) for number in range(3)] == [[]] * 3
+    found = [alone.broken({"front": scene(1.2, 40.0, seed=n)}, STEP_S * n, np.eye(3)) for n in range(3)]
+    assert found == [[]] * 3
+
+
+@pytest.mark.parametrize(("turn_deg", "judged"), [(5.0, True), (15.0, False)])
+def test_while_the_drone_turns_fast_no_camera_is_judged(turn_deg: float, judged: bool) -> None:
+    monitor = ContinuityMonitor(NoiseParameters())
+    for number in range(2):
+        shown = {name: view(number) for name in CAMERAS} | {"left": blocks(16, 1.0, number)}
+        broken = monitor.broken(shown, STEP_S * number, rotation_from_euler(0.0, 0.0, number * np.deg2rad(turn_deg)))
+    assert broken == (["left"] if judged else [])
