@@ -65,18 +65,13 @@ def _add_scenario(commands: Commands) -> None:
     parser.add_argument("--name", metavar="NAME", help="of the flight")
     parser.add_argument("--drones", metavar="N", type=_drone_count, help="size of the flock, 1 to 100")
     parser.add_argument("--duration", metavar="S", type=positive_number, help="seconds to fly")
-<<<<<<< HEAD
-    parser.add_argument("--mission", choices=MISSIONS, help="where the flock wants to go")
-    parser.add_argument("--obstacles", choices=OBSTACLES, help="what the flock flies between")
-    parser.add_argument("--drone", metavar="FILE", help="of the drones (default: the simulated drone that comes along)")
-=======
     parser.add_argument("--mission", choices=MISSIONS, help="kind of mission")
+    parser.add_argument("--obstacles", choices=OBSTACLES, help="what the flock flies between")
     parser.add_argument(
         "--drone",
         metavar="FILE",
         help="the drones' configuration (default: that of the simulated drone that comes with flockd)",
     )
->>>>>>> h_A
     parser.set_defaults(run=_new_scenario)
 
 
