@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from flockd.config.base import NonNegative, Positive, Section, Vector3, refuse
 from flockd.config.drone import DroneConfig
 from flockd.config.mission import MissionParameters, mission_faults
-from flockd.config.obstacles import ObstaclesConfig
+from flockd.config.obstacle_field import ObstaclesConfig
 
 MAX_DRONES = 100
 """More would take days and all memory."""
@@ -115,8 +115,8 @@ class ScenarioConfig(Section):
     faults: tuple[CameraFaultConfig, ...] = ()
     """None, unless a flight is to show what flockd does about them."""
     drone: DroneConfig
-    """In the file: the path of the drone's own configuration, relative to the scenario's; or that configuration. A key
-    `mission` beside it is flown instead of its own."""
+    """In the file: the path of the drone's own configuration, relative to the scenario's; or that configuration. Keys
+    `mission` and `obstacles` beside it are flown instead of its own."""
 
     def drone_of(self, vehicle: int) -> DroneConfig:
         """The configuration that one vehicle's pilot flies with."""
