@@ -50,9 +50,8 @@ class ObstacleRanging:
         """Of points (n, 3) metres NED from the drone, and what they are labelled with (n,)."""
         p = self._parameters
         away_m = np.hypot(points[:, 0], points[:, 1])
-        sectors = (
-            np.round(np.arctan2(points[:, 1], points[:, 0]) * (SECTORS / (2 * math.pi))).astype(np.int64) % SECTORS
-        )
+        azimuths = np.nan_to_num(np.arctan2(points[:, 1], points[:, 0]))
+        sectors = np.round(azimuths * (SECTORS / (2 * math.pi))).astype(np.int64) % SECTORS
         in_band = np.abs(points[:, 2]) <= p.height_band_m
         above_ground = points[:, 2] <= observation.vehicle.height_m - _GROUND_MARGIN_M
         counts = in_band & above_ground & (labels == 0) & (away_m <= p.range_m)  # NaN counts nowhere
