@@ -3,16 +3,19 @@
 python -m tools.soak --steps 100000              # the pilot with the shipped networks on small images
 python -m tools.soak --daemon --minutes 60       # a real `flockd run`, a fake autopilot, rendered frames
 python -m tools.soak --steps 5000 --json
+python -m tools.soak --daemon --samples soak.csv # each sample too, to draw the curve
 
-Prints for memory, file descriptors, threads, latency and what waits or is lost: the first and the last tenth's mean,
-and the slope over the run with its 95 % confidence interval. The slope is a straight line through the means of 20
-stretches of the run after its first tenth, so that neighbouring samples, which are alike, do not count as independent.
+Prints for memory, file descriptors, threads, latency and what waits or is lost: how much it grew in the first tenth of
+the run, which is the warm-up; the mean of the next and of the last tenth; and the slope over the rest with its 95 %
+confidence interval. The slope is a straight line through the means of 20
+stretches of the run after the warm-up, so that neighbouring samples, which are alike, do not count as independent.
 Exit code 1 if something grows by more than its allowance, all of the interval above it.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import os
 import socket
@@ -49,7 +52,7 @@ SAMPLES = 400
 SAMPLE_S = 2.0
 PATIENCE_S = 600.0
 """For the daemon to become ready: a busy computer compiles the renderer for minutes."""
-ALLOWED = {"memory, MB": 0.03, "descriptors": 0.02, "threads": 0.02, "step, ms": 0.15}
+ALLOWED = {"memory, MB": 0.03, "own memory, MB": 0.03, "descriptors": 0.02, "threads": 0.02, "step, ms": 0.15}
 """Growth over the run, as a share of the mean, that is noise; of any other quantity, none is judged."""
 
 
@@ -57,11 +60,14 @@ ALLOWED = {"memory, MB": 0.03, "descriptors": 0.02, "threads": 0.02, "step, ms":
 class Slope:
     """How one quantity went."""
 
+    warm_up: float
+    """Growth in the first tenth, from its first samples to its last."""
     first: float
-    """Mean of the first tenth."""
+    """Mean of the second tenth."""
     last: float
+    """Mean of the last tenth."""
     slope: float
-    """Over the whole run, in the quantity's unit."""
+    """Over the run without its first tenth, in the quantity's unit."""
     low: float
     high: float
     """Of the 95 % confidence interval of the slope."""
@@ -77,17 +83,26 @@ def slope_of(name: str, values: Sequence[float]) -> Slope:
     margin = float(np.nan_to_num(stats.t.ppf(0.975, STRETCHES - 2) * line.stderr))  # NaN: the same all the time
     low, high = float(line.slope) - margin, float(line.slope) + margin
     allowed = ALLOWED.get(name, np.inf) * abs(float(samples.mean()))
+    edge = max(tenth // 10, 1)
     return Slope(
-        float(samples[:tenth].mean()), float(samples[-tenth:].mean()), float(line.slope), low, high, low > allowed
+        warm_up=float(samples[tenth - edge : tenth].mean() - samples[:edge].mean()),
+        first=float(samples[tenth : 2 * tenth].mean()),
+        last=float(samples[-tenth:].mean()),
+        slope=float(line.slope),
+        low=low,
+        high=high,
+        grows=low > allowed,
     )
 
 
 def process_facts(pid: int) -> dict[str, float]:
     """What Linux counts of a process. Raises OSError when it has ended."""
     folder = Path(f"/proc/{pid}")
-    pages = int((folder / "statm").read_text(encoding="ascii").split()[1])
+    lines = (line.split() for line in (folder / "status").read_text(encoding="ascii").splitlines())
+    kilobytes = {words[0]: int(words[1]) for words in lines if words[-1] == "kB"}
     return {
-        "memory, MB": pages * os.sysconf("SC_PAGE_SIZE") / 1e6,
+        "memory, MB": 1.024e-3 * kilobytes["VmRSS:"],
+        "own memory, MB": 1.024e-3 * kilobytes["RssAnon:"],  # without files' pages, as of libraries first used late
         "descriptors": float(len(list((folder / "fd").iterdir()))),
         "threads": float(len(list((folder / "task").iterdir()))),
     }
@@ -181,7 +196,7 @@ def soak_daemon(minutes: float) -> dict[str, list[float]]:
         folder = Path(name)
         with (
             FrameServer(
-                world,
+                CameraSimulator(world),
                 [config.name],
                 endpoint=frames_at,
                 rate_hz=2.0,
@@ -262,20 +277,24 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=5000, help="of the pilot (default: 5000)")
     parser.add_argument("--daemon", action="store_true", help="a whole daemon instead")
     parser.add_argument("--minutes", type=float, default=60.0, help="of the daemon (default: 60)")
+    parser.add_argument("--samples", type=Path, metavar="FILE", help="write every sample to a CSV file")
     parser.add_argument("--json", action="store_true", help="print the slopes as JSON")
     args = parser.parse_args()
     samples = soak_daemon(args.minutes) if args.daemon else soak_pilot(args.steps)
+    if args.samples is not None:
+        with args.samples.open("w", encoding="utf-8", newline="") as file:
+            csv.writer(file).writerows([samples.keys(), *zip(*samples.values(), strict=True)])
     slopes = {name: slope_of(name, _filled(values)) for name, values in samples.items()}
     if args.json:
         print(json.dumps({name: asdict(slope) for name, slope in slopes.items()}, indent=1))
     else:
         what = f"{args.minutes:g} minutes of a daemon" if args.daemon else f"{args.steps} steps of the pilot"
         print(f"{what}, {len(next(iter(samples.values())))} samples")
-        print(f"{'':20}{'first':>10}{'last':>10}{'growth over the run, 95 %':>34}")
+        print(f"{'':20}{'warm-up':>10}{'first':>10}{'last':>10}{'growth after the warm-up, 95 %':>34}")
         for name, one in slopes.items():
             verdict = "  GROWS" if one.grows else ""
             interval = f"{one.slope:+.3f} ({one.low:+.3f} to {one.high:+.3f})"
-            print(f"{name:20}{one.first:10.2f}{one.last:10.2f}{interval:>34}{verdict}")
+            print(f"{name:20}{one.warm_up:+10.2f}{one.first:10.2f}{one.last:10.2f}{interval:>34}{verdict}")
     return 1 if any(slope.grows for slope in slopes.values()) else 0
 
 

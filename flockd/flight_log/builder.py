@@ -92,6 +92,8 @@ class FlightLogBuilder:
         for neighbour in output.neighbours:
             if neighbour.confirmed:
                 self._tracked.append((float(step), float(i), float(neighbour.track), *neighbour.position.tolist()))
+        if output.obstacles is not None:
+            self.add_obstacles(step, i, output.obstacles)
         ego = output.ego_motion
         if ego is not None:
             self._ego_rotation[step, i], self._ego_translation[step, i] = ego.rotation, ego.translation

@@ -34,6 +34,7 @@ from flockd.obstacles import Avoidance, LocalMap
 from flockd.perception import Networks, Observation, Perception, load_networks
 from flockd.perception.detection.detector import DetectionTrace
 from flockd.perception.obstacles import ObstacleRanging
+from flockd.pilot.ground_scale import scaled_by_ground
 from flockd.pilot.motions import ego_motion, neighbour_motions
 from flockd.pilot.trim import VelocityTrim
 from flockd.tracking import Blind, Measurement, Prediction, Tracker
@@ -132,6 +133,7 @@ class FlockPilot:
         observation = self._perception.observe(frames, vehicle, predictions, trace.detection, laps.end)
         trace.observation = observation
         ego, why_no_ego = self._ego_motion(observation)
+        ego = self._scaled(observation, ego)
         laps.end("ego_motion")
         motions, why_no_motion = self._neighbour_motions(observation, ego)
         laps.end("neighbour_motion")
@@ -160,6 +162,7 @@ class FlockPilot:
             stages_ms=laps.stages_ms,
             mission=mission,
             noisy_cameras=observation.noisy_cameras or None,
+            ground=observation.ground,
             obstacles=obstacles,
         )
 
@@ -196,6 +199,17 @@ class FlockPilot:
         if not self._is_plausible(_displacement(observation, ego), ego.interval_s):
             return None, ("ego-motion: no vehicle changes its velocity that fast",)
         return ego, ()
+
+    def _scaled(self, observation: Observation, ego: EgoMotion | None) -> EgoMotion | None:
+        """The own motion with the range finder's scale where the ground shows it, and as it is otherwise."""
+        if ego is None or observation.ground is None:
+            return ego
+        try:
+            scaled, slope = scaled_by_ground(self._rig, observation, ego)
+        except ValueError:  # at a standstill, or over water and walls: the depth maps' scale stays
+            return ego
+        self._perception.see_slope(slope)
+        return scaled
 
     def _is_plausible(self, displacement: FloatArray, interval_s: float) -> bool:
         """Whether the last velocity can have become this one; after some refusals the last one is doubted instead."""
@@ -328,6 +342,9 @@ def _why_refused(frames: FrameSet, vehicle: VehicleState) -> str | None:
         return "input refused: the height is not finite"
     if velocity is not None and not np.isfinite(velocity).all():
         return "input refused: the autopilot's velocity is not finite"
+    reading = vehicle.ground_range
+    if reading is not None and not math.isfinite(reading.time_s):
+        return "input refused: the range finder's time is not finite"
     for place in (vehicle.position, vehicle.home_deg):
         if place is not None and not np.isfinite(place).all():
             return "input refused: the autopilot's position is not finite"
