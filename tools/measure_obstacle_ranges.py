@@ -32,6 +32,7 @@ LEAST_CLEARANCE_M = 1.0
 """Places nearer to an obstacle are left out: no drone flies there."""
 EXTENT_M = 45.0
 """The places lie no farther from the origin, north and east: beyond 60 m nothing stands."""
+ALL = frozenset({"depth", "segmentation", "distance"})
 STEP_M = 5.0
 """Between two places."""
 
