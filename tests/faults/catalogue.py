@@ -135,8 +135,7 @@ CATALOGUE = (
         11, "task-dies", "a task of the daemon dies", "Hold, and an exit code that is not zero",
         (
             f"{_HERE}computer.py::test_a_task_dies",
-            "tests/daemon/test_flight.py::test_a_dead_control_task_is_held_by_the_last_resort",
-            "tests/daemon/test_flight.py::test_any_other_dead_task_is_a_hold_too",
+            "tests/daemon/test_flight.py::test_a_dead_task_is_held_by_the_last_resort",
         ),
         within_s=2.0,
     ),
