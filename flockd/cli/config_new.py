@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from flockd.config.new_files import NewDrone, NewScenario
 
 MISSIONS = ("circle_then_tangent", "hover", "velocity", "waypoints", "follow", "operator")
+OBSTACLES = ("none", "forest", "village")
 SOURCES = ("v4l2", "shared_memory")
 MOST_CAMERAS = 16
 
@@ -65,6 +66,7 @@ def _add_scenario(commands: Commands) -> None:
     parser.add_argument("--drones", metavar="N", type=_drone_count, help="size of the flock, 1 to 100")
     parser.add_argument("--duration", metavar="S", type=positive_number, help="seconds to fly")
     parser.add_argument("--mission", choices=MISSIONS, help="kind of mission")
+    parser.add_argument("--obstacles", choices=OBSTACLES, help="what the flock flies between")
     parser.add_argument(
         "--drone",
         metavar="FILE",
@@ -113,6 +115,7 @@ def _new_scenario(args: argparse.Namespace) -> int:
         drones=_asked(args, "drones", "number of drones", default.drones, _drone_count),
         duration_s=_asked(args, "duration", "seconds to fly", default.duration_s, positive_number),
         mission=_asked(args, "mission", _choice("mission", MISSIONS), default.mission, _one_of(MISSIONS)),
+        obstacles=_asked(args, "obstacles", _choice("obstacles", OBSTACLES), default.obstacles, _one_of(OBSTACLES)),
         drone_file=_asked(args, "drone", "file of the drones", default.drone_file, str),
     )
     return _write(args.file, scenario_text(new))

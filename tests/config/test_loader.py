@@ -389,6 +389,22 @@ def test_the_schema_describes_the_file_and_not_the_merged_model() -> None:
         ),
         (
             "scenario: two",
+            "scenario: two\nworld:\n  obstacles:\n    kind: jungle",
+            "scenario.yaml:4: world.obstacles.kind: jungle is not known; write `forest` or `village`",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nworld:\n  obstacles:\n    kind: forest\n    trees_per_hectare: 900",
+            "scenario.yaml:5: world.obstacles.trees_per_hectare: 900 is not at most 400; write a number from 50 to 400",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nworld:\n  obstacles:\n    kind: village\n    trees_per_hectare: 100",
+            "scenario.yaml:5: world.obstacles.trees_per_hectare: has no meaning with kind `village`, only with "
+            "`forest`; delete it",
+        ),
+        (
+            "scenario: two",
             "scenario: two\nduration_s: 0.1",
             "scenario.yaml:2: duration_s: 0.1 s is shorter than a step of 0.5 s; write 0.5 or more",
         ),
