@@ -24,6 +24,9 @@ FlowRefinement = Literal["dis", "quick_dis", "none"]
 ScaleSource = Literal["network", "height", "velocity"]
 """Where the metric scale of the background comes from."""
 
+HeightSource = Literal["range_finder", "barometer", "best"]
+"""What measures the height above ground that fixes the background's scale."""
+
 OwnVelocitySource = Literal["vision", "autopilot"]
 """Whose estimate of its own velocity a drone flies by."""
 

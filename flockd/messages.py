@@ -58,6 +58,24 @@ class FrameSet:
 
 
 @dataclass(frozen=True, eq=False)
+class RangeReading:
+    """How far a range finder that faces down says the ground is, or the autopilot in its place."""
+
+    time_s: float
+    """When it was measured, on the clock of `VehicleState`."""
+    range_m: float
+    """Slant range along the body's down axis; of the autopilot's own distance to bottom, straight down."""
+    vertical: bool = False
+    """It is the autopilot's own distance to bottom."""
+    min_m: float | None = None
+    """Nearer than this the sensor measures nothing; None: not known."""
+    max_m: float | None = None
+    """Farther than this, likewise."""
+    quality: float | None = None
+    """Of the signal, 0 (none) to 1; None: the sensor does not say."""
+
+
+@dataclass(frozen=True, eq=False)
 class VehicleState:
     """What the drone's own autopilot says of itself. Nothing in here comes from another drone."""
 
@@ -65,13 +83,27 @@ class VehicleState:
     R_ned_body: Matrix3
     """(3, 3) attitude."""
     height_m: float
-    """Height above ground from the barometer, metres, up positive."""
+    """Height above home from the barometer, metres, up positive: above the ground where that is level."""
     velocity_ned: Vector3 | None = None
     """(3,) m/s, the autopilot's own estimate, where it has one."""
     position: Vector2 | None = None
     """(2,) metres north and east of home, the autopilot's own estimate, where it has one."""
     home_deg: Vector2 | None = None
     """(2,) latitude and longitude of home, where the autopilot knows it."""
+    ground_range: RangeReading | None = None
+    """The newest of the range finder that faces down, however old or bad; None: none was heard."""
+
+
+@dataclass(frozen=True, eq=False)
+class GroundEstimate:
+    """The ground below the drone, as a plane: what fixed the metric scale of depth."""
+
+    height_m: float
+    """Of the body's origin above the ground straight below."""
+    slope: Vector2
+    """(2,) rise of the ground for each metre to the north and to the east."""
+    source: str
+    """`range_finder` or `barometer`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,6 +218,28 @@ class Detection:
         return self.range_m * math.sqrt(float(self.bearing @ self.covariance @ self.bearing))
 
 
+SECTORS = 72
+"""Directions of `ObstacleRanges`: one every 5 degrees."""
+
+Sectors = Annotated[FloatArray, Shape((SECTORS,))]
+
+
+@dataclass(frozen=True, eq=False)
+class ObstacleRanges:
+    """Nearest obstacle in each of n equal sectors around the drone, level, over the heights that the drone needs.
+
+    Sector k is centred on the azimuth 2 pi k / n, clockwise from north.
+    """
+
+    time_s: float
+    range_m: Sectors
+    """(n,) metres, level, from the drone's centre; inf where nothing was seen within `seen_m`."""
+    sigma_m: Sectors
+    """(n,) metres: standard deviation of `range_m`; 0 where that is inf."""
+    seen_m: Sectors
+    """(n,) metres: how far the sector is known to be free or measured; 0 where it was not looked at."""
+
+
 @dataclass(frozen=True, eq=False)
 class Neighbour:
     """A tracked drone, in level axes that point north, east and down, relative to the own drone."""
@@ -262,3 +316,7 @@ class PilotOutput:
     """None for the paper's circle and tangent, which has no goal and no end."""
     noisy_cameras: tuple[str, ...] | None = None
     """Whose images were noise, and were not used; None: no camera's."""
+    ground: GroundEstimate | None = None
+    """What the height gave as the ground; None: level ground below the barometer's height, or no scale at all."""
+    obstacles: ObstacleRanges | None = None
+    """The local map; None where obstacles are not looked for."""

@@ -32,7 +32,10 @@ MAY_IMPORT = {
     "flocking": BASE,
     "safety": BASE,
     "mission": BASE | {"safety"},  # for the fence
-    "pilot": BASE | {"geometry", "inference", "perception", "tracking", "flocking", "safety", "mission"},
+    "obstacles": BASE | {"safety", "flocking"},
+    "pilot": BASE
+    | {"obstacles"}
+    | {"geometry", "inference", "perception", "tracking", "flocking", "safety", "mission"},
     "sources": BASE | {"zenoh_session", "image_header"},
     "autopilot": BASE,
     "telemetry": BASE | {"zenoh_session"},
@@ -51,6 +54,7 @@ MAY_IMPORT = {
         "tracking",
         "flocking",
         "mission",
+        "obstacles",
         "safety",
         "pilot",
         "telemetry",
@@ -61,6 +65,7 @@ MAY_IMPORT = {
     "report": BASE | {"flocking", "flight_log"},
     "view": BASE | {"geometry", "perception", "pilot", "recording"},
     "daemon": BASE
+    | {"obstacles"}
     | {"geometry", "inference", "perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"}
     | {"mission"},
     "doctor": BASE | {"geometry", "inference", "perception", "pilot", "sources", "autopilot", "telemetry", "daemon"},
@@ -95,6 +100,7 @@ PURE = (
     "safety",
     "pilot",
     "mission",
+    "obstacles",
 )
 """No clock, no socket, no thread, no environment: what is tested is what flies."""
 IMPURE_MODULES = {

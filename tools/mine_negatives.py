@@ -9,11 +9,12 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flockd.inference import OnnxModel
 from flockd.perception import group_instances
 from flockd.perception.requirements import check_roles
-from tools.training.dataset import ground_plane, open_pairs, ray_tangents
+from tools.training.dataset import PairSet, ground_plane, open_pairs, ray_tangents
 
 
 def main() -> None:
@@ -25,7 +26,13 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
     pairs = open_pairs(arguments.data)
-    model = OnnxModel(arguments.model, threads=arguments.threads, check=check_roles)
+    found = mined(pairs, OnnxModel(arguments.model, threads=arguments.threads, check=check_roles))
+    np.save(arguments.out, found)
+    print(f"{arguments.out}: {len(found)} in {pairs.count} images")
+
+
+def mined(pairs: PairSet, model: OnnxModel) -> NDArray[np.float32]:
+    """(n, 5) as ``main`` writes them, of the pairs' first images."""
     found = []
     for pair in range(pairs.count):
         focal = float(pairs["focal"][pair])
@@ -40,8 +47,7 @@ def main() -> None:
                 left, top, right, bottom = instance.box
                 half = max(right - left, bottom - top) / 2
                 found.append((pair, 0, (left + right) / 2, (top + bottom) / 2, half))
-    np.save(arguments.out, np.array(found, np.float32))
-    print(f"{arguments.out}: {len(found)} in {pairs.count} images")
+    return np.array(found, np.float32).reshape(-1, 5)
 
 
 if __name__ == "__main__":

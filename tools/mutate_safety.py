@@ -33,11 +33,13 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 SAFETY = Path("flockd/safety")
 TESTS = {
-    "gate.py": ("test_gate.py", "test_fence.py", "test_supervisor.py"),
+    "gate.py": ("test_gate.py", "test_obstacles.py", "test_fence.py", "test_supervisor.py"),
+    "approach.py": ("test_obstacles.py", "test_gate.py", "test_fence.py", "test_supervisor.py"),
+    "half_planes.py": ("test_obstacles.py", "test_gate.py", "test_fence.py", "test_supervisor.py"),
     "fence.py": ("test_fence.py", "test_gate.py", "test_supervisor.py"),
 }
 """The files of tests/safety, the likeliest to notice first; else the supervisor's."""
-SUPERVISORS_TESTS = ("test_supervisor.py", "test_gate.py", "test_fence.py")
+SUPERVISORS_TESTS = ("test_supervisor.py", "test_gate.py", "test_obstacles.py", "test_fence.py")
 CPU_LIMIT_S = 60
 """For a mutant that never ends; many times what the tests take."""
 
@@ -55,11 +57,18 @@ EQUIVALENT: dict[str, str] = {
     "supervisor.py Supervisor.__init__: pass  # self._now_s = -math.inf": "each step writes it before it is read",
     "supervisor.py Supervisor.__init__: self._now_s = (math.inf)": "each step writes it before it is read",
     "supervisor.py Supervisor.__init__: self._now_s = -(0.0)": "each step writes it before it is read",
-    "gate.py _within: if ((over < 0)).all():": "with a limit just reached, its foot is the velocity itself",
-    "gate.py _within: fitting = candidates[(np.max(candidates @ directions.T - limits, axis=1) < _ROUNDING_M_S)]": (
+    "half_planes.py nearest_within: if ((over < 0)).all():": (
+        "with a limit just reached, its foot is the velocity itself"
+    ),
+    "half_planes.py nearest_within: fits = "
+    "(np.max(candidates @ directions.T - limits, axis=1, initial=-np.inf) < _ROUNDING_M_S)": (
         "differs where the rounding is exactly the rounding allowed"
     ),
-    "gate.py _crossings: i, j = np.triu_indices(len(directions), (0))": "a line is parallel to itself",
+    "half_planes.py nearest_within: binding = ~((limits >= np.hypot(*velocity) + _ROUNDING_M_S))"
+    "  # the others hold for all that is no longer": "a limit of just this speed binds nothing",
+    "half_planes.py nearest_within: binding = ~(limits > (np.hypot(*velocity) - _ROUNDING_M_S))"
+    "  # the others hold for all that is no longer": "differs by the rounding allowed",
+    "half_planes.py _crossings: i, j = np.triu_indices(len(directions), (0))": "a line is parallel to itself",
     "fence.py _inside: ends = np.roll(corners, (1), axis=0)": "the same outline, the other way round",
     "fence.py _inside: return bool(np.sum((east >= e1 + (e2 - e1) * (north - n1) / (n2 - n1))) % 2)": (
         "the same ray, to the west; a closed outline is crossed an even number of times in all"

@@ -29,10 +29,10 @@ Feeds = dict[str, NDArray[Any]]
 IMAGES, COMPARED = 32, 16
 WITHOUT_HEIGHT = 0.3
 """Share of the images whose geometry says nothing of the ground."""
-IN_8_BITS = ("Conv", "Relu", "Resize")
-KEPT = ("head", "look")
-"""Layers with this in their names stay as they are: they write metres and places. So do sums, which in 8 bits cost ten
-times the accuracy that all else together does."""
+IN_8_BITS = ("Conv", "Relu", "Clip", "Resize")
+KEPT = ("head", "look", "fixed")
+"""Layers with this in their names stay as they are: they write metres and places, or learnt from other pictures. So do
+sums, which in 8 bits cost ten times the accuracy that all else together does."""
 AT_MOST = 0.1
 """Mean difference from the float network, as a share of the output's standard deviation, beyond which it is refused."""
 
@@ -47,16 +47,26 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--accuracy", action="append", default=[], metavar="WHAT=FIGURE", help="measured accuracy")
     arguments = parser.parse_args()
-    manifest, file = load_manifest(arguments.manifest)
+    accuracy = dict(measured.split("=", 1) for measured in arguments.accuracy)
+    path, differences = quantise(arguments.manifest, arguments.data, arguments.out, accuracy)
+    size = path.with_suffix(".onnx").stat().st_size
+    print(f"{path}: {size / 1e6:.1f} MB; mean differences in deviations: {differences}")
+
+
+def quantise(float_manifest: Path, data: Path, out: Path, accuracy: dict[str, str]) -> tuple[Path, dict[str, float]]:
+    """Write the 8-bit twin into ``out``: its manifest, and each output's mean difference in standard deviations.
+
+    Raises SystemExit where one differs too much.
+    """
+    manifest, file = load_manifest(float_manifest)
     draw = _crops if "crop" in manifest.contents else _images
-    feeds = list(draw(manifest, arguments.data, IMAGES + COMPARED))
+    feeds = list(draw(manifest, data, IMAGES + COMPARED))
     name = f"{manifest.name}_int8"
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    twin = arguments.out / f"{name}.onnx"
+    out.mkdir(parents=True, exist_ok=True)
+    twin = out / f"{name}.onnx"
     _quantise(file, feeds[:IMAGES], twin)
     differences = _differences(file, twin, feeds[IMAGES:])
-    accuracy = dict(measured.split("=", 1) for measured in arguments.accuracy)
-    accuracy |= {
+    accuracy = accuracy | {
         f"{output}, mean difference from {manifest.name}": f"{d} deviations" for output, d in differences.items()
     }
     document = manifest.model_dump(mode="json", exclude_defaults=True)
@@ -70,8 +80,7 @@ def main() -> None:
     }
     names = list(manifest.outputs)
     golden = ort.InferenceSession(str(twin), providers=["CPUExecutionProvider"]).run(names, golden_feeds(manifest))
-    path = write_manifest(document, twin, dict(zip(names, golden, strict=True)))
-    print(f"{path}: {twin.stat().st_size / 1e6:.1f} MB; mean differences in deviations: {differences}")
+    return write_manifest(document, twin, dict(zip(names, golden, strict=True))), differences
 
 
 class _Reader(CalibrationDataReader):

@@ -12,25 +12,55 @@ import argparse
 import multiprocessing
 import os
 import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flockd.sim.airframe import DroneModel
+from flockd.sim.drone_models import drone_model
 from tools.training import worlds
 from tools.training.dataset import FOCAL_PX, HEIGHT, R_BODY_CAMERA, WIDTH
-from tools.training.scenes import drawn_attitude
+from tools.training.distractions import drawn_distraction
+from tools.training.drone_generator import generated_drone
+from tools.training.samples import DroneInView, crop_around, crop_at, sample_of, sample_without_drone
+from tools.training.scenes import drawn_attitude, outline_of
 
 Array = NDArray[Any]
 PICTURES_A_SCENE = 3
-PAINTED = 8
-"""Drones of each family in a world, painted differently."""
+PAINTED, SHAPES_PAINTED = 8, 3
+"""Drones of each family and of each generated shape in a world, painted differently."""
 MOST_DRONES = 3
 MIN_PIXELS = 8
 """That much of it must be seen: a drone six pixels wide is still to be told from a bird."""
+HIDDEN_SHARE = 0.02
+"""Of its outline: a drone of which something hides less is whole."""
 WITH_DISTRACTORS, DISTRACTOR_ALONE = 0.3, 0.1
 """Shares of the scenes: a bird or the like before or behind the drone, and in its place, where half are too far."""
+
+
+class DrawModels(Protocol):
+    """Whatever says which drones fly in a world; workers are given it."""
+
+    def __call__(self, rng: np.random.Generator) -> list[list[DroneModel]]:
+        """Shapes, each painted in several ways."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class CropJob:
+    """One file of crops."""
+
+    file: Path
+    seed: int
+    """Of the world."""
+    scenes: int
+    draw_models: DrawModels
+    measures: bool = False
+    """Also note `range_m`, and whether the drone is `whole`: within the image, and nothing before it."""
 
 
 def main() -> None:
@@ -42,56 +72,69 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=400, help="drones a world")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     arguments = parser.parse_args()
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    os.environ["NUMBA_NUM_THREADS"] = "1"
     # From the far end of the training worlds: other places than those of whole images.
     seeds = worlds.TRAINING[::-1][arguments.skip :][: arguments.worlds]
-    jobs = [(arguments.out / f"{seed}.npz", seed, arguments.scenes) for seed in seeds]
-    jobs = [job for job in jobs if not job[0].is_file()]
+    jobs = [CropJob(arguments.out / f"{seed}.npz", seed, arguments.scenes, drones_of_training) for seed in seeds]
     begin = time.monotonic()
-    with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
-        for done, _ in enumerate(pool.imap_unordered(_render_world, jobs), start=1):
-            print(f"{done}/{len(jobs)} worlds, {time.monotonic() - begin:.0f} s", flush=True)
+    for done, total in render_crops(jobs, arguments.processes):
+        print(f"{done}/{total} worlds, {time.monotonic() - begin:.0f} s", flush=True)
 
 
-def _render_world(job: tuple[Path, int, int]) -> None:
-    from flockd.sim.drone_models import drone_model  # noqa: PLC0415 - numba starts in the worker
-    from flockd.sim.world import World  # noqa: PLC0415
+def drones_of_training(rng: np.random.Generator) -> list[list[DroneModel]]:
+    """Every family of the training, and as many shapes of the generator as the drones of a world are to have."""
+    families = [[drone_model(family, _paint(rng)) for _ in range(PAINTED)] for family in worlds.FAMILIES]
+    drawn = rng.choice(worlds.SHAPES, round(len(families) * worlds.SHAPES_SHARE / (1 - worlds.SHAPES_SHARE)))
+    shapes = [[generated_drone(int(shape), _paint(rng)) for _ in range(SHAPES_PAINTED)] for shape in drawn]
+    return [*families, *shapes]
 
-    path, seed, count = job
-    rng = np.random.Generator(np.random.PCG64([seed, 1]))
-    world = World.generate(seed, ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])), keep_out=None)
-    places = world.free_points(count, rng, 2.0)
-    models = {
-        family: [drone_model(family, int(rng.integers(1 << 31))) for _ in range(PAINTED)] for family in worlds.FAMILIES
-    }
-    samples = [sample for place in places for sample in _scene(world, place, models, rng)]
+
+def _paint(rng: np.random.Generator) -> int:
+    return int(rng.integers(1 << 31))
+
+
+def render_crops(jobs: Sequence[CropJob], processes: int | None) -> Iterator[tuple[int, int]]:
+    """Write each job's file that is not there yet; yields how many of how many are done."""
+    missing = [job for job in jobs if not job.file.is_file()]
+    for job in missing:
+        job.file.parent.mkdir(parents=True, exist_ok=True)
+    os.environ["NUMBA_NUM_THREADS"] = "1"
+    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+        for done, _ in enumerate(pool.imap_unordered(_render_world, missing), start=1):
+            yield done, len(missing)
+
+
+def _render_world(job: CropJob) -> None:
+    from flockd.sim.world import World  # noqa: PLC0415 - numba starts in the worker
+
+    rng = np.random.Generator(np.random.PCG64([job.seed, 1]))
+    world = World.generate(job.seed, ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])), keep_out=None)
+    places = world.free_points(job.scenes, rng, 2.0)
+    models = job.draw_models(rng)
+    samples = [sample for place in places for sample in _scene(world, place, models, rng, measures=job.measures)]
     joined = {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
-    draft = path.with_suffix(".part")
+    draft = job.file.with_suffix(".part")
     with draft.open("wb") as file:
         np.savez(file, allow_pickle=False, **joined)
-    draft.replace(path)
+    draft.replace(job.file)
 
 
-def _scene(world: Any, place: Array, models: dict[int, list[Any]], rng: np.random.Generator) -> list[dict[str, Array]]:
+def _scene(
+    world: Any, place: Array, models: list[list[DroneModel]], rng: np.random.Generator, *, measures: bool
+) -> list[dict[str, Array]]:
     """Pictures of one drone from one camera; other drones and distractors may stand before or behind it."""
     from flockd.sim.renderer import Renderer  # noqa: PLC0415
-    from tools.training.distractions import drawn_distraction  # noqa: PLC0415
-    from tools.training.samples import DroneInView, crop_around, crop_at, sample_of, sample_without_drone  # noqa: PLC0415
 
     focal = FOCAL_PX * float(np.exp(rng.normal(0, 0.08)))
     ground = float(world.height_at(place[:1], place[1:2])[0])
     position = np.array([place[0], place[1], -(ground + rng.uniform(1.5, 8.0))])
     R_ned_camera = drawn_attitude(rng) @ R_BODY_CAMERA
     count = int(rng.choice([1, 2, MOST_DRONES], p=[0.6, 0.25, 0.15]))
-    families = rng.choice(worlds.FAMILIES, count)
-    drones = [models[int(family)][int(rng.integers(PAINTED))] for family in families]
+    shapes = rng.choice(len(models), count)
+    drones = [models[shape][int(rng.integers(len(models[shape])))] for shape in shapes]
     positions = _places(position, R_ned_camera, focal, count, rng)
     positions[:, 2] = np.minimum(positions[:, 2], -(ground + 0.5))
     rotations = np.array([drawn_attitude(rng) for _ in range(count)])
-    seen = DroneInView(
-        focal, R_ned_camera.T @ (positions[0] - position), R_ned_camera.T @ rotations[0], int(families[0])
-    )
+    seen = DroneInView(focal, R_ned_camera.T @ (positions[0] - position), R_ned_camera.T @ rotations[0], drones[0])
     if seen.centre[2] < 0.3:
         return []
     alone, beside = rng.random() < DISTRACTOR_ALONE, rng.random() < WITH_DISTRACTORS
@@ -117,11 +160,30 @@ def _scene(world: Any, place: Array, models: dict[int, list[Any]], rng: np.rando
         return []
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     image[top:bottom, left:right] = view.rgb
-    if alone:
-        return [sample_without_drone(crop, image) for crop in crops]
     mine = np.zeros((HEIGHT, WIDTH), np.bool_)
-    mine[top:bottom, left:right] = view.ids == 1
-    return [sample_of(seen, crop, image, mine) for crop in crops]
+    if alone:
+        samples = [sample_without_drone(crop, image) for crop in crops]
+    else:
+        mine[top:bottom, left:right] = view.ids == 1
+        samples = [sample_of(seen, crop, image, mine) for crop in crops]
+    if not measures:
+        return samples
+    whole = not alone and _is_whole(seen, view, matrix, (left, top))
+    return [{**s, "range_m": np.linalg.norm(seen.centre), "whole": np.array(whole)} for s in samples]
+
+
+def _is_whole(drone: DroneInView, view: Any, matrix: Array, corner: tuple[int, int]) -> bool:
+    """Within the camera's image, whose part from ``corner`` on the view shows, and hardly anything before it."""
+    places = drone.model.vertices @ drone.rotation.T + drone.centre
+    if places[:, 2].min() < 0.05:
+        return False
+    pixels = places @ matrix.T
+    pixels = pixels[:, :2] / pixels[:, 2:] + corner
+    if (pixels < 1).any() or (pixels > (WIDTH - 1, HEIGHT - 1)).any():
+        return False
+    outline = outline_of(places, matrix, view.ids.shape)
+    before = (view.depth < drone.centre[2] - drone.model.size_m / 2) | view.distractors | (view.ids > 1)
+    return bool((before & outline).sum() < HIDDEN_SHARE * outline.sum())
 
 
 def _places(position: Array, R_ned_camera: Array, focal: float, count: int, rng: np.random.Generator) -> Array:

@@ -2,8 +2,8 @@
 
 python -m tools.render_training_data OUT --worlds 120 --pairs 30 --split training
 
-A third of the scenes have birds and the like in them. With ``--families unseen`` the drones are of the families that
-no network is trained on.
+A third of the scenes have birds and the like in them. Two thirds of the drones of training worlds are of generated
+shapes. With ``--families unseen`` the drones are of the families that no network is trained on.
 """
 
 from __future__ import annotations
@@ -12,17 +12,24 @@ import argparse
 import multiprocessing
 import os
 import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flockd.sim.airframe import DroneModel
+from flockd.sim.drone_models import drone_model
 from tools.training import worlds
 from tools.training.dataset import FOCAL_PX, HEIGHT, MAX_DRONES, R_BODY_CAMERA, WIDTH, create_part, note
+from tools.training.drone_generator import generated_drone
 from tools.training.scenes import attitude, drawn_attitude
 
 Array = NDArray[Any]
+SHAPES_A_WORLD = 24
+"""Of the generator, where it is drawn from."""
 WITH_DISTRACTORS = 1 / 3
 """Share of the scenes."""
 
@@ -40,34 +47,61 @@ def main() -> None:
     arguments = parser.parse_args()
     seeds = {"training": worlds.TRAINING, "validation": worlds.VALIDATION, "test": worlds.TEST}[arguments.split]
     families = {"training": worlds.FAMILIES, "unseen": worlds.UNSEEN_FAMILIES}[arguments.families]
-    os.environ["NUMBA_NUM_THREADS"] = "1"
+    share = worlds.SHAPES_SHARE if (arguments.split, arguments.families) == ("training", "training") else 0.0
     wanted = range(arguments.skip, arguments.skip + arguments.worlds)
-    jobs = [(arguments.out / f"part-{i:04d}", seeds[i], arguments.pairs, families) for i in wanted]
-    jobs = [job for job in jobs if not (job[0] / "made.json").is_file()]
+    jobs = [PairJob(arguments.out / f"part-{i:04d}", seeds[i], arguments.pairs, families, share) for i in wanted]
     begin = time.monotonic()
-    with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
-        for done, _ in enumerate(pool.imap_unordered(_render_world, jobs), start=1):
-            print(f"{done}/{len(jobs)} worlds, {time.monotonic() - begin:.0f} s", flush=True)
+    for done, total in render_pairs(jobs, arguments.processes):
+        print(f"{done}/{total} worlds, {time.monotonic() - begin:.0f} s", flush=True)
 
 
-def _render_world(job: tuple[Path, int, int, range]) -> None:
-    from flockd.sim.drone_models import drone_model  # noqa: PLC0415 - numba starts in the worker
-    from flockd.sim.renderer import Renderer  # noqa: PLC0415
+@dataclass(frozen=True)
+class PairJob:
+    """One part of a folder of pairs."""
+
+    folder: Path
+    seed: int
+    """Of the world."""
+    pairs: int
+    families: range
+    shapes_share: float = 0.0
+    """Of the drones, how many are of the generator's shapes instead."""
+
+
+def render_pairs(jobs: Sequence[PairJob], processes: int | None) -> Iterator[tuple[int, int]]:
+    """Write each job's part that is not there yet; yields how many of how many are done."""
+    missing = [job for job in jobs if not (job.folder / "made.json").is_file()]
+    os.environ["NUMBA_NUM_THREADS"] = "1"
+    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+        for done, _ in enumerate(pool.imap_unordered(_render_world, missing), start=1):
+            yield done, len(missing)
+
+
+def _render_world(job: PairJob) -> None:
+    from flockd.sim.renderer import Renderer  # noqa: PLC0415 - numba starts in the worker
     from flockd.sim.world import World  # noqa: PLC0415
 
-    folder, seed, count, allowed = job
+    folder, seed, count = job.folder, job.seed, job.pairs
     rng = np.random.Generator(np.random.PCG64(seed))
     world = World.generate(seed, ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])), keep_out=None)
+    drawn = rng.choice(worlds.SHAPES, SHAPES_A_WORLD) if job.shapes_share else ()
+    shapes = [generated_drone(int(shape), int(rng.integers(1 << 31))) for shape in drawn]
     part = create_part(folder, count)
     places = world.free_points(count, rng, 2.0)
     for index in range(count):
-        families = rng.choice(allowed, MAX_DRONES)
-        drones = [drone_model(int(f), int(rng.integers(1 << 31))) for f in families]
+        drones = [_drawn_drone(job, shapes, rng) for _ in range(MAX_DRONES)]
+        families = np.array([drone.family for drone in drones])
         renderer = Renderer(world, drones)
         _render_pair(renderer, world, places[index], families, part, index, rng)
     for array in part.values():
         array.flush()  # type: ignore[attr-defined]
-    note(folder, seed=seed, pairs=count, families=list(allowed))
+    note(folder, seed=seed, pairs=count, families=list(job.families), shapes_share=job.shapes_share)
+
+
+def _drawn_drone(job: PairJob, shapes: list[DroneModel], rng: np.random.Generator) -> DroneModel:
+    if rng.random() < job.shapes_share:
+        return shapes[int(rng.integers(len(shapes)))]
+    return drone_model(int(rng.choice(job.families)), int(rng.integers(1 << 31)))
 
 
 def _render_pair(

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from flockd.config import load_scenario
 from flockd.sim.autopilots import TRUTH_PORT
+from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.frame_server import FrameServer
 from flockd.sim.ground_station import GroundStation
 from flockd.sim.start import with_drones
@@ -41,7 +42,7 @@ def main() -> None:
     with (
         GroundStation(ports, clock) as station,
         FrameServer(
-            scenario, names, endpoint=args.endpoint, rate_hz=RATE_HZ, poses=station.poses, clock=clock,
+            CameraSimulator(scenario), names, endpoint=args.endpoint, rate_hz=RATE_HZ, poses=station.poses, clock=clock,
             speed_factor=args.speed_factor,
         ) as server,
     ):  # fmt: skip

@@ -199,7 +199,7 @@ def soak_daemon(minutes: float) -> dict[str, list[float]]:
         folder = Path(name)
         with (
             FrameServer(
-                world,
+                CameraSimulator(world),
                 [config.name],
                 endpoint=frames_at,
                 rate_hz=2.0,

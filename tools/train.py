@@ -31,7 +31,7 @@ from tools.training.augment import photometric
 from tools.training.crop_files import CropFiles
 from tools.training.dataset import PairSet, open_pairs
 from tools.training.from_onnx import begin_with_onnx
-from tools.training.networks import MAX_DEPTH_M, DistanceNet, FlowNet, NeighboursNet
+from tools.training.networks import MAX_DEPTH_M, MAX_FAMILIES, DistanceNet, FlowNet, NeighboursNet
 from tools.training.samples import (
     Sample,
     flow_sample,
@@ -40,6 +40,8 @@ from tools.training.samples import (
 )
 
 Batch = dict[str, Tensor]
+NO_NAME = -1
+"""Of a shape that is no family of its own in the training's hint."""
 
 
 class Task:
@@ -140,7 +142,8 @@ class DistanceTask(Task):
         return {**drawn, "picture": picture}
 
     def _no_drone(self, rng: np.random.Generator) -> Sample:
-        hard = self.negatives[int(rng.integers(len(self.negatives)))] if rng.random() < 0.7 else None
+        is_hard = len(self.negatives) > 0 and rng.random() < 0.7
+        hard = self.negatives[int(rng.integers(len(self.negatives)))] if is_hard else None
         return no_drone_sample(self.pairs, hard, rng)
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
@@ -151,9 +154,12 @@ class DistanceTask(Task):
         error = (out[:, 0] - batch["target"][:, 0]).abs()
         centre = (out[:, 1:3] - batch["target"][:, 1:3]).abs().clamp(max=30).sum(1)
         nll = error / torch.exp(out[:, 3]) * 1.414 + out[:, 3]
-        family = F.cross_entropy(families, batch["family"], reduction="none")
+        # A generated or a fleet's own shape has no name in the hint, and where an own one's motors are may be unknown.
+        named = torch.where(batch["family"] < MAX_FAMILIES, batch["family"], NO_NAME)
+        family = F.cross_entropy(families, named, reduction="none", ignore_index=NO_NAME)
         apparent = (out[:, 5] - batch["apparent"]).abs()
-        where = -(_motor_maps(batch["motors"]) * motors).sum(2).mean(1)
+        known = batch["motors"].isfinite().all(2).all(1)
+        where = -(_motor_maps(batch["motors"].nan_to_num(0.0)) * motors).sum(2).mean(1) * known
         each = 0.3 * nll + 2.0 * error + 0.05 * centre + 0.3 * family + 2.0 * apparent + 0.2 * where
         seen = there > 0.5
         right = (out[:, 4] > 0) == seen
@@ -162,7 +168,7 @@ class DistanceTask(Task):
             "p95": float(error[seen].quantile(0.95).detach()),
             "apparent": float(apparent[seen].median().detach()),
             "centre": float(centre[seen].median().detach()),
-            "family": float((families[seen].argmax(1) == batch["family"][seen]).float().mean()),
+            "family": float((families[seen].argmax(1) == named[seen]).float().mean()),
             "drone": float(right[seen].float().mean()),
             "other": float(right[~seen].float().mean()) if (~seen).any() else float("nan"),
         }
@@ -280,23 +286,26 @@ def main() -> None:
     task.rate = arguments.rate or task.rate
     arguments.out.mkdir(parents=True, exist_ok=True)
     if arguments.start and not (arguments.out / "checkpoint.pt").is_file():
-        _start(task, arguments.start, arguments.seed)
+        try:
+            start(task, arguments.start, arguments.seed)
+        except ValueError as error:
+            raise SystemExit(f"--start: {error}") from None
         torch.save({"net": task.net.state_dict()}, arguments.out / "start.pt")
     if arguments.compile:
         task.net.compile(dynamic=False)
     train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed)
 
 
-def _start(task: Task, weights: Path, seed: int) -> None:
-    """Give the task's network the weights of another run, or of a network that it or another one exported."""
+def start(task: Task, weights: Path, seed: int) -> None:
+    """Give the task's network the weights of another run, or of a network that it or another one exported.
+
+    Raises ValueError where an ONNX file is of another network.
+    """
     if weights.suffix != ".onnx":
         begin_with(task.net, torch.load(weights, map_location="cpu")["net"])
         return
     batch = _stack(task.batch_samples(np.random.default_rng(seed)), torch.device("cpu"))
-    try:
-        begin_with_onnx(task.net, weights, lambda: task.loss(batch))
-    except ValueError as error:
-        raise SystemExit(f"--start: {error}") from None
+    begin_with_onnx(task.net, weights, lambda: task.loss(batch))
 
 
 def begin_with(net: nn.Module, weights: dict[str, Tensor]) -> None:

@@ -23,6 +23,7 @@ import numpy as np
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import development as mavlink
 
+from flockd.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.autopilot.fake_telemetry import ON_GROUND_M, Mode, TelemetryStreams, VehicleSnapshot
 from flockd.autopilot.fake_vehicle import Demand, Motion, MotionState, PointMass
 from flockd.messages import FloatArray, Setpoint
@@ -62,6 +63,7 @@ class FakeAutopilot:
         home_deg: tuple[float, float] = HOME_DEG,
         truth_port: int | None = None,
         speed_factor: float = 1.0,
+        range_finder: FakeRangeFinder | None = None,
     ) -> None:
         """Bind a socket; nothing is sent before `start`.
 
@@ -76,6 +78,7 @@ class FakeAutopilot:
             truth_port: where a simulator listens: it gets the true pose, as PX4 in software
                 sends it, and may send commands, as a ground station may.
             speed_factor: how fast its time passes.
+            range_finder: its own, which faces down; None: it has none.
         """
         self._speed_factor = speed_factor
         self.battery_share = 1.0
@@ -115,7 +118,7 @@ class FakeAutopilot:
         self._landed_s: float | None = None
         self._sticks = -math.inf, np.zeros(2)
         """When a person last moved them, and forward and right from -1 to 1."""
-        self._streams = TelemetryStreams(self._mav, truth, heartbeat_s, home_deg, self._clock())
+        self._streams = TelemetryStreams(self._mav, truth, heartbeat_s, home_deg, self._clock(), range_finder)
         self._lock = threading.RLock()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fake autopilot", daemon=True)

@@ -11,6 +11,7 @@ import numpy as np
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import development as mavlink
 
+from flockd.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.autopilot.fake_vehicle import MotionState
 from flockd.earth import metres_a_degree
 from flockd.messages import FloatArray
@@ -18,10 +19,13 @@ from flockd.messages import FloatArray
 Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "RTL", "OFFBOARD"]
 """PX4's modes by the names pymavlink gives them; LOITER is Hold."""
 
-DEFAULT_STREAMS_S = {31: 0.1, 32: 0.1, 245: 1.0, 1: 1.0, 24: 1.0, 230: 1.0, 242: 1.0, 436: 2.0}
+DEFAULT_STREAMS_S = {31: 0.1, 32: 0.1, 245: 1.0, 1: 1.0, 24: 1.0, 230: 1.0, 242: 1.0, 436: 2.0, 132: 0.1, 141: 0.1}
 """Message number and seconds between two, until another rate is requested."""
 TRUTH_S = 0.04
 ON_GROUND_M = 0.05
+UNKNOWN_COVARIANCE = 255
+FULL_SIGNAL, NO_SIGNAL = 100, 1
+"""Of DISTANCE_SENSOR's `signal_quality`, whose 0 is for sensors that do not say."""
 ALL_ESTIMATED = 1 | 2 | 4 | 8 | 16 | 32
 
 
@@ -53,7 +57,10 @@ class TelemetryStreams:
         heartbeat_s: float,
         home_deg: tuple[float, float],
         started_s: float,
+        range_finder: FakeRangeFinder | None = None,
     ) -> None:
+        self._range_finder = range_finder
+        self._clearance_m = math.nan
         self._mav, self._truth = link, truth
         self._heartbeat_s, self._home_deg, self._started_s = heartbeat_s, home_deg, started_s
         self.intervals_s = dict(DEFAULT_STREAMS_S)
@@ -75,6 +82,8 @@ class TelemetryStreams:
             24: self._send_gps,
             230: self._send_estimator,
             242: self._send_home,
+            132: self._send_range,
+            141: self._send_altitude,
         }
         for number, sender in senders.items():
             self._send_if_due(now, number, self.intervals_s[number], sender)
@@ -149,6 +158,33 @@ class TelemetryStreams:
     def _send_home(self) -> None:
         lat, lon, alt = self._place(np.zeros(3))
         self._mav.home_position_send(lat, lon, alt, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0)
+
+    def _send_range(self) -> None:
+        """Nothing in a dropout; of ground out of its limits a reading without a signal, as drivers do."""
+        self._clearance_m = math.nan
+        if self._range_finder is None:
+            return
+        motion = self._vehicle.motion
+        reading = self._range_finder.read(self._now_s, motion.position, motion.velocity, motion.R_ned_body)
+        if reading is None or reading.min_m is None or reading.max_m is None:
+            return
+        if reading.quality:
+            self._clearance_m = reading.range_m * float(motion.R_ned_body[2, 2])
+        self._mav.distance_sensor_send(
+            self._boot_ms(),
+            *(round(100.0 * metres) for metres in (reading.min_m, reading.max_m, reading.range_m)),
+            mavlink.MAV_DISTANCE_SENSOR_LASER,
+            0,
+            mavlink.MAV_SENSOR_ROTATION_PITCH_270,
+            UNKNOWN_COVARIANCE,
+            signal_quality=FULL_SIGNAL if reading.quality else NO_SIGNAL,
+        )
+
+    def _send_altitude(self) -> None:
+        """With the distance to bottom, which PX4 has as long as it has ranges."""
+        height_m = -float(self._vehicle.motion.position[2])
+        heights_m = [height_m] * 4
+        self._mav.altitude_send(self._boot_ms() * 1000, *heights_m, math.nan, self._clearance_m)
 
     def _send_truth(self) -> None:
         attitude, place = (

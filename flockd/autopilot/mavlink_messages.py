@@ -7,7 +7,7 @@ Values of enumerations are checked where they enter: one that is not known here 
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from flockd.autopilot.autopilot_status import AutopilotStatus, FlightMode, LandedState
-from flockd.messages import FloatArray, VehicleState
+from flockd.messages import FloatArray, RangeReading, VehicleState
 
 Fields = Mapping[str, Any]
 
@@ -62,6 +62,12 @@ ENUMERATIONS: Mapping[tuple[str, str], int] = {
 """How many values each field's enumeration has, from 0, by message and field: of the MAVLink dialect `common`."""
 RANGES: Mapping[tuple[str, str], range] = {("SYS_STATUS", "battery_remaining"): range(-1, 101)}
 """What other fields may be, likewise; -1 is MAVLink's own word for unknown."""
+FACES_DOWN = 25
+"""Of MAV_SENSOR_ORIENTATION: MAV_SENSOR_ROTATION_PITCH_270."""
+FULL_SIGNAL, NO_SIGNAL = 100, 1
+"""Of DISTANCE_SENSOR's `signal_quality`, in percent; 0 is for sensors that do not say."""
+RANGE_LOST_S = 0.5
+"""A range finder that is silent for so long gives way to the autopilot's own distance to bottom."""
 QUATERNION_TOLERANCE = 0.1
 """Of its norm from 1; one that is farther off is no attitude."""
 HOME_TOLERANCE_M = 0.5
@@ -94,6 +100,7 @@ class ReceivedMessages:
         self._home_moved = False
         self._landed = False
         self._text = StatusText()
+        self._ranges = RangeMessages()
 
     def add(self, name: str, fields: Fields, time_s: float) -> None:
         """Takes a message by its name and fields, NaN as null, as MAVSDK decodes them to JSON."""
@@ -102,6 +109,8 @@ class ReceivedMessages:
             if whole is None:
                 return
             fields = {**fields, "text": whole}
+        if name == "DISTANCE_SENSOR":
+            self._ranges.add(fields, time_s)
         self._newest[name] = ReceivedMessage(time_s, self._checked(name, fields))
         if name in ("HEARTBEAT", "EXTENDED_SYS_STATE"):
             status = self.status(time_s)
@@ -187,7 +196,22 @@ class ReceivedMessages:
             velocity_ned=velocity,
             position=None if self._home is None else (place - self._home)[:2],
             home_deg=self._home_deg,
+            ground_range=self.ground_range(),
         )
+
+    def ground_range(self) -> RangeReading | None:
+        """The newest of the range finder that faces down, or PX4's distance to bottom where that is silent."""
+        sensor, altitude = self._ranges.newest, self._newest.get("ALTITUDE")
+        bottom = None if altitude is None else _vector(altitude.fields, "bottom_clearance")
+        if altitude is None or bottom is None or bottom[0] <= 0.0:
+            return sensor
+        if sensor is not None and altitude.time_s - sensor.time_s <= RANGE_LOST_S:
+            return sensor
+        return RangeReading(altitude.time_s, float(bottom[0]), vertical=True)
+
+    def range_finders(self) -> Mapping[int, tuple[float, ...]]:
+        """When the last readings came, by the MAV_SENSOR_ORIENTATION of the sensor."""
+        return self._ranges.arrivals_s()
 
     def flight_mode(self) -> FlightMode:
         """By the newer of heartbeat and CURRENT_MODE; a mode that is not in `MODES` is `other`."""
@@ -215,6 +239,28 @@ class ReceivedMessages:
                 self._report(f"the autopilot sends {value}, which flockd does not know; it counts as unknown")
             self._unknown_values[value] += 1
         return {**fields, **dict.fromkeys(unknown)} if unknown else fields
+
+
+class RangeMessages:
+    """DISTANCE_SENSOR messages: of several sensors, with the newest reading of the one that faces down."""
+
+    KEPT = 200
+    """Arrivals of each orientation, to tell its rate."""
+
+    def __init__(self) -> None:
+        self.newest: RangeReading | None = None
+        self._arrivals_s: dict[int, deque[float]] = {}
+
+    def add(self, fields: Fields, time_s: float) -> None:
+        """Takes a message by its fields."""
+        orientation = int(fields.get("orientation") or 0)
+        self._arrivals_s.setdefault(orientation, deque(maxlen=self.KEPT)).append(time_s)
+        if orientation == FACES_DOWN:
+            self.newest = _range_reading(fields, time_s)
+
+    def arrivals_s(self) -> Mapping[int, tuple[float, ...]]:
+        """By orientation."""
+        return {orientation: tuple(times) for orientation, times in list(self._arrivals_s.items())}
 
 
 class StatusText:
@@ -251,6 +297,20 @@ def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
+    )
+
+
+def _range_reading(fields: Fields, time_s: float) -> RangeReading:
+    """In metres; a field that is missing is not known."""
+    centimetres = [fields.get(f"{name}_distance") for name in ("current", "min", "max")]
+    current, least, most = (None if value is None else 0.01 * float(value) for value in centimetres)
+    signal = int(fields.get("signal_quality") or 0)
+    return RangeReading(
+        time_s,
+        math.nan if current is None else current,
+        min_m=least,
+        max_m=most or None,
+        quality=None if signal == 0 else min((signal - NO_SIGNAL) / (FULL_SIGNAL - NO_SIGNAL), 1.0),
     )
 
 

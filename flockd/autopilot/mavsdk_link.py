@@ -29,7 +29,7 @@ from flockd.autopilot.autopilot_status import AutopilotError, AutopilotStatus, F
 from flockd.autopilot.mavlink_messages import MODES, Fields, ReceivedMessages, result_text
 from flockd.autopilot.throttled_log import ThrottledLog
 from flockd.config.autopilot import AutopilotParameters
-from flockd.messages import Setpoint, VehicleState
+from flockd.messages import RangeReading, Setpoint, VehicleState
 
 T = TypeVar("T")
 Clock = Callable[[], float]
@@ -52,6 +52,8 @@ STREAMS_HZ = {
     "ESTIMATOR_STATUS": (230, 2.0),
     "HOME_POSITION": (242, 1.0),
     "CURRENT_MODE": (436, 20.0),
+    "DISTANCE_SENSOR": (132, 30.0),
+    "ALTITUDE": (141, 10.0),
 }
 """What is asked for, by message number and rate. PX4 sends CURRENT_MODE at once when the mode changes, at this rate at
 most; its heartbeat comes once a second whatever one asks."""
@@ -129,6 +131,14 @@ class AutopilotLink:
     def vehicle_state(self) -> VehicleState | None:
         """See `ReceivedMessages.vehicle_state`."""
         return self._received.vehicle_state()
+
+    def ground_range(self) -> RangeReading | None:
+        """See `ReceivedMessages.ground_range`."""
+        return self._received.ground_range()
+
+    def range_finders(self) -> Mapping[int, tuple[float, ...]]:
+        """See `ReceivedMessages.range_finders`."""
+        return self._received.range_finders()
 
     def unknown_values(self) -> Mapping[str, int]:
         """See `ReceivedMessages.unknown_values`."""

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
-from flockd.choices import TRUTH_ROLES, AutopilotKind, ScaleSource, SimulatedPerception
+from flockd.choices import TRUTH_ROLES, AutopilotKind, HeightSource, ScaleSource, SimulatedPerception
 from flockd.cli import sim_fleet
 from flockd.cli.flight_summary import report_flight
 from flockd.cli.output import Phases, complain
@@ -35,6 +35,7 @@ OPTIONS = {
     "seed": "seed",
     "flow": "drone.perception.flow",
     "scale": "drone.perception.scale",
+    "height": "drone.perception.height",
     "wind": "vehicle.wind_m_s",
     "speed": "drone.mission.speed_m_s",
     "radius": "drone.mission.radius_m",
@@ -76,6 +77,9 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument("--flow", metavar="NAME", help="the model for optical flow, or `dis`")
     parser.add_argument("--scale", choices=get_args(ScaleSource), help="where the background's scale comes from")
+    parser.add_argument(
+        "--height", choices=get_args(HeightSource), help="what measures the height above ground that gives the scale"
+    )
     parser.add_argument("--drones", metavar="N", type=_flock_size, help="size of the flock")
     parser.add_argument("--duration", metavar="S", type=positive_number, help="seconds to fly")
     parser.add_argument("--wind", metavar="N,E", type=_wind, help="mean wind in m/s, to the north and to the east")
@@ -234,7 +238,9 @@ def _recorders(
 def _check_options(args: argparse.Namespace) -> None:
     sim_fleet.check_options(args)
     if args.perception == "truth":
-        idle = [option for option in ("flow", "scale", "swap", "telemetry", "record") if getattr(args, option)]
+        idle = [
+            option for option in ("flow", "scale", "height", "swap", "telemetry", "record") if getattr(args, option)
+        ]
         if idle:
             raise UsageError(f"--{idle[0]} has no meaning without networks; drop it or --perception truth")
 

@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 
 from flockd.choices import OwnVelocitySource
 from flockd.config.autopilot import AutopilotParameters
+from flockd.config.avoidance import ObstacleParameters
 from flockd.config.base import Section, refuse
 from flockd.config.flocking import FlockingParameters
 from flockd.config.geometry import GeometryParameters
@@ -39,6 +40,7 @@ class DroneConfig(Section):
     tracking: TrackingParameters = TrackingParameters()
     flocking: FlockingParameters = FlockingParameters()
     mission: MissionParameters = MissionParameters()
+    obstacles: ObstacleParameters = ObstacleParameters()
     safety: SafetyParameters = SafetyParameters()
     own_velocity: OwnVelocitySource = "vision"
     yaw: Literal["hold", "course"] = "course"

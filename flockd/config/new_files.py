@@ -68,7 +68,8 @@ def drone_text(new: NewDrone) -> str:
             f"cy: {height / 2}}}",
             f"      extrinsics: {{position_m: [{_plain(forward_m)}, {_plain(right_m)}, 0.0], yaw_deg: {yaw_deg:g}}}",
         ]
-    lines += ["", *_source(new, names), "", "perception:", "  threads: 2", "  scale: height", "own_velocity: vision"]
+    lines += ["", *_source(new, names), "", "perception:", "  threads: 2", "  scale: height"]
+    lines += ["  height: best    # a range finder that faces down, else the barometer", "own_velocity: vision"]
     lines += ["yaw: course", "", *_mission(new.mission), ""]
     lines += [
         "autopilot:",

@@ -6,7 +6,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from flockd.choices import ROLES, FlowRefinement, Provider, Role, ScaleSource
+from flockd.choices import ROLES, FlowRefinement, HeightSource, Provider, Role, ScaleSource
 from flockd.config.base import Distance, NonNegative, Positive, Section, Share, refuse
 
 DIS, NO_MODEL = "dis", "none"
@@ -79,6 +79,22 @@ class NoiseParameters(Section):
     """So many clean images in a row before a camera that was noisy is used again."""
 
 
+class RangeFinderParameters(Section):
+    """When a range to the ground is used, and how the ground below is followed from ranges."""
+
+    max_age_s: Annotated[float, Field(gt=0, le=5)] = 0.3
+    """An older reading is not used: the sensor has stopped."""
+    min_quality: Share = 0.1
+    """Nor is one whose signal is weaker, where the sensor says how strong it is."""
+    noise: Annotated[float, Field(gt=0, le=0.2)] = 0.02
+    """Standard deviation of a range, as a share of it."""
+    bridge_s: Annotated[float, Field(ge=0, le=10)] = 2.0
+    """So long after the last good reading the ground is expected where it was, with its slope and the own motion."""
+    gate_sigma: Positive = 4.0
+    """A reading farther from the expected ground, in standard deviations, is that of something else: a crate, another
+    drone, a hole. The second in a row is believed."""
+
+
 class PerceptionConfig(Section):
     """Which model fills which role. A name is a manifest in `models_dir`, or a path to one that ends in `.yaml`.
 
@@ -120,6 +136,11 @@ class PerceptionConfig(Section):
     scale: ScaleSource = "height"
     """The background's metric scale: `network` (pure RGB, as in the paper), `height` (attitude and height above ground
     from the autopilot) or `velocity` (attitude and velocity from the autopilot; the drone has to move)."""
+    height: HeightSource = "barometer"
+    """What measures the height for `scale: height`. `barometer`: the autopilot's height above home, so that the ground
+    must be level. `range_finder`: a sensor that faces down; without a good reading there is no scale. `best`: the range
+    finder, and while that gives nothing, the barometer."""
+    range_finder: RangeFinderParameters = RangeFinderParameters()
 
     @model_validator(mode="after")
     def _a_known_size_is_of_use(self) -> Self:

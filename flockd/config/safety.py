@@ -38,9 +38,12 @@ class GateParameters(Section):
     max_climb_m_s: Annotated[float, Field(gt=0, le=20)] = 1.5
     """The height that is asked for changes no faster, up or down."""
     braking_m_s2: Annotated[float, Field(gt=0, le=20)] = 1.5
-    """How hard every drone of the flock can brake: none flies faster towards a neighbour than it can stop in time."""
+    """How hard every drone of the flock can brake: none flies faster towards a neighbour or an obstacle than it can
+    stop in time."""
+    obstacle_clearance_m: Annotated[float, Field(ge=0, le=100)] = 0.6
+    """From the drone's middle to an obstacle's surface: nearer than this, no velocity towards it."""
     reaction_s: Annotated[float, Field(ge=0, le=5)] = 0.5
-    """From a neighbour's change of velocity until the own drone has begun to brake."""
+    """From a neighbour's change of velocity, or from seeing an obstacle, until the own drone has begun to brake."""
     fence_radius_m: Annotated[float, Field(gt=0, le=100_000)] | None = 100.0
     """Around home, level; beyond it only inward velocity. null: no circle."""
     fence_corners_m: tuple[tuple[_Metres, _Metres], ...] = ()

@@ -8,9 +8,10 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from flockd.config.base import NonNegative, Positive, Section, Vector3, refuse
+from flockd.config.base import NonNegative, Positive, Section, Share, Vector3, refuse
 from flockd.config.drone import DroneConfig
 from flockd.config.mission import MissionParameters, mission_faults
+from flockd.config.obstacles import ObstaclesConfig
 
 MAX_DRONES = 100
 """More would take days and all memory."""
@@ -49,6 +50,26 @@ class VehicleConfig(Section):
     """Mean wind, north and east."""
     gust_m_s: NonNegative = 0.0
     """Standard deviation of the velocity that gusts add, each axis."""
+    radius_m: Annotated[float, Field(gt=0, le=5)] = 0.35
+    """Of the sphere around its centre that holds the whole drone: nearer to an obstacle it collides."""
+
+
+class RangeFinderConfig(Section):
+    """A simulated range finder that faces down, and what separates its readings from the truth."""
+
+    rate_hz: Annotated[float, Field(gt=0, le=200)] = 30.0
+    noise: Share = 0.015
+    """Standard deviation of a reading, as a share of it; 0.01 m at least, as MAVLink sends centimetres."""
+    min_m: NonNegative = 0.15
+    """Nearer ground is not measured: the reading then has no signal."""
+    max_m: Positive = 20.0
+    """Nor is ground that is farther."""
+    tilt_deg: Annotated[float, Field(ge=0, le=10)] = 0.5
+    """Standard deviation of the angle, about each axis, by which it is mounted off the body's down axis."""
+    dropouts_per_min: NonNegative = 2.0
+    """How often it stops giving readings, ..."""
+    dropout_s: Positive = 0.5
+    """... and for how long, mean."""
 
 
 class SensorConfig(Section):
@@ -64,19 +85,28 @@ class SensorConfig(Section):
     """Standard deviation of the slow error of the autopilot's own velocity."""
     position_error_m: NonNegative = 0.5
     """Standard deviation of the slow error of the autopilot's own position, each axis."""
+    range_finder: RangeFinderConfig | None = RangeFinderConfig()
+    """null: the drone has none."""
     image_noise: NonNegative = 2.0
     """Standard deviation in grey levels of 0-255."""
 
 
 class WorldConfig(Section):
-    """The rendered world."""
+    """The world."""
 
     ground_relief_m: NonNegative = 0.15
     """Standard deviation of the gently uneven ground; 0 is flat."""
+    hills_m: Annotated[float, Field(ge=0, le=20)] = 0.0
+    """From the lowest to the highest point of its hills, where `hills_slope` lets them be so high; level at the
+    origin."""
+    hills_slope: Annotated[float, Field(gt=0, le=0.5)] = 0.15
+    """Rise for each metre where they are steepest."""
     clearance_m: NonNegative = 9.0
     """Free of obstacles on both sides of the planned path."""
     drone_family: Annotated[int, Field(ge=0, le=DRONE_FAMILIES - 1)] | Literal["any"] = "any"
     """Which mesh the drones wear; `any`: drawn from the seed, the same for the whole flock."""
+    obstacles: ObstaclesConfig | None = None
+    """Trees, or houses, walls, poles and wires, for the flock to fly between; null: none within `clearance_m`."""
 
 
 class CameraFaultConfig(Section):

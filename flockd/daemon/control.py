@@ -20,6 +20,7 @@ from flockd.daemon.stream_gate import Clearance, StreamGate
 from flockd.daemon.supervisor_inputs import InputCollector, position_from_home
 from flockd.daemon.vehicle_history import VehicleHistory
 from flockd.messages import FloatArray, Setpoint, VehicleState
+from flockd.obstacles import nearest_points
 from flockd.safety import (
     Action,
     Decision,
@@ -56,6 +57,7 @@ class Control:
         """``on_tick`` is called at the end of each tick with the decision before and the one now."""
         assert config.autopilot is not None
         self._autopilot = config.autopilot
+        self._sigmas = config.obstacles.sigmas
         self._link, self._streamer, self._stream_gate, self._pilot_loop = link, streamer, stream_gate, pilot_loop
         self._input_collector, self._requests, self._history = input_collector, requests, history
         self._operator, self._on_tick, self._clock = operator, on_tick, clock
@@ -147,6 +149,7 @@ class Control:
         confirmed = [] if result is None else [n for n in result.output.neighbours if n.confirmed]
         age_s = 0.0 if result is None else now - result.time_s
         own = np.nan_to_num(velocity)
+        ranges = None if result is None else result.output.obstacles
         places = [n.position + age_s * (n.velocity - own) for n in confirmed]  # at constant velocity since the step
         return Surroundings(
             position=position_from_home(status),
@@ -155,6 +158,7 @@ class Control:
             height_m=math.nan if vehicle is None else vehicle.height_m,
             neighbours=np.reshape(places, (len(places), 3)),
             neighbour_velocities=np.reshape([n.velocity[:2] for n in confirmed], (len(confirmed), 2)),
+            obstacles=np.empty((0, 2)) if ranges is None else nearest_points(ranges, self._sigmas) - age_s * own[:2],
         )
 
     def _takeover(self) -> Takeover | None:

@@ -15,6 +15,7 @@ from flockd.config import DroneConfig
 from flockd.daemon.watched_networks import NetworkStuckError, WatchedNetworks
 from flockd.daemon.worker import Worker
 from flockd.messages import FrameSet, MissionOrder, PilotOutput, VehicleState
+from flockd.perception.depth import OF_HEIGHT
 from flockd.pilot import FlockPilot
 from flockd.sources import FrameSource
 
@@ -63,6 +64,7 @@ class PilotLoop:
         self._pilot: FlockPilot | None = None
         self._flight = 0
         self._failure: str | None = None
+        self._height_fault: str | None = None
         self._took_s: deque[float] = deque(maxlen=STEPS_REMEMBERED)
         self.frames: FrameSet | None = None
         """The newest; None before the first."""
@@ -131,6 +133,7 @@ class PilotLoop:
         self._pilot = pilot
         self.newest = StepResult(taken_s, output, flight, number)
         self._count(self.newest)
+        self._note_height(output)
         self._on_step(frames, vehicle, output, order)
 
     def _new_pilot(self) -> FlockPilot:
@@ -142,6 +145,13 @@ class PilotLoop:
         if why != self._failure:
             self._log_event(f"a step failed: {why}")
         self._failure = why
+
+    def _note_height(self, output: PilotOutput) -> None:
+        """An event when the range finder begins to fail, for another reason, or works again."""
+        fault = next((reason for reason in output.reasons if reason.startswith(OF_HEIGHT)), None)
+        if fault != self._height_fault:
+            self._log_event(fault or f"{OF_HEIGHT}the range finder works again")
+        self._height_fault = fault
 
     def _count(self, result: StepResult) -> None:
         if result.number > 1:  # the first has nothing to compare with

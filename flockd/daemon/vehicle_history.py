@@ -8,7 +8,7 @@ from collections import deque
 import cv2
 import numpy as np
 
-from flockd.messages import FloatArray, VehicleState
+from flockd.messages import FloatArray, RangeReading, VehicleState
 
 HISTORY_S = 2.0
 
@@ -50,7 +50,15 @@ def _between(before: VehicleState, after: VehicleState, time_s: float) -> Vehicl
         velocity_ned=_between_vectors(before.velocity_ned, after.velocity_ned, share),
         position=_between_vectors(before.position, after.position, share),
         home_deg=after.home_deg,
+        ground_range=_nearest_range(before.ground_range, after.ground_range, time_s),
     )
+
+
+def _nearest_range(before: RangeReading | None, after: RangeReading | None, time_s: float) -> RangeReading | None:
+    """The reading that was taken nearest to a time: ranges jump at edges, so that nothing is between two."""
+    if before is None or after is None:
+        return after or before
+    return min(before, after, key=lambda reading: abs(reading.time_s - time_s))
 
 
 def _between_vectors(before: FloatArray | None, after: FloatArray | None, share: float) -> FloatArray | None:

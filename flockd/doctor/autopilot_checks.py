@@ -11,6 +11,7 @@ from flockd.config import DroneConfig
 from flockd.config.autopilot import AutopilotParameters
 from flockd.config.safety import GateParameters
 from flockd.doctor.finding import Finding, Level, failed, failed_from_error, passed, warned
+from flockd.doctor.range_checks import WATCHED_S, judge_range_finder
 
 HEARD_S = 10.0
 OLDEST_TRIED = (1, 14)
@@ -40,10 +41,17 @@ async def _ask(config: DroneConfig, parameters: AutopilotParameters) -> list[Fin
             found += [failed_from_error("firmware", str(firmware)), signing]
         else:
             found += [failed_from_error("firmware", str(firmware)), *await _parameters(link, config, parameters)]
+        if link.status().heartbeat_age_s <= parameters.max_heartbeat_age_s:
+            found += await _range_finder(link, config)
         found += judge_messages(link.unknown_values())
     finally:
         await link.close()
     return found
+
+
+async def _range_finder(link: AutopilotLink, config: DroneConfig) -> list[Finding]:
+    await asyncio.sleep(WATCHED_S if config.perception.height != "barometer" else 0.0)
+    return judge_range_finder(link.ground_range(), link.range_finders(), config)
 
 
 async def _firmware(link: AutopilotLink) -> Firmware | AutopilotError:

@@ -63,11 +63,13 @@ class FlockingLaw:
         The acceleration's norm is limited first, then that of V + u * st. Arguments and errors as of `acceleration`;
         `step_s` is the sampling time st.
         """
+        return self.limited(velocity, self.acceleration(velocity, positions, velocities, desired), step_s)
+
+    def limited(self, velocity: ArrayLike, acceleration: FloatArray, step_s: float) -> tuple[FloatArray, FloatArray]:
+        """As `command`, for an acceleration (2,) m/s^2 without limits."""
         if not (math.isfinite(step_s) and step_s > 0):
             raise ValueError(f"the step must be finite and positive, not {step_s} s")
-        u = limit_norm(
-            self.acceleration(velocity, positions, velocities, desired), self.parameters.max_acceleration_m_s2
-        )
+        u = limit_norm(acceleration, self.parameters.max_acceleration_m_s2)
         return limit_norm(np.asarray(velocity, dtype=float) + u * step_s, self.parameters.max_speed_m_s), u
 
 

@@ -4,6 +4,7 @@ from flockd.geometry.cameras import Camera, PinholeCamera, WideAngleCamera
 from flockd.geometry.ego_motion import estimate_ego_motion
 from flockd.geometry.ego_motion_refinement import refine_ego_motion
 from flockd.geometry.ground import ground_inverse_depth
+from flockd.geometry.ground_fit import FittedGround, GroundSamples, fit_ground
 from flockd.geometry.neighbour_motion import estimate_neighbour_motion
 from flockd.geometry.pairs import BACKGROUND_LABEL, PointPairs, grid_pixels, label_pixels, lift_matches
 from flockd.geometry.polar import log_polar, log_polar_covariance, log_polar_residual
@@ -12,11 +13,14 @@ from flockd.geometry.rigid_fit import fit_rigid
 from flockd.geometry.robust.ransac import RansacResult, ransac_rigid
 from flockd.geometry.rotations import euler_from_rotation, rotation_angle_deg, rotation_from_euler
 from flockd.geometry.transform import RigidTransform
+from flockd.geometry.triangulation import inverse_depths
 from flockd.geometry.virtual_camera import VirtualCrop, virtual_crop
 
 __all__ = [
     "BACKGROUND_LABEL",
     "Camera",
+    "FittedGround",
+    "GroundSamples",
     "PinholeCamera",
     "PointPairs",
     "RansacResult",
@@ -29,9 +33,11 @@ __all__ = [
     "estimate_ego_motion",
     "estimate_neighbour_motion",
     "euler_from_rotation",
+    "fit_ground",
     "fit_rigid",
     "grid_pixels",
     "ground_inverse_depth",
+    "inverse_depths",
     "label_pixels",
     "lift_matches",
     "log_polar",

@@ -244,10 +244,7 @@ class OnnxNetworks:
         key = str(path)
         if key not in self._models:
             if not path.is_file():
-                raise ModelError(
-                    f"perception.{role}: there is no model {name!r} ({path} is missing); "
-                    f"choose one of {', '.join(sorted(p.stem for p in self._dir.glob('*.yaml'))) or 'none at hand'}"
-                )
+                raise ModelError(f"perception.{role}: {_what_to_name_instead(name, role, path, self._dir)}")
             self._models[key] = OnnxModel(
                 path,
                 threads=self._config.threads,
@@ -263,6 +260,15 @@ class OnnxNetworks:
                 "choose another"
             )
         return model
+
+
+def _what_to_name_instead(name: str, role: Role, path: Path, folder: Path) -> str:
+    if name.endswith(".onnx"):
+        return f"{name} is a model's ONNX file; name the manifest beside it, {Path(name).with_suffix('.yaml')}"
+    if "/" in name and not name.endswith(".yaml"):
+        return f"{name!r} is no model's name, and no manifest; name the manifest, as in {Path(name) / role}.yaml"
+    at_hand = ", ".join(sorted(p.stem for p in folder.glob("*.yaml"))) or "none at hand"
+    return f"there is no model {name!r} ({path} is missing); choose one of {at_hand}"
 
 
 def _in_batches(model: OnnxModel, images: Sequence[UInt8Array]) -> dict[str, Float32Array]:

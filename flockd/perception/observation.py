@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from flockd.messages import Detection, Float32Array, UInt8Array, VehicleState
+from flockd.messages import Detection, Float32Array, GroundEstimate, ObstacleRanges, UInt8Array, VehicleState
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +36,10 @@ class Observation:
     """Why something is missing: each is one short sentence."""
     noisy_cameras: tuple[str, ...] = ()
     """Whose images were noise, and were not used."""
+    ground: GroundEstimate | None = None
+    """See `PilotOutput.ground`."""
+    obstacles: ObstacleRanges | None = None
+    """Exact ones, of a simulation; None: they are in the cameras' depth."""
 
     @property
     def flows(self) -> dict[str, Float32Array]:

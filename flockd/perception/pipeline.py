@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from flockd.config.perception import PerceptionConfig
 from flockd.geometry import Rig, ground_inverse_depth
 from flockd.inference import models_folder
 from flockd.inference.checks import Deadline, no_deadline
-from flockd.messages import Float32Array, Frame, FrameSet, VehicleState
+from flockd.messages import Float32Array, FloatArray, Frame, FrameSet, GroundEstimate, VehicleState
 from flockd.perception.continuity import ContinuityMonitor
-from flockd.perception.depth import VelocityScale, fix_by_height
+from flockd.perception.depth import GroundBelow, NoGround, VelocityScale, fix_by_height
 from flockd.perception.detection.detector import DetectionTrace, Detector
 from flockd.perception.detection.masks import depth_of_drones, without_borders
 from flockd.perception.image_noise import NoiseMonitor
@@ -32,6 +34,7 @@ class Perception:
         known_size = None if size_m is None else KnownSize(size_m, config.drone_size_sigma_m)
         self._detector = Detector(rig, networks, config.detection, known_size)
         self._velocity_scale = VelocityScale(rig) if config.scale == "velocity" else None
+        self._ground = GroundBelow(config.height, config.range_finder) if config.scale == "height" else None
         self._noise = NoiseMonitor(config.noise)
         self._continuity = ContinuityMonitor(config.noise)
         self._last: Observation | None = None
@@ -54,7 +57,8 @@ class Perception:
             lap: called at the end of each stage with its name, to time it.
         """
         usable, noisy, unusable = self._usable(frames, vehicle)
-        scenes, failed = self._scenes(usable, vehicle)
+        ground, ungrounded = self._ground_at(vehicle)
+        scenes, failed = self._scenes(usable, vehicle, ground)
         lap("scene")
         previous, restarted = self._pair(frames)
         flows = self._flows(previous, {name: usable[name] for name in scenes})
@@ -67,10 +71,16 @@ class Perception:
             depth = depth_of_drones(scene.depth, masks[name], self._rig.cameras[name], detections)
             labels = without_borders(masks[name], self._config.detection.mask_border_px)
             cameras[name] = CameraObservation(images[name], depth, labels, flows.get(name))
-        reasons = (*unusable, *failed, *restarted, *unscaled)
-        self._last = Observation(frames.time_s, vehicle, cameras, detections, previous, reasons, noisy)
+        reasons = (*unusable, *ungrounded, *failed, *restarted, *unscaled)
+        found = ground if isinstance(ground, GroundEstimate) and self._config.height != "barometer" else None
+        self._last = Observation(frames.time_s, vehicle, cameras, detections, previous, reasons, noisy, found)
         lap("detection")
         return self._last
+
+    def see_slope(self, slope: FloatArray) -> None:
+        """Takes the ground's slope (2,) at the newest observation, as the own motion showed it, for the next ones."""
+        if self._ground is not None:
+            self._ground.see_slope(slope)
 
     def _usable(self, frames: FrameSet, vehicle: VehicleState) -> tuple[dict[str, Frame], tuple[str, ...], Reasons]:
         """The frames of the rig's cameras that have the right size and show a scene, and whose show noise or damage."""
@@ -95,18 +105,32 @@ class Perception:
             del usable[name]
         return usable, tuple(noisy), reasons
 
-    def _scenes(self, frames: Mapping[str, Frame], vehicle: VehicleState) -> tuple[dict[str, SceneMaps], Reasons]:
-        """The networks' maps of every camera, with the scale that the height gives where it is to give it."""
+    def _ground_at(self, vehicle: VehicleState) -> tuple[GroundEstimate | NoGround | None, Reasons]:
+        """The ground where the height is to give the scale, and what was wrong with its source; None: it is not to."""
+        if self._ground is None:
+            return None, []
+        ground, fallback = self._ground.update(vehicle)
+        if isinstance(ground, NoGround):
+            return ground, [ground.reason]
+        return ground, [] if fallback is None else [fallback]
+
+    def _scenes(
+        self, frames: Mapping[str, Frame], vehicle: VehicleState, ground: GroundEstimate | NoGround | None
+    ) -> tuple[dict[str, SceneMaps], Reasons]:
+        """The networks' maps of every camera, with the scale that the ground gives where it is to give it."""
         scenes, reasons = {}, []
         for name, frame in frames.items():
             camera = self._rig.cameras[name]
             try:
-                ground = None
-                if self._config.scale == "height":
-                    stride = self._networks.map_stride
-                    ground = ground_inverse_depth(camera, vehicle.R_ned_body, vehicle.height_m, stride=stride)
-                scene = self._networks.scene(frame, camera, ground)
-                scenes[name] = scene if ground is None else fix_by_height(scene, ground)
+                plane = None
+                if isinstance(ground, GroundEstimate):
+                    stride, slope = self._networks.map_stride, (float(ground.slope[0]), float(ground.slope[1]))
+                    R_ned_body = vehicle.R_ned_body
+                    plane = ground_inverse_depth(camera, R_ned_body, ground.height_m, stride=stride, slope=slope)
+                scene = self._networks.scene(frame, camera, plane)
+                if isinstance(ground, NoGround):
+                    scene = replace(scene, depth=np.full_like(scene.depth, np.nan), open=None)
+                scenes[name] = scene if plane is None else fix_by_height(scene, plane)
             except (FloatingPointError, ValueError) as error:  # an output that is not finite; a height below the ground
                 reasons.append(f"camera {name}: {error}")
         return scenes, reasons

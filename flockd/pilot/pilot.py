@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
@@ -22,20 +23,26 @@ from flockd.messages import (
     MissionStatus,
     Neighbour,
     NeighbourMotion,
+    ObstacleRanges,
     PilotOutput,
     VehicleState,
     VelocityCommand,
 )
 from flockd.mission import Moment, Navigator
 from flockd.mission.navigator import middle_of
+from flockd.obstacles import Avoidance, LocalMap
 from flockd.perception import Networks, Observation, Perception, load_networks
 from flockd.perception.detection.detector import DetectionTrace
+from flockd.perception.obstacles import ObstacleRanging
+from flockd.pilot.ground_scale import scaled_by_ground
 from flockd.pilot.motions import ego_motion, neighbour_motions
 from flockd.pilot.trim import VelocityTrim
 from flockd.tracking import Blind, Measurement, Prediction, Tracker
 
 _ROTATION_TOLERANCE = 1e-3
 """Of an attitude's R R^T from the identity: MAVLink sends quaternions in single precision, which are 1e-6 off."""
+_BY_VELOCITY_SIGMA_M = 0.1
+"""Of where the drone went in a step, each axis, by its velocity alone."""
 
 
 @dataclass
@@ -46,6 +53,20 @@ class StepTrace:
     detection: DetectionTrace = field(default_factory=DetectionTrace)
 
 
+class Observer(Protocol):
+    """What sees for the pilot: see `Perception.observe`."""
+
+    def observe(
+        self,
+        frames: FrameSet,
+        vehicle: VehicleState,
+        predictions: Sequence[Prediction],
+        trace: DetectionTrace | None,
+        lap: Callable[[str], None],
+    ) -> Observation:
+        """What the newest frame set shows."""
+
+
 class FlockPilot:
     """One drone's pilot. Remembers the last frame set and its tracks; everything else comes in with each step."""
 
@@ -54,16 +75,23 @@ class FlockPilot:
         config: DroneConfig,
         networks: Networks | None = None,
         stopwatch: Callable[[], float] | None = None,
+        observer: Observer | None = None,
     ) -> None:
         """``networks`` may be shared by several pilots; None: those that the configuration names.
 
-        ``stopwatch`` (seconds) only fills ``stages_ms``. Raises ModelError.
+        ``stopwatch`` (seconds) only fills ``stages_ms``. ``observer`` takes perception's place: simulations have exact
+        ones. Raises ModelError.
         """
         self._config = config
         self._rig = build_rig(config.rig)
-        self._perception = Perception(self._rig, networks or load_networks(config.perception), config.perception)
+        self._perception = observer or Perception(
+            self._rig, networks or load_networks(config.perception), config.perception
+        )
         self._tracker = Tracker(config.tracking)
         self._law = FlockingLaw(config.flocking)
+        self._map = LocalMap(config.obstacles) if config.obstacles.enabled else None
+        self._ranging = ObstacleRanging(self._rig, config.obstacles) if config.obstacles.enabled else None
+        self._avoidance = Avoidance(config.obstacles, config.safety.gate, config.step_s)
         self._navigator = Navigator(config.mission, config.safety.gate)
         limit_m_s, memory = 0.0, 0.0
         if config.autopilot is not None and config.own_velocity == "vision":
@@ -105,6 +133,7 @@ class FlockPilot:
         observation = self._perception.observe(frames, vehicle, predictions, trace.detection, laps.end)
         trace.observation = observation
         ego, why_no_ego = self._ego_motion(observation)
+        ego = self._scaled(observation, ego)
         laps.end("ego_motion")
         motions, why_no_motion = self._neighbour_motions(observation, ego)
         laps.end("neighbour_motion")
@@ -113,7 +142,9 @@ class FlockPilot:
         tracks = self._track(observation, ego, motions, velocity)
         neighbours = self._tracker.neighbours()
         laps.end("tracking")
-        command, mission = self._command(observation, neighbours, velocity)
+        obstacles = self._local_map(observation, ego, velocity)
+        laps.end("obstacles")
+        command, mission = self._command(observation, neighbours, velocity, obstacles)
         laps.end("flocking")
         self._last_time_s = observation.time_s
         reasons = (*observation.reasons, *why_no_ego, *why_no_motion)
@@ -131,6 +162,8 @@ class FlockPilot:
             stages_ms=laps.stages_ms,
             mission=mission,
             noisy_cameras=observation.noisy_cameras or None,
+            ground=observation.ground,
+            obstacles=obstacles,
         )
 
     def _refused(self, frames: FrameSet, reason: str) -> PilotOutput:
@@ -166,6 +199,17 @@ class FlockPilot:
         if not self._is_plausible(_displacement(observation, ego), ego.interval_s):
             return None, ("ego-motion: no vehicle changes its velocity that fast",)
         return ego, ()
+
+    def _scaled(self, observation: Observation, ego: EgoMotion | None) -> EgoMotion | None:
+        """The own motion with the range finder's scale where the ground shows it, and as it is otherwise."""
+        if ego is None or observation.ground is None:
+            return ego
+        try:
+            scaled, slope = scaled_by_ground(self._rig, observation, ego)
+        except ValueError:  # at a standstill, or over water and walls: the depth maps' scale stays
+            return ego
+        self._perception.see_slope(slope)
+        return scaled
 
     def _is_plausible(self, displacement: FloatArray, interval_s: float) -> bool:
         """Whether the last velocity can have become this one; after some refusals the last one is doubted instead."""
@@ -209,6 +253,20 @@ class FlockPilot:
         measurements = [_measurement(observation, d, motions.get(d.label), caution) for d in observation.detections]
         return self._tracker.update(observation.time_s, measurements, velocity, self._blind(observation))
 
+    def _local_map(
+        self, observation: Observation, ego: EgoMotion | None, velocity: FloatArray | None
+    ) -> ObstacleRanges | None:
+        """The local map at this time; None where obstacles are not looked for."""
+        if self._map is None or self._ranging is None:
+            return None
+        displacement, sigma_m = None, 0.0
+        if ego is not None:
+            displacement, sigma_m = _displacement(observation, ego)[:2], self._config.geometry.own_displacement_sigma_m
+        elif velocity is not None and self._last_time_s is not None:
+            displacement, sigma_m = velocity[:2] * (observation.time_s - self._last_time_s), _BY_VELOCITY_SIGMA_M
+        ranges = observation.obstacles or self._ranging.ranges(observation)
+        return self._map.step(observation.time_s, ranges, displacement, sigma_m)
+
     def _blind(self, observation: Observation) -> Blind | None:
         """Where only cameras point that gave nothing in this step; None: they all did."""
         gone = self._rig.cameras.keys() - observation.cameras.keys()
@@ -226,7 +284,11 @@ class FlockPilot:
         return blind
 
     def _command(
-        self, observation: Observation, neighbours: Sequence[Neighbour], velocity: FloatArray | None
+        self,
+        observation: Observation,
+        neighbours: Sequence[Neighbour],
+        velocity: FloatArray | None,
+        obstacles: ObstacleRanges | None,
     ) -> tuple[VelocityCommand, MissionStatus | None]:
         if self._first_time_s is None:
             self._first_time_s = observation.time_s
@@ -246,7 +308,12 @@ class FlockPilot:
         self._order = None
         desired = self._navigator.pull(guidance)
         own = guidance.velocity if velocity is None else velocity[:2]  # before the first pair: as desired
-        command, acceleration = self._law.command(own, level_offsets(places), velocities, desired, self._config.step_s)
+        if obstacles is None:
+            command, acceleration = self._law.command(
+                own, level_offsets(places), velocities, desired, self._config.step_s
+            )
+        else:
+            command, acceleration = self._avoidance.command(self._law, own, places, velocities, desired, obstacles)
         self._yaw_rad = self._heading(vehicle, guidance.course_rad)
         trim = self._trim.velocity
         return VelocityCommand(
@@ -275,6 +342,9 @@ def _why_refused(frames: FrameSet, vehicle: VehicleState) -> str | None:
         return "input refused: the height is not finite"
     if velocity is not None and not np.isfinite(velocity).all():
         return "input refused: the autopilot's velocity is not finite"
+    reading = vehicle.ground_range
+    if reading is not None and not math.isfinite(reading.time_s):
+        return "input refused: the range finder's time is not finite"
     for place in (vehicle.position, vehicle.home_deg):
         if place is not None and not np.isfinite(place).all():
             return "input refused: the autopilot's position is not finite"

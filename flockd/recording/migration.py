@@ -31,7 +31,7 @@ RENAMED: Final[Mapping[str, str]] = {"desired": "mission"}
 """Keys of 0.1.0, or whole sections, that only have another name or place now: the new one."""
 
 
-ADDED: Final[Mapping[str, Json]] = {"perception.verification": "none"}
+ADDED: Final[Mapping[str, Json]] = {"perception.verification": "none", "perception.height": "barometer"}
 """Keys that came later, with the value that does what was done before them, where the recording has their section."""
 
 

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 
 from flockd.config.safety import GateParameters
 from flockd.messages import FloatArray, Setpoint, VelocityCommand
+from flockd.safety.approach import towards_neighbours, towards_obstacles
 from flockd.safety.fence import is_fenced, offsets_outside
+from flockd.safety.half_planes import nearest_within
 from flockd.safety.policy import Action
 
 
@@ -53,6 +55,8 @@ class Surroundings:
     """(n, 2) m/s over ground, north and east."""
     height_m: float
     """Of the drone, as in `VehicleState`; NaN: not known."""
+    obstacles: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    """(m, 2) metres, north and east, relative to the drone: points of obstacles, each the nearest that it may be."""
 
 
 class Objection(StrEnum):
@@ -66,10 +70,12 @@ class Objection(StrEnum):
     COMMAND_TOO_LARGE = "command_too_large"
     POSITION_UNKNOWN = "position_unknown"
     NEIGHBOUR_UNKNOWN = "neighbour_unknown"
+    OBSTACLE_UNKNOWN = "obstacle_unknown"
     SLOWED = "slowed"
     FENCE = "fence"
     HEIGHT = "height"
     SEPARATION = "separation"
+    OBSTACLE = "obstacle"
 
 
 @dataclass(frozen=True)
@@ -80,18 +86,11 @@ class Verdict:
     objections: tuple[Objection, ...]
 
 
-_ROUNDING_M_S = 1e-9
-_PARALLEL = 1e-6
-"""Sine of the angle between two directions below which their limits are not combined."""
-
 _COLUMN = 1.5
 """A neighbour is above or below where its level range is less than this many times the degraded separation: downwash
 widens on its way down, and neither drone stays exactly where it is."""
 _HEIGHT_NOISE_M = 0.3
 """Of a height over a few seconds: a difference this small between asked and own height is no climb."""
-
-SAME_SPOT_M = 0.1
-"""A neighbour whose level range is smaller is above or below, in no direction: cameras do not measure one that well."""
 
 _MOVES = frozenset({Action.FLY, Action.FLY_DEGRADED})
 _STANDS_STILL = frozenset({Action.OFFER, Action.HOVER, Action.ASK_HOLD, Action.ASK_RETURN, Action.ASK_LAND})
@@ -101,8 +100,9 @@ class Gate:
     """Passes each setpoint, makes it smaller, or sends nothing.
 
     A speed above the limit or a number that is not finite is refused: the drone is brought to a standstill instead.
-    Towards a neighbour the drone flies no faster than it can brake before the minimum distance. Every change of
-    velocity stays within the acceleration limit, except that this one, and no velocity outward beyond the fence, win.
+    Towards a neighbour or an obstacle the drone flies no faster than it can brake before the minimum distance. Every
+    change of velocity stays within the acceleration limit, except that this one, and no velocity outward beyond the
+    fence, win.
     """
 
     def __init__(self, parameters: GateParameters) -> None:
@@ -171,6 +171,7 @@ class Gate:
                 Objection.NEIGHBOUR_UNKNOWN,
                 not (np.isfinite(around.neighbours).all() and np.isfinite(around.neighbour_velocities).all()),
             ),
+            (Objection.OBSTACLE_UNKNOWN, not np.isfinite(around.obstacles).all()),
         )
         found = [objection for objection, holds in refusals if holds]
         objections.extend(found)
@@ -195,45 +196,22 @@ class Gate:
     def _within_space(
         self, velocity: FloatArray, action: Action, around: Surroundings, objections: list[Objection]
     ) -> FloatArray:
-        """The velocity without what leads farther out of the fence or too fast towards a neighbour."""
+        """The velocity without what leads out of the fence, too fast towards a neighbour, or too near an obstacle."""
         p = self._parameters
         separation_m = p.min_separation_m if action is Action.FLY else p.degraded_separation_m
         outward = _units(offsets_outside(p, around.position))
-        towards, most_m_s = self._approaches(around, separation_m)
-        limits = np.concatenate([np.zeros(len(outward)), most_m_s])
-        for objection, directions, most in (
-            (Objection.FENCE, outward, np.zeros(len(outward))),
-            (Objection.SEPARATION, towards, most_m_s),
-        ):
-            if (directions @ velocity > most).any():
+        to_neighbours = towards_neighbours(p, around.neighbours, around.neighbour_velocities, separation_m)
+        to_obstacles = towards_obstacles(around.obstacles, p.obstacle_clearance_m, p.braking_m_s2, p.reaction_s)
+        limits = {
+            Objection.FENCE: (outward, np.zeros(len(outward))),
+            Objection.SEPARATION: to_neighbours,
+            Objection.OBSTACLE: to_obstacles,
+        }
+        for objection, (directions, most_m_s) in limits.items():
+            if (directions @ velocity > most_m_s).any():
                 objections.append(objection)
-        return _within(velocity, np.concatenate([outward, towards]), limits)
-
-    def _approaches(self, around: Surroundings, separation_m: float) -> tuple[FloatArray, FloatArray]:
-        """For each neighbour about at the drone's height its direction, (n, 2), and how fast to fly there, (n,) m/s.
-
-        Nearer than the separation: not at all. Farther, so fast that the distance left suffices if both brake, as in
-        Shalev-Shwartz et al. 2017, "On a formal model of safe and scalable self-driving cars": with v towards a
-        neighbour that comes at w (negative: goes), the drone's reaction time r and its braking b,
-        (v + w) r + v^2 / 2b + w |w| / 2b <= distance left. The neighbour's gate may let it begin to come just now; so,
-        but for following one that goes, this has to hold for w = v too.
-        """
-        p = self._parameters
-        offsets = around.neighbours
-        ranges = np.hypot(offsets[:, 0], offsets[:, 1])
-        about_m = max(separation_m, p.vertical_separation_m)
-        meets = (ranges >= SAME_SPOT_M) & (ranges < math.inf) & (np.abs(offsets[:, 2]) < about_m)
-        offsets, ranges = offsets[meets], ranges[meets]
-        towards = offsets[:, :2] / ranges[:, None]
-        velocities = np.nan_to_num(around.neighbour_velocities[meets], posinf=0.0, neginf=0.0)
-        comes = -np.clip(np.sum(velocities * towards, axis=1), -p.max_speed_m_s, p.max_speed_m_s)
-        left_m = ranges - separation_m
-        lag = p.braking_m_s2 * p.reaction_s
-        square = lag**2 + 2 * p.braking_m_s2 * (left_m - comes * p.reaction_s) - comes * np.abs(comes)
-        most_m_s = np.sqrt(np.maximum(square, lag**2)) - lag
-        if_both_come = np.sqrt(lag**2 + p.braking_m_s2 * np.maximum(left_m, 0.0)) - lag
-        most_m_s = np.minimum(most_m_s, np.maximum(if_both_come, -comes))
-        return towards, np.where(left_m > 0, most_m_s, 0.0)
+        every_direction, every_limit = zip(*limits.values(), strict=True)
+        return nearest_within(velocity, np.concatenate(every_direction), np.concatenate(every_limit))
 
     def _within_climb(
         self, now_s: float, action: Action, wanted: Wanted, around: Surroundings, objections: list[Objection]
@@ -281,35 +259,6 @@ class Gate:
         if within != height_m:
             objections.append(Objection.HEIGHT)
         return within
-
-
-def _within(velocity: FloatArray, directions: FloatArray, limits: FloatArray) -> FloatArray:
-    """The nearest velocity whose part along each direction, (n, 2) of length 1, is within its limit, (n,), 0 or more.
-
-    In the plane that is the velocity itself, or its foot on the line where one limit is reached, or the point where
-    two such lines cross. Standstill always fits.
-    """
-    over = directions @ velocity - limits
-    if (over <= 0).all():
-        return velocity
-    feet = velocity - over[:, None] * directions
-    candidates = np.vstack([np.zeros(2), feet, _crossings(directions, limits)])
-    fitting = candidates[np.max(candidates @ directions.T - limits, axis=1) <= _ROUNDING_M_S]
-    nearest: FloatArray = fitting[np.argmin(np.linalg.norm(fitting - velocity, axis=1))]
-    return nearest
-
-
-def _crossings(directions: FloatArray, limits: FloatArray) -> FloatArray:
-    """(m, 2): where two of the lines n . v = limit cross, for each two that are not parallel (Cramer's rule)."""
-    i, j = np.triu_indices(len(directions), 1)
-    a, b = directions[i], directions[j]
-    determinants = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-    cross = np.abs(determinants) > _PARALLEL
-    a, b, c, d = a[cross], b[cross], limits[i][cross], limits[j][cross]
-    crossings: FloatArray = (
-        np.column_stack([c * b[:, 1] - d * a[:, 1], d * a[:, 0] - c * b[:, 0]]) / determinants[cross, None]
-    )
-    return crossings
 
 
 def _units(vectors: FloatArray) -> FloatArray:

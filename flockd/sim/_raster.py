@@ -1,7 +1,8 @@
 """The renderer's inner loops, compiled: set up triangles, fill a depth buffer, shade what is seen.
 
-No fastmath: a shared edge must give the same crossing from both of its triangles (no holes), and the bytes must not
-depend on the number of threads. Each image row is written by one thread only.
+No fastmath: a shared edge must give the same crossing from both of its triangles (no holes). Each runs on the thread
+that calls it and releases the GIL, so that several images are drawn side by side: compiled for parallel rows, they took
+three times as long to compile, and half as much processor time again to run.
 """
 # Compiled loops are long: a call for each few lines would cost more than it explains.
 # ruff: noqa: PLR0912, PLR0915
@@ -12,20 +13,18 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
-# Bit-reversed, so that a thread's contiguous share of the loop is spread over the whole image.
-BAND_ORDER = np.array([0, 8, 4, 12, 2, 10, 6, 14, 1, 9, 5, 13, 3, 11, 7, 15], dtype=np.int64)
 SUBSAMPLES = 3
 """Drone colours are sampled 3x3 per pixel; the middle sample is the pixel's centre."""
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def project_vertices(vertices: Any, P: Any, origin: Any) -> Any:
     """Homogeneous pixel coordinates (n, 3): ``P @ (vertex - origin)``."""
     count = vertices.shape[0]
     q = np.empty((count, 3))
-    for i in prange(count):
+    for i in range(count):
         x = vertices[i, 0] - origin[0]
         y = vertices[i, 1] - origin[1]
         z = vertices[i, 2] - origin[2]
@@ -34,14 +33,14 @@ def project_vertices(vertices: Any, P: Any, origin: Any) -> Any:
     return q
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def set_up_triangles(q: Any, triangles: Any, width: int, height: int, rows: Any, planes: Any) -> None:
     """Row range and plane coefficients of each triangle that can be seen; rows (0, -1) for the others.
 
     ``planes[t]`` holds three edge functions (a, b, c), positive inside, and 1/z, each linear in (u, v, 1). They are
     homogeneous (cross products of the corners), so a triangle that reaches behind the camera needs no clipping.
     """
-    for t in prange(triangles.shape[0]):
+    for t in range(triangles.shape[0]):
         rows[t, 0] = 0
         rows[t, 1] = -1
         a = triangles[t, 0]
@@ -96,7 +95,7 @@ def set_up_triangles(q: Any, triangles: Any, width: int, height: int, rows: Any,
         p[11] = (e0z + e1z + e2z) / determinant
 
 
-@njit(cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def list_visible(rows: Any) -> Any:
     """Indices of the triangles with a row range, in order."""
     count = 0
@@ -112,50 +111,41 @@ def list_visible(rows: Any) -> Any:
     return visible
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
-def fill(visible: Any, rows: Any, planes: Any, inverse_depth: Any, hit: Any, band_order: Any) -> None:
+@njit(nogil=True, cache=True, error_model="numpy")
+def fill(visible: Any, rows: Any, planes: Any, inverse_depth: Any, hit: Any) -> None:
     """Nearest triangle of each pixel: 1/z and its index (-1 for none), row spans from the edges' crossings."""
     height, width = hit.shape
-    bands = band_order.shape[0]
-    for i in prange(bands):
-        band = band_order[i]
-        first = height * band // bands
-        last = height * (band + 1) // bands - 1
-        for y in range(first, last + 1):
-            for x in range(width):
-                inverse_depth[y, x] = 0.0
-                hit[y, x] = -1
-        for k in range(visible.shape[0]):
-            t = visible[k]
-            if rows[t, 1] < first or rows[t, 0] > last:
+    for y in range(height):
+        for x in range(width):
+            inverse_depth[y, x] = 0.0
+            hit[y, x] = -1
+    for k in range(visible.shape[0]):
+        t = visible[k]
+        p = planes[t]
+        for y in range(rows[t, 0], rows[t, 1] + 1):
+            v = y + 0.5
+            low = 0.0
+            high = width - 1.0
+            for e in range(0, 9, 3):
+                slope = p[e]
+                rest = p[e + 1] * v + p[e + 2]
+                if slope > 0.0:
+                    low = max(low, -rest / slope - 0.5)
+                elif slope < 0.0:
+                    high = min(high, -rest / slope - 0.5)
+                elif rest < 0.0:
+                    high = -1.0
+            if low > high:
                 continue
-            p = planes[t]
-            top = max(first, rows[t, 0])
-            bottom = min(last, rows[t, 1])
-            for y in range(top, bottom + 1):
-                v = y + 0.5
-                low = 0.0
-                high = width - 1.0
-                for e in range(0, 9, 3):
-                    slope = p[e]
-                    rest = p[e + 1] * v + p[e + 2]
-                    if slope > 0.0:
-                        low = max(low, -rest / slope - 0.5)
-                    elif slope < 0.0:
-                        high = min(high, -rest / slope - 0.5)
-                    elif rest < 0.0:
-                        high = -1.0
-                if low > high:
-                    continue
-                x0 = math.ceil(low)
-                x1 = math.floor(high)
-                step = np.float32(p[9])
-                start = np.float32(p[9] * (x0 + 0.5) + p[10] * v + p[11])
-                for x in range(x0, x1 + 1):
-                    value = start + step * np.float32(x - x0)
-                    if value > inverse_depth[y, x]:
-                        inverse_depth[y, x] = value
-                        hit[y, x] = t
+            x0 = math.ceil(low)
+            x1 = math.floor(high)
+            step = np.float32(p[9])
+            start = np.float32(p[9] * (x0 + 0.5) + p[10] * v + p[11])
+            for x in range(x0, x1 + 1):
+                value = start + step * np.float32(x - x0)
+                if value > inverse_depth[y, x]:
+                    inverse_depth[y, x] = value
+                    hit[y, x] = t
 
 
 @njit(cache=True, error_model="numpy")
@@ -292,7 +282,7 @@ def _sky(sky: Any, bits: int, x: float, y: float, z: float) -> Any:
     return _bilinear(sky, 0, bits, a + 0.5, b + 0.5)
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def shade_scene(
     hit: Any,
     planes: Any,
@@ -331,83 +321,81 @@ def shade_scene(
     ground_size = 1 << ground_bits
     ground_level = ground_bits - math.log2(2.0 * extent)
     focal_level = math.log2(focal)
-    lanes = 32
-    for lane in prange(lanes):
-        for y in range(lane, height, lanes):
-            v = y + 0.5
-            for x in range(width):
-                u = x + 0.5
-                cx = inverse_K[0, 0] * u + inverse_K[0, 1] * v + inverse_K[0, 2]
-                cy = inverse_K[1, 1] * v + inverse_K[1, 2]
-                rn = R[0, 0] * cx + R[0, 1] * cy + R[0, 2]
-                re = R[1, 0] * cx + R[1, 1] * cy + R[1, 2]
-                rd = R[2, 0] * cx + R[2, 1] * cy + R[2, 2]
-                length = math.sqrt(cx * cx + cy * cy + 1.0)
-                t = hit[y, x]
-                if t < 0:
-                    depth[y, x] = np.inf
-                    packed = _sky(sky, sky_bits, rn, re, rd)
-                    rgb[y, x, 0] = _encode(tone, 4.0 * _byte(packed, 0))
-                    rgb[y, x, 1] = _encode(tone, 4.0 * _byte(packed, 8))
-                    rgb[y, x, 2] = _encode(tone, 4.0 * _byte(packed, 16))
-                    continue
-                z = 1.0 / (planes[t, 9] * u + planes[t, 10] * v + planes[t, 11])
-                depth[y, x] = z
-                n = origin[0] + rn * z
-                e = origin[1] + re * z
-                d = origin[2] + rd * z
-                nn, ne, nd = normals[t, 0], normals[t, 1], normals[t, 2]
-                # A pixel's footprint, log2 of metres: midway between its short side and its long one, which
-                # grazing views stretch; a little sharper than that.
-                facing = max(0.02 * length, -(rn * nn + re * ne + rd * nd))
-                footprint = 0.5 * math.log2(z * z * length / facing) - focal_level - 0.4
-                free = 1.0
-                if x >= blob_rows[y, 0] and x < blob_rows[y, 1]:
-                    free = _blob_shadow(blobs, sun, n, e, d)
-                kind = texture[t]
-                if kind < 0:
-                    gu = (n / extent + 1.0) * 0.5
-                    gv = (e / extent + 1.0) * 0.5
-                    beyond = not (0.0 <= gu <= 1.0 and 0.0 <= gv <= 1.0)
-                    if beyond:  # mirrored
-                        gu = 1.0 - abs(1.0 - (gu - 2.0 * math.floor(gu * 0.5)))
-                        gv = 1.0 - abs(1.0 - (gv - 2.0 * math.floor(gv * 0.5)))
-                    packed = sample(ground, 0, ground_bits, gv, gu, footprint + ground_level)
-                    gi = ground_kind[
-                        min(ground_size - 1, int(gu * ground_size)), min(ground_size - 1, int(gv * ground_size))
-                    ]
-                    tile = ground_detail[gi, 1]
-                    fine = sample(
-                        texels,
-                        int(ground_detail[gi, 0]) * texture_area,
-                        texture_bits,
-                        e * tile,
-                        n * tile,
-                        footprint + ground_detail[gi, 2],
-                    )
-                    cosine = -sun[2] if beyond else _byte(packed, 24)
-                    red, green, blue = _light(light, -1.0, cosine * free)
-                    red *= 2.0 * _byte(packed, 0) * _byte(fine, 0)
-                    green *= 2.0 * _byte(packed, 8) * _byte(fine, 8)
-                    blue *= 2.0 * _byte(packed, 16) * _byte(fine, 16)
-                else:
-                    tu = uv[t, 0, 0] * n + uv[t, 0, 1] * e + uv[t, 0, 2] * d + uv[t, 0, 3]
-                    tv = uv[t, 1, 0] * n + uv[t, 1, 1] * e + uv[t, 1, 2] * d + uv[t, 1, 3]
-                    fine = sample(texels, kind * texture_area, texture_bits, tu, tv, footprint + level[t])
-                    cosine = nn * sun[0] + ne * sun[1] + nd * sun[2]
-                    if cosine > 0.0:
-                        cosine *= free * sun_reaches(shadow, shadow_frame, n + 0.08 * nn, e + 0.08 * ne, d + 0.08 * nd)
-                    red, green, blue = _light(light, nd, max(0.0, cosine))
-                    red *= 2.0 * tint[t, 0] * _byte(fine, 0)
-                    green *= 2.0 * tint[t, 1] * _byte(fine, 8)
-                    blue *= 2.0 * tint[t, 2] * _byte(fine, 16)
-                clear = math.exp(-fog * z * length)
-                rgb[y, x, 0] = _encode(tone, red * clear + light[4, 0] * (1.0 - clear))
-                rgb[y, x, 1] = _encode(tone, green * clear + light[4, 1] * (1.0 - clear))
-                rgb[y, x, 2] = _encode(tone, blue * clear + light[4, 2] * (1.0 - clear))
+    for y in range(height):
+        v = y + 0.5
+        for x in range(width):
+            u = x + 0.5
+            cx = inverse_K[0, 0] * u + inverse_K[0, 1] * v + inverse_K[0, 2]
+            cy = inverse_K[1, 1] * v + inverse_K[1, 2]
+            rn = R[0, 0] * cx + R[0, 1] * cy + R[0, 2]
+            re = R[1, 0] * cx + R[1, 1] * cy + R[1, 2]
+            rd = R[2, 0] * cx + R[2, 1] * cy + R[2, 2]
+            length = math.sqrt(cx * cx + cy * cy + 1.0)
+            t = hit[y, x]
+            if t < 0:
+                depth[y, x] = np.inf
+                packed = _sky(sky, sky_bits, rn, re, rd)
+                rgb[y, x, 0] = _encode(tone, 4.0 * _byte(packed, 0))
+                rgb[y, x, 1] = _encode(tone, 4.0 * _byte(packed, 8))
+                rgb[y, x, 2] = _encode(tone, 4.0 * _byte(packed, 16))
+                continue
+            z = 1.0 / (planes[t, 9] * u + planes[t, 10] * v + planes[t, 11])
+            depth[y, x] = z
+            n = origin[0] + rn * z
+            e = origin[1] + re * z
+            d = origin[2] + rd * z
+            nn, ne, nd = normals[t, 0], normals[t, 1], normals[t, 2]
+            # A pixel's footprint, log2 of metres: midway between its short side and its long one, which
+            # grazing views stretch; a little sharper than that.
+            facing = max(0.02 * length, -(rn * nn + re * ne + rd * nd))
+            footprint = 0.5 * math.log2(z * z * length / facing) - focal_level - 0.4
+            free = 1.0
+            if x >= blob_rows[y, 0] and x < blob_rows[y, 1]:
+                free = _blob_shadow(blobs, sun, n, e, d)
+            kind = texture[t]
+            if kind < 0:
+                gu = (n / extent + 1.0) * 0.5
+                gv = (e / extent + 1.0) * 0.5
+                beyond = not (0.0 <= gu <= 1.0 and 0.0 <= gv <= 1.0)
+                if beyond:  # mirrored
+                    gu = 1.0 - abs(1.0 - (gu - 2.0 * math.floor(gu * 0.5)))
+                    gv = 1.0 - abs(1.0 - (gv - 2.0 * math.floor(gv * 0.5)))
+                packed = sample(ground, 0, ground_bits, gv, gu, footprint + ground_level)
+                gi = ground_kind[
+                    min(ground_size - 1, int(gu * ground_size)), min(ground_size - 1, int(gv * ground_size))
+                ]
+                tile = ground_detail[gi, 1]
+                fine = sample(
+                    texels,
+                    int(ground_detail[gi, 0]) * texture_area,
+                    texture_bits,
+                    e * tile,
+                    n * tile,
+                    footprint + ground_detail[gi, 2],
+                )
+                cosine = -sun[2] if beyond else _byte(packed, 24)
+                red, green, blue = _light(light, -1.0, cosine * free)
+                red *= 2.0 * _byte(packed, 0) * _byte(fine, 0)
+                green *= 2.0 * _byte(packed, 8) * _byte(fine, 8)
+                blue *= 2.0 * _byte(packed, 16) * _byte(fine, 16)
+            else:
+                tu = uv[t, 0, 0] * n + uv[t, 0, 1] * e + uv[t, 0, 2] * d + uv[t, 0, 3]
+                tv = uv[t, 1, 0] * n + uv[t, 1, 1] * e + uv[t, 1, 2] * d + uv[t, 1, 3]
+                fine = sample(texels, kind * texture_area, texture_bits, tu, tv, footprint + level[t])
+                cosine = nn * sun[0] + ne * sun[1] + nd * sun[2]
+                if cosine > 0.0:
+                    cosine *= free * sun_reaches(shadow, shadow_frame, n + 0.08 * nn, e + 0.08 * ne, d + 0.08 * nd)
+                red, green, blue = _light(light, nd, max(0.0, cosine))
+                red *= 2.0 * tint[t, 0] * _byte(fine, 0)
+                green *= 2.0 * tint[t, 1] * _byte(fine, 8)
+                blue *= 2.0 * tint[t, 2] * _byte(fine, 16)
+            clear = math.exp(-fog * z * length)
+            rgb[y, x, 0] = _encode(tone, red * clear + light[4, 0] * (1.0 - clear))
+            rgb[y, x, 1] = _encode(tone, green * clear + light[4, 1] * (1.0 - clear))
+            rgb[y, x, 2] = _encode(tone, blue * clear + light[4, 2] * (1.0 - clear))
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def smooth_edges(hit: Any, texture: Any, planes: Any, linear: Any, tone: Any, sharp: Any, rgb: Any) -> None:
     """Blend colours along edges by coverage: four samples in a pixel ask which of the 3x3 pixels' triangles covers it.
 
@@ -415,83 +403,81 @@ def smooth_edges(hit: Any, texture: Any, planes: Any, linear: Any, tone: Any, sh
     copy of ``sharp``.
     """
     height, width = hit.shape
-    lanes = 32
-    for lane in prange(lanes):
-        seen = np.empty(9, dtype=np.int64)
-        at = np.empty((9, 2), dtype=np.int64)
-        for y in range(lane, height, lanes):
-            for x in range(width):
-                t = hit[y, x]
-                if (
-                    (x == 0 or hit[y, x - 1] == t)
-                    and (x + 1 == width or hit[y, x + 1] == t)
-                    and (y == 0 or hit[y - 1, x] == t)
-                    and (y + 1 == height or hit[y + 1, x] == t)
-                ):
+    seen = np.empty(9, dtype=np.int64)
+    at = np.empty((9, 2), dtype=np.int64)
+    for y in range(height):
+        for x in range(width):
+            t = hit[y, x]
+            if (
+                (x == 0 or hit[y, x - 1] == t)
+                and (x + 1 == width or hit[y, x + 1] == t)
+                and (y == 0 or hit[y - 1, x] == t)
+                and (y + 1 == height or hit[y + 1, x] == t)
+            ):
+                continue
+            edge = False
+            for k in range(4):
+                i = x + (k == 0) - (k == 1)
+                j = y + (k == 2) - (k == 3)
+                if i < 0 or j < 0 or i >= width or j >= height or hit[j, i] == t:
                     continue
-                edge = False
-                for k in range(4):
-                    i = x + (k == 0) - (k == 1)
-                    j = y + (k == 2) - (k == 3)
-                    if i < 0 or j < 0 or i >= width or j >= height or hit[j, i] == t:
-                        continue
-                    if t >= 0 and hit[j, i] >= 0 and texture[t] < 0 and texture[hit[j, i]] < 0:
-                        continue  # the ground runs on
-                    change = 0.0
-                    for channel in range(3):
-                        change += abs(float(sharp[j, i, channel]) - float(sharp[y, x, channel]))
-                    edge = edge or change > 24.0
-                if not edge:
-                    continue
-                count = 1
-                seen[0] = t
-                at[0, 0] = y
-                at[0, 1] = x
-                for j in range(max(0, y - 1), min(height, y + 2)):
-                    for i in range(max(0, x - 1), min(width, x + 2)):
-                        known = False
-                        for k in range(count):
-                            known = known or seen[k] == hit[j, i]
-                        if not known:
-                            seen[count] = hit[j, i]
-                            at[count, 0] = j
-                            at[count, 1] = i
-                            count += 1
-                red = 0.0
-                green = 0.0
-                blue = 0.0
-                for sample_number in range(4):
-                    u = x + 0.125 + 0.25 * sample_number
-                    v = y + 0.125 + 0.25 * ((2 * sample_number + 1) % 5)
-                    best = -1
-                    nearest = 0.0
+                if t >= 0 and hit[j, i] >= 0 and texture[t] < 0 and texture[hit[j, i]] < 0:
+                    continue  # the ground runs on
+                change = 0.0
+                for channel in range(3):
+                    change += abs(float(sharp[j, i, channel]) - float(sharp[y, x, channel]))
+                edge = edge or change > 24.0
+            if not edge:
+                continue
+            count = 1
+            seen[0] = t
+            at[0, 0] = y
+            at[0, 1] = x
+            for j in range(max(0, y - 1), min(height, y + 2)):
+                for i in range(max(0, x - 1), min(width, x + 2)):
+                    known = False
                     for k in range(count):
-                        if seen[k] < 0:
-                            if best < 0:
-                                best = k
-                            continue
-                        p = planes[seen[k]]
-                        if (
-                            p[0] * u + p[1] * v + p[2] >= 0.0
-                            and p[3] * u + p[4] * v + p[5] >= 0.0
-                            and p[6] * u + p[7] * v + p[8] >= 0.0
-                        ):
-                            inverse = p[9] * u + p[10] * v + p[11]
-                            if inverse > nearest:
-                                nearest = inverse
-                                best = k
-                    best = max(0, best)  # covered by something that no pixel shows: as the pixel itself
-                    j = at[best, 0]
-                    i = at[best, 1]
-                    red += 0.25 * linear[sharp[j, i, 0]]
-                    green += 0.25 * linear[sharp[j, i, 1]]
-                    blue += 0.25 * linear[sharp[j, i, 2]]
-                rgb[y, x, 0] = _encode(tone, red)
-                rgb[y, x, 1] = _encode(tone, green)
-                rgb[y, x, 2] = _encode(tone, blue)
+                        known = known or seen[k] == hit[j, i]
+                    if not known:
+                        seen[count] = hit[j, i]
+                        at[count, 0] = j
+                        at[count, 1] = i
+                        count += 1
+            red = 0.0
+            green = 0.0
+            blue = 0.0
+            for sample_number in range(4):
+                u = x + 0.125 + 0.25 * sample_number
+                v = y + 0.125 + 0.25 * ((2 * sample_number + 1) % 5)
+                best = -1
+                nearest = 0.0
+                for k in range(count):
+                    if seen[k] < 0:
+                        if best < 0:
+                            best = k
+                        continue
+                    p = planes[seen[k]]
+                    if (
+                        p[0] * u + p[1] * v + p[2] >= 0.0
+                        and p[3] * u + p[4] * v + p[5] >= 0.0
+                        and p[6] * u + p[7] * v + p[8] >= 0.0
+                    ):
+                        inverse = p[9] * u + p[10] * v + p[11]
+                        if inverse > nearest:
+                            nearest = inverse
+                            best = k
+                best = max(0, best)  # covered by something that no pixel shows: as the pixel itself
+                j = at[best, 0]
+                i = at[best, 1]
+                red += 0.25 * linear[sharp[j, i, 0]]
+                green += 0.25 * linear[sharp[j, i, 1]]
+                blue += 0.25 * linear[sharp[j, i, 2]]
+            rgb[y, x, 0] = _encode(tone, red)
+            rgb[y, x, 1] = _encode(tone, green)
+            rgb[y, x, 2] = _encode(tone, blue)
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def shade_drone(
     hit: Any,
     inverse_depth: Any,
@@ -530,93 +516,89 @@ def shade_drone(
     sun = light[0]
     texture_area = ((4 << (2 * texture_bits)) - 1) // 3
     texture_size = float(1 << texture_bits)
-    lanes = 16
-    for lane in prange(lanes):
-        for row in range(lane, count, lanes):
-            y = top + row
-            for column in range(hit.shape[1] // s):
-                x = left + column
-                limit = 0.0
-                if depth[y, x] < np.inf:
-                    limit = 1.0 / depth[y, x]
-                covered = 0
-                sum_red = 0.0
-                sum_green = 0.0
-                sum_blue = 0.0
-                last = -1
-                red = 0.0
-                green = 0.0
-                blue = 0.0
-                for j in range(s):
-                    for i in range(s):
-                        t = hit[row * s + j, column * s + i]
-                        if t < 0 or inverse_depth[row * s + j, column * s + i] <= limit:
-                            continue
-                        covered += 1
-                        if t != last:
-                            last = t
-                            a = column * s + i + 0.5
-                            b = row * s + j + 0.5
-                            z = 1.0 / (planes[t, 9] * a + planes[t, 10] * b + planes[t, 11])
-                            u = left + a / s
-                            v = top + b / s
-                            cx = inverse_K[0, 0] * u + inverse_K[0, 1] * v + inverse_K[0, 2]
-                            cy = inverse_K[1, 1] * v + inverse_K[1, 2]
-                            rn = (R[0, 0] * cx + R[0, 1] * cy + R[0, 2]) * z
-                            re = (R[1, 0] * cx + R[1, 1] * cy + R[1, 2]) * z
-                            rd = (R[2, 0] * cx + R[2, 1] * cy + R[2, 2]) * z
-                            away = math.sqrt(rn * rn + re * re + rd * rd)
-                            nn, ne, nd = normals[t, 0], normals[t, 1], normals[t, 2]
-                            n = origin[0] + rn - position[0]
-                            e = origin[1] + re - position[1]
-                            d = origin[2] + rd - position[2]
-                            bx = R_ned_body[0, 0] * n + R_ned_body[1, 0] * e + R_ned_body[2, 0] * d
-                            by = R_ned_body[0, 1] * n + R_ned_body[1, 1] * e + R_ned_body[2, 1] * d
-                            bz = R_ned_body[0, 2] * n + R_ned_body[1, 2] * e + R_ned_body[2, 2] * d
-                            tu = uv[t, 0, 0] * bx + uv[t, 0, 1] * by + uv[t, 0, 2] * bz + uv[t, 0, 3]
-                            tv = uv[t, 1, 0] * bx + uv[t, 1, 1] * by + uv[t, 1, 2] * bz + uv[t, 1, 3]
-                            facing = max(0.05, -(rn * nn + re * ne + rd * nd) / away)
-                            # Tiles per metre are the same both ways on a drone.
-                            tile = abs(uv[t, 0, 0]) + abs(uv[t, 0, 1]) + abs(uv[t, 0, 2])
-                            fine = sample(
-                                texels,
-                                texture[t] * texture_area,
-                                texture_bits,
-                                tu,
-                                tv,
-                                math.log2(z / focal / math.sqrt(facing) * texture_size * tile),
+    for row in range(count):
+        y = top + row
+        for column in range(hit.shape[1] // s):
+            x = left + column
+            limit = 0.0
+            if depth[y, x] < np.inf:
+                limit = 1.0 / depth[y, x]
+            covered = 0
+            sum_red = 0.0
+            sum_green = 0.0
+            sum_blue = 0.0
+            last = -1
+            red = 0.0
+            green = 0.0
+            blue = 0.0
+            for j in range(s):
+                for i in range(s):
+                    t = hit[row * s + j, column * s + i]
+                    if t < 0 or inverse_depth[row * s + j, column * s + i] <= limit:
+                        continue
+                    covered += 1
+                    if t != last:
+                        last = t
+                        a = column * s + i + 0.5
+                        b = row * s + j + 0.5
+                        z = 1.0 / (planes[t, 9] * a + planes[t, 10] * b + planes[t, 11])
+                        u = left + a / s
+                        v = top + b / s
+                        cx = inverse_K[0, 0] * u + inverse_K[0, 1] * v + inverse_K[0, 2]
+                        cy = inverse_K[1, 1] * v + inverse_K[1, 2]
+                        rn = (R[0, 0] * cx + R[0, 1] * cy + R[0, 2]) * z
+                        re = (R[1, 0] * cx + R[1, 1] * cy + R[1, 2]) * z
+                        rd = (R[2, 0] * cx + R[2, 1] * cy + R[2, 2]) * z
+                        away = math.sqrt(rn * rn + re * re + rd * rd)
+                        nn, ne, nd = normals[t, 0], normals[t, 1], normals[t, 2]
+                        n = origin[0] + rn - position[0]
+                        e = origin[1] + re - position[1]
+                        d = origin[2] + rd - position[2]
+                        bx = R_ned_body[0, 0] * n + R_ned_body[1, 0] * e + R_ned_body[2, 0] * d
+                        by = R_ned_body[0, 1] * n + R_ned_body[1, 1] * e + R_ned_body[2, 1] * d
+                        bz = R_ned_body[0, 2] * n + R_ned_body[1, 2] * e + R_ned_body[2, 2] * d
+                        tu = uv[t, 0, 0] * bx + uv[t, 0, 1] * by + uv[t, 0, 2] * bz + uv[t, 0, 3]
+                        tv = uv[t, 1, 0] * bx + uv[t, 1, 1] * by + uv[t, 1, 2] * bz + uv[t, 1, 3]
+                        facing = max(0.05, -(rn * nn + re * ne + rd * nd) / away)
+                        # Tiles per metre are the same both ways on a drone.
+                        tile = abs(uv[t, 0, 0]) + abs(uv[t, 0, 1]) + abs(uv[t, 0, 2])
+                        fine = sample(
+                            texels,
+                            texture[t] * texture_area,
+                            texture_bits,
+                            tu,
+                            tv,
+                            math.log2(z / focal / math.sqrt(facing) * texture_size * tile),
+                        )
+                        cosine = nn * sun[0] + ne * sun[1] + nd * sun[2]
+                        if cosine > 0.0:
+                            cosine *= sun_reaches(
+                                shadow, shadow_frame, n + position[0], e + position[1], d + position[2]
                             )
-                            cosine = nn * sun[0] + ne * sun[1] + nd * sun[2]
-                            if cosine > 0.0:
-                                cosine *= sun_reaches(
-                                    shadow, shadow_frame, n + position[0], e + position[1], d + position[2]
-                                )
-                            red, green, blue = _light(light, nd, max(0.0, cosine))
-                            clear = math.exp(-fog * away)
-                            red = red * 2.0 * colours[t, 0] * _byte(fine, 0) * clear + light[4, 0] * (1.0 - clear)
-                            green = green * 2.0 * colours[t, 1] * _byte(fine, 8) * clear + light[4, 1] * (1.0 - clear)
-                            blue = blue * 2.0 * colours[t, 2] * _byte(fine, 16) * clear + light[4, 2] * (1.0 - clear)
-                        sum_red += red
-                        sum_green += green
-                        sum_blue += blue
-                if covered == 0:
-                    continue
-                share = 1.0 / (s * s)
-                rest = 1.0 - covered * share
-                rgb[y, x, 0] = _encode(tone, linear[rgb[y, x, 0]] * rest + sum_red * share)
-                rgb[y, x, 1] = _encode(tone, linear[rgb[y, x, 1]] * rest + sum_green * share)
-                rgb[y, x, 2] = _encode(tone, linear[rgb[y, x, 2]] * rest + sum_blue * share)
-                middle_y = row * s + s // 2
-                middle_x = column * s + s // 2
-                t = hit[middle_y, middle_x]
-                if t >= 0 and inverse_depth[middle_y, middle_x] > limit:
-                    depth[y, x] = 1.0 / (
-                        planes[t, 9] * (middle_x + 0.5) + planes[t, 10] * (middle_y + 0.5) + planes[t, 11]
-                    )
-                    ids[y, x] = identity
+                        red, green, blue = _light(light, nd, max(0.0, cosine))
+                        clear = math.exp(-fog * away)
+                        red = red * 2.0 * colours[t, 0] * _byte(fine, 0) * clear + light[4, 0] * (1.0 - clear)
+                        green = green * 2.0 * colours[t, 1] * _byte(fine, 8) * clear + light[4, 1] * (1.0 - clear)
+                        blue = blue * 2.0 * colours[t, 2] * _byte(fine, 16) * clear + light[4, 2] * (1.0 - clear)
+                    sum_red += red
+                    sum_green += green
+                    sum_blue += blue
+            if covered == 0:
+                continue
+            share = 1.0 / (s * s)
+            rest = 1.0 - covered * share
+            rgb[y, x, 0] = _encode(tone, linear[rgb[y, x, 0]] * rest + sum_red * share)
+            rgb[y, x, 1] = _encode(tone, linear[rgb[y, x, 1]] * rest + sum_green * share)
+            rgb[y, x, 2] = _encode(tone, linear[rgb[y, x, 2]] * rest + sum_blue * share)
+            middle_y = row * s + s // 2
+            middle_x = column * s + s // 2
+            t = hit[middle_y, middle_x]
+            if t >= 0 and inverse_depth[middle_y, middle_x] > limit:
+                depth[y, x] = 1.0 / (planes[t, 9] * (middle_x + 0.5) + planes[t, 10] * (middle_y + 0.5) + planes[t, 11])
+                ids[y, x] = identity
 
 
-@njit(cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def fill_shadow(vertices: Any, triangles: Any, frame: Any, shadow: Any) -> None:
     """Greatest height towards the sun in each cell of the shadow map (parallel projection)."""
     size = shadow.shape[0]
@@ -667,7 +649,7 @@ def _noise(maps: Any, k: int, u: float, v: float) -> float:
     return float(above * (1.0 - wy) + below * wy)
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def compose_ground(
     noise: Any,
     extent: float,
@@ -696,7 +678,7 @@ def compose_ground(
     size = kinds.shape[0]
     cells = heights.shape[0] - 1
     coarse = openness.shape[0]
-    for row in prange(size):
+    for row in range(size):
         n = ((row + 0.5) / size * 2.0 - 1.0) * extent
         for column in range(size):
             e = ((column + 0.5) / size * 2.0 - 1.0) * extent
@@ -787,11 +769,11 @@ def compose_ground(
             kinds[row, column] = kind
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def flow(depth: Any, ids: Any, depth_2: Any, ids_2: Any, H: Any, t: Any, out: Any, valid: Any) -> None:
     """Pixel motion: ``z2 (u2, v2, 1) = z H[id] (u, v, 1) + t[id]``, and whether the second image shows that point."""
     height, width = ids.shape
-    for y in prange(height):
+    for y in range(height):
         for x in range(width):
             u = x + 0.5
             v = y + 0.5

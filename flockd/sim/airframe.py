@@ -33,8 +33,8 @@ class DroneModel:
     uv: FloatArray
     """(m, 2, 4) texture coordinates in tiles from body (x, y, z, 1)."""
     hubs: FloatArray
-    """(4, 3) tops of the motors: front right, rear right, rear left, front left (plus frame: front, right, rear, left).
-    """
+    """(n, 3) tops of the motors; of the families: front right, rear right, rear left, front left (plus frame: front,
+    right, rear, left)."""
     extent: FloatArray
     """(2, 3) least and greatest corner, propellers at any angle; a family's own."""
     size_m: float
@@ -123,6 +123,32 @@ class Airframe:
         slope = np.radians([-70, -35, 0, 35, 70])
         rings = [oval(r, r, z) + centre for r, z in zip(radius * np.cos(slope), radius * np.sin(slope), strict=True)]
         self.loft(rings, [colour] * (len(rings) - 1))
+
+    def ring(
+        self,
+        x: float,
+        y: float,
+        z: float,
+        inner: float,
+        outer: float,
+        half_height: float,
+        first: FloatArray,
+        second: FloatArray,
+    ) -> None:
+        """A short upright tube with a wall, every third segment in the first colour."""
+        sides = 12
+        angle = np.arange(sides) * 2 * math.pi / sides
+        ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        profile = ((outer, half_height), (outer, -half_height), (inner, -half_height), (inner, half_height))
+        vertices = np.vstack([np.column_stack([ring * r + (x, y), np.full(sides, z + up)]) for r, up in profile])
+        faces, tint = [], []
+        for k in range(sides):
+            j = (k + 1) % sides
+            for side in range(4):
+                a, b = side * sides, (side + 1) % 4 * sides
+                faces += [(a + k, b + j, a + j), (a + k, b + k, b + j)]
+                tint += [first if k % 3 == 0 else second] * 2
+        self.mesh.add(vertices, np.array(faces), int(self.skin[0]), np.array(tint), (0.3, 0.3))
 
     def rotor(self, x: float, y: float, z: float, radius: float, motor: tuple[float, float], *, accent: bool) -> None:
         """A motor standing on (x, y, z), with its propeller. ``motor``: radius and height."""

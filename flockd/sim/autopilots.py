@@ -14,9 +14,11 @@ from typing import Protocol, Self
 import numpy as np
 
 from flockd.autopilot.fake_autopilot import FakeAutopilot
+from flockd.autopilot.fake_range_finder import FakeRangeFinder, Ground
 from flockd.autopilot.fake_vehicle import Demand, MotionState
 from flockd.config.scenario import ScenarioConfig, StartConfig, VehicleConfig
 from flockd.errors import UnavailableError, UsageError
+from flockd.messages import FloatArray
 from flockd.sim.ground_station import FULL_STICK_M_S, home_deg
 from flockd.sim.leftovers import described, px4_instance, user_of_port
 from flockd.sim.processes import Program, Programs
@@ -84,8 +86,9 @@ class SimulatedAutopilots:
 
     name = "fake autopilot"
 
-    def __init__(self, scenario: ScenarioConfig, speed_factor: float) -> None:
-        self._scenario, self._speed_factor = scenario, speed_factor
+    def __init__(self, scenario: ScenarioConfig, speed_factor: float, ground: Ground) -> None:
+        """``ground``: of the world, which range finders measure to."""
+        self._scenario, self._speed_factor, self._ground = scenario, speed_factor, ground
         self.ports = tuple(Ports(_free_port(), _free_port()) for _ in scenario.vehicles)
         self._stack = ExitStack()
 
@@ -108,6 +111,7 @@ class SimulatedAutopilots:
                 home_deg=home_deg(position),
                 truth_port=ports.truth,
                 speed_factor=self._speed_factor,
+                range_finder=self._range_finder(i, position),
             )
             fake.parameters["MIS_TAKEOFF_ALT"] = -float(position[2])
             fake.parameters["MPC_VEL_MANUAL"] = FULL_STICK_M_S
@@ -116,6 +120,17 @@ class SimulatedAutopilots:
     def programs(self) -> Sequence[Program]:
         """See `Autopilots`."""
         return ()
+
+    def _range_finder(self, number: int, home: FloatArray) -> FakeRangeFinder | None:
+        """A vehicle's, which counts its position from home."""
+        config = self._scenario.sensors.range_finder
+        if config is None:
+            return None
+
+        def ground(north: FloatArray, east: FloatArray) -> FloatArray:
+            return self._ground(north + home[0], east + home[1])
+
+        return FakeRangeFinder(config, ground, (self._scenario.seed, number, 2))
 
 
 class Px4s:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from typing import Protocol
 
 import cv2
@@ -15,7 +17,7 @@ from flockd.messages import FloatArray, Frame, FrameSet, UInt8Array
 from flockd.mission import Moment, Navigator
 from flockd.sim.camera_faults import CameraFaults
 from flockd.sim.drone_models import FAMILIES, drone_model
-from flockd.sim.renderer import Renderer
+from flockd.sim.renderer import Renderer, View
 from flockd.sim.truth_perception import RenderTruth
 from flockd.sim.vehicles import REFERENCE_DEG
 from flockd.sim.world import World
@@ -50,29 +52,43 @@ class CameraSimulator:
             ground_relief_m=scenario.world.ground_relief_m,
             keep_out=planned_path(scenario),
             clearance_m=scenario.world.clearance_m + _spread(scenario),
+            hills_m=scenario.world.hills_m,
+            hills_slope=scenario.world.hills_slope,
         )
         rng = np.random.default_rng([scenario.seed, 1])
         drawn, wanted = int(rng.integers(FAMILIES)), scenario.world.drone_family
         family = drawn if wanted == "any" else wanted
         self._count = len(scenario.vehicles)
         models = [drone_model(family, int(rng.integers(1 << 31))) for _ in range(self._count)]
+        self._world = world
         self._renderer = Renderer(world, models)
         self._noise = _ImageNoise(scenario.sensors.image_noise, scenario.seed)
         self._faults = CameraFaults(scenario.faults, scenario.seed)
+        self._executor = ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="camera")
+
+    def ground_height(self, north: FloatArray, east: FloatArray) -> FloatArray:
+        """(n,) metres above z = 0 of the ground that is drawn, at points (n,) north and east."""
+        return self._world.height_at(north, east)
 
     def capture(self, drone: int, step: int, time_s: float, vehicles: FlockPoses) -> tuple[FrameSet, RenderTruth]:
         """The frame set of one drone, and the truth behind it."""
         others = [i for i in range(self._count) if i != drone]
         R_ned_body, position = vehicles.R_ned_body[drone], vehicles.position[drone]
-        views, turns, places, frames = {}, {}, {}, {}
-        for name, mounted in self.rig.cameras.items():
-            turns[name] = R_ned_body @ mounted.T_body_camera.rotation
-            places[name] = position + R_ned_body @ mounted.T_body_camera.translation
-            views[name] = self._renderer.render(
-                mounted.camera.matrix, mounted.camera.size, turns[name], places[name],
+        cameras = self.rig.cameras
+        turns = {name: R_ned_body @ mounted.T_body_camera.rotation for name, mounted in cameras.items()}
+        places = {name: position + R_ned_body @ mounted.T_body_camera.translation for name, mounted in cameras.items()}
+
+        def view(name: str) -> View:
+            camera = cameras[name].camera
+            return self._renderer.render(
+                camera.matrix, camera.size, turns[name], places[name],
                 drone_rotations=vehicles.R_ned_body, drone_positions=vehicles.position, shown=others,
             )  # fmt: skip
-            image = self._faults.applied(drone, name, time_s, self._noise.add(views[name].rgb))
+
+        # Side by side; noise and faults are drawn in the cameras' order, so that the images do not depend on that.
+        views, frames = dict(zip(cameras, self._executor.map(view, cameras), strict=True)), {}
+        for name, seen in views.items():
+            image = self._faults.applied(drone, name, time_s, self._noise.add(seen.rgb))
             frames[name] = Frame(name, image, time_s, step)
         truth = RenderTruth(views, turns, places, R_ned_body, position, vehicles.R_ned_body, vehicles.position, others)
         return FrameSet(time_s, frames), truth

@@ -9,7 +9,6 @@ import math
 
 import numpy as np
 
-from flockd.messages import FloatArray
 from flockd.sim.airframe import Airframe, DroneModel, outline, oval
 
 
@@ -138,35 +137,9 @@ def _ducted(c: Airframe) -> None:
     c.box((-0.075, 0, -0.004), (0.014, 0.024, 0.014), c.rear)
     for x, y in _corners(0.082, 0.085):
         accent = c.front if x > 0 else c.rear
-        _ring(c, x, y, 0.074, 0.08, 0.02, accent, c.body)
+        c.ring(x, y, 0.0, 0.074, 0.08, 0.02, accent, c.body)
         c.rotor(x, y, 0.012, 0.068, (0.011, 0.02), accent=False)
         c.beam((x - 0.077, y, 0.014), (x + 0.077, y, 0.014), (0.004, 0.003), [c.frame])
-
-
-def _ring(
-    c: Airframe,
-    x: float,
-    y: float,
-    inner: float,
-    outer: float,
-    half_height: float,
-    first: FloatArray,
-    second: FloatArray,
-) -> None:
-    """A short tube with a wall, every third segment in the first colour."""
-    sides = 12
-    angle = np.arange(sides) * 2 * math.pi / sides
-    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    profile = ((outer, half_height), (outer, -half_height), (inner, -half_height), (inner, half_height))
-    vertices = np.vstack([np.column_stack([ring * r + (x, y), np.full(sides, z)]) for r, z in profile])
-    faces, tint = [], []
-    for k in range(sides):
-        j = (k + 1) % sides
-        for side in range(4):
-            a, b = side * sides, (side + 1) % 4 * sides
-            faces += [(a + k, b + j, a + j), (a + k, b + k, b + j)]
-            tint += [first if k % 3 == 0 else second] * 2
-    c.mesh.add(vertices, np.array(faces), int(c.skin[0]), np.array(tint), (0.3, 0.3))
 
 
 def _long_legs(c: Airframe) -> None:

@@ -9,10 +9,13 @@ import numpy as np
 
 from flockd.config.scenario import ScenarioConfig
 from flockd.flocking import FlockingLaw
-from flockd.messages import BoolArray, FloatArray, MissionStatus
+from flockd.messages import BoolArray, FloatArray, MissionStatus, ObstacleRanges
 from flockd.mission import Moment, Navigator
 from flockd.mission.navigator import middle_of
+from flockd.obstacles import Avoidance
 from flockd.sim.handover import Handover
+from flockd.sim.obstacle_worlds import obstacles_of
+from flockd.sim.obstacles import true_ranges
 from flockd.sim.vehicles import REFERENCE_DEG, Vehicles
 
 
@@ -32,12 +35,14 @@ class Commands:
     """See `PilotOutput.mission`."""
     desired: FloatArray
     """(n, 2) m/s: what each mission wants, times its pull."""
+    obstacles: tuple[ObstacleRanges | None, ...]
+    """What each drone saw of them; None where it does not look for any."""
 
     @classmethod
     def of(cls, n: int) -> Self:
         """Standstill of n drones, to be filled."""
         still = (np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n), np.full(n, np.nan))
-        return cls(*still, missions=(None,) * n, desired=np.zeros((n, 2)))
+        return cls(*still, missions=(None,) * n, desired=np.zeros((n, 2)), obstacles=(None,) * n)
 
     @property
     def takeovers(self) -> list[str | None]:
@@ -46,7 +51,7 @@ class Commands:
 
 
 class ExactFlock:
-    """The flocking law and each drone's mission on the exact states of all drones."""
+    """The flocking law and each drone's mission on the exact states of all drones, and exact ranges to obstacles."""
 
     def __init__(self, scenario: ScenarioConfig) -> None:
         drone = scenario.drone
@@ -56,18 +61,23 @@ class ExactFlock:
             for i, vehicle in enumerate(scenario.vehicles)
         ]
         self._yaw_rad = np.full(len(self._pilots), start_yaw(scenario))
+        self._obstacles = obstacles_of(scenario)
+        self._avoids = drone.obstacles.enabled
+        self._avoidances = [Avoidance(drone.obstacles, drone.safety.gate, drone.step_s) for _ in self._pilots]
 
     def step(self, time_s: float, positions: FloatArray, velocities: FloatArray) -> Commands:
         """Of drones at (n, 3) m and (n, 3) m/s in NED; called in order of time."""
-        found = [self._of(i, time_s, positions, velocities) for i in range(len(self._pilots))]
+        seen = [true_ranges(self._obstacles, time_s, place) if self._obstacles.solids else None for place in positions]
+        found = [self._of(i, time_s, positions, velocities, ranges) for i, ranges in enumerate(seen)]
         velocity, acceleration, yaw_rad, height_m, missions, desired = zip(*found, strict=True)
         self._yaw_rad = np.array(yaw_rad)
         return Commands(
-            np.array(velocity), np.array(acceleration), self._yaw_rad, np.array(height_m), missions, np.array(desired)
-        )
+            np.array(velocity), np.array(acceleration), self._yaw_rad, np.array(height_m), missions, np.array(desired),
+            tuple(seen),
+        )  # fmt: skip
 
     def _of(
-        self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray
+        self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray, ranges: ObstacleRanges | None
     ) -> tuple[FloatArray, FloatArray, float, float, MissionStatus | None, FloatArray]:
         here, moving = positions[:, :2], velocities[:, :2]
         pilot = self._pilots[i]
@@ -79,7 +89,13 @@ class ExactFlock:
         moment = Moment(time_s, here[i], middle_of(offsets[self._sees(offsets)]), np.array(REFERENCE_DEG))
         guidance = pilot.step(moment)
         desired = pilot.pull(guidance)
-        command, acceleration = self._law.command(moving[i], offsets, moving[others], desired, self._step_s)
+        if ranges is None or not self._avoids:
+            command, acceleration = self._law.command(moving[i], offsets, moving[others], desired, self._step_s)
+        else:
+            places = positions[others] - positions[i]
+            command, acceleration = self._avoidances[i].command(
+                self._law, moving[i], places, moving[others], desired, ranges
+            )
         yaw_rad = float(self._yaw_rad[i]) if guidance.course_rad is None else guidance.course_rad
         height_m = np.nan if guidance.height_m is None else guidance.height_m
         return command, acceleration, yaw_rad, height_m, pilot.status(guidance), desired

@@ -20,6 +20,7 @@ from flockd.config.scenario import ScenarioConfig
 from flockd.errors import UnavailableError
 from flockd.flight_log.fleet_log import FleetFrame, FleetRun, fleet_key_frames, fleet_log
 from flockd.sim.autopilots import Autopilots, Px4s, SimulatedAutopilots
+from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.daemons import Daemons, fleet_configs
 from flockd.sim.exact_states import HandPilot, exact_states_at
 from flockd.sim.frame_server import FrameServer
@@ -77,7 +78,13 @@ def fly_fleet(
         stack.enter_context(_kept(folder, logs))
         recorded = recordings or folder / "recordings"
         recorded.mkdir(parents=True, exist_ok=True)
-        autopilots = stack.enter_context(_autopilots(scenario, kind, speed_factor, environment, folder))
+        cameras = CameraSimulator(scenario)  # takes seconds
+        autopilots: Autopilots = (
+            Px4s(scenario, speed_factor, environment, folder)
+            if kind == "px4"
+            else SimulatedAutopilots(scenario, speed_factor, cameras.ground_height)
+        )
+        stack.enter_context(autopilots)
         ports, endpoint = autopilots.ports, _free_endpoint()
         configs = fleet_configs(scenario, sitl, ports=ports, endpoint=endpoint, speed_factor=speed_factor)
         names = [None if vehicle.by_hand else f"drone{i + 1}" for i, vehicle in enumerate(scenario.vehicles)]
@@ -85,7 +92,7 @@ def fly_fleet(
         station = stack.enter_context(GroundStation([port.truth for port in ports], clock))
         server = stack.enter_context(
             FrameServer(
-                scenario, names, endpoint=endpoint, rate_hz=configs[0].source.shared_memory.rate_hz,
+                cameras, names, endpoint=endpoint, rate_hz=configs[0].source.shared_memory.rate_hz,
                 poses=station.poses, clock=clock, speed_factor=speed_factor,
             )
         )  # fmt: skip
@@ -326,14 +333,6 @@ def _at_standstill(scenario: ScenarioConfig) -> ScenarioConfig:
     """With all drones hovering at the start, as autopilots begin in Hold."""
     vehicles = tuple(vehicle.model_copy(update={"velocity_m_s": (0.0, 0.0)}) for vehicle in scenario.vehicles)
     return scenario.model_copy(update={"vehicles": vehicles})
-
-
-def _autopilots(
-    scenario: ScenarioConfig, kind: AutopilotKind, speed_factor: float, environment: Mapping[str, str], folder: Path
-) -> Autopilots:
-    if kind == "px4":
-        return Px4s(scenario, speed_factor, environment, folder)
-    return SimulatedAutopilots(scenario, speed_factor)
 
 
 @contextmanager

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Self
 
-from flockd.config.scenario import ScenarioConfig
 from flockd.flight_log.fleet_log import FleetFrame
 from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.ground_station import Poses
@@ -19,7 +18,7 @@ class FrameServer:
 
     def __init__(
         self,
-        scenario: ScenarioConfig,
+        cameras: CameraSimulator,
         drones: Sequence[str | None],
         *,
         endpoint: str,
@@ -28,12 +27,11 @@ class FrameServer:
         clock: Callable[[], float],
         speed_factor: float,
     ) -> None:
-        """Generates the world, which takes seconds. ``drones`` are names in the order of ``poses``; None: without
-        cameras.
+        """``drones`` are names in the order of ``poses``; None: without cameras.
 
         Raises UnavailableError for an endpoint that cannot be used.
         """
-        self._cameras = CameraSimulator(scenario)
+        self._cameras = cameras
         self._publisher = FramePublisher(listen=[endpoint])
         self._drones, self._period_s = tuple(drones), 1.0 / rate_hz
         self._poses, self._clock, self._speed_factor = poses, clock, speed_factor

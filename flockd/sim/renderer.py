@@ -1,16 +1,14 @@
 """Camera images of a world with drones in it: colour, exact metric depth and instance ids, on the CPU.
 
-Triangles become homogeneous edge functions (no clipping), the nearest one of each pixel is found in horizontal bands in
-parallel, and only what is seen is shaded. The result does not depend on the number of threads.
+Triangles become homogeneous edge functions (no clipping), the nearest one of each pixel is found, and only what is seen
+is shaded. An image is drawn on the thread that asks for it; several may be drawn side by side.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -96,23 +94,22 @@ class Renderer:
         blobs, blob_rows = self._shadows(positions, P, origin, width, height)
         depth = np.empty((height, width), dtype=np.float32)
         sharp = np.empty((height, width, 3), dtype=np.uint8)
-        with _threads_worth(width * height):
-            q = _raster.project_vertices(world.vertices, P, origin)
-            rows, planes = _set_up(q, world.triangles, width, height)
-            hit, _ = _fill(rows, planes, width, height)
-            _raster.shade_scene(
-                hit, planes, inverse_K, R, origin, focal, world.normals, world.texture, world.uv, world.level,
-                world.tint, world.texels, textures.TEXTURE_BITS, world.ground_map, GROUND_MAP_BITS, world.ground_kind,
-                world.ground_detail, world.extent_m, world.shadow_map, world.shadow_frame, world.light,
-                world.fog_per_m, world.sky, SKY_BITS, world.tone, blobs, blob_rows, sharp, depth,
-            )  # fmt: skip
-            view = View(
-                rgb=sharp.copy(),
-                depth=depth,
-                ids=np.zeros((height, width), dtype=np.uint8),
-                distractors=np.zeros((height, width), dtype=np.bool_),
-            )
-            _raster.smooth_edges(hit, world.texture, planes, self._linear, world.tone, sharp, view.rgb)
+        q = _raster.project_vertices(world.vertices, P, origin)
+        rows, planes = _set_up(q, world.triangles, width, height)
+        hit, _ = _fill(rows, planes, width, height)
+        _raster.shade_scene(
+            hit, planes, inverse_K, R, origin, focal, world.normals, world.texture, world.uv, world.level,
+            world.tint, world.texels, textures.TEXTURE_BITS, world.ground_map, GROUND_MAP_BITS, world.ground_kind,
+            world.ground_detail, world.extent_m, world.shadow_map, world.shadow_frame, world.light,
+            world.fog_per_m, world.sky, SKY_BITS, world.tone, blobs, blob_rows, sharp, depth,
+        )  # fmt: skip
+        view = View(
+            rgb=sharp.copy(),
+            depth=depth,
+            ids=np.zeros((height, width), dtype=np.uint8),
+            distractors=np.zeros((height, width), dtype=np.bool_),
+        )
+        _raster.smooth_edges(hit, world.texture, planes, self._linear, world.tone, sharp, view.rgb)
         chosen = np.arange(count)[np.asarray(shown)] if len(np.asarray(shown)) else np.arange(0)
         things: list[tuple[int, DroneModel | Distractor, FloatArray, FloatArray, FloatArray]] = [
             (int(k) + 1, self._drones[k], self._normals[k], rotations[k], positions[k]) for k in chosen
@@ -154,16 +151,15 @@ class Renderer:
         s = _raster.SUBSAMPLES
         zoom = np.array([[s, 0.0, -s * left], [0.0, s, -s * top], [0.0, 0.0, 1.0]])
         wide, high = s * (right - left), s * (bottom - top)
-        with _threads_worth(wide * high):
-            q = _raster.project_vertices(vertices, np.ascontiguousarray(zoom @ P), np.zeros(3))
-            rows, planes = _set_up(q, model.triangles, wide, high)
-            hit, inverse_depth = _fill(rows, planes, wide, high)
-            _raster.shade_drone(
-                hit, inverse_depth, planes, left, top, inverse_K, R, origin, focal, np.ascontiguousarray(rotation),
-                position, normals @ rotation.T, model.texture, model.uv, model.colours, self._machine,
-                textures.TEXTURE_BITS, world.shadow_map, world.shadow_frame, world.light, world.fog_per_m, world.tone,
-                self._linear, identity, view.rgb, view.depth, view.ids,
-            )  # fmt: skip
+        q = _raster.project_vertices(vertices, np.ascontiguousarray(zoom @ P), np.zeros(3))
+        rows, planes = _set_up(q, model.triangles, wide, high)
+        hit, inverse_depth = _fill(rows, planes, wide, high)
+        _raster.shade_drone(
+            hit, inverse_depth, planes, left, top, inverse_K, R, origin, focal, np.ascontiguousarray(rotation),
+            position, normals @ rotation.T, model.texture, model.uv, model.colours, self._machine,
+            textures.TEXTURE_BITS, world.shadow_map, world.shadow_frame, world.light, world.fog_per_m, world.tone,
+            self._linear, identity, view.rgb, view.depth, view.ids,
+        )  # fmt: skip
 
     def _shadows(
         self, positions: FloatArray, P: FloatArray, origin: FloatArray, width: int, height: int
@@ -201,19 +197,8 @@ def _set_up(q: FloatArray, triangles: Indices, width: int, height: int) -> tuple
 def _fill(rows: Indices, planes: FloatArray, width: int, height: int) -> tuple[Indices, Float32Array]:
     inverse_depth = np.empty((height, width), dtype=np.float32)
     hit = np.empty((height, width), dtype=np.int32)
-    _raster.fill(_raster.list_visible(rows), rows, planes, inverse_depth, hit, _raster.BAND_ORDER)
+    _raster.fill(_raster.list_visible(rows), rows, planes, inverse_depth, hit)
     return hit, inverse_depth
-
-
-@contextmanager
-def _threads_worth(samples: int) -> Iterator[None]:
-    """One thread for a small image: waiting for a second one would cost more than it saves."""
-    threads = numba.get_num_threads()
-    numba.set_num_threads(threads if samples > 100_000 else 1)
-    try:
-        yield
-    finally:
-        numba.set_num_threads(threads)
 
 
 def _bounds(q: FloatArray, width: int, height: int) -> tuple[int, int, int, int]:

@@ -182,7 +182,10 @@ class _VisionPilots:
             i: FlockPilot(scenario.drone_of(i), self._truths.get(i, learned), stopwatch=time.perf_counter)
             for i in self._drones
         }
-        self._autopilots = {i: SimulatedAutopilot(scenario.sensors, seed=scenario.seed, drone=i) for i in self._drones}
+        ground = self._cameras.ground_height
+        self._autopilots = {
+            i: SimulatedAutopilot(scenario.sensors, seed=scenario.seed, drone=i, ground=ground) for i in self._drones
+        }
         # Pilots share nothing but the networks, so their order does not matter: each steps as soon as its images are
         # rendered, all at a time, for five one after the other on two cores would leave one core idle for the last.
         self._executor = ThreadPoolExecutor(min(len(self._drones), 2 * (os.cpu_count() or 1) + 1))

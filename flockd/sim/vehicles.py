@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from flockd.autopilot.fake_range_finder import FakeRangeFinder, Ground, level_ground
 from flockd.config.scenario import SensorConfig, StartConfig, VehicleConfig
 from flockd.messages import FloatArray, VehicleState
 
@@ -110,7 +111,8 @@ class Vehicles:
 class SimulatedAutopilot:
     """One drone's autopilot: the truth with seeded errors that change slowly, and noise on the barometer."""
 
-    def __init__(self, config: SensorConfig, *, seed: int, drone: int) -> None:
+    def __init__(self, config: SensorConfig, *, seed: int, drone: int, ground: Ground = level_ground) -> None:
+        """``ground`` is what its range finder measures to, if it has one."""
         self._config = config
         self._random = np.random.default_rng([seed, drone])
         self._time_s: float | None = None
@@ -120,6 +122,8 @@ class SimulatedAutopilot:
         # A generator of its own: the position came later, and the other errors are as they were without it.
         self._of_position = np.random.default_rng([seed, drone, 1])
         self._position_error = config.position_error_m * self._of_position.normal(size=2)
+        ranger = config.range_finder
+        self._range_finder = None if ranger is None else FakeRangeFinder(ranger, ground, (seed, drone, 2))
 
     def read(self, time_s: float, position: FloatArray, velocity: FloatArray, R_ned_body: FloatArray) -> VehicleState:
         """What it says at `time_s`, not before the last, of a drone at `position` (3,) m NED, ground at z = 0.
@@ -142,6 +146,8 @@ class SimulatedAutopilot:
         kick = math.sqrt(1 - keep**2) * config.position_error_m * self._of_position.normal(size=2)
         self._position_error = keep * self._position_error + kick
         noise = config.barometer_noise_m * self._random.normal()
+        ranger = self._range_finder
+        ground_range = None if ranger is None else ranger.read(time_s, position, velocity, R_ned_body)
         return VehicleState(
             time_s=time_s,
             R_ned_body=euler_rotation(*self._tilt_error) @ R_ned_body,
@@ -149,6 +155,7 @@ class SimulatedAutopilot:
             velocity_ned=velocity + self._velocity_error,
             position=position[:2] + self._position_error,
             home_deg=np.array(REFERENCE_DEG),
+            ground_range=ground_range,
         )
 
     def _drift(self, error: FloatArray, sigma: float, time_constant_s: float, elapsed_s: float) -> FloatArray:

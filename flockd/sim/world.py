@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from flockd.messages import Float32Array, FloatArray, UInt8Array
 from flockd.sim import _raster, sky, terrain, textures
+from flockd.sim.hills import hills
 from flockd.sim.mesh import face_normals, unit
 from flockd.sim.scenery import Scenery, footprint_distance
 from flockd.sim.textures import PackedArray
@@ -72,11 +73,14 @@ class World:
         keep_out: FloatArray | None = None,
         clearance_m: float = 9.0,
         extent_m: float = 80.0,
+        hills_m: float = 0.0,
+        hills_slope: float = 0.15,
     ) -> World:
         """A world drawn from ``seed``: the same arguments give the same bytes.
 
         ``ground_relief_m``: standard deviation of the ground's height (0: exactly flat). Nothing taller than 0.3 m
-        comes closer than ``clearance_m`` to any of the ``keep_out`` points (n, 2) north, east.
+        comes closer than ``clearance_m`` to any of the ``keep_out`` points (n, 2) north, east. ``hills_m`` and
+        ``hills_slope``: see `flockd.sim.hills`; their ground is added to the relief.
         """
         if extent_m < 20.0:
             raise ValueError(f"extent_m must be at least 20 m, not {extent_m}")
@@ -85,6 +89,8 @@ class World:
         rng = np.random.default_rng(seed)
         light, fog, sky_map = sky.draw_sky(rng)
         heights = terrain.relief(rng, extent_m, ground_relief_m)
+        if hills_m > 0.0:  # drawn by themselves: the rest of the world is as without them
+            heights = heights + hills(np.random.default_rng([seed, 3]), extent_m, hills_m, hills_slope)
         ground_vertices, ground_triangles = terrain.ground_mesh(heights, extent_m)
         scenery = Scenery(rng, heights, extent_m, keep_out, clearance_m, len(ground_vertices))
         mesh, ground_count = scenery.mesh, len(ground_triangles)

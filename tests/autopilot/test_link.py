@@ -14,10 +14,12 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from flockd.autopilot.autopilot_status import AutopilotError, Firmware
 from flockd.autopilot.fake_autopilot import TICK_S, FakeAutopilot
+from flockd.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.autopilot.fake_telemetry import TelemetryStreams
 from flockd.autopilot.fake_vehicle import Demand, MotionState
 from flockd.autopilot.mavsdk_link import SETPOINT_TYPE_MASK, AutopilotLink
 from flockd.config.autopilot import AutopilotParameters
+from flockd.config.scenario import RangeFinderConfig
 from flockd.messages import Setpoint
 from tests.autopilot.conftest import HEARTBEAT_S, free_port
 from tests.autopilot.flight import flying, north, until
@@ -265,3 +267,30 @@ def test_two_programs_cannot_command_one_drone(port: int, fake_autopilot: FakeAu
         await link.close()
 
     asyncio.run(story())
+
+
+def test_the_range_finder_is_heard_along_the_bodys_down_axis_and_falls_silent_with_it(port: int) -> None:
+    """Leaning by 30 degrees at 6 m: the slant range is 6 m / cos 30; out of its reach it sends no signal."""
+    sin, cos = math.sin(math.radians(30.0)), math.cos(math.radians(30.0))
+    leaning = np.array([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])
+    place = np.array([0.0, 0.0, -6.0])
+    config = RangeFinderConfig(noise=0.0, tilt_deg=0.0, dropouts_per_min=0.0, max_m=12.0)
+
+    def still(_demand: Demand, _interval_s: float) -> MotionState:
+        return MotionState(place.copy(), np.zeros(3), leaning)
+
+    async def story() -> None:
+        link = await AutopilotLink.connect(_parameters(port))
+        await until(lambda: (state := link.vehicle_state()) is not None and state.ground_range is not None)
+        reading = link.ground_range()
+        assert reading is not None
+        assert reading.range_m == pytest.approx(6.0 / cos, abs=0.05)  # 0.01 m of noise, and centimetres
+        assert (reading.min_m, reading.max_m, reading.quality) == pytest.approx((0.15, 12.0, 1.0))
+        place[2] = -15.0
+        await until(lambda: (reading := link.ground_range()) is not None and reading.quality == 0.0)
+        assert set(link.range_finders()) == {25}
+        await link.close()
+
+    finder = FakeRangeFinder(config, level_ground, (0,))
+    with FakeAutopilot(port, height_m=6.0, motion=still, heartbeat_s=HEARTBEAT_S, range_finder=finder):
+        asyncio.run(story())

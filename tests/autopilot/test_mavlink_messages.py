@@ -157,3 +157,50 @@ def test_a_chunk_that_is_lost_is_marked_and_does_not_mix_texts() -> None:
     newest = lost.newest("STATUSTEXT")
     assert newest is not None
     assert newest.fields["text"] == "a" * 50 + "...end"
+
+
+POSE = (
+    ("ATTITUDE_QUATERNION", {"q1": 1.0, "q2": 0.0, "q3": 0.0, "q4": 0.0}),
+    ("LOCAL_POSITION_NED", {"x": 0.0, "y": 0.0, "z": -4.0, "vx": 0.0, "vy": 0.0, "vz": 0.0}),
+)
+
+
+def _distance(orientation: int, current: int, signal: int = 0) -> tuple[str, dict[str, Any]]:
+    limits = {"min_distance": 15, "max_distance": 2000}
+    return "DISTANCE_SENSOR", {
+        **limits, "current_distance": current, "orientation": orientation, "signal_quality": signal
+    }  # fmt: skip
+
+
+def test_the_range_is_that_of_the_sensor_which_faces_down() -> None:
+    down = int(mavlink.MAV_SENSOR_ROTATION_PITCH_270)
+    received, _ = _received(*POSE, _distance(down, 412, 100), _distance(0, 90))
+    state = received.vehicle_state()
+    assert state is not None
+    reading = state.ground_range
+    assert reading is not None
+    assert (reading.time_s, reading.range_m, reading.min_m, reading.max_m) == pytest.approx((2.0, 4.12, 0.15, 20.0))
+    assert (reading.quality, reading.vertical) == (1.0, False)
+    assert received.range_finders() == {down: (2.0,), 0: (3.0,)}
+    for signal, quality in ((0, None), (1, 0.0), (51, pytest.approx(0.505, abs=0.001))):
+        received.add(*_distance(down, 412, signal), 4.0)
+        newest = received.ground_range()
+        assert newest is not None
+        assert newest.quality == quality
+
+
+def test_px4s_distance_to_bottom_serves_where_no_sensor_is_heard() -> None:
+    nothing, _ = _received(*POSE, _distance(0, 90), ("ALTITUDE", {"bottom_clearance": None}))
+    assert nothing.ground_range() is None
+    received, _ = _received(*POSE, ("ALTITUDE", {"bottom_clearance": 3.9}))
+    reading = received.ground_range()
+    assert reading is not None
+    assert (reading.time_s, reading.range_m, reading.vertical, reading.max_m) == (2.0, 3.9, True, None)
+    received.add(*_distance(25, 412), 2.1)
+    newest = received.ground_range()
+    assert newest is not None
+    assert not newest.vertical, "the sensor's own reading is preferred"
+    received.add("ALTITUDE", {"bottom_clearance": 3.8}, 2.7)
+    newest = received.ground_range()
+    assert newest is not None
+    assert newest.vertical, "until it is silent"

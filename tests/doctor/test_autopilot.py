@@ -8,10 +8,12 @@ import pytest
 
 from flockd.autopilot.autopilot_status import Firmware
 from flockd.autopilot.fake_autopilot import FakeAutopilot
+from flockd.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.autopilot.mavsdk_link import AutopilotLink
 from flockd.config import DroneConfig, load_drone
 from flockd.config.autopilot import AutopilotParameters
 from flockd.config.safety import GateParameters, SafetyParameters
+from flockd.config.scenario import RangeFinderConfig
 from flockd.data import data_path
 from flockd.doctor import Check, Finding, Level, autopilot_checks, run_checks
 from flockd.doctor.autopilot_checks import JUDGES, check_autopilot, judge_firmware, judge_messages, judge_signing
@@ -49,7 +51,8 @@ def test_an_autopilot_that_is_set_up_well_and_left_as_it_is(monkeypatch: pytest.
 
     monkeypatch.setattr(FakeAutopilot, "_obey", noting)
     port = free_port()
-    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
+    finder = FakeRangeFinder(RangeFinderConfig(dropouts_per_min=0.0), level_ground, (0,))
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, range_finder=finder) as fake_autopilot:
         fake_autopilot.parameters.update(GOOD)
         found = _examined(port)
         assert (fake_autopilot.armed, fake_autopilot.mode) == (False, "LOITER")
@@ -57,7 +60,7 @@ def test_an_autopilot_that_is_set_up_well_and_left_as_it_is(monkeypatch: pytest.
         assert fake_autopilot.refused_setpoints == 0
         assert fake_autopilot.parameters == {**fake_autopilot.parameters, **GOOD}
     assert set(asked) <= {LISTENS, REQUESTS_MESSAGE}, "it listens and asks, and commands nothing"
-    assert found.keys() == {"heartbeat", "firmware", "signing", *GOOD}
+    assert found.keys() == {"heartbeat", "firmware", "signing", "range finder", *GOOD}
     assert {about for about, finding in found.items() if finding.level is not Level.PASS} == {"firmware"}
     assert found["firmware"].measured.startswith("PX4 0.0.1 is older than 1.14"), "the fake autopilot is not PX4"
     assert "system 1 at udpin://127.0.0.1" in found["heartbeat"].measured

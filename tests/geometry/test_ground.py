@@ -74,3 +74,19 @@ def test_a_camera_on_the_ground_and_a_stride_that_does_not_fit_are_refused() -> 
         ground_inverse_depth(RIG.cameras["front"], LEVEL, 0.0)
     with pytest.raises(ValueError, match="stride of 7 does not divide an image of 480x640"):
         ground_inverse_depth(RIG.cameras["front"], LEVEL, 4.0, stride=7)
+
+
+def test_a_slope_is_ground_that_rises_by_so_much_for_each_metre() -> None:
+    """Against points of a hillside 4 m below the drone that rises by 10 % to the north and falls by 5 % to the east."""
+    attitude = Rotation.from_euler("ZYX", [50.0, 4.0, -7.0], degrees=True)
+    random, slope = np.random.default_rng(2), (0.1, -0.05)
+    for camera in RIG.cameras.values():
+        inverse = ground_inverse_depth(camera, attitude.as_matrix(), 4.0, slope=slope)
+        level = random.uniform(-12.0, 12.0, (300, 2))
+        points = np.column_stack([level, 4.0 - level @ np.array(slope)])  # NED, from the drone
+        seen = camera.T_body_camera.inverse().apply(attitude.inv().apply(points))
+        pixels = 222.0 * seen[:, :2] / seen[:, 2:] + np.array([240.0, 320.0])
+        shown = (seen[:, 2] > 0.5) & (pixels >= 1.0).all(axis=1) & (pixels < [479.0, 639.0]).all(axis=1)
+        assert shown.sum() > 10
+        column, row = pixels[shown].astype(int).T
+        np.testing.assert_allclose(inverse[row, column], 1.0 / seen[shown, 2], atol=0.003)  # half a pixel off

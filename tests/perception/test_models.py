@@ -122,6 +122,25 @@ def test_a_model_that_is_not_there_is_refused_with_those_that_are() -> None:
         OnnxNetworks(PerceptionConfig(flow="raft"), MODELS)
 
 
+@pytest.mark.parametrize(
+    ("named", "said"),
+    [
+        (
+            "../mine",
+            r"'\.\./mine' is no model's name, and no manifest; name the manifest, as in \.\./mine/distance\.yaml",
+        ),
+        (
+            "/mine/range.onnx",
+            r"/mine/range\.onnx is a model's ONNX file; name the manifest beside it, /mine/range\.yaml",
+        ),
+    ],
+    ids=["folder", "ONNX file"],
+)
+def test_who_names_something_beside_a_manifest_is_told_what_to_name(named: str, said: str) -> None:
+    with pytest.raises(ModelError, match=rf"^perception\.distance: {said}$"):
+        OnnxNetworks(PerceptionConfig(distance=named), MODELS)
+
+
 def shifted_pictures(shift: tuple[int, int], size: tuple[int, int]) -> tuple[UInt8Array, UInt8Array]:
     """Two windows of one rendered picture, so that all of the first has moved by ``shift`` px right and down."""
     width, height = size

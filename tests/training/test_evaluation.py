@@ -6,7 +6,8 @@ import numpy as np
 
 from flockd.geometry import log_polar, log_polar_covariance
 from flockd.messages import Detection
-from tools.evaluation.on_pairs import _pairings
+from tools.evaluation.on_pairs import _pairings, _view
+from tools.training.dataset import HEIGHT, WIDTH, PairSet
 
 
 def detection(*position: float) -> Detection:
@@ -26,3 +27,24 @@ def test_one_detection_is_not_two_drones_and_none_is_found_in_another_direction(
     near, far = np.array([2.0, 0.0, 0.0]), np.array([10.0, 0.1, 0.0])
     assert list(_pairings((detection(9.0, 0.09, 0.0),), [near, far], [0.5, 0.5])) == [1]
     assert not _pairings((detection(0.0, 2.0, 0.0),), [near, far], [0.5, 0.5])
+
+
+def test_a_grey_drone_before_the_sky_seen_from_below_is_said_to_be_that() -> None:
+    depth, ids = np.full((HEIGHT // 2, WIDTH // 2), 80.0, np.float32), np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8)
+    ids[100:110, 50:70] = 1
+    image = np.full((HEIGHT, WIDTH, 3), 200, np.uint8)
+    image[200:220, 100:140] = 140
+    # Camera axes: right, down, forward. The drone hovers level, 3 m ahead of the camera and 3 m above it.
+    level = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    pairs = PairSet(
+        {
+            "drone_centre": np.array([[[[0.0, -3.0, 3.0]]]]),
+            "drone_rotation": level[None, None, None],
+            "image": image[None, None],
+        },
+        1,
+    )
+    below_deg, sky_share, contrast = _view(pairs, 0, 0, depth, ids)
+    assert np.isclose(below_deg, 45.0)
+    assert sky_share == 1.0
+    assert np.isclose(contrast, 60.0)

@@ -13,6 +13,7 @@ import pytest
 
 from flockd.cli import main
 from flockd.data import data_path
+from flockd.sim.drone_models import drone_model
 from tools.training import worlds
 from tools.training.augment import UNTOUCHED, photometric
 from tools.training.crop_files import CropFiles
@@ -87,7 +88,7 @@ def test_the_mask_of_a_crop_is_the_drone_that_it_faces() -> None:
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     image[300:340, 220:260], image[300:340, 262:302] = (255, 0, 0), (0, 0, 255)
     mine = image[:, :, 0] > 0
-    seen = DroneInView(FOCAL_PX, np.array([(240 - WIDTH / 2) / FOCAL_PX * 4, 0.0, 4.0]), np.eye(3), 0)
+    seen = DroneInView(FOCAL_PX, np.array([(240 - WIDTH / 2) / FOCAL_PX * 4, 0.0, 4.0]), np.eye(3), drone_model(0, 0))
     for _ in range(10):
         sample = sample_of(seen, crop_around(seen, rng), image, mine)
         red = sample["picture"][:, :, 0] > 127

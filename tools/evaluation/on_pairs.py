@@ -15,16 +15,19 @@ from flockd.config.perception import PerceptionConfig
 from flockd.geometry import Rig
 from flockd.messages import UNCLASSED, Detection, Frame, FrameSet, VehicleState
 from flockd.perception import DisFlow, Networks, Perception
-from flockd.sim.drone_models import drone_model
+from flockd.sim.drone_models import FAMILIES, drone_model
 from tools.training.dataset import HEIGHT, R_BODY_CAMERA, WIDTH, PairSet, rig_camera
-from tools.training.samples import SIZES_M
+from tools.training.scenes import outline_of
 
 Array = NDArray[Any]
+SIZES_M = [drone_model(family, 0).size_m for family in range(FAMILIES)]
 MIN_PIXELS = 6
 """Drones of which less is to be seen do not count, neither as found nor as missed."""
 MASK_WITHIN_M = 10.0
 HEIGHT_SIGMAS_M = {"barometer": 0.1, "range finder": 0.03}
 """Standard deviations of the height above ground that an autopilot gives, by what it measures it with."""
+SKY_M = 79.0
+"""Depth from which on a rendered pixel shows the sky."""
 WHOLE_HIDES = 0.02
 """A drone is whole when it is inside the image and no more of its outline is hidden than this."""
 
@@ -41,6 +44,12 @@ class Drone:
     """Of its range, relative; 0 where it was not found."""
     sigma: float
     """What was said of that error's standard deviation."""
+    below_deg: float = 0.0
+    """How far below the drone's own horizontal plane the camera is, as the drone sees it; negative: above it."""
+    sky_share: float = 0.0
+    """Of what surrounds the drone in the image."""
+    contrast: float = 0.0
+    """Between the drone's mean colour and that of what surrounds it, grey levels."""
 
 
 class Findings:
@@ -100,7 +109,7 @@ def look_at_pairs(pairs: PairSet, networks: Networks, indices: Iterable[int]) ->
             found.depth_pixels[given].append(off[::16])
         labels = view.cameras["camera"].labels
         _masks(((labels > 0) & (labels != UNCLASSED))[1::2, 1::2], ids, pairs, index, found)
-        _drones(view.detections, pairs, index, depth, ids, found)
+        compare_drones(view.detections, pairs, index, depth, ids, found)
         flow = np.asarray(pairs["flow"][index], np.float32)
         valid = np.asarray(pairs["flow_valid"][index])
         first, second = (Frame("camera", images[k], 0.5 * k, k) for k in (0, 1))
@@ -129,10 +138,10 @@ def _masks(guess: Array, ids: Array, pairs: PairSet, index: int, found: Findings
         found.iou.append(float((mine & said).sum() / max((mine | said).sum(), 1)))
 
 
-def _drones(
+def compare_drones(
     detections: tuple[Detection, ...], pairs: PairSet, index: int, depth: Array, ids: Array, found: Findings
 ) -> None:
-    """A detection is a drone's if it lies in the drone's direction, however wrong its range is."""
+    """Note every drone of a pair's first image: a detection is a drone's if it lies in its direction, at any range."""
     found.images += 1
     seen = np.flatnonzero(pairs["drone_pixels"][index, 0] >= MIN_PIXELS)
     places = [R_BODY_CAMERA @ np.asarray(pairs["drone_centre"][index, 0, drone], np.float64) for drone in seen]
@@ -146,8 +155,25 @@ def _drones(
             distance = float(np.linalg.norm(best.position))
             error, sigma = distance / range_m - 1.0, best.range_sigma_m / distance
         whole = inside and _hidden_share(pairs, index, int(drone), depth, ids) < WHOLE_HIDES
-        found.drones.append(Drone(range_m, float(right - left), bool(whole), best is not None, error, sigma))
+        view = _view(pairs, index, int(drone), depth, ids)
+        drone_found = best is not None
+        found.drones.append(Drone(range_m, float(right - left), bool(whole), drone_found, error, sigma, *view))
     found.false += len(detections) - len(detection_of)
+
+
+def _view(pairs: PairSet, index: int, drone: int, depth: Array, ids: Array) -> tuple[float, float, float]:
+    """A drone's ``below_deg``, ``sky_share`` and ``contrast``."""
+    towards_camera = -np.asarray(pairs["drone_centre"][index, 0, drone], np.float64)
+    down = towards_camera @ np.asarray(pairs["drone_rotation"][index, 0, drone], np.float64)[:, 2]
+    below_deg = float(np.degrees(np.arcsin(np.clip(down / np.linalg.norm(towards_camera), -1, 1))))
+    own = (ids == drone + 1).astype(np.uint8)
+    around = (cv2.dilate(own, np.ones((9, 9), np.uint8)) > 0) & (cv2.dilate(own, np.ones((3, 3), np.uint8)) == 0)
+    around &= ids == 0
+    if not own.any() or not around.any():
+        return below_deg, 0.0, 0.0
+    image = np.asarray(pairs["image"][index][0])[::2, ::2].astype(np.float32)
+    contrast = np.abs(image[own > 0].mean(0) - image[around].mean(0)).max()
+    return below_deg, float((depth[around] >= SKY_M).mean()), float(contrast)
 
 
 def _pairings(detections: tuple[Detection, ...], places: list[Array], sizes_m: list[float]) -> dict[int, Detection]:
@@ -173,11 +199,11 @@ def _hidden_share(pairs: PairSet, index: int, drone: int, depth: Array, ids: Arr
     family = int(pairs["drone_family"][index, drone])
     centre = np.asarray(pairs["drone_centre"][index, 0, drone], np.float64)
     corners = drone_model(family, 0).vertices @ np.asarray(pairs["drone_rotation"][index, 0, drone], np.float64).T
-    corners = (corners + centre)[(corners + centre)[:, 2] > 0.05]
-    half_px = float(pairs["focal"][index]) / 2 * corners[:, :2] / corners[:, 2:] + np.array([WIDTH, HEIGHT]) / 4
-    outline = np.zeros(ids.shape, np.uint8)
-    cv2.fillConvexPoly(outline, cv2.convexHull(np.round(half_px).astype(np.int32)), 1)
+    half = float(pairs["focal"][index]) / 2
+    outline = outline_of(
+        corners + centre, np.array([[half, 0, WIDTH / 4], [0, half, HEIGHT / 4], [0, 0, 1]]), ids.shape
+    )
     nearer = depth < centre[2] - SIZES_M[family] / 2
     others = np.flatnonzero(pairs["drone_centre"][index, 0, :, 2] < centre[2]) + 1
     nearer |= np.isin(ids, others)
-    return float((nearer & (outline > 0)).sum() / max(int(outline.sum()), 1))
+    return float((nearer & outline).sum() / max(int(outline.sum()), 1))

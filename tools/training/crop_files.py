@@ -13,6 +13,8 @@ _LOOK_EVERY = 200
 """Calls between two looks into the folder."""
 _AIMED_SHARE = 0.6
 """At least so many of the drones are in the middle and fill their crop: the last crop of a drone is what counts."""
+_NONE_SHARE = 0.08
+"""Of what is drawn: what is no drone, however many families there are."""
 _AIMED_OFF_PX, _AIMED_PX = 4.0, (60.0, 84.0)
 
 
@@ -45,13 +47,17 @@ class CropFiles:
             )
         self._ends = np.cumsum([len(file["drone"]) for file in self._files.values()])
         family = np.concatenate([np.where(file["drone"] > 0.5, file["family"], -1) for file in self._files.values()])
-        aimed = np.concatenate([_aimed(file) for file in self._files.values()])
-        self._of_family = [np.flatnonzero(family == one) for one in np.unique(family)]
-        self._aimed_of_family = [np.flatnonzero((family == one) & aimed) for one in np.unique(family)]
+        aimed = np.concatenate([is_aimed(file) for file in self._files.values()])
+        names = np.unique(family)
+        self._of_family = [np.flatnonzero(family == one) for one in names]
+        self._aimed_of_family = [np.flatnonzero((family == one) & aimed) for one in names]
+        none = names == -1
+        share = _NONE_SHARE if none.any() and not none.all() else float(none.all())
+        self._shares = np.where(none, share, (1 - share) / max(1, np.count_nonzero(~none)))
 
     def draw(self, rng: np.random.Generator) -> Sample:
-        """Any of them: every family, and what is none, as often, however many crops there are of it."""
-        one = int(rng.integers(len(self._of_family)))
+        """Any of them: every family as often, however many crops there are of it, and now and then what is none."""
+        one = int(rng.choice(len(self._shares), p=self._shares))
         rows = self._of_family[one]
         if rng.random() < _AIMED_SHARE and len(self._aimed_of_family[one]):
             rows = self._aimed_of_family[one]
@@ -62,7 +68,8 @@ class CropFiles:
         return {name: values[row] for name, values in file.items()}
 
 
-def _aimed(file: Sample) -> NDArray[np.bool_]:
+def is_aimed(file: Sample) -> NDArray[np.bool_]:
+    """(n,) which crops of a file show their drone as a cascade's last crop does: in the middle, and filling it."""
     low, high = np.log(_AIMED_PX)
     off = np.linalg.norm(file["target"][:, 1:3], axis=1)
     return np.asarray((off < _AIMED_OFF_PX) & (low < file["apparent"]) & (file["apparent"] < high))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import cv2
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.geometry import Rig, VirtualCrop, virtual_crop
-from flockd.sim.drone_models import FAMILIES, drone_model
+from flockd.sim.airframe import DroneModel
 from tools.training.augment import motion_blur, photometric
 from tools.training.dataset import (
     HEIGHT,
@@ -24,8 +25,6 @@ from tools.training.dataset import (
 from tools.training.networks import MAX_DEPTH_M
 
 Sample = dict[str, NDArray[Any]]
-SIZES_M = [drone_model(family, 0).size_m for family in range(FAMILIES)]
-HUBS = [drone_model(family, 0).hubs for family in range(FAMILIES)]
 
 
 def neighbours_sample(
@@ -85,12 +84,12 @@ class DroneInView:
     """(3,) of the drone, in the camera's axes, metres."""
     rotation: NDArray[np.float64]
     """(3, 3) from the drone's body to the camera's axes."""
-    family: int
+    model: DroneModel
 
 
 def crop_around(drone: DroneInView, rng: np.random.Generator) -> VirtualCrop:
     """Where the second stage might look at a drone."""
-    return crop_at(drone.centre, SIZES_M[drone.family], drone.focal, rng)
+    return crop_at(drone.centre, drone.model.size_m, drone.focal, rng)
 
 
 def crop_at(centre: NDArray[Any], size_m: float, focal: float, rng: np.random.Generator) -> VirtualCrop:
@@ -109,7 +108,7 @@ def crop_at(centre: NDArray[Any], size_m: float, focal: float, rng: np.random.Ge
 def sample_of(drone: DroneInView, crop: VirtualCrop, image: NDArray[Any], mine: NDArray[Any]) -> Sample:
     """What ``crop`` shows of the camera's ``image`` (h, w, 3), with the truth; ``mine`` (h, w): the drone's pixels."""
     picture, _ = crop.sample({"camera": image})
-    hubs = drone.centre + HUBS[drone.family] @ drone.rotation.T
+    hubs = drone.centre + four_motors(drone.model.hubs) @ drone.rotation.T
     points = np.vstack([drone.centre[None], hubs]) @ R_BODY_CAMERA.T
     place, *motors = crop.camera.project(crop.T_body_virtual.inverse().apply(points)) - 48.0
     log_range = np.log(np.linalg.norm(drone.centre) / crop.camera.matrix[0, 0])
@@ -118,10 +117,23 @@ def sample_of(drone: DroneInView, crop: VirtualCrop, image: NDArray[Any], mine: 
         "mask": _mask_of(crop, mine),
         "target": np.array([log_range, *place], np.float32),
         "motors": np.asarray(motors, np.float32),
-        "family": np.array(drone.family),
-        "apparent": np.array(np.log(SIZES_M[drone.family]) - log_range, np.float32),
+        "family": np.array(drone.model.family),
+        "apparent": np.array(np.log(drone.model.size_m) - log_range, np.float32),
         "drone": np.array(1.0, np.float32),
     }
+
+
+def four_motors(hubs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of a drone's motors (n, 3) the four that spread about as far one way as another, and then farthest."""
+    if len(hubs) == 4:
+        return hubs
+
+    def spread(chosen: tuple[int, ...]) -> float:
+        places = hubs[list(chosen), :2]
+        narrow, wide = np.linalg.eigvalsh(np.cov(places.T))
+        return float(narrow + 0.1 * wide)
+
+    return hubs[list(max(combinations(range(len(hubs)), 4), key=spread))]
 
 
 def _mask_of(crop: VirtualCrop, mine: NDArray[Any]) -> NDArray[np.uint8]:

@@ -2,6 +2,7 @@
 
 from flockd.perception.depth.by_height import fix_by_height
 from flockd.perception.depth.by_velocity import VelocityScale
+from flockd.perception.depth.ground_below import OF_HEIGHT, GroundBelow, NoGround
 from flockd.perception.depth.scale import Scale
 
-__all__ = ["Scale", "VelocityScale", "fix_by_height"]
+__all__ = ["OF_HEIGHT", "GroundBelow", "NoGround", "Scale", "VelocityScale", "fix_by_height"]

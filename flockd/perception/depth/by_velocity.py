@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flockd.geometry import Rig, RigCamera, RigidTransform, grid_pixels
+from flockd.geometry import Rig, RigCamera, RigidTransform, grid_pixels, inverse_depths
 from flockd.messages import Float32Array, FloatArray, UInt8Array, VehicleState
 from flockd.perception.depth.scale import Scale, fit_scale
 from flockd.perception.maps import SceneMaps
@@ -133,13 +133,7 @@ def _triangulated(
     column, row = end.astype(np.int64).T
     background = maps.labels[row, column] == 0
     start, end, column, row = start[background], end[background], column[background], row[background]
-    between = camera.T_body_camera.inverse() @ motion @ camera.T_body_camera
-    # p is parallel to R q / w + t, so that p x R q + w (p x t) = 0: linear in w, and honest about noise around zero.
-    p = camera.camera.rays(start)
-    turned = camera.camera.unproject(end, np.ones(len(end))) @ between.rotation.T
-    across, parallax = np.cross(p, between.translation), np.cross(p, turned)
-    baseline = np.linalg.norm(across, axis=1)
+    inverse, baseline = inverse_depths(camera, motion, start, end)
     usable = baseline > parameters.min_baseline_m  # false for NaN: outside a lens's circle there is no ray
-    inverse = -(parallax * across).sum(axis=1)[usable] / baseline[usable] ** 2
     sigma = parameters.flow_sigma_px / camera.camera.focal_px / baseline[usable]
-    return _Samples(maps.open.inverse[row, column][usable].astype(np.float64), inverse, sigma)
+    return _Samples(maps.open.inverse[row, column][usable].astype(np.float64), inverse[usable], sigma)

@@ -1,0 +1,73 @@
+"""Shapes of drones drawn from a seed. Needs the extra `train`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flockd.sim.airframe import DroneModel
+from flockd.sim.drone_models import FAMILIES
+from tools.training.drone_generator import FIRST_GENERATED, SIZES_M, generated_drone
+from tools.training.samples import four_motors
+
+SHAPES = range(24)
+
+
+@pytest.fixture(scope="module")
+def drones() -> list[DroneModel]:
+    return [generated_drone(shape, 7) for shape in SHAPES]
+
+
+def test_a_shape_is_its_own_whatever_its_paint() -> None:
+    first, again, repainted = generated_drone(11, 1), generated_drone(11, 1), generated_drone(11, 2)
+    assert np.array_equal(first.vertices, again.vertices)
+    assert np.array_equal(first.colours, again.colours)
+    assert repainted.size_m == first.size_m
+    assert np.allclose(repainted.hubs, first.hubs)
+    assert np.allclose(repainted.extent[:, :2], first.extent[:, :2])
+    assert not np.array_equal(repainted.colours[: len(first.colours)], first.colours[: len(repainted.colours)])
+    assert first.family == FIRST_GENERATED + 11 > FAMILIES
+
+
+def test_drones_have_four_to_eight_rotors_and_the_sizes_of_drones(drones: list[DroneModel]) -> None:
+    assert {len(drone.hubs) for drone in drones} == {4, 6, 8}
+    sizes = [drone.size_m for drone in drones]
+    assert SIZES_M[0] <= min(sizes) < 0.25
+    assert 0.9 < max(sizes) <= SIZES_M[1]
+    assert len({round(size, 9) for size in sizes}) == len(drones), "no two alike"
+
+
+def test_the_size_is_what_the_mesh_measures_from_tip_to_tip(drones: list[DroneModel]) -> None:
+    for drone in drones:
+        apart = np.linalg.norm(drone.hubs[:, None, :2] - drone.hubs[None, :, :2], axis=2).max()
+        assert apart < drone.size_m
+        angles = np.linspace(0, np.pi, 90)
+        along = drone.vertices[:, :2] @ np.stack([np.cos(angles), np.sin(angles)])
+        widest = float(np.ptp(along, axis=0).max())
+        # Propellers may stand across the arms, and guards reach a little beyond them.
+        assert apart <= widest + 1e-6
+        assert widest < 1.12 * drone.size_m
+
+
+def test_drones_are_level_balanced_and_light_enough_to_draw(drones: list[DroneModel]) -> None:
+    for drone in drones:
+        assert np.isfinite(drone.vertices).all()
+        assert drone.colours.min() >= 0
+        assert drone.colours.max() <= 1.25
+        assert len(drone.triangles) < 4000
+        assert np.ptp(drone.extent[:, 2]) < 0.5 * drone.size_m
+        middle = drone.hubs[:, :2].mean(0)
+        assert np.linalg.norm(middle) < 0.2 * drone.size_m, "its rotors carry it"
+        assert abs(middle[1]) < 0.01 * drone.size_m, "left as right"
+
+
+def test_the_four_motors_of_a_large_drone_are_those_that_spread_evenly() -> None:
+    angles = np.arange(8) * np.pi / 4
+    ring = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(8)])
+    chosen = four_motors(ring)
+    assert np.cov(chosen[:, :2].T) == pytest.approx(np.eye(2) * 2 / 3, abs=1e-9), "every other one"
+    pairs = np.vstack([ring[::2], ring[::2] + np.array([0, 0, 0.1])])
+    assert {tuple(np.round(hub[:2], 6)) for hub in four_motors(pairs)} == {
+        tuple(np.round(hub[:2], 6)) for hub in ring[::2]
+    }
+    assert np.array_equal(four_motors(ring[1:5]), ring[1:5])

@@ -1,0 +1,101 @@
+"""Reading a fleet's own drone from a mesh. Needs the extra `train`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from tools.training.own_mesh import MOST_TRIANGLES, UP_AXES, _upright, painted, read_mesh
+
+RED = [255, 0, 0, 255]
+
+
+def cross_of_boxes(unit: float = 1.0) -> trimesh.Trimesh:
+    """A drone of two bars, 0.6 m and 0.4 m long, 0.1 m wide and 0.05 m tall, and a post on top: z up, 0.15 m in all."""
+    bars = [trimesh.creation.box((0.6, 0.1, 0.05)), trimesh.creation.box((0.1, 0.4, 0.05))]
+    post = trimesh.creation.box((0.02, 0.02, 0.1), transform=trimesh.transformations.translation_matrix((0, 0, 0.075)))
+    mesh = trimesh.util.concatenate([*bars, post])
+    mesh.apply_translation((3.0, 2.0, 1.0))
+    mesh.apply_scale(unit)
+    return mesh
+
+
+def written(folder: Path, name: str, mesh: trimesh.Trimesh) -> Path:
+    path = folder / name
+    mesh.export(path)
+    return path
+
+
+@pytest.mark.parametrize(("ending", "unit"), [("stl", 1000.0), ("obj", 1 / 0.0254), ("stl", 100.0), ("obj", 1.0)])
+def test_the_drones_size_says_the_unit_of_a_file_that_does_not(tmp_path: Path, ending: str, unit: float) -> None:
+    drone = read_mesh(written(tmp_path, f"drone.{ending}", cross_of_boxes(unit)), 0.62)
+    sides = drone.extent[1] - drone.extent[0]
+    assert sorted(sides) == pytest.approx([0.15, 0.4, 0.6], rel=1e-3)
+    assert sides[2] == pytest.approx(0.15, rel=1e-3), "upright"
+    assert drone.extent.sum(0) == pytest.approx(np.zeros(3), abs=1e-6), "the origin is the middle"
+    assert drone.size_m == 0.62
+
+
+@pytest.mark.parametrize("up", UP_AXES)
+def test_what_is_up_in_the_file_is_up_in_the_air_and_nothing_is_mirrored(up: str) -> None:
+    axes = _upright(np.eye(3), up).T
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+    said = np.eye(3)["xyz".index(up[-1])] * (-1 if up.startswith("-") else 1)
+    assert (axes @ said).tolist() == [0.0, 0.0, -1.0], "z points down"
+
+
+@pytest.mark.parametrize(("name", "up"), [("drone.glb", None), ("drone.stl", "y")])
+def test_gltf_says_which_way_is_up_and_for_other_files_the_user_does(tmp_path: Path, name: str, up: str | None) -> None:
+    mesh = cross_of_boxes()
+    mesh.vertices = mesh.vertices[:, [1, 2, 0]]
+    drone = read_mesh(written(tmp_path, name, mesh), 0.6, up)
+    top = drone.vertices[np.argsort(drone.vertices[:, 2])[:4]]
+    assert np.abs(top[:, :2]).max() < 0.02, "the post is on top"
+
+
+def test_colours_of_a_file_are_kept_and_a_drone_without_is_painted_part_by_part(tmp_path: Path) -> None:
+    mesh = cross_of_boxes()
+    mesh.visual.face_colors = RED
+    red = painted(read_mesh(written(tmp_path, "red.glb", mesh), 0.6, "z"), 1)
+    assert (red.colours[:, 0] > 0.5).all()
+    assert (red.colours[:, 1:] < 0.05).all()
+    plain = read_mesh(written(tmp_path, "plain.stl", cross_of_boxes()), 0.6)
+    paints = [painted(plain, seed).colours for seed in range(8)]
+    assert all(np.isfinite(paint).all() and paint.min() > 0 and paint.max() <= 0.9 for paint in paints)
+    assert max(len(np.unique(paint, axis=0)) for paint in paints) == 3, "two bars and a post"
+    assert len({paint.tobytes() for paint in paints}) == len(paints)
+
+
+def test_a_mesh_of_very_many_triangles_is_simplified_to_what_a_camera_sees(tmp_path: Path) -> None:
+    dense = cross_of_boxes().subdivide_to_size(0.006)
+    assert len(dense.faces) > MOST_TRIANGLES
+    drone = read_mesh(written(tmp_path, "dense.stl", dense), 0.6)
+    assert len(drone.triangles) <= 2 * MOST_TRIANGLES, "each has two sides"
+    assert drone.extent[1] - drone.extent[0] == pytest.approx([0.4, 0.6, 0.15], abs=0.008)
+
+
+@pytest.mark.parametrize(
+    ("name", "size_m", "up", "said"),
+    [
+        ("drone.stl", 0.2, None, r"is 0\.608.* wide .* \(0\.608 m if its unit is m.*--size-m 0\.2 m fits none"),
+        ("drone.stl", 0.6, "x", r"would be 0\.\d+ x 0\.\d+ x 0\.60 m, the last upright.*correct --up"),
+        ("drone.stl", 7.0, None, r"--size-m 7: a drone measures 0\.05 to 5 m"),
+        ("drone.ply", 0.6, None, r"a mesh is read from \.glb, \.gltf, \.obj, \.stl"),
+        ("none.stl", 0.6, None, r"none\.stl: there is no such file"),
+        ("text.glb", 0.6, None, r"text\.glb: is no mesh that can be read"),
+        ("text.stl", 0.6, None, r"text\.stl: (is no mesh that can be read|holds no triangles)"),
+    ],
+    ids=["size", "up", "no drone's size", "format", "missing", "broken glTF", "broken STL"],
+)  # fmt: skip
+def test_a_file_that_cannot_be_the_drone_is_refused_in_one_sentence(
+    tmp_path: Path, name: str, size_m: float, up: str | None, said: str
+) -> None:
+    written(tmp_path, "drone.stl", cross_of_boxes())
+    for broken in ("text.glb", "text.stl"):
+        (tmp_path / broken).write_text("no mesh at all", encoding="utf-8")
+    with pytest.raises(ValueError, match=said) as refused:
+        read_mesh(tmp_path / name, size_m, up)
+    assert "\n" not in str(refused.value)

@@ -1,0 +1,281 @@
+"""Multirotors drawn from a seed: hundreds of shapes, so that no network learns a dozen by heart.
+
+Four to eight rotors on arms in many layouts, bodies, guards, landing gear, payloads and lights, 0.15 to 1.2 m from tip
+to tip. A shape's size is its own, as of the simulator's families; only paint and propeller angles differ within it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from flockd.sim.airframe import Airframe, DroneModel, outline, oval
+from tools.training.drone_parts import add_guards, add_landing_gear, add_lights, add_payloads, hanging_rotor
+
+Array = NDArray[Any]
+FIRST_GENERATED = 1000
+"""Family numbers of generated shapes begin here."""
+SIZES_M = (0.15, 1.2)
+DRAWN_SIZE_M = 0.6
+"""A shape is put together at this size and then scaled: propellers and plates are thinner on small drones."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What one shape is drawn from; metres, body FRD."""
+
+    hubs: Array
+    """(n, 3) where the arms end."""
+    radius: float
+    """Of the propellers."""
+    is_coaxial: bool
+    """A second rotor hangs under each arm."""
+    has_booms: bool
+    """Two beams along the body carry the rotors, instead of an arm for each."""
+    reach: float
+    """Mean distance of the arms' ends from the middle."""
+    body: tuple[float, float, float]
+    """Half length, half width, half height."""
+
+
+def generated_drone(shape: int, seed: int) -> DroneModel:
+    """Shape number ``shape``, colours and propeller angles from ``seed``."""
+    if shape < 0:
+        raise ValueError(f"shape must not be negative: {shape}")
+    craft = Airframe(np.random.default_rng([FIRST_GENERATED + shape, seed]))
+    rng = np.random.default_rng([FIRST_GENERATED, shape])
+    guard = str(rng.choice(["none", "ducts", "rails", "arcs"], p=[0.76, 0.08, 0.08, 0.08]))
+    plan = _plan(rng, room=0.84 if guard == "ducts" else 1.0)
+    _BODIES[int(rng.integers(len(_BODIES)))](craft, plan, rng)
+    (_booms if plan.has_booms else _arms)(craft, plan, rng)
+    _rotors(craft, plan, rng)
+    add_guards(craft, guard, plan.hubs, plan.radius)
+    add_landing_gear(craft, plan.hubs, plan.reach, plan.body, rng)
+    add_payloads(craft, plan.reach, plan.body, rng)
+    add_lights(craft, plan.hubs, plan.reach, rng)
+    model = craft.model(FIRST_GENERATED + shape, seed)
+    return _scaled(model, float(np.exp(rng.uniform(*np.log(SIZES_M)))) / model.size_m)
+
+
+def _scaled(model: DroneModel, factor: float) -> DroneModel:
+    uv = model.uv.copy()
+    uv[:, :, :3] /= factor
+    return replace(
+        model,
+        vertices=model.vertices * np.float32(factor),
+        uv=uv,
+        hubs=model.hubs * factor,
+        extent=model.extent * factor,
+        size_m=model.size_m * factor,
+    )
+
+
+def _plan(rng: Generator, room: float) -> Plan:
+    """Layout and sizes; ``room``: of the propellers as a share of what there is."""
+    names, shares = zip(*_LAYOUTS, strict=True)
+    layout = names[int(rng.choice(len(names), p=np.array(shares) / sum(shares)))]
+    places = np.asarray(layout(rng), float)
+    is_coaxial = layout in (_y6, _x8)
+    apart = np.linalg.norm(places[:, None, :2] - places[None, :, :2], axis=2)
+    nearest = float((apart + 1e9 * np.eye(len(places))).min())
+    radius = nearest * float(rng.uniform(0.35, 0.47)) * room
+    if is_coaxial:
+        radius = min(radius, 0.62)
+    scale = DRAWN_SIZE_M / float((apart + 2 * radius).max())
+    hubs, radius = places * scale, radius * scale
+    reach = float(np.linalg.norm(hubs[:, :2], axis=1).mean())
+    half = reach * rng.uniform(0.27, 0.46)
+    wide = half * rng.uniform(0.5, 0.95)
+    hubs[:, 2] -= reach * rng.choice([0.0, rng.uniform(-0.05, 0.14)])
+    return Plan(hubs, radius, is_coaxial, layout in (_h4, _h6, _h8), reach, (half, wide, half * rng.uniform(0.22, 0.5)))
+
+
+def _on_circle(count: int, first: float) -> Array:
+    angles = first + 2 * np.pi * np.arange(count) / count
+    return np.column_stack([np.cos(angles), np.sin(angles), np.zeros(count)])
+
+
+def _x4(rng: Generator) -> Array:
+    return _on_circle(4, np.pi / 4)
+
+
+def _plus4(rng: Generator) -> Array:
+    return _on_circle(4, 0.0)
+
+
+def _long_x(rng: Generator) -> Array:
+    return _on_circle(4, np.pi / 4) * [1.0, rng.choice([rng.uniform(0.6, 0.85), rng.uniform(1.15, 1.5)]), 1.0]
+
+
+def _folding(rng: Generator) -> Array:
+    """Front arms high and swept ahead, rear ones low, or the other way."""
+    high = float(rng.uniform(-0.12, 0.12))
+    front, rear = (rng.uniform(0.75, 1.0), rng.uniform(0.85, 1.05)), (-rng.uniform(0.7, 0.9), rng.uniform(0.7, 0.95))
+    return np.array([[x, side * y, z] for (x, y), z in ((front, high), (rear, -high)) for side in (1.0, -1.0)])
+
+
+def _dead_cat(rng: Generator) -> Array:
+    front, rear = (rng.uniform(0.3, 0.6), rng.uniform(0.95, 1.2)), (-rng.uniform(0.8, 1.0), rng.uniform(0.5, 0.8))
+    return np.array([[x, side * y, 0.0] for x, y in (front, rear) for side in (1.0, -1.0)])
+
+
+def _in_two_rows(rows: int, apart: float) -> Array:
+    return np.array([[x, side * apart, 0.0] for x in np.linspace(1.0, -1.0, rows) for side in (1.0, -1.0)])
+
+
+def _h4(rng: Generator) -> Array:
+    return _in_two_rows(2, rng.uniform(0.75, 1.2))
+
+
+def _h6(rng: Generator) -> Array:
+    return _in_two_rows(3, rng.uniform(0.55, 0.9))
+
+
+def _h8(rng: Generator) -> Array:
+    return _in_two_rows(4, rng.uniform(0.45, 0.7))
+
+
+def _x6(rng: Generator) -> Array:
+    return _on_circle(6, np.pi / 6)
+
+
+def _plus6(rng: Generator) -> Array:
+    return _on_circle(6, 0.0)
+
+
+def _y6(rng: Generator) -> Array:
+    return _on_circle(3, float(rng.choice([0.0, np.pi / 3])))
+
+
+def _x8(rng: Generator) -> Array:
+    return _on_circle(4, np.pi / 4)
+
+
+def _octo(rng: Generator) -> Array:
+    return _on_circle(8, float(rng.choice([0.0, np.pi / 8])))
+
+
+_LAYOUTS: tuple[tuple[Callable[[Generator], Array], float], ...] = (
+    (_x4, 0.2), (_plus4, 0.06), (_long_x, 0.12), (_folding, 0.13), (_dead_cat, 0.12), (_h4, 0.08), (_h6, 0.03),
+    (_h8, 0.02), (_x6, 0.07), (_plus6, 0.03), (_y6, 0.04), (_x8, 0.05), (_octo, 0.05),
+)  # fmt: skip
+"""And how often each is drawn; half-length of an arm about 1."""
+
+
+def _plates(c: Airframe, plan: Plan, rng: Generator) -> None:
+    """Carbon plates on posts, the battery on top or between them."""
+    half, wide, tall = plan.body
+    gap, thin = tall * rng.uniform(0.8, 1.3), 0.012 * plan.reach
+    for z in (0.0, -gap):
+        c.loft([_rounded(half, wide, z - thin), _rounded(half, wide, z + thin)], [c.frame])
+    for x, y in ((0.7, 0.6), (-0.7, 0.6), (-0.7, -0.6), (0.7, -0.6)):
+        c.rod((x * half, y * wide, 0), (x * half, y * wide, -gap), 0.02 * plan.reach, [c.metal])
+    z = -gap - 0.5 * tall if rng.random() < 0.6 else -0.5 * gap
+    c.box((0, 0, z), (0.7 * half, 0.5 * wide, 0.4 * tall), c.body)
+    c.box((0.85 * half, 0, -0.5 * gap), (0.12 * half, 0.4 * wide, 0.3 * tall), c.front)
+
+
+def _crate(c: Airframe, plan: Plan, rng: Generator) -> None:
+    half, wide, tall = plan.body
+    c.box((0, 0, 0), (half, wide, 0.7 * tall), c.body)
+    c.box((-0.1 * half, 0, -0.9 * tall), (0.7 * half, 0.75 * wide, 0.3 * tall), c.body * rng.uniform(0.6, 1.2))
+    c.box((half, 0, 0), (0.08 * half, 0.6 * wide, 0.35 * tall), c.front)
+    c.box((-half, 0, 0), (0.08 * half, 0.6 * wide, 0.35 * tall), c.rear)
+
+
+def _sleek(c: Airframe, plan: Plan, rng: Generator) -> None:
+    """A smooth shell, nose to tail, longer than others."""
+    half, wide, tall = plan.body[0] * rng.uniform(1.1, 1.6), plan.body[1] * rng.uniform(0.6, 1.0), plan.body[2]
+    nose, waist = rng.uniform(0.35, 0.9), rng.uniform(0.35, 0.9)
+    right = [(half, 0.5 * nose * wide), (0.7 * half, nose * wide), (0.0, wide), (-0.7 * half, waist * wide),
+             (-half, 0.4 * waist * wide)]  # fmt: skip
+    rings = [outline(right, z * tall, s) for z, s in ((-1.0, 0.6), (-0.55, 0.94), (0.2, 1.0), (0.75, 0.75))]
+    c.loft(rings, [c.body * 1.1, c.body, c.body * 0.8])
+    c.box((0.95 * half, 0, -0.1 * tall), (0.06 * half, 0.3 * nose * wide, 0.25 * tall), np.full(3, 0.03))
+    c.box((-0.95 * half, 0, -0.1 * tall), (0.06 * half, 0.3 * waist * wide, 0.25 * tall), c.rear)
+    c.box((0.2 * half, 0, -1.02 * tall), (0.25 * half, 0.3 * wide, 0.05 * tall), c.front)
+
+
+def _egg(c: Airframe, plan: Plan, rng: Generator) -> None:
+    half, wide, tall = plan.body
+    profile = [(0.35, -1.2), (0.75, -0.9), (1.0, -0.2), (0.9, 0.4), (0.5, 0.8)]
+    c.loft([oval(r * half, r * wide, z * tall) for r, z in profile], [c.body, c.body, c.rear, c.frame])
+    for side in (-1.0, 1.0):
+        c.ball((0.85 * half, 0.3 * side * wide, -0.1 * tall), 0.16 * wide, c.front)
+
+
+def _drum(c: Airframe, plan: Plan, rng: Generator) -> None:
+    """Round plates around a hub with a dome, as of large multirotors."""
+    round_, tall = 0.5 * (plan.body[0] + plan.body[1]), plan.body[2]
+    sides = int(rng.choice([8, 12]))
+    c.rod((0, 0, -0.5 * tall), (0, 0, 0.5 * tall), round_, [c.frame, c.body], sides)
+    rings = [oval(r * round_, r * round_, -z * tall) for r, z in ((0.3, 1.5), (0.6, 1.3), (0.85, 0.9), (0.9, 0.5))]
+    c.loft(rings, [c.body, c.body, c.body * 0.8])
+    c.box((0.95 * round_, 0, 0), (0.12 * round_, 0.3 * round_, 0.3 * tall), c.front)
+    c.box((-0.95 * round_, 0, 0), (0.12 * round_, 0.3 * round_, 0.3 * tall), c.rear)
+
+
+def _racer(c: Airframe, plan: Plan, rng: Generator) -> None:
+    """A narrow plate with a tall thin canopy."""
+    half, wide, tall = plan.body[0], 0.45 * plan.body[1], plan.body[2] * 1.3
+    c.box((0, 0, 0), (half, wide, 0.02 * plan.reach), c.frame)
+    side = [(0.9 * half, 0.8 * wide), (-0.8 * half, wide)]
+    c.loft([outline(side, z * tall, s) for z, s in ((-1.0, 0.5), (-0.5, 0.9), (0.0, 1.0))], [c.body, c.body * 0.8])
+    c.rod((0.8 * half, 0, -0.5 * tall), (1.05 * half, 0, -0.6 * tall), 0.5 * wide, [np.full(3, 0.02)], 8)
+    c.box((-0.1 * half, 0, -1.1 * tall), (0.45 * half, 0.9 * wide, 0.25 * tall), c.rear)
+
+
+_BODIES = (_plates, _crate, _sleek, _egg, _drum, _racer)
+
+
+def _rounded(half: float, wide: float, z: float) -> Array:
+    right = [(half, 0.55 * wide), (0.75 * half, wide), (-0.75 * half, wide), (-half, 0.55 * wide)]
+    return outline(right, z)
+
+
+def _arms(c: Airframe, plan: Plan, rng: Generator) -> None:
+    """One arm a motor, straight, level or rising, some bent at an elbow."""
+    thick = plan.reach * float(rng.uniform(0.022, 0.055))
+    is_round, bent = bool(rng.random() < 0.5), float(rng.choice([0.0, rng.uniform(0.1, 0.25)], p=[0.75, 0.25]))
+    accents = int(rng.integers(1, 4))
+    half, wide, _ = plan.body
+    for x, y, z in plan.hubs:
+        accent = c.front if x > 0.01 * plan.reach else c.rear
+        colours = [*[c.frame] * accents, accent]
+        root = (0.5 * half * x / plan.reach, 0.5 * wide * y / plan.reach, 0.4 * z)
+        if bent:
+            elbow = ((0.55 - bent) * x, (0.55 + bent) * y, z)
+            c.rod(root, elbow, thick, [c.frame], 7)
+            root, colours = elbow, [c.frame, accent]
+        if is_round or abs(root[2] - z) > 0.5 * thick:
+            c.rod(root, (x, y, z), thick, colours, 7)
+        else:
+            c.beam((root[0], root[1], z), (x, y, z), (thick, 0.7 * thick), colours)
+
+
+def _booms(c: Airframe, plan: Plan, rng: Generator) -> None:
+    """Two beams along, and cross beams to the body."""
+    thick = plan.reach * float(rng.uniform(0.025, 0.05))
+    front, rear, side = plan.hubs[:, 0].max(), plan.hubs[:, 0].min(), plan.hubs[:, 1].max()
+    z = float(plan.hubs[0, 2])
+    for y in (-side, side):
+        c.rod((1.05 * rear, y, z), (1.05 * front, y, z), thick, [c.rear, c.frame, c.body, c.frame, c.front], 8)
+    for x in np.linspace(0.55, -0.55, int(rng.integers(2, 4))) * plan.body[0]:
+        c.rod((x, 0.4 * plan.body[1], 0), (x, side, z), 0.8 * thick, [c.frame], 7)
+        c.rod((x, -0.4 * plan.body[1], 0), (x, -side, z), 0.8 * thick, [c.frame], 7)
+
+
+def _rotors(c: Airframe, plan: Plan, rng: Generator) -> None:
+    """A motor and a propeller on each arm, and under it where the layout is coaxial."""
+    motor = (plan.radius * float(rng.uniform(0.11, 0.18)), plan.radius * float(rng.uniform(0.15, 0.32)))
+    accent = bool(rng.random() < 0.5)
+    for x, y, z in plan.hubs:
+        c.rotor(x, y, z, plan.radius, motor, accent=accent)
+    if plan.is_coaxial:
+        for x, y, z in plan.hubs:
+            hanging_rotor(c, (x, y, z), plan.radius, motor)

@@ -1,0 +1,189 @@
+"""A drone's mesh from a file (glTF, STL, OBJ) as the renderer draws it.
+
+Only glTF says its unit (metres) and which way is up (+y); of the others, the drone's known size says the unit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from flockd.config.perception import MAX_DRONE_SIZE_M, MIN_DRONE_SIZE_M
+from flockd.sim.airframe import MACHINE_TEXTURES, Airframe, DroneModel
+from flockd.sim.mesh import Mesh, face_normals
+
+Array = NDArray[Any]
+GLTF = (".glb", ".gltf")
+ENDINGS = (*GLTF, ".obj", ".stl")
+OWN_FAMILY = 20_000
+"""Number of the own drone's shape, beyond those of the simulator and of the generator."""
+UNITS_M = {"m": 1.0, "in": 0.0254, "cm": 0.01, "mm": 0.001}
+WIDTHS = (0.6, 1.05)
+"""A mesh is as wide as this share of the drone's size from tip to tip: its propellers may stand across the arms, or be
+missing."""
+FLAT = 0.7
+"""Of a mesh that stands upright, no level side is less than this share of its height."""
+MOST_BYTES = 500 << 20
+MOST_TRIANGLES_READ, MOST_TRIANGLES = 4_000_000, 40_000
+CELLS = (320, 160, 80)
+"""A mesh of too many triangles is simplified to so many cells from tip to tip, in turn: at first a fifth of a
+crop's pixel each."""
+UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
+
+
+def read_mesh(path: Path, size_m: float, up: str | None = None) -> DroneModel:
+    """The drone in the file, body FRD (its heading is arbitrary), metres, unpainted where the file has no colours.
+
+    ``size_m``: its widest horizontal distance, propeller tip to tip. ``up``: one of ``UP_AXES``; by default +y of glTF
+    and +z of others. Raises ValueError with one sentence that says what is wrong.
+    """
+    if not MIN_DRONE_SIZE_M <= size_m <= MAX_DRONE_SIZE_M:
+        raise ValueError(f"--size-m {size_m:g}: a drone measures {MIN_DRONE_SIZE_M:g} to {MAX_DRONE_SIZE_M:g} m")
+    mesh = _loaded(path)
+    is_gltf = path.suffix.lower() in GLTF
+    vertices = _upright(np.asarray(mesh.vertices, np.float64), up or ("y" if is_gltf else "z"))
+    vertices = _in_metres(path, vertices, size_m, {"m": 1.0} if is_gltf else UNITS_M)
+    triangles, colours = np.asarray(mesh.faces), _colours(mesh)
+    for cells in CELLS:
+        if len(triangles) > MOST_TRIANGLES:
+            vertices, triangles, kept = _simplified(vertices, triangles, size_m / cells)
+            colours = None if colours is None else colours[kept]
+    if len(triangles) > MOST_TRIANGLES:
+        raise ValueError(
+            f"{path}: has {len(triangles)} triangles without small details, and at most {MOST_TRIANGLES} are drawn; "
+            "simplify it where it was modelled"
+        )
+    has_area = np.linalg.norm(face_normals(vertices, triangles), axis=1) > 0.5
+    return _model(vertices, triangles[has_area], None if colours is None else colours[has_area], size_m)
+
+
+def painted(model: DroneModel, seed: int) -> DroneModel:
+    """The same drone in another light and wear; one whose file says no colours is painted, each part in one colour."""
+    rng = np.random.default_rng([model.family, seed])
+    if np.isnan(model.colours).any():
+        one_side = model.triangles[: len(model.triangles) // 2]
+        touching = trimesh.graph.face_adjacency(one_side)
+        parts = np.tile(trimesh.graph.connected_component_labels(touching, node_count=len(one_side)), 2)
+        craft = Airframe(rng)
+        paints = np.array([craft.body, craft.frame, craft.metal, craft.front, craft.rear])
+        colours = paints[rng.choice(len(paints), int(parts.max()) + 1, p=_SHARES)][parts]
+    else:
+        colours = model.colours * np.exp(rng.normal(0, 0.15)) * np.exp(rng.normal(0, 0.04, 3))
+    texture = np.full(len(model.triangles), int(rng.integers(MACHINE_TEXTURES)), np.int32)
+    return replace(model, seed=seed, colours=np.clip(colours, 0.01, 0.9).astype(np.float32), texture=texture)
+
+
+_SHARES = (0.35, 0.35, 0.1, 0.1, 0.1)
+"""Of body, frame, metal, front and rear colours."""
+
+
+def _loaded(path: Path) -> Any:
+    """One mesh of all that the file shows."""
+    ending = path.suffix.lower()
+    if ending not in ENDINGS:
+        raise ValueError(f"{path}: a mesh is read from {', '.join(ENDINGS)}; export it as one of these")
+    if not path.is_file():
+        raise ValueError(f"{path}: there is no such file")
+    if path.stat().st_size > MOST_BYTES:
+        raise ValueError(f"{path}: is larger than {MOST_BYTES >> 20} MB; simplify it where it was modelled")
+    try:
+        mesh: Any = trimesh.load_mesh(path)
+        if isinstance(mesh, trimesh.Scene):
+            mesh = mesh.to_mesh()
+    except Exception as error:  # noqa: BLE001 - whatever a parser of foreign files raises, the file is at fault
+        raise ValueError(f"{path}: is no mesh that can be read ({str(error) or type(error).__name__})") from None
+    if not len(getattr(mesh, "faces", ())):
+        raise ValueError(f"{path}: holds no triangles; export the drone's surface as a mesh")
+    if len(mesh.faces) > MOST_TRIANGLES_READ:
+        raise ValueError(
+            f"{path}: has {len(mesh.faces)} triangles, and at most {MOST_TRIANGLES_READ} are read; "
+            "simplify it where it was modelled"
+        )
+    if not np.isfinite(mesh.vertices).all():
+        raise ValueError(f"{path}: has places that are no numbers; export it again")
+    return mesh
+
+
+def _upright(vertices: Array, up: str) -> Array:
+    """Right-handed axes with ``up`` -> any level axes and z down."""
+    if up not in UP_AXES:
+        raise ValueError(f"--up {up}: is one of {', '.join(UP_AXES)}")
+    axis, sign = "xyz".index(up[-1]), -1.0 if up.startswith("-") else 1.0
+    down = -sign * vertices[:, axis]
+    first, second = vertices[:, (axis + 1) % 3], vertices[:, (axis + 2) % 3]
+    # (first, second, up) is right-handed; so is (second, first, down).
+    return np.column_stack([second, first, down] if sign > 0 else [first, second, down])
+
+
+def _in_metres(path: Path, vertices: Array, size_m: float, units: dict[str, float]) -> Array:
+    """Centred, and in the one unit in which it is about as wide as it should be."""
+    low, high = vertices.min(0), vertices.max(0)
+    across, along, tall = high - low
+    width = _widest(vertices[:, :2])
+    if not width > 0:
+        raise ValueError(f"{path}: is a single point or line seen from above; export the whole drone")
+    fits = [scale for scale in units.values() if WIDTHS[0] * size_m <= width * scale <= WIDTHS[1] * size_m]
+    if not fits:
+        would = ", ".join(f"{width * scale:.3g} m if its unit is {unit}" for unit, scale in units.items())
+        raise ValueError(
+            f"{path}: is {width:.4g} wide seen from above ({would}), and --size-m {size_m:g} m fits none; "
+            "correct --size-m, --up, or the scale on export"
+        )
+    if min(across, along) < FLAT * tall:
+        shape = " x ".join(f"{fits[0] * side:.2f}" for side in (across, along, tall))
+        raise ValueError(f"{path}: would be {shape} m, the last upright, and a drone is wider than tall; correct --up")
+    return (vertices - (low + high) / 2) * fits[0]
+
+
+def _widest(points: Array) -> float:
+    """Largest distance between any two of (n, 2), to a thousandth."""
+    angles = np.linspace(0, np.pi, 90, endpoint=False)
+    along = points @ np.stack([np.cos(angles), np.sin(angles)])
+    return float(np.ptp(along, axis=0).max())
+
+
+def _simplified(vertices: Array, triangles: Array, cell_m: float) -> tuple[Array, Array, Array]:
+    """Corners of one cell become one; and the rows of the triangles that remain."""
+    cells = np.round(vertices / cell_m).astype(np.int64)
+    _, which, inverse = np.unique(cells @ [1 << 40, 1 << 20, 1], return_index=True, return_inverse=True)
+    coarse = inverse[triangles]
+    real = (coarse[:, 0] != coarse[:, 1]) & (coarse[:, 1] != coarse[:, 2]) & (coarse[:, 2] != coarse[:, 0])
+    corners = np.sort(coarse, axis=1)
+    _, first = np.unique((corners[:, 0] * len(which) + corners[:, 1]) * len(which) + corners[:, 2], return_index=True)
+    kept = np.intersect1d(np.flatnonzero(real), first)
+    return vertices[which], coarse[kept], kept
+
+
+def _colours(mesh: Any) -> Array | None:
+    """(m, 3) linear albedo of each triangle, where the file says one."""
+    visual = mesh.visual
+    if visual.kind == "texture":
+        visual = visual.to_color()
+    if not visual.defined:
+        return None
+    grey = np.asarray(visual.face_colors, np.float64)[:, :3] / 255.0
+    return np.where(grey <= 0.04045, grey / 12.92, ((grey + 0.055) / 1.055) ** 2.4)
+
+
+def _model(vertices: Array, triangles: Array, colours: Array | None, size_m: float) -> DroneModel:
+    """Each triangle is seen from both sides: in files of many programs, some face the wrong way."""
+    mesh, both = Mesh(), np.vstack([triangles, triangles[:, ::-1]])
+    tint = np.full((len(triangles), 3), np.nan) if colours is None else colours
+    mesh.add(vertices, both, 0, np.vstack([tint, tint]), (0.3, 0.3))
+    return DroneModel(
+        family=OWN_FAMILY,
+        seed=0,
+        vertices=vertices.astype(np.float32),
+        triangles=both.astype(np.int32),
+        colours=np.concatenate(mesh.tint).astype(np.float32),
+        texture=np.concatenate(mesh.texture).astype(np.int32),
+        uv=np.concatenate(mesh.uv),
+        hubs=np.full((4, 3), np.nan),
+        extent=np.stack([vertices.min(0), vertices.max(0)]),
+        size_m=size_m,
+    )
