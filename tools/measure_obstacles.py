@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from flockd.config import ScenarioConfig, load_scenario
-from flockd.config.obstacles import ObstaclesConfig
+from flockd.config.obstacle_field import ObstaclesConfig
 from flockd.flocking.metrics import min_distance, order, union
 from flockd.messages import Detection, EgoMotion, FloatArray, FrameSet, PilotOutput, VehicleState
 from flockd.obstacles import nearest_points
