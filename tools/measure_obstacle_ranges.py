@@ -3,9 +3,10 @@
     python -m tools.measure_obstacle_ranges config/forest.yaml --seed 100 --places 12
     python -m tools.measure_obstacle_ranges config/village.yaml --seed 100 --places 12 --true
 
-Two image sets of the first drone at each of a row of places along the way, and the ranges of the second. A sector whose
-true range is R counts as missed where neither it nor the sectors beside it show anything nearer than 1.5 R, and as false
-where it shows something nearer than 0.67 R with nothing true as near beside it. The error is of sectors that are neither.
+Two image sets of the first drone at each of a row of places along the way, and the ranges of the second. A sector
+whose true range is R counts as missed where neither it nor the sectors beside it show anything nearer than 1.5 R, and
+as false where it shows something nearer than 0.67 R with nothing true as near beside it. The error is of sectors that
+are neither.
 """
 
 from __future__ import annotations
