@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from flockd.config import ScenarioConfig, load_scenario
-from flockd.messages import FloatArray
+from flockd.messages import BoolArray, FloatArray
 from flockd.perception import Perception, load_networks
 from flockd.perception.obstacles import ObstacleRanging
 from flockd.pilot.motions import ego_motion
@@ -119,7 +119,7 @@ def _beside(ranges: FloatArray) -> FloatArray:
     return nearest
 
 
-def _share(chosen: FloatArray) -> float:
+def _share(chosen: BoolArray) -> float:
     return round(float(np.mean(chosen)), 3) if len(chosen) else 0.0
 
 

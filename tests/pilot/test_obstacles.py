@@ -11,7 +11,7 @@ import pytest
 
 from flockd.config import DroneConfig, load_scenario
 from flockd.data import data_path
-from flockd.messages import SECTORS, FrameSet, ObstacleRanges, PilotOutput, VehicleState
+from flockd.messages import SECTORS, FloatArray, FrameSet, ObstacleRanges, PilotOutput, VehicleState
 from flockd.perception import Observation
 from flockd.pilot import FlockPilot
 from flockd.recording.codec import from_json, parsed, to_json
@@ -32,6 +32,9 @@ class Observer:
     ) -> Observation:
         ranges = true_ranges(WALL, frames.time_s, np.array([0.0, 0.0, -4.0])) if self.sees else None
         return Observation(frames.time_s, vehicle, {}, (), None, obstacles=ranges)
+
+    def see_slope(self, slope: FloatArray) -> None:
+        raise AssertionError("exact ranges need no slope")
 
 
 def drone(*, enabled: bool) -> DroneConfig:

@@ -128,7 +128,8 @@ class ObstacleRanging:
         cells = sectors * shape[1] + bins
 
         def summed(values: FloatArray | None) -> FloatArray:
-            return np.bincount(cells, values, minlength=math.prod(shape)).reshape(shape)
+            totals = np.bincount(cells, values, minlength=math.prod(shape)).reshape(shape)
+            return totals.astype(float)
 
         count = summed(None)
         enough = np.cumsum(count, axis=1) >= self._parameters.min_pixels
