@@ -143,7 +143,7 @@ class ExactObserver:
         return self.now
 
     def see_slope(self, slope: FloatArray) -> None:
-        """Exact ranges need none."""
+        """The truth has its own."""
 
 
 class ExactPilot(FlockPilot):

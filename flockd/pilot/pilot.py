@@ -67,7 +67,7 @@ class Observer(Protocol):
         """What the newest frame set shows."""
 
     def see_slope(self, slope: FloatArray) -> None:
-        """Takes in how the ground slopes."""
+        """See `Perception.see_slope`."""
 
 
 class FlockPilot:

@@ -49,13 +49,13 @@ class CameraSimulator:
                     "change its intrinsics for simulated flights"
                 )
         obstacles = obstacles_of(scenario)
-        field = scenario.world.obstacles
+        field, path = scenario.world.obstacles, planned_path(scenario)
         clearance_m = scenario.world.clearance_m + _spread(scenario)
         world = World.generate(
             scenario.seed,
             ground_relief_m=scenario.world.ground_relief_m,
-            keep_out=planned_path(scenario) if field is None else _field_and_path(field.extent_m, scenario),
-            clearance_m=clearance_m if field is None else max(clearance_m, _FIELD_GRID_M),
+            keep_out=path if field is None else np.concatenate([path, field_grid(field.extent_m)]),
+            clearance_m=clearance_m if field is None else max(clearance_m, FIELD_GRID_M),
             obstacles=obstacles if obstacles.solids else None,
             hills_m=scenario.world.hills_m,
             hills_slope=scenario.world.hills_slope,
@@ -99,14 +99,13 @@ class CameraSimulator:
         return FrameSet(time_s, frames), truth
 
 
-_FIELD_GRID_M = 3.0
+FIELD_GRID_M = 3.0
 
 
-def _field_and_path(extent_m: float, scenario: ScenarioConfig) -> FloatArray:
-    """(n, 2) the planned path, and a grid over the obstacles' area, where nothing else is to stand."""
-    axis = np.arange(-extent_m, extent_m + _FIELD_GRID_M, _FIELD_GRID_M)
-    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    return np.concatenate([planned_path(scenario), grid])
+def field_grid(extent_m: float) -> FloatArray:
+    """(n, 2) m north and east all over the area of obstacles, where nothing else is to stand: `World.keep_out`."""
+    axis = np.arange(-extent_m, extent_m + FIELD_GRID_M, FIELD_GRID_M)
+    return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
 
 
 class _ImageNoise:

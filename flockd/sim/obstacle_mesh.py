@@ -10,6 +10,7 @@ from numpy.random import Generator
 
 from flockd.messages import Float32Array, FloatArray
 from flockd.sim import textures
+from flockd.sim.obstacle_worlds import LOWEST_CROWN_M
 from flockd.sim.obstacles import Box, Capsule, Frustum, Material, Obstacles
 from flockd.sim.scenery import Scenery, leaf_colour, paint_colour, roof_colour
 
@@ -81,6 +82,9 @@ def _draw_capsule(scenery: Scenery, solid: Capsule, look: _Look, shade: float, r
         (one + other) / 2, np.full(3, _SWELL * solid.radius), 0.0, rng, look.texture, look.tint * shade,
         look.tile_m[0], half_height=abs(one[2] - other[2]) / 2,
     )  # fmt: skip
+    if min(solid.height, solid.other_height) - solid.radius < LOWEST_CROWN_M:
+        top = max(solid.height, solid.other_height) + solid.radius
+        scenery.obstacles.append((solid.north, solid.east, solid.radius, solid.radius, 0.0, top))
 
 
 def _look(scenery: Scenery, rng: Generator, material: Material) -> _Look:

@@ -16,6 +16,8 @@ from flockd.sim.obstacles import Box, Capsule, Frustum, Material, Obstacles, Sol
 
 DEPTH_M = 0.6
 """How far everything reaches below z = 0, where the ground may lie lower."""
+LOWEST_CROWN_M = 6.0
+"""Of a forest's old trees."""
 _TREE_TRIES = 400
 _YOUNG = 0.12
 """Share of a forest's trees that have branches down to the ground."""
@@ -119,7 +121,7 @@ def _young_tree(rng: Generator, place: FloatArray, crown: float) -> list[Solid]:
 
 def _old_tree(rng: Generator, place: FloatArray, trunk: float, *, conifer: bool) -> list[Solid]:
     north, east = place.tolist()
-    bare, height = float(rng.uniform(6.0, 8.5)), float(rng.uniform(11.0, 17.0))
+    bare, height = float(rng.uniform(LOWEST_CROWN_M, 8.5)), float(rng.uniform(11.0, 17.0))
     crown = float(rng.uniform(1.0, 2.2))
     solids: list[Solid] = [Frustum(north, east, trunk, 0.5 * trunk, -DEPTH_M, bare + 0.6 * (height - bare), "bark")]
     if conifer:
@@ -129,10 +131,11 @@ def _old_tree(rng: Generator, place: FloatArray, trunk: float, *, conifer: bool)
             Frustum(north, east, 0.75 * crown, 0.0, middle, height, "needles"),
         ]
         return solids
-    for _ in range(int(rng.integers(2, 5))):
+    solids.append(Capsule(north, east, bare + crown, north, east, max(bare + crown, height - crown), crown, "leaves"))
+    for _ in range(int(rng.integers(1, 4))):
         radius = float(rng.uniform(0.5, 0.8)) * crown
-        up = float(rng.uniform(bare + radius, max(bare + radius + 0.1, height - radius)))
-        aside, angle = 0.6 * crown * rng.random(), rng.uniform(0, 2 * math.pi)
+        up = float(rng.uniform(bare + radius, max(bare + radius + 0.1, height - 2 * radius)))
+        aside, angle = 0.8 * crown, rng.uniform(0, 2 * math.pi)
         at = north + aside * math.cos(angle), east + aside * math.sin(angle)
         solids.append(Capsule(*at, up, *at, up + 0.4 * radius, radius, "leaves"))
     return solids

@@ -82,8 +82,8 @@ class World:
 
         ``ground_relief_m``: standard deviation of the ground's height (0: exactly flat). Nothing taller than 0.3 m
         comes closer than ``clearance_m`` to any of the ``keep_out`` points (n, 2) north, east, but ``obstacles``, which
-        stand where they stand, on level ground. ``hills_m`` and ``hills_slope``: see `flockd.sim.hills`; their ground is
-        added to the relief.
+        stand where they stand, on level ground. ``hills_m`` and ``hills_slope``: see `flockd.sim.hills`; their ground
+        is added to the relief.
         """
         if extent_m < 20.0:
             raise ValueError(f"extent_m must be at least 20 m, not {extent_m}")

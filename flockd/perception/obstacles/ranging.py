@@ -29,7 +29,7 @@ _NEAREST_M = 0.3
 _RATIO = 1.1
 """Of a range to that of the bin before it."""
 _GROUND_MARGIN_M = 0.7
-"""What is no higher than this above the ground that the autopilot's height gives counts as ground."""
+"""What is no higher than this above the ground counts as ground."""
 _HORIZON = 0.1
 """Tangent of the elevation up to which a ray shows how far the drone sees at its own height."""
 
@@ -105,7 +105,7 @@ class ObstacleRanging:
         away_m = np.hypot(north, east)
         sectors = np.round(np.arctan2(east, north) * (SECTORS / (2 * math.pi))).astype(np.int64) % SECTORS
         in_band = np.abs(down) <= p.height_band_m
-        above_ground = down <= observation.vehicle.height_m - _GROUND_MARGIN_M
+        above_ground = down <= _ground_down_m(observation, north, east) - _GROUND_MARGIN_M
         counts = in_band & above_ground & (labels == 0) & (away_m <= p.range_m)
         range_m, relative = self._agreed(
             sectors[counts], away_m[counts].astype(float), points.relative_sigma[counts].astype(float)
@@ -137,6 +137,14 @@ class ObstacleRanging:
         in_first = np.maximum(count[first], 1)
         mean_m = np.where(enough.any(axis=1), summed(away_m)[first] / in_first, np.inf)
         return mean_m, summed(relative)[first] / in_first
+
+
+def _ground_down_m(observation: Observation, north: Float32Array, east: Float32Array) -> float | Float32Array:
+    """How far below the drone the ground is under points (n,): level, or the plane that ranges to it tell."""
+    ground = observation.ground
+    if ground is None:
+        return observation.vehicle.height_m
+    return np.asarray(ground.height_m - north * ground.slope[0] - east * ground.slope[1], np.float32)
 
 
 def _bin(range_m: FloatArray | float) -> FloatArray:
