@@ -142,6 +142,9 @@ class ExactObserver:
         assert self.now is not None
         return self.now
 
+    def see_slope(self, slope: FloatArray) -> None:
+        """The truth has its own."""
+
 
 class ExactPilot(FlockPilot):
     """A pilot whose ego-motion is what its autopilot says."""

@@ -65,7 +65,9 @@ class Miner:
         for _ in range(places):
             half = float(np.exp(self._rng.uniform(math.log(5.0), math.log(110.0))))
             u, v = self._rng.uniform(0, width), self._rng.uniform(0, height)
-            self._cut("place", rig, image, (u - half, v - half * 0.5, u + half, v + half * 0.5))
+            place = (u - half, v - half * 0.5, u + half, v + half * 0.5)
+            if all(_gap(place, other) > 0 for other in boxes):
+                self._cut("place", rig, image, place)
 
     def save(self, path: Path) -> None:
         """All that was collected."""

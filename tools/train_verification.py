@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -47,8 +48,10 @@ class VerificationTask(Task):
 
     net: VerificationNet
 
-    def __init__(self, rendered: Path, patches: Path) -> None:
-        super().__init__(VerificationNet(), sum(MIX.values()), 6e-4)
+    def __init__(self, rendered: Path, patches: Path, mix: Mapping[str, int] = MIX) -> None:
+        """``mix``: samples of a batch, by kinds of ``KINDS``."""
+        super().__init__(VerificationNet(), sum(mix.values()), 6e-4)
+        self.mix = mix
         self.rendered = CropFiles(rendered)
         self.negatives = RealPatches(patches, "negative", weights=NEGATIVE_WEIGHTS)
         self.places = RealPatches(patches, "place", weights={"skydrones": 8.0, "skyothers": 8.0})
@@ -57,10 +60,10 @@ class VerificationTask(Task):
         self._shown: list[tuple[int, int] | None] = []
 
     def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
-        """As many of each kind as `MIX` says."""
+        """As many of each kind as the mix says."""
         self.rendered.look_for_more()
         self._shown = []
-        kinds = [(number, kind) for number, kind in enumerate(KINDS) for _ in range(MIX[kind])]
+        kinds = [(number, kind) for number, kind in enumerate(KINDS) for _ in range(self.mix.get(kind, 0))]
         return [self._of_kind(kind, rng) | {"kind": np.array(number)} for number, kind in kinds]
 
     def _of_kind(self, kind: str, rng: np.random.Generator) -> Sample:
@@ -108,6 +111,8 @@ class VerificationTask(Task):
             )
         figures = {"rendered none": float((probability[(kind == 0) & (there < 0.5)] > 0.8).float().mean())}
         for number, name in enumerate(KINDS):
+            if name not in self.mix:
+                continue
             mine = (kind == number) & (there > 0.5) if name != "negative" else kind == number
             figures[name] = float((probability[mine] > 0.8).float().mean())
         return loss, figures

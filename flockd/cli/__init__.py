@@ -40,9 +40,9 @@ exit codes:
   0    done
   1    a check failed
   2    the command line is wrong
-  69   something is not there: an autopilot, a device, an extra
+  69   something is unavailable: an autopilot, a device, an optional package
   78   a configuration or a model is wrong
-  130  interrupted by Ctrl-C; what was flown until then is reported"""
+  130  interrupted by Ctrl-C; a report of what was flown is written"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -66,8 +66,8 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--autopilot",
         choices=get_args(AutopilotKind),
-        help="fly with a real `flockd run` a drone, and this autopilot (default: with the simulator's own pilots); "
-        "`px4` needs FLOCKD_PX4, the SITL build folder of PX4",
+        help="fly with a real `flockd run` for each drone, and this autopilot (default: with the simulator's own "
+        "pilots); `px4` needs FLOCKD_PX4, the SITL build folder of PX4",
     )
     parser.add_argument(
         "--speed-factor",
@@ -85,7 +85,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("--wind", metavar="N,E", type=_wind, help="mean wind in m/s, to the north and to the east")
     parser.add_argument("--speed", metavar="V", type=positive_number, help="desired speed of the flock in m/s")
     parser.add_argument(
-        "--radius", metavar="R", type=positive_number, help="of the circle in m, measured at the middle"
+        "--radius", metavar="R", type=positive_number, help="of the circle in m, measured at the flock's centre"
     )
     parser.add_argument("--seed", metavar="N", type=seed, help="of the world and of all noise")
     parser.add_argument(
@@ -109,7 +109,7 @@ def add(commands: Commands) -> None:
         help="write a recording of each drone to DIR/recordings, 4.5 MB a drone and simulated second",
     )
     told = parser.add_mutually_exclusive_group()
-    told.add_argument("--quiet", action="store_true", help="no progress, and nothing but the path of the report")
+    told.add_argument("--quiet", action="store_true", help="print only the path of the report, and no progress")
     told.add_argument("--verbose", action="store_true", help="say what is flown, and each phase with its time")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     parser.set_defaults(run=_run)

@@ -50,7 +50,7 @@ def drone_text(new: NewDrone) -> str:
     width, height = new.size_px
     focal_px = width / 2 / math.radians(new.field_of_view_deg / 2)
     lines = [
-        "# A drone for `flockd run`. What is yours to fill in says so. Then `flockd config check` this file, and have",
+        "# A drone for `flockd run`. Fill in what is marked so. Then `flockd config check` this file, and have",
         "# `flockd doctor` examine the drone. `flockd config schema drone` lists every key there is.",
         f"name: {new.name}    # different for each drone of a fleet",
         "step_s: 0.5",
@@ -86,7 +86,7 @@ def drone_text(new: NewDrone) -> str:
         "",
         "telemetry:",
         f"  fleet: {new.fleet}",
-        "  listen: [tcp/0.0.0.0:7447]    # whoever reaches this computer may watch",
+        "  listen: [tcp/0.0.0.0:7447]    # anyone who reaches this computer may watch",
         "  commands: []                  # of hold, land, resume, goto and velocity, what watchers may ask for",
     ]
     return "\n".join(lines) + "\n"

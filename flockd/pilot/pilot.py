@@ -66,6 +66,9 @@ class Observer(Protocol):
     ) -> Observation:
         """What the newest frame set shows."""
 
+    def see_slope(self, slope: FloatArray) -> None:
+        """See `Perception.see_slope`."""
+
 
 class FlockPilot:
     """One drone's pilot. Remembers the last frame set and its tracks; everything else comes in with each step."""

@@ -286,7 +286,7 @@ def test_a_rig_is_calibrated_from_folders(tmp_path: Path, capsys: Capture) -> No
             )
     command = ("calibrate", "rig", shots, "--config", config, "--out", out)
     text = told(capsys, 0, *command)
-    assert "front: is the reference, and stays where it is" in text
+    assert "front: is the reference and keeps its mounting" in text
     assert re.search(r"right: yaw 8[78]\.\d+ pitch \d\.\d+ roll -\d\.\d+ \+- 0\.\d+ deg", text)
     told(capsys, 0, "config", "check", out)
     front, right = load_drone(out).rig.cameras

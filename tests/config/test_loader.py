@@ -225,7 +225,7 @@ def test_a_scenario_reports_a_drone_file_that_is_not_there(tmp_path: Path) -> No
         (b"- rig\n", ":1: is a list at its top level; write keys with values, such as `seed: 0`"),
         (b"rig\n", ":1: is a single value at its top level; write keys with values, such as `seed: 0`"),
         (b"step_s: 1\nrig: \xff\n", ":2: is not UTF-8 text; save the file in UTF-8"),
-        (b"rig:\n\tcameras: []\n", ":2: a tab stands where YAML wants spaces; indent and separate with spaces"),
+        (b"rig:\n\tcameras: []\n", ":2: a tab stands where YAML needs spaces; indent and separate with spaces"),
         (b"yaw: hold\nstep_s:1\nrig: {}\n", ":2: put a space after the `:`"),
         (
             b"a: 1\nrig: {b: 1\n",

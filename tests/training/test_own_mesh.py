@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from tools.training.own_mesh import MOST_TRIANGLES, UP_AXES, _upright, painted, read_mesh
+from flockd.sim.airframe import DroneModel
+from tools.training.own_mesh import MOST_TRIANGLES, UP_AXES, _upright, painted, read_meshes
 
 RED = [255, 0, 0, 255]
 
@@ -29,9 +30,23 @@ def written(folder: Path, name: str, mesh: trimesh.Trimesh) -> Path:
     return path
 
 
+def read(path: Path, size_m: float, up: str | None = None) -> DroneModel:
+    (drone,) = read_meshes([path], size_m, up)
+    return drone
+
+
+def test_files_of_one_drone_keep_their_common_origin(tmp_path: Path) -> None:
+    """With and without the post: the bars, whose middle is then another, stay where they are."""
+    whole = cross_of_boxes()
+    bars = trimesh.Trimesh(whole.vertices[:16], whole.faces[:24], process=False)
+    first, second = read_meshes([written(tmp_path, "a.stl", whole), written(tmp_path, "b.stl", bars)], 0.62)
+    assert first.extent[1].tolist() == pytest.approx(second.extent[1].tolist(), abs=1e-6), "their undersides"
+    assert second.extent[0, 2] - first.extent[0, 2] == pytest.approx(0.1, abs=1e-6), "the post, z down"
+
+
 @pytest.mark.parametrize(("ending", "unit"), [("stl", 1000.0), ("obj", 1 / 0.0254), ("stl", 100.0), ("obj", 1.0)])
 def test_the_drones_size_says_the_unit_of_a_file_that_does_not(tmp_path: Path, ending: str, unit: float) -> None:
-    drone = read_mesh(written(tmp_path, f"drone.{ending}", cross_of_boxes(unit)), 0.62)
+    drone = read(written(tmp_path, f"drone.{ending}", cross_of_boxes(unit)), 0.62)
     sides = drone.extent[1] - drone.extent[0]
     assert sorted(sides) == pytest.approx([0.15, 0.4, 0.6], rel=1e-3)
     assert sides[2] == pytest.approx(0.15, rel=1e-3), "upright"
@@ -51,7 +66,7 @@ def test_what_is_up_in_the_file_is_up_in_the_air_and_nothing_is_mirrored(up: str
 def test_gltf_says_which_way_is_up_and_for_other_files_the_user_does(tmp_path: Path, name: str, up: str | None) -> None:
     mesh = cross_of_boxes()
     mesh.vertices = mesh.vertices[:, [1, 2, 0]]
-    drone = read_mesh(written(tmp_path, name, mesh), 0.6, up)
+    drone = read(written(tmp_path, name, mesh), 0.6, up)
     top = drone.vertices[np.argsort(drone.vertices[:, 2])[:4]]
     assert np.abs(top[:, :2]).max() < 0.02, "the post is on top"
 
@@ -59,10 +74,10 @@ def test_gltf_says_which_way_is_up_and_for_other_files_the_user_does(tmp_path: P
 def test_colours_of_a_file_are_kept_and_a_drone_without_is_painted_part_by_part(tmp_path: Path) -> None:
     mesh = cross_of_boxes()
     mesh.visual.face_colors = RED
-    red = painted(read_mesh(written(tmp_path, "red.glb", mesh), 0.6, "z"), 1)
+    red = painted(read(written(tmp_path, "red.glb", mesh), 0.6, "z"), 1)
     assert (red.colours[:, 0] > 0.5).all()
     assert (red.colours[:, 1:] < 0.05).all()
-    plain = read_mesh(written(tmp_path, "plain.stl", cross_of_boxes()), 0.6)
+    plain = read(written(tmp_path, "plain.stl", cross_of_boxes()), 0.6)
     paints = [painted(plain, seed).colours for seed in range(8)]
     assert all(np.isfinite(paint).all() and paint.min() > 0 and paint.max() <= 0.9 for paint in paints)
     assert max(len(np.unique(paint, axis=0)) for paint in paints) == 3, "two bars and a post"
@@ -72,7 +87,7 @@ def test_colours_of_a_file_are_kept_and_a_drone_without_is_painted_part_by_part(
 def test_a_mesh_of_very_many_triangles_is_simplified_to_what_a_camera_sees(tmp_path: Path) -> None:
     dense = cross_of_boxes().subdivide_to_size(0.006)
     assert len(dense.faces) > MOST_TRIANGLES
-    drone = read_mesh(written(tmp_path, "dense.stl", dense), 0.6)
+    drone = read(written(tmp_path, "dense.stl", dense), 0.6)
     assert len(drone.triangles) <= 2 * MOST_TRIANGLES, "each has two sides"
     assert drone.extent[1] - drone.extent[0] == pytest.approx([0.4, 0.6, 0.15], abs=0.008)
 
@@ -97,5 +112,5 @@ def test_a_file_that_cannot_be_the_drone_is_refused_in_one_sentence(
     for broken in ("text.glb", "text.stl"):
         (tmp_path / broken).write_text("no mesh at all", encoding="utf-8")
     with pytest.raises(ValueError, match=said) as refused:
-        read_mesh(tmp_path / name, size_m, up)
+        read(tmp_path / name, size_m, up)
     assert "\n" not in str(refused.value)

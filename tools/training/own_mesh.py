@@ -5,6 +5,7 @@ Only glTF says its unit (metres) and which way is up (+y); of the others, the dr
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,14 +37,23 @@ crop's pixel each."""
 UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 
 
-def read_mesh(path: Path, size_m: float, up: str | None = None) -> DroneModel:
-    """The drone in the file, body FRD (its heading is arbitrary), metres, unpainted where the file has no colours.
+def read_meshes(paths: Sequence[Path], size_m: float, up: str | None = None) -> list[DroneModel]:
+    """The drone in the files, body FRD (its heading is arbitrary), metres, unpainted where a file has no colours.
 
-    ``size_m``: its widest horizontal distance, propeller tip to tip. ``up``: one of ``UP_AXES``; by default +y of glTF
-    and +z of others. Raises ValueError with one sentence that says what is wrong.
+    Several files show the same drone from the same origin, as with other propellers. ``size_m``: its widest horizontal
+    distance, propeller tip to tip. ``up``: one of ``UP_AXES``; by default +y of glTF and +z of others. Raises
+    ValueError with one sentence that says what is wrong.
     """
     if not MIN_DRONE_SIZE_M <= size_m <= MAX_DRONE_SIZE_M:
         raise ValueError(f"--size-m {size_m:g}: a drone measures {MIN_DRONE_SIZE_M:g} to {MAX_DRONE_SIZE_M:g} m")
+    surfaces = [_surface(path, size_m, up) for path in paths]
+    corners = np.vstack([vertices for vertices, _, _ in surfaces])
+    middle = (corners.min(0) + corners.max(0)) / 2
+    return [_model(vertices - middle, triangles, colours, size_m) for vertices, triangles, colours in surfaces]
+
+
+def _surface(path: Path, size_m: float, up: str | None) -> tuple[Array, Array, Array | None]:
+    """Corners in metres, triangles, and their colours."""
     mesh = _loaded(path)
     is_gltf = path.suffix.lower() in GLTF
     vertices = _upright(np.asarray(mesh.vertices, np.float64), up or ("y" if is_gltf else "z"))
@@ -59,7 +69,7 @@ def read_mesh(path: Path, size_m: float, up: str | None = None) -> DroneModel:
             "simplify it where it was modelled"
         )
     has_area = np.linalg.norm(face_normals(vertices, triangles), axis=1) > 0.5
-    return _model(vertices, triangles[has_area], None if colours is None else colours[has_area], size_m)
+    return vertices, triangles[has_area], None if colours is None else colours[has_area]
 
 
 def painted(model: DroneModel, seed: int) -> DroneModel:
@@ -67,7 +77,8 @@ def painted(model: DroneModel, seed: int) -> DroneModel:
     rng = np.random.default_rng([model.family, seed])
     if np.isnan(model.colours).any():
         one_side = model.triangles[: len(model.triangles) // 2]
-        touching = trimesh.graph.face_adjacency(one_side)
+        _, corner = np.unique(np.round(model.vertices, 5), axis=0, return_inverse=True)
+        touching = trimesh.graph.face_adjacency(corner.reshape(-1)[one_side])
         parts = np.tile(trimesh.graph.connected_component_labels(touching, node_count=len(one_side)), 2)
         craft = Airframe(rng)
         paints = np.array([craft.body, craft.frame, craft.metal, craft.front, craft.rear])
@@ -92,7 +103,7 @@ def _loaded(path: Path) -> Any:
     if path.stat().st_size > MOST_BYTES:
         raise ValueError(f"{path}: is larger than {MOST_BYTES >> 20} MB; simplify it where it was modelled")
     try:
-        mesh: Any = trimesh.load_mesh(path)
+        mesh: Any = trimesh.load_mesh(path, process=False)
         if isinstance(mesh, trimesh.Scene):
             mesh = mesh.to_mesh()
     except Exception as error:  # noqa: BLE001 - whatever a parser of foreign files raises, the file is at fault
@@ -121,7 +132,7 @@ def _upright(vertices: Array, up: str) -> Array:
 
 
 def _in_metres(path: Path, vertices: Array, size_m: float, units: dict[str, float]) -> Array:
-    """Centred, and in the one unit in which it is about as wide as it should be."""
+    """In the one unit in which it is about as wide as it should be."""
     low, high = vertices.min(0), vertices.max(0)
     across, along, tall = high - low
     width = _widest(vertices[:, :2])
@@ -137,7 +148,7 @@ def _in_metres(path: Path, vertices: Array, size_m: float, units: dict[str, floa
     if min(across, along) < FLAT * tall:
         shape = " x ".join(f"{fits[0] * side:.2f}" for side in (across, along, tall))
         raise ValueError(f"{path}: would be {shape} m, the last upright, and a drone is wider than tall; correct --up")
-    return (vertices - (low + high) / 2) * fits[0]
+    return vertices * fits[0]
 
 
 def _widest(points: Array) -> float:

@@ -97,6 +97,7 @@ class GroundBelow:
         return None
 
     def _is_unexplained(self, row: FloatArray, ground_m: float, variance: float) -> bool:
+        assert self._state is not None
         sigma_m = math.sqrt(float(row @ self._covariance @ row) + variance)
         return abs(ground_m - float(row @ self._state)) > self._parameters.gate_sigma * sigma_m
 

@@ -8,7 +8,16 @@ import numpy as np
 
 from flockd.config.avoidance import ObstacleParameters
 from flockd.geometry import Rig, RigCamera, grid_pixels
-from flockd.messages import SECTORS, UNCLASSED, Float32Array, FloatArray, IntArray, ObstacleRanges, UInt8Array
+from flockd.messages import (
+    SECTORS,
+    UNCLASSED,
+    BoolArray,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    ObstacleRanges,
+    UInt8Array,
+)
 from flockd.perception.observation import Observation
 
 _STRIDE_PX = 4
@@ -17,7 +26,7 @@ _NEAREST_M = 0.3
 _RATIO = 1.1
 """Of a range to that of the bin before it."""
 _GROUND_MARGIN_M = 0.7
-"""What is no higher than this above the ground that the autopilot's height gives counts as ground."""
+"""What is no higher than this above the ground counts as ground."""
 _HORIZON = 0.1
 """Tangent of the elevation up to which a ray shows how far the drone sees at its own height."""
 
@@ -31,33 +40,33 @@ class ObstacleRanging:
 
     def __init__(self, rig: Rig, parameters: ObstacleParameters) -> None:
         self._rig, self._parameters = rig, parameters
-        self._pixels = {name: grid_pixels(camera.camera.size, _STRIDE_PX) for name, camera in rig.cameras.items()}
-        self._rays = {name: _body_rays(camera, self._pixels[name]) for name, camera in rig.cameras.items()}
-        self._edges_m = _NEAREST_M * _RATIO ** np.arange(1 + math.ceil(_bin(parameters.range_m)))
+        self._rays = {name: _body_rays(camera) for name, camera in rig.cameras.items()}
+        self._bins = 1 + math.ceil(_bin(parameters.range_m))
 
     def ranges(self, observation: Observation) -> ObstacleRanges:
         """Of one observation, whose depth has its scale."""
-        points, drones = [np.empty((0, 3), np.float32)], [np.empty(0, np.uint8)]
+        points, labels = [np.empty((3, 0), np.float32)], [np.empty(0, np.uint8)]
+        R_ned_body = observation.vehicle.R_ned_body.astype(np.float32)
+        grid = slice(_STRIDE_PX // 2, None, _STRIDE_PX)  # of `grid_pixels`
         for name, camera in observation.cameras.items():
-            column, row = self._pixels[name].astype(np.int64).T
-            R_ned_body = observation.vehicle.R_ned_body.astype(np.float32)
-            offset = (R_ned_body @ self._rig.cameras[name].T_body_camera.translation).astype(np.float32)
-            points.append((self._rays[name] @ R_ned_body.T) * camera.depth[row, column, None] + offset)
-            drones.append(camera.labels[row, column])
-        return self._nearest(observation, np.concatenate(points), np.concatenate(drones))
+            origin = R_ned_body @ self._rig.cameras[name].T_body_camera.translation.astype(np.float32)
+            north, east, down = (R_ned_body @ self._rays[name]) * camera.depth[grid, grid].ravel() + origin[:, None]
+            about_level = (np.abs(down) <= self._parameters.height_band_m) | _is_level(north, east, down)
+            points.append(np.stack([north[about_level], east[about_level], down[about_level]]))
+            labels.append(camera.labels[grid, grid].ravel()[about_level])
+        return self._nearest(observation, np.concatenate(points, axis=1), np.concatenate(labels))
 
     def _nearest(self, observation: Observation, points: Float32Array, labels: UInt8Array) -> ObstacleRanges:
-        """Of points (n, 3) metres NED from the drone, and what they are labelled with (n,)."""
+        """Of points (3, n) metres NED from the drone, and what they are labelled with (n,)."""
         p = self._parameters
-        away_m = np.hypot(points[:, 0], points[:, 1])
-        sectors = (
-            np.round(np.arctan2(points[:, 1], points[:, 0]) * (SECTORS / (2 * math.pi))).astype(np.int64) % SECTORS
-        )
-        in_band = np.abs(points[:, 2]) <= p.height_band_m
-        above_ground = points[:, 2] <= observation.vehicle.height_m - _GROUND_MARGIN_M
-        counts = in_band & above_ground & (labels == 0) & (away_m <= p.range_m)  # NaN counts nowhere
+        north, east, down = points
+        away_m = np.hypot(north, east)
+        sectors = np.round(np.arctan2(east, north) * (SECTORS / (2 * math.pi))).astype(np.int64) % SECTORS
+        in_band = np.abs(down) <= p.height_band_m
+        above_ground = down <= _ground_down_m(observation, north, east) - _GROUND_MARGIN_M
+        counts = in_band & above_ground & (labels == 0) & (away_m <= p.range_m)
         range_m = self._agreed(sectors[counts], away_m[counts].astype(float))
-        level = (np.abs(points[:, 2]) <= _HORIZON * away_m) & (labels != UNCLASSED)
+        level = _is_level(north, east, down) & (labels != UNCLASSED)
         seen_m = _medians(sectors[level], np.minimum(away_m[level], p.range_m))
         found = np.isfinite(range_m)
         sigma_m = np.where(found, p.range_sigma * np.where(found, range_m, 0.0), 0.0)
@@ -67,8 +76,8 @@ class ObstacleRanging:
 
     def _agreed(self, sectors: IntArray, away_m: FloatArray) -> FloatArray:
         """(SECTORS,) metres: the mean of the nearest points of each sector that are enough; inf where none are."""
-        bins = np.clip(np.floor(_bin(away_m)), 0, len(self._edges_m) - 1).astype(np.int64)
-        shape = (SECTORS, len(self._edges_m))
+        bins = np.minimum(np.floor(_bin(away_m)), self._bins - 1).astype(np.int64)
+        shape = (SECTORS, self._bins)
         cells = sectors * shape[1] + bins
         count = np.bincount(cells, minlength=math.prod(shape)).reshape(shape)
         total_m = np.bincount(cells, away_m, minlength=math.prod(shape)).reshape(shape)
@@ -80,15 +89,30 @@ class ObstacleRanging:
         return np.where(enough.any(axis=1), mean_m, np.inf)
 
 
+def _ground_down_m(observation: Observation, north: Float32Array, east: Float32Array) -> float | Float32Array:
+    """How far below the drone the ground is under points (n,): level, or the plane that ranges to it tell."""
+    ground = observation.ground
+    if ground is None:
+        return observation.vehicle.height_m
+    return np.asarray(ground.height_m - north * ground.slope[0] - east * ground.slope[1], np.float32)
+
+
 def _bin(range_m: FloatArray | float) -> FloatArray:
     """On the logarithmic scale of ranges."""
     bins: FloatArray = np.log(np.maximum(range_m, _NEAREST_M) / _NEAREST_M) / math.log(_RATIO)
     return bins
 
 
-def _body_rays(camera: RigCamera, pixels: FloatArray) -> Float32Array:
-    """(n, 3): what has to be multiplied by a pixel's depth, in body axes."""
-    rays: FloatArray = camera.camera.unproject(pixels, np.ones(len(pixels))) @ camera.T_body_camera.rotation.T
+def _is_level(north: Float32Array, east: Float32Array, down: Float32Array) -> BoolArray:
+    """(n,) of points: whether they are about as high as the drone, seen from it; NaN is not."""
+    level: BoolArray = down**2 <= _HORIZON**2 * (north**2 + east**2)
+    return level
+
+
+def _body_rays(camera: RigCamera) -> Float32Array:
+    """(3, n): what has to be multiplied by the depth of each pixel that is taken, in body axes."""
+    pixels = grid_pixels(camera.camera.size, _STRIDE_PX)
+    rays: FloatArray = camera.T_body_camera.rotation @ camera.camera.unproject(pixels, np.ones(len(pixels))).T
     return rays.astype(np.float32)
 
 
