@@ -33,7 +33,7 @@ def test_a_drone_has_its_cameras_evenly_around(tmp_path: Path) -> None:
 
 
 def test_on_a_terminal_it_asks_until_the_answer_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    answers = iter(["", "a hundred", "3", "", "waypoints", ""])
+    answers = iter(["", "a hundred", "3", "", "waypoints", "", ""])
     monkeypatch.setattr("sys.stdin.isatty", lambda: True)
     monkeypatch.setattr("builtins.input", lambda _: next(answers))
     file = tmp_path / "asked.yaml"
