@@ -116,8 +116,8 @@ def test_a_command_that_cannot_be_flown(
     wrong: list[bool] = []
     step = FlockPilot.step
 
-    def spoiled(self: FlockPilot, frames: FrameSet, vehicle: VehicleState) -> PilotOutput:
-        output = step(self, frames, vehicle)
+    def spoiled(self: FlockPilot, frames: FrameSet, vehicle: VehicleState, *rest: Any) -> PilotOutput:
+        output = step(self, frames, vehicle, *rest)
         if not wrong:
             return output
         return replace(output, command=replace(output.command, velocity=np.array(velocity)))
