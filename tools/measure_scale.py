@@ -18,7 +18,7 @@ from typing import get_args
 import numpy as np
 
 from flockd.choices import HeightSource
-from flockd.config import load_scenario
+from flockd.config import DroneConfig, load_scenario
 from flockd.config.scenario import ScenarioConfig
 from flockd.messages import FloatArray, PilotOutput
 from flockd.perception import load_networks
@@ -27,6 +27,8 @@ from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.exact_states import ExactFlock, start_yaw, step_times
 from flockd.sim.vehicles import SimulatedAutopilot, Vehicles
 
+SETTLED_S = 6.0
+"""Before, the range finder has not measured yet what the cameras see behind the drone."""
 LEAST_STEP_M = 0.1
 """A shorter step says nothing of the scale."""
 
@@ -41,14 +43,18 @@ class Errors:
     """The own speed over the true one, less 1."""
     height: list[float] = field(default_factory=list)
     """The height above ground that was used over the true one, less 1."""
+    settled: list[bool] = field(default_factory=list)
+    """Of each entry of `along_m`: after `SETTLED_S`."""
     missing: int = 0
 
     def figures(self) -> dict[str, float]:
         """Largest and median, of sizes."""
         along, scale, height = (np.abs(values) for values in (self.along_m, self.scale, self.height))
+        later = along[np.array(self.settled)] if any(self.settled) else np.array([np.nan])
         return {
             "steps": len(along), "missing": self.missing,
             "along_largest_m": float(along.max()), "along_median_m": float(np.median(along)),
+            "settled_largest_m": float(later.max()), "settled_median_m": float(np.median(later)),
             "scale_largest": float(scale.max()), "scale_median": float(np.median(scale)),
             "scale_bias": float(np.median(self.scale)), "height_median": float(np.median(height)),
         }  # fmt: skip
@@ -73,19 +79,19 @@ def measure(scenario: ScenarioConfig, drone: int, sources: tuple[HeightSource, .
             used_m = state.height_m if output.ground is None else output.ground.height_m
             found[source].height.append(used_m / (-float(position[2]) - ground_m) - 1.0)
             if before is not None:
-                _judge(output, before[1].T @ (position - before[0]), found[source])
+                _judge(output, before[1].T @ (position - before[0]), found[source], settled=time_s > SETTLED_S)
         before = position, R_ned_body
         commands = flock.step(float(time_s), vehicles.position, vehicles.velocity)
         vehicles.step(commands.velocity, commands.yaw_rad, scenario.drone.step_s, commands.height_m)
     return found
 
 
-def _with_height(scenario: ScenarioConfig, drone: int, source: HeightSource):  # type: ignore[no-untyped-def]
+def _with_height(scenario: ScenarioConfig, drone: int, source: HeightSource) -> DroneConfig:
     config = scenario.drone_of(drone)
     return config.model_copy(update={"perception": config.perception.model_copy(update={"height": source})})
 
 
-def _judge(output: PilotOutput, moved: FloatArray, errors: Errors) -> None:
+def _judge(output: PilotOutput, moved: FloatArray, errors: Errors, *, settled: bool) -> None:
     """``moved`` (3,) m in the body frame at the step's start."""
     if output.ego_motion is None:
         errors.missing += 1
@@ -93,6 +99,7 @@ def _judge(output: PilotOutput, moved: FloatArray, errors: Errors) -> None:
     length_m = float(np.linalg.norm(moved))
     along_m = float(output.ego_motion.translation @ moved) / max(length_m, 1e-9)
     errors.along_m.append(along_m - length_m)
+    errors.settled.append(bool(settled))
     if length_m > LEAST_STEP_M:
         errors.scale.append(float(np.linalg.norm(output.ego_motion.translation)) / length_m - 1.0)
 
@@ -112,7 +119,7 @@ def main() -> int:
         for drone in args.drones:
             for source, errors in measure(scenario, drone - 1, tuple(args.heights)).items():
                 print(json.dumps({"seed": seed, "drone": drone, "height": source, **errors.figures()}), flush=True)
-                for name in ("along_m", "scale", "height"):
+                for name in ("along_m", "scale", "height", "settled"):
                     getattr(pooled[source], name).extend(getattr(errors, name))
                 pooled[source].missing += errors.missing
     for source, errors in pooled.items():
