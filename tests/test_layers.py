@@ -283,6 +283,7 @@ def test_nothing_imports_the_commands() -> None:
 FILES_OF_ONE_NAME = {
     "__init__.py": "marks a package",
     "errors.py": "the error types of its folder",
+    "avoidance.py": "the section of the configuration for obstacles, and what flies around them",
     "rig.py": "the rig's section of the configuration, and the rig built from it",
 }
 """Names that several files of the package may share, and why."""

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from flockd.config import ScenarioConfig, load_scenario
-from flockd.config.obstacles import ObstaclesConfig
+from flockd.config.obstacle_field import ObstaclesConfig
 from flockd.flocking.metrics import min_distance, order, union
 from flockd.messages import Detection, EgoMotion, FloatArray, FrameSet, PilotOutput, VehicleState
 from flockd.obstacles import nearest_points
@@ -141,6 +141,9 @@ class ExactObserver:
         """What was put there."""
         assert self.now is not None
         return self.now
+
+    def see_slope(self, slope: FloatArray) -> None:
+        """The truth has its own."""
 
 
 class ExactPilot(FlockPilot):

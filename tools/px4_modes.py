@@ -4,7 +4,7 @@
     python -m tools.px4_modes --only gps_off wind --speed-factor 0.5 --json
 
 Each fault has a PX4 of its own, which hovers or flies in offboard at setpoints that flockd's autopilot link sends, from
-a process of its own. No cameras and no pilot: what PX4 does is the question. It ends with 1 if a mode differs.
+a process of its own; for `daemon_killed` a whole `flockd run` flies by rendered images. Exit code 1: a mode differs.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import asyncio
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -27,19 +28,24 @@ from typing import Self
 import numpy as np
 
 from flockd.autopilot.mavsdk_link import AutopilotLink
-from flockd.config import load_scenario
+from flockd.config import DroneConfig, ScenarioConfig, load, load_scenario
 from flockd.config.autopilot import AutopilotParameters
 from flockd.data import data_path
 from flockd.errors import FlockdError, UnavailableError
 from flockd.messages import Setpoint
-from flockd.sim.autopilots import Px4s, px4_folder
+from flockd.sim.autopilots import Ports, Px4s, px4_folder
+from flockd.sim.daemons import Daemons, fleet_configs
+from flockd.sim.frame_server import FrameServer
 from flockd.sim.ground_station import GroundStation
-from flockd.sim.processes import Programs
+from flockd.sim.processes import Program, Programs
 from flockd.sim.start import with_drones
 from flockd.sources import clock_at
+from tools.bench_daemon import free_port
+from tools.soak import small
 
 HEIGHT_M = 4.0
 SETPOINTS_HZ = 20.0
+FRAMES_HZ = 2.0
 SHELL_PORT = 14580
 """Of this computer, where PX4's instance 0 listens to its companion computer."""
 START_S = 120.0
@@ -65,6 +71,8 @@ class Fault:
     parameters: Mapping[str, str] = field(default_factory=dict)
     north_m_s: float = 0.0
     """The commanded velocity."""
+    by_daemon: bool = False
+    """A whole daemon flies, and not a process that sends setpoints alone."""
 
 
 def _shell(*command: str) -> Callable[[Px4Flight], None]:
@@ -100,13 +108,16 @@ FAULTS = (
         "geofence_return", "RTL", "GF_ACTION 3: Return outside GF_MAX_HOR_DIST",
         lambda flight: None, {"GF_ACTION": "3", "GF_MAX_HOR_DIST": "15"}, north_m_s=1.5,
     ),
-    Fault("daemon_killed", "LOITER", "COM_OBL_RC_ACT 5: Hold", lambda flight: flight.kill_companion()),
     Fault(
-        "daemon_killed_land", "LAND", "COM_OBL_RC_ACT 4: Land",
+        "daemon_killed", "LOITER", "COM_OBL_RC_ACT 5: Hold", lambda flight: flight.kill_companion(), by_daemon=True
+    ),
+    Fault("sender_killed", "LOITER", "COM_OBL_RC_ACT 5: Hold", lambda flight: flight.kill_companion()),
+    Fault(
+        "sender_killed_land", "LAND", "COM_OBL_RC_ACT 4: Land",
         lambda flight: flight.kill_companion(), {"COM_OBL_RC_ACT": "4"},
     ),
     Fault(
-        "daemon_killed_return", "RTL", "COM_OBL_RC_ACT 3: Return",
+        "sender_killed_return", "RTL", "COM_OBL_RC_ACT 3: Return",
         lambda flight: flight.kill_companion(), {"COM_OBL_RC_ACT": "3"},
     ),
     Fault(
@@ -171,18 +182,49 @@ class Px4Flight:
         self.station = self._stack.enter_context(GroundStation([port.truth], self._clock))
         self._until(lambda: self.station.is_connected(0), START_S * self._speed_factor, "PX4 sends nothing")
         self.station.request_messages()
-        self._companions = self._stack.enter_context(Programs())
-        options = ["--companion", *map(str, (port.offboard, self._speed_factor, self._fault.north_m_s))]
-        log = folder / "companion.log"
-        command = [sys.executable, "-m", "tools.px4_modes", *options]
-        self._companion = self._companions.start("companion", command, os.environ, Path(__file__).parents[1], log)
-        self._until(lambda: "streaming" in log.read_text(), START_S * self._speed_factor, "no setpoints")
+        start = self._start_daemon if self._fault.by_daemon else self._start_sender
+        self._companion = start(scenario, port, folder)
         station = self.station
         self._request(lambda: station.is_armed(0), lambda: station.arm(0), "was not armed")
         self._request(self._is_up, self._climb, "did not climb")
         self._request(
             lambda: station.mode(0) == "OFFBOARD", lambda: station.select(0, "OFFBOARD"), "did not go into offboard"
         )
+
+    def _start_sender(self, scenario: ScenarioConfig, port: Ports, folder: Path) -> Program:
+        """A process that sends setpoints."""
+        companions = self._stack.enter_context(Programs())
+        options = ["--companion", *map(str, (port.offboard, self._speed_factor, self._fault.north_m_s))]
+        log = folder / "companion.log"
+        command = [sys.executable, "-m", "tools.px4_modes", *options]
+        companion = companions.start("companion", command, os.environ, Path(__file__).parents[1], log)
+        self._until(lambda: "streaming" in log.read_text(), START_S * self._speed_factor, "no setpoints")
+        return companion
+
+    def _start_daemon(self, scenario: ScenarioConfig, port: Ports, folder: Path) -> Program:
+        """A whole `flockd run`, with small images of the scenario's world and nobody else in it."""
+        sitl = load(data_path("config") / "px4_sitl.yaml")
+        assert isinstance(sitl, DroneConfig)
+        endpoint, speed_factor = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", self._speed_factor
+        scenario = scenario.model_copy(update={"drone": small(scenario.drone)})
+        (config,) = fleet_configs(scenario, sitl, ports=[port], endpoint=endpoint, speed_factor=speed_factor)
+        config = config.model_copy(update={"safety": config.safety.model_copy(update={"alone_s": None})})
+        server = self._stack.enter_context(
+            FrameServer(
+                scenario,
+                [config.name],
+                endpoint=endpoint,
+                rate_hz=FRAMES_HZ,
+                poses=self.station.poses,
+                clock=self._clock,
+                speed_factor=speed_factor,
+            )
+        )
+        daemons = self._stack.enter_context(Daemons([config], folder=folder, recordings=folder, environment=os.environ))
+        server.start()
+        daemons.start()
+        self._until(lambda: daemons.is_ready(0), START_S * speed_factor, "the daemon did not become ready")
+        return daemons.programs()[0]
 
     def trial(self) -> Result:
         """Injects the fault and watches what comes."""

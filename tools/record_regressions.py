@@ -111,7 +111,7 @@ class _Keeper:
 
 def _scenario(starts: Starts, seed: int) -> ScenarioConfig:
     """The paper's flight, shorter, from other places, with cameras of half the width and height."""
-    paper = load_scenario(data_path("config") / "paper_flight.yaml")
+    paper = load_scenario(data_path("config") / "paper_flight.yaml", {"drone.perception.height": "barometer"})
     cameras = []
     for camera in paper.drone.rig.cameras:
         width, height = camera.size_px

@@ -3,7 +3,8 @@
 python -m tools.render_training_data OUT --worlds 120 --pairs 30 --split training
 
 A third of the scenes have birds and the like in them. Two thirds of the drones of training worlds are of generated
-shapes. With ``--families unseen`` the drones are of the families that no network is trained on.
+shapes. With ``--families unseen`` the drones are of the families that no network is trained on. With
+``--obstacles 0.4`` four in ten worlds have a forest or a village, with the camera between trunks and before walls.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from flockd.sim.airframe import DroneModel
 from flockd.sim.drone_models import drone_model
+from flockd.sim.obstacle_worlds import LOWEST_CROWN_M, generate_obstacles
 from tools.training import worlds
 from tools.training.dataset import FOCAL_PX, HEIGHT, MAX_DRONES, R_BODY_CAMERA, WIDTH, create_part, note
 from tools.training.drone_generator import generated_drone
@@ -30,6 +32,8 @@ from tools.training.scenes import attitude, drawn_attitude
 Array = NDArray[Any]
 SHAPES_A_WORLD = 24
 """Of the generator, where it is drawn from."""
+NEAREST_M = 1.2
+"""To an obstacle: a camera moves by up to a metre within a pair."""
 WITH_DISTRACTORS = 1 / 3
 """Share of the scenes."""
 
@@ -43,13 +47,17 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=120)
     parser.add_argument("--skip", type=int, default=0, help="worlds of the split, which are rendered already")
     parser.add_argument("--pairs", type=int, default=30, help="pairs a world")
+    parser.add_argument("--obstacles", type=float, default=0.0, metavar="SHARE", help="of the worlds; default: none")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     arguments = parser.parse_args()
     seeds = {"training": worlds.TRAINING, "validation": worlds.VALIDATION, "test": worlds.TEST}[arguments.split]
     families = {"training": worlds.FAMILIES, "unseen": worlds.UNSEEN_FAMILIES}[arguments.families]
     share = worlds.SHAPES_SHARE if (arguments.split, arguments.families) == ("training", "training") else 0.0
     wanted = range(arguments.skip, arguments.skip + arguments.worlds)
-    jobs = [PairJob(arguments.out / f"part-{i:04d}", seeds[i], arguments.pairs, families, share) for i in wanted]
+    jobs = [
+        PairJob(arguments.out / f"part-{i:04d}", seeds[i], arguments.pairs, families, share, arguments.obstacles)
+        for i in wanted
+    ]
     begin = time.monotonic()
     for done, total in render_pairs(jobs, arguments.processes):
         print(f"{done}/{total} worlds, {time.monotonic() - begin:.0f} s", flush=True)
@@ -66,6 +74,8 @@ class PairJob:
     families: range
     shapes_share: float = 0.0
     """Of the drones, how many are of the generator's shapes instead."""
+    obstacles_share: float = 0.0
+    """Of worlds: how likely this one has a forest or a village."""
 
 
 def render_pairs(jobs: Sequence[PairJob], processes: int | None) -> Iterator[tuple[int, int]]:
@@ -78,24 +88,43 @@ def render_pairs(jobs: Sequence[PairJob], processes: int | None) -> Iterator[tup
 
 
 def _render_world(job: PairJob) -> None:
-    from flockd.sim.renderer import Renderer  # noqa: PLC0415 - numba starts in the worker
+    from flockd.sim.camera_simulator import FIELD_GRID_M, field_grid  # noqa: PLC0415 - numba starts in the worker
+    from flockd.sim.renderer import Renderer  # noqa: PLC0415
     from flockd.sim.world import World  # noqa: PLC0415
 
     folder, seed, count = job.folder, job.seed, job.pairs
     rng = np.random.Generator(np.random.PCG64(seed))
-    world = World.generate(seed, ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])), keep_out=None)
+    field = worlds.drawn_obstacles(seed, job.obstacles_share)
+    world = World.generate(
+        seed,
+        ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])),
+        keep_out=None if field is None else field_grid(field.extent_m),
+        clearance_m=9.0 if field is None else FIELD_GRID_M,
+        obstacles=None if field is None else generate_obstacles(field, seed, np.zeros((0, 2))),
+    )
     drawn = rng.choice(worlds.SHAPES, SHAPES_A_WORLD) if job.shapes_share else ()
     shapes = [generated_drone(int(shape), int(rng.integers(1 << 31))) for shape in drawn]
     part = create_part(folder, count)
-    places = world.free_points(count, rng, 2.0)
+    places = world.free_points(count, rng, 2.0) if field is None else _places_among(world, count, rng, field.extent_m)
+    highest_m = 8.0 if field is None else LOWEST_CROWN_M - 0.5
     for index in range(count):
         drones = [_drawn_drone(job, shapes, rng) for _ in range(MAX_DRONES)]
         families = np.array([drone.family for drone in drones])
         renderer = Renderer(world, drones)
-        _render_pair(renderer, world, places[index], families, part, index, rng)
+        _render_pair(renderer, world, places[index], highest_m, families, part, index, rng)
     for array in part.values():
         array.flush()  # type: ignore[attr-defined]
-    note(folder, seed=seed, pairs=count, families=list(job.families), shapes_share=job.shapes_share)
+    note(
+        folder, seed=seed, pairs=count, families=list(job.families), shapes_share=job.shapes_share,
+        obstacles=None if field is None else field.kind,
+    )  # fmt: skip
+
+
+def _places_among(world: Any, count: int, rng: np.random.Generator, extent_m: float) -> Array:
+    """(count, 2) between obstacles, half of them in front of the nearest of four times as many."""
+    free = world.free_points(4 * count, rng, NEAREST_M, within_m=extent_m)
+    near = free[np.argsort(world.obstacle_distance(free))[: count // 2]]
+    return np.concatenate([near, free[rng.permutation(len(free))[: count - len(near)]]])
 
 
 def _drawn_drone(job: PairJob, shapes: list[DroneModel], rng: np.random.Generator) -> DroneModel:
@@ -108,6 +137,7 @@ def _render_pair(
     renderer: Any,
     world: Any,
     place: Array,
+    highest_m: float,
     families: Array,
     part: dict[str, Array],
     index: int,
@@ -118,7 +148,7 @@ def _render_pair(
 
     focal = FOCAL_PX * float(np.exp(rng.normal(0, 0.08)))
     matrix = np.array([[focal, 0.0, WIDTH / 2], [0.0, focal, HEIGHT / 2], [0.0, 0.0, 1.0]])
-    height = float(rng.uniform(1.5, 8.0))
+    height = float(rng.uniform(1.5, highest_m))
     ground = float(world.height_at(place[:1], place[1:2])[0])
     position = np.array([place[0], place[1], -(ground + height)])
     start = drawn_attitude(rng)

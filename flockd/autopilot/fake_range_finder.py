@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
-from flockd.config.scenario import RangeFinderConfig
 from flockd.messages import FloatArray, RangeReading
+
+if TYPE_CHECKING:  # the fake autopilot runs as a program of its own, which begins sooner without the configuration
+    from flockd.config.scenario import RangeFinderConfig
 
 Ground = Callable[[FloatArray, FloatArray], FloatArray]
 """Height above z = 0 of the ground at points (n,) north and (n,) east, metres."""
@@ -32,8 +34,8 @@ class FakeRangeFinder:
     def __init__(self, config: RangeFinderConfig, ground: Ground, seed: tuple[int, ...]) -> None:
         self._config, self._ground = config, ground
         self._random = np.random.default_rng(seed)
-        turn, _ = cv2.Rodrigues(np.array([*self._random.normal(size=2), 0.0]) * math.radians(config.tilt_deg))
-        self._axis = np.asarray(turn, np.float64)[:, 2]
+        axis = np.array([*np.tan(math.radians(config.tilt_deg) * self._random.normal(size=2)), 1.0])
+        self._axis: FloatArray = axis / np.linalg.norm(axis)
         self._phase_s = float(self._random.uniform(0.0, 1.0 / config.rate_hz))
         self._out_until_s = -math.inf
         self._next_dropout_s: float | None = None

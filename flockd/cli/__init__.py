@@ -40,9 +40,9 @@ exit codes:
   0    done
   1    a check failed
   2    the command line is wrong
-  69   something is not there: an autopilot, a device, an extra
+  69   something is unavailable: an autopilot, a device, an optional package
   78   a configuration or a model is wrong
-  130  interrupted by Ctrl-C; what was flown until then is reported"""
+  130  interrupted by Ctrl-C; a report of what was flown is written"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -89,7 +89,7 @@ def _parser() -> Parser:
     parser = Parser(
         prog="flockd",
         description="Drones that flock by vision alone.",
-        examples=("flockd sim --duration 10", "flockd sim", "flockd config check config/paper_flight.yaml"),
+        examples=("flockd sim --duration 10 --drones 3", "flockd sim", "flockd config check config/paper_flight.yaml"),
         notes=EXIT_CODES,
     )
     parser.add_argument("--version", action="version", version=f"flockd {__version__}")

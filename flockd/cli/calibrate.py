@@ -15,6 +15,6 @@ def add(commands: Commands) -> None:
         "flockd calibrate drone --distance 3.0 a.jpg b.jpg --distance 5.0 c.jpg d.jpg --fov 70",
     )
     parser = commands(
-        "calibrate", "Measure the cameras (lenses, where they sit, their time) and the drones' size.", examples
+        "calibrate", "Measure the cameras (lenses, mountings, time offsets) and the drones' size.", examples
     )
     add_commands(parser, (calibrate_camera.add, calibrate_rig.add, calibrate_drone.add))

@@ -54,7 +54,9 @@ def add(commands: Commands) -> None:
         "--views", metavar="N", type=positive_count, default=MOST_VIEWS, help="use N views at most (60)"
     )
     parser.add_argument("--max-blur", metavar="PX", type=positive_number, help="widest edge of a sharp view (4)")
-    parser.add_argument("--serial", metavar="TEXT", help="what identifies the camera, where it cannot be asked")
+    parser.add_argument(
+        "--serial", metavar="TEXT", help="the camera's serial number, where the device does not give it"
+    )
     parser.add_argument("--picture", metavar="FILE", type=Path, help="draw the coverage and the residuals (.png)")
     parser.add_argument("--size", metavar="WxH", type=pair, default=(640, 480), help="of a /dev/video (640x480)")
     parser.add_argument(
@@ -179,7 +181,7 @@ def _say_lens(result: Mapping[str, Any], collector: Collector) -> None:
     say(f"  field of view {across} x {down} degrees")
     say(f"residual: rms {rms['rms']:.3f} px; of a view {min(views):.3f} to {max(views):.3f}; max {rms['max']:.2f}")
     assert collector.coverage is not None
-    say(f"coverage: {100 * result['coverage']:.0f} %")
+    say(f"coverage: {100 * result['coverage']:.0f} % of the image; ## where corners of the board were seen")
     for line in collector.coverage.text:
         say(f"  {line}")
     for sentence in result["advice"]:

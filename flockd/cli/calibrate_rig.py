@@ -36,15 +36,19 @@ def add(commands: Commands) -> None:
         "flockd calibrate rig drone1.mcap --by motion",
     )
     description = (
-        "Measure where cameras sit: beside each other, from a board that neighbours see together; or how they are "
-        "turned in the body, and their time, from the autopilot's attitude in a recording."
+        "Measure the cameras' mountings: relative poses, from a board that two of them see at once; or "
+        "orientation in the body and time offset, from the autopilot's attitude in a recording."
     )
     parser = commands("rig", description, examples)
-    help_of_source = "a folder with one of images for each camera, or a recording; by default --config's cameras, live"
+    help_of_source = (
+        "a folder with a folder of images for each camera, or a recording; by default --config's cameras, live"
+    )
     parser.add_argument("source", metavar="SOURCE", nargs="?", help=help_of_source)
     parser.add_argument("--by", choices=("board", "motion"), default="board", help="default: board")
-    parser.add_argument("--reference", metavar="NAME", help="the camera that sits where --config says (the first)")
-    help_of_offset = f"how far camera and autopilot may be apart ({MAX_OFFSET_S:g})"
+    parser.add_argument(
+        "--reference", metavar="NAME", help="the camera whose mounting --config gives (default: the first)"
+    )
+    help_of_offset = f"largest time offset between cameras and autopilot ({MAX_OFFSET_S:g})"
     parser.add_argument("--max-offset", metavar="S", type=positive_number, default=MAX_OFFSET_S, help=help_of_offset)
     add_shared(parser, "the drone, with its cameras' intrinsics; a recording has its own")
     parser.set_defaults(run=_rig)
@@ -77,7 +81,7 @@ def _by_board(args: argparse.Namespace, out: Path) -> int:
 
 def _by_motion(args: argparse.Namespace, out: Path) -> int:
     if args.source is None or Path(args.source).is_dir():
-        raise UsageError("motion is measured in a recording, which knows the autopilot's attitude; name one as SOURCE")
+        raise UsageError("motion is measured in a recording, which holds the autopilot's attitude; name one as SOURCE")
     session = _session(args)
     with progress("tracking features", "steps") as on_image:
         alignments = session.align_cameras(args.max_offset, on_image)
@@ -114,7 +118,7 @@ def _report(args: argparse.Namespace, result: Mapping[str, Any]) -> int:
     for name, one in result["cameras"].items():
         x, y, z = one["position_m"]
         if name == result["reference"]:
-            say(f"{name}: is the reference, and stays where it is")
+            say(f"{name}: is the reference and keeps its mounting")
             continue
         say(
             f"{name}: yaw {one['yaw_deg']:.2f} pitch {one['pitch_deg']:.2f} roll {one['roll_deg']:.2f} +- "

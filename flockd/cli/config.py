@@ -30,7 +30,7 @@ def add(commands: Commands) -> None:
 def _add_check(commands: Commands) -> None:
     examples = ("flockd config check my_flight.yaml", "flockd config check --json config/*.yaml")
     parser = commands("check", "Report all errors in drone and scenario files.", examples)
-    parser.add_argument("files", nargs="+", metavar="FILE", type=Path)
+    parser.add_argument("files", nargs="+", metavar="FILE", type=Path, help="of drones or scenarios")
     parser.add_argument("--json", action="store_true", help="print the problems as JSON")
     parser.set_defaults(run=_check)
 
@@ -38,7 +38,7 @@ def _add_check(commands: Commands) -> None:
 def _add_show(commands: Commands) -> None:
     examples = ("flockd config show config/paper_flight.yaml", "flockd config show --json config/simulator.yaml")
     parser = commands("show", "Show a file with every default filled in, a scenario with its drone.", examples)
-    parser.add_argument("file", metavar="FILE", type=Path)
+    parser.add_argument("file", metavar="FILE", type=Path, help="of a drone or a scenario")
     parser.add_argument("--json", action="store_true", help="print JSON instead of YAML")
     parser.set_defaults(run=_show)
 
@@ -46,7 +46,7 @@ def _add_show(commands: Commands) -> None:
 def _add_schema(commands: Commands) -> None:
     examples = ("flockd config schema drone", "flockd config schema scenario > scenario.schema.json")
     parser = commands("schema", "Print the JSON schema of a kind of file, for editors and other tools.", examples)
-    parser.add_argument("kind", choices=("drone", "scenario"))
+    parser.add_argument("kind", choices=("drone", "scenario"), help="of the file")
     parser.set_defaults(run=_schema)
 
 

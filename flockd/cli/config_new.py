@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from flockd.config.new_files import NewDrone, NewScenario
 
 MISSIONS = ("circle_then_tangent", "hover", "velocity", "waypoints", "follow", "operator")
+OBSTACLES = ("none", "forest", "village")
 SOURCES = ("v4l2", "shared_memory")
 MOST_CAMERAS = 16
 
@@ -24,12 +25,14 @@ MOST_CAMERAS = 16
 def add(commands: Commands) -> None:
     """Adds the command."""
     examples = ("flockd config new drone my_drone.yaml", "flockd config new scenario my_flight.yaml --drones 3")
-    parser = commands("new", "Write a commented file of a drone or a scenario that checks.", examples, _NOTES)
+    parser = commands(
+        "new", "Write a commented file of a drone or a scenario, which `flockd config check` passes.", examples, _NOTES
+    )
     add_commands(parser, (_add_drone, _add_scenario))
 
 
 _NOTES = """\
-On a terminal, what no option says is asked, with the default in brackets; --defaults asks nothing."""
+On a terminal it asks for what no option gives, with the default in brackets; with --defaults it asks nothing."""
 
 
 def _add_drone(commands: Commands) -> None:
@@ -39,14 +42,16 @@ def _add_drone(commands: Commands) -> None:
     )
     parser = commands("drone", "Write the configuration of a real drone.", examples)
     _add_common(parser)
-    parser.add_argument("--name", metavar="NAME", help="by which telemetry and recordings know it")
-    parser.add_argument("--cameras", metavar="N", type=_camera_count, help="how many, evenly around")
+    parser.add_argument("--name", metavar="NAME", help="its name in telemetry and recordings")
+    parser.add_argument(
+        "--cameras", metavar="N", type=_camera_count, help="number of cameras, evenly spaced around the drone"
+    )
     parser.add_argument("--size", metavar="WxH", type=_size, help="of an image in pixels")
     parser.add_argument("--field-of-view", metavar="DEG", type=_field_of_view, help="of an image's width, 10 to 190")
     parser.add_argument("--source", choices=SOURCES, help="USB cameras, or frames from another program")
     parser.add_argument("--autopilot", metavar="ADDRESS", help="serial:///dev/NAME:BAUD or udpin://0.0.0.0:PORT")
-    parser.add_argument("--fleet", metavar="NAME", help="by which telemetry knows the fleet")
-    parser.add_argument("--mission", choices=MISSIONS, help="where it wants to go")
+    parser.add_argument("--fleet", metavar="NAME", help="the fleet's name in telemetry")
+    parser.add_argument("--mission", choices=MISSIONS, help="kind of mission")
     parser.set_defaults(run=_new_drone)
 
 
@@ -60,15 +65,20 @@ def _add_scenario(commands: Commands) -> None:
     parser.add_argument("--name", metavar="NAME", help="of the flight")
     parser.add_argument("--drones", metavar="N", type=_drone_count, help="size of the flock, 1 to 100")
     parser.add_argument("--duration", metavar="S", type=positive_number, help="seconds to fly")
-    parser.add_argument("--mission", choices=MISSIONS, help="where the flock wants to go")
-    parser.add_argument("--drone", metavar="FILE", help="of the drones (default: the simulated drone that comes along)")
+    parser.add_argument("--mission", choices=MISSIONS, help="kind of mission")
+    parser.add_argument("--obstacles", choices=OBSTACLES, help="what the flock flies between")
+    parser.add_argument(
+        "--drone",
+        metavar="FILE",
+        help="the drones' configuration (default: that of the simulated drone that comes with flockd)",
+    )
     parser.set_defaults(run=_new_scenario)
 
 
 def _add_common(parser: Parser) -> None:
     parser.add_argument("file", metavar="FILE", type=Path, help="to write")
-    parser.add_argument("--force", action="store_true", help="write over the file if there is one")
-    parser.add_argument("--defaults", action="store_true", help="ask nothing: what no option says is the default")
+    parser.add_argument("--force", action="store_true", help="overwrite the file if it exists")
+    parser.add_argument("--defaults", action="store_true", help="ask nothing; what no option gives has its default")
 
 
 def _new_drone(args: argparse.Namespace) -> int:
@@ -105,6 +115,7 @@ def _new_scenario(args: argparse.Namespace) -> int:
         drones=_asked(args, "drones", "number of drones", default.drones, _drone_count),
         duration_s=_asked(args, "duration", "seconds to fly", default.duration_s, positive_number),
         mission=_asked(args, "mission", _choice("mission", MISSIONS), default.mission, _one_of(MISSIONS)),
+        obstacles=_asked(args, "obstacles", _choice("obstacles", OBSTACLES), default.obstacles, _one_of(OBSTACLES)),
         drone_file=_asked(args, "drone", "file of the drones", default.drone_file, str),
     )
     return _write(args.file, scenario_text(new))
@@ -181,7 +192,7 @@ def _path_from(folder: Path, file: Path) -> str:
 def _refuse_what_is_there(args: argparse.Namespace) -> None:
     """Before anything is asked."""
     if args.file.exists() and not args.force:
-        raise UsageError(f"{args.file} is there already; name another file, or write over it with --force")
+        raise UsageError(f"{args.file} exists; name another file, or overwrite it with --force")
     if not args.file.parent.is_dir():
         raise UsageError(f"{args.file.parent} is not a folder; make it first")
 

@@ -38,9 +38,13 @@ def add(commands: Commands) -> None:
     )
     parser = commands("detect", "Detect drones in pictures, with the code that flies.", examples, NOTES)
     parser.add_argument("pictures", metavar="PICTURES", nargs="+", type=Path, help="images, folders of them, videos")
-    parser.add_argument("--out", metavar="FOLDER", type=Path, help="draw what is found into copies there")
+    parser.add_argument(
+        "--out", metavar="FOLDER", type=Path, help="write copies of the pictures with the detections drawn in"
+    )
     parser.add_argument("--force", action="store_true", help="overwrite what is there")
-    parser.add_argument("--labels", metavar="FILE", type=Path, help="COCO boxes of category `drone`, to measure with")
+    parser.add_argument(
+        "--labels", metavar="FILE", type=Path, help="COCO boxes of category `drone`: measures how many are found"
+    )
     parser.add_argument(
         "--min-probability", metavar="P", type=_probability, default=0.0, help="leave out what is less probable (0)"
     )

@@ -23,9 +23,9 @@ ALL = "all"
 REPEAT_S = 1.0
 """Half of the time for which an operator's velocity holds."""
 PLAIN = {
-    "hold": "Have the autopilots of drones hold: they stop, and flockd hands over.",
-    "land": "Have the autopilots of drones land where they are.",
-    "resume": "Let drones be ready again whose flight was ended in the air; their pilots then select offboard.",
+    "hold": "Make the drones' autopilots hold position: the drones stop, and flockd hands over.",
+    "land": "Make the drones' autopilots land them where they are.",
+    "resume": "Make drones ready again after their flight was ended in the air; their pilots then select offboard.",
 }
 
 
@@ -56,12 +56,14 @@ def _add_goto(commands: Commands) -> None:
         "The goal takes the place of the mission until the flight ends. A drone whose mission is `operator` hovers\n"
         "two seconds after the last one: send it with --repeat, and Ctrl-C stops it."
     )
-    parser = commands("goto", "Send drones to a place, which they lead the middle of their flock to.", examples, notes)
+    parser = commands("goto", "Send drones to a place: they lead the centre of their flock there.", examples, notes)
     _add_drones(parser)
     parser.add_argument("north", metavar="NORTH", type=_number, help="metres north of the mission's origin")
     parser.add_argument("east", metavar="EAST", type=_number, help="metres east of it")
     parser.add_argument("--degrees", action="store_true", help="NORTH and EAST are latitude and longitude")
-    parser.add_argument("--height", metavar="M", type=_number, help="above the ground at home (default: as now)")
+    parser.add_argument(
+        "--height", metavar="M", type=_number, help="height above the ground at home (default: the present one)"
+    )
     parser.add_argument("--speed", metavar="V", type=positive_number, help="in m/s (default: the mission's)")
     parser.add_argument("--repeat", action="store_true", help="send it every second until Ctrl-C")
     _add_connection(parser)
@@ -70,13 +72,15 @@ def _add_goto(commands: Commands) -> None:
 
 def _add_velocity(commands: Commands) -> None:
     examples = ("flockd fleet velocity drone1 0.5 0 --seconds 10", "flockd fleet velocity all 0 -1 --height 6")
-    parser = commands("velocity", "Have drones fly at a velocity for as long as it is sent.", examples)
+    parser = commands("velocity", "Make drones fly at a velocity for as long as it is sent.", examples)
     _add_drones(parser)
     parser.add_argument("north", metavar="NORTH", type=_number, help="m/s to the north")
     parser.add_argument("east", metavar="EAST", type=_number, help="m/s to the east")
-    parser.add_argument("--height", metavar="M", type=_number, help="above the ground at home (default: as now)")
     parser.add_argument(
-        "--seconds", metavar="S", type=positive_number, help="send it again every second for so long (default: once)"
+        "--height", metavar="M", type=_number, help="height above the ground at home (default: the present one)"
+    )
+    parser.add_argument(
+        "--seconds", metavar="S", type=positive_number, help="repeat it every second for S seconds (default: once)"
     )
     _add_connection(parser)
     parser.set_defaults(run=_velocity)
@@ -103,7 +107,7 @@ def _add_connection(parser: Parser) -> None:
     )
     parser.add_argument("--listen", metavar="ENDPOINT", action="append", help="where drones connect to")
     parser.add_argument("--zenoh-config", metavar="FILE", type=Path, help="zenoh's own settings, as for TLS")
-    parser.add_argument("--json", action="store_true", help="print the answers as JSON, by drone")
+    parser.add_argument("--json", action="store_true", help="print the replies as JSON, by drone")
 
 
 def _number(text: str) -> float:
@@ -167,7 +171,7 @@ def _drones(operator: FleetOperator, wanted: str, places: str) -> tuple[str, ...
     missing = [name for name in names or () if name not in {key.split("/")[1] for key in found}]
     if missing or not found:
         raise UnavailableError(
-            f"{' and '.join(missing) or 'no drone'} was not found at {places}; nothing was asked of any; check "
+            f"{' and '.join(missing) or 'no drone'} was not found at {places}; no request was sent; check "
             "`flockd status`"
         )
     return found

@@ -58,6 +58,7 @@ def _key_figures(summary: Mapping[str, Any]) -> dict[str, str]:
         "order at the end": _number(flock["order_tail"], "of 1", 3),
         "union at the end": _number(flock["union_tail"], "of 1", 2),
         "mission": _mission(summary["mission"]),
+        "obstacles": _obstacles(summary["obstacles"]),
         "own motion estimated": "" if summary["has_truth"] else _number(own["own_motion_ratio"], "of the steps", 3),
         "neighbours known within 10 m": _number(neighbours["recall_within_10m"], "of 1", 3),
         "false neighbours": _number(neighbours["false_per_drone_minute"], "a drone and minute", 2),
@@ -71,6 +72,13 @@ def _mission(mission: Mapping[str, Any]) -> str:
         return ""
     when = f"first there after {mission['time_s']:g} s" if mission["time_s"] is not None else "never there"
     return f"{mission['final_error_m']:.2f} m from the last goal at the end, {when}"
+
+
+def _obstacles(obstacles: Mapping[str, Any]) -> str:
+    """Of a flight among obstacles: how often and how nearly drones hit them."""
+    if obstacles["collisions"] is None:
+        return ""
+    return f"{obstacles['collisions']} collisions, {obstacles['min_clearance_m']:.2f} m at the nearest"
 
 
 def _number(value: float | None, unit: str, digits: int) -> str:

@@ -51,7 +51,9 @@ def _add_bench(commands: Commands) -> None:
     )
     description = "Time each model, for each provider and number of threads: milliseconds a run, the median."
     parser = _add_options(commands("bench", description, examples), _bench)
-    parser.add_argument("--provider", metavar="NAME,...", help=f"{', '.join(PROVIDERS)} (default: all there are)")
+    parser.add_argument(
+        "--provider", metavar="NAME,...", help=f"{', '.join(PROVIDERS)} (default: all that are installed)"
+    )
     parser.add_argument("--threads", metavar="N,...", type=_counts, default=(1, 2), help="on the CPU (default: 1,2)")
     parser.add_argument("--size", metavar="WxH", type=_size, default=(640, 480), help="of the image (default: 640x480)")
     parser.add_argument("--runs", metavar="N", type=positive_count, default=RUNS, help=f"to time (default: {RUNS})")
@@ -171,7 +173,7 @@ def _providers(text: str | None) -> Sequence[Provider]:
     named = [provider for provider in PROVIDERS if provider in text.split(",")]
     unknown = sorted(set(text.split(",")) - set(PROVIDERS))
     if unknown:
-        raise UsageError(f"--provider: {unknown[0]!r} is none of {', '.join(PROVIDERS)}; choose of these")
+        raise UsageError(f"--provider: {unknown[0]!r} is none of {', '.join(PROVIDERS)}; choose one of these")
     return named
 
 

@@ -27,11 +27,11 @@ def add_picture_options(parser: Parser) -> None:
     )
     camera.add_argument("--config", metavar="FILE", type=Path, help="this drone's camera, networks and settings")
     camera.add_argument("--camera", metavar="NAME", help="which of --config's cameras, where it has several")
-    networks = parser.add_argument_group("the networks", "by default those of --config, else those that fly")
+    networks = parser.add_argument_group("the networks", "by default those of --config, else flockd's own")
     networks.add_argument("--models", metavar="FOLDER", type=Path, help="folder of the manifests")
     networks.add_argument("--first-stage", metavar="NAME", help="the model for depth and segmentation")
     networks.add_argument("--second-stage", metavar="NAME", help="the model for the distance")
-    networks.add_argument("--verification", metavar="NAME", help="the model that tells drones from all else, or `none`")
+    networks.add_argument("--verification", metavar="NAME", help="the model that verifies detections, or `none`")
     networks.add_argument("--threads", metavar="N", type=_threads, help="processor threads (2)")
 
 

@@ -31,9 +31,9 @@ def add(commands: Commands) -> None:
         "flockd replay rgbd_folder --depth recorded --stride 3 --trajectory path.txt",
         "flockd replay clip.mp4 --calibration K.txt --flow dis --json",
     )
-    description = "Let the pilot fly a recorded flight again: the same frames and vehicle states, the same code."
+    description = "Run the pilot on a recorded flight again: the same frames and vehicle states, the same code."
     parser = commands("replay", description, examples)
-    parser.add_argument("recording", metavar="RECORDING", type=Path)
+    parser.add_argument("recording", metavar="RECORDING", type=Path, help="a recording, or a dataset (see below)")
     parser.add_argument(
         "--speed", metavar="X", type=_speed, default=0.0, help="times real time; 0: as fast as it goes (default)"
     )

@@ -25,7 +25,9 @@ _OF_DATASETS = ("depth", "stride", "flow", "calibration", "trajectory")
 def add_dataset_options(parser: Parser) -> None:
     """Adds what only replays of datasets have."""
     group = parser.add_argument_group("datasets", "a folder with images, depth and poses, or a video, as RECORDING")
-    group.add_argument("--depth", choices=("recorded", "network"), help="whose depth is used (default: network)")
+    group.add_argument(
+        "--depth", choices=("recorded", "network"), help="the recorded depth, or that of the network (default: network)"
+    )
     group.add_argument("--stride", metavar="N", type=positive_count, help="pair frame i with frame i + N (default: 1)")
     group.add_argument("--flow", metavar="NAME", help="use this flow model, or `dis`")
     group.add_argument("--calibration", metavar="FILE", type=Path, help="K.txt, or a drone's YAML with one camera")
@@ -34,7 +36,7 @@ def add_dataset_options(parser: Parser) -> None:
 
 def refuse_dataset_options(args: argparse.Namespace) -> None:
     """Raises UsageError where a recording is to be replayed like a dataset."""
-    _refuse(args, _OF_DATASETS, "is for datasets; a recording of flockd knows it by itself, or takes it from --config")
+    _refuse(args, _OF_DATASETS, "is for datasets; a recording of flockd holds it, or --config gives it")
 
 
 def run_dataset(args: argparse.Namespace) -> int:

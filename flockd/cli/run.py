@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.parser import Commands
 from flockd.errors import ExitCode, UnavailableError, UsageError
-from flockd.printable import printable
 
 if TYPE_CHECKING:
     from flockd.config import DroneConfig
@@ -46,10 +45,21 @@ def add(commands: Commands) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     _check_limits()
+    from flockd.daemon import StderrLog
+
+    log = StderrLog()
+    _log_to_stderr(log)
+    try:
+        return _run_daemon(args)
+    finally:
+        log.close()  # before the last sentence
+
+
+def _run_daemon(args: argparse.Namespace) -> int:
+    """Until it is asked to end, with each configuration that it is asked to reload."""
     from flockd.config import load_drone
     from flockd.daemon import ServiceManager, event_loop_at, only_instance
 
-    _log_to_stderr()
     service = ServiceManager(os.environ)
     config: DroneConfig | None = load_drone(args.config)
     if args.record is not None:
@@ -117,17 +127,9 @@ async def _say_what_it_waits_for(daemon: Daemon, every_s: float) -> None:
         await asyncio.sleep(every_s)
 
 
-class _Printable(logging.Formatter):
-    """A log goes to terminals, and texts in it come from the autopilot and from operators."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        return printable(super().format(record))
-
-
-def _log_to_stderr() -> None:
+def _log_to_stderr(handler: logging.Handler) -> None:
     """The journal dates its lines itself."""
     dated = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
-    handler = logging.StreamHandler()
-    handler.setFormatter(_Printable(f"{dated}%(message)s"))
+    handler.setFormatter(logging.Formatter(f"{dated}%(message)s"))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
     logging.getLogger("flockd.autopilot").setLevel(logging.WARNING)  # MAVSDK tells a lot of itself

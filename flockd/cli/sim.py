@@ -25,7 +25,8 @@ SCENARIO = "paper_flight.yaml"
 COSTS = """\
 costs, measured with five drones on a processor without 8-bit instructions, November 2026:
   time       12 s of processor time a simulated second, so 11 minutes on two free cores for the whole flight, and 10 s
-             to begin; with --perception truth a few seconds
+             to begin; a flight of 10 s with three drones 66 s of processor time; with --perception truth a few
+             seconds
   memory     1 GB
   disk       35 MB for the report and what it is made of
   --record   another 4.5 MB a drone and simulated second: 2.5 GB for the whole flight
@@ -66,8 +67,8 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--autopilot",
         choices=get_args(AutopilotKind),
-        help="fly with a real `flockd run` a drone, and this autopilot (default: with the simulator's own pilots); "
-        "`px4` needs FLOCKD_PX4, the SITL build folder of PX4",
+        help="fly with a real `flockd run` for each drone, and this autopilot (default: with the simulator's own "
+        "pilots); `px4` needs FLOCKD_PX4, the SITL build folder of PX4",
     )
     parser.add_argument(
         "--speed-factor",
@@ -85,7 +86,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("--wind", metavar="N,E", type=_wind, help="mean wind in m/s, to the north and to the east")
     parser.add_argument("--speed", metavar="V", type=positive_number, help="desired speed of the flock in m/s")
     parser.add_argument(
-        "--radius", metavar="R", type=positive_number, help="of the circle in m, measured at the middle"
+        "--radius", metavar="R", type=positive_number, help="of the circle in m, measured at the flock's centre"
     )
     parser.add_argument("--seed", metavar="N", type=seed, help="of the world and of all noise")
     parser.add_argument(
@@ -109,7 +110,7 @@ def add(commands: Commands) -> None:
         help="write a recording of each drone to DIR/recordings, 4.5 MB a drone and simulated second",
     )
     told = parser.add_mutually_exclusive_group()
-    told.add_argument("--quiet", action="store_true", help="no progress, and nothing but the path of the report")
+    told.add_argument("--quiet", action="store_true", help="print only the path of the report, and no progress")
     told.add_argument("--verbose", action="store_true", help="say what is flown, and each phase with its time")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     parser.set_defaults(run=_run)

@@ -7,6 +7,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--as-recorded",
         action="store_true",
-        help="do not fly again for what no recording holds: drones in the images, depth and point pairs",
+        help="show only what was recorded; drones in the images, depth and point pairs would be computed again",
     )
     parser.add_argument("--json", action="store_true", help="with --save: print the result as JSON")
     parser.set_defaults(run=_run)
@@ -88,7 +89,7 @@ def _write(args: argparse.Namespace, path: Path) -> dict[str, Any]:
     scenes = Scenes(recording, fly_again=fly_again)
     total = sum(start_s <= time_s <= end_s for _, time_s in recording.contents.steps)
     shown = 0
-    with written_whole(path) as draft, RerunFile(draft, recording.drone, scenes.rig) as file:
+    with written_whole(path) as draft, closing(RerunFile(draft, recording.drone, scenes.rig)) as file:
         with progress("flying again" if fly_again else "reading", "steps") as tell:
             for moment in scenes.moments(start_s, end_s):
                 file.show(moment)
@@ -138,7 +139,7 @@ def _write_flock(args: argparse.Namespace, path: Path) -> dict[str, Any]:
     )
     with (
         written_whole(path) as draft,
-        FlockFile(draft, folder.resolve().name, cameras) as file,
+        closing(FlockFile(draft, folder.resolve().name, cameras)) as file,
         progress("reading", "steps") as tell,
     ):
         for recording, (start_s, end_s) in zip(recordings, stretches, strict=True):

@@ -255,7 +255,7 @@ def _syntax_problem(file: str, text: str, error: yaml.MarkedYAMLError) -> Config
     problem = error.problem or ""
     opened = error.context_mark.line + 1 if error.context_mark is not None else line
     if "'\\t'" in problem:
-        message = "a tab stands where YAML wants spaces; indent and separate with spaces"
+        message = "a tab stands where YAML needs spaces; indent and separate with spaces"
     elif "cannot start any token" in problem:
         sign = problem.split("'")[1]
         message = f"a value cannot begin with `{sign}`; put it in quotes"

@@ -18,6 +18,8 @@ from flockd.errors import ConfigError, ConfigProblem
 
 PATHS = {("perception", key) for key in ("models_dir", "engines_dir", *ROLES)} | {("telemetry", "zenoh_config")}
 """Keys of a drone whose values are paths; of a model's role only where it ends in `.yaml`, else it is a name."""
+_BESIDE_DRONE = ("mission", "obstacles")
+"""Sections of a drone that its scenario may have instead."""
 OVERRIDE = "override"
 """Stands where else a file's name does."""
 
@@ -68,6 +70,7 @@ def schema_of(kind: Literal["drone", "scenario"]) -> dict[str, Any]:
     schema["properties"]["drone"] = {"title": "Drone", **drone, "anyOf": [{"type": "string"}, inline]}
     of_all = "Of all vehicles without one of their own, instead of that in `drone`."
     schema["properties"]["mission"] = {"$ref": "#/$defs/MissionParameters", "description": of_all}
+    schema["properties"]["obstacles"] = {"$ref": "#/$defs/ObstacleParameters", "description": "Instead of `drone`'s."}
     return schema
 
 
@@ -95,7 +98,8 @@ def _scenario_document(path: Path, overrides: Overrides) -> Document:
         fault = "is a drone's own file, and a scenario is needed here; name one with the keys `vehicles` and `drone`"
         raise ConfigError([ConfigProblem(str(path), 0, "", fault)])
     _merge_drone(document, path.parent)
-    _merge_mission(document)
+    for key in _BESIDE_DRONE:
+        _merge_section(document, key)
     _override(document, overrides)
     return document
 
@@ -130,20 +134,20 @@ def _merge_drone(document: Document, folder: Path) -> None:
     document.spoiled.update((*key, *path) for path in drone.spoiled)
 
 
-def _merge_mission(document: Document) -> None:
-    """Puts a scenario's `mission` in place of its drone's, with its places: one file flies many missions."""
+def _merge_section(document: Document, key: str) -> None:
+    """Puts a scenario's section in place of its drone's, with its places: one drone's file flies many missions."""
     drone = document.values.get("drone")
-    if not isinstance(drone, dict) or "mission" not in document.values:
+    if not isinstance(drone, dict) or key not in document.values:
         return
-    mission = document.values.pop("mission")
-    old = [path for path in document.places if path[:2] == ("drone", "mission")]
+    section = document.values.pop(key)
+    old = [path for path in document.places if path[:2] == ("drone", key)]
     for path in old:
         del document.places[path]
-    document.spoiled -= {path for path in document.spoiled if path[:2] == ("drone", "mission")}
-    of_scenario = [path for path in document.places if path[:1] == ("mission",)]
+    document.spoiled -= {path for path in document.spoiled if path[:2] == ("drone", key)}
+    of_scenario = [path for path in document.places if path[:1] == (key,)]
     document.places.update({("drone", *path): document.places.pop(path) for path in of_scenario})
-    document.spoiled |= {("drone", *path) for path in document.spoiled if path[:1] == ("mission",)}
-    document.values["drone"] = {**drone, "mission": mission}
+    document.spoiled |= {("drone", *path) for path in document.spoiled if path[:1] == (key,)}
+    document.values["drone"] = {**drone, key: section}
 
 
 def _anchor(document: Document) -> None:

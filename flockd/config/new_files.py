@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from flockd.config.mission import MissionKind
+from flockd.config.obstacle_field import ObstacleKind
 
 SPACING_M = 3.5
 """Between neighbours on the ring of start positions, as the law wants them; `flocking.desired_distance_m`."""
@@ -39,6 +40,7 @@ class NewScenario:
     drones: int = 5
     duration_s: float = 60.0
     mission: MissionKind = "circle_then_tangent"
+    obstacles: ObstacleKind | Literal["none"] = "none"
     drone_file: str = "simulator.yaml"
 
 
@@ -48,13 +50,13 @@ def drone_text(new: NewDrone) -> str:
     width, height = new.size_px
     focal_px = width / 2 / math.radians(new.field_of_view_deg / 2)
     lines = [
-        "# A drone for `flockd run`. What is yours to fill in says so. Then `flockd config check` this file, and have",
-        "# `flockd doctor` examine the drone. `flockd config schema drone` lists every key there is.",
+        "# A drone for `flockd run`. Fill in what is marked `fill in`. Then run `flockd config check` on it, and",
+        "# `flockd doctor` on the drone. `flockd config schema drone` lists every key there is.",
         f"name: {new.name}    # different for each drone of a fleet",
         "step_s: 0.5",
         "",
         "rig:",
-        "  # Yours to fill in: intrinsics and extrinsics, by `flockd calibrate camera` and `flockd calibrate rig`. A",
+        "  # Fill in: intrinsics and extrinsics, by `flockd calibrate camera` and `flockd calibrate rig`. A",
         "  # lens that is 2 % off puts every neighbour 2 % off. position_m: forward, right, down from the middle.",
         "  cameras:",
     ]
@@ -84,7 +86,7 @@ def drone_text(new: NewDrone) -> str:
         "",
         "telemetry:",
         f"  fleet: {new.fleet}",
-        "  listen: [tcp/0.0.0.0:7447]    # whoever reaches this computer may watch",
+        "  listen: [tcp/0.0.0.0:7447]    # anyone who reaches this computer may watch",
         "  commands: []                  # of hold, land, resume, goto and velocity, what watchers may ask for",
     ]
     return "\n".join(lines) + "\n"
@@ -103,6 +105,7 @@ def scenario_text(new: NewScenario) -> str:
         "",
         *_mission(new.mission),
         "",
+        *_obstacles(new.obstacles),
         "vehicle:",
         "  wind_m_s: [0.0, 0.0]   # north, east",
         "  gust_m_s: 0.0          # standard deviation of the velocity that gusts add",
@@ -132,13 +135,13 @@ def _source(new: NewDrone, names: Sequence[str]) -> list[str]:
             "  set_tolerance_s: 0.01",
             "  shared_memory:",
             f"    drone: {new.name}",
-            "    connect: [tcp/127.0.0.1:7448]    # yours to fill in: where that program listens",
+            "    connect: [tcp/127.0.0.1:7448]    # fill in: where that program listens",
             "    rate_hz: 10.0",
         ]
     lines = [
         "source:",
         "  kind: v4l2",
-        "  # Yours to fill in: the socket of each camera, which `ls /dev/v4l/by-path` shows as an entry that ends in",
+        "  # Fill in: the socket of each camera, which `ls /dev/v4l/by-path` shows as an entry that ends in",
         "  # index0, and its own controls (`v4l2-ctl -d DEVICE --list-ctrls`): a short, fixed exposure.",
         "  cameras:",
     ]
@@ -170,6 +173,24 @@ def _mission(kind: MissionKind) -> list[str]:
         ],
     }
     return ["mission:    # where it wants to go", f"  kind: {kind}", *of_kind[kind]]
+
+
+def _obstacles(kind: ObstacleKind | Literal["none"]) -> list[str]:
+    of_kind = {
+        "forest": ["    trees_per_hectare: 100.0    # 50 to 400"],
+        "village": ["    houses_per_hectare: 8.0     # 2 to 16"],
+    }
+    if kind == "none":
+        return []
+    return [
+        "obstacles:",
+        "  enabled: true          # the drones fly around what they see",
+        "world:",
+        "  obstacles:             # drawn from the seed; the places where drones begin stay free",
+        f"    kind: {kind}",
+        *of_kind[kind],
+        "",
+    ]
 
 
 def _plain(metres: float) -> str:

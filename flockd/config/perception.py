@@ -72,6 +72,9 @@ class NoiseParameters(Section):
     """... or where details at one of the finest scales are stronger than this, in grey levels, ..."""
     max_rough_rise: Share = 0.4
     """... in this much more of it than in any of the last five."""
+    max_unexplained: Share = 0.35
+    """Nor is it where this much more of it than of the other cameras' images does not follow from the image before, as
+    when it is damaged in blocks, or covered by soft noise. 1: all are used."""
     clean_images: Annotated[int, Field(ge=1, le=100)] = 2
     """So many clean images in a row before a camera that was noisy is used again."""
 

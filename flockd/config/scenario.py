@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from flockd.config.base import NonNegative, Positive, Section, Share, Vector3, refuse
 from flockd.config.drone import DroneConfig
 from flockd.config.mission import MissionParameters, mission_faults
-from flockd.config.obstacles import ObstaclesConfig
+from flockd.config.obstacle_field import ObstaclesConfig
 
 MAX_DRONES = 100
 """More would take days and all memory."""
@@ -106,7 +106,14 @@ class WorldConfig(Section):
     drone_family: Annotated[int, Field(ge=0, le=DRONE_FAMILIES - 1)] | Literal["any"] = "any"
     """Which mesh the drones wear; `any`: drawn from the seed, the same for the whole flock."""
     obstacles: ObstaclesConfig | None = None
-    """Trees, or houses, walls, poles and wires, for the flock to fly between; null: none within `clearance_m`."""
+    """Trees, or houses, walls, poles and wires, for the flock to fly between, on level ground; null: none within
+    `clearance_m`."""
+
+    @model_validator(mode="after")
+    def _obstacles_stand_on_level_ground(self) -> Self:
+        if self.obstacles is not None and self.hills_m > 0:
+            refuse(self, {("obstacles",): "stand on level ground only; delete them, or write 0 for `hills_m`"})
+        return self
 
 
 class CameraFaultConfig(Section):
@@ -140,8 +147,8 @@ class ScenarioConfig(Section):
     faults: tuple[CameraFaultConfig, ...] = ()
     """None, unless a flight is to show what flockd does about them."""
     drone: DroneConfig
-    """In the file: the path of the drone's own configuration, relative to the scenario's; or that configuration. A key
-    `mission` beside it is flown instead of its own."""
+    """In the file: the path of the drone's own configuration, relative to the scenario's; or that configuration. Keys
+    `mission` and `obstacles` beside it are flown instead of its own."""
 
     def drone_of(self, vehicle: int) -> DroneConfig:
         """The configuration that one vehicle's pilot flies with."""

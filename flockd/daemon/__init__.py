@@ -4,6 +4,7 @@ from flockd.daemon.daemon import Daemon, DaemonError, Ending
 from flockd.daemon.lock import only_instance, service_lock
 from flockd.daemon.service_manager import ServiceManager
 from flockd.daemon.simulated_loop import event_loop_at
+from flockd.daemon.stderr_log import StderrLog
 from flockd.sources import clock_at
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "DaemonError",
     "Ending",
     "ServiceManager",
+    "StderrLog",
     "clock_at",
     "event_loop_at",
     "only_instance",

@@ -6,7 +6,7 @@ import asyncio
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,7 +64,7 @@ class PilotLoop:
         self._pilot: FlockPilot | None = None
         self._flight = 0
         self._failure: str | None = None
-        self._height_fault: str | None = None
+        self._height_reports = HeightReports()
         self._took_s: deque[float] = deque(maxlen=STEPS_REMEMBERED)
         self.frames: FrameSet | None = None
         """The newest; None before the first."""
@@ -133,7 +133,9 @@ class PilotLoop:
         self._pilot = pilot
         self.newest = StepResult(taken_s, output, flight, number)
         self._count(self.newest)
-        self._note_height(output)
+        report = self._height_reports.update(output.reasons)
+        if report is not None:
+            self._log_event(report)
         self._on_step(frames, vehicle, output, order)
 
     def _new_pilot(self) -> FlockPilot:
@@ -146,19 +148,26 @@ class PilotLoop:
             self._log_event(f"a step failed: {why}")
         self._failure = why
 
-    def _note_height(self, output: PilotOutput) -> None:
-        """An event when the range finder begins to fail, for another reason, or works again."""
-        fault = next((reason for reason in output.reasons if reason.startswith(OF_HEIGHT)), None)
-        if fault != self._height_fault:
-            self._log_event(fault or f"{OF_HEIGHT}the range finder works again")
-        self._height_fault = fault
-
     def _count(self, result: StepResult) -> None:
         if result.number > 1:  # the first has nothing to compare with
             self.ego_motion_failures = 0 if result.output.ego_motion is not None else self.ego_motion_failures + 1
         self.noisy_images.update(result.output.noisy_cameras or ())
         seen = [result.time_s - neighbour.unseen_s for neighbour in result.output.neighbours if neighbour.confirmed]
         self.neighbour_seen_s = max([self.neighbour_seen_s, *seen])
+
+
+class HeightReports:
+    """Reports when the range finder begins to fail, fails for another reason, or works again."""
+
+    def __init__(self) -> None:
+        self._fault: str | None = None
+
+    def update(self, reasons: Sequence[str]) -> str | None:
+        """The sentence that a step's reasons are worth; None: nothing new."""
+        before, self._fault = self._fault, next((one for one in reasons if one.startswith(OF_HEIGHT)), None)
+        if self._fault == before:
+            return None
+        return self._fault or f"{OF_HEIGHT}the range finder works again"
 
 
 def _frame_period_s(config: DroneConfig) -> float:

@@ -67,7 +67,7 @@ async def _parameters(link: AutopilotLink, config: DroneConfig, parameters: Auto
         try:
             value = await link.parameter(name, kind)
         except AutopilotError as error:
-            fix = f"see whether this firmware has {name}, and whether the link loses much"
+            fix = f"check whether this firmware has {name}, and whether the link loses messages"
             found.append(failed(name, str(error), fix))
             if link.status().heartbeat_age_s > parameters.max_heartbeat_age_s:
                 found.append(judge_heartbeat(link.system_id, link.status(), parameters))
@@ -81,7 +81,7 @@ def judge_heartbeat(system_id: int, status: AutopilotStatus, parameters: Autopil
     """Heard, and at rest."""
     measured = f"system {system_id} at {parameters.address}, heard {status.heartbeat_age_s:.1f} s ago"
     if status.heartbeat_age_s > parameters.max_heartbeat_age_s:
-        return failed("heartbeat", f"{measured} and not since", "see to the cable, its baud rate, and who else uses it")
+        return failed("heartbeat", f"{measured} and not since", "check the cable, its baud rate, and what else uses it")
     if status.armed:
         return warned("heartbeat", f"{measured}, and armed", "disarm it on the ground before you examine it")
     return passed("heartbeat", f"{measured}, disarmed, in flight mode {status.flight_mode}")
@@ -90,11 +90,11 @@ def judge_heartbeat(system_id: int, status: AutopilotStatus, parameters: Autopil
 def judge_signing(responds: bool, heartbeat_age_s: float, parameters: AutopilotParameters) -> Finding:
     """Whether it accepts messages that are not signed (MAVLink 2): flockd's are not, and others' need not be either."""
     if responds:
-        return passed("signing", "it accepts unsigned messages, flockd's and anybody's: let nobody else reach it")
+        return passed("signing", "it accepts unsigned messages of any sender: keep all others off its link")
     if heartbeat_age_s > parameters.max_heartbeat_age_s:
-        return warned("signing", "not known: it is not heard any more", "see to the link first")
+        return warned("signing", "not known: it is not heard any more", "repair the link first")
     measured = "it is heard and does not respond: nothing reaches it, or it accepts signed messages only"
-    return failed("signing", measured, "see to the cable's other direction; remove the signing key from its SD card")
+    return failed("signing", measured, "check the cable's other direction; remove the signing key from its SD card")
 
 
 def judge_messages(unknown_values: Mapping[str, int]) -> list[Finding]:

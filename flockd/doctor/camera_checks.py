@@ -94,7 +94,7 @@ def _judged(camera: CameraConfig, config: DroneConfig, watched: Watched | None) 
     if watched is not None and config.source is not None:
         device = next((entry for entry in config.source.cameras if entry.name == camera.name), None)
         rate_hz = device.rate_hz if device else config.source.shared_memory.rate_hz
-        fix_rate = FIX_RATE if device else "see what keeps the program that publishes them from it"
+        fix_rate = FIX_RATE if device else "check why the program that publishes them is late"
         problems += stream_problems(camera.name, watched, rate_hz, config.safety.max_dropped_share, fix_rate)
         problems += [] if device is None else _exposure_problems(device)
         measured = [
@@ -136,7 +136,7 @@ def stream_problems(
         grey = float(watched.image.mean())
         if not DARK <= grey <= BRIGHT:
             how = "dark" if grey < DARK else "bright"
-            fix = "take off the cap, or set exposure and gain for the light where it flies"
+            fix = "remove the lens cap, or set exposure and gain for the light where it flies"
             yield warned(about, f"the image is too {how} (mean {grey:.0f} of 255)", fix)
 
 
@@ -241,7 +241,7 @@ def _record(
 def _refusal(captured: CapturedBuffer, image_format: ImageFormat, silence_s: float) -> str | None:
     """As the source in flight would refuse it."""
     if captured.flagged:
-        return "damaged by the driver's own account"
+        return "damaged, as the driver reports"
     if not -MAX_AHEAD_S <= time.monotonic() - captured.time_s <= silence_s:
         return "with a time stamp far from now"
     try:

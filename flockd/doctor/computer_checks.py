@@ -90,7 +90,7 @@ def check_temperature(config: DroneConfig, folder: Path = THERMAL) -> Iterator[F
     slowed = sorted(_slowed(folder))
     if slowed:
         measured = f"the processor is being slowed down ({', '.join(slowed)})"
-        yield warned("temperature", measured, "cool it, and see to its power supply; then measure the step again")
+        yield warned("temperature", measured, "cool it, and check its power supply; then measure the step again")
     if not zones:
         measured = "this computer reports no temperature, so flockd will not notice when it gets too hot"
         yield warned("temperature", measured, "load the driver of its thermal sensor, if it has one")
@@ -99,9 +99,9 @@ def check_temperature(config: DroneConfig, folder: Path = THERMAL) -> Iterator[F
     limit_c = config.safety.degraded_temperature_c
     measured = f"{zones[hottest]:.0f} °C ({hottest}); from {limit_c:g} on it flies slowly"
     if zones[hottest] >= limit_c:
-        yield failed("temperature", measured, "let it cool down, and give it air or a heat sink")
+        yield failed("temperature", measured, "let it cool down, and improve its airflow, or add a heat sink")
     elif zones[hottest] > limit_c - SPARE_K:
-        yield warned("temperature", f"{measured}: little is left", "give it air or a heat sink")
+        yield warned("temperature", f"{measured}: little is left", "improve its airflow, or add a heat sink")
     else:
         yield passed("temperature", measured)
 
@@ -156,7 +156,7 @@ def check_clock(
     """The wall clock, by which recordings and logs are dated, and the monotonic one, by which it flies."""
     date = today()
     if not YEARS[0] <= date.year <= YEARS[1]:
-        measured = f"the wall clock says {date:%Y-%m-%d}: recordings get wrong dates, and TLS no valid certificate"
+        measured = f"the wall clock shows {date:%Y-%m-%d}: recordings get wrong dates, and TLS no valid certificate"
         yield failed("wall clock", measured, "set it (`timedatectl set-time`), or fit a battery for the clock")
     elif error_us() >= SYNCHRONISED_BELOW_US:
         measured = f"{date:%Y-%m-%d %H:%M} UTC, not synchronised: recordings of several drones will not fit together"

@@ -40,7 +40,7 @@ def lens_problems(camera: CameraConfig) -> Iterator[Finding]:
     try:
         angle = width_deg(camera)
     except ValueError as error:
-        yield failed(about, f"its calibration makes no camera ({error})", again)
+        yield failed(about, f"its calibration is unusable ({error})", again)
         return
     off = max(abs(lens.cx / camera.size_px[0] - 0.5), abs(lens.cy / camera.size_px[1] - 0.5))
     if off > ODD_CENTRE:

@@ -60,4 +60,6 @@ def _of_error(about: str, error: BaseException) -> Finding:
         return failed(about, f"a library cannot be loaded ({error})", "install flockd again, for this computer")
     if isinstance(error, OSError):
         return failed(about, f"{error.filename or 'the system'}: {error.strerror or error}", "check that it responds")
-    return failed(about, f"the check itself broke ({error!r})", "tell the makers of flockd, with your configuration")
+    return failed(
+        about, f"the check itself failed ({error!r})", "report it to flockd's developers, with your configuration"
+    )

@@ -10,12 +10,12 @@ import numpy as np
 from flockd.flight_log.log import FlightLog
 from flockd.flight_log.metadata import FlightMetadata
 from flockd.flight_log.truth_matching import match_neighbours
-from flockd.messages import BoolArray, FloatArray, MissionStatus, PilotOutput
+from flockd.messages import SECTORS, BoolArray, FloatArray, MissionStatus, ObstacleRanges, PilotOutput
 
 _BY_STEP = (
     "_times", "_position", "_velocity", "_attitude", "_desired", "_command_velocity", "_command_acceleration",
     "_ego_rotation", "_ego_translation", "_ego_inlier_ratio", "_own_velocity", "_neighbour_position",
-    "_neighbour_velocity", "_detection_position", "_false_tracks", "_goal",
+    "_neighbour_velocity", "_detection_position", "_false_tracks", "_goal", "_obstacle_range",
 )  # fmt: skip
 """Arrays with a row for each step."""
 
@@ -36,6 +36,7 @@ class FlightLogBuilder:
         self._own_velocity = np.full((steps, n, 3), nan)
         self._neighbour_position, self._neighbour_velocity = (np.full((steps, n, n, 3), nan) for _ in range(2))
         self._detection_position = np.full((steps, n, n, 3), nan)
+        self._obstacle_range = np.full((steps, n, SECTORS), nan)
         self._false_tracks = np.zeros((steps, n), np.int64)
         self._false_so_far: list[set[int]] = [set() for _ in range(n)]
         self._tracked: list[tuple[float, ...]] = []
@@ -65,6 +66,10 @@ class FlightLogBuilder:
         if goals:
             self._goal[step] = Counter(goals).most_common(1)[0][0]
 
+    def add_obstacles(self, step: int, i: int, seen: ObstacleRanges) -> None:
+        """What drone ``i`` knew of them."""
+        self._obstacle_range[step, i] = np.where(seen.seen_m > 0, seen.range_m, np.nan)
+
     def add_exact_states(
         self, step: int, i: int, others: BoolArray, relative: FloatArray, velocities: FloatArray,
         command: FloatArray, acceleration: FloatArray,
@@ -87,6 +92,8 @@ class FlightLogBuilder:
         for neighbour in output.neighbours:
             if neighbour.confirmed:
                 self._tracked.append((float(step), float(i), float(neighbour.track), *neighbour.position.tolist()))
+        if output.obstacles is not None:
+            self.add_obstacles(step, i, output.obstacles)
         ego = output.ego_motion
         if ego is not None:
             self._ego_rotation[step, i], self._ego_translation[step, i] = ego.rotation, ego.translation
@@ -126,6 +133,7 @@ class FlightLogBuilder:
         """The log, with positions and velocities (S, N, 3) of the companion with exact states, if there is one."""
         drones = self._position.shape[1]
         truth_position, truth_velocity = companion or (np.zeros((0, drones, 3)), np.zeros((0, drones, 3)))
+        looked = not np.isnan(self._obstacle_range).all()
         return FlightLog(
             time_s=self._times, position=self._position, velocity=self._velocity, attitude=self._attitude,
             desired=self._desired, command_velocity=self._command_velocity,
@@ -136,4 +144,5 @@ class FlightLogBuilder:
             false_tracks=self._false_tracks, truth_position=truth_position, truth_velocity=truth_velocity,
             stages_ms={stage: np.array(ms) for stage, ms in self._stages.items()}, metadata=metadata,
             tracked=np.array(self._tracked).reshape(-1, 6), goal=self._goal,
+            obstacle_range=self._obstacle_range if looked else np.zeros((0, 0, 0)),
         )  # fmt: skip

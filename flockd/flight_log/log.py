@@ -13,6 +13,8 @@ from flockd.flight_log.metadata import FlightMetadata
 from flockd.messages import BoolArray, FloatArray, IntArray
 
 _STAGE_PREFIX = "stage "
+_LEFT_AWAY = ("goal", "obstacles", "clearance", "obstacle_range")
+"""From the file, where they are empty."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +68,16 @@ class FlightLog:
     goal: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     """(S, 2) m north and east: where most drones that have a goal want to go, to the millimetre; NaN without
     one; (0, 2) in logs from before there were goals."""
+    obstacles: FloatArray = field(default_factory=lambda: np.zeros((0, 7)))
+    """(K, 7) each solid from above: metres north and east of its middle, half its length and width, the heading of its
+    length (rad), and its lowest and highest height above z = 0. A round one has its radius as half length, and half
+    width 0."""
+    clearance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    """(S, N) m, the smallest distance of a drone's centre from an obstacle's surface from the step to the next, inside
+    negative; (0, 0) without obstacles."""
+    obstacle_range: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    """(S, N, n) m, `ObstacleRanges.range_m` as each drone knew them; NaN where it did not look; (0, 0, 0) if none
+    did."""
 
     @property
     def has_truth(self) -> bool:
@@ -89,6 +101,7 @@ class FlightLog:
 
     def __post_init__(self) -> None:
         steps, drones = self.position.shape[:2]
+        sectors = self.obstacle_range.shape[-1]
         companion = steps if len(self.truth_position) else 0
         state, seen = (steps, drones, 3), (steps, drones, drones, 3)
         expected: dict[str, tuple[int, ...]] = {
@@ -108,6 +121,9 @@ class FlightLog:
             "detection_position": seen,
             "false_tracks": (steps, drones),
             "goal": (steps if len(self.goal) else 0, 2),
+            "obstacles": (len(self.obstacles), 7),
+            "clearance": (steps, drones) if len(self.clearance) else (0, 0),
+            "obstacle_range": (steps, drones, sectors) if len(self.obstacle_range) else (0, 0, 0),
             "truth_position": (companion, drones, 3),
             "truth_velocity": (companion, drones, 3),
         }
@@ -121,8 +137,9 @@ class FlightLog:
         arrays: dict[str, Any] = {
             part.name: getattr(self, part.name) for part in fields(self) if part.name not in ("stages_ms", "metadata")
         }
-        if not len(self.goal):
-            del arrays["goal"]
+        for name in _LEFT_AWAY:
+            if not len(arrays[name]):
+                del arrays[name]
         arrays |= {_STAGE_PREFIX + stage: samples for stage, samples in self.stages_ms.items()}
         with path.open("wb") as file:
             np.savez_compressed(file, **arrays, meta=self.metadata.model_dump_json(exclude_unset=True))

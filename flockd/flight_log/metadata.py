@@ -114,6 +114,8 @@ class FlightMetadata(BaseModel):
     """It was ended before its time; `duration_s` is what was flown."""
     mission: MissionMetadata | None = None
     """None in logs from before there were missions."""
+    drone_radius_m: float | None = None
+    """Of the sphere that holds a drone; None where there is nothing to collide with."""
     clock_at_start_s: float | None = None
     """Time of the recordings' clock at the log's 0 s."""
 

@@ -92,9 +92,9 @@ def _fitted(ground: GroundSamples, weights: FloatArray, spread: FloatArray) -> F
     """(3,) height and slope. A point at inverse depth w is on the plane where ``n . (ray + w offset) = w height``."""
     at = ground.rays + ground.inverse[:, None] * ground.offsets
     rows = np.column_stack([ground.inverse, -at[:, :2]])
-    root = np.sqrt(weights) / spread
-    found: FloatArray = np.linalg.lstsq(rows * root[:, None], at[:, 2] * root, rcond=None)[0]
-    return found
+    root: FloatArray = np.sqrt(weights) / spread
+    found, *_ = np.linalg.lstsq(rows * root[:, None], at[:, 2] * root, rcond=None)
+    return np.asarray(found, np.float64)
 
 
 def _residuals(ground: GroundSamples, plane: FloatArray) -> FloatArray:

@@ -67,12 +67,13 @@ class Avoidance:
         """The velocity (2,) m/s nearest to the given one from which the drone can stop before what is near.
 
         `neighbours` (n, 3) metres NED from the drone, with their `velocities` (n, 2) m/s. A step passes before the
-        next velocity, which counts as reaction.
+        next velocity, which counts as reaction. Neighbours turn aside here without notice: they are kept as far off as
+        by a degraded drone.
         """
         p, gate = self._parameters, self._gate
         points = nearest_points(ranges, p.sigmas)
         to_obstacles = towards_obstacles(points, p.clearance_m, gate.braking_m_s2, self._reaction_s)
-        to_neighbours = towards_neighbours(gate, neighbours, velocities, gate.min_separation_m)
+        to_neighbours = towards_neighbours(gate, neighbours, velocities, gate.degraded_separation_m)
         directions, most_m_s = zip(to_obstacles, to_neighbours, strict=True)
         return nearest_within(velocity, np.concatenate(directions), np.concatenate(most_m_s))
 

@@ -12,6 +12,7 @@ from flockd.geometry import Rig, ground_inverse_depth
 from flockd.inference import models_folder
 from flockd.inference.checks import Deadline, no_deadline
 from flockd.messages import Float32Array, FloatArray, Frame, FrameSet, GroundEstimate, VehicleState
+from flockd.perception.continuity import ContinuityMonitor
 from flockd.perception.depth import GroundBelow, NoGround, VelocityScale, fix_by_height
 from flockd.perception.detection.detector import DetectionTrace, Detector
 from flockd.perception.detection.masks import depth_of_drones, without_borders
@@ -35,6 +36,7 @@ class Perception:
         self._velocity_scale = VelocityScale(rig) if config.scale == "velocity" else None
         self._ground = GroundBelow(config.height, config.range_finder) if config.scale == "height" else None
         self._noise = NoiseMonitor(config.noise)
+        self._continuity = ContinuityMonitor(config.noise)
         self._last: Observation | None = None
 
     def observe(
@@ -54,7 +56,7 @@ class Perception:
             trace: filled with what the detector went through, where a caller wants to see it.
             lap: called at the end of each stage with its name, to time it.
         """
-        usable, noisy, unusable = self._usable(frames)
+        usable, noisy, unusable = self._usable(frames, vehicle)
         ground, ungrounded = self._ground_at(vehicle)
         scenes, failed = self._scenes(usable, vehicle, ground)
         lap("scene")
@@ -71,7 +73,8 @@ class Perception:
             cameras[name] = CameraObservation(images[name], depth, labels, flows.get(name))
         reasons = (*unusable, *ungrounded, *failed, *restarted, *unscaled)
         found = ground if isinstance(ground, GroundEstimate) and self._config.height != "barometer" else None
-        self._last = Observation(frames.time_s, vehicle, cameras, detections, previous, reasons, noisy, found)
+        track = None if found is None or self._ground is None else self._ground.track(vehicle)
+        self._last = Observation(frames.time_s, vehicle, cameras, detections, previous, reasons, noisy, found, track)
         lap("detection")
         return self._last
 
@@ -80,8 +83,8 @@ class Perception:
         if self._ground is not None:
             self._ground.see_slope(slope)
 
-    def _usable(self, frames: FrameSet) -> tuple[dict[str, Frame], tuple[str, ...], Reasons]:
-        """The frames of the rig's cameras that have the right size and show a scene, and whose show noise."""
+    def _usable(self, frames: FrameSet, vehicle: VehicleState) -> tuple[dict[str, Frame], tuple[str, ...], Reasons]:
+        """The frames of the rig's cameras that have the right size and show a scene, and whose show noise or damage."""
         usable, noisy, reasons = {}, [], []
         for name, camera in self._rig.cameras.items():
             width, height = camera.camera.size
@@ -96,6 +99,11 @@ class Perception:
                 reasons.append(f"camera {name}: its image is noise")
             else:
                 usable[name] = frame
+        images = {name: frame.image for name, frame in usable.items()}
+        for name in self._continuity.broken(images, frames.time_s, vehicle.R_ned_body):
+            noisy.append(name)
+            reasons.append(f"camera {name}: its image does not follow from the one before")
+            del usable[name]
         return usable, tuple(noisy), reasons
 
     def _ground_at(self, vehicle: VehicleState) -> tuple[GroundEstimate | NoGround | None, Reasons]:

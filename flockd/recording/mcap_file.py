@@ -108,7 +108,7 @@ class _ChunkIndices:
         """What the writer calls when a chunk has ended."""
         builder = RecordBuilder()
         index.write(builder)
-        self._packed += builder.end()
+        self._packed += builder.end()  # type: ignore[no-untyped-call]
 
     def __iter__(self) -> Iterator[ChunkIndex]:
         """When the file is finished."""
@@ -116,7 +116,7 @@ class _ChunkIndices:
         while stream.count < len(self._packed):
             stream.read1()  # the opcode
             stream.read8()  # the record's length
-            yield ChunkIndex.read(stream)  # type: ignore[no-untyped-call]
+            yield ChunkIndex.read(stream)
 
 
 class McapFile:

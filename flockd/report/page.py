@@ -22,6 +22,7 @@ from flockd.messages import UInt8Array
 from flockd.report.curves import account_curves, error_curves, flight_curves
 from flockd.report.figure_files import inline_svg
 from flockd.report.filmstrip import filmstrip_figure
+from flockd.report.obstacle_figures import in_the_way, obstacle_figure
 from flockd.report.page_texts import page_texts
 from flockd.report.style import colour_of
 from flockd.report.trajectories import trajectories
@@ -47,7 +48,7 @@ def write_report(directory: Path, progress: Callable[[int, int], None] = lambda 
         old.unlink()
     drawings = _DRAWINGS_OF_TRUTH if log.has_truth else _DRAWINGS_OF_ACCOUNT
     total = len(drawings) + len(frames)
-    embedded: dict[str, Markup | None] = {"trajectories": None, "errors": None}
+    embedded: dict[str, Markup | None] = {"trajectories": None, "obstacles": None, "errors": None}
     for number, (name, (draw, file, description)) in enumerate(drawings.items()):
         progress(number, total)
         embedded[name] = _embed(log, draw, folder / f"{file}.png", description)
@@ -74,6 +75,7 @@ def write_report(directory: Path, progress: Callable[[int, int], None] = lambda 
 _Draw = Callable[..., Figure | None]
 _DRAWINGS_OF_TRUTH: dict[str, tuple[_Draw, str, str]] = {
     "trajectories": (trajectories, "trajectories", "Paths and formation from above"),
+    "obstacles": (obstacle_figure, "obstacles", "Clearance over time, and what a drone knew of the obstacles"),
     "curves": (flight_curves, "curves", "Airspeed, course, heights, distances and deviations over time"),
     "errors": (error_curves, "errors", "Errors of the estimates over time"),
 }
@@ -88,7 +90,8 @@ _DRAWINGS_OF_ACCOUNT: dict[str, tuple[_Draw, str, str]] = {
 
 
 def _flight_data(log: FlightLog) -> str:
-    """What the page plays: times, and of each drone metres north, east and up, to the centimetre."""
+    """What the page plays: times, and of each drone metres north, east and up, to the centimetre; the obstacles
+    as in the log, and whether they are in the way."""
     drones = log.position.shape[1]
     up = log.position * (1.0, 1.0, -1.0)
     data = {
@@ -96,6 +99,10 @@ def _flight_data(log: FlightLog) -> str:
         "position": (np.round(up, 2) + 0.0).tolist(),
         "colours": [colour_of(number, drones) for number in range(drones)],
         "names": [f"{number + 1}" for number in range(drones)],
+        "obstacles": [
+            [*np.round(row[:5], 3).tolist(), bool(near)]
+            for row, near in zip(log.obstacles, in_the_way(log), strict=True)
+        ],
     }
     return json.dumps(data, separators=(",", ":"))
 

@@ -162,6 +162,13 @@ def _facts(summary: Summary, log: FlightLog) -> list[dict[str, str]]:
         facts.append(
             _fact("From the last goal", _number(mission["final_error_m"], 2), f"the middle, at the end; {when}", "m")
         )
+    obstacles = summary["obstacles"]
+    if obstacles["collisions"] is not None:
+        near = f"{obstacles['time_within_1m_s']:g} s within 1 m, all drones together"
+        facts += [
+            _fact("Collisions", _number(obstacles["collisions"], 0), "with obstacles, once per contact"),
+            _fact("Clearance", _number(obstacles["min_clearance_m"], 2), f"the smallest to an obstacle; {near}", "m"),
+        ]
     if neighbours["recall_within_10m"] is not None:
         facts += [
             _fact("Neighbours known", _number(100 * neighbours["recall_within_10m"], 1), "of those within 10 m", "%"),

@@ -90,6 +90,21 @@ for (const player of document.querySelectorAll(".player")) {
     }
     pen.stroke();
 
+    for (const [n, e, length, width, heading, inTheWay] of flight.obstacles) {
+      pen.fillStyle = inTheWay ? "#8a7355" : colour("--grid");
+      pen.beginPath();
+      if (width === 0) {
+        pen.arc(x([n, e]), y([n, e]), Math.max(length / metres, 1), 0, 2 * Math.PI);
+      } else {
+        const [along, across] = [[Math.cos(heading), Math.sin(heading)], [-Math.sin(heading), Math.cos(heading)]];
+        for (const [a, b] of [[1, 1], [1, -1], [-1, -1], [-1, 1]]) {
+          const corner = [n, e].map((v, axis) => v + a * length * along[axis] + b * width * across[axis]);
+          pen.lineTo(x(corner), y(corner));
+        }
+      }
+      pen.fill();
+    }
+
     const step = stepAt(time);
     places.forEach((place, i) => {
       pen.strokeStyle = flight.colours[i];

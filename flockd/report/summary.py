@@ -19,6 +19,8 @@ CONVERGENCE_BAND = {"obj1": 0.05, "obj2": 0.2}
 """How near to its tail mean a sum must stay to have converged."""
 RECALL_RANGE_M = 10.0
 SAME_GOAL_M = 1e-6
+NEAR_M = 1.0
+"""To an obstacle."""
 
 Json = dict[str, Any]
 
@@ -33,9 +35,9 @@ def summarise(log: FlightLog) -> Json:
     interaction distance. `neighbours`: the share of all drones within 10 m, at all steps, of which there was a
     confirmed track, and new false tracks; of drones and steps that were recorded. A flight whose perception is "truth"
     has no perception: its `neighbours` are null and it is itself Table 3's "truth". Of a recording without truth
-    (`has_truth`) all of these are null. `mission` is `mission_figures`. `own_account` needs no truth: the recorded
-    drones' own estimates. `autopilot` names what real daemons flew, and `fleet` holds their figures; null where the
-    simulator ran the pilots.
+    (`has_truth`) all of these are null. `mission` is `mission_figures`, `obstacles` is `obstacle_figures`.
+    `own_account` needs no truth: the recorded drones' own estimates. `autopilot` names what real daemons flew, and
+    `fleet` holds their figures; null where the simulator ran the pilots.
     """
     metadata, value = log.metadata, log.metadata.model_dump()
     return {
@@ -46,6 +48,7 @@ def summarise(log: FlightLog) -> Json:
         "table3": _table_3(log),
         "flock": _flock(log),
         "mission": mission_figures(log),
+        "obstacles": obstacle_figures(log),
         "neighbours": _neighbours(log),
         "own_account": _own_account(log),
         "stages_ms": {
@@ -124,6 +127,24 @@ def mission_figures(log: FlightLog) -> Json:
         "arrived": bool(away_m[-1] <= mission.reached_m),
         "time_s": float(log.time_s[there[0]]) if len(there) else None,
         "final_error_m": float(away_m[-1]),
+    }
+
+
+def obstacle_figures(log: FlightLog) -> Json:
+    """How near the drones came to the obstacles; all null without any.
+
+    `collisions` counts each drone's contacts: from when the sphere around it touches an obstacle until it is free
+    again. `min_clearance_m` is the smallest distance from that sphere to an obstacle, inside negative, and
+    `time_within_1m_s` how long it was below 1 m, summed over the drones.
+    """
+    if not len(log.clearance) or log.metadata.drone_radius_m is None:
+        return dict.fromkeys(("collisions", "min_clearance_m", "time_within_1m_s"))
+    free_m = log.clearance - log.metadata.drone_radius_m
+    touching = np.vstack([np.zeros((1, free_m.shape[1]), dtype=bool), free_m < 0])
+    return {
+        "collisions": int((touching[1:] & ~touching[:-1]).sum()),
+        "min_clearance_m": float(free_m.min()),
+        "time_within_1m_s": float((free_m < NEAR_M).sum() * log.metadata.step_s),
     }
 
 

@@ -15,6 +15,7 @@ from flockd.flight_log.log import FlightLog
 from flockd.flocking.metrics import pair_distances
 from flockd.messages import BoolArray, FloatArray
 from flockd.report.curves import NARROW_IN
+from flockd.report.obstacle_figures import IN_THE_WAY, LEGEND, add_obstacles
 from flockd.report.style import FEW, INK, MUTED, NAMED, ON_COLOUR, PAPER, STYLE, colour_of, drone_name
 from flockd.report.summary import SAME_GOAL_M
 
@@ -47,11 +48,15 @@ def trajectories(log: FlightLog, *, narrow: bool = False) -> Figure:
             _plan(paths, track, color=colour, linewidth=1.4 if drones <= FEW else 0.8)
             _plan(paths, track[:1], color=colour, marker="o", markersize=5, markerfacecolor=PAPER, zorder=4)
             _plan(paths, track[-1:], color=colour, marker="o", markersize=6, markeredgecolor=PAPER, zorder=5)
+        add_obstacles(paths, log)
         goals = _goals(log)
         paths.plot(goals[:, 1], goals[:, 0], **_GOAL)
         paths.set_aspect("equal", adjustable="datalim")
         paths.set(xlabel="east, m", ylabel="north, m", title="Paths")
-        paths.legend(handles=_path_handles(drones, exact=exact is not None, goals=len(goals) > 0), loc="best")
+        handles = _path_handles(drones, exact=exact is not None, goals=len(goals) > 0)
+        if len(log.obstacles):
+            handles.append(Line2D([], [], color=IN_THE_WAY, marker="s", linestyle="", label="obstacle"))
+        paths.legend(handles=handles, **(LEGEND if len(log.obstacles) else {"loc": "best"}))
 
         reach = 1.15 * max(np.abs(_centred(log.position[step])).max() for step in (0, -1)) + 1.2
         for axes, step, name in zip(formations, (0, -1), ("start", "end"), strict=False):

@@ -149,18 +149,22 @@ def fill(visible: Any, rows: Any, planes: Any, inverse_depth: Any, hit: Any) -> 
 
 
 @njit(cache=True, error_model="numpy")
+def _spread(packed: Any) -> Any:
+    """Four packed bytes, each in 16 bits of its own: the first, third, second and fourth from below."""
+    wide = np.uint64(packed)
+    return (wide | wide << np.uint64(24)) & np.uint64(0x00FF00FF00FF00FF)
+
+
+@njit(cache=True, error_model="numpy")
 def _blend(a: Any, b: Any, weight: Any) -> Any:
-    """Four packed bytes of a and b mixed, weight of b in 1/256."""
-    keep = np.uint64(256) - weight
-    low = np.uint64(0x00FF00FF)
-    even = (((a & low) * keep + (b & low) * weight) >> np.uint64(8)) & low
-    odd = (((a >> np.uint64(8)) & low) * keep + ((b >> np.uint64(8)) & low) * weight) & np.uint64(0xFF00FF00)
-    return even | odd
+    """Four spread bytes of a and b mixed, weight of b in 1/256."""
+    lanes = np.uint64(0x00FF00FF00FF00FF)
+    return ((a * (np.uint64(256) - weight) + b * weight) >> np.uint64(8)) & lanes
 
 
 @njit(cache=True, error_model="numpy")
 def _bilinear(texels: Any, base: int, bits: int, u: float, v: float) -> Any:
-    """Packed colour of one level at (u, v) in tiles, repeating."""
+    """Spread colour of one level at (u, v) in tiles, repeating."""
     size = 1 << bits
     mask = size - 1
     fu = u * (size * 256.0) - 128.0
@@ -175,19 +179,19 @@ def _bilinear(texels: Any, base: int, bits: int, u: float, v: float) -> Any:
     row0 = base + (y0 << bits)
     row1 = base + (((y0 + 1) & mask) << bits)
     # Unsigned indices spare the check for negative ones.
-    a = _blend(np.uint64(texels[np.uint64(row0 + x0)]), np.uint64(texels[np.uint64(row0 + x1)]), wu)
-    b = _blend(np.uint64(texels[np.uint64(row1 + x0)]), np.uint64(texels[np.uint64(row1 + x1)]), wu)
+    a = _blend(_spread(texels[np.uint64(row0 + x0)]), _spread(texels[np.uint64(row0 + x1)]), wu)
+    b = _blend(_spread(texels[np.uint64(row1 + x0)]), _spread(texels[np.uint64(row1 + x1)]), wu)
     return _blend(a, b, wv)
 
 
 @njit(cache=True, error_model="numpy")
 def sample(texels: Any, base: int, bits: int, u: float, v: float, level: float) -> Any:
-    """Trilinear packed colour; ``level`` 0 is the finest of ``bits`` + 1 levels, stored in turn from ``base``."""
+    """Trilinear spread colour; ``level`` 0 is the finest of ``bits`` + 1 levels, stored in turn from ``base``."""
     if level <= 0.0:
         return _bilinear(texels, base, bits, u, v)
     whole = int(level)
     if whole >= bits:
-        return np.uint64(texels[base + ((4 << (2 * bits)) - 1) // 3 - 1])
+        return _spread(texels[base + ((4 << (2 * bits)) - 1) // 3 - 1])
     # Levels before this one hold 4^bits + 4^(bits-1) + ... texels.
     start = base + ((4 << (2 * bits)) - (4 << (2 * (bits - whole)))) // 3
     fine = _bilinear(texels, start, bits - whole, u, v)
@@ -197,9 +201,9 @@ def sample(texels: Any, base: int, bits: int, u: float, v: float, level: float) 
 
 
 @njit(cache=True, error_model="numpy")
-def _byte(packed: Any, shift: int) -> float:
-    """One channel of a packed colour, linear light: textures are stored as square roots."""
-    value = float((packed >> np.uint64(shift)) & np.uint64(255)) * (1.0 / 255.0)
+def _byte(spread: Any, shift: int) -> float:
+    """One channel of a spread colour, linear light: textures are stored as square roots."""
+    value = float((spread >> np.uint64(shift)) & np.uint64(255)) * (1.0 / 255.0)
     return value * value
 
 
@@ -272,7 +276,7 @@ def _encode(tone: Any, value: float) -> Any:
 
 @njit(cache=True, error_model="numpy")
 def _sky(sky: Any, bits: int, x: float, y: float, z: float) -> Any:
-    """Packed sky colour of a direction, NED: an octahedral map of the upper half."""
+    """Spread sky colour of a direction, NED: an octahedral map of the upper half."""
     z = max(0.0, -z)
     scale = 0.5 / max(1e-9, abs(x) + abs(y) + z)
     size = 1 << bits
@@ -321,22 +325,26 @@ def shade_scene(
     ground_size = 1 << ground_bits
     ground_level = ground_bits - math.log2(2.0 * extent)
     focal_level = math.log2(focal)
+    r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
+    r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
+    r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
+    k00, k01, k02, k11, k12 = inverse_K[0, 0], inverse_K[0, 1], inverse_K[0, 2], inverse_K[1, 1], inverse_K[1, 2]
     for y in range(height):
         v = y + 0.5
         for x in range(width):
             u = x + 0.5
-            cx = inverse_K[0, 0] * u + inverse_K[0, 1] * v + inverse_K[0, 2]
-            cy = inverse_K[1, 1] * v + inverse_K[1, 2]
-            rn = R[0, 0] * cx + R[0, 1] * cy + R[0, 2]
-            re = R[1, 0] * cx + R[1, 1] * cy + R[1, 2]
-            rd = R[2, 0] * cx + R[2, 1] * cy + R[2, 2]
+            cx = k00 * u + k01 * v + k02
+            cy = k11 * v + k12
+            rn = r00 * cx + r01 * cy + r02
+            re = r10 * cx + r11 * cy + r12
+            rd = r20 * cx + r21 * cy + r22
             length = math.sqrt(cx * cx + cy * cy + 1.0)
             t = hit[y, x]
             if t < 0:
                 depth[y, x] = np.inf
                 packed = _sky(sky, sky_bits, rn, re, rd)
                 rgb[y, x, 0] = _encode(tone, 4.0 * _byte(packed, 0))
-                rgb[y, x, 1] = _encode(tone, 4.0 * _byte(packed, 8))
+                rgb[y, x, 1] = _encode(tone, 4.0 * _byte(packed, 32))
                 rgb[y, x, 2] = _encode(tone, 4.0 * _byte(packed, 16))
                 continue
             z = 1.0 / (planes[t, 9] * u + planes[t, 10] * v + planes[t, 11])
@@ -373,10 +381,10 @@ def shade_scene(
                     n * tile,
                     footprint + ground_detail[gi, 2],
                 )
-                cosine = -sun[2] if beyond else _byte(packed, 24)
+                cosine = -sun[2] if beyond else _byte(packed, 48)
                 red, green, blue = _light(light, -1.0, cosine * free)
                 red *= 2.0 * _byte(packed, 0) * _byte(fine, 0)
-                green *= 2.0 * _byte(packed, 8) * _byte(fine, 8)
+                green *= 2.0 * _byte(packed, 32) * _byte(fine, 32)
                 blue *= 2.0 * _byte(packed, 16) * _byte(fine, 16)
             else:
                 tu = uv[t, 0, 0] * n + uv[t, 0, 1] * e + uv[t, 0, 2] * d + uv[t, 0, 3]
@@ -387,7 +395,7 @@ def shade_scene(
                     cosine *= free * sun_reaches(shadow, shadow_frame, n + 0.08 * nn, e + 0.08 * ne, d + 0.08 * nd)
                 red, green, blue = _light(light, nd, max(0.0, cosine))
                 red *= 2.0 * tint[t, 0] * _byte(fine, 0)
-                green *= 2.0 * tint[t, 1] * _byte(fine, 8)
+                green *= 2.0 * tint[t, 1] * _byte(fine, 32)
                 blue *= 2.0 * tint[t, 2] * _byte(fine, 16)
             clear = math.exp(-fog * z * length)
             rgb[y, x, 0] = _encode(tone, red * clear + light[4, 0] * (1.0 - clear))
@@ -578,7 +586,7 @@ def shade_drone(
                         red, green, blue = _light(light, nd, max(0.0, cosine))
                         clear = math.exp(-fog * away)
                         red = red * 2.0 * colours[t, 0] * _byte(fine, 0) * clear + light[4, 0] * (1.0 - clear)
-                        green = green * 2.0 * colours[t, 1] * _byte(fine, 8) * clear + light[4, 1] * (1.0 - clear)
+                        green = green * 2.0 * colours[t, 1] * _byte(fine, 32) * clear + light[4, 1] * (1.0 - clear)
                         blue = blue * 2.0 * colours[t, 2] * _byte(fine, 16) * clear + light[4, 2] * (1.0 - clear)
                     sum_red += red
                     sum_green += green

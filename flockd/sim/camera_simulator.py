@@ -17,6 +17,7 @@ from flockd.messages import FloatArray, Frame, FrameSet, UInt8Array
 from flockd.mission import Moment, Navigator
 from flockd.sim.camera_faults import CameraFaults
 from flockd.sim.drone_models import FAMILIES, drone_model
+from flockd.sim.obstacle_worlds import obstacles_of
 from flockd.sim.renderer import Renderer, View
 from flockd.sim.truth_perception import RenderTruth
 from flockd.sim.vehicles import REFERENCE_DEG
@@ -47,11 +48,15 @@ class CameraSimulator:
                     f"drone.rig: camera {name!r}: the renderer supports only pinhole cameras without distortion; "
                     "change its intrinsics for simulated flights"
                 )
+        obstacles = obstacles_of(scenario)
+        field, path = scenario.world.obstacles, planned_path(scenario)
+        clearance_m = scenario.world.clearance_m + _spread(scenario)
         world = World.generate(
             scenario.seed,
             ground_relief_m=scenario.world.ground_relief_m,
-            keep_out=planned_path(scenario),
-            clearance_m=scenario.world.clearance_m + _spread(scenario),
+            keep_out=path if field is None else np.concatenate([path, field_grid(field.extent_m)]),
+            clearance_m=clearance_m if field is None else max(clearance_m, FIELD_GRID_M),
+            obstacles=obstacles if obstacles.solids else None,
             hills_m=scenario.world.hills_m,
             hills_slope=scenario.world.hills_slope,
         )
@@ -92,6 +97,15 @@ class CameraSimulator:
             frames[name] = Frame(name, image, time_s, step)
         truth = RenderTruth(views, turns, places, R_ned_body, position, vehicles.R_ned_body, vehicles.position, others)
         return FrameSet(time_s, frames), truth
+
+
+FIELD_GRID_M = 3.0
+
+
+def field_grid(extent_m: float) -> FloatArray:
+    """(n, 2) m north and east all over the area of obstacles, where nothing else is to stand: `World.keep_out`."""
+    axis = np.arange(-extent_m, extent_m + FIELD_GRID_M, FIELD_GRID_M)
+    return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
 
 
 class _ImageNoise:

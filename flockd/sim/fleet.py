@@ -21,6 +21,7 @@ from flockd.errors import UnavailableError
 from flockd.flight_log.fleet_log import FleetFrame, FleetRun, fleet_key_frames, fleet_log
 from flockd.sim.autopilots import Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.camera_simulator import CameraSimulator
+from flockd.sim.clearances import with_obstacles
 from flockd.sim.daemons import Daemons, fleet_configs
 from flockd.sim.exact_states import HandPilot, exact_states_at
 from flockd.sim.frame_server import FrameServer
@@ -105,7 +106,7 @@ def fly_fleet(
         times = np.array([frame.time_s - run.frames[0].time_s for frame in run.frames])
         companion = exact_states_at(times, scenario)
         log = fleet_log(scenario, configs, run, recorded, speed_factor, companion)
-        return Flight(log, fleet_key_frames(recorded, run))
+        return Flight(with_obstacles(log, scenario), fleet_key_frames(recorded, run))
 
 
 class _Fleet:

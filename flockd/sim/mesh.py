@@ -177,12 +177,16 @@ class Mesh:
         texture: int,
         tint: FloatArray,
         tile: float,
+        *,
+        half_height: float = 0.0,
     ) -> None:
-        """A lumpy ellipsoid; each facet a slightly different shade."""
+        """A lumpy ellipsoid, its halves drawn apart upright; each facet a slightly different shade."""
         sphere, faces = _SPHERE
         lumpy = sphere * (1.0 + rough * rng.uniform(-1, 1, (len(sphere), 1)))
         shades = tint * rng.uniform(0.85, 1.15, (len(faces), 1))
-        self.add(turn(lumpy, rng.uniform(0, 6.28)) * radii + centre, faces, texture, shades, (tile, tile))
+        skin = turn(lumpy, rng.uniform(0, 6.28)) * radii
+        skin[:, 2] += half_height * np.sign(np.where(np.abs(skin[:, 2]) < 1e-9, 0.0, skin[:, 2]))
+        self.add(skin + centre, faces, texture, shades, (tile, tile))
 
 
 # fmt: off

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 from numpy.random import Generator
 
-from flockd.config.obstacles import ObstaclesConfig
+from flockd.config.obstacle_field import ObstaclesConfig
 from flockd.config.scenario import ScenarioConfig
+from flockd.errors import UsageError
 from flockd.messages import FloatArray
 from flockd.sim.obstacles import Box, Capsule, Frustum, Material, Obstacles, Solid
 
 DEPTH_M = 0.6
 """How far everything reaches below z = 0, where the ground may lie lower."""
+LOWEST_CROWN_M = 6.0
+"""Of a forest's old trees."""
 _TREE_TRIES = 400
 _YOUNG = 0.12
 """Share of a forest's trees that have branches down to the ground."""
@@ -28,7 +32,7 @@ _SPAN_PARTS = 6
 def obstacles_of(scenario: ScenarioConfig) -> Obstacles:
     """Those of its world, drawn from its seed; none where it has no `world.obstacles`.
 
-    Raises ValueError where they do not fit in.
+    Raises UsageError where they do not fit in.
     """
     if scenario.world.obstacles is None:
         return Obstacles()
@@ -39,13 +43,20 @@ def obstacles_of(scenario: ScenarioConfig) -> Obstacles:
 def generate_obstacles(config: ObstaclesConfig, seed: int, starts: FloatArray) -> Obstacles:
     """The obstacles of a scenario; `starts` (n, 2) m north and east are kept free by `config.free_start_m`.
 
-    Raises ValueError where they do not fit into the area.
+    Raises UsageError where they do not fit into the area.
     """
     rng = np.random.default_rng([seed, 3])
     free = [(float(north), float(east), config.free_start_m) for north, east in starts]
     free += [(place.north_m, place.east_m, place.radius_m) for place in config.clearings]
     site = _Site(rng, config.extent_m, np.array(free).reshape(-1, 3))
     return Obstacles(_forest(site, config) if config.kind == "forest" else _village(site, config))
+
+
+def _crowded(config: ObstaclesConfig, fitted: str, key: str) -> UsageError:
+    return UsageError(
+        f"world.obstacles: only {fitted} fit in with {config.min_gap_m:g} m between them; "
+        f"write a smaller `{key}` or `min_gap_m`"
+    )
 
 
 class _Site:
@@ -91,7 +102,7 @@ def _forest(site: _Site, config: ObstaclesConfig) -> list[Solid]:
         trunk = float(rng.uniform(0.08, 0.3))
         place = site.anywhere(_TREE_TRIES, max(trunk, crown), config.min_gap_m)
         if place is None:
-            raise ValueError(f"only {number} of {count} trees fit in with {config.min_gap_m:g} m between them")
+            raise _crowded(config, f"{number} of {count} trees", "trees_per_hectare")
         if young:
             solids += _young_tree(rng, place, crown)
         else:
@@ -110,7 +121,7 @@ def _young_tree(rng: Generator, place: FloatArray, crown: float) -> list[Solid]:
 
 def _old_tree(rng: Generator, place: FloatArray, trunk: float, *, conifer: bool) -> list[Solid]:
     north, east = place.tolist()
-    bare, height = float(rng.uniform(6.0, 8.5)), float(rng.uniform(11.0, 17.0))
+    bare, height = float(rng.uniform(LOWEST_CROWN_M, 8.5)), float(rng.uniform(11.0, 17.0))
     crown = float(rng.uniform(1.0, 2.2))
     solids: list[Solid] = [Frustum(north, east, trunk, 0.5 * trunk, -DEPTH_M, bare + 0.6 * (height - bare), "bark")]
     if conifer:
@@ -120,10 +131,11 @@ def _old_tree(rng: Generator, place: FloatArray, trunk: float, *, conifer: bool)
             Frustum(north, east, 0.75 * crown, 0.0, middle, height, "needles"),
         ]
         return solids
-    for _ in range(int(rng.integers(2, 5))):
+    solids.append(Capsule(north, east, bare + crown, north, east, max(bare + crown, height - crown), crown, "leaves"))
+    for _ in range(int(rng.integers(1, 4))):
         radius = float(rng.uniform(0.5, 0.8)) * crown
-        up = float(rng.uniform(bare + radius, max(bare + radius + 0.1, height - radius)))
-        aside, angle = 0.6 * crown * rng.random(), rng.uniform(0, 2 * math.pi)
+        up = float(rng.uniform(bare + radius, max(bare + radius + 0.1, height - 2 * radius)))
+        aside, angle = 0.8 * crown, rng.uniform(0, 2 * math.pi)
         at = north + aside * math.cos(angle), east + aside * math.sin(angle)
         solids.append(Capsule(*at, up, *at, up + 0.4 * radius, radius, "leaves"))
     return solids
@@ -142,7 +154,7 @@ def _village(site: _Site, config: ObstaclesConfig) -> list[Solid]:
         reach = math.hypot(*half)
         place = _beside(site, street, reach, config.min_gap_m)
         if place is None:
-            raise ValueError(f"only {number} of {count} houses fit in with {config.min_gap_m:g} m between them")
+            raise _crowded(config, f"{number} of {count} houses", "houses_per_hectare")
         turn = float(along_street + rng.normal(0.0, 0.08) + (math.pi / 2 if rng.random() < 0.5 else 0.0))
         houses.append(_house(rng, place, half, turn, solids))
     for _ in range(round(0.8 * count)):
@@ -187,7 +199,8 @@ def _wall(site: _Site, street: float, gap: float, solids: list[Solid]) -> None:
         return
     material: Material = "stone" if rng.random() < 0.5 else "bricks"
     top = float(rng.uniform(2.0, 5.5))
-    solids.append(Box(*middle.tolist(), length / 2, float(rng.uniform(0.1, 0.25)), heading, -DEPTH_M, top, material))
+    north, east = middle.tolist()
+    solids.append(Box(north, east, length / 2, float(rng.uniform(0.1, 0.25)), heading, -DEPTH_M, top, material))
 
 
 def _garden_tree(rng: Generator, place: FloatArray, crown: float) -> list[Solid]:
@@ -208,9 +221,10 @@ def _street_poles(site: _Site, street: float) -> list[Solid]:
         place = np.array([along + rng.uniform(-2.0, 2.0), street + _STREET_M / 2 - 0.3])
         height, radius = float(rng.uniform(7.5, 8.5)), float(rng.uniform(0.08, 0.15))
         if site.take(place, radius, 0.5):
-            solids.append(Frustum(*place.tolist(), radius, 0.7 * radius, -DEPTH_M, height, "wood"))
+            north, east = place.tolist()
+            solids.append(Frustum(north, east, radius, 0.7 * radius, -DEPTH_M, height, "wood"))
             tops.append(np.array([*place, height - 0.3]))
-    for one, other in zip(tops[:-1], tops[1:], strict=True):
+    for one, other in itertools.pairwise(tops):
         solids += _wire(one, other, sag=0.03 * float(np.linalg.norm(other - one)))
     return solids
 
@@ -233,4 +247,5 @@ def _wire(one: FloatArray, other: FloatArray, *, sag: float) -> list[Solid]:
     points = one + share * (other - one)
     points[:, 2] -= sag * 4 * (share * (1 - share))[:, 0]
     radius = 0.012
-    return [Capsule(*a.tolist(), *b.tolist(), radius, "metal") for a, b in zip(points[:-1], points[1:], strict=True)]
+    ends = [tuple(float(metres) for metres in point) for point in points]
+    return [Capsule(*(*a, *b), radius=radius, material="metal") for a, b in itertools.pairwise(ends)]

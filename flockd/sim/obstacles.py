@@ -116,6 +116,24 @@ class Obstacles:
                 np.minimum(nearest, distance(part[:, None], flat[None]).min(axis=0), out=nearest)
         return nearest.reshape(np.shape(points)[:-1])
 
+    def outlines(self) -> FloatArray:
+        """(k, 7) of `FlightLog.obstacles`, a sloping line without its round ends."""
+        upright, boxes, lines = self._frusta, self._boxes, self._capsules
+        way = lines[:, 3:5] - lines[:, :2]
+        length = np.hypot(way[:, 0], way[:, 1])
+        low = np.minimum(lines[:, 2], lines[:, 5]) - lines[:, 6]
+        high = np.maximum(lines[:, 2], lines[:, 5]) + lines[:, 6]
+        of_frusta = [upright[:, :2], upright[:, 2:4].max(axis=1), np.zeros((len(upright), 2)), upright[:, 4:6]]
+        of_lines = [
+            (lines[:, :2] + lines[:, 3:5]) / 2,
+            np.where(length > 0, length / 2, lines[:, 6]),
+            np.where(length > 0, lines[:, 6], 0.0),
+            np.arctan2(way[:, 1], way[:, 0]),
+            low,
+            high,
+        ]
+        return np.vstack([np.column_stack(of_frusta), boxes, np.column_stack(of_lines)])
+
     def _sections(self, low: float, high: float) -> tuple[FloatArray, FloatArray]:
         """What lies between two heights, seen from above: discs (k, 3) and rectangles (m, 5), rows as of the solids."""
         frusta = self._frusta[(self._frusta[:, 4] <= high) & (self._frusta[:, 5] >= low)]
@@ -130,7 +148,7 @@ def true_ranges(
     obstacles: Obstacles, time_s: float, position: FloatArray, *, limit_m: float = RANGE_LIMIT_M
 ) -> ObstacleRanges:
     """What a drone at `position` (3,) NED would measure without errors: all around, up to `limit_m`."""
-    azimuths = np.arange(SECTORS) * (2 * math.pi / SECTORS)
+    azimuths = np.arange(SECTORS, dtype=float) * (2 * math.pi / SECTORS)
     range_m = obstacles.ranges(position, azimuths, half_width=math.pi / SECTORS, limit_m=limit_m)
     return ObstacleRanges(
         time_s=time_s,

@@ -50,18 +50,19 @@ class Scenery:
         self.ground_names = [textures.GROUNDS[i].__name__ for i in names]
         self.ground_kinds = len(names)
         self.textures = [textures.GROUNDS[i](rng) for i in names]
-        self.leaves = [self._texture(textures.leaves(rng)) for _ in range(2)]
-        self.bark = self._texture(textures.bark(rng))
+        self.leaves = [self.add_texture(textures.leaves(rng)) for _ in range(2)]
+        self.bark = self.add_texture(textures.bark(rng))
         walls = [textures.WALLS[i](rng) for i in rng.permutation(len(textures.WALLS))[:3]]
-        self.walls = [self._texture(w) for w in walls]
-        self.roofs = [self._texture(textures.ROOFS[i](rng)) for i in rng.permutation(len(textures.ROOFS))[:2]]
+        self.walls = [self.add_texture(w) for w in walls]
+        self.roofs = [self.add_texture(textures.ROOFS[i](rng)) for i in rng.permutation(len(textures.ROOFS))[:2]]
         self.facades = [
-            self._texture(textures.facade(rng, walls[int(rng.integers(0, 3))], _paint(rng))) for _ in range(4)
+            self.add_texture(textures.facade(rng, walls[int(rng.integers(0, 3))], paint_colour(rng))) for _ in range(4)
         ]
-        self.planks = self._texture(textures.planks(rng))
-        self.rock = self._texture(textures.soil(rng))
+        self.planks = self.add_texture(textures.planks(rng))
+        self.rock = self.add_texture(textures.soil(rng))
 
-    def _texture(self, texture: Float32Array) -> int:
+    def add_texture(self, texture: Float32Array) -> int:
+        """Its number."""
         self.textures.append(texture)
         return len(self.textures) - 1
 
@@ -172,7 +173,7 @@ class Scenery:
             return
         z = self._ground_z(place)
         windows = rng.random() < 0.75
-        paint = _paint(rng)
+        paint = paint_colour(rng)
         facade = int(rng.choice(self.facades)) if windows else int(rng.choice(self.walls))
         tint = np.full(3, 0.5) * rng.uniform(0.75, 1.2) if windows else paint
         bay_m = rng.uniform(2.2, 4.0)
@@ -194,8 +195,8 @@ class Scenery:
             )
             if side == 0 and rng.random() < 0.7:
                 entrance = wall.at(rng.uniform(-0.6, 0.6) * length, out, z - 1.0)
-                self.mesh.box(entrance, (0.5, 0.04, 1.05), wall.heading, self.planks, _paint(rng), (1.0, 2.0))
-        roof_tint = _roof_colour(rng)
+                self.mesh.box(entrance, (0.5, 0.04, 1.05), wall.heading, self.planks, paint_colour(rng), (1.0, 2.0))
+        roof_tint = roof_colour(rng)
         roof = int(rng.choice(self.roofs))
         top = z - wall_m
         if rng.random() < 0.35:
@@ -215,7 +216,7 @@ class Scenery:
                     (size[0], size[1], size[2]),
                     place.heading,
                     self.roofs[1],
-                    _paint(rng),
+                    paint_colour(rng),
                 )
             return
         la, lb = a + overhang, b + overhang
@@ -239,7 +240,7 @@ class Scenery:
             wide = rng.uniform(0.2, 0.45)
             spot = place.at(rng.uniform(-0.5, 0.5) * ridge, rng.uniform(-0.4, 0.4) * b, top - roof_m)
             self.mesh.box(
-                spot, (wide, wide, rng.uniform(0.7, 1.3)), place.heading, self.walls[0], _paint(rng), (1.5, 1.5)
+                spot, (wide, wide, rng.uniform(0.7, 1.3)), place.heading, self.walls[0], paint_colour(rng), (1.5, 1.5)
             )
 
     def _container(self) -> None:
@@ -253,7 +254,7 @@ class Scenery:
                 (a, b, h + 0.1),
                 place.heading,
                 texture,
-                _paint(rng),
+                paint_colour(rng),
                 (2.4, 2.4),
             )
 
@@ -263,7 +264,7 @@ class Scenery:
         place = self._place(a, 0.25, 2 * h)
         if place is None:
             return
-        tint, style = _paint(rng), rng.random()
+        tint, style = paint_colour(rng), rng.random()
         sections = max(2, int(a))
         for k in range(sections):
             x = (2 * (k + 0.5) / sections - 1) * a
@@ -281,7 +282,7 @@ class Scenery:
                     (half, 0.24, h + 0.2),
                     place.heading,
                     self.leaves[0],
-                    _leaf_colour(rng),
+                    leaf_colour(rng),
                     (1.2, 1.2),
                 )
             else:
@@ -307,7 +308,7 @@ class Scenery:
         if place is None:
             return
         z = self._ground_z(place)
-        paint = _paint(rng)
+        paint = paint_colour(rng)
         smooth = self.facades[0]
         self.mesh.box(place.at(0, 0, z - 0.58), (length, width, 0.3), place.heading, self.rock, paint, (4.0, 4.0))
         self.mesh.box(
@@ -339,14 +340,19 @@ class Scenery:
         if place is None:
             return
         z = self._ground_z(place)
-        tint = _paint(rng)
+        tint = paint_colour(rng)
         self.mesh.frustum(place.at(0, 0, z + 0.3), place.at(0, 0, z - h), (r, 0.7 * r), 8, self.rock, tint)
         style = rng.random()
         if style < 0.4:
             self.mesh.box(place.at(0.25, 0, z - h), (0.35, 0.1, 0.06), place.heading, self.rock, tint)
         elif style < 0.75:
             self.mesh.box(
-                place.at(r, 0, z - h + 0.4), (0.02, 0.35, 0.35), place.heading, self.facades[1], _paint(rng), (0.9, 0.9)
+                place.at(r, 0, z - h + 0.4),
+                (0.02, 0.35, 0.35),
+                place.heading,
+                self.facades[1],
+                paint_colour(rng),
+                (0.9, 0.9),
             )
         else:
             self.mesh.blob(place.at(0, 0, z - h), np.full(3, 0.2), 0.0, rng, self.rock, np.full(3, 0.5), 2.0)
@@ -440,7 +446,7 @@ class Scenery:
                 0.2,
                 rng,
                 int(rng.choice(self.leaves)),
-                _leaf_colour(rng),
+                leaf_colour(rng),
                 1.2,
             )
 
@@ -479,7 +485,7 @@ class Scenery:
             )
         else:
             self.mesh.blob(
-                place.at(0, 0, z), np.array([size, size, 0.8 * size]), 0.25, rng, self.leaves[1], _leaf_colour(rng), 0.8
+                place.at(0, 0, z), np.array([size, size, 0.8 * size]), 0.25, rng, self.leaves[1], leaf_colour(rng), 0.8
             )
 
     def _horizon(self) -> None:
@@ -489,9 +495,7 @@ class Scenery:
             bearing, away = rng.uniform(0, 2 * math.pi), self.extent * rng.uniform(1.9, 4.5)
             wide, high = rng.uniform(8, 35), rng.uniform(4, 16)
             centre = np.array([away * math.cos(bearing), away * math.sin(bearing), 0.2 * high])
-            self.mesh.blob(
-                centre, np.array([wide, wide, high]), 0.12, rng, self.leaves[0], _leaf_colour(rng) * 0.8, 6.0
-            )
+            self.mesh.blob(centre, np.array([wide, wide, high]), 0.12, rng, self.leaves[0], leaf_colour(rng) * 0.8, 6.0)
 
 
 def footprint_distance(obstacles: FloatArray, points: FloatArray) -> FloatArray:
@@ -537,25 +541,26 @@ class _TreeStyle:
             bare=float(rng.uniform(0.08, 0.4)),
             layers=int(rng.integers(2, 5)),
             texture=int(rng.choice(leaves)),
-            colour=_leaf_colour(rng),
+            colour=leaf_colour(rng),
         )
 
 
-def _leaf_colour(rng: Generator) -> FloatArray:
+def leaf_colour(rng: Generator) -> FloatArray:
     """Green mostly; sometimes autumn or blossom."""
     if rng.random() < 0.8:
         return np.array([rng.uniform(0.05, 0.2), rng.uniform(0.14, 0.32), rng.uniform(0.02, 0.09)])
     return np.array([rng.uniform(0.25, 0.5), rng.uniform(0.1, 0.32), rng.uniform(0.03, 0.2)])
 
 
-def _paint(rng: Generator) -> FloatArray:
+def paint_colour(rng: Generator) -> FloatArray:
     """Any wall's or machine's colour: mostly muted, sometimes strong."""
     grey = rng.uniform(0.06, 0.7)
     strength = rng.uniform(0.0, 0.25) if rng.random() < 0.65 else rng.uniform(0.4, 0.85)
     return np.asarray(np.clip(grey * (1 - strength) + strength * grey * 2.2 * rng.random(3), 0.02, 0.8))
 
 
-def _roof_colour(rng: Generator) -> FloatArray:
+def roof_colour(rng: Generator) -> FloatArray:
+    """Red, grey, brown or green."""
     base = np.array([(0.4, 0.14, 0.08), (0.2, 0.2, 0.22), (0.3, 0.22, 0.15), (0.15, 0.22, 0.2)])[
         int(rng.integers(0, 4))
     ]

@@ -27,6 +27,7 @@ from flockd.pilot import FlockPilot, StepTrace
 from flockd.recording import Recorder
 from flockd.recording.truth import TrueDrone, Truth
 from flockd.sim.camera_simulator import CameraSimulator
+from flockd.sim.clearances import with_obstacles
 from flockd.sim.exact_states import Commands, ExactFlock, HandPilot, fly_exact_states, start_yaw, step_times
 from flockd.sim.handover import Handover
 from flockd.sim.truth_perception import TruthPerception
@@ -124,7 +125,7 @@ def fly(
         wall_s=time.perf_counter() - begin,
     )
     key_frames = sorted((frame for frame in key_frames if frame.time_s < metadata.duration_s), key=lambda f: f.drone)
-    return Flight(builder.build(metadata, companion), tuple(key_frames))
+    return Flight(with_obstacles(builder.build(metadata, companion), scenario), tuple(key_frames))
 
 
 _PREPARATIONS = 4
@@ -147,6 +148,8 @@ class _ExactStatePilots:
             relative = positions[others] - positions[i]
             command, acceleration = commands.velocity[i], commands.acceleration[i]
             builder.add_exact_states(step, i, others, relative, velocities, command, acceleration)
+            if (seen := commands.obstacles[i]) is not None:
+                builder.add_obstacles(step, i, seen)
         return commands
 
     def key_frames(self) -> list[KeyFrame]:

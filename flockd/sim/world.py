@@ -13,9 +13,10 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from flockd.messages import Float32Array, FloatArray, UInt8Array
-from flockd.sim import _raster, sky, terrain, textures
+from flockd.sim import _raster, obstacle_mesh, sky, terrain, textures
 from flockd.sim.hills import hills
 from flockd.sim.mesh import face_normals, unit
+from flockd.sim.obstacles import Obstacles
 from flockd.sim.scenery import Scenery, footprint_distance
 from flockd.sim.textures import PackedArray
 
@@ -73,14 +74,16 @@ class World:
         keep_out: FloatArray | None = None,
         clearance_m: float = 9.0,
         extent_m: float = 80.0,
+        obstacles: Obstacles | None = None,
         hills_m: float = 0.0,
         hills_slope: float = 0.15,
     ) -> World:
         """A world drawn from ``seed``: the same arguments give the same bytes.
 
         ``ground_relief_m``: standard deviation of the ground's height (0: exactly flat). Nothing taller than 0.3 m
-        comes closer than ``clearance_m`` to any of the ``keep_out`` points (n, 2) north, east. ``hills_m`` and
-        ``hills_slope``: see `flockd.sim.hills`; their ground is added to the relief.
+        comes closer than ``clearance_m`` to any of the ``keep_out`` points (n, 2) north, east, but ``obstacles``, which
+        stand where they stand, on level ground. ``hills_m`` and ``hills_slope``: see `flockd.sim.hills`; their ground
+        is added to the relief.
         """
         if extent_m < 20.0:
             raise ValueError(f"extent_m must be at least 20 m, not {extent_m}")
@@ -93,6 +96,8 @@ class World:
             heights = heights + hills(np.random.default_rng([seed, 3]), extent_m, hills_m, hills_slope)
         ground_vertices, ground_triangles = terrain.ground_mesh(heights, extent_m)
         scenery = Scenery(rng, heights, extent_m, keep_out, clearance_m, len(ground_vertices))
+        if obstacles is not None:
+            obstacle_mesh.draw_obstacles(scenery, obstacles, seed)
         mesh, ground_count = scenery.mesh, len(ground_triangles)
         vertices = np.vstack([ground_vertices, *mesh.vertices])
         triangles = np.vstack([ground_triangles, *mesh.triangles]).astype(np.int32)

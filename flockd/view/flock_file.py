@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -64,14 +63,6 @@ class FlockFile:
             self._log(f"world/path/{drone}", rr.LineStrips3D([track], colors=[colour_of(number)]), static=True)
         self._recording.flush()
         self._recording.disconnect()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _show_flock(self, truth: Truth) -> None:
         places: dict[str, FloatArray] = {drone.name: drone.position for drone in truth.drones}

@@ -11,8 +11,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import cv2
 import numpy as np
@@ -95,14 +94,6 @@ class RerunFile:
         self._log("world/path", rr.LineStrips3D([self._track], colors=[_OWN]), static=True)
         self._recording.flush()
         self._recording.disconnect()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _mount(self, camera: RigCamera) -> None:
         """Where a camera sits; a wide-angle one has no image plane in 3D, and lens distortion is left as it is."""

@@ -48,7 +48,7 @@ def test_nothing_is_overwritten_without_force_nor_written_that_does_not_check(
     file = tmp_path / "mine.yaml"
     file.write_text("mine", encoding="utf-8")
     assert main(["config", "new", "drone", str(file), "--defaults"]) == 2
-    assert "is there already; name another file, or write over it with --force" in capsys.readouterr().err
+    assert "exists; name another file, or overwrite it with --force" in capsys.readouterr().err
     assert main(["config", "new", "drone", str(file), "--defaults", "--force", "--autopilot", "nowhere"]) == 2
     assert "was not written, as it would not check (autopilot.address" in capsys.readouterr().err
     assert file.read_text(encoding="utf-8") == "mine"

@@ -225,7 +225,7 @@ def test_a_scenario_reports_a_drone_file_that_is_not_there(tmp_path: Path) -> No
         (b"- rig\n", ":1: is a list at its top level; write keys with values, such as `seed: 0`"),
         (b"rig\n", ":1: is a single value at its top level; write keys with values, such as `seed: 0`"),
         (b"step_s: 1\nrig: \xff\n", ":2: is not UTF-8 text; save the file in UTF-8"),
-        (b"rig:\n\tcameras: []\n", ":2: a tab stands where YAML wants spaces; indent and separate with spaces"),
+        (b"rig:\n\tcameras: []\n", ":2: a tab stands where YAML needs spaces; indent and separate with spaces"),
         (b"yaw: hold\nstep_s:1\nrig: {}\n", ":2: put a space after the `:`"),
         (
             b"a: 1\nrig: {b: 1\n",
@@ -386,6 +386,22 @@ def test_the_schema_describes_the_file_and_not_the_merged_model() -> None:
             "scenario: two",
             "scenario: two\nworld: {drone_family: 99}",
             "scenario.yaml:2: world.drone_family: 99 is not at most 13; write a whole number from 0 to 13 or `any`",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nworld:\n  obstacles:\n    kind: jungle",
+            "scenario.yaml:4: world.obstacles.kind: jungle is not known; write `forest` or `village`",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nworld:\n  obstacles:\n    kind: forest\n    trees_per_hectare: 900",
+            "scenario.yaml:5: world.obstacles.trees_per_hectare: 900 is not at most 400; write a number from 50 to 400",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nworld:\n  obstacles:\n    kind: village\n    trees_per_hectare: 100",
+            "scenario.yaml:5: world.obstacles.trees_per_hectare: has no meaning with kind `village`, only with "
+            "`forest`; delete it",
         ),
         (
             "scenario: two",

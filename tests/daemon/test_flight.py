@@ -310,8 +310,11 @@ def test_at_its_end_a_mission_hands_over_to_the_autopilot(
     tell(story)
 
 
-def test_a_dead_control_task_is_held_by_the_last_resort(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("task", "function"), [("control", "flockd.daemon.control.Control.tick"), ("pilot", "flockd.pilot.FlockPilot.step")]
+)
+def test_a_dead_task_is_held_by_the_last_resort(
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch, task: str, function: str
 ) -> None:
     async def story() -> None:
         async with aboard(fake_autopilot, port, tmp_path) as ship:
@@ -321,10 +324,10 @@ def test_a_dead_control_task_is_held_by_the_last_resort(
             def dies(*_: object) -> None:
                 raise ArithmeticError("for the test")
 
-            monkeypatch.setattr("flockd.daemon.control.Control.tick", dies)
+            monkeypatch.setattr(function, dies)
             await until(lambda: fake_autopilot.mode == "LOITER", 2.0)
             assert not fake_autopilot.failsafe
-            with pytest.raises(DaemonError, match=r"a task died \(control: ArithmeticError\('for the test'\)\)"):
+            with pytest.raises(DaemonError, match=rf"a task died \({task}: ArithmeticError\('for the test'\)\)"):
                 await ship.ending
 
     tell(story)
@@ -346,26 +349,6 @@ def test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe(
             before = len(fake_autopilot.setpoints)
             await ship.until_state("silent")
             assert len(fake_autopilot.setpoints) == before, "one more, and PX4 would be in offboard again"
-
-    tell(story)
-
-
-def test_any_other_dead_task_is_a_hold_too(
-    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def story() -> None:
-        async with aboard(fake_autopilot, port, tmp_path) as ship:
-            await ship.is_ready_in_the_air()
-            await ship.flies()
-
-            def dies(*_: object) -> None:
-                raise ArithmeticError("for the test")
-
-            monkeypatch.setattr("flockd.pilot.FlockPilot.step", dies)
-            await until(lambda: fake_autopilot.mode == "LOITER", 2.0)
-            assert not fake_autopilot.failsafe
-            with pytest.raises(DaemonError, match="pilot: ArithmeticError"):
-                await ship.ending
 
     tell(story)
 

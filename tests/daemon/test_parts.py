@@ -27,7 +27,7 @@ from flockd.daemon.worker import BusyError, LateError, Worker
 from flockd.data import data_path
 from flockd.errors import UnavailableError
 from flockd.inference import OnnxModel
-from flockd.messages import Frame, VehicleState
+from flockd.messages import Frame, RangeReading, VehicleState
 from flockd.sources import CameraStatus, Count
 from tests.daemon.aboard import TinyPerceiver
 
@@ -265,3 +265,29 @@ def test_frames_get_the_vehicle_state_of_their_time() -> None:
     assert between.velocity_ned is not None
     assert between.velocity_ned[0] == pytest.approx(9.24)
     assert math.degrees(math.atan2(between.R_ned_body[1, 0], between.R_ned_body[0, 0])) == pytest.approx(92.4)
+
+
+def test_frames_get_the_range_that_was_taken_nearest_to_them() -> None:
+    """Between two ranges there is none: over an edge, their mean would be of nothing."""
+    from flockd.daemon.vehicle_history import VehicleHistory
+
+    history, level = VehicleHistory(), np.eye(3)
+    for time_s, reading in (
+        (1.0, RangeReading(0.98, 4.0)),
+        (1.1, RangeReading(1.09, 2.5)),
+        (1.2, None),
+    ):
+        history.add(VehicleState(time_s, level, 4.0, ground_range=reading))
+    found = [history.at(time_s) for time_s in (1.02, 1.06, 1.18)]
+    assert [state and state.ground_range and state.ground_range.range_m for state in found] == [4.0, 2.5, 2.5]
+
+
+def test_a_range_finder_that_fails_is_an_event_and_so_is_its_return() -> None:
+    from flockd.daemon.pilot_loop import HeightReports
+
+    reports = HeightReports()
+    weak = "height: the range finder's signal is too weak; the barometer's is used"
+    old = "height: the range is too old; the barometer's is used"
+    steps = ((), ("camera left: no frame", weak), (weak,), (old,), ("camera left: no frame",), ())
+    found = [reports.update(reasons) for reasons in steps]
+    assert found == [None, weak, None, old, "height: the range finder works again", None]

@@ -39,7 +39,7 @@ def test_the_shipped_calibrations_can_be_true(camera: CameraConfig) -> None:
         ({"fx": 337.0}, Level.WARNING, "fx 337 and fy 320 differ by 5%"),
         ({"fx": 130.0, "fy": 130.0}, Level.FAILURE, "the pinhole calibration sees 136 degrees from left to right"),
         ({"fx": 1100.0, "fy": 1100.0}, Level.WARNING, "32 degrees from left to right see few neighbours"),
-        ({"distortion": (0.1,)}, Level.FAILURE, "its calibration makes no camera (PinholeCamera takes"),
+        ({"distortion": (0.1,)}, Level.FAILURE, "its calibration is unusable (PinholeCamera takes"),
         # Turns back at r = 0.82 of the focal length (1 - 3 * 0.5 r^2 = 0), where it images 0.54; the border is at 1.
         ({"distortion": (-0.5, 0.0, 0.0, 0.0)}, Level.FAILURE, "sees no direction at its border"),
     ],

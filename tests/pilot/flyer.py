@@ -19,6 +19,8 @@ from flockd.sim.vehicles import Vehicles
 from tests.perception.shipped import SECOND_STAGE
 
 STEP_S = 0.5
+BAROMETER = {"drone.perception.height": "barometer"}
+"""Its vehicle states hold no range."""
 CRUISE = np.array([[1.0, 0.0], [0.8, 0.2]])
 TURNED = np.array([0.2, 0.0])
 
@@ -40,7 +42,7 @@ class NoNetworks:
 
 
 def scenario_with(*places: tuple[float, float, float]) -> ScenarioConfig:
-    scenario = load_scenario(data_path("config") / "paper_flight.yaml", {"seed": 4})
+    scenario = load_scenario(data_path("config") / "paper_flight.yaml", {"seed": 4, **BAROMETER})
     start = scenario.vehicles[0]
     drones = tuple(start.model_copy(update={"position_m": place, "velocity_m_s": (1.0, 0.0)}) for place in places)
     return scenario.model_copy(update={"vehicles": drones})

@@ -21,6 +21,7 @@ from flockd.messages import (
     MissionOrder,
     Neighbour,
     PilotOutput,
+    RangeReading,
     VehicleState,
     VelocityCommand,
 )
@@ -54,6 +55,7 @@ class MadeUpPilot:
         seen = sum(float((frame.image * np.arange(1.0, 4.0)).sum()) for frame in frames.frames.values()) / 1e6
         felt = float(vehicle.R_ned_body.sum()) + vehicle.height_m / 3.0
         felt += 0.0 if vehicle.velocity_ned is None else float(vehicle.velocity_ned.sum())
+        felt += 0.0 if vehicle.ground_range is None else vehicle.ground_range.range_m + vehicle.ground_range.time_s / 7
         self._memory = math.sin(self._memory + seen + felt + self.gain)
         m = self._memory
         whole: PilotOutput = filled(PilotOutput, m)
@@ -97,7 +99,9 @@ def inputs(
         }
         turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         velocity = None if step == 1 else rng.normal(size=3)
-        yield FrameSet(time_s, frames), VehicleState(time_s, turn, float(rng.normal(5.0)), velocity)
+        reading = None if step % 3 == 1 else RangeReading(time_s - 0.01, 4.0 + step / 3, min_m=0.2, quality=0.7 / 9)
+        height_m = float(rng.normal(5.0))
+        yield FrameSet(time_s, frames), VehicleState(time_s, turn, height_m, velocity, ground_range=reading)
 
 
 def record(

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
@@ -21,6 +22,7 @@ from flockd.flight_log.log import FlightLog
 from flockd.flight_log.metadata import FlightMetadata
 from flockd.report.curves import error_curves, flight_curves
 from flockd.report.filmstrip import filmstrip_figure
+from flockd.report.obstacle_figures import obstacle_figure
 from flockd.report.page import write_report
 from flockd.report.summary import summarise, write_summary
 from flockd.report.trajectories import gabriel_edges, trajectories
@@ -388,6 +390,32 @@ def test_paths_have_equal_axes_with_north_up() -> None:
     assert texts.count("2.47") == 5
 
 
+def test_obstacles_are_drawn_where_they_stand_and_as_they_were_known() -> None:
+    log = _flight(duration_s=10.0)
+    steps, drones = log.position.shape[:2]
+    clearance, known = np.full((steps, drones), 4.0), np.full((steps, drones, 72), np.inf)
+    clearance[6, 2], known[6, 2, 18] = 0.5, 0.85
+    north, east, down = log.position[6, 2]
+    pole = [north, east + 1.0, 0.15, 0.0, 0.0, 0.0, 8.0]
+    wall = [north - 5.0, east, 2.0, 0.1, math.pi / 2, 0.0, -down + 1.0]
+    log = replace(
+        log, obstacles=np.array([pole, wall]), clearance=clearance, obstacle_range=known,
+        metadata=log.metadata.model_copy(update={"drone_radius_m": 0.35}),
+    )  # fmt: skip
+    figure = obstacle_figure(log)
+    assert figure is not None
+    local = _axes(figure.axes, label="Drone 3 at its nearest, t = 3 s")
+    shapes = [path.get_extents() for group in local.collections for path in group.get_paths()]
+    assert [shape.width for shape in shapes] == pytest.approx([0.3, 4.0], abs=0.01), "the wall's length points east"
+    assert (shapes[0].x0 + shapes[0].x1) / 2 == pytest.approx(east + 1.0, abs=0.01)
+    ((x, y),) = [line.get_data() for line in local.get_lines()]
+    assert np.mean(x) == pytest.approx(east + 0.85, abs=0.01)
+    assert np.mean(y) == pytest.approx(north, abs=0.01)
+    curves = _axes(figure.axes, label="clearance, m")
+    assert min(min(line.get_ydata()) for line in curves.get_lines()[:5]) == pytest.approx(0.15)
+    assert obstacle_figure(_flight(duration_s=10.0)) is None
+
+
 def test_errors_are_drawn_signed() -> None:
     figure = error_curves(_flight(duration_s=10.0))
     assert figure is not None
@@ -450,10 +478,22 @@ def test_a_filmstrip_survives_its_file(tmp_path: Path) -> None:
 
 def test_a_moment_shows_its_cameras_in_rig_order_with_named_drones() -> None:
     figure = filmstrip_figure(_moment())
-    titles = [axes.get_title(loc="left") for axes in figure.axes]
-    assert [title for title in titles if title] == ["left", "back"]
     names = [text.get_text() for axes in figure.axes for text in axes.texts]
+    assert [name for name in names if name in {"left", "back"}] == ["left", "back"]
     assert names.count("#4  3.21 m") == 2
+
+
+def test_an_arrow_ends_at_the_border_of_its_image() -> None:
+    """At the left border of each image everything moves 100 px to the left, which is drawn 6 px long."""
+    moment = _moment()
+    flow = np.ones((96, 64, 2), np.float32)
+    flow[:, :4] = -100.0, 0.0
+    canvas = FigureCanvasAgg(filmstrip_figure(KeyFrame(**{**vars(moment), "flow": {"left": flow, "back": flow}})))
+    canvas.draw()
+    plate = np.asarray(canvas.buffer_rgba())[-700:, :, :3]  # 160 pixels an inch: within the row of the flow
+    assert np.ptp(plate[:, 49:560].astype(int)) > 100
+    for beside in (plate[:, 40:47], plate[:, 561:567]):
+        assert np.array_equal(np.unique(beside.reshape(-1, 3), axis=0), [(0x14, 0x18, 0x1F)])
 
 
 def test_a_camera_may_lack_a_map() -> None:
@@ -476,7 +516,7 @@ def test_names_of_close_drones_do_not_cover_each_other() -> None:
         KeyFrame(**{**vars(moment), "labels": {"left": labels}, "ranges": {1: 3.0, 2: 3.1}, "track_ids": {2: 4}})
     )
     figure.canvas.draw()
-    names = [text for axes in figure.axes for text in axes.texts if text.get_text().endswith(" m")]
+    names = [text for axes in figure.axes for text in axes.texts if text.get_text().startswith(("#", "new"))]
     assert sorted(name.get_text() for name in names) == ["#4  3.10 m", "new  3.00 m"]
     one, other = (name.get_window_extent() for name in names)
     assert not one.overlaps(other)

@@ -233,7 +233,7 @@ def test_a_single_drone_has_no_distances() -> None:
         value = getattr(log, name)
         if name in ("neighbour_position", "neighbour_velocity", "detection_position"):
             alone[name] = value[:, :1, :1]
-        elif name not in ("time_s", "desired", "goal", "stages_ms", "metadata"):
+        elif name not in ("time_s", "desired", "goal", "obstacles", "obstacle_range", "stages_ms", "metadata"):
             alone[name] = value[:, :1]
     summary = summarise(replace(log, **alone, metadata=log.metadata.model_copy(update={"drones": 1})))
     assert summary["flock"]["min_distance_m"] is None
@@ -318,3 +318,18 @@ def test_a_mission_has_arrived_where_the_middle_is_at_the_last_goal() -> None:
     assert (before["arrived"], before["time_s"]) == (False, None)
     nowhere = summarise(_hand_made())["mission"]
     assert nowhere == {"kind": None, "arrived": None, "time_s": None, "final_error_m": None}
+
+
+def test_a_contact_with_an_obstacle_counts_once_however_long_it_lasts() -> None:
+    clearance = np.full((STEPS, DRONES), 5.0)
+    clearance[3:6, 0] = 0.2, 0.1, 0.34
+    clearance[8, 0] = 0.3
+    clearance[9:12, 1] = 1.2
+    log = _hand_made()
+    assert set(summarise(log)["obstacles"].values()) == {None}
+    among = replace(log, clearance=clearance, metadata=log.metadata.model_copy(update={"drone_radius_m": 0.35}))
+    assert summarise(among)["obstacles"] == {
+        "collisions": 2,
+        "min_clearance_m": pytest.approx(0.1 - 0.35),
+        "time_within_1m_s": pytest.approx(7 * 0.5),
+    }

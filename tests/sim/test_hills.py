@@ -41,7 +41,8 @@ def test_the_range_is_that_of_the_ground_which_is_drawn(world: World) -> None:
     renderer, random = Renderer(world, []), np.random.default_rng(0)
     matrix = np.array([[400.0, 0.0, 32.5], [0.0, 400.0, 32.5], [0.0, 0.0, 1.0]])
     for north, east in random.uniform(-25.0, 25.0, (6, 2)):
-        R = euler_rotation(*random.uniform(-0.35, 0.35, 2), float(random.uniform(-3.0, 3.0)))
+        roll, pitch, yaw = random.uniform(-0.35, 0.35, 3) * [1.0, 1.0, 8.0]
+        R = euler_rotation(float(roll), float(pitch), float(yaw))
         place = np.array([north, east, -7.0])
         R_body_camera = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         view = renderer.render(

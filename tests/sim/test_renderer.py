@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 
-import numba
 import numpy as np
 import pytest
 import trimesh
@@ -210,17 +210,13 @@ def test_the_same_seed_gives_the_same_bytes(scenes: list[Scene]) -> None:
         assert not np.array_equal(a.colours, c.colours)
 
 
-def test_the_bytes_do_not_depend_on_the_threads(scenes: list[Scene]) -> None:
-    before = numba.get_num_threads()
-    views = []
-    try:
-        for threads in (1, min(2, before)):
-            numba.set_num_threads(threads)
-            views.append(scenes[1].render())
-    finally:
-        numba.set_num_threads(before)
-    for name in ("rgb", "depth", "ids"):
-        assert np.array_equal(getattr(views[0], name), getattr(views[1], name)), name
+def test_images_drawn_side_by_side_are_those_drawn_one_after_the_other(scenes: list[Scene]) -> None:
+    alone = [scene.render() for scene in scenes[:2]]
+    with ThreadPoolExecutor(4) as executor:
+        together = list(executor.map(lambda number: scenes[number % 2].render(), range(8)))
+    for number, view in enumerate(together):
+        for name in ("rgb", "depth", "ids"):
+            assert np.array_equal(getattr(view, name), getattr(alone[number % 2], name)), name
 
 
 @pytest.mark.parametrize("size", [(96, 96), (31, 17), (640, 480)])

@@ -113,6 +113,39 @@ def test_nobody_is_left_behind_when_it_is_told_to_end(tmp_path: Path) -> None:
     assert (tmp_path / "out/logs/drone1.yaml").is_file()
 
 
+@pytest.mark.slow
+def test_an_interrupted_fleet_lands_and_leaves_a_report_of_what_was_flown(tmp_path: Path) -> None:
+    """Ctrl-C while two drones fly, as a terminal sends it: to the whole process group."""
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    out = tmp_path / "out"
+    options = ["--autopilot", "standin", "--speed-factor", "0.5", "--duration", "600", "--out", str(out)]
+    # As from a terminal: a shell that starts something in the background has it ignore Ctrl-C.
+    run = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler);"
+        "from flockd.cli import main; sys.exit(main())"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", run, "sim", str(_scenario(tmp_path, drones=2)), *options],
+        cwd=data_path("config").parent, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
+    ) as simulator:  # fmt: skip
+        assert simulator.stderr is not None
+        for line in simulator.stderr:
+            if (flying := re.match(r"flying: (\d+) of 600 s", line)) and int(flying[1]) >= 2:
+                break
+        os.killpg(simulator.pid, signal.SIGINT)
+        printed, told = simulator.communicate(timeout=600.0)
+    assert simulator.returncode == 130, told
+    assert told.splitlines()[-1] == "interrupted; the report is of what was flown"
+    assert f"report: {out / 'report.html'}" in printed
+    log = FlightLog.load(out / "flight.npz")
+    assert log.metadata.interrupted
+    assert 2.0 <= log.metadata.duration_s < 300.0
+    np.testing.assert_allclose(log.position[0, :, 2], -1.5, atol=0.3)
+    assert "interrupted" in (out / "report.html").read_text(encoding="utf-8")
+    assert _left_behind(str(tmp_path)) == []
+
+
 def test_a_daemon_that_does_not_come_up_ends_the_flight_with_its_own_words(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

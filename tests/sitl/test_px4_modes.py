@@ -33,11 +33,16 @@ def test_without_px4_it_says_what_to_do(
     assert capsys.readouterr().err.startswith(f"there is no PX4 in {tmp_path}, which FLOCKD_PX4 names; set it to")
 
 
-def test_a_killed_companion_ends_a_fake_autopilots_offboard_flight_in_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("name", "speed_factor"), [("sender_killed", 2.0), pytest.param("daemon_killed", 1.0, marks=pytest.mark.slow)]
+)
+def test_a_killed_companion_ends_a_fake_autopilots_offboard_flight_in_hold(
+    name: str, speed_factor: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The whole of a trial, with a fake autopilot in PX4's place: it goes from offboard to Hold a second later."""
     monkeypatch.setattr("tools.px4_modes.Px4s", _Fake)
-    (killed,) = [fault for fault in FAULTS if fault.name == "daemon_killed"]
-    (result,) = run([killed], 2.0, lambda result: None)
+    (killed,) = [fault for fault in FAULTS if fault.name == name]
+    (result,) = run([killed], speed_factor, lambda result: None)
     assert result.modes == ("OFFBOARD", "LOITER"), result
     assert result.kept
     assert result.reaction_s is not None

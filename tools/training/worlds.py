@@ -5,6 +5,12 @@ Training, validation and test worlds never meet; flights use seeds below all of 
 are those of ``tools.training.drone_generator``: training worlds have them besides the families.
 """
 
+from __future__ import annotations
+
+import numpy as np
+
+from flockd.config.obstacle_field import ObstaclesConfig
+
 FLIGHTS = range(0, 1_000_000)
 TRAINING = range(1_000_000, 2_000_000)
 VALIDATION = range(2_000_000, 3_000_000)
@@ -15,3 +21,16 @@ UNSEEN_FAMILIES = range(12, 14)
 SHAPES = range(400)
 SHAPES_SHARE = 2 / 3
 """Of the drones of training worlds."""
+
+
+def drawn_obstacles(seed: int, share: float) -> ObstaclesConfig | None:
+    """What stands in the middle of a world to be flown around: nothing in all but ``share`` of the worlds."""
+    rng = np.random.default_rng([seed, 5])
+    if rng.random() >= share:
+        return None
+    extent_m, gap_m = float(rng.uniform(25.0, 45.0)), float(rng.uniform(1.2, 2.0))
+    if rng.random() < 0.6:
+        trees = float(np.exp(rng.uniform(np.log(50.0), np.log(400.0))))
+        return ObstaclesConfig(kind="forest", extent_m=extent_m, min_gap_m=gap_m, trees_per_hectare=trees)
+    houses = float(rng.uniform(4.0, 10.0))
+    return ObstaclesConfig(kind="village", extent_m=extent_m, min_gap_m=gap_m, houses_per_hectare=houses)

@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 
 from flockd.config.base import NonNegative, Section, refuse
 
+ObstacleKind = Literal["forest", "village"]
 _Metres = Annotated[float, Field(ge=-75, le=75)]
 _ONLY_FOR = {"trees_per_hectare": "forest", "houses_per_hectare": "village"}
 """Keys that only one kind has."""
@@ -25,7 +26,7 @@ class ClearingConfig(Section):
 class ObstaclesConfig(Section):
     """What stands around the world's origin, drawn from the scenario's seed."""
 
-    kind: Literal["forest", "village"]
+    kind: ObstacleKind
     """`forest`: trunks with crowns above the drones, and a few young trees with branches down to the ground;
     `village`: a street from south to north with poles and wires, and houses, walls and trees beside it."""
     extent_m: Annotated[float, Field(ge=15, le=75)] = 60.0

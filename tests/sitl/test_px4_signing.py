@@ -1,0 +1,63 @@
+"""PX4 with a MAVLink 2 signing key does not listen to flockd, and the doctor says so; without it, all is as before."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink import mavutil
+
+from flockd.config import DroneConfig, load, load_scenario
+from flockd.data import data_path
+from flockd.doctor.autopilot_checks import check_autopilot
+from flockd.doctor.finding import Level
+from flockd.sim.autopilots import Px4s
+from flockd.sim.start import with_drones
+
+PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
+SPEED_FACTOR, START_S, TIMES, PAUSE_S = 0.5, 120.0, 5, 0.5
+KEY, NO_KEY = bytes(range(1, 33)), bytes(32)
+EPOCH_2015_S, TICKS_A_S = 1420070400, 1e5
+"""Of MAVLink's signature time stamps."""
+LATER = 10**8
+
+
+def _signing(config: DroneConfig) -> Level:
+    (found,) = [finding for finding in check_autopilot(config) if finding.about == "signing"]
+    return found.level
+
+
+def _again(send: Callable[[], None]) -> None:
+    """Datagrams may be lost."""
+    for _ in range(TIMES):
+        send()
+        time.sleep(PAUSE_S)
+
+
+@PX4
+@pytest.mark.slow
+def test_with_a_key_px4_hears_nobody_who_does_not_sign_until_the_key_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MAVLINK20", "1")
+    config = load(data_path("config") / "px4_sitl.yaml")
+    assert isinstance(config, DroneConfig)
+    scenario = with_drones(load_scenario(data_path("config") / "px4_flight.yaml"), 1)
+    with Px4s(scenario, SPEED_FACTOR, os.environ, tmp_path, {}) as px4:
+        px4.start()
+        station: Any = mavutil.mavlink_connection(f"udpin:127.0.0.1:{px4.ports[0].truth}", source_system=255)
+        try:
+            assert station.wait_heartbeat(timeout=START_S) is not None
+            assert _signing(config) is Level.PASS, "it accepts unsigned messages"
+            stamp = int((time.time() - EPOCH_2015_S) * TICKS_A_S)
+            _again(lambda: station.mav.setup_signing_send(1, 1, KEY, stamp))
+            assert _signing(config) is Level.FAILURE, "it is heard and does not respond"
+            station.setup_signing(KEY, sign_outgoing=True, initial_timestamp=stamp + LATER)
+            _again(lambda: station.mav.setup_signing_send(1, 1, NO_KEY, 0))
+            assert _signing(config) is Level.PASS, "the old key signed its own removal"
+        finally:
+            station.close()
