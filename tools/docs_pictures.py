@@ -5,6 +5,7 @@
     flockd sim --duration 5 --drones 3 --out SHORT
     python -m tools.docs_pictures seen SHORT docs/pictures/seen.webp         # what a drone sees
     python -m tools.docs_pictures law docs/pictures/law_curve.svg            # Eq. 39 and 41 over distance
+    python -m tools.docs_pictures world config/forest.yaml docs/pictures/forest.webp      # what stands at the start
 
 detected.webp is what `flockd detect` draws; the other pictures in docs/pictures are drawn by hand.
 """
@@ -21,6 +22,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
+from flockd.config import load_scenario
 from flockd.config.flocking import FlockingParameters
 from flockd.flight_log.key_frames import load_key_frames
 from flockd.flight_log.log import FlightLog
@@ -38,12 +40,17 @@ TRAIL_STEPS = 24
 ARM_M = 0.8
 """Of a drone as drawn, larger than it is."""
 COLOURS = 48
+WORLD_ROWS = slice(80, 480)
+"""Of the images of a world, without much sky and ground."""
 
 
 def main() -> None:
     """Reads the command line and draws."""
     parser = argparse.ArgumentParser(description="Draws the pictures of the documentation.")
     kinds = parser.add_subparsers(dest="kind", required=True)
+    world = kinds.add_parser("world")
+    world.add_argument("scenario", type=Path, help="of `flockd sim`")
+    world.add_argument("out", type=Path)
     for kind in ("flock", "seen"):
         of_flight = kinds.add_parser(kind)
         of_flight.add_argument("flight", type=Path, help="folder of a flight of `flockd sim`")
@@ -54,9 +61,25 @@ def main() -> None:
         save_flock(FlightLog.load(args.flight / LOG_NAME), args.out)
     elif args.kind == "seen":
         save_seen(args.flight / KEY_FRAMES_NAME, args.out)
+    elif args.kind == "world":
+        save_world(args.scenario, args.out)
     else:
         save_law(args.out)
     print(f"{args.out}: {args.out.stat().st_size / 1e3:.0f} kB")
+
+
+def save_world(scenario_file: Path, path: Path) -> None:
+    """What the first drone of a scenario sees as it starts, from its left to its right."""
+    from flockd.sim.camera_simulator import CameraSimulator  # noqa: PLC0415 - numba takes its time
+    from flockd.sim.exact_states import start_yaw  # noqa: PLC0415
+    from flockd.sim.vehicles import Vehicles  # noqa: PLC0415
+
+    scenario = load_scenario(scenario_file)
+    vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=start_yaw(scenario), seed=scenario.seed)
+    frames, _ = CameraSimulator(scenario).capture(0, 0, 0.0, vehicles)
+    images = np.hstack([frames.frames[name].image for name in ("left", "front", "right")])
+    middle = Image.fromarray(images[WORLD_ROWS])
+    middle.resize((middle.width * 2 // 3, middle.height * 2 // 3), Image.Resampling.LANCZOS).save(path, quality=78)
 
 
 def save_flock(log: FlightLog, path: Path) -> None:

@@ -16,11 +16,15 @@ from matplotlib.transforms import Affine2D
 from flockd.flight_log.log import FlightLog
 from flockd.messages import BoolArray
 from flockd.report.curves import NARROW_IN
-from flockd.report.style import BAND, FEW, GRID, INK, STYLE, colour_of, drone_name
+from flockd.report.style import BAND, FEW, GRID, INK, PAPER, STYLE, colour_of, drone_name
 
 IN_THE_WAY: Final = "#8a7355"
 """Of obstacles at the heights that were flown; the others are pale."""
 _FREE: Final = "#cfe6f5"
+LEGEND: Final[dict[str, Any]] = {
+    "loc": "upper right", "frameon": True, "facecolor": PAPER, "edgecolor": "none", "framealpha": 0.85,
+}  # fmt: skip
+"""Over obstacles."""
 _FLOWN_BAND_M = 0.75
 """Obstacles this far above and below the flown heights count as in the way."""
 _MAP_M = 12.0
@@ -99,14 +103,14 @@ def _local_map(axes: Axes, log: FlightLog, step: int, drone: int, radius_m: floa
     handles = [Patch(color=IN_THE_WAY, label="obstacle"), Patch(color=GRID, label="above or below")]
     if knew:
         handles += [Patch(color=_FREE, label="known free"), Patch(color=INK, label="range it knew")]
-    axes.legend(handles=handles, loc="upper right", frameon=True, facecolor="white", edgecolor="none", framealpha=0.8)
+    axes.legend(handles=handles, **LEGEND)
 
 
 def _add_free_sectors(axes: Axes, log: FlightLog, step: int, drone: int) -> None:
     for begin_deg, end_deg, range_m in _sectors(log, step, drone):
         reach = min(range_m, 2 * _MAP_M)
         east, north = log.position[step, drone, 1], log.position[step, drone, 0]
-        axes.add_patch(Wedge((east, north), reach, begin_deg, end_deg, color=_FREE, linewidth=0, zorder=0.5))
+        axes.add_patch(Wedge((east, north), reach, begin_deg, end_deg, color=_FREE, linewidth=0.6, zorder=0.5))
 
 
 def _add_ranges(axes: Axes, log: FlightLog, step: int, drone: int) -> None:

@@ -15,7 +15,7 @@ from flockd.flight_log.log import FlightLog
 from flockd.flocking.metrics import pair_distances
 from flockd.messages import BoolArray, FloatArray
 from flockd.report.curves import NARROW_IN
-from flockd.report.obstacle_figures import IN_THE_WAY, add_obstacles
+from flockd.report.obstacle_figures import IN_THE_WAY, LEGEND, add_obstacles
 from flockd.report.style import FEW, INK, MUTED, NAMED, ON_COLOUR, PAPER, STYLE, colour_of, drone_name
 from flockd.report.summary import SAME_GOAL_M
 
@@ -56,7 +56,7 @@ def trajectories(log: FlightLog, *, narrow: bool = False) -> Figure:
         handles = _path_handles(drones, exact=exact is not None, goals=len(goals) > 0)
         if len(log.obstacles):
             handles.append(Line2D([], [], color=IN_THE_WAY, marker="s", linestyle="", label="obstacle"))
-        paths.legend(handles=handles, loc="upper right" if len(log.obstacles) else "best")
+        paths.legend(handles=handles, **(LEGEND if len(log.obstacles) else {"loc": "best"}))
 
         reach = 1.15 * max(np.abs(_centred(log.position[step])).max() for step in (0, -1)) + 1.2
         for axes, step, name in zip(formations, (0, -1), ("start", "end"), strict=False):

@@ -199,7 +199,8 @@ def _wall(site: _Site, street: float, gap: float, solids: list[Solid]) -> None:
         return
     material: Material = "stone" if rng.random() < 0.5 else "bricks"
     top = float(rng.uniform(2.0, 5.5))
-    solids.append(Box(*middle.tolist(), length / 2, float(rng.uniform(0.1, 0.25)), heading, -DEPTH_M, top, material))
+    north, east = middle.tolist()
+    solids.append(Box(north, east, length / 2, float(rng.uniform(0.1, 0.25)), heading, -DEPTH_M, top, material))
 
 
 def _garden_tree(rng: Generator, place: FloatArray, crown: float) -> list[Solid]:
@@ -220,7 +221,8 @@ def _street_poles(site: _Site, street: float) -> list[Solid]:
         place = np.array([along + rng.uniform(-2.0, 2.0), street + _STREET_M / 2 - 0.3])
         height, radius = float(rng.uniform(7.5, 8.5)), float(rng.uniform(0.08, 0.15))
         if site.take(place, radius, 0.5):
-            solids.append(Frustum(*place.tolist(), radius, 0.7 * radius, -DEPTH_M, height, "wood"))
+            north, east = place.tolist()
+            solids.append(Frustum(north, east, radius, 0.7 * radius, -DEPTH_M, height, "wood"))
             tops.append(np.array([*place, height - 0.3]))
     for one, other in itertools.pairwise(tops):
         solids += _wire(one, other, sag=0.03 * float(np.linalg.norm(other - one)))
@@ -245,4 +247,5 @@ def _wire(one: FloatArray, other: FloatArray, *, sag: float) -> list[Solid]:
     points = one + share * (other - one)
     points[:, 2] -= sag * 4 * (share * (1 - share))[:, 0]
     radius = 0.012
-    return [Capsule(*a.tolist(), *b.tolist(), radius, "metal") for a, b in itertools.pairwise(points)]
+    ends = [tuple(float(metres) for metres in point) for point in points]
+    return [Capsule(*(*a, *b), radius=radius, material="metal") for a, b in itertools.pairwise(ends)]

@@ -148,7 +148,7 @@ def true_ranges(
     obstacles: Obstacles, time_s: float, position: FloatArray, *, limit_m: float = RANGE_LIMIT_M
 ) -> ObstacleRanges:
     """What a drone at `position` (3,) NED would measure without errors: all around, up to `limit_m`."""
-    azimuths = np.arange(SECTORS) * (2 * math.pi / SECTORS)
+    azimuths = np.arange(SECTORS, dtype=float) * (2 * math.pi / SECTORS)
     range_m = obstacles.ranges(position, azimuths, half_width=math.pi / SECTORS, limit_m=limit_m)
     return ObstacleRanges(
         time_s=time_s,

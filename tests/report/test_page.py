@@ -22,6 +22,7 @@ from flockd.flight_log.log import FlightLog
 from flockd.flight_log.metadata import FlightMetadata
 from flockd.report.curves import error_curves, flight_curves
 from flockd.report.filmstrip import filmstrip_figure
+from flockd.report.obstacle_figures import obstacle_figure
 from flockd.report.page import write_report
 from flockd.report.summary import summarise, write_summary
 from flockd.report.trajectories import gabriel_edges, trajectories
@@ -387,6 +388,32 @@ def test_paths_have_equal_axes_with_north_up() -> None:
     assert paths.get_ylim()[0] < paths.get_ylim()[1]
     texts = [text.get_text() for text in _axes(figure.axes, label="Formation at the end, t = 109.5 s").texts]
     assert texts.count("2.47") == 5
+
+
+def test_obstacles_are_drawn_where_they_stand_and_as_they_were_known() -> None:
+    log = _flight(duration_s=10.0)
+    steps, drones = log.position.shape[:2]
+    clearance, known = np.full((steps, drones), 4.0), np.full((steps, drones, 72), np.inf)
+    clearance[6, 2], known[6, 2, 18] = 0.5, 0.85
+    north, east, down = log.position[6, 2]
+    pole = [north, east + 1.0, 0.15, 0.0, 0.0, 0.0, 8.0]
+    wall = [north - 5.0, east, 2.0, 0.1, math.pi / 2, 0.0, -down + 1.0]
+    log = replace(
+        log, obstacles=np.array([pole, wall]), clearance=clearance, obstacle_range=known,
+        metadata=log.metadata.model_copy(update={"drone_radius_m": 0.35}),
+    )  # fmt: skip
+    figure = obstacle_figure(log)
+    assert figure is not None
+    local = _axes(figure.axes, label="Drone 3 at its nearest, t = 3 s")
+    shapes = [path.get_extents() for group in local.collections for path in group.get_paths()]
+    assert [shape.width for shape in shapes] == pytest.approx([0.3, 4.0], abs=0.01), "the wall's length points east"
+    assert (shapes[0].x0 + shapes[0].x1) / 2 == pytest.approx(east + 1.0, abs=0.01)
+    ((x, y),) = [line.get_data() for line in local.get_lines()]
+    assert np.mean(x) == pytest.approx(east + 0.85, abs=0.01)
+    assert np.mean(y) == pytest.approx(north, abs=0.01)
+    curves = _axes(figure.axes, label="clearance, m")
+    assert min(min(line.get_ydata()) for line in curves.get_lines()[:5]) == pytest.approx(0.15)
+    assert obstacle_figure(_flight(duration_s=10.0)) is None
 
 
 def test_errors_are_drawn_signed() -> None:

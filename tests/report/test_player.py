@@ -13,6 +13,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 import pytest
 from py_mini_racer import MiniRacer
 
@@ -141,6 +142,15 @@ def test_drones_are_drawn_with_north_up_and_true_to_scale(html: str) -> None:
     assert sum(x for x, _ in followed) / 3 == pytest.approx(300.0, abs=0.5), "the middle of the canvas"
     assert sum(y for _, y in followed) / 3 == pytest.approx(200.0, abs=0.5)
     assert followed[1][0] - followed[2][0] > side_px
+
+
+def test_a_round_obstacle_is_drawn_where_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flockd.report.page._embed", lambda *_: None)
+    log = _flight(drones=3, duration_s=10.0)
+    under_the_second = [*log.position[0, 1, :2], 0.3, 0.0, 0.0, 0.0, 8.0]
+    page = _Browser(_report(tmp_path, replace(log, obstacles=np.array([under_the_second]))))
+    obstacle, _, second, _ = page.circles()
+    assert obstacle == pytest.approx(second, abs=0.2)
 
 
 def test_a_reader_chooses_the_plate_of_a_drone_and_moment(html: str) -> None:
