@@ -36,6 +36,8 @@ _HORIZON = 0.1
 
 _GRID = slice(_STRIDE_PX // 2, None, _STRIDE_PX)
 """Of `grid_pixels`."""
+_STEEPEST = 0.25
+"""Sine of the elevation up to which pixels are triangulated: the band of heights from 3 m on, and its middle nearer."""
 _MIN_BASELINE_M = 0.05
 """Across the line of sight: with less between two images, their flow shows no depth."""
 _FLOW_SIGMA_PX = 1.0
@@ -76,6 +78,7 @@ class ObstacleRanging:
     def __init__(self, rig: Rig, parameters: ObstacleParameters) -> None:
         self._rig, self._parameters = rig, parameters
         self._rays = {name: _body_rays(camera) for name, camera in rig.cameras.items()}
+        self._triangulations = {name: _Triangulation(camera) for name, camera in rig.cameras.items()}
         self._bins = 1 + math.ceil(_bin(parameters.range_m))
 
     def ranges(self, observation: Observation, ego: EgoMotion | None = None) -> ObstacleRanges:
@@ -87,9 +90,8 @@ class ObstacleRanging:
             places = (R_ned_body @ self._rays[name]) * camera.depth[_GRID, _GRID].ravel() + origin[:, None]
             relative = np.full(places.shape[1], self._parameters.range_sigma, np.float32)
             parts.append(self._about_level(_Points(places, relative, camera.labels[_GRID, _GRID].ravel())))
-            before = observation.previous.cameras.get(name) if observation.previous else None
-            if ego is not None and before is not None and camera.flow is not None:
-                moved = triangulated(self._rig.cameras[name], ego, before, camera)
+            if ego is not None and observation.previous is not None and camera.flow is not None:
+                moved = self._triangulations[name].points(ego, observation.previous, camera)
                 ahead = R_ned_body @ moved.places + origin[:, None]
                 parts.append(self._about_level(_Points(ahead, moved.relative_sigma, moved.labels)))
         return self._nearest(observation, _Points.concatenate(parts))
@@ -177,30 +179,45 @@ def _medians(sectors: IntArray, values: Float32Array) -> FloatArray:
     return np.where(count > 0, values[order][middle], 0.0).astype(float)
 
 
-def triangulated(camera: RigCamera, ego: EgoMotion, before: CameraObservation, now: CameraObservation) -> _Points:
-    """What stood still between two images of one camera, from the flow and the drone's own motion; (3, n) body axes.
+class _Triangulation:
+    """Of one camera: places of what stood still between two of its images."""
 
-    Without the camera's own place. Where a pixel's inverse depth is not well above that of the sky, it is left out.
-    """
-    assert now.flow is not None
-    mounted, lens = camera.T_body_camera, camera.camera
-    between = mounted.inverse() @ RigidTransform(ego.rotation, ego.translation) @ mounted
-    start = grid_pixels(lens.size, _STRIDE_PX)
-    end = start + now.flow[_GRID, _GRID].reshape(-1, 2)
-    still = lens.in_image(end) & (before.labels[_GRID, _GRID].ravel() == 0)
-    start, end = start[still], end[still]
-    column, row = end.astype(np.int64).T
-    background = now.labels[row, column] == 0
-    start, end = start[background], end[background]
-    ray = lens.unproject(end, np.ones(len(end)))
-    # p is parallel to R q / w + t, so that p x R q + w (p x t) = 0: linear in the inverse depth w.
-    p = lens.rays(start)
-    across, parallax = np.cross(p, between.translation), np.cross(p, ray @ between.rotation.T)
-    baseline = np.linalg.norm(across, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = -(parallax * across).sum(axis=1) / baseline**2
-        sigma = _FLOW_SIGMA_PX / lens.focal_px / baseline
-        certain = (baseline > _MIN_BASELINE_M) & (inverse > _CERTAIN_SIGMAS * sigma)
-    places = mounted.rotation @ (ray[certain] / inverse[certain, None]).T
-    relative = (sigma / inverse)[certain].astype(np.float32)
-    return _Points(places.astype(np.float32), relative, np.zeros(len(relative), np.uint8))
+    def __init__(self, camera: RigCamera) -> None:
+        self._camera = camera
+        width, height = camera.camera.size
+        rows = slice(_STRIDE_PX // 2, height, 2 * _STRIDE_PX)  # every second one of those of `grid_pixels`
+        self._grid = rows, slice(_STRIDE_PX // 2, width, _STRIDE_PX)
+        row, column = np.mgrid[self._grid].reshape(2, -1)
+        self._pixels = np.stack([column, row], axis=1) + 0.5
+        self._rays = camera.camera.rays(self._pixels)
+        self._down_body = camera.T_body_camera.rotation @ self._rays.T
+
+    def points(self, ego: EgoMotion, before: Observation, now: CameraObservation) -> _Points:
+        """From the flow and the drone's own motion, in body axes, without the camera's own place.
+
+        Where a pixel's inverse depth is not well above that of the sky, it is left out.
+        """
+        assert now.flow is not None
+        mounted, lens = self._camera.T_body_camera, self._camera.camera
+        between = mounted.inverse() @ RigidTransform(ego.rotation, ego.translation) @ mounted
+        near_level = np.abs(before.vehicle.R_ned_body[2] @ self._down_body) <= _STEEPEST
+        start, p = self._pixels[near_level], self._rays[near_level]
+        end = start + now.flow[self._grid].reshape(-1, 2)[near_level]
+        labels_before = before.cameras[self._camera.name].labels[self._grid].ravel()
+        still = lens.in_image(end) & (labels_before[near_level] == 0)
+        end, p = end[still], p[still]
+        column, row = end.astype(np.int64).T
+        background = now.labels[row, column] == 0
+        end, p = end[background], p[background]
+        ray = lens.unproject(end, np.ones(len(end)))
+        # p is parallel to R q / w + t, so that p x R q + w (p x t) = 0: linear in the inverse depth w.
+        across, turned = np.cross(p, between.translation), ray @ between.rotation.T
+        parallax = np.cross(p, turned)
+        baseline = np.sqrt(np.einsum("ij,ij->i", across, across))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = -np.einsum("ij,ij->i", parallax, across) / baseline**2
+            sigma = _FLOW_SIGMA_PX / lens.focal_px / baseline
+            certain = (baseline > _MIN_BASELINE_M) & (inverse > _CERTAIN_SIGMAS * sigma)
+        places = mounted.rotation @ (ray[certain] / inverse[certain, None]).T
+        relative = (sigma / inverse)[certain].astype(np.float32)
+        return _Points(places.astype(np.float32), relative, np.zeros(len(relative), np.uint8))
