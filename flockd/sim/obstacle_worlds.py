@@ -27,6 +27,7 @@ _STREET_M = 6.0
 _POLE_SPACING_M = 25.0
 _SPAN_PARTS = 6
 """Straight parts of a sagging wire."""
+_WIRE_RADIUS_M = 0.012
 
 
 def obstacles_of(scenario: ScenarioConfig) -> Obstacles:
@@ -246,6 +247,8 @@ def _wire(one: FloatArray, other: FloatArray, *, sag: float) -> list[Solid]:
     share = np.linspace(0.0, 1.0, _SPAN_PARTS + 1)[:, None]
     points = one + share * (other - one)
     points[:, 2] -= sag * 4 * (share * (1 - share))[:, 0]
-    radius = 0.012
-    ends = [tuple(float(metres) for metres in point) for point in points]
-    return [Capsule(*(*a, *b), radius=radius, material="metal") for a, b in itertools.pairwise(ends)]
+    return [Capsule(*a, *b, _WIRE_RADIUS_M, "metal") for a, b in itertools.pairwise(map(_three, points))]
+
+
+def _three(point: FloatArray) -> tuple[float, float, float]:
+    return float(point[0]), float(point[1]), float(point[2])

@@ -408,11 +408,12 @@ def test_obstacles_are_drawn_where_they_stand_and_as_they_were_known() -> None:
     shapes = [path.get_extents() for group in local.collections for path in group.get_paths()]
     assert [shape.width for shape in shapes] == pytest.approx([0.3, 4.0], abs=0.01), "the wall's length points east"
     assert (shapes[0].x0 + shapes[0].x1) / 2 == pytest.approx(east + 1.0, abs=0.01)
-    ((x, y),) = [line.get_data() for line in local.get_lines()]
+    (known_range,) = local.get_lines()
+    x, y = np.asarray(known_range.get_xdata()), np.asarray(known_range.get_ydata())
     assert np.mean(x) == pytest.approx(east + 0.85, abs=0.01)
     assert np.mean(y) == pytest.approx(north, abs=0.01)
     curves = _axes(figure.axes, label="clearance, m")
-    assert min(min(line.get_ydata()) for line in curves.get_lines()[:5]) == pytest.approx(0.15)
+    assert np.min([np.asarray(line.get_ydata()) for line in curves.get_lines()[:5]]) == pytest.approx(0.15)
     assert obstacle_figure(_flight(duration_s=10.0)) is None
 
 

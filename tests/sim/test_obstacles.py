@@ -23,7 +23,8 @@ START = np.array([[0.0, 0.0]])
 
 
 def _ranges(obstacles: Obstacles, degrees: list[float], half_width_deg: float = 0.0) -> list[float]:
-    return obstacles.ranges(HERE, np.radians(degrees), half_width=math.radians(half_width_deg)).tolist()
+    found = obstacles.ranges(HERE, np.radians(degrees), half_width=math.radians(half_width_deg))
+    return [float(range_m) for range_m in found]
 
 
 def test_a_range_is_that_to_the_surface_along_the_azimuth() -> None:
