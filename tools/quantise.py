@@ -29,10 +29,10 @@ Feeds = dict[str, NDArray[Any]]
 IMAGES, COMPARED = 32, 16
 WITHOUT_HEIGHT = 0.3
 """Share of the images whose geometry says nothing of the ground."""
-IN_8_BITS = ("Conv", "Relu", "Clip", "Resize")
-KEPT = ("head", "look", "fixed")
-"""Layers with this in their names stay as they are: they write metres and places, or learnt from other pictures. So do
-sums, which in 8 bits cost ten times the accuracy that all else together does."""
+IN_8_BITS = ("Conv", "Relu", "Resize")
+KEPT = ("head", "look")
+"""Layers with this in their names stay as they are: they write metres and places. So do sums, which in 8 bits cost ten
+times the accuracy that all else together does."""
 AT_MOST = 0.1
 """Mean difference from the float network, as a share of the output's standard deviation, beyond which it is refused."""
 

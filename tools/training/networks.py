@@ -2,6 +2,7 @@
 
 - ``NeighboursNet``: one image -> metric depth, drone mask, and each drone pixel's offset to its drone's centre.
 - ``DistanceNet``: a small crop centred on one drone -> its range, centre and uncertainty.
+- ``VerificationNet``: the same crop -> whether it shows a drone at all.
 - ``FlowNet``: two images -> optical flow, by recurrent lookups in an all-pairs correlation (RAFT, Teed & Deng 2020).
 """
 
@@ -14,8 +15,6 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
-
-from tools.training.verification_net import VerificationNet
 
 Out = TypeVar("Out")
 MAX_DEPTH_M = 80.0
@@ -95,9 +94,8 @@ def _of_large_blocks(kernel: Tensor, step: int) -> Tensor:
 
 def first_layers_of(net: nn.Module, kernels: list[tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
     """The weights that ``_on_entry`` made these kernels and biases of, without their normalisation."""
-    if isinstance(net, VerificationNet):
-        return net.stem_of(*kernels)
-    sizes = {"NeighboursNet": {"fine.0": 2, "stem.0": 4}, "DistanceNet": {"stem.0": 2}}
+    crops = {"stem.0": 2}
+    sizes = {"NeighboursNet": {"fine.0": 2, "stem.0": 4}, "DistanceNet": crops, "VerificationNet": crops}
     weights: dict[str, Tensor] = {}
     for (name, size), (kernel, bias) in zip(sizes.get(type(net).__name__, {}).items(), kernels, strict=True):
         ours = kernel[:, :12].reshape(-1, 2, 2, 3, *kernel.shape[2:]).permute(0, 3, 1, 2, 4, 5) * 127.5
@@ -248,6 +246,38 @@ class DistanceNet(nn.Module):
         if not self.training:
             return out, mask
         return out, mask, _in_full_precision(self.family, x), where[:, : self.motors].flatten(2).log_softmax(2)
+
+
+class VerificationNet(nn.Module):
+    """Whether there is a drone in the middle of a crop.
+
+    The encoder is the one of ``DistanceNet``, trained apart from it: what tells a drone from a bird or a branch has to
+    be learnt from soft real photographs, of which nobody knows a range.
+
+    Input: `crop` (n, 96, 96, 3) uint8, as ``DistanceNet`` takes it. Output (n, 1): logit of there being a drone.
+    """
+
+    size = DistanceNet.size
+    widths = DistanceNet.widths
+    hidden = 160
+
+    def __init__(self) -> None:
+        super().__init__()
+        w = self.widths
+        self.stem = _conv(12, w[0])
+        self.down = nn.ModuleList([_conv(a, b, stride=2) for a, b in pairwise(w)])
+        self.body = nn.ModuleList([_Residual(b) for b in w[1:]])
+        self.more = nn.ModuleDict({str(i): _Residual(w[i]) for i in (2, 3)})
+        self.summary = nn.Sequential(nn.Linear(w[-1] * 9, self.hidden), nn.ReLU(True), nn.Dropout(0.2))
+        self.head = nn.Linear(self.hidden, 1)
+
+    def forward(self, crop: Tensor) -> Tensor:
+        """One logit (n, 1) a crop."""
+        x = self.stem(_blocks(crop, 2)) if self.training else _on_entry(self.stem, _entry(crop), 2)
+        for i, (down, body) in enumerate(zip(self.down, self.body, strict=True), start=1):
+            x = body(down(x))
+            x = self.more[str(i)](x) if str(i) in self.more else x
+        return _in_full_precision(self.head, self.summary(x.flatten(1)))
 
 
 def _moments(where: Tensor) -> tuple[Tensor, Tensor]:
