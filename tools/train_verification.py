@@ -10,11 +10,7 @@ from __future__ import annotations
 
 import argparse
 from collections import deque
-<<<<<<< ours
-from collections.abc import Mapping
-=======
-from collections.abc import Callable
->>>>>>> theirs
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import cv2
@@ -51,17 +47,12 @@ HARD_PROBABILITY, HARD_SHARE, HARD_ONES, FEWEST_HARD = 0.3, 0.35, 4000, 200
 class VerificationTask(Task):
     """Drones and what is none: rendered, rendered before real backgrounds, and real."""
 
-<<<<<<< ours
     net: VerificationNet
 
     def __init__(self, rendered: Path, patches: Path, mix: Mapping[str, int] = MIX) -> None:
         """``mix``: samples of a batch, by kinds of ``KINDS``."""
         super().__init__(VerificationNet(), sum(mix.values()), 6e-4)
         self.mix = mix
-=======
-    def __init__(self, rendered: Path, patches: Path) -> None:
-        super().__init__(VerificationNet(), sum(MIX.values()), 6e-4)
->>>>>>> theirs
         self.rendered = CropFiles(rendered)
         self.negatives = RealPatches(patches, "negative", weights=NEGATIVE_WEIGHTS)
         self.places = RealPatches(patches, "place", weights={"skydrones": 8.0, "skyothers": 8.0})
@@ -161,7 +152,6 @@ def main() -> None:
 
 def _start(task: VerificationTask, weights: Path, seed: int) -> None:
     net = task.net
-    assert isinstance(net, VerificationNet)
     if weights.suffix != ".onnx":
         begin_with(net, torch.load(weights, map_location="cpu")["net"])
         return
