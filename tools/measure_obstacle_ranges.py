@@ -1,11 +1,12 @@
 """What the depth network says of obstacles: ranges by sight against the true ones, in a rendered world.
 
     python -m tools.measure_obstacle_ranges config/forest.yaml --seed 100 --places 12
-    python -m tools.measure_obstacle_ranges config/village.yaml --seed 100 --places 12 --true-depth
+    python -m tools.measure_obstacle_ranges config/village.yaml --seed 100 --places 12 --true
 
-One image set of the first drone at each of a row of places along the way. A sector whose true range is R counts as
-missed where neither it nor the sectors beside it show anything nearer than 1.5 R, and as false where it shows something
-nearer than 0.67 R with nothing true as near beside it. The error is of sectors that are neither.
+Two image sets of the first drone at each of a row of places along the way, and the ranges of the second. A sector
+whose true range is R counts as missed where neither it nor the sectors beside it show anything nearer than 1.5 R, and
+as false where it shows something nearer than 0.67 R with nothing true as near beside it. The error is of sectors that
+are neither.
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from flockd.config import ScenarioConfig, load_scenario
-from flockd.messages import FloatArray
+from flockd.messages import BoolArray, FloatArray
 from flockd.perception import Perception, load_networks
 from flockd.perception.obstacles import ObstacleRanging
+from flockd.pilot.motions import ego_motion
 from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.obstacle_worlds import obstacles_of
 from flockd.sim.obstacles import true_ranges
@@ -32,9 +34,12 @@ LEAST_CLEARANCE_M = 1.0
 """Places nearer to an obstacle are left out: no drone flies there."""
 EXTENT_M = 45.0
 """The places lie no farther from the origin, north and east: beyond 60 m nothing stands."""
-ALL = frozenset({"depth", "segmentation", "distance"})
+ALL = frozenset({"depth", "segmentation", "distance", "flow"})
 STEP_M = 5.0
 """Between two places."""
+WAY_M = 0.75
+"""Between the two images of a place: half a second at 1.5 m/s."""
+NEAR_M = 6.0
 
 
 def main() -> None:
@@ -43,44 +48,52 @@ def main() -> None:
     parser.add_argument("scenario", type=Path)
     parser.add_argument("--seed", type=int, default=100)
     parser.add_argument("--places", type=int, default=12)
-    parser.add_argument(
-        "--true-depth", action="store_true", help="of the renderer: what is left is geometry's own error"
-    )
+    parser.add_argument("--true", action="store_true", help="of the renderer: what is left is geometry's own error")
     args = parser.parse_args()
-    pairs = measured(load_scenario(args.scenario, {"seed": args.seed}), args.places, true_depth=args.true_depth)
-    for low, high in itertools.pairwise(BINS_M):
-        print(json.dumps({"from_m": low, "to_m": high, **figures(pairs, low, high)}))
-    free = np.isinf(pairs[..., 0])
-    print(json.dumps({"free_sectors": int(free.sum()), "with_something_within_6_m": _share(pairs[..., 1][free] < 6.0)}))
+    by_depth, by_both = measured(load_scenario(args.scenario, {"seed": args.seed}), args.places, true=args.true)
+    for name, pairs in (("depth", by_depth), ("depth and flow", by_both)):
+        for low, high in itertools.pairwise(BINS_M):
+            print(json.dumps({"by": name, "from_m": low, "to_m": high, **figures(pairs, low, high)}))
+        free = np.isinf(pairs[..., 0])
+        near = _share(pairs[..., 1][free] < NEAR_M)
+        print(json.dumps({"by": name, "free_sectors": int(free.sum()), "with_something_within_6_m": near}))
 
 
-def measured(scenario: ScenarioConfig, places: int, *, true_depth: bool) -> FloatArray:
-    """(places, n, 2): of each place and sector the true range and the one by sight."""
+def measured(scenario: ScenarioConfig, places: int, *, true: bool) -> tuple[FloatArray, FloatArray]:
+    """(places, n, 2): of each place and sector the true range and the one by sight; by depth, and by flow as well."""
     cameras, obstacles = CameraSimulator(scenario), obstacles_of(scenario)
-    drone = scenario.drone
-    learned = load_networks(drone.perception)
-    ranging, pairs = ObstacleRanging(cameras.rig, drone.obstacles), []
+    drone, learned = scenario.drone, load_networks(scenario.drone.perception)
+    ranging = ObstacleRanging(cameras.rig, drone.obstacles)
+    pairs: tuple[list[FloatArray], list[FloatArray]] = [], []
     for number in range(10 * places):
-        moved = tuple(
-            start.model_copy(update={"position_m": (start.position_m[0] + STEP_M * number, *start.position_m[1:])})
-            for start in scenario.vehicles
-        )
-        vehicles = Vehicles(moved, scenario.vehicle, seed=number)
-        if len(pairs) == places or np.abs(vehicles.position[0, :2]).max() > EXTENT_M:
+        vehicles = [_flock_at(scenario, STEP_M * number + way_m) for way_m in (0.0, WAY_M)]
+        here = vehicles[1].position[0]
+        if len(pairs[0]) == places or np.abs(here[:2]).max() > EXTENT_M:
             break
-        if obstacles.clearance(vehicles.position).min() < LEAST_CLEARANCE_M:
+        if min(float(obstacles.clearance(flock.position).min()) for flock in vehicles) < LEAST_CLEARANCE_M:
             continue
-        frames, truth = cameras.capture(0, number, float(number), vehicles)
-        seen = TruthPerception(
-            learned, frozenset({"depth", "segmentation", "distance"} if true_depth else ()), cameras.rig
-        )
-        seen.show(truth)
+        networks = TruthPerception(learned, ALL if true else frozenset(), cameras.rig)
+        perception = Perception(cameras.rig, networks, drone.perception)
         autopilot = SimulatedAutopilot(scenario.sensors, seed=scenario.seed, drone=0)
-        state = autopilot.read(float(number), vehicles.position[0], vehicles.velocity[0], vehicles.R_ned_body[0])
-        found = ranging.ranges(Perception(cameras.rig, seen, drone.perception).observe(frames, state))
-        true = true_ranges(obstacles, 0.0, vehicles.position[0], limit_m=drone.obstacles.range_m)
-        pairs.append(np.stack([true.range_m, found.range_m], axis=1))
-    return np.array(pairs)
+        for step, flock in enumerate(vehicles):
+            frames, truth = cameras.capture(0, step, drone.step_s * step, flock)
+            networks.show(truth)
+            state = autopilot.read(drone.step_s * step, flock.position[0], flock.velocity[0], flock.R_ned_body[0])
+            observation = perception.observe(frames, state)
+        exact_m = true_ranges(obstacles, 0.0, here, limit_m=drone.obstacles.range_m).range_m
+        ego = ego_motion(cameras.rig, observation, drone.geometry)
+        for found, motion in zip(pairs, (None, ego), strict=True):
+            found.append(np.stack([exact_m, ranging.ranges(observation, motion).range_m], axis=1))
+    return np.array(pairs[0]), np.array(pairs[1])
+
+
+def _flock_at(scenario: ScenarioConfig, way_m: float) -> Vehicles:
+    """All drones, so far north of their starts."""
+    moved = tuple(
+        start.model_copy(update={"position_m": (start.position_m[0] + way_m, *start.position_m[1:])})
+        for start in scenario.vehicles
+    )
+    return Vehicles(moved, scenario.vehicle, seed=0)
 
 
 def figures(pairs: FloatArray, low_m: float, high_m: float) -> dict[str, float | int]:
@@ -106,7 +119,7 @@ def _beside(ranges: FloatArray) -> FloatArray:
     return nearest
 
 
-def _share(chosen: FloatArray) -> float:
+def _share(chosen: BoolArray) -> float:
     return round(float(np.mean(chosen)), 3) if len(chosen) else 0.0
 
 

@@ -169,7 +169,7 @@ def _scene(
     if not measures:
         return samples
     whole = not alone and _is_whole(seen, view, matrix, (left, top))
-    return [{**s, "range_m": np.linalg.norm(seen.centre), "whole": np.array(whole)} for s in samples]
+    return [{**s, "range_m": np.array(np.linalg.norm(seen.centre)), "whole": np.array(whole)} for s in samples]
 
 
 def _is_whole(drone: DroneInView, view: Any, matrix: Array, corner: tuple[int, int]) -> bool:

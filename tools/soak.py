@@ -46,7 +46,10 @@ SHRINK = 4
 """Of the simulator's front camera, the only one: 120 x 160 pixels, so that 100,000 steps are hours and not days."""
 ROUND_STEPS = 40
 """After so many steps the drone is where it began: the same images again."""
-SWING_M, HEIGHT_M, NEIGHBOUR_M = 2.0, 4.0, 2.0
+SWING_M, HEIGHT_M = 2.0, 4.0
+NEIGHBOUR_M, PILOTS_NEIGHBOUR_M = 2.0, 1.0
+"""How far away the other drone is. In images as small as this it is detected up to a metre; a daemon that really flies
+would keep away from it there, for ever, so that it flies as if alone."""
 STRETCHES = 20
 SAMPLES = 400
 SAMPLE_S = 2.0
@@ -134,12 +137,12 @@ def round_trip(phase: float) -> tuple[Poses, FloatArray]:
     angle = 2 * np.pi * phase
     place = np.array([SWING_M * np.sin(angle), SWING_M * np.cos(angle), -HEIGHT_M])
     velocity = 2 * np.pi * SWING_M * np.array([np.cos(angle), -np.sin(angle), 0.0])
-    return follower(place, velocity, np.eye(3)), velocity
+    return follower(place, velocity, np.eye(3), PILOTS_NEIGHBOUR_M), velocity
 
 
-def follower(place: FloatArray, velocity: FloatArray, rotation: FloatArray) -> Poses:
+def follower(place: FloatArray, velocity: FloatArray, rotation: FloatArray, distance_m: float = NEIGHBOUR_M) -> Poses:
     """The drone, and a neighbour north of it that does as it does."""
-    beside = np.array([NEIGHBOUR_M, 0.0, 0.0])
+    beside = np.array([distance_m, 0.0, 0.0])
     return Poses(np.stack([place, place + beside]), np.stack([velocity, velocity]), np.stack([rotation, rotation]))
 
 

@@ -89,7 +89,7 @@ def _parser() -> Parser:
     parser = Parser(
         prog="flockd",
         description="Drones that flock by vision alone.",
-        examples=("flockd sim --duration 10", "flockd sim", "flockd config check config/paper_flight.yaml"),
+        examples=("flockd sim --duration 10 --drones 3", "flockd sim", "flockd config check config/paper_flight.yaml"),
         notes=EXIT_CODES,
     )
     parser.add_argument("--version", action="version", version=f"flockd {__version__}")

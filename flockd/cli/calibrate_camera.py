@@ -181,7 +181,7 @@ def _say_lens(result: Mapping[str, Any], collector: Collector) -> None:
     say(f"  field of view {across} x {down} degrees")
     say(f"residual: rms {rms['rms']:.3f} px; of a view {min(views):.3f} to {max(views):.3f}; max {rms['max']:.2f}")
     assert collector.coverage is not None
-    say(f"coverage: {100 * result['coverage']:.0f} %")
+    say(f"coverage: {100 * result['coverage']:.0f} % of the image; ## where corners of the board were seen")
     for line in collector.coverage.text:
         say(f"  {line}")
     for sentence in result["advice"]:

@@ -25,7 +25,8 @@ SCENARIO = "paper_flight.yaml"
 COSTS = """\
 costs, measured with five drones on a processor without 8-bit instructions, November 2026:
   time       12 s of processor time a simulated second, so 11 minutes on two free cores for the whole flight, and 10 s
-             to begin; with --perception truth a few seconds
+             to begin; a flight of 10 s with three drones 66 s of processor time; with --perception truth a few
+             seconds
   memory     1 GB
   disk       35 MB for the report and what it is made of
   --record   another 4.5 MB a drone and simulated second: 2.5 GB for the whole flight

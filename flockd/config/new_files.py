@@ -50,13 +50,13 @@ def drone_text(new: NewDrone) -> str:
     width, height = new.size_px
     focal_px = width / 2 / math.radians(new.field_of_view_deg / 2)
     lines = [
-        "# A drone for `flockd run`. Fill in what is marked so. Then `flockd config check` this file, and have",
-        "# `flockd doctor` examine the drone. `flockd config schema drone` lists every key there is.",
+        "# A drone for `flockd run`. Fill in what is marked `fill in`. Then run `flockd config check` on it, and",
+        "# `flockd doctor` on the drone. `flockd config schema drone` lists every key there is.",
         f"name: {new.name}    # different for each drone of a fleet",
         "step_s: 0.5",
         "",
         "rig:",
-        "  # Yours to fill in: intrinsics and extrinsics, by `flockd calibrate camera` and `flockd calibrate rig`. A",
+        "  # Fill in: intrinsics and extrinsics, by `flockd calibrate camera` and `flockd calibrate rig`. A",
         "  # lens that is 2 % off puts every neighbour 2 % off. position_m: forward, right, down from the middle.",
         "  cameras:",
     ]
@@ -135,13 +135,13 @@ def _source(new: NewDrone, names: Sequence[str]) -> list[str]:
             "  set_tolerance_s: 0.01",
             "  shared_memory:",
             f"    drone: {new.name}",
-            "    connect: [tcp/127.0.0.1:7448]    # yours to fill in: where that program listens",
+            "    connect: [tcp/127.0.0.1:7448]    # fill in: where that program listens",
             "    rate_hz: 10.0",
         ]
     lines = [
         "source:",
         "  kind: v4l2",
-        "  # Yours to fill in: the socket of each camera, which `ls /dev/v4l/by-path` shows as an entry that ends in",
+        "  # Fill in: the socket of each camera, which `ls /dev/v4l/by-path` shows as an entry that ends in",
         "  # index0, and its own controls (`v4l2-ctl -d DEVICE --list-ctrls`): a short, fixed exposure.",
         "  cameras:",
     ]

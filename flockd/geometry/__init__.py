@@ -5,6 +5,7 @@ from flockd.geometry.ego_motion import estimate_ego_motion
 from flockd.geometry.ego_motion_refinement import refine_ego_motion
 from flockd.geometry.ground import ground_inverse_depth
 from flockd.geometry.ground_fit import FittedGround, GroundSamples, fit_ground
+from flockd.geometry.ground_track import scale_on_track
 from flockd.geometry.neighbour_motion import estimate_neighbour_motion
 from flockd.geometry.pairs import BACKGROUND_LABEL, PointPairs, grid_pixels, label_pixels, lift_matches
 from flockd.geometry.polar import log_polar, log_polar_covariance, log_polar_residual
@@ -47,5 +48,6 @@ __all__ = [
     "refine_ego_motion",
     "rotation_angle_deg",
     "rotation_from_euler",
+    "scale_on_track",
     "virtual_crop",
 ]

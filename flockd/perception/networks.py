@@ -223,7 +223,7 @@ class OnnxNetworks:
         unknown = manifest.results["depth"].depth.unknown
         if config.scale == "network" and unknown != "nothing":
             raise ModelError(
-                f"perception.scale: depth model {config.depth!r} knows no metres, so `network` cannot give the scale; "
+                f"perception.scale: depth model {config.depth!r} has no metric scale for `network` to take; "
                 "write height or velocity, or choose a metric model"
             )
         takes_ground = "geometry" in manifest.contents

@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from flockd.messages import Detection, Float32Array, GroundEstimate, ObstacleRanges, UInt8Array, VehicleState
+from flockd.messages import (
+    Detection,
+    Float32Array,
+    FloatArray,
+    GroundEstimate,
+    ObstacleRanges,
+    UInt8Array,
+    VehicleState,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +46,8 @@ class Observation:
     """Whose images were noise, and were not used."""
     ground: GroundEstimate | None = None
     """See `PilotOutput.ground`."""
+    ground_track: FloatArray | None = None
+    """(k, 3) metres NED from the drone: where the last ranges hit the ground; None: no range finder is used."""
     obstacles: ObstacleRanges | None = None
     """Exact ones, of a simulation; None: they are in the cameras' depth."""
 

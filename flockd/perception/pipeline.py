@@ -73,7 +73,8 @@ class Perception:
             cameras[name] = CameraObservation(images[name], depth, labels, flows.get(name))
         reasons = (*unusable, *ungrounded, *failed, *restarted, *unscaled)
         found = ground if isinstance(ground, GroundEstimate) and self._config.height != "barometer" else None
-        self._last = Observation(frames.time_s, vehicle, cameras, detections, previous, reasons, noisy, found)
+        track = None if found is None or self._ground is None else self._ground.track(vehicle)
+        self._last = Observation(frames.time_s, vehicle, cameras, detections, previous, reasons, noisy, found, track)
         lap("detection")
         return self._last
 

@@ -2,20 +2,32 @@
 
 Two images and the motion between them give the depth of matched points in units of that motion, and so the ground's
 plane: its slope, and the drone's height above it. Where a range finder says how high that is, the unit is known.
+Ground is not plane, and a bump of 0.2 m straight below would be 4 % at 5 m: so, once the drone has flown far enough,
+the places that the last ranges hit are compared with the same places in the images.
 """
 
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
-from flockd.geometry import GroundSamples, Rig, RigCamera, RigidTransform, fit_ground, grid_pixels, inverse_depths
+from flockd.geometry import (
+    GroundSamples,
+    Rig,
+    RigCamera,
+    RigidTransform,
+    fit_ground,
+    grid_pixels,
+    inverse_depths,
+    scale_on_track,
+)
 from flockd.messages import EgoMotion, Float32Array, FloatArray
 from flockd.perception import CameraObservation, Observation
 
-STRIDE_PX = 8
+STRIDE_PX = 4
 FLOW_SIGMA_PX = 0.3
 MIN_BASELINE_M = 0.08
 """Across the line of sight; with less, the ground's depth is noise."""
@@ -38,8 +50,13 @@ def scaled_by_ground(rig: Rig, observation: Observation, ego: EgoMotion) -> tupl
     ]
     if not samples:
         raise ValueError("no camera has both frames")
-    plane = fit_ground(GroundSamples.concatenate(samples), ground.height_m, ground.slope)
+    seen = GroundSamples.concatenate(samples)
+    plane = fit_ground(seen, ground.height_m, ground.slope)
     factor = ground.height_m / plane.height
+    track = observation.ground_track
+    if track is not None:
+        with suppress(ValueError):  # before it has flown far enough, the plane alone tells
+            factor = scale_on_track(seen, track, plane.slope, factor)
     if not abs(math.log(factor)) < math.log(MAX_CORRECTION):
         raise ValueError("the ground that is seen does not fit the range")
     return replace(ego, translation=ego.translation * factor), plane.slope

@@ -267,7 +267,7 @@ class FlockPilot:
             displacement, sigma_m = _displacement(observation, ego)[:2], self._config.geometry.own_displacement_sigma_m
         elif velocity is not None and self._last_time_s is not None:
             displacement, sigma_m = velocity[:2] * (observation.time_s - self._last_time_s), _BY_VELOCITY_SIGMA_M
-        ranges = observation.obstacles or self._ranging.ranges(observation)
+        ranges = observation.obstacles or self._ranging.ranges(observation, ego)
         return self._map.step(observation.time_s, ranges, displacement, sigma_m)
 
     def _blind(self, observation: Observation) -> Blind | None:

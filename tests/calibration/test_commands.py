@@ -71,7 +71,7 @@ def test_a_folder_of_images_becomes_a_camera_that_checks(folder: Path, capsys: C
     assert "refused: 1 no board: wall.png" in text
     assert re.search(r"refused: 1 blurred, as edges wider than 4\.0 px are: soft\.png \(edges \d\.\d px wide\)", text)
     assert re.search(r"residual: rms 0\.\d+ px; of a view 0\.\d+ to 0\.\d+; max \d\.\d+", text)
-    assert re.search(r"coverage: \d\d %\n  (## |\.\. ){7}", text)
+    assert re.search(r"coverage: \d\d % of the image; ## where corners of the board were seen\n  (## |\.\. ){7}", text)
     told(capsys, 0, "config", "check", out)
     camera = load_drone(out).rig.cameras[0]
     assert (camera.name, camera.size_px) == ("front", (480, 360))

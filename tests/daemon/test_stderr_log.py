@@ -14,8 +14,9 @@ PIPE_BYTES = 1 << 16
 LINE = "x" * 1000
 
 
-def _logged(log: StderrLog, text: str) -> None:
-    log.emit(logging.LogRecord("flockd", logging.INFO, "", 0, text, None, None))
+def _logged(log: StderrLog, text: str, times: int = 1) -> None:
+    for _ in range(times):
+        log.emit(logging.LogRecord("flockd", logging.INFO, "", 0, text, None, None))
 
 
 def _all_of(reader: int) -> list[str]:
@@ -28,7 +29,7 @@ def _all_of(reader: int) -> list[str]:
 def test_a_reader_that_does_not_come_stops_nobody_and_what_was_lost_is_counted() -> None:
     reader, writer = os.pipe()
     log, many = StderrLog(writer), 2 * BACKLOG
-    said = threading.Thread(target=lambda: [_logged(log, LINE) for _ in range(many)], daemon=True)
+    said = threading.Thread(target=_logged, args=(log, LINE, many), daemon=True)
     said.start()
     said.join(30.0)
     assert not said.is_alive(), "2 MB went into a pipe of 64 kB, and nobody has read"

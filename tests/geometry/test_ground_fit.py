@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from flockd.geometry import GroundSamples, RigidTransform, fit_ground, inverse_depths
+from flockd.geometry import GroundSamples, RigidTransform, fit_ground, inverse_depths, scale_on_track
 
 from .synthetic_world import four_camera_rig
 
@@ -82,3 +82,29 @@ def test_a_wall_and_too_little_ground_are_no_plane() -> None:
     few = samples.select(np.arange(len(samples.inverse)) < 40)
     with pytest.raises(ValueError, match="too little ground"):
         fit_ground(few, 5.0, np.zeros(2))
+
+
+def _bumpy(level: Array) -> Array:
+    """How far down ground with waves of 0.25 m is, with a crest straight below the drone."""
+    return np.asarray(5.0 - 0.25 * np.cos(2.0 * np.pi * level[:, 0] / 14.0) - 0.05 * level[:, 1])
+
+
+def test_a_crest_below_the_drone_misleads_the_plane_and_the_places_that_were_measured_do_not() -> None:
+    rng = np.random.default_rng(3)
+    level = rng.uniform(-14.0, 14.0, (12_000, 2))
+    samples = _seen(np.column_stack([level, _bumpy(level) - (rng.random(12_000) < 0.1)]), 0.96, 0.3, rng)
+    behind = np.column_stack([-0.5 * np.arange(25), 0.1 * np.arange(25)])
+    track = np.column_stack([behind, _bumpy(behind) * (1.0 + 0.015 * rng.standard_normal(25))])
+    plane = fit_ground(samples, 4.75, np.zeros(2))
+    by_plane = 4.75 / plane.height
+    assert abs(by_plane * 0.96 - 1.0) > 0.02, "else this shows nothing"
+    factor = scale_on_track(samples, track, plane.slope, by_plane)
+    assert factor == pytest.approx(1.0 / 0.96, rel=0.008)
+
+
+def test_places_out_of_view_say_nothing() -> None:
+    rng = np.random.default_rng(0)
+    samples = _seen(_hillside(rng, np.zeros(2), 5.0, 0.0, 0.0), 1.0, 0.0, rng)
+    for places in (np.empty((0, 3)), np.array([[0.0, 0.0, 5.0]]), np.array([[-4.0, 0.0, 5.0]])):
+        with pytest.raises(ValueError, match="ground"):
+            scale_on_track(samples, places, np.zeros(2), 1.0)

@@ -91,7 +91,7 @@ def test_depth_for_one_focal_length_is_scaled_to_the_cameras(tmp_path: Path) -> 
 def test_a_relative_network_is_refused_where_nothing_fixes_its_scale(tmp_path: Path) -> None:
     relative = {"depth": {"quantity": "inverse_depth", "unknown": "scale_and_shift"}}
     path = one_channel_depth(tmp_path, output=relative)
-    with pytest.raises(ModelError, match=r"perception\.scale: .* knows no metres, .* write height or velocity"):
+    with pytest.raises(ModelError, match=r"perception\.scale: .* has no metric scale .* write height or velocity"):
         perception_with(path, scale="network")
     for scale in ("height", "velocity"):
         seen = perception_with(path, scale=scale).scene(front(plain((51, 0, 0))), camera_of(40.0, SIZE), None)

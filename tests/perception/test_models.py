@@ -103,7 +103,7 @@ def test_the_simulator_refuses_a_flipped_bit_in_one_sentence(
     (tmp_path / "simulator.yaml").write_text(drone)
     flight = tmp_path / "flight.yaml"
     flight.write_text((ROOT / "config" / "paper_flight.yaml").read_text())
-    assert main(["sim", str(flight), "--duration", "1", "--out", str(tmp_path / "out")]) == 78
+    assert main(["sim", str(flight), "--duration", "1", "--quiet", "--out", str(tmp_path / "out")]) == 78
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert f"{copies / 'neighbours_int8.yaml'}:6: sha256: {copies / 'neighbours_int8.onnx'}" in error

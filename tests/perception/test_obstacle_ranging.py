@@ -11,7 +11,7 @@ from flockd.config import load_scenario
 from flockd.config.avoidance import ObstacleParameters
 from flockd.data import data_path
 from flockd.geometry import Rig, build_rig, grid_pixels
-from flockd.messages import SECTORS, UNCLASSED, FloatArray, ObstacleRanges, VehicleState
+from flockd.messages import SECTORS, UNCLASSED, EgoMotion, FloatArray, ObstacleRanges, VehicleState
 from flockd.perception import CameraObservation, Observation
 from flockd.perception.obstacles import ObstacleRanging
 
@@ -133,3 +133,35 @@ def test_a_few_wrong_pixels_are_no_obstacle() -> None:
     camera = CameraObservation(np.zeros((640, 480, 3), np.uint8), pixels, np.zeros((640, 480), np.uint8), None)
     vehicle = VehicleState(0.0, LEVEL, HEIGHT_M)
     assert found(RANGING.ranges(Observation(0.0, vehicle, {"front": camera}, (), None))) == {}
+
+
+def test_what_depth_does_not_show_the_flow_does() -> None:
+    """The drone flies 0.6 m north-east and yaws; depth is that of the sky, as of a network that knows no trunks."""
+    trunk, way = (3.0, -0.8, 0.3), np.array([0.5, 0.3, 0.05])
+    yaw = math.radians(8.0)
+    R_ned_body = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1.0]])
+    before, now = {}, {}
+    for name, camera in RIG.cameras.items():
+        width, height = camera.camera.size
+        blank = {"image": np.zeros((height, width, 3), np.uint8), "labels": np.zeros((height, width), np.uint8)}
+        sky = np.full((height, width), SKY_M, np.float32)
+        pixels = grid_pixels((width, height), 1)
+        turn, origin = camera.T_body_camera.rotation, camera.T_body_camera.translation
+        rays = camera.camera.unproject(pixels, np.ones(len(pixels))) @ turn.T
+        ground = np.where(rays[:, 2] > 0, (HEIGHT_M - origin[2]) / np.maximum(rays[:, 2], 1e-9), 1e4)
+        depth = np.minimum(ground, towards_trunk(origin, rays, trunk[:2], trunk[2]))
+        points = (origin + rays * depth[:, None] - way) @ R_ned_body  # in the body now
+        flow = camera.camera.project((points - origin) @ turn) - pixels
+        before[name] = CameraObservation(depth=sky, flow=None, **blank)
+        now[name] = CameraObservation(depth=sky, flow=flow.reshape(height, width, 2).astype(np.float32), **blank)
+    first = Observation(0.0, VehicleState(0.0, LEVEL, HEIGHT_M), before, (), None)
+    observation = Observation(0.5, VehicleState(0.5, R_ned_body, HEIGHT_M - way[2]), now, (), first)
+    assert found(RANGING.ranges(observation)) == {}
+    ego = EgoMotion(R_ned_body, way, 0.5, 100, 100, 0.01)
+    ranges = RANGING.ranges(observation, ego)
+    offset = np.array(trunk[:2]) - way[:2]
+    sector = round(math.degrees(math.atan2(offset[1], offset[0])) / 5) % SECTORS
+    away_m = float(np.hypot(*offset)) - trunk[2]
+    assert ranges.range_m[sector] == pytest.approx(away_m, rel=0.07)
+    assert 0.0 < ranges.sigma_m[sector] < 0.2 * away_m
+    assert all((k - sector + 3) % SECTORS <= 6 for k in found(ranges))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,17 +15,18 @@ from tools.training.own_mesh import MOST_TRIANGLES, UP_AXES, _upright, painted, 
 RED = [255, 0, 0, 255]
 
 
-def cross_of_boxes(unit: float = 1.0) -> trimesh.Trimesh:
+def cross_of_boxes(unit: float = 1.0) -> Any:
     """A drone of two bars, 0.6 m and 0.4 m long, 0.1 m wide and 0.05 m tall, and a post on top: z up, 0.15 m in all."""
     bars = [trimesh.creation.box((0.6, 0.1, 0.05)), trimesh.creation.box((0.1, 0.4, 0.05))]
-    post = trimesh.creation.box((0.02, 0.02, 0.1), transform=trimesh.transformations.translation_matrix((0, 0, 0.075)))
-    mesh = trimesh.util.concatenate([*bars, post])
+    post = trimesh.creation.box((0.02, 0.02, 0.1))
+    post.apply_translation((0.0, 0.0, 0.075))
+    mesh: Any = trimesh.util.concatenate([*bars, post])
     mesh.apply_translation((3.0, 2.0, 1.0))
     mesh.apply_scale(unit)
     return mesh
 
 
-def written(folder: Path, name: str, mesh: trimesh.Trimesh) -> Path:
+def written(folder: Path, name: str, mesh: Any) -> Path:
     path = folder / name
     mesh.export(path)
     return path

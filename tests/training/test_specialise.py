@@ -7,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import trimesh
 import yaml
@@ -99,4 +98,4 @@ def test_too_few_photographs_and_anothers_folder_are_refused(
             main()
         assert refused.value.code == 2
         assert said in capsys.readouterr().err
-    assert np.array_equal(list(work.iterdir()), [work / "drone.json"]), "nothing was begun"
+    assert list(work.iterdir()) == [work / "drone.json"], "nothing was begun"

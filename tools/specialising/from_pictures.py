@@ -24,9 +24,9 @@ from flockd.data import data_path
 from flockd.inference import OnnxModel, load_manifest
 from flockd.messages import UInt8Array
 from flockd.perception.requirements import check_roles
-from flockd.pictures.coco_labels import Box, check_size, read_labels
+from flockd.pictures.coco_labels import check_size, read_labels
 from flockd.pictures.picture_files import PictureFile, find_pictures
-from flockd.pictures.single_frame import MAX_SIDE_PX
+from flockd.pictures.single_frame import MAX_SIDE_PX, Box
 from tools.export import draw_back, export
 from tools.mine_pictures import Miner
 from tools.quantise import quantise

@@ -53,7 +53,7 @@ class CropFiles:
         self._aimed_of_family = [np.flatnonzero((family == one) & aimed) for one in names]
         none = names == -1
         share = _NONE_SHARE if none.any() and not none.all() else float(none.all())
-        self._shares = np.where(none, share, (1 - share) / max(1, np.count_nonzero(~none)))
+        self._shares = np.where(none, share, (1 - share) / max(1, int(np.count_nonzero(~none))))
 
     def draw(self, rng: np.random.Generator) -> Sample:
         """Any of them: every family as often, however many crops there are of it, and now and then what is none."""

@@ -109,7 +109,7 @@ def _plus4(rng: Generator) -> Array:
 
 
 def _long_x(rng: Generator) -> Array:
-    return _on_circle(4, np.pi / 4) * [1.0, rng.choice([rng.uniform(0.6, 0.85), rng.uniform(1.15, 1.5)]), 1.0]
+    return _on_circle(4, np.pi / 4) * np.array([1.0, rng.choice([rng.uniform(0.6, 0.85), rng.uniform(1.15, 1.5)]), 1.0])
 
 
 def _folding(rng: Generator) -> Array:

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from flockd.config.perception import MAX_DRONE_SIZE_M, MIN_DRONE_SIZE_M
 from flockd.sim.airframe import MACHINE_TEXTURES, Airframe, DroneModel
@@ -76,10 +78,7 @@ def painted(model: DroneModel, seed: int) -> DroneModel:
     """The same drone in another light and wear; one whose file says no colours is painted, each part in one colour."""
     rng = np.random.default_rng([model.family, seed])
     if np.isnan(model.colours).any():
-        one_side = model.triangles[: len(model.triangles) // 2]
-        _, corner = np.unique(np.round(model.vertices, 5), axis=0, return_inverse=True)
-        touching = trimesh.graph.face_adjacency(corner.reshape(-1)[one_side])
-        parts = np.tile(trimesh.graph.connected_component_labels(touching, node_count=len(one_side)), 2)
+        parts = _parts(model)
         craft = Airframe(rng)
         paints = np.array([craft.body, craft.frame, craft.metal, craft.front, craft.rear])
         colours = paints[rng.choice(len(paints), int(parts.max()) + 1, p=_SHARES)][parts]
@@ -87,6 +86,15 @@ def painted(model: DroneModel, seed: int) -> DroneModel:
         colours = model.colours * np.exp(rng.normal(0, 0.15)) * np.exp(rng.normal(0, 0.04, 3))
     texture = np.full(len(model.triangles), int(rng.integers(MACHINE_TEXTURES)), np.int32)
     return replace(model, seed=seed, colours=np.clip(colours, 0.01, 0.9).astype(np.float32), texture=texture)
+
+
+def _parts(model: DroneModel) -> Array:
+    """(m,) numbers from 0 up, the same of triangles that hang together by their corners' places."""
+    places, corner = np.unique(np.round(model.vertices, 5), axis=0, return_inverse=True)
+    a, b, c = corner.reshape(-1)[model.triangles].T
+    edges = (np.ones(2 * len(a)), (np.concatenate([a, b]), np.concatenate([b, c])))
+    _, part = connected_components(coo_matrix(edges, shape=(len(places), len(places))), directed=False)
+    return np.asarray(part[a])
 
 
 _SHARES = (0.35, 0.35, 0.1, 0.1, 0.1)

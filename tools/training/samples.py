@@ -133,7 +133,8 @@ def four_motors(hubs: NDArray[np.float64]) -> NDArray[np.float64]:
         narrow, wide = np.linalg.eigvalsh(np.cov(places.T))
         return float(narrow + 0.1 * wide)
 
-    return hubs[list(max(combinations(range(len(hubs)), 4), key=spread))]
+    chosen: list[tuple[int, ...]] = list(combinations(range(len(hubs)), 4))
+    return hubs[list(max(chosen, key=spread))]
 
 
 def _mask_of(crop: VirtualCrop, mine: NDArray[Any]) -> NDArray[np.uint8]:

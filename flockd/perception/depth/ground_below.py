@@ -8,6 +8,7 @@ point; points one after the other tell the slope along the path, and images that
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +29,8 @@ SEEN_SLOPE = 0.04
 """Standard deviation, each axis, of a slope from images of rough ground, which has bumps around the drone, too."""
 ROUGHNESS_M = 0.03
 """Standard deviation of what the ground departs from its slope over a metre."""
+TRACK_POINTS = 40
+"""Ranges remembered: 20 s of steps of the paper's length."""
 LONGEST_GAP_S = 5.0
 """After a longer one between two steps nothing is known of the ground any more."""
 BELIEVED_AFTER = 2
@@ -52,6 +55,15 @@ class GroundBelow:
         self._last: VehicleState | None = None
         self._measured_s = -math.inf
         self._unexplained = 0
+        self._flown = np.zeros(2)
+        """North and east since the beginning, as the autopilot says."""
+        self._track: deque[FloatArray] = deque(maxlen=TRACK_POINTS)
+        """(3,) each: where a range hit the ground, north and east in that frame, and the ground's height there."""
+
+    def track(self, vehicle: VehicleState) -> FloatArray:
+        """(k, 3) metres NED from the drone: where the last ranges hit the ground; of the step of the last `update`."""
+        places = np.array(self._track).reshape(-1, 3)
+        return np.column_stack([places[:, :2] - self._flown, vehicle.height_m - places[:, 2]])
 
     def update(self, vehicle: VehicleState) -> tuple[GroundEstimate | NoGround, str | None]:
         """The ground at a step, and why its source is not the one that was wanted; None: it is."""
@@ -87,13 +99,14 @@ class GroundBelow:
             self._unexplained += 1
             if self._unexplained < BELIEVED_AFTER:
                 return "the range is not that of the ground expected"
-            self._state = None
+            self._forget()
         if self._state is None:
             self._state = np.array([ground_m, 0.0, 0.0])
             self._covariance = np.diag([variance, FIRST_SLOPE**2, FIRST_SLOPE**2])
         else:
             self._correct(row[None], np.array([ground_m]), np.array([[variance]]))
         self._unexplained, self._measured_s = 0, vehicle.time_s
+        self._track.append(np.array([*(self._flown + point[:2]), ground_m]))
         return None
 
     def _is_unexplained(self, row: FloatArray, ground_m: float, variance: float) -> bool:
@@ -107,14 +120,19 @@ class GroundBelow:
             return
         way = _way(last, vehicle)
         if way is None or not 0.0 < vehicle.time_s - last.time_s <= LONGEST_GAP_S:
-            self._state, self._unexplained = None, 0
+            self._forget()
             return
+        self._flown = self._flown + way
         onward = np.eye(3)
         onward[0, 1:] = way
         length_m = float(np.hypot(*way))
         change = np.array([ROUGHNESS_M**2, SLOPE_CHANGE**2, SLOPE_CHANGE**2]) * length_m
         self._state = onward @ self._state
         self._covariance = onward @ self._covariance @ onward.T + np.diag(change)
+
+    def _forget(self) -> None:
+        self._state, self._unexplained = None, 0
+        self._track.clear()
 
     def _correct(self, rows: FloatArray, measured: FloatArray, noise: FloatArray) -> None:
         assert self._state is not None

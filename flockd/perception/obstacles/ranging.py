@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from flockd.config.avoidance import ObstacleParameters
-from flockd.geometry import Rig, RigCamera, grid_pixels
+from flockd.geometry import Rig, RigCamera, RigidTransform, grid_pixels
 from flockd.messages import (
     SECTORS,
     UNCLASSED,
     BoolArray,
+    EgoMotion,
     Float32Array,
     FloatArray,
     IntArray,
     ObstacleRanges,
     UInt8Array,
 )
-from flockd.perception.observation import Observation
+from flockd.perception.observation import CameraObservation, Observation
 
 _STRIDE_PX = 4
 """Between pixels that are taken: a trunk of 0.2 m at 10 m is 4 px wide at 222 px a radian."""
@@ -29,6 +32,38 @@ _GROUND_MARGIN_M = 0.7
 """What is no higher than this above the ground counts as ground."""
 _HORIZON = 0.1
 """Tangent of the elevation up to which a ray shows how far the drone sees at its own height."""
+
+
+_GRID = slice(_STRIDE_PX // 2, None, _STRIDE_PX)
+"""Of `grid_pixels`."""
+_MIN_BASELINE_M = 0.05
+"""Across the line of sight: with less between two images, their flow shows no depth."""
+_FLOW_SIGMA_PX = 1.0
+_CERTAIN_SIGMAS = 5.0
+"""A point by flow counts where its inverse depth is so many standard deviations from that of the sky."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """Places (3, n) metres, with relative standard deviations of their ranges (n,) and labels (n,)."""
+
+    places: Float32Array
+    relative_sigma: Float32Array
+    labels: UInt8Array
+
+    def where(self, chosen: BoolArray) -> _Points:
+        return _Points(self.places[:, chosen], self.relative_sigma[chosen], self.labels[chosen])
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[_Points]) -> _Points:
+        return cls(
+            np.concatenate([part.places for part in parts], axis=1),
+            np.concatenate([part.relative_sigma for part in parts]),
+            np.concatenate([part.labels for part in parts]),
+        )
+
+
+_NOTHING = _Points(np.empty((3, 0), np.float32), np.empty(0, np.float32), np.empty(0, np.uint8))
 
 
 class ObstacleRanging:
@@ -43,50 +78,65 @@ class ObstacleRanging:
         self._rays = {name: _body_rays(camera) for name, camera in rig.cameras.items()}
         self._bins = 1 + math.ceil(_bin(parameters.range_m))
 
-    def ranges(self, observation: Observation) -> ObstacleRanges:
-        """Of one observation, whose depth has its scale."""
-        points, labels = [np.empty((3, 0), np.float32)], [np.empty(0, np.uint8)]
+    def ranges(self, observation: Observation, ego: EgoMotion | None = None) -> ObstacleRanges:
+        """Of one observation, whose depth has its scale, and of the flow since the one before where `ego` is known."""
         R_ned_body = observation.vehicle.R_ned_body.astype(np.float32)
-        grid = slice(_STRIDE_PX // 2, None, _STRIDE_PX)  # of `grid_pixels`
+        parts = [_NOTHING]
         for name, camera in observation.cameras.items():
             origin = R_ned_body @ self._rig.cameras[name].T_body_camera.translation.astype(np.float32)
-            north, east, down = (R_ned_body @ self._rays[name]) * camera.depth[grid, grid].ravel() + origin[:, None]
-            about_level = (np.abs(down) <= self._parameters.height_band_m) | _is_level(north, east, down)
-            points.append(np.stack([north[about_level], east[about_level], down[about_level]]))
-            labels.append(camera.labels[grid, grid].ravel()[about_level])
-        return self._nearest(observation, np.concatenate(points, axis=1), np.concatenate(labels))
+            places = (R_ned_body @ self._rays[name]) * camera.depth[_GRID, _GRID].ravel() + origin[:, None]
+            relative = np.full(places.shape[1], self._parameters.range_sigma, np.float32)
+            parts.append(self._about_level(_Points(places, relative, camera.labels[_GRID, _GRID].ravel())))
+            before = observation.previous.cameras.get(name) if observation.previous else None
+            if ego is not None and before is not None and camera.flow is not None:
+                moved = triangulated(self._rig.cameras[name], ego, before, camera)
+                ahead = R_ned_body @ moved.places + origin[:, None]
+                parts.append(self._about_level(_Points(ahead, moved.relative_sigma, moved.labels)))
+        return self._nearest(observation, _Points.concatenate(parts))
 
-    def _nearest(self, observation: Observation, points: Float32Array, labels: UInt8Array) -> ObstacleRanges:
-        """Of points (3, n) metres NED from the drone, and what they are labelled with (n,)."""
-        p = self._parameters
-        north, east, down = points
+    def _about_level(self, points: _Points) -> _Points:
+        """Those that are in the drone's band of heights, or show how far it sees."""
+        return points.where((np.abs(points.places[2]) <= self._parameters.height_band_m) | _is_level(*points.places))
+
+    def _nearest(self, observation: Observation, points: _Points) -> ObstacleRanges:
+        """Of places (3, n) metres NED from the drone."""
+        p, labels = self._parameters, points.labels
+        north, east, down = points.places
         away_m = np.hypot(north, east)
         sectors = np.round(np.arctan2(east, north) * (SECTORS / (2 * math.pi))).astype(np.int64) % SECTORS
         in_band = np.abs(down) <= p.height_band_m
         above_ground = down <= _ground_down_m(observation, north, east) - _GROUND_MARGIN_M
         counts = in_band & above_ground & (labels == 0) & (away_m <= p.range_m)
-        range_m = self._agreed(sectors[counts], away_m[counts].astype(float))
+        range_m, relative = self._agreed(
+            sectors[counts], away_m[counts].astype(float), points.relative_sigma[counts].astype(float)
+        )
         level = _is_level(north, east, down) & (labels != UNCLASSED)
         seen_m = _medians(sectors[level], np.minimum(away_m[level], p.range_m))
         found = np.isfinite(range_m)
-        sigma_m = np.where(found, p.range_sigma * np.where(found, range_m, 0.0), 0.0)
+        sigma_m = np.where(found, relative * np.where(found, range_m, 0.0), 0.0)
         return ObstacleRanges(
             observation.time_s, range_m, sigma_m, np.where(found, np.minimum(range_m, p.range_m), seen_m)
         )
 
-    def _agreed(self, sectors: IntArray, away_m: FloatArray) -> FloatArray:
-        """(SECTORS,) metres: the mean of the nearest points of each sector that are enough; inf where none are."""
+    def _agreed(self, sectors: IntArray, away_m: FloatArray, relative: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(SECTORS,) metres: the mean of the nearest points of each sector that are enough; inf where none are.
+
+        And the mean of their relative standard deviations.
+        """
         bins = np.minimum(np.floor(_bin(away_m)), self._bins - 1).astype(np.int64)
         shape = (SECTORS, self._bins)
         cells = sectors * shape[1] + bins
-        count = np.bincount(cells, minlength=math.prod(shape)).reshape(shape)
-        total_m = np.bincount(cells, away_m, minlength=math.prod(shape)).reshape(shape)
+
+        def summed(values: FloatArray | None) -> FloatArray:
+            totals = np.bincount(cells, values, minlength=math.prod(shape)).reshape(shape)
+            return totals.astype(float)
+
+        count = summed(None)
         enough = np.cumsum(count, axis=1) >= self._parameters.min_pixels
-        first = np.argmax(enough, axis=1)
-        every = np.arange(SECTORS)
-        with np.errstate(invalid="ignore"):
-            mean_m = total_m[every, first] / count[every, first]
-        return np.where(enough.any(axis=1), mean_m, np.inf)
+        first = (np.arange(SECTORS), np.argmax(enough, axis=1))
+        in_first = np.maximum(count[first], 1)
+        mean_m = np.where(enough.any(axis=1), summed(away_m)[first] / in_first, np.inf)
+        return mean_m, summed(relative)[first] / in_first
 
 
 def _ground_down_m(observation: Observation, north: Float32Array, east: Float32Array) -> float | Float32Array:
@@ -125,3 +175,32 @@ def _medians(sectors: IntArray, values: Float32Array) -> FloatArray:
     if not len(values):
         return np.zeros(SECTORS)
     return np.where(count > 0, values[order][middle], 0.0).astype(float)
+
+
+def triangulated(camera: RigCamera, ego: EgoMotion, before: CameraObservation, now: CameraObservation) -> _Points:
+    """What stood still between two images of one camera, from the flow and the drone's own motion; (3, n) body axes.
+
+    Without the camera's own place. Where a pixel's inverse depth is not well above that of the sky, it is left out.
+    """
+    assert now.flow is not None
+    mounted, lens = camera.T_body_camera, camera.camera
+    between = mounted.inverse() @ RigidTransform(ego.rotation, ego.translation) @ mounted
+    start = grid_pixels(lens.size, _STRIDE_PX)
+    end = start + now.flow[_GRID, _GRID].reshape(-1, 2)
+    still = lens.in_image(end) & (before.labels[_GRID, _GRID].ravel() == 0)
+    start, end = start[still], end[still]
+    column, row = end.astype(np.int64).T
+    background = now.labels[row, column] == 0
+    start, end = start[background], end[background]
+    ray = lens.unproject(end, np.ones(len(end)))
+    # p is parallel to R q / w + t, so that p x R q + w (p x t) = 0: linear in the inverse depth w.
+    p = lens.rays(start)
+    across, parallax = np.cross(p, between.translation), np.cross(p, ray @ between.rotation.T)
+    baseline = np.linalg.norm(across, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = -(parallax * across).sum(axis=1) / baseline**2
+        sigma = _FLOW_SIGMA_PX / lens.focal_px / baseline
+        certain = (baseline > _MIN_BASELINE_M) & (inverse > _CERTAIN_SIGMAS * sigma)
+    places = mounted.rotation @ (ray[certain] / inverse[certain, None]).T
+    relative = (sigma / inverse)[certain].astype(np.float32)
+    return _Points(places.astype(np.float32), relative, np.zeros(len(relative), np.uint8))
