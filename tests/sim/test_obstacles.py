@@ -83,16 +83,18 @@ def test_clearance_is_the_distance_in_three_dimensions() -> None:
 
 
 def test_ranges_agree_with_marching_along_the_rays_by_the_clearance() -> None:
-    rng = np.random.default_rng(5)
-    for config in (ObstaclesConfig(kind="forest", extent_m=20.0), ObstaclesConfig(kind="village", extent_m=20.0)):
+    for config in (
+        ObstaclesConfig(kind="forest", extent_m=20.0, trees_per_hectare=400.0),
+        ObstaclesConfig(kind="village"),
+    ):
         obstacles = generate_obstacles(config, 2, START)
-        azimuths = rng.uniform(0, 2 * math.pi, 24)
-        rays = np.column_stack([np.cos(azimuths), np.sin(azimuths), np.zeros(24)])
-        away = np.zeros(24)
-        for _ in range(100):
+        azimuths = np.linspace(0.0, 2 * math.pi, 90)
+        rays = np.column_stack([np.cos(azimuths), np.sin(azimuths), np.zeros(90)])
+        away = np.zeros(90)
+        for _ in range(200):
             away = np.minimum(away + obstacles.clearance(HERE + away[:, None] * rays), 50.0)
         exact = obstacles.ranges(HERE, azimuths, (0.0, 0.0))
-        assert np.isfinite(exact).any()
+        assert np.isfinite(exact).sum() > 9
         np.testing.assert_allclose(np.minimum(exact, 50.0), away, atol=0.02)
 
 
