@@ -98,8 +98,8 @@ def unexplained_share(before: UInt8Array, now: UInt8Array) -> float:
     seen_before: BoolArray = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
     if not seen_before.any():
         return 0.0
-    moved = np.asarray(cv2.remap(before.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
-    return float(_differs(moved, now.astype(np.float32), seen_before)[seen_before].mean())
+    moved = cv2.remap(before.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return float(_differs(np.asarray(moved, np.float32), now.astype(np.float32), seen_before)[seen_before].mean())
 
 
 def _differs(moved: Float32Array, now: Float32Array, seen_before: BoolArray) -> BoolArray:
