@@ -36,6 +36,7 @@ def test_hills_are_as_high_and_as_steep_as_they_may_be_and_level_where_drones_be
     np.testing.assert_array_equal(heights[0], 0.0)
 
 
+@pytest.mark.slow
 def test_the_range_is_that_of_the_ground_which_is_drawn(world: World) -> None:
     """A camera along the body's down axis: the depth of its middle pixel is the range."""
     renderer, random = Renderer(world, []), np.random.default_rng(0)
@@ -88,10 +89,10 @@ def test_noise_age_and_limits_are_those_of_the_configuration() -> None:
 
 def test_dropouts_are_as_frequent_and_long_as_configured() -> None:
     config = RangeFinderConfig(dropouts_per_min=6.0, dropout_s=1.0)
-    missing = np.array([one is None for one in _readings(config, np.full(3_000, 5.0), 0.1)])
+    missing = np.array([one is None for one in _readings(config, np.full(10_000, 5.0), 0.1)])
     assert missing.mean() == pytest.approx(1.0 / 11.0, rel=0.3)  # 1 s out of every 10 s and 1 s
     begins = np.flatnonzero(np.diff(missing.astype(int)) == 1)
-    assert len(begins) == pytest.approx(3_000 * 0.1 / 11.0, rel=0.3)
+    assert len(begins) == pytest.approx(10_000 * 0.1 / 11.0, rel=0.3)
 
 
 def test_a_drone_without_a_range_finder_has_no_range_and_its_other_errors_are_the_same() -> None:
