@@ -143,7 +143,7 @@ def test_a_camera_out_of_step(off_s: float, level: Level) -> None:
         (
             {"flags": lambda number: 0x2000 | (FLAG_ERROR if number % 2 else 0)},
             Level.FAILURE,
-            "damaged by the driver",
+            "damaged, as the driver reports",
         ),
         ({"pictures": JPEGS[:1]}, Level.FAILURE, "frozen"),
         ({"pictures": [*JPEGS[:3], JPEGS[3][:-100]]}, Level.FAILURE, "corrupt (JPEG ends too early)"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from flockd.config.scenario import ScenarioConfig
@@ -53,7 +54,7 @@ class _Fake(SimulatedAutopilots):
     """Fake autopilots that are made as PX4s are."""
 
     def __init__(self, scenario: ScenarioConfig, speed_factor: float, *_: object) -> None:
-        super().__init__(scenario, speed_factor)
+        super().__init__(scenario, speed_factor, lambda north, _: np.zeros_like(north))
 
 
 def test_a_mode_that_was_not_promised_is_shown_as_such() -> None:
