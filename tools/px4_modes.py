@@ -34,6 +34,7 @@ from flockd.data import data_path
 from flockd.errors import FlockdError, UnavailableError
 from flockd.messages import Setpoint
 from flockd.sim.autopilots import Ports, Px4s, px4_folder
+from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.daemons import Daemons, fleet_configs
 from flockd.sim.frame_server import FrameServer
 from flockd.sim.ground_station import GroundStation
@@ -211,7 +212,7 @@ class Px4Flight:
         config = config.model_copy(update={"safety": config.safety.model_copy(update={"alone_s": None})})
         server = self._stack.enter_context(
             FrameServer(
-                scenario,
+                CameraSimulator(scenario),
                 [config.name],
                 endpoint=endpoint,
                 rate_hz=FRAMES_HZ,

@@ -81,7 +81,7 @@ def slow_soft_noise(image: UInt8Array, number: int, rng: np.random.Generator) ->
     """Filtered noise of 10 grey levels more with each image, up to 60: never is there much more than in the last."""
     soft = cv2.GaussianBlur(rng.standard_normal(image.shape), (0, 0), 1.5)
     added = image + min(10.0 * (number + 1), 60.0) / soft.std() * soft
-    return np.clip(added, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(added, 0, 255), np.uint8)
 
 
 def test_a_camera_whose_images_do_not_follow_from_each_other_does_not_steer(recording: Recording) -> None:

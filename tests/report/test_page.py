@@ -490,8 +490,9 @@ def test_an_arrow_ends_at_the_border_of_its_image() -> None:
     flow = np.ones((96, 64, 2), np.float32)
     flow[:, :4] = -100.0, 0.0
     canvas = FigureCanvasAgg(filmstrip_figure(KeyFrame(**{**vars(moment), "flow": {"left": flow, "back": flow}})))
-    canvas.draw()
-    plate = np.asarray(canvas.buffer_rgba())[-700:, :, :3]  # 160 pixels an inch: within the row of the flow
+    canvas.draw()  # type: ignore[no-untyped-call]
+    drawn = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
+    plate = drawn[-700:, :, :3]  # 160 pixels an inch: within the row of the flow
     assert np.ptp(plate[:, 49:560].astype(int)) > 100
     for beside in (plate[:, 40:47], plate[:, 561:567]):
         assert np.array_equal(np.unique(beside.reshape(-1, 3), axis=0), [(0x14, 0x18, 0x1F)])
