@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from flockd.messages import FloatArray, VelocityCommand
 from flockd.safety import Action, Gate, GateParameters, Objection, Permission, Surroundings, Verdict, Wanted
-from flockd.safety.approach import stopping_speed, towards_obstacles
+from flockd.safety.approach import SAME_SPOT_M, stopping_speed, towards_neighbours, towards_obstacles
 from flockd.safety.half_planes import nearest_within
 
 PARAMETERS = GateParameters(obstacle_clearance_m=0.6, braking_m_s2=1.5, reaction_s=0.5).model_copy(
@@ -133,3 +133,9 @@ def test_a_velocity_that_is_not_finite_does_not_raise() -> None:
 def test_a_gap_between_two_walls_is_flown_through_in_its_middle() -> None:
     points = [(0.1 * k, side) for k in range(-20, 21) for side in (-0.9, 0.9)]
     np.testing.assert_allclose(velocity_of(flown([1.0, 0.0], among(*points))), [1.0, 0.0])
+
+
+def test_a_neighbour_at_the_same_spot_has_no_direction_and_one_a_little_farther_has() -> None:
+    for range_m, count in ((0.9 * SAME_SPOT_M, 0), (SAME_SPOT_M, 1), (1.1 * SAME_SPOT_M, 1)):
+        directions, most_m_s = towards_neighbours(PARAMETERS, np.array([[range_m, 0.0, 0.0]]), np.zeros((1, 2)), 1.0)
+        assert len(directions) == len(most_m_s) == count, range_m
