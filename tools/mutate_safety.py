@@ -68,6 +68,11 @@ EQUIVALENT: dict[str, str] = {
     "  # the others hold for all that is no longer": "a limit of just this speed binds nothing",
     "half_planes.py nearest_within: binding = ~(limits > (np.hypot(*velocity) - _ROUNDING_M_S))"
     "  # the others hold for all that is no longer": "differs by the rounding allowed",
+    "half_planes.py nearest_within: fits = (np.max(candidates @ directions.T - limits, axis=1)) <= _ROUNDING_M_S": (
+        "a limit that is exceeded binds, so that there always is one, unless a direction is longer than 1 by rounding"
+    ),
+    "half_planes.py : _PARALLEL = (0.0)": "lines that are all but parallel cross far away, or as near as a foot",
+    "half_planes.py _crossings: cross = (np.abs(determinants) >= _PARALLEL)": "the same, at just this angle",
     "half_planes.py _crossings: i, j = np.triu_indices(len(directions), (0))": "a line is parallel to itself",
     "fence.py _inside: ends = np.roll(corners, (1), axis=0)": "the same outline, the other way round",
     "fence.py _inside: return bool(np.sum((east >= e1 + (e2 - e1) * (north - n1) / (n2 - n1))) % 2)": (

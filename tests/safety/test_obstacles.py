@@ -139,3 +139,27 @@ def test_a_neighbour_at_the_same_spot_has_no_direction_and_one_a_little_farther_
     for range_m, count in ((0.9 * SAME_SPOT_M, 0), (SAME_SPOT_M, 1), (1.1 * SAME_SPOT_M, 1)):
         directions, most_m_s = towards_neighbours(PARAMETERS, np.array([[range_m, 0.0, 0.0]]), np.zeros((1, 2)), 1.0)
         assert len(directions) == len(most_m_s) == count, range_m
+
+
+def fastest(*neighbours: tuple[float, float], velocities: ArrayLike, separation_m: float = 1.0) -> FloatArray:
+    """How fast to fly towards each neighbour at this place north and east, at the drone's height."""
+    offsets = np.array([[*place, 0.0] for place in neighbours])
+    return towards_neighbours(PARAMETERS, offsets, np.array(velocities, dtype=float), separation_m)[1]
+
+
+@pytest.mark.parametrize("velocity", [math.inf, -math.inf, math.nan])
+def test_a_neighbour_whose_velocity_is_no_number_counts_as_one_that_hovers(velocity: float) -> None:
+    assert fastest((3.0, 0.0), velocities=[[velocity, 0.0]]) == fastest((3.0, 0.0), velocities=[[0.0, 0.0]])
+
+
+def test_each_neighbours_own_velocity_counts() -> None:
+    comes, goes = [-3.0, 0.0], [0.0, 1.0]
+    both = fastest((4.0, 0.0), (0.0, 4.0), velocities=[comes, goes])
+    assert both[0] == fastest((4.0, 0.0), velocities=[comes])[0]
+    assert both[1] == fastest((0.0, 4.0), velocities=[goes])[0]
+    assert both[0] < both[1]
+
+
+def test_nobody_follows_a_neighbour_at_the_separation_itself() -> None:
+    assert fastest((1.0, 0.0), velocities=[[2.0, 0.0]], separation_m=1.0) == 0.0
+    assert fastest((1.001, 0.0), velocities=[[2.0, 0.0]], separation_m=1.0) > 0.0
