@@ -149,7 +149,8 @@ def fastest(*neighbours: tuple[float, float], velocities: ArrayLike, separation_
 
 @pytest.mark.parametrize("velocity", [math.inf, -math.inf, math.nan])
 def test_a_neighbour_whose_velocity_is_no_number_counts_as_one_that_hovers(velocity: float) -> None:
-    assert fastest((3.0, 0.0), velocities=[[velocity, 0.0]]) == fastest((3.0, 0.0), velocities=[[0.0, 0.0]])
+    for away_m in (1.2, 3.0):
+        assert fastest((away_m, 0.0), velocities=[[velocity, 0.0]]) == fastest((away_m, 0.0), velocities=[[0.0, 0.0]])
 
 
 def test_each_neighbours_own_velocity_counts() -> None:
