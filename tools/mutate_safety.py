@@ -57,6 +57,10 @@ EQUIVALENT: dict[str, str] = {
     "supervisor.py Supervisor.__init__: pass  # self._now_s = -math.inf": "each step writes it before it is read",
     "supervisor.py Supervisor.__init__: self._now_s = (math.inf)": "each step writes it before it is read",
     "supervisor.py Supervisor.__init__: self._now_s = -(0.0)": "each step writes it before it is read",
+    "gate.py Gate._within_space: every_direction, every_limit = (zip(*limits.values()))": "each of them is a pair",
+    "gate.py Gate._within_space: every_direction, every_limit = zip(*limits.values(), strict=(False))": (
+        "each of them is a pair"
+    ),
     "half_planes.py nearest_within: if ((over < 0)).all():": (
         "with a limit just reached, its foot is the velocity itself"
     ),

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from flockd.messages import FloatArray, VelocityCommand
 from flockd.safety import Action, Gate, GateParameters, Objection, Permission, Surroundings, Verdict, Wanted
 from flockd.safety.approach import SAME_SPOT_M, stopping_speed, towards_neighbours, towards_obstacles
+from flockd.safety.gate import _units
 from flockd.safety.half_planes import nearest_within
 
 PARAMETERS = GateParameters(obstacle_clearance_m=0.6, braking_m_s2=1.5, reaction_s=0.5).model_copy(
@@ -164,3 +165,7 @@ def test_each_neighbours_own_velocity_counts() -> None:
 def test_nobody_follows_a_neighbour_at_the_separation_itself() -> None:
     assert fastest((1.0, 0.0), velocities=[[2.0, 0.0]], separation_m=1.0) == 0.0
     assert fastest((1.001, 0.0), velocities=[[2.0, 0.0]], separation_m=1.0) > 0.0
+
+
+def test_what_has_no_length_has_no_direction() -> None:
+    assert np.allclose(_units(np.array([[0.0, 0.0], [3.0, 4.0]])), [[0.6, 0.8]])
