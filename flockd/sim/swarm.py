@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
@@ -16,21 +15,20 @@ from flockd.choices import TRUTH_ROLES, SimulatedPerception
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import UsageError
 from flockd.flight_log.builder import FlightLogBuilder
-from flockd.flight_log.capture import capture, key_frame_steps
+from flockd.flight_log.capture import key_frame_steps
 from flockd.flight_log.key_frames import KeyFrame
 from flockd.flight_log.log import FlightLog
 from flockd.flight_log.metadata import FlightMetadata, MissionMetadata
-from flockd.messages import FloatArray, MissionStatus, PilotOutput
+from flockd.messages import FloatArray, MissionStatus
 from flockd.mission.circle_then_tangent import desired_of
-from flockd.perception import load_networks
-from flockd.pilot import FlockPilot, StepTrace
 from flockd.recording import Recorder
 from flockd.recording.truth import TrueDrone, Truth
 from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.clearances import with_obstacles
 from flockd.sim.exact_states import Commands, ExactFlock, HandPilot, fly_exact_states, start_yaw, step_times
 from flockd.sim.handover import Handover
-from flockd.sim.truth_perception import TruthPerception
+from flockd.sim.pilot_pool import PilotPool
+from flockd.sim.pilots import Stepped
 from flockd.sim.vehicles import SimulatedAutopilot, Vehicles
 from flockd.telemetry import TelemetrySink, publish_step
 
@@ -55,6 +53,7 @@ def fly(
     swap: frozenset[str] = frozenset(),
     telemetry: TelemetrySink | None = None,
     recorders: Sequence[Recorder] = (),
+    processes: int | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     preparing: Callable[[int, int], None] = lambda done, total: None,
 ) -> Flight:
@@ -68,6 +67,8 @@ def fly(
         swap: roles of perception that take the truth instead of a network's estimate.
         telemetry: where every drone's output is published; nothing comes back from there.
         recorders: one a drone, or none; nothing comes back from there either.
+        processes: for pilots that see, beside this one, which draws the images; 0 or 1: they step in this one; None: as
+            many as there are processors, and no more than drones.
         progress: called with (steps done, steps in all).
         preparing: the same, of what is done before the first step: the companion, the networks, the world.
     """
@@ -80,36 +81,37 @@ def fly(
     times = step_times(scenario)
     builder = FlightLogBuilder(times, len(scenario.vehicles))
     preparing(0, _PREPARATIONS)
-    companion = fly_exact_states(scenario)[1:]
-    pilots = (
-        _ExactStatePilots(scenario)
-        if perception == "truth"
-        else _VisionPilots(scenario, swap, telemetry, recorders, companion, preparing)
-    )
-    preparing(_PREPARATIONS, _PREPARATIONS)
     handover = Handover(scenario)
     vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=start_yaw(scenario), seed=scenario.seed)
     chosen = key_frame_steps(len(times))
     key_frames: list[KeyFrame] = []
     flown = 0
-    try:
-        for step, time_s in enumerate(times):
-            builder.add_truth(step, vehicles.position, vehicles.velocity, vehicles.R_ned_body)
-            commands = pilots.step(step, float(time_s), vehicles, builder)
-            builder.add_missions(step, commands.desired, commands.missions)
-            if step in chosen:
+    with ExitStack() as stack:
+        pool = stack.enter_context(PilotPool(scenario, swap, processes)) if perception == "learned" else None
+        companion = fly_exact_states(scenario)[1:]
+        pilots = (
+            _ExactStatePilots(scenario)
+            if pool is None
+            else _VisionPilots(scenario, pool, telemetry, recorders, companion, preparing)
+        )
+        preparing(_PREPARATIONS, _PREPARATIONS)
+        try:
+            for step, time_s in enumerate(times):
+                builder.add_truth(step, vehicles.position, vehicles.velocity, vehicles.R_ned_body)
+                commands = pilots.step(step, float(time_s), vehicles, builder, pictured=step in chosen)
+                builder.add_missions(step, commands.desired, commands.missions)
                 key_frames += pilots.key_frames()
-            velocity, height_m = handover.applied(
-                commands.takeovers, vehicles.position, commands.velocity, commands.height_m
-            )
-            vehicles.step(velocity, commands.yaw_rad, scenario.drone.step_s, height_m)
-            flown = step + 1
-            progress(flown, len(times))
-    except KeyboardInterrupt:
-        if flown < _LEAST_STEPS:
-            raise
-        builder.cut(flown)
-        companion = companion[0][:flown], companion[1][:flown]
+                velocity, height_m = handover.applied(
+                    commands.takeovers, vehicles.position, commands.velocity, commands.height_m
+                )
+                vehicles.step(velocity, commands.yaw_rad, scenario.drone.step_s, height_m)
+                flown = step + 1
+                progress(flown, len(times))
+        except KeyboardInterrupt:
+            if flown < _LEAST_STEPS:
+                raise
+            builder.cut(flown)
+            companion = companion[0][:flown], companion[1][:flown]
     metadata = FlightMetadata.of_configuration(
         scenario.drone,
         scenario=scenario.scenario,
@@ -139,8 +141,10 @@ class _ExactStatePilots:
         self._flock = ExactFlock(scenario)
         self._by_hand = [vehicle.by_hand for vehicle in scenario.vehicles]
 
-    def step(self, step: int, time_s: float, vehicles: Vehicles, builder: FlightLogBuilder) -> Commands:
-        """Of all drones."""
+    def step(
+        self, step: int, time_s: float, vehicles: Vehicles, builder: FlightLogBuilder, *, pictured: bool
+    ) -> Commands:
+        """Of all drones; there are no images."""
         positions, velocities = vehicles.position, vehicles.velocity
         commands = self._flock.step(time_s, positions, velocities)
         for i in (i for i, by_hand in enumerate(self._by_hand) if not by_hand):
@@ -153,7 +157,7 @@ class _ExactStatePilots:
         return commands
 
     def key_frames(self) -> list[KeyFrame]:
-        """None, as there are no images."""
+        """None."""
         return []
 
 
@@ -163,7 +167,7 @@ class _VisionPilots:
     def __init__(
         self,
         scenario: ScenarioConfig,
-        swap: frozenset[str],
+        pool: PilotPool,
         telemetry: TelemetrySink | None,
         recorders: Sequence[Recorder],
         companion: tuple[FloatArray, FloatArray],
@@ -174,44 +178,35 @@ class _VisionPilots:
         self._telemetry, self._recorders = telemetry, recorders
         self._cameras = CameraSimulator(scenario)
         preparing(2, _PREPARATIONS)
-        learned = load_networks(scenario.drone.perception)
+        pool.wait_until_ready()
         preparing(3, _PREPARATIONS)
+        self._pool, self._drones = pool, pool.drones
         self._scenario, self._yaw_rad = scenario, start_yaw(scenario)
-        vehicles = range(len(scenario.vehicles))
-        self._hands = {i: HandPilot(scenario, i) for i in vehicles if scenario.vehicles[i].by_hand}
-        self._drones = [i for i in vehicles if i not in self._hands]
-        self._truths = {i: TruthPerception(learned, swap, self._cameras.rig) for i in self._drones} if swap else {}
-        self._pilots = {
-            i: FlockPilot(scenario.drone_of(i), self._truths.get(i, learned), stopwatch=time.perf_counter)
-            for i in self._drones
-        }
+        self._hands = {i: HandPilot(scenario, i) for i in range(len(scenario.vehicles)) if i not in self._drones}
         ground = self._cameras.ground_height
         self._autopilots = {
             i: SimulatedAutopilot(scenario.sensors, seed=scenario.seed, drone=i, ground=ground) for i in self._drones
         }
-        # Pilots share nothing but the networks, so their order does not matter: each steps as soon as its images are
-        # rendered, all at a time, for five one after the other on two cores would leave one core idle for the last.
-        self._executor = ThreadPoolExecutor(min(len(self._drones), 2 * (os.cpu_count() or 1) + 1))
-        self._traces: dict[int, StepTrace] = {}
-        self._outputs: dict[int, PilotOutput] = {}
+        self._stepped: dict[int, Stepped] = {}
 
-    def step(self, step: int, time_s: float, vehicles: Vehicles, builder: FlightLogBuilder) -> Commands:
-        """Of all drones."""
+    def step(
+        self, step: int, time_s: float, vehicles: Vehicles, builder: FlightLogBuilder, *, pictured: bool
+    ) -> Commands:
+        """Of all drones. Each steps as soon as its images are drawn."""
         steps = {}
         render_ms = {}
-        self._traces = {i: StepTrace() for i in self._drones}
-        for i, pilot in self._pilots.items():
+        for i in self._drones:
             begin = time.perf_counter()
-            frames, render_truth = self._cameras.capture(i, step, time_s, vehicles)
-            if self._truths:
-                self._truths[i].show(render_truth)
+            frames, seen = self._cameras.capture(i, step, time_s, vehicles)
             render_ms[i] = 1e3 * (time.perf_counter() - begin)
             state = self._autopilots[i].read(time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i])
-            steps[i] = frames, state, self._executor.submit(pilot.step, frames, state, self._traces[i])
-        self._outputs = {i: future.result() for i, (_, _, future) in steps.items()}
+            with_pictures = pictured and i in self._drones[:_KEY_FRAME_DRONES]
+            steps[i] = frames, state, self._pool.step(i, frames, state, seen, pictured=with_pictures)
+        self._stepped = {i: future.result() for i, (_, _, future) in steps.items()}
         truth = self._truth(step, time_s, vehicles)
-        for i, output in self._outputs.items():
+        for i, stepped in self._stepped.items():
             frames, state, _ = steps[i]
+            output = stepped.output
             if self._telemetry is not None:
                 publish_step(self._telemetry, f"drone{i + 1}", state, output)
             if self._recorders:
@@ -226,8 +221,8 @@ class _VisionPilots:
         count = len(self._scenario.vehicles)
         commands = Commands.of(count)
         missions: list[MissionStatus | None] = [None] * count
-        for i, output in self._outputs.items():
-            command = output.command
+        for i, stepped in self._stepped.items():
+            output, command = stepped.output, stepped.output.command
             commands.velocity[i], commands.acceleration[i] = command.velocity, command.acceleration
             commands.yaw_rad[i] = command.yaw_rad
             commands.height_m[i] = np.nan if command.height_m is None else command.height_m
@@ -256,9 +251,5 @@ class _VisionPilots:
         return Truth(time_s, tuple(drones))
 
     def key_frames(self) -> list[KeyFrame]:
-        """What the pilots worked with in the last step."""
-        return [
-            frame.at_half_size()
-            for drone in self._drones[:_KEY_FRAME_DRONES]
-            for frame in capture(self._traces[drone], self._outputs[drone], drone)
-        ]
+        """What the pilots worked with in the last step, where that was asked for."""
+        return [frame for stepped in self._stepped.values() for frame in stepped.key_frames]

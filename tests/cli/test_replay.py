@@ -250,7 +250,7 @@ def flight(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
             ]
             for recorder in recorders:
                 stack.enter_context(recorder)
-            return fly(flown, recorders=recorders).log
+            return fly(flown, recorders=recorders, processes=1).log
 
     folder = tmp_path_factory.mktemp("flight")
     return Flight(fly_recorded, folder, fly_recorded(folder, []))

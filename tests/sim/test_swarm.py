@@ -12,7 +12,7 @@ from flockd.config import Overrides, ScenarioConfig, load_scenario
 from flockd.data import data_path
 from flockd.flight_log.log import FlightLog
 from flockd.sim.start import with_drones
-from flockd.sim.swarm import fly
+from flockd.sim.swarm import Flight, fly
 from flockd.telemetry import TelemetrySink
 from flockd.telemetry.publisher import ZenohTelemetry
 
@@ -27,13 +27,18 @@ def scenario(duration_s: float = 0.5 * STEPS, height: str = "best") -> ScenarioC
 
 
 def flown(telemetry: TelemetrySink | None = None) -> FlightLog:
-    return fly(scenario(), telemetry=telemetry).log
+    return fly(scenario(), telemetry=telemetry, processes=1).log
 
 
 @pytest.fixture(scope="module")
-def alone() -> FlightLog:
-    """A flight in which all telemetry is cut."""
-    return flown()
+def cut() -> Flight:
+    """A flight in one process, in which all telemetry is cut."""
+    return fly(scenario(), processes=1)
+
+
+@pytest.fixture(scope="module")
+def alone(cut: Flight) -> FlightLog:
+    return cut.log
 
 
 def assert_same_flight(a: FlightLog, b: FlightLog) -> None:
@@ -42,8 +47,15 @@ def assert_same_flight(a: FlightLog, b: FlightLog) -> None:
             assert getattr(a, part.name).tobytes() == getattr(b, part.name).tobytes(), part.name
 
 
-def test_the_same_seed_is_the_same_flight(alone: FlightLog) -> None:
-    assert_same_flight(alone, flown())
+def test_the_same_seed_is_the_same_flight_in_however_many_processes(cut: Flight) -> None:
+    again = fly(scenario(), processes=2)
+    assert_same_flight(cut.log, again.log)
+    assert [(frame.time_s, frame.drone) for frame in again.key_frames] == [(0.5, 0), (1.5, 0), (0.5, 1), (1.5, 1)]
+    for one, other in zip(cut.key_frames, again.key_frames, strict=True):
+        for maps in ("images", "depth", "labels", "flow"):
+            ours, theirs = getattr(one, maps), getattr(other, maps)
+            assert {camera: a.tobytes() for camera, a in ours.items()} == {c: a.tobytes() for c, a in theirs.items()}
+        assert (one.track_ids, one.ranges) == (other.track_ids, other.ranges)
 
 
 class Deaf:
@@ -74,7 +86,8 @@ def test_each_drone_decides_from_its_own_images_alone() -> None:
     """
     changed = scenario(height="barometer")
     sensors = changed.sensors.model_copy(update={"velocity_error_m_s": 5.0})
-    right, wrong = fly(changed).log, fly(changed.model_copy(update={"sensors": sensors})).log
+    wrongly = changed.model_copy(update={"sensors": sensors})
+    right, wrong = (fly(flight, processes=1).log for flight in (changed, wrongly))
     assert np.array_equal(right.ego_translation[1], wrong.ego_translation[1], equal_nan=True)
     assert np.array_equal(right.command_velocity[0], wrong.command_velocity[0])
 

@@ -1,0 +1,67 @@
+"""The pilots of all drones that flockd flies, stepped side by side."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from functools import partial
+from types import TracebackType
+from typing import Self
+
+from flockd.config.scenario import ScenarioConfig
+from flockd.geometry import build_rig
+from flockd.messages import FrameSet, VehicleState
+from flockd.sim.pilot_process import PilotProcess
+from flockd.sim.pilots import Pilots, Stepped
+from flockd.sim.truth_perception import RenderTruth, TruthPerception
+
+
+class PilotPool:
+    """Between ``__enter__`` and ``__exit__``. Pilots share nothing but networks, so their order does not matter.
+
+    Each process steps its drones one after the other, as their images come, while the next ones are drawn.
+    """
+
+    def __init__(self, scenario: ScenarioConfig, swap: frozenset[str], processes: int | None) -> None:
+        """In as many ``processes``; 1: in this one; None: as many as there are processors. Never more than drones."""
+        self.drones = tuple(i for i, vehicle in enumerate(scenario.vehicles) if not vehicle.by_hand)
+        """Counted from 0."""
+        count = min(len(self.drones), (os.cpu_count() or 1) if processes is None else processes)
+        self._shares = [self.drones[first::count] for first in range(count)]
+        self._scenario = scenario
+        self._swap = partial(TruthPerception, swap=swap, rig=build_rig(scenario.drone.rig)) if swap else None
+        self._homes: list[Pilots | PilotProcess] = []
+        self._stack = ExitStack()
+        self._threads = [ThreadPoolExecutor(1, thread_name_prefix="pilots") for _ in self._shares]
+
+    def __enter__(self) -> Self:
+        """Starts the processes, which load their networks while the caller goes on."""
+        with ExitStack() as stack:
+            if len(self._shares) > 1:
+                for share in self._shares:
+                    self._homes.append(stack.enter_context(PilotProcess(self._scenario, share, self._swap)))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+        for thread in self._threads:
+            thread.shutdown()
+
+    def wait_until_ready(self) -> None:
+        """Until all networks are loaded. Raises ModelError, and UnavailableError when a process has ended."""
+        if not self._homes:
+            self._homes.append(Pilots(self._scenario, self.drones, self._swap))
+        for home in self._homes:
+            home.wait_until_ready()
+
+    def step(
+        self, drone: int, frames: FrameSet, vehicle: VehicleState, truth: RenderTruth, *, pictured: bool
+    ) -> Future[Stepped]:
+        """See `Pilots.step`; what it gives is there once the drone's process has come to it."""
+        home = self.drones.index(drone) % len(self._homes)
+        shown = truth if self._swap else None
+        return self._threads[home].submit(self._homes[home].step, drone, frames, vehicle, shown, pictured=pictured)

@@ -1,0 +1,57 @@
+"""The pilots of some of the drones, whichever process they step in."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from flockd.config.scenario import ScenarioConfig
+from flockd.flight_log.capture import capture
+from flockd.flight_log.key_frames import KeyFrame
+from flockd.messages import FrameSet, PilotOutput, VehicleState
+from flockd.perception import Networks, load_networks
+from flockd.pilot import FlockPilot, StepTrace
+
+if TYPE_CHECKING:  # a process of pilots does not load the renderer, unless truths need it
+    from flockd.sim.truth_perception import RenderTruth, TruthPerception
+
+Swap = Callable[[Networks], "TruthPerception"]
+"""Puts the truth in the place of some networks."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stepped:
+    """What a drone's pilot did in a step."""
+
+    output: PilotOutput
+    key_frames: Sequence[KeyFrame]
+    """What it worked with, at half size; empty where that was not asked for, or where it saw nothing."""
+
+
+class Pilots:
+    """Pilots that share their networks and nothing else."""
+
+    def __init__(self, scenario: ScenarioConfig, drones: Sequence[int], swap: Swap | None) -> None:
+        """Of ``drones``, counted from 0. Raises ModelError."""
+        learned = load_networks(scenario.drone.perception)
+        self._truths = {} if swap is None else {i: swap(learned) for i in drones}
+        self._pilots = {
+            i: FlockPilot(scenario.drone_of(i), self._truths.get(i, learned), stopwatch=time.perf_counter)
+            for i in drones
+        }
+
+    def wait_until_ready(self) -> None:
+        """At once: they are."""
+
+    def step(
+        self, drone: int, frames: FrameSet, vehicle: VehicleState, truth: RenderTruth | None, *, pictured: bool
+    ) -> Stepped:
+        """One step of one drone. ``truth`` is what its frames show, for a swap; ``pictured``: with its key frames."""
+        if truth is not None:
+            self._truths[drone].show(truth)
+        trace = StepTrace() if pictured else None
+        output = self._pilots[drone].step(frames, vehicle, trace)
+        seen = [] if trace is None else capture(trace, output, drone)
+        return Stepped(output, [frame.at_half_size() for frame in seen])

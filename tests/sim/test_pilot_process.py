@@ -1,0 +1,88 @@
+"""A process of pilots ends with the simulator; where it ends before, or cannot begin, one sentence says so."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from flockd.config import Overrides, ScenarioConfig, load_scenario
+from flockd.data import data_path
+from flockd.errors import ModelError, UnavailableError
+from flockd.sim.pilot_process import PilotProcess
+from flockd.sim.pilots import Pilots
+from flockd.sim.swarm import fly
+from tests.sim.test_orphans import _until_gone
+
+FLIGHT = """\
+import os, sys
+from flockd.config import load_scenario
+from flockd.sim.pilot_process import PilotProcess
+process = PilotProcess(load_scenario(sys.argv[1]), [0], None)
+print(process.pid, flush=True)
+process.wait_until_ready()
+print("ready", flush=True)
+sys.stdin.read()
+"""
+PAPER = data_path("config") / "paper_flight.yaml"
+
+
+def scenario(**overrides: float | str) -> ScenarioConfig:
+    changes: Overrides = {"drone.perception.flow": "dis", **overrides}
+    return load_scenario(PAPER, changes)
+
+
+def test_one_that_was_killed_is_named_with_what_it_flew() -> None:
+    with PilotProcess(scenario(), [0, 2], None) as process:
+        os.kill(process.pid, signal.SIGKILL)
+        with pytest.raises(UnavailableError) as caught:
+            process.wait_until_ready()
+    assert str(caught.value) == (
+        "the process that flew drone1, drone3 was ended by SIGKILL; if nobody ended it, free some memory, and fly again"
+    )
+
+
+def test_what_a_configuration_lacks_is_told_as_in_one_process() -> None:
+    lacking = scenario(**{"drone.perception.depth": "no_such_model"})
+    with pytest.raises(ModelError) as here:
+        Pilots(lacking, [0], None)
+    with PilotProcess(lacking, [0], None) as process, pytest.raises(ModelError) as there:
+        process.wait_until_ready()
+    assert "no_such_model" in str(there.value)
+    assert str(there.value) == str(here.value)
+
+
+@pytest.mark.slow
+def test_it_ends_with_a_simulator_that_was_killed() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", FLIGHT, str(PAPER)],
+        cwd=Path(__file__).parents[2], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    ) as simulator:  # fmt: skip
+        assert simulator.stdout is not None
+        pid = int(simulator.stdout.readline())
+        assert simulator.stdout.readline() == "ready\n"
+        simulator.kill()
+    _until_gone([pid], timeout_s=60.0)
+
+
+@pytest.mark.slow
+def test_an_interrupted_flight_is_what_was_flown_and_leaves_no_process() -> None:
+    before = _children()
+
+    def interrupt(done: int, total: int) -> None:
+        if done == 3:
+            assert len(_children() - before) == 2
+            raise KeyboardInterrupt
+
+    log = fly(scenario(duration_s=5.0), processes=2, progress=interrupt).log
+    assert (len(log.time_s), log.metadata.interrupted) == (3, True)
+    assert _children() == before
+
+
+def _children() -> set[str]:
+    """Of this process, on any of its threads."""
+    return {pid for task in Path("/proc/self/task").iterdir() for pid in (task / "children").read_text().split()}
