@@ -23,6 +23,9 @@ from flockd.recording import Recorder
 from flockd.recording.reader import Recording
 from flockd.sim.start import with_drones
 from tests.recording.made_up import MODELS, MadeUpPilot, drone_config, record
+from tests.worlds import worlds_once
+
+__all__ = ["worlds_once"]
 
 Capture = pytest.CaptureFixture[str]
 

@@ -7,8 +7,9 @@ import numpy as np
 
 from flockd.messages import Float32Array, UInt8Array
 from tests.inference.conftest import copies
+from tests.worlds import worlds_once
 
-__all__ = ["copies"]
+__all__ = ["copies", "worlds_once"]
 
 
 def grey(image: UInt8Array) -> UInt8Array:

@@ -1,0 +1,5 @@
+"""Worlds are generated once."""
+
+from tests.worlds import worlds_once
+
+__all__ = ["worlds_once"]
