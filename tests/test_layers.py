@@ -24,6 +24,7 @@ MAY_IMPORT = {
     "image_header": set(),
     "printable": set(),
     "zenoh_session": {"errors"},
+    "side_process": {"errors"},
     "config": {"choices", "messages", "errors"},
     "geometry": BASE,
     "inference": BASE,
@@ -60,9 +61,10 @@ MAY_IMPORT = {
         "telemetry",
         "recording",
         "flight_log",
+        "side_process",
     }
     | {"sources", "autopilot"},  # real daemons are fed frames and given autopilots
-    "report": BASE | {"flocking", "flight_log"},
+    "report": BASE | {"flocking", "flight_log", "side_process"},
     "view": BASE | {"geometry", "perception", "pilot", "recording"},
     "daemon": BASE
     | {"obstacles"}

@@ -104,7 +104,9 @@ class PinholeCamera(Camera):
         points = np.asarray(points, dtype=np.float64)
         with np.errstate(divide="ignore", invalid="ignore"):
             inverse_z = np.where(points[:, 2] > 0.0, 1.0 / points[:, 2], np.nan)
-            normalised = np.stack([points[:, 0] * inverse_z, points[:, 1] * inverse_z], axis=1)
+            normalised = np.empty((len(points), 2))
+            np.multiply(points[:, 0], inverse_z, out=normalised[:, 0])
+            np.multiply(points[:, 1], inverse_z, out=normalised[:, 1])
             if self.distortion:
                 normalised = self._distort(normalised)
         return self._to_pixels(normalised)
@@ -136,7 +138,9 @@ class PinholeCamera(Camera):
         if self.distortion:
             normalised = self._undistort(normalised)
         depth = np.asarray(depth, dtype=np.float64)
-        return np.stack([normalised[:, 0] * depth, normalised[:, 1] * depth, depth], axis=1)
+        points = np.empty((len(normalised), 3))
+        points[:, 0], points[:, 1], points[:, 2] = normalised[:, 0] * depth, normalised[:, 1] * depth, depth
+        return points
 
     def _coefficients(self) -> tuple[float, float, float, float, float]:
         k1, k2, p1, p2 = self.distortion[:4]

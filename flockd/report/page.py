@@ -6,6 +6,7 @@ import base64
 import io
 import json
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +27,17 @@ from flockd.report.obstacle_figures import in_the_way, obstacle_figure
 from flockd.report.page_texts import page_texts
 from flockd.report.style import colour_of
 from flockd.report.trajectories import trajectories
+from flockd.side_process import SideProcess, shared
 
 
-def write_report(directory: Path, progress: Callable[[int, int], None] = lambda done, total: None) -> Path:
+def write_report(
+    directory: Path, progress: Callable[[int, int], None] = lambda done, total: None, processes: int = 1
+) -> Path:
     """Write `report.html` and `figures/*.png` into a flight's folder and return the page's path.
 
     The folder holds `flight.npz` (FlightLog), `summary.json` (of `summarise`) and, if key frames were kept,
-    `filmstrip.npz`. Raises FileNotFoundError if one of the first two is missing.
+    `filmstrip.npz`. Figures are drawn in as many ``processes``, of which this is one. Raises FileNotFoundError if one
+    of the first two is missing.
     """
     for name in ("flight.npz", "summary.json"):
         if not (directory / name).is_file():
@@ -47,17 +52,23 @@ def write_report(directory: Path, progress: Callable[[int, int], None] = lambda 
     for old in folder.glob("*.png"):
         old.unlink()
     drawings = _DRAWINGS_OF_TRUTH if log.has_truth else _DRAWINGS_OF_ACCOUNT
-    total = len(drawings) + len(frames)
+    shapes = [(name, narrow) for name in drawings for narrow in (False, True)]
+    # As files only the first drone's: 1.4 MB each.
+    files = [folder / f"filmstrip_{number}.png" for number in range(1, len(frames) + 1)]
+    strips = [
+        (frame, file if frame.drone == frames[0].drone else None) for frame, file in zip(frames, files, strict=True)
+    ]
+    draw = _Drawings(log, folder)
+    with ExitStack() as stack:
+        helpers = [
+            stack.enter_context(SideProcess("drew figures", _Drawings, log, folder)) for _ in range(1, processes)
+        ]
+        drawn = shared([*shapes, *strips], draw, helpers, progress)
     embedded: dict[str, Markup | None] = {"trajectories": None, "obstacles": None, "errors": None}
-    for number, (name, (draw, file, description)) in enumerate(drawings.items()):
-        progress(number, total)
-        embedded[name] = _embed(log, draw, folder / f"{file}.png", description)
-    plates = []
-    for number, frame in enumerate(frames, start=1):
-        progress(len(drawings) + number - 1, total)
-        # As files only the first drone's: 1.4 MB each.
-        path = folder / f"filmstrip_{number}.png" if frame.drone == frames[0].drone else None
-        plates.append(_plate(frame, path))
+    for (name, _), element in zip(shapes, drawn, strict=False):
+        if element is not None:
+            embedded[name] = Markup("\n").join(part for part in (embedded.get(name), element) if part)
+    plates = drawn[len(shapes) :]
     page = _template().render(
         **page_texts(summary, log),
         **embedded,
@@ -66,7 +77,6 @@ def write_report(directory: Path, progress: Callable[[int, int], None] = lambda 
         player=Markup(_flight_data(log)) if log.has_truth else None,
         script=Markup((Path(__file__).parent / "report.js").read_text(encoding="utf-8")),
     )
-    progress(total, total)
     path = directory / "report.html"
     path.write_text(page, encoding="utf-8")
     return path
@@ -119,26 +129,40 @@ _MAX_SVG_BYTES = 700_000
 """Long flights of many drones make SVG elements larger than the PNG file."""
 
 
-def _embed(log: FlightLog, draw: _Draw, path: Path, description: str) -> Markup | None:
-    """Writes the figure's PNG. For the page, drawings for a wide and for a narrow window, or PNGs if those are less."""
-    parts = []
-    for narrow in (False, True):
-        figure = draw(log, narrow=narrow)
-        if figure is None:
-            return None
-        kind = "narrow" if narrow else "wide"
-        element = inline_svg(figure, f"{path.stem}-{kind}", description)
-        figure.set_layout_engine("none")  # everything has its place now, and finding it again takes as long as drawing
-        large = len(element) > _MAX_SVG_BYTES
-        if large or not narrow:
-            image = io.BytesIO()
-            figure.savefig(image, format="png")
-            if not narrow:
-                path.write_bytes(image.getvalue())
-            if large:
-                element = f'<img src="{_data_url("image/png", image.getvalue())}" alt="{description}">'
-        parts.append(f'<div class="{kind}">{element}</div>')
-    return Markup("\n".join(parts))  # drawn here, from numbers
+class _Drawings:
+    """Draws what it is asked for."""
+
+    def __init__(self, log: FlightLog, folder: Path) -> None:
+        """PNG files go to the folder."""
+        self._log, self._folder = log, folder
+
+    def __call__(self, what: str | KeyFrame, how: bool | Path | None) -> Markup | dict[str, Any] | None:
+        """A figure by its name, for a narrow window or a wide one, or a key frame's plate with a file or without."""
+        if isinstance(what, KeyFrame):
+            assert not isinstance(how, bool)
+            return _plate(what, how)
+        drawings = _DRAWINGS_OF_TRUTH if self._log.has_truth else _DRAWINGS_OF_ACCOUNT
+        draw, file, description = drawings[what]
+        return _embed(self._log, draw, self._folder / f"{file}.png", description, narrow=bool(how))
+
+
+def _embed(log: FlightLog, draw: _Draw, path: Path, description: str, *, narrow: bool) -> Markup | None:
+    """A drawing for a wide or for a narrow window, or a PNG if that is less; the wide one also as a PNG file."""
+    figure = draw(log, narrow=narrow)
+    if figure is None:
+        return None
+    kind = "narrow" if narrow else "wide"
+    element = inline_svg(figure, f"{path.stem}-{kind}", description)
+    figure.set_layout_engine("none")  # everything has its place now, and finding it again takes as long as drawing
+    large = len(element) > _MAX_SVG_BYTES
+    if large or not narrow:
+        image = io.BytesIO()
+        figure.savefig(image, format="png")
+        if not narrow:
+            path.write_bytes(image.getvalue())
+        if large:
+            element = f'<img src="{_data_url("image/png", image.getvalue())}" alt="{description}">'
+    return Markup(f'<div class="{kind}">{element}</div>')  # drawn here, from numbers
 
 
 def _plate(frame: KeyFrame, file: Path | None) -> dict[str, Any]:

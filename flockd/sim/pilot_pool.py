@@ -12,7 +12,7 @@ from typing import Self
 from flockd.config.scenario import ScenarioConfig
 from flockd.geometry import build_rig
 from flockd.messages import FrameSet, VehicleState
-from flockd.sim.pilot_process import PilotProcess
+from flockd.side_process import SideProcess
 from flockd.sim.pilots import Pilots, Stepped
 from flockd.sim.truth_perception import RenderTruth, TruthPerception
 
@@ -31,16 +31,18 @@ class PilotPool:
         self._shares = [self.drones[first::count] for first in range(count)]
         self._scenario = scenario
         self._swap = partial(TruthPerception, swap=swap, rig=build_rig(scenario.drone.rig)) if swap else None
-        self._homes: list[Pilots | PilotProcess] = []
+        self._processes: list[SideProcess] = []
+        self._here: Pilots | None = None
         self._stack = ExitStack()
         self._threads = [ThreadPoolExecutor(1, thread_name_prefix="pilots") for _ in self._shares]
 
     def __enter__(self) -> Self:
         """Starts the processes, which load their networks while the caller goes on."""
         with ExitStack() as stack:
-            if len(self._shares) > 1:
-                for share in self._shares:
-                    self._homes.append(stack.enter_context(PilotProcess(self._scenario, share, self._swap)))
+            for share in self._shares if len(self._shares) > 1 else ():
+                names = ", ".join(f"drone{drone + 1}" for drone in share)
+                process = SideProcess(f"flew {names}", Pilots, self._scenario, share, self._swap)
+                self._processes.append(stack.enter_context(process))
             self._stack = stack.pop_all()
         return self
 
@@ -53,15 +55,15 @@ class PilotPool:
 
     def wait_until_ready(self) -> None:
         """Until all networks are loaded. Raises ModelError, and UnavailableError when a process has ended."""
-        if not self._homes:
-            self._homes.append(Pilots(self._scenario, self.drones, self._swap))
-        for home in self._homes:
-            home.wait_until_ready()
+        if not self._processes:
+            self._here = Pilots(self._scenario, self.drones, self._swap)
+        for process in self._processes:
+            process.wait_until_ready()
 
     def step(
         self, drone: int, frames: FrameSet, vehicle: VehicleState, truth: RenderTruth, *, pictured: bool
     ) -> Future[Stepped]:
-        """See `Pilots.step`; what it gives is there once the drone's process has come to it."""
-        home = self.drones.index(drone) % len(self._homes)
-        shown = truth if self._swap else None
-        return self._threads[home].submit(self._homes[home].step, drone, frames, vehicle, shown, pictured=pictured)
+        """Of a drone's pilot, see `Pilots`; it is there once the drone's process has come to it."""
+        place = self.drones.index(drone) % len(self._shares)
+        pilots = self._here or self._processes[place].ask
+        return self._threads[place].submit(pilots, drone, frames, vehicle, truth if self._swap else None, pictured)

@@ -42,11 +42,8 @@ class Pilots:
             for i in drones
         }
 
-    def wait_until_ready(self) -> None:
-        """At once: they are."""
-
-    def step(
-        self, drone: int, frames: FrameSet, vehicle: VehicleState, truth: RenderTruth | None, *, pictured: bool
+    def __call__(
+        self, drone: int, frames: FrameSet, vehicle: VehicleState, truth: RenderTruth | None, pictured: bool
     ) -> Stepped:
         """One step of one drone. ``truth`` is what its frames show, for a swap; ``pictured``: with its key frames."""
         if truth is not None:

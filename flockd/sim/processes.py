@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
 
-import flockd
+from flockd.side_process import with_package
 from flockd.sim.bound_to_parent import bound
 
 END_S = 30.0
@@ -108,14 +108,6 @@ class Programs:
                 except subprocess.TimeoutExpired:
                     os.killpg(program.process.pid, signal.SIGKILL)
                     program.process.wait()
-
-
-def with_package(environment: Mapping[str, str]) -> dict[str, str]:
-    """The environment, in which Python finds this package wherever it runs."""
-    package, known = str(Path(flockd.__file__).parents[1]), environment.get("PYTHONPATH")
-    if known and package in known.split(os.pathsep):
-        return dict(environment)
-    return {**environment, "PYTHONPATH": f"{package}{os.pathsep}{known}" if known else package}
 
 
 @contextmanager

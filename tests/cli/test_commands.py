@@ -362,7 +362,7 @@ def test_each_flight_has_its_own_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("flockd.report.flight_folder.write_report", lambda folder, progress: folder)
+    monkeypatch.setattr("flockd.report.flight_folder.write_report", lambda folder, progress, processes: folder)
     for expected in ("", "-2", "-3"):
         assert main(["sim", "--perception", "truth", "--duration", "2", "--quiet"]) == 0
         assert capsys.readouterr().out == f"out/paper_flight-truth-seed0{expected}/report.html\n"
@@ -382,7 +382,7 @@ def test_an_interrupted_flight_leaves_its_report_and_can_be_flown_again(
         step(vehicles, *arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Vehicles, "step", interrupted)
-    monkeypatch.setattr("flockd.report.flight_folder.write_report", lambda folder, progress: folder)
+    monkeypatch.setattr("flockd.report.flight_folder.write_report", lambda folder, progress, processes: folder)
     folder = tmp_path / "flight"
     command = ["sim", "--perception", "truth", "--duration", "20", "--quiet", "--out", str(folder)]
     assert main(command) == 130

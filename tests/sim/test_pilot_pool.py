@@ -13,7 +13,7 @@ import pytest
 from flockd.config import Overrides, ScenarioConfig, load_scenario
 from flockd.data import data_path
 from flockd.errors import ModelError, UnavailableError
-from flockd.sim.pilot_process import PilotProcess
+from flockd.side_process import SideProcess
 from flockd.sim.pilots import Pilots
 from flockd.sim.swarm import fly
 from tests.sim.test_orphans import _until_gone
@@ -21,8 +21,9 @@ from tests.sim.test_orphans import _until_gone
 FLIGHT = """\
 import os, sys
 from flockd.config import load_scenario
-from flockd.sim.pilot_process import PilotProcess
-process = PilotProcess(load_scenario(sys.argv[1]), [0], None)
+from flockd.side_process import SideProcess
+from flockd.sim.pilots import Pilots
+process = SideProcess("flew", Pilots, load_scenario(sys.argv[1]), [0], None)
 print(process.pid, flush=True)
 process.wait_until_ready()
 print("ready", flush=True)
@@ -37,12 +38,12 @@ def scenario(**overrides: float | str) -> ScenarioConfig:
 
 
 def test_one_that_was_killed_is_named_with_what_it_flew() -> None:
-    with PilotProcess(scenario(), [0, 2], None) as process:
+    with SideProcess("flew drone1, drone3", Pilots, scenario(), [0, 2], None) as process:
         os.kill(process.pid, signal.SIGKILL)
         with pytest.raises(UnavailableError) as caught:
             process.wait_until_ready()
     assert str(caught.value) == (
-        "the process that flew drone1, drone3 was ended by SIGKILL; if nobody ended it, free some memory, and fly again"
+        "the process that flew drone1, drone3 was ended by SIGKILL; if nobody ended it, free some memory, and try again"
     )
 
 
@@ -50,7 +51,7 @@ def test_what_a_configuration_lacks_is_told_as_in_one_process() -> None:
     lacking = scenario(**{"drone.perception.depth": "no_such_model"})
     with pytest.raises(ModelError) as here:
         Pilots(lacking, [0], None)
-    with PilotProcess(lacking, [0], None) as process, pytest.raises(ModelError) as there:
+    with SideProcess("flew drone1", Pilots, lacking, [0], None) as process, pytest.raises(ModelError) as there:
         process.wait_until_ready()
     assert "no_such_model" in str(there.value)
     assert str(there.value) == str(here.value)
