@@ -337,6 +337,19 @@ def test_a_flock_that_falls_apart_is_not_praised(tmp_path: Path) -> None:
     assert "but did not stay one flock" in _report(tmp_path, log)
 
 
+@pytest.mark.slow
+def test_however_many_processes_draw_it_the_report_is_the_same(tmp_path: Path) -> None:
+    one, two = tmp_path / "one", tmp_path / "two"
+    for folder, processes in ((one, 1), (two, 3)):
+        folder.mkdir()
+        _report(folder, _flight(drones=2, duration_s=5.0), _moment(), replace(_moment(), drone=5))
+        write_report(folder, processes=processes)
+    names = sorted(path.relative_to(one) for path in one.rglob("*") if path.suffix in {".html", ".png"})
+    assert len(names) == 5, "the page, three figures and the first drone's key frame"
+    for name in names:
+        assert (one / name).read_bytes() == (two / name).read_bytes(), name
+
+
 def test_a_folder_without_a_flight_is_refused_in_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"flight\.npz is missing"):
         write_report(tmp_path)

@@ -1,4 +1,4 @@
-"""A process of pilots ends with the simulator; where it ends before, or cannot begin, one sentence says so."""
+"""Processes of pilots end with the simulator; where one cannot begin or ends before, one sentence says so."""
 
 from __future__ import annotations
 
@@ -37,16 +37,6 @@ def scenario(**overrides: float | str) -> ScenarioConfig:
     return load_scenario(PAPER, changes)
 
 
-def test_one_that_was_killed_is_named_with_what_it_flew() -> None:
-    with SideProcess("flew drone1, drone3", Pilots, scenario(), [0, 2], None) as process:
-        os.kill(process.pid, signal.SIGKILL)
-        with pytest.raises(UnavailableError) as caught:
-            process.wait_until_ready()
-    assert str(caught.value) == (
-        "the process that flew drone1, drone3 was ended by SIGKILL; if nobody ended it, free some memory, and try again"
-    )
-
-
 def test_what_a_configuration_lacks_is_told_as_in_one_process() -> None:
     lacking = scenario(**{"drone.perception.depth": "no_such_model"})
     with pytest.raises(ModelError) as here:
@@ -81,6 +71,19 @@ def test_an_interrupted_flight_is_what_was_flown_and_leaves_no_process() -> None
 
     log = fly(scenario(duration_s=5.0), processes=2, progress=interrupt).log
     assert (len(log.time_s), log.metadata.interrupted) == (3, True)
+    assert _children() == before
+
+
+@pytest.mark.slow
+def test_a_flight_ends_in_one_sentence_when_a_process_of_its_pilots_is_killed() -> None:
+    before = _children()
+
+    def kill(done: int, total: int) -> None:
+        if done == 1:
+            os.kill(int(max(_children() - before, key=int)), signal.SIGKILL)
+
+    with pytest.raises(UnavailableError, match="the process that flew drone2, drone4 was ended by SIGKILL"):
+        fly(scenario(duration_s=5.0), processes=2, progress=kill)
     assert _children() == before
 
 
