@@ -54,6 +54,8 @@ NEIGHBOUR_M, PILOTS_NEIGHBOUR_M = 2.0, 1.0
 would keep away from it there, for ever, so that it flies as if alone."""
 STRETCHES = 20
 SAMPLES, MIN_SAMPLES = 400, 40
+MOST_STEPS = 8
+"""From one sample to the next: a run that is bounded in time may end after few."""
 SAMPLE_S = 2.0
 DAEMON_MINUTES = 60.0
 PATIENCE_S = 600.0
@@ -180,7 +182,7 @@ def soak_pilot(steps: int, minutes: float) -> tuple[int, dict[str, list[float]]]
         poses, velocity = round_trip(number / ROUND_STEPS)
         scenes.append((cameras.capture(0, number, 0.0, poses)[0], velocity / (ROUND_STEPS * period_s)))
     samples: dict[str, list[float]] = {}
-    every, took_s = min(max(steps // SAMPLES, 1), ROUND_STEPS), 0.0
+    every, took_s = min(max(steps // SAMPLES, 1), MOST_STEPS), 0.0
     until_s = time.monotonic() + 60.0 * minutes
     for number in range(steps):
         if time.monotonic() > until_s and number >= MIN_SAMPLES * every:
