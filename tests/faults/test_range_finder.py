@@ -21,7 +21,7 @@ from tests.autopilot.conftest import HOVER_M
 from tests.autopilot.flight import until
 from tests.daemon.aboard import SECONDS_TO_FAIL
 from tests.faults.catalogue import RecordProperty, reacted
-from tests.faults.process import Process, flying
+from tests.faults.process import Process, drone, started
 from tests.starvation import tell
 
 pytestmark = pytest.mark.slow
@@ -53,8 +53,13 @@ def _by(source: HeightSource) -> Callable[[DroneConfig], DroneConfig]:
     return change
 
 
-async def _is_used(process: Process) -> None:
-    """Steps were made with a range; nothing is wrong with the newest."""
+async def _flies_by_range(process: Process) -> None:
+    """In offboard, at whatever speed; steps were made with a range, and nothing is wrong with the newest."""
+    await started(process)
+    await process.is_ready_in_the_air()
+    await until(lambda: len(process.fake_autopilot.setpoints) > 5, SECONDS_TO_FAIL)
+    process.fake_autopilot.pilot_selects("OFFBOARD")
+    await process.until_state("normal", "degraded")
     steps = process.heard()["computer"].message["steps"]
     await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
     heights = [event for event in process.events if event.startswith("height: ")]
@@ -72,8 +77,8 @@ def test_the_range_finder_lies(
     sensor = _Lying()
 
     async def story() -> None:
-        async with flying(tmp_path, change=_by("best"), range_finder=sensor) as process:
-            await _is_used(process)
+        async with drone(tmp_path, change=_by("best"), range_finder=sensor) as process:
+            await _flies_by_range(process)
             autopilot, told = process.fake_autopilot, len(process.events)
             sensor.lie = lie
             if climbs:
@@ -101,8 +106,8 @@ def test_without_the_barometer_a_lie_is_no_scale_and_ends_in_hold(
     sensor = _Lying()
 
     async def story() -> None:
-        async with flying(tmp_path, change=_by("range_finder"), range_finder=sensor) as process:
-            await _is_used(process)
+        async with drone(tmp_path, change=_by("range_finder"), range_finder=sensor) as process:
+            await _flies_by_range(process)
             sensor.lie = lambda range_m: 0.3
             fault_s = time.monotonic()
             await process.until_event(f"{LIE}; there is no scale")
