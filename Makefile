@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help demo docs lint test test-all mutate mutate-all references lock sbom clean
+.PHONY: help demo docs lint test test-all coverage mutate mutate-all references lock sbom clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -27,6 +27,10 @@ test: lint ## lint and all tests but the slow ones, on two cores in under 10 min
 
 test-all: lint ## lint and all tests, those too that take minutes each
 	$(BIN)/python -m pytest -n 2
+
+coverage: $(VENV)/test.installed ## which branches of the safety layer its tests take; fails below all of them
+	$(BIN)/python -m coverage run --branch --source=flockd/safety -m pytest tests/safety
+	$(BIN)/python -m coverage report --show-missing --fail-under=100
 
 mutate: $(VENV)/test.installed ## try the safety layer's tests on a sample of its mutants, in about a minute
 	$(BIN)/python -m tools.mutate_safety --sample 60

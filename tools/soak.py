@@ -1,6 +1,7 @@
 """Run for long and see what grows: the pilot's steps, or a whole daemon.
 
 python -m tools.soak --steps 100000              # the pilot with the shipped networks on small images
+python -m tools.soak --steps 100000 --minutes 80 # as many of them as this computer does in that time
 python -m tools.soak --daemon --minutes 60       # a real `flockd run`, a fake autopilot, rendered frames
 python -m tools.soak --steps 5000 --json
 python -m tools.soak --daemon --samples soak.csv # each sample too, to draw the curve
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import ctypes
 import json
 import os
 import socket
@@ -51,11 +53,22 @@ NEIGHBOUR_M, PILOTS_NEIGHBOUR_M = 2.0, 1.0
 """How far away the other drone is. In images as small as this it is detected up to a metre; a daemon that really flies
 would keep away from it there, for ever, so that it flies as if alone."""
 STRETCHES = 20
-SAMPLES = 400
+SAMPLES, MIN_SAMPLES = 400, 40
+MOST_STEPS = 8
+"""From one sample to the next: a run that is bounded in time may end after few."""
 SAMPLE_S = 2.0
+DAEMON_MINUTES = 60.0
 PATIENCE_S = 600.0
 """For the daemon to become ready: a busy computer compiles the renderer for minutes."""
-ALLOWED = {"memory, MB": 0.03, "own memory, MB": 0.03, "descriptors": 0.02, "threads": 0.02, "step, ms": 0.15}
+MALLINFO = ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost")
+ALLOWED = {
+    "memory, MB": 0.03,
+    "own memory, MB": 0.03,
+    "python blocks": 0.01,
+    "descriptors": 0.02,
+    "threads": 0.02,
+    "step, ms": 0.15,
+}
 """Growth over the run, as a share of the mean, that is noise; of any other quantity, none is judged."""
 
 
@@ -146,8 +159,22 @@ def follower(place: FloatArray, velocity: FloatArray, rotation: FloatArray, dist
     return Poses(np.stack([place, place + beside]), np.stack([velocity, velocity]), np.stack([rotation, rotation]))
 
 
-def soak_pilot(steps: int) -> dict[str, list[float]]:
-    """Samples of each quantity."""
+class _Malloc(ctypes.Structure):
+    """glibc's ``struct mallinfo2``."""
+
+    _fields_ = tuple((name, ctypes.c_size_t) for name in MALLINFO)
+
+
+def allocated() -> dict[str, float]:
+    """What this process has asked for and not given back: memory that grows without it is kept by the allocator."""
+    mallinfo2 = ctypes.CDLL(None).mallinfo2  # of all arenas; glibc from 2.33 on
+    mallinfo2.restype = _Malloc
+    told = mallinfo2()
+    return {"malloc in use, MB": 1e-6 * (told.uordblks + told.hblkhd), "python blocks": float(sys.getallocatedblocks())}
+
+
+def soak_pilot(steps: int, minutes: float) -> tuple[int, dict[str, list[float]]]:
+    """How many steps were made in the time, and samples of each quantity."""
     world = scenario()
     cameras, pilot, period_s = CameraSimulator(world), FlockPilot(world.drone), world.drone.step_s
     scenes = []
@@ -155,8 +182,11 @@ def soak_pilot(steps: int) -> dict[str, list[float]]:
         poses, velocity = round_trip(number / ROUND_STEPS)
         scenes.append((cameras.capture(0, number, 0.0, poses)[0], velocity / (ROUND_STEPS * period_s)))
     samples: dict[str, list[float]] = {}
-    every, took_s = max(steps // SAMPLES, 1), 0.0
+    every, took_s = min(max(steps // SAMPLES, 1), MOST_STEPS), 0.0
+    until_s = time.monotonic() + 60.0 * minutes
     for number in range(steps):
+        if time.monotonic() > until_s and number >= MIN_SAMPLES * every:
+            return number, samples
         seen, velocity = scenes[number % ROUND_STEPS]
         time_s = 1000.0 + number * period_s
         frames = {name: Frame(name, frame.image, time_s, number) for name, frame in seen.frames.items()}
@@ -167,13 +197,14 @@ def soak_pilot(steps: int) -> dict[str, list[float]]:
         if (number + 1) % every == 0:
             facts = {
                 **process_facts(os.getpid()),
+                **allocated(),
                 "step, ms": 1e3 * took_s / every,
                 "tracks": float(len(output.neighbours)),
                 "detections": float(len(output.detections)),
             }
             _add(samples, facts)
             took_s = 0.0
-    return samples
+    return steps, samples
 
 
 def _add(samples: dict[str, list[float]], facts: Mapping[str, float]) -> None:
@@ -279,11 +310,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=5000, help="of the pilot (default: 5000)")
     parser.add_argument("--daemon", action="store_true", help="a whole daemon instead")
-    parser.add_argument("--minutes", type=float, default=60.0, help="of the daemon (default: 60)")
+    parser.add_argument("--minutes", type=float, help="of the daemon (default: 60), or the most that steps may take")
     parser.add_argument("--samples", type=Path, metavar="FILE", help="write every sample to a CSV file")
     parser.add_argument("--json", action="store_true", help="print the slopes as JSON")
     args = parser.parse_args()
-    samples = soak_daemon(args.minutes) if args.daemon else soak_pilot(args.steps)
+    if args.daemon:
+        minutes = args.minutes or DAEMON_MINUTES
+        what, samples = f"{minutes:g} minutes of a daemon", soak_daemon(minutes)
+    else:
+        done, samples = soak_pilot(args.steps, args.minutes or np.inf)
+        what = f"{done} steps of the pilot"
     if args.samples is not None:
         with args.samples.open("w", encoding="utf-8", newline="") as file:
             csv.writer(file).writerows([samples.keys(), *zip(*samples.values(), strict=True)])
@@ -291,7 +327,6 @@ def main() -> int:
     if args.json:
         print(json.dumps({name: asdict(slope) for name, slope in slopes.items()}, indent=1))
     else:
-        what = f"{args.minutes:g} minutes of a daemon" if args.daemon else f"{args.steps} steps of the pilot"
         print(f"{what}, {len(next(iter(samples.values())))} samples")
         print(f"{'':20}{'warm-up':>10}{'first':>10}{'last':>10}{'growth after the warm-up, 95 %':>34}")
         for name, one in slopes.items():

@@ -92,7 +92,14 @@ class RangeFinderParameters(Section):
     """So long after the last good reading the ground is expected where it was, with its slope and the own motion."""
     gate_sigma: Positive = 4.0
     """A reading farther from the expected ground, in standard deviations, is that of something else: a crate, another
-    drone, a hole. The second in a row is believed."""
+    drone, a hole. The second in a row is believed, if it does not contradict the height as the next three say."""
+    max_slope: Annotated[float, Field(ge=0, le=2)] = 0.25
+    """Between two places of the last `compare_s`, the ground rises by no more than this for each metre between them,
+    ..."""
+    tolerance_m: Annotated[float, Field(gt=0, le=100)] = 1.0
+    """... this for a step in it and the barometer's drift, and `gate_sigma` of the range. Where ranges and the
+    barometer's height say that it does, the range finder is not believed."""
+    compare_s: Annotated[float, Field(gt=0, le=120)] = 15.0
 
 
 class PerceptionConfig(Section):

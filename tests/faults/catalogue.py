@@ -417,5 +417,15 @@ CATALOGUE = (
         ),
         within_s=6.0,
     ),
+    Fault(
+        47, "range-finder-lies", "the range finder is stuck, something hangs in its beam, or its readings jump",
+        "the barometer's height is used, and an event says so; without it no scale, then Hold",
+        (
+            f"{_HERE}range_finder.py::test_the_range_finder_lies",
+            f"{_HERE}range_finder.py::test_without_the_barometer_a_lie_is_no_scale_and_ends_in_hold",
+            "tests/perception/depth/test_contradiction.py",
+        ),
+        within_s=3.0,
+    ),
 )
 # fmt: on

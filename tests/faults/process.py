@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from flockd.autopilot.fake_autopilot import FakeAutopilot
+from flockd.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.config import DroneConfig
 from flockd.messages import UInt8Array
 from flockd.sim.daemons import Daemons
@@ -84,6 +85,7 @@ async def drone(
     change: Callable[[DroneConfig], DroneConfig] = lambda config: config,
     height_m: float = HOVER_M,
     environment: Mapping[str, str] | None = None,
+    range_finder: FakeRangeFinder | None = None,
 ) -> AsyncIterator[Process]:
     """A daemon with the shipped networks, started beside a vehicle in the air; its recordings go to ``folder``.
 
@@ -94,6 +96,7 @@ async def drone(
         change: makes another configuration of the usual one.
         height_m: of the vehicle at the start; 0 for the ground.
         environment: beside this process's own.
+        range_finder: the autopilot's.
     """
     port, frames, telemetry = free_port(), free_endpoint(), free_endpoint()
     config = config_for(port, frames, telemetry)
@@ -102,7 +105,7 @@ async def drone(
     known = {**os.environ, **(environment or {})}
     try:
         with (
-            FakeAutopilot(port, height_m=height_m, heartbeat_s=HEARTBEAT_S) as autopilot,
+            FakeAutopilot(port, height_m=height_m, heartbeat_s=HEARTBEAT_S, range_finder=range_finder) as autopilot,
             Daemons([config], folder=folder, recordings=folder, environment=known) as daemons,
             watched(telemetry) as (watcher, session, events),
         ):
@@ -121,10 +124,13 @@ async def started(process: Process) -> None:
 
 @asynccontextmanager
 async def flying(
-    folder: Path, *, change: Callable[[DroneConfig], DroneConfig] = lambda config: config
+    folder: Path,
+    *,
+    change: Callable[[DroneConfig], DroneConfig] = lambda config: config,
+    range_finder: FakeRangeFinder | None = None,
 ) -> AsyncIterator[Process]:
     """The same, in offboard flight at cruise speed."""
-    async with drone(folder, change=change) as process:
+    async with drone(folder, change=change, range_finder=range_finder) as process:
         await started(process)
         await process.is_ready_in_the_air()
         await process.flies()

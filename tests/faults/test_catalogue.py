@@ -15,7 +15,7 @@ from tests.faults.catalogue import CATALOGUE, REACTION, Fault, fault_named, reac
 from tools.faults import outcome
 
 ROOT = Path(__file__).parents[2]
-ROWS = 46
+ROWS = 47
 FAULT = fault_named("sigterm")
 
 

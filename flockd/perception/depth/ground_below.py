@@ -16,6 +16,7 @@ import numpy as np
 from flockd.choices import HeightSource
 from flockd.config.perception import RangeFinderParameters
 from flockd.messages import FloatArray, GroundEstimate, RangeReading, VehicleState
+from flockd.perception.depth.contradiction import ContradictionMonitor, GroundPoint
 
 OF_HEIGHT = "height: "
 """How reasons begin that tell of the height's source."""
@@ -57,6 +58,7 @@ class GroundBelow:
         self._unexplained = 0
         self._flown = np.zeros(2)
         """North and east since the beginning, as the autopilot says."""
+        self._contradictions = ContradictionMonitor(parameters)
         self._track: deque[FloatArray] = deque(maxlen=TRACK_POINTS)
         """(3,) each: where a range hit the ground, north and east in that frame, and the ground's height there."""
 
@@ -93,6 +95,12 @@ class GroundBelow:
         along = np.array([0.0, 0.0, 1.0]) if reading.vertical else vehicle.R_ned_body[:, 2]
         point = reading.range_m * along
         ground_m = _height_at(reading.time_s, vehicle) - float(point[2])
+        place = GroundPoint(vehicle.time_s, self._flown + point[:2], ground_m, reading.range_m)
+        home = None if vehicle.position is None else self._flown - vehicle.position
+        if self._contradictions.update(place, home):
+            if self._contradictions.doubted:  # the readings before made the state false, too
+                self._forget()
+            return "the range contradicts the barometer"
         variance = (self._parameters.noise * reading.range_m) ** 2 + HEIGHT_NOISE_M**2
         row = np.array([1.0, point[0], point[1]])
         if self._state is not None and self._is_unexplained(row, ground_m, variance):
@@ -116,13 +124,16 @@ class GroundBelow:
 
     def _predict(self, vehicle: VehicleState) -> None:
         last, self._last = self._last, vehicle
-        if self._state is None or last is None:
+        if last is None:
             return
         way = _way(last, vehicle)
         if way is None or not 0.0 < vehicle.time_s - last.time_s <= LONGEST_GAP_S:
             self._forget()
+            self._contradictions.forget()
             return
         self._flown = self._flown + way
+        if self._state is None:
+            return
         onward = np.eye(3)
         onward[0, 1:] = way
         length_m = float(np.hypot(*way))

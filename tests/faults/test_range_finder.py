@@ -1,0 +1,122 @@
+"""A range finder that lies, while a whole drone flies: stuck, something in its beam, a jump."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flockd.autopilot.fake_range_finder import FakeRangeFinder, level_ground
+from flockd.autopilot.fake_vehicle import Demand
+from flockd.choices import HeightSource
+from flockd.config import DroneConfig
+from flockd.config.scenario import RangeFinderConfig
+from flockd.messages import FloatArray, RangeReading
+from tests.autopilot.conftest import HOVER_M
+from tests.autopilot.flight import until
+from tests.daemon.aboard import SECONDS_TO_FAIL
+from tests.faults.catalogue import RecordProperty, reacted
+from tests.faults.process import Process, drone, started
+from tests.starvation import tell
+
+pytestmark = pytest.mark.slow
+LIE, WORKS = "height: the range contradicts the barometer", "height: the range finder works again"
+NOTICED_M = 1.3
+"""A contradiction of a metre and 8 % of the range is noticed."""
+QUIET_S = 1.5
+
+
+class _Lying(FakeRangeFinder):
+    """Says what a story wants, with a full signal; the truth while that is None."""
+
+    lie: Callable[[float], float] | None = None
+
+    def __init__(self) -> None:
+        super().__init__(RangeFinderConfig(dropouts_per_min=0.0), level_ground, (0,))
+
+    def read(
+        self, time_s: float, position: FloatArray, velocity: FloatArray, R_ned_body: FloatArray
+    ) -> RangeReading | None:
+        reading, lie = super().read(time_s, position, velocity, R_ned_body), self.lie
+        return reading if reading is None or lie is None else replace(reading, range_m=lie(reading.range_m), quality=1)
+
+
+def _by(source: HeightSource) -> Callable[[DroneConfig], DroneConfig]:
+    def change(config: DroneConfig) -> DroneConfig:
+        return config.model_copy(update={"perception": config.perception.model_copy(update={"height": source})})
+
+    return change
+
+
+async def _flies_by_range(process: Process) -> None:
+    """In offboard, at whatever speed; steps were made with a range, and nothing is wrong with the newest."""
+    await started(process)
+    await process.is_ready_in_the_air()
+    await until(lambda: len(process.fake_autopilot.setpoints) > 5, SECONDS_TO_FAIL)
+    process.fake_autopilot.pilot_selects("OFFBOARD")
+    await process.until_state("normal", "degraded")
+    steps = process.heard()["computer"].message["steps"]
+    await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
+    heights = [event for event in process.events if event.startswith("height: ")]
+    assert not heights or heights[-1] == WORKS, heights
+
+
+@pytest.mark.parametrize(
+    ("lie", "climbs"),
+    [(lambda range_m: HOVER_M, True), (lambda range_m: 0.3, False), (lambda range_m: range_m + 3.0, False)],
+    ids=["stuck in a climb", "landing gear in the beam", "a jump"],
+)
+def test_the_range_finder_lies(
+    lie: Callable[[float], float], climbs: bool, tmp_path: Path, record_property: RecordProperty
+) -> None:
+    sensor = _Lying()
+
+    async def story() -> None:
+        async with drone(tmp_path, change=_by("best"), range_finder=sensor) as process:
+            await _flies_by_range(process)
+            autopilot, told = process.fake_autopilot, len(process.events)
+            sensor.lie = lie
+            if climbs:
+                autopilot._demand = lambda: Demand(np.zeros(2), -HOVER_M - 4.0, 0.0)  # type: ignore[method-assign]
+                await until(lambda: -autopilot.state.position[2] > HOVER_M + NOTICED_M, SECONDS_TO_FAIL)
+            fault_s = time.monotonic()
+            await process.until_event(f"{LIE}; the barometer's is used")
+            reacted(record_property, "range-finder-lies", time.monotonic() - fault_s)
+            assert WORKS not in process.events[told:]
+            steps = process.heard()["computer"].message["steps"]
+            await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
+            assert autopilot.mode == "OFFBOARD", "it flies on by the barometer"
+            assert process.state() in {"normal", "degraded"}
+            sensor.lie = None
+            await until(lambda: WORKS in process.events[told:], SECONDS_TO_FAIL)
+            limit_m_s = process.config.safety.gate.max_speed_m_s
+            assert all(np.linalg.norm(sent.velocity[:2]) <= limit_m_s + 1e-6 for _, sent in autopilot.setpoints)
+
+    tell(story)
+
+
+def test_without_the_barometer_a_lie_is_no_scale_and_ends_in_hold(
+    tmp_path: Path, record_property: RecordProperty
+) -> None:
+    sensor = _Lying()
+
+    async def story() -> None:
+        async with drone(tmp_path, change=_by("range_finder"), range_finder=sensor) as process:
+            await _flies_by_range(process)
+            sensor.lie = lambda range_m: 0.3
+            fault_s = time.monotonic()
+            await process.until_event(f"{LIE}; there is no scale")
+            reacted(record_property, "range-finder-lies", time.monotonic() - fault_s)
+            await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+            await process.until_event("silent: ")
+            sensor.lie = None
+            sent = len(process.fake_autopilot.setpoints)
+            await asyncio.sleep(QUIET_S)
+            assert len(process.fake_autopilot.setpoints) == sent, "no return by itself"
+
+    tell(story)
