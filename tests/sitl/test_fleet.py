@@ -174,8 +174,8 @@ def test_without_px4_it_says_what_to_do(
     [
         (["--speed-factor", "0.5"], "--speed-factor is for real daemons; drop it, or name their --autopilot"),
         (
-            ["--autopilot", "standin", "--speed-factor", "0.05"],
-            "--speed-factor 0.05 is not from 0.1 to 10; choose another",
+            ["--autopilot", "standin", "--speed-factor", "0.01"],
+            "--speed-factor 0.01 is not from 0.02 to 10; choose another",
         ),
         (
             ["--autopilot", "standin", "--perception", "truth"],
