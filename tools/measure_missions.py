@@ -4,9 +4,9 @@
     python -m tools.measure_missions config/one_knows.yaml --seeds 10 --gust 0.3
 
 Each seed moves every start by up to half a metre and draws other gusts; seed 0 of --jitter 0 is the scenario as it is.
-A waypoint's distance is the nearest that the true middle of the flock came to it, in order of the waypoints. Order is of
-the flock under way: until its middle has come to the last waypoint, where it slows down and holds, and directions are
-those of the gusts.
+A waypoint's distance is the nearest that the true middle of the flock came to it, in order of the waypoints. Order is
+of the flock under way: until its middle has come to the last waypoint. There it slows down and holds, and the directions
+are those of the gusts.
 """
 
 from __future__ import annotations

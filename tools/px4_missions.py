@@ -77,7 +77,7 @@ class Row:
     time_s: float | None
     """From the beginning of the flight to when it was there first."""
     error_m: float
-    """Of the flock's middle, or of the drone that is flown by hand: the nearest it came; of the last goal at the end."""
+    """Of the flock's middle, or of the drone flown by hand: the nearest that it came; to the last goal, at the end."""
     farthest_m: float
     """From there to the farthest drone, at the end of the way there."""
     closest_m: float
@@ -109,7 +109,9 @@ class Order:
         return "" if self._sent is None else self._sent.communicate(timeout=ORDER_ANSWER_S)[0].strip()
 
 
-def fly(mission: Mission, kind: AutopilotKind, speed_factor: float, out: Path, told: Callable[[str], None]) -> list[Row]:
+def fly(
+    mission: Mission, kind: AutopilotKind, speed_factor: float, out: Path, told: Callable[[str], None]
+) -> list[Row]:
     """One flight, with its report in the new folder ``out``; its goals, in order. Raises FlockdError."""
     scenario = load_scenario(data_path("config") / mission.scenario, {"duration_s": mission.duration_s})
     scenario = with_drones(scenario, mission.drones)
@@ -150,9 +152,7 @@ def rows(mission: Mission, scenario: ScenarioConfig, log: FlightLog) -> list[Row
     return _rows(plan.mean(axis=1), plan, np.array(list(dict.fromkeys(map(tuple, goals)))), log.time_s, common)
 
 
-def _rows(
-    led: FloatArray, plan: FloatArray, goals: FloatArray, times: FloatArray, common: dict[str, Any]
-) -> list[Row]:
+def _rows(led: FloatArray, plan: FloatArray, goals: FloatArray, times: FloatArray, common: dict[str, Any]) -> list[Row]:
     """Of `led` (S, 2) m, which flies to the goals (n, 2) m in order, and of all drones at `plan` (S, N, 2) m."""
     found, since = [], 0
     for number, goal in enumerate(goals):

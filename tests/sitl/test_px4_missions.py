@@ -35,7 +35,9 @@ def _log(plan: np.ndarray, goal: np.ndarray, modes: dict[str, list[str]]) -> Any
     fleet = SimpleNamespace(modes=modes)
     position = np.concatenate([plan, np.full((*plan.shape[:2], 1), -4.0)], axis=-1)
     times = 0.5 * np.arange(len(plan))
-    return cast("Any", SimpleNamespace(position=position, goal=goal, time_s=times, metadata=SimpleNamespace(fleet=fleet)))
+    return cast(
+        "Any", SimpleNamespace(position=position, goal=goal, time_s=times, metadata=SimpleNamespace(fleet=fleet))
+    )
 
 
 def test_each_goal_of_a_flight_has_a_row() -> None:
