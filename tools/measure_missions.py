@@ -5,8 +5,8 @@
 
 Each seed moves every start by up to half a metre and draws other gusts; seed 0 of --jitter 0 is the scenario as it is.
 A waypoint's distance is the nearest that the true middle of the flock came to it, in order of the waypoints. Order is
-of the flock under way: until its middle has come to the last waypoint. There it slows down and holds, and the directions
-are those of the gusts.
+of the flock under way: until its middle has come to the last waypoint. There it slows down and holds, and
+directions are those of the gusts.
 """
 
 from __future__ import annotations
