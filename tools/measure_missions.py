@@ -97,8 +97,9 @@ def measured(scenario: ScenarioConfig) -> dict[str, Any]:
     }
 
 
-def _mean(values: Sequence[float] | FloatArray) -> float | None:
-    return round(float(np.mean(values)), 4) if len(values) and None not in values else None
+def _mean(values: Sequence[float | None] | FloatArray) -> float | None:
+    known = [value for value in values if value is not None]
+    return round(float(np.mean(known)), 4) if known else None
 
 
 def _waypoints(scenario: ScenarioConfig) -> FloatArray:

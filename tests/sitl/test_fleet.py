@@ -218,7 +218,7 @@ def test_a_person_flies_one_drone_by_its_sticks_in_position_mode() -> None:
         GroundStation([port], time.monotonic) as station,
         FakeAutopilot(free_port(), height_m=2.0, yaw_rad=0.7, truth_port=port) as fake_autopilot,
     ):
-        fake_autopilot.parameters["MPC_VEL_MANUAL"] = FULL_STICK_M_S
+        fake_autopilot.parameters |= {"MPC_VEL_MANUAL": FULL_STICK_M_S, "MAN_DEADZONE": 0.0}
         until_s = time.monotonic() + 10.0
         while not station.is_connected(0):
             assert time.monotonic() < until_s
