@@ -4,13 +4,16 @@
     python -m tools.measure_missions config/one_knows.yaml --seeds 10 --gust 0.3
 
 Each seed moves every start by up to half a metre and draws other gusts; seed 0 of --jitter 0 is the scenario as it is.
-A waypoint's distance is the nearest that the true middle of the flock came to it, in order of the waypoints.
+A waypoint's distance is the nearest that the true middle of the flock came to it, in order of the waypoints. Order is
+of the flock under way: until its middle has come to the last waypoint. There it slows down and holds, and
+directions are those of the gusts.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +27,10 @@ from flockd.sim.exact_states import fly_exact_states
 TAIL_S = 10.0
 FLYING_M_S = 0.2
 """Order is of steps in which the middle flies faster than this: at a standstill directions are noise."""
+PASSED_M = 2.0
+"""A waypoint counts as passed when the middle is as near."""
+TURN_S = 8.0
+"""A turn is so long, from when the middle is `PASSED_M` from a waypoint that others follow."""
 
 
 def main() -> None:
@@ -45,6 +52,8 @@ def main() -> None:
                 "widest_at_the_end_m": max(row["widest_at_the_end_m"] for row in rows),
                 "closest_m": min(row["closest_m"] for row in rows),
                 "least_order_flying": min(row["order_flying"] for row in rows),
+                "mean_order_flying": round(float(np.mean([row["order_flying"] for row in rows])), 4),
+                "mean_order_turning": _mean([row["order_turning"] for row in rows]),
                 "least_union": min(row["union_tail"] for row in rows),
             }
         )
@@ -68,17 +77,29 @@ def measured(scenario: ScenarioConfig) -> dict[str, Any]:
     times, position, velocity = fly_exact_states(scenario)
     middle = position[..., :2].mean(axis=1)
     tail = np.flatnonzero(times >= times[-1] - TAIL_S)
-    flying = np.flatnonzero(np.linalg.norm(velocity[..., :2].mean(axis=1), axis=1) > FLYING_M_S)
+    nearest_m, passed = _passed(middle, _waypoints(scenario))
+    moving = np.linalg.norm(velocity[..., :2].mean(axis=1), axis=1) > FLYING_M_S
+    under_way = moving & (np.arange(len(times)) < (passed[-1] if len(passed) else len(times)))
+    turning = np.zeros(len(times), dtype=bool)
+    for step in passed[:-1]:
+        turning |= (times >= times[step]) & (times < times[step] + TURN_S)
+    orders = np.array([order(velocities[:, :2]) for velocities in velocity])
     reach_m = scenario.drone.flocking.observation_distance_m
     return {
         "seed": scenario.seed,
-        "waypoints_m": _passed(middle, _waypoints(scenario)),
+        "waypoints_m": nearest_m,
         "widest_at_the_end_m": round(_widest(position[-1]), 3),
         "widest_m": round(max(_widest(places) for places in position), 3),
         "closest_m": round(min(min_distance(places) for places in position), 3),
-        "order_flying": round(float(np.mean([order(velocity[s, :, :2]) for s in flying])), 4),
+        "order_flying": _mean(orders[under_way]),
+        "order_turning": _mean(orders[under_way & turning]),
         "union_tail": round(float(np.mean([union(position[s, :, :2], reach_m) for s in tail])), 4),
     }
+
+
+def _mean(values: Sequence[float | None] | FloatArray) -> float | None:
+    known = [value for value in values if value is not None]
+    return round(float(np.mean(known)), 4) if known else None
 
 
 def _waypoints(scenario: ScenarioConfig) -> FloatArray:
@@ -88,16 +109,20 @@ def _waypoints(scenario: ScenarioConfig) -> FloatArray:
     return np.array([(waypoint.north_m, waypoint.east_m) for waypoint in waypoints], dtype=float).reshape(-1, 2)
 
 
-def _passed(middle: FloatArray, waypoints: FloatArray) -> list[float]:
-    """The nearest that the middle (S, 2) came to each waypoint, each after it was nearest to the one before."""
-    nearest, since = [], 0
+def _passed(middle: FloatArray, waypoints: FloatArray) -> tuple[list[float], list[int]]:
+    """The nearest that the middle (S, 2) came to each waypoint, and the steps in which it was there first.
+
+    Each is looked for after the one before. A waypoint that was not passed counts from the step nearest to it.
+    """
+    nearest, steps, since = [], [], 0
     for waypoint in waypoints:
         away_m = np.linalg.norm(middle[since:] - waypoint, axis=1)
-        within = np.flatnonzero(away_m <= 2.0)
+        within = np.flatnonzero(away_m <= PASSED_M)
         first = int(within[0]) if len(within) else int(np.argmin(away_m))
         since += first
         nearest.append(round(float(away_m[first : first + 10].min()), 3))
-    return nearest
+        steps.append(since)
+    return nearest, steps
 
 
 def _widest(places: FloatArray) -> float:

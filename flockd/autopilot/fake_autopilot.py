@@ -26,6 +26,7 @@ from pymavlink.dialects.v20 import development as mavlink
 from flockd.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.autopilot.fake_telemetry import ON_GROUND_M, Mode, TelemetryStreams, VehicleSnapshot
 from flockd.autopilot.fake_vehicle import Demand, Motion, MotionState, PointMass
+from flockd.autopilot.sticks import stick_curve
 from flockd.messages import FloatArray, Setpoint
 
 TICK_S = 0.02
@@ -94,6 +95,7 @@ class FakeAutopilot:
             "GF_MAX_VER_DIST": 0.0,
             "MIS_TAKEOFF_ALT": 2.5,
             "MPC_VEL_MANUAL": 10.0,
+            "MAN_DEADZONE": 0.1,
         }
         """An int is an INT32 parameter, a float a REAL32 one."""
         self.setpoints: deque[tuple[float, Setpoint]] = deque(maxlen=MAX_SETPOINTS_KEPT)
@@ -294,11 +296,12 @@ class FakeAutopilot:
 
     def _by_hand(self) -> FloatArray:
         """(2,) m/s north and east that the sticks ask for; level, and at rest once they are not heard any more."""
-        moved_s, (forward, right) = self._sticks
+        moved_s, sticks = self._sticks
+        ahead, right = stick_curve(sticks, self.parameters["MAN_DEADZONE"])
         if self._clock() - moved_s > STICKS_FRESH_S:
             return np.zeros(2)
         cos, sin = math.cos(self._hold_yaw_rad), math.sin(self._hold_yaw_rad)
-        return self.parameters["MPC_VEL_MANUAL"] * np.array([cos * forward - sin * right, sin * forward + cos * right])
+        return self.parameters["MPC_VEL_MANUAL"] * np.array([cos * ahead - sin * right, sin * ahead + cos * right])
 
     # MAVLink, in
 

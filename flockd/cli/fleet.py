@@ -170,10 +170,8 @@ def _drones(operator: FleetOperator, wanted: str, places: str) -> tuple[str, ...
     found = operator.drones(names)
     missing = [name for name in names or () if name not in {key.split("/")[1] for key in found}]
     if missing or not found:
-        raise UnavailableError(
-            f"{' and '.join(missing) or 'no drone'} was not found at {places}; no request was sent; check "
-            "`flockd status`"
-        )
+        who = f"{' and '.join(missing)} {'was' if len(missing) == 1 else 'were'} not" if missing else "no drone was"
+        raise UnavailableError(f"{who} found at {places}; no request was sent; check `flockd status`")
     return found
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 SITL = "px4_sitl.yaml"
 DEFAULT_SPEED_FACTOR = 0.25
 """Two cores then keep up with five drones."""
-SPEED_FACTORS = (0.1, 10.0)
+SPEED_FACTORS = (0.02, 10.0)
 """What a daemon's configuration allows."""
 
 

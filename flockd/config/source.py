@@ -40,7 +40,7 @@ class SharedMemoryParameters(Section):
     """zenoh endpoints of the program that publishes them."""
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
     """How often each camera's frames come; `safety.camera_timeout_periods` counts in these."""
-    speed_factor: Annotated[float, Field(ge=0.1, le=10)] = 1.0
+    speed_factor: Annotated[float, Field(ge=0.02, le=10)] = 1.0
     """How fast a simulator's time passes: at 0.5, half a second of it in each real one, and all of flockd's times and
     time-outs count in it."""
 

@@ -41,6 +41,7 @@ class FlightLogBuilder:
         self._false_so_far: list[set[int]] = [set() for _ in range(n)]
         self._tracked: list[tuple[float, ...]] = []
         self._stages: dict[str, list[float]] = {}
+        self._mission_over = [False] * n
 
     def add_truth(self, step: int, position: FloatArray, velocity: FloatArray, R_ned_body: FloatArray) -> None:
         """True states of all drones as a step begins: (N, 3) m and (N, 3) m/s NED, (N, 3, 3).
@@ -54,15 +55,18 @@ class FlightLogBuilder:
     ) -> None:
         """What each drone's mission wants, (n, 2) m/s, and how far it is.
 
-        `homes` (n, 2) are metres north and east from which the drones' goals count; None: all from the origin.
+        `homes` (n, 2) are metres north and east from which the drones' goals count; None: all from the origin. A drone
+        whose mission was over in an earlier step has no goal any more. Call it in order of the steps.
         """
         same = (desired == desired[0]).all()
         self._desired[step] = desired[0] if same else desired.mean(axis=0)
         goals = [
             tuple(np.round(mission.goal + (0.0 if homes is None else homes[i]), 3).tolist())
             for i, mission in enumerate(missions)
-            if mission is not None and mission.goal is not None
+            if mission is not None and mission.goal is not None and not self._mission_over[i]
         ]
+        for i, mission in enumerate(missions):
+            self._mission_over[i] |= mission is not None and mission.takeover is not None
         if goals:
             self._goal[step] = Counter(goals).most_common(1)[0][0]
 

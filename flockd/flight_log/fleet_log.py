@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -63,7 +63,9 @@ class FleetRun:
     cores: dict[str, float] = field(default_factory=dict)
     """How many processor cores each kind of program kept busy."""
     handed_over: dict[str, str] = field(default_factory=dict)
-    """Why a drone did not fly to the end, by its name."""
+    """Why a drone did not fly to the end, by its name; also where its mission ends so."""
+    modes: dict[str, list[str]] = field(default_factory=dict)
+    """The flight modes of each autopilot, in order, by its drone's name."""
     autopilot: str = ""
     clock_rates: list[float] = field(default_factory=list)
     """Seconds of each autopilot's clock in one of the simulation's."""
@@ -93,6 +95,7 @@ def fleet_log(
     flown = [i for i, vehicle in enumerate(scenario.vehicles) if not vehicle.by_hand]
     statuses: list[dict[int, MissionStatus | None]] = [{} for _ in frames]
     processed: dict[str, int] = {}
+    over: set[str] = set()
     longest_s, spanning = 0.0, 0
     for i, config in zip(flown, configs, strict=True):
         steps = [(rows[o.time_s], o, R) for o, R in _outputs(recordings, config.name) if o.time_s in rows]
@@ -106,6 +109,8 @@ def fleet_log(
             kept = replace(output, ego_motion=None) if spans_more else output
             builder.add_output(row, i, kept, R_ned_body, output.stages_ms)
             statuses[row][i] = output.mission
+            if output.mission is not None and output.mission.takeover is not None:
+                over.add(config.name)
         processed[config.name] = len(steps)
     _add_missions(builder, scenario, frames, times, statuses)
     metadata = FlightMetadata.of_configuration(
@@ -121,7 +126,7 @@ def fleet_log(
         perception="learned",
         wall_s=run.wall_s,
         autopilot=run.autopilot,
-        fleet=_metadata(run, times, drone.flocking, speed_factor, processed, longest_s, spanning),
+        fleet=_metadata(run, times, drone.flocking, speed_factor, processed, longest_s, spanning, over),
     )
     return builder.build(metadata, companion)
 
@@ -153,7 +158,7 @@ def _add_missions(
 
 def _metadata(
     run: FleetRun, times: FloatArray, flocking: FlockingParameters, speed_factor: float,
-    processed: dict[str, int], longest_step_s: float, spanning: int,
+    processed: dict[str, int], longest_step_s: float, spanning: int, over: Set[str],
 ) -> FleetMetadata:  # fmt: skip
     delays_s = [frame.delay_s for frame in run.frames]
     position = np.array([frame.position[:, :2] for frame in run.frames])
@@ -170,7 +175,9 @@ def _metadata(
         autopilot_clock_rates=[round(rate, 4) for rate in run.clock_rates],
         order_last_20s=float(np.mean([order(velocity[s]) for s in end])),
         union_last_20s=float(np.mean([union(position[s], flocking.observation_distance_m) for s in end])),
-        handed_over=run.handed_over,
+        handed_over={name: why for name, why in run.handed_over.items() if name not in over},
+        mission_over={name: why for name, why in run.handed_over.items() if name in over},
+        modes=run.modes,
         exit_codes=run.exit_codes,
         notes=run.notes,
     )

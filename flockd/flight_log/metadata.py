@@ -49,6 +49,10 @@ class FleetMetadata(BaseModel):
     union_last_20s: float
     handed_over: dict[str, str]
     """Why a drone did not fly to the end, by its name."""
+    mission_over: dict[str, str] = {}
+    """When a drone's autopilot took over as its mission was over, by the drone's name."""
+    modes: dict[str, list[str]] = {}
+    """The flight modes of each autopilot, in order, by the drone's name."""
     exit_codes: dict[str, int]
     """Of the daemons, by the drone's name."""
     notes: list[str]

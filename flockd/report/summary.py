@@ -109,7 +109,8 @@ def objective_sums(log: FlightLog, position: FloatArray, velocity: FloatArray) -
 def mission_figures(log: FlightLog) -> Json:
     """Whether the flock's true middle is at its last goal at the end, since when, and how far away; null without one.
 
-    `time_s`: the first time that it was there, once that goal was the one to fly to.
+    The end is that of the mission, where the autopilots land or return then, else that of the flight. `time_s`: the
+    first time that it was there, once that goal was the one to fly to.
     """
     mission = log.metadata.mission
     figures: Json = {"kind": None if mission is None else mission.kind, "arrived": None, "time_s": None}
@@ -124,9 +125,9 @@ def mission_figures(log: FlightLog) -> Json:
     there = np.flatnonzero((away_m <= mission.reached_m) & (np.arange(len(away_m)) >= since))
     return {
         **figures,
-        "arrived": bool(away_m[-1] <= mission.reached_m),
+        "arrived": bool(away_m[goals[-1]] <= mission.reached_m),
         "time_s": float(log.time_s[there[0]]) if len(there) else None,
-        "final_error_m": float(away_m[-1]),
+        "final_error_m": float(away_m[goals[-1]]),
     }
 
 

@@ -45,8 +45,8 @@ PARAMETERS = {
 BY_HAND = {
     "COM_RC_IN_MODE": "1",  # sticks come over MAVLink
     "MPC_VEL_MANUAL": f"{FULL_STICK_M_S:g}",
-    "MPC_XY_MAN_EXPO": "0",  # twice the stick is twice the speed
-    "MPC_HOLD_DZ": "0.02",
+    "MAN_DEADZONE": "0",  # a person who leads slowly hardly moves a stick
+    "MPC_HOLD_DZ": "0",  # the same before PX4 1.18
 }
 """Of an instance that a person flies in Position mode, too."""
 
@@ -115,6 +115,7 @@ class SimulatedAutopilots:
             )
             fake.parameters["MIS_TAKEOFF_ALT"] = -float(position[2])
             fake.parameters["MPC_VEL_MANUAL"] = FULL_STICK_M_S
+            fake.parameters["MAN_DEADZONE"] = 0.0
             self._stack.enter_context(fake)
 
     def programs(self) -> Sequence[Program]:

@@ -177,6 +177,7 @@ class _Fleet:
             while (flying_s := self._clock() - run.began_s) < total_s:
                 progress(int(flying_s), int(total_s))
                 self._note_handovers(run, flying_s)
+                self._note_modes(run)
                 self._fly_by_hand(flying_s)
                 self._server.frames()
                 time.sleep(POLL_S)
@@ -244,6 +245,12 @@ class _Fleet:
                 self._left_s[i] = min(flying_s, self._clock() - run.began_s)
             if flying_s - self._left_s[i] >= REASON_S * self._speed_factor:
                 run.handed_over[program.name] = f"after {self._left_s[i]:.1f} s {self._why(i, program)}"
+
+    def _note_modes(self, run: FleetRun) -> None:
+        for i in self._all:
+            mode, flown = self._station.mode(i), run.modes.setdefault(f"drone{i + 1}", [])
+            if [mode] != flown[-1:]:
+                flown.append(mode)
 
     def _why(self, i: int, program: Program) -> str:
         if program.ended is not None:

@@ -21,6 +21,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import development as mavlink
 
 from flockd.autopilot.mavlink_messages import StatusText
+from flockd.autopilot.sticks import stick_curve
 from flockd.earth import metres_a_degree
 from flockd.errors import UnavailableError
 from flockd.messages import FloatArray
@@ -37,6 +38,7 @@ MODE_HZ = 20.0
 FULL_STICK_M_S = 3.0
 """MPC_VEL_MANUAL of vehicles that are flown by hand: what a stick at its end asks for."""
 _STICK = 1000
+_DEFLECTIONS = np.linspace(0.0, 1.0, _STICK + 1)
 _NEUTRAL_THROTTLE = 500
 MAX_FORWARD_S = 0.2
 """A pose is extrapolated by no more than this."""
@@ -194,7 +196,8 @@ class GroundStation:
         yaw_rad = math.atan2(R[1, 0], R[0, 0])
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
         ahead = np.array([cos * velocity[0] + sin * velocity[1], -sin * velocity[0] + cos * velocity[1]])
-        x, y = (int(stick) for stick in np.round(np.clip(ahead / FULL_STICK_M_S, -1.0, 1.0) * _STICK))
+        sticks = np.sign(ahead) * np.interp(np.abs(ahead) / FULL_STICK_M_S, stick_curve(_DEFLECTIONS), _DEFLECTIONS)
+        x, y = (int(stick) for stick in np.round(sticks * _STICK))
         with self._lock:
             vehicle.mav.manual_control_send(number + 1, x, y, _NEUTRAL_THROTTLE, 0, 0)
 

@@ -22,6 +22,10 @@ def test_a_motion_over_a_skipped_frame_set_is_not_in_the_log(tmp_path: Path) -> 
         for row, time_s in enumerate(times)
     )
     run = FleetRun(began_s=times[0], wall_s=9.0, frames=frames, autopilot="PX4 1.18.0", clock_rates=[0.50004])
+    assert outputs[-1].mission is not None
+    assert outputs[-1].mission.takeover is not None
+    run.handed_over = {config.name: "after 3 s its mission was over", "drone9": "after 2 s its battery was"}
+    run.modes = {config.name: ["OFFBOARD", "LAND"]}
     scenario = load_scenario(data_path("config") / "paper_flight.yaml")
     scenario = scenario.model_copy(update={"vehicles": scenario.vehicles[:1]})
     companion = (np.zeros((5, 1, 3)), np.zeros((5, 1, 3)))
@@ -35,6 +39,9 @@ def test_a_motion_over_a_skipped_frame_set_is_not_in_the_log(tmp_path: Path) -> 
     assert metadata.fleet is not None
     assert metadata.fleet.frame_sets_looked_at == {config.name: 4}
     assert (metadata.fleet.frame_sets, metadata.fleet.motions_over_more_than_one_frame_set) == (5, 1)
+    assert metadata.fleet.mission_over == {config.name: "after 3 s its mission was over"}
+    assert metadata.fleet.handed_over == {"drone9": "after 2 s its battery was"}
+    assert metadata.fleet.modes == {config.name: ["OFFBOARD", "LAND"]}
     assert metadata.fleet.frames_late_s.p50 == 0.02
     assert metadata.fleet.autopilot_clock_rates == [0.5]
     np.testing.assert_allclose(metadata.fleet.longest_step_s, 0.1)

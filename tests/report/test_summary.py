@@ -316,6 +316,9 @@ def test_a_mission_has_arrived_where_the_middle_is_at_the_last_goal() -> None:
     assert (arrived["arrived"], arrived["time_s"]) == (True, 11.0)
     before = summarise(_first(log, 12))["mission"]
     assert (before["arrived"], before["time_s"]) == (False, None)
+    landed = replace(log, goal=np.where(np.arange(STEPS)[:, None] < 24, goal, np.nan))  # over after 11.5 s
+    over = summarise(landed)["mission"]
+    assert over == {"kind": "waypoints", "arrived": True, "time_s": 11.0, "final_error_m": pytest.approx(0.5, abs=0.01)}
     nowhere = summarise(_hand_made())["mission"]
     assert nowhere == {"kind": None, "arrived": None, "time_s": None, "final_error_m": None}
 

@@ -51,6 +51,7 @@ class _World:
         height_m = np.array([-vehicle.position_m[2] for vehicle in scenario.vehicles])
         station = SimpleNamespace(
             mode_is=lambda i, mode: self.modes[i] == mode,
+            mode=lambda i: self.modes[i],
             is_armed=lambda i: self.armed[i],
             last_text=lambda i: "",
             select=self.select,
@@ -91,6 +92,15 @@ def test_a_drone_that_leaves_at_the_very_end_is_noted_too() -> None:
     assert run.handed_over == {}
     fleet._note_handovers(run, np.inf)
     assert run.handed_over == {"drone2": "after 19.9 s its daemon ended with exit code 70 (last line of drone2)"}
+
+
+def test_each_change_of_a_flight_mode_is_noted_once() -> None:
+    world = _World()
+    fleet, run = world.fleet(), FleetRun(0.0)
+    for mode in ("OFFBOARD", "LOITER", "LOITER", "OFFBOARD"):
+        world.modes[1] = mode
+        fleet._note_modes(run)
+    assert run.modes == {"drone1": ["OFFBOARD"], "drone2": ["OFFBOARD", "LOITER", "OFFBOARD"]}
 
 
 def test_drones_land_though_another_ones_autopilot_is_dead(monkeypatch: pytest.MonkeyPatch) -> None:

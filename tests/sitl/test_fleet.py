@@ -174,8 +174,8 @@ def test_without_px4_it_says_what_to_do(
     [
         (["--speed-factor", "0.5"], "--speed-factor is for real daemons; drop it, or name their --autopilot"),
         (
-            ["--autopilot", "standin", "--speed-factor", "0.05"],
-            "--speed-factor 0.05 is not from 0.1 to 10; choose another",
+            ["--autopilot", "standin", "--speed-factor", "0.01"],
+            "--speed-factor 0.01 is not from 0.02 to 10; choose another",
         ),
         (
             ["--autopilot", "standin", "--perception", "truth"],
@@ -218,7 +218,7 @@ def test_a_person_flies_one_drone_by_its_sticks_in_position_mode() -> None:
         GroundStation([port], time.monotonic) as station,
         FakeAutopilot(free_port(), height_m=2.0, yaw_rad=0.7, truth_port=port) as fake_autopilot,
     ):
-        fake_autopilot.parameters["MPC_VEL_MANUAL"] = FULL_STICK_M_S
+        fake_autopilot.parameters |= {"MPC_VEL_MANUAL": FULL_STICK_M_S, "MAN_DEADZONE": 0.0}
         until_s = time.monotonic() + 10.0
         while not station.is_connected(0):
             assert time.monotonic() < until_s
