@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from tools.train import Batch, Task, begin_with, train
+from tools.train import begin_with, train
 from tools.training import real_samples
 from tools.training.augment import photometric
 from tools.training.crop_files import CropFiles
@@ -27,6 +27,7 @@ from tools.training.from_onnx import begin_with_onnx
 from tools.training.networks import DistanceNet, VerificationNet
 from tools.training.real_patches import RealPatches
 from tools.training.samples import Sample
+from tools.training.tasks import Batch, Task
 
 MIX = {"rendered": 34, "composite": 16, "real drone": 8, "cut out": 4, "negative": 34}
 """Samples of a batch."""

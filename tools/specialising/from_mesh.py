@@ -29,13 +29,14 @@ from tools.quantise import quantise
 from tools.render_drone_crops import CropJob, render_crops
 from tools.render_training_data import PairJob, render_pairs
 from tools.specialising.runs import claim, command_line, table, training_s
-from tools.train import DistanceTask, start, train
+from tools.train import start, train
 from tools.training import worlds
 from tools.training.dataset import PairSet, open_pairs
 from tools.training.manifests import note_accuracy
 from tools.training.networks import DistanceNet
 from tools.training.own_mesh import painted
 from tools.training.samples import no_drone_sample
+from tools.training.tasks import DistanceTask
 
 RATE = 8e-4
 """Learning rate to begin with: less than of a network that knows nothing yet."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from tools.training.camera_effects import drawn_effects, through_camera
 
 Image = NDArray[np.uint8]
 UNTOUCHED = 0.5
@@ -42,6 +45,14 @@ def photometric(images: list[Image], rng: np.random.Generator) -> list[Image]:
             changed = np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR))
         out.append(np.asarray(changed, dtype=np.uint8))
     return out
+
+
+def as_filmed(image: Image, rng: np.random.Generator) -> Image:
+    """The image (h, w, 3) as a camera delivers it: half of them through a cheap one, the others as of `photometric`."""
+    if rng.random() < 0.5:
+        (changed,) = photometric([image], rng)
+        return changed
+    return through_camera(image, drawn_effects(float(np.exp(rng.uniform(math.log(0.5), 0.0))), rng), rng)
 
 
 def motion_blur(images: list[Image], rng: np.random.Generator) -> list[Image]:

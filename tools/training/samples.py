@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flockd.geometry import Rig, VirtualCrop, virtual_crop
 from flockd.sim.airframe import DroneModel
-from tools.training.augment import motion_blur, photometric
+from tools.training.augment import as_filmed, motion_blur, photometric
 from tools.training.dataset import (
     HEIGHT,
     R_BODY_CAMERA,
@@ -23,14 +23,25 @@ from tools.training.dataset import (
     rig_camera,
 )
 from tools.training.networks import MAX_DEPTH_M
+from tools.training.real_samples import repainted
 
 Sample = dict[str, NDArray[Any]]
 
 
 def neighbours_sample(
-    pairs: PairSet, index: int, rng: np.random.Generator, *, crop_px: int | None = None, augment: bool = True
+    pairs: PairSet,
+    index: int,
+    rng: np.random.Generator,
+    *,
+    crop_px: int | None = None,
+    augment: bool = True,
+    behind: NDArray[np.uint8] | None = None,
 ) -> Sample:
-    """Image, geometry planes and targets for ``NeighboursNet``; ``crop_px``: of a square, mostly around a drone."""
+    """Image, geometry planes and targets for ``NeighboursNet``; ``crop_px``: of a square, mostly around a drone.
+
+    ``behind``, of the sample's size, is shown behind the drones instead of the rendered world. Its depth is not known:
+    NaN.
+    """
     k = int(rng.integers(2))
     image, depth, ids = pairs["image"][index][k], pairs["depth"][index][k], pairs["ids"][index][k]
     focal = float(pairs["focal"][index])
@@ -48,8 +59,13 @@ def neighbours_sample(
         image = image[top : top + crop_px, left : left + crop_px]
         half = np.s_[..., top // 2 : (top + crop_px) // 2, left // 2 : (left + crop_px) // 2]
         depth, ids, offset, geometry = depth[half], ids[half], offset[half], geometry[half]
+    depth = np.minimum(depth.astype(np.float32), MAX_DEPTH_M)
+    if behind is not None:
+        share = cv2.resize((ids > 0).astype(np.float32), None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)[:, :, None]
+        image = np.round(share * repainted(image, rng) + (1 - share) * behind).astype(np.uint8)
+        depth = np.where(ids > 0, depth, np.float32(np.nan))
     if augment:
-        (image,) = photometric([image], rng)
+        image = as_filmed(image, rng)
         if rng.random() < 0.5:
             image, depth, ids = image[:, ::-1], depth[:, ::-1], ids[:, ::-1]
             geometry, offset = geometry[:, :, ::-1].copy(), offset[:, :, ::-1].copy()
@@ -58,7 +74,7 @@ def neighbours_sample(
     return {
         "image": np.ascontiguousarray(image),
         "geometry": np.ascontiguousarray(geometry),
-        "depth": np.minimum(depth.astype(np.float32), MAX_DEPTH_M)[None],
+        "depth": np.ascontiguousarray(depth)[None],
         "drone": (ids > 0).astype(np.float32)[None],
         "offset": np.ascontiguousarray(offset),
     }
