@@ -37,10 +37,11 @@ def test_an_operators_order_in_flight_has_its_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Fake autopilots and tiny pictures: two drones fly the paper's circle until they are sent somewhere else."""
-    ordered = Mission("ordered", str(_scenario(tmp_path, drones=2)), 25.0, 2, order_at_s=2.0, order=(4.0, 3.0))
+    ordered = Mission("ordered", str(_scenario(tmp_path, drones=2)), 12.0, 2, order_at_s=2.0, order=(4.0, 3.0))
     monkeypatch.setattr("tools.px4_missions.MISSIONS", (ordered,))
-    main(["--autopilot", "standin", "--speed-factor", "1", "--out", str(tmp_path / "out"), "--json"])
+    code = main(["--autopilot", "standin", "--speed-factor", "0.25", "--out", str(tmp_path / "out"), "--json"])
     told = capsys.readouterr()
+    assert code in {0, 1}, told.err  # 1: two drones that cannot see each other may come too close
     (row,) = json.loads(told.out)["goals"]
     assert (row["goal"], row["arrived"], row["modes"]) == ("4, 3", True, "drone1 OFFBOARD, drone2 OFFBOARD"), told.err
     assert row["time_s"] > 2.0
