@@ -13,7 +13,6 @@ import pytest
 
 from flockd.config import load_scenario
 from flockd.data import data_path
-from tests.sitl.test_fleet import _scenario
 from tools.px4_missions import MISSIONS, Mission, kept, main, rows
 
 PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
@@ -30,23 +29,6 @@ def test_px4_flies_missions(mission: Mission, tmp_path: Path, capsys: pytest.Cap
     goals = json.loads(told.out)["goals"]
     assert len(goals) == (3 if mission.order_at_s is not None else 2)
     assert all(goal["error_m"] < 2.0 for goal in goals)
-
-
-@pytest.mark.slow
-def test_an_operators_order_in_flight_has_its_row(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Fake autopilots and tiny pictures: two drones fly the paper's circle until they are sent somewhere else."""
-    ordered = Mission("ordered", str(_scenario(tmp_path, drones=2)), 12.0, 2, order_at_s=2.0, order=(4.0, 3.0))
-    monkeypatch.setattr("tools.px4_missions.MISSIONS", (ordered,))
-    code = main(["--autopilot", "standin", "--speed-factor", "0.25", "--out", str(tmp_path / "out"), "--json"])
-    told = capsys.readouterr()
-    assert code in {0, 1}, told.err  # 1: two drones that cannot see each other may come too close
-    (row,) = json.loads(told.out)["goals"]
-    assert (row["goal"], row["arrived"], row["modes"]) == ("4, 3", True, "drone1 OFFBOARD, drone2 OFFBOARD"), told.err
-    assert row["time_s"] > 2.0
-    assert "tiny/drone1: goto is being tried" in told.err
-    assert (tmp_path / "out/ordered/report.html").is_file()
 
 
 def _log(plan: np.ndarray, goal: np.ndarray, modes: dict[str, list[str]]) -> Any:
