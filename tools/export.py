@@ -55,7 +55,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
         "data": f"Rendered by tools.render_training_data from seeded worlds. {REAL_PICTURES}",
         "size_multiple": 32,
         "map_stride": 2,
-        "thresholds": {"proposal_logit": -1.5, "mask_logit": 0.4, "proposal_logit_alone": 0.0},
+        "thresholds": {"proposal_logit": 0.0, "mask_logit": 0.4, "proposal_logit_alone": 0.0},
         "golden_size": [480, 640],
         "inputs": {
             "image": IMAGE,
