@@ -24,8 +24,8 @@ ALLOWED_DIFFERENCE = 2e-3
 """Between ONNX Runtime and torch, as a share of the output's largest value."""
 BEGUN_WITH_SHARE = 0.35
 DATA = "Rendered by tools.render_training_data from seeded worlds; no foreign data."
-REAL_PICTURES = (
-    "Real pictures, none of a held-out scene: "
+REAL_DATA = (
+    "Rendered by tools.render_drone_crops from seeded worlds. Real pictures, none of a held-out scene: "
     "data set of Drone Detection and Classification using Machine Learning and Sensor Fusion, clips 11-20, 51-60, "
     "71-80 and from 111 of each kind (F. Svanstroem, CC0 1.0); HoloLens sample data of deep-video-mvs, first 73 frames "
     "(A. Duzceker, MIT); BoofCV-Data@cc6d8adf (P. Abeles, CC BY 4.0; without "
@@ -33,7 +33,8 @@ REAL_PICTURES = (
     "Machine-Learning-with-Apache-Spark-Quick-Start-Guide@d001ad4b (parts of Open Images, listed as CC BY 2.0); "
     "license-plate-dataset@f00f309e (R. L. Chiriac, MIT); robocup_ml@45430e3b (A. Poole, Apache-2.0); "
     "sample-videos@57978890 (Intel, CC BY 4.0); clothing-dataset@7ed86a9c (A. Grigorev, CC0 1.0); "
-    "odm_data_caliterra@bec3dc72 (CC0 1.0); drone_dataset_brighton_beach@9506a9bf (P. Toffanin, BSD-2-Clause)."
+    "odm_data_caliterra@bec3dc72 (CC0 1.0); drone_dataset_brighton_beach@9506a9bf (P. Toffanin, BSD-2-Clause). "
+    "Begun with the encoder of `distance`."
 )
 TRAINED_BY = {"verification": "tools.train_verification"}
 """Where it is not tools.train."""
@@ -52,10 +53,9 @@ NETWORKS: dict[str, dict[str, Any]] = {
         "net": NeighboursNet,
         "roles": ["depth", "segmentation"],
         "description": "U-Net: metric depth, drone mask and centre offsets of one image",
-        "data": f"Rendered by tools.render_training_data from seeded worlds. {REAL_PICTURES}",
         "size_multiple": 32,
         "map_stride": 2,
-        "thresholds": {"proposal_logit": 0.0, "mask_logit": 0.4, "proposal_logit_alone": 0.0},
+        "thresholds": {"proposal_logit": -1.5, "mask_logit": 0.4, "proposal_logit_alone": 0.0},
         "golden_size": [480, 640],
         "inputs": {
             "image": IMAGE,
@@ -112,8 +112,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
         "net": VerificationNet,
         "roles": ["verification"],
         "description": "Whether there is a drone in the middle of a crop",
-        "data": "Rendered by tools.render_drone_crops from seeded worlds. "
-        f"{REAL_PICTURES} Begun with the encoder of `distance`.",
+        "data": REAL_DATA,
         "size_multiple": 1,
         "golden_size": [96, 96],
         "thresholds": {
