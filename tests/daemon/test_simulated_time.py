@@ -64,7 +64,7 @@ def test_the_clock_of_a_real_drone_is_the_computers() -> None:
             "serial:///dev/ttyS1:921600",
             "an autopilot on a cable is none; delete it",
         ),
-        ("{kind: shared_memory, shared_memory: {speed_factor: 0.05}}", "udpin://127.0.0.1:14540", "0.1"),
+        ("{kind: shared_memory, shared_memory: {speed_factor: 0.01}}", "udpin://127.0.0.1:14540", "0.02"),
     ],
 )
 def test_what_is_real_cannot_be_slow(source: str, autopilot: str, told: str, tmp_path: Path) -> None:
