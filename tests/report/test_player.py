@@ -15,6 +15,7 @@ from typing import Any, Self
 
 import numpy as np
 import pytest
+from markupsafe import Markup
 from py_mini_racer import MiniRacer
 
 from tests.report.test_page import _flight, _moment, _report
@@ -92,7 +93,7 @@ def html(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Three drones on a triangle fly 10 s; plates of two of them at two moments; without figures."""
     moments = [replace(_moment(time_s=time_s), drone=drone) for drone in (0, 2) for time_s in (3.0, 9.0)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("flockd.report.page._embed", lambda *_, **__: None)
+        patch.setattr("flockd.report.page._embed", lambda *_, **__: Markup(""))
         return _report(tmp_path_factory.mktemp("played"), _flight(drones=3, duration_s=10.0), *moments)
 
 
@@ -145,7 +146,7 @@ def test_drones_are_drawn_with_north_up_and_true_to_scale(html: str) -> None:
 
 
 def test_a_round_obstacle_is_drawn_where_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flockd.report.page._embed", lambda *_, **__: None)
+    monkeypatch.setattr("flockd.report.page._embed", lambda *_, **__: Markup(""))
     log = _flight(drones=3, duration_s=10.0)
     under_the_second = [*log.position[0, 1, :2], 0.3, 0.0, 0.0, 0.0, 8.0]
     page = _Browser(_report(tmp_path, replace(log, obstacles=np.array([under_the_second]))))
