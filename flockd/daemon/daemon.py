@@ -159,6 +159,7 @@ class Daemon:
         concerns = {
             "control": components.control.run,
             "requests": components.requests.run,
+            "refusals": components.refusals.run,
             "pilot": components.pilot_loop.run,
             "loop lag": components.lag.run,
             "thermometer": components.thermometer.run,

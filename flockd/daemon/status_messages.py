@@ -76,11 +76,14 @@ def _status_line(decision: Decision) -> str:
 
 def _flight_message(components: Components, now: float) -> FlightMessage:
     decision, status, stream = components.control.decision, components.link.status(), components.streamer.report()
-    vehicle = components.link.vehicle_state()
+    vehicle, refusals = components.link.vehicle_state(), components.refusals.current
     return FlightMessage(
         time_s=now,
         state=decision.state.value,
-        reasons=[ReasonMessage(event=reason.event.value, sentence=reason.sentence) for reason in decision.reasons],
+        reasons=[
+            *(ReasonMessage(event=reason.event.value, sentence=reason.sentence) for reason in decision.reasons),
+            *(ReasonMessage(event=refusal.reason, sentence=refusal.sentence) for refusal in refusals),
+        ],
         flight_mode=status.flight_mode,
         armed=None if math.isinf(status.heartbeat_age_s) else status.armed,
         in_air=None if status.landed_state == "unknown" else status.in_air,

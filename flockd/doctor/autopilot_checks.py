@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from flockd.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware
 from flockd.autopilot.mavsdk_link import AutopilotLink
+from flockd.autopilot.refusals import Refusal
 from flockd.config import DroneConfig
 from flockd.config.autopilot import AutopilotParameters
 from flockd.config.safety import GateParameters
@@ -14,6 +15,8 @@ from flockd.doctor.finding import Finding, Level, failed, failed_from_error, pas
 from flockd.doctor.range_checks import WATCHED_S, judge_range_finder
 
 HEARD_S = 10.0
+CHECKS_S = 2.0
+"""For the autopilot to run its checks and to tell them."""
 OLDEST_TRIED = (1, 14)
 """Before PX4 1.14, COM_OBL_RC_ACT held only with a remote control, and COM_OBL_ACT without."""
 LONGEST_LOSS_S = 1.0
@@ -42,11 +45,24 @@ async def _ask(config: DroneConfig, parameters: AutopilotParameters) -> list[Fin
         else:
             found += [failed_from_error("firmware", str(firmware)), *await _parameters(link, config, parameters)]
         if link.status().heartbeat_age_s <= parameters.max_heartbeat_age_s:
+            found += judge_refusals(await _refusals(link))
             found += await _range_finder(link, config)
         found += judge_messages(link.unknown_values())
     finally:
         await link.close()
     return found
+
+
+async def _refusals(link: AutopilotLink) -> tuple[Refusal, ...]:
+    """What the autopilot's checks say when they are run now; without such a list, what its messages say."""
+    try:
+        async with asyncio.timeout(CHECKS_S):
+            await link.ask_for_checks()
+            while not link.knows_checks():
+                await asyncio.sleep(0.02)
+    except (AutopilotError, TimeoutError):
+        pass
+    return link.refusals()
 
 
 async def _range_finder(link: AutopilotLink, config: DroneConfig) -> list[Finding]:
@@ -95,6 +111,14 @@ def judge_signing(responds: bool, heartbeat_age_s: float, parameters: AutopilotP
         return warned("signing", "not known: it is not heard any more", "repair the link first")
     measured = "it is heard and does not respond: nothing reaches it, or it accepts signed messages only"
     return failed("signing", measured, "check the cable's other direction; remove the signing key from its SD card")
+
+
+def judge_refusals(refusals: Sequence[Refusal]) -> list[Finding]:
+    """Why it could not be armed or fly offboard now."""
+    if not refusals:
+        return [passed("arming", "its checks let it be armed and fly offboard")]
+    refused = [(f"refuses {refusal.refused}: " if refusal.refused else "", refusal) for refusal in refusals]
+    return [failed("arming", f"{start}{refusal.what}", refusal.remedy) for start, refusal in refused]
 
 
 def judge_messages(unknown_values: Mapping[str, int]) -> list[Finding]:

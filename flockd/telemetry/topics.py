@@ -125,7 +125,8 @@ class ReasonMessage(TypedDict):
     """Something that is the matter."""
 
     event: str
-    """For programs: a value of `flockd.safety.Event`."""
+    """For programs: a value of `flockd.safety.Event`, or the name of an autopilot's reason to refuse, as in
+    `flockd.autopilot.refusal_reasons`."""
     sentence: str
     """For people."""
 
@@ -137,7 +138,7 @@ class FlightMessage(TypedDict):
     state: str
     """`idle`, `ready`, `normal`, `degraded`, `hover`, `asking` (for Hold or worse) or `silent` (handed over)."""
     reasons: list[ReasonMessage]
-    """What is the matter, the worst first."""
+    """What is the matter, the worst first; then why the autopilot would refuse to arm or to fly offboard."""
     flight_mode: str
     """The autopilot's."""
     armed: bool | None

@@ -28,7 +28,7 @@ GOOD: dict[str, float | int] = {
     "GF_MAX_VER_DIST": 15.0,
 }
 """For the quadrotor's own fence of 50 m and 10 m of height."""
-LISTENS, REQUESTS_MESSAGE = 511, 512
+LISTENS, REQUESTS_MESSAGE, RUNS_CHECKS = 511, 512, 401
 
 
 def _config(port: int) -> DroneConfig:
@@ -59,8 +59,8 @@ def test_an_autopilot_that_is_set_up_well_and_left_as_it_is(monkeypatch: pytest.
         assert not fake_autopilot.setpoints
         assert fake_autopilot.refused_setpoints == 0
         assert fake_autopilot.parameters == {**fake_autopilot.parameters, **GOOD}
-    assert set(asked) <= {LISTENS, REQUESTS_MESSAGE}, "it listens and asks, and commands nothing"
-    assert found.keys() == {"heartbeat", "firmware", "signing", "range finder", *GOOD}
+    assert set(asked) <= {LISTENS, REQUESTS_MESSAGE, RUNS_CHECKS}, "it listens and asks, and commands nothing"
+    assert found.keys() == {"heartbeat", "firmware", "signing", "arming", "range finder", *GOOD}
     assert {about for about, finding in found.items() if finding.level is not Level.PASS} == {"firmware"}
     assert found["firmware"].measured.startswith("PX4 0.0.1 is older than 1.14"), "the fake autopilot is not PX4"
     assert "system 1 at udpin://127.0.0.1" in found["heartbeat"].measured
@@ -83,6 +83,16 @@ def test_bad_values_are_read_and_reported_with_what_to_do() -> None:
     assert found["GF_ACTION"].level is Level.FAILURE
     assert "GF_ACTION could not be read (timeout)" in found["GF_ACTION"].measured
     assert (found["heartbeat"].level, found["heartbeat"].measured[-9:]) == (Level.WARNING, "and armed")
+
+
+def test_what_keeps_it_from_being_armed_is_a_failure_each_with_what_to_do() -> None:
+    port = free_port()
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
+        fake_autopilot.failing = {"check_gyro_not_calibrated"}
+        found = _examined(port)["arming"]
+    assert (found.level, found.measured, found.fix) == (
+        Level.FAILURE, "refuses to arm: a gyroscope is not calibrated", "calibrate it in the ground station"
+    )  # fmt: skip
 
 
 def test_nobody_there_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
