@@ -69,6 +69,7 @@ class FakeAutopilot:
         truth_port: int | None = None,
         speed_factor: float = 1.0,
         range_finder: FakeRangeFinder | None = None,
+        clock_ahead_s: float = 0.0,
     ) -> None:
         """Bind a socket; nothing is sent before `start`.
 
@@ -84,6 +85,7 @@ class FakeAutopilot:
                 sends it, and may send commands, as a ground station may.
             speed_factor: how fast its time passes.
             range_finder: its own, which faces down; None: it has none.
+            clock_ahead_s: what its clock shows when it is made.
         """
         self._speed_factor = speed_factor
         self.battery_share = 1.0
@@ -129,7 +131,9 @@ class FakeAutopilot:
         """Sent so far."""
         self._sticks = -math.inf, np.zeros(2)
         """When a person last moved them, and forward and right from -1 to 1."""
-        self._streams = TelemetryStreams(self._mav, truth, heartbeat_s, home_deg, self._clock(), range_finder)
+        self.clock_offset_s = clock_ahead_s - self._clock()
+        """Its own clock, of its stamps and of TIMESYNC, less the monotonic clock times the speed factor."""
+        self._streams = TelemetryStreams(self._mav, truth, heartbeat_s, home_deg, -self.clock_offset_s, range_finder)
         self._lock = threading.RLock()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fake autopilot", daemon=True)
@@ -338,6 +342,9 @@ class FakeAutopilot:
                 )
             case "MANUAL_CONTROL" if message.target == self._mav.srcSystem:
                 self._sticks = arrived_s, np.clip([message.x, message.y], -1000, 1000) / 1000
+            case "TIMESYNC" if message.tc1 == 0:
+                own_ns = int(1e9 * (self._clock() + self.clock_offset_s))
+                self._mav.timesync_send(own_ns, message.ts1)
             case "PARAM_REQUEST_READ":
                 self._send_parameter(message.param_id)
             case _:

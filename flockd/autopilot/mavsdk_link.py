@@ -15,6 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any, Self, TypeVar
 
 from mavsdk.component_type import ComponentType
@@ -26,6 +27,7 @@ from mavsdk.plugins.param import Param, ParamError
 from mavsdk.system import System
 
 from flockd.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware, FlightMode
+from flockd.autopilot.clock_sync import ClockEstimate
 from flockd.autopilot.mavlink_messages import MODES, Fields, ReceivedMessages, result_text
 from flockd.autopilot.refusal_reasons import REMEDIES_OF_RESULTS
 from flockd.autopilot.refusals import Refusal
@@ -63,6 +65,11 @@ STREAMS_HZ = {
 """What is asked for, by message number and rate. PX4 sends CURRENT_MODE at once when the mode changes, at this rate at
 most; its heartbeat comes once a second whatever one asks."""
 RECEIVED = (*STREAMS_HZ, "HEARTBEAT", "AUTOPILOT_VERSION", "STATUSTEXT", "EVENT")
+TIME_SYNC = "TIMESYNC"
+TIME_SYNC_S = 0.1
+"""Between two exchanges."""
+MOST_OPEN = 20
+"""Exchanges whose reply is waited for; older ones are lost."""
 TEXT_MEMORY_S = 2.0
 STREAMS_S = 0.5
 """Setpoints that are not farther apart are a stream."""
@@ -94,7 +101,9 @@ class AutopilotLink:
         """When the last setpoint was sent."""
         self._param = Param(system)
         self._direct = MavlinkDirect(system)
-        for name in RECEIVED:
+        self._time_syncs: deque[int] = deque(maxlen=MOST_OPEN)
+        """This computer's times in nanoseconds of exchanges that were not answered yet."""
+        for name in (*RECEIVED, TIME_SYNC):
             self._direct.subscribe_message(name, self._receive)
 
     @classmethod
@@ -165,6 +174,19 @@ class AutopilotLink:
     async def ask_for_checks(self) -> None:
         """Asks it to send its list of failed checks. Raises AutopilotError where it cannot."""
         await self._command("for its checks", COMMAND_RUN_CHECKS)
+
+    def clock(self) -> ClockEstimate | None:
+        """The autopilot's clock; None while it is not known. It is measured by `synchronise`."""
+        return self._received.clock.estimate
+
+    async def synchronise(self) -> None:
+        """Exchanges times with the autopilot until cancelled."""
+        while True:
+            sent_ns = int(1e9 * self._clock())
+            self._time_syncs.append(sent_ns)
+            with suppress(MavlinkDirectError):  # a link that cannot send says so where setpoints are sent
+                self._direct.send_message(self._message(TIME_SYNC, {"tc1": 0, "ts1": sent_ns}))
+            await asyncio.sleep(TIME_SYNC_S)
 
     def take_reports(self) -> list[str]:
         """What happened to the messages since the last call that people should know, each in one sentence."""
@@ -239,11 +261,21 @@ class AutopilotLink:
 
     def _receive(self, message: MavlinkMessage, _: object) -> None:
         """Called on MAVSDK's thread, one message after the other."""
+        now = self._clock()
         if message.system_id != self._system_id or message.component_id != AUTOPILOT_COMPONENT:
             if message.message_name == "HEARTBEAT":
-                self._received.add_other_heartbeat(json.loads(message.fields_json), self._clock())
-            return
-        self._received.add(message.message_name, json.loads(message.fields_json), self._clock())
+                self._received.add_other_heartbeat(json.loads(message.fields_json), now)
+        elif message.message_name == TIME_SYNC:
+            self._take_time(json.loads(message.fields_json), now)
+        else:
+            self._received.add(message.message_name, json.loads(message.fields_json), now)
+
+    def _take_time(self, fields: Fields, now: float) -> None:
+        """Takes the reply to an exchange of ours; the autopilot asks in the same message, which is left to others."""
+        sent_ns = int(fields["ts1"])
+        if fields["tc1"] and sent_ns in self._time_syncs:
+            self._time_syncs.remove(sent_ns)
+            self._received.clock.add(1e-9 * sent_ns, 1e-9 * int(fields["tc1"]), now)
 
     async def _set_mode(self, mode: FlightMode) -> None:
         main, sub = next(numbers for numbers, name in MODES.items() if name == mode)

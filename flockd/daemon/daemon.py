@@ -160,6 +160,7 @@ class Daemon:
             "control": components.control.run,
             "requests": components.requests.run,
             "refusals": components.refusals.run,
+            "autopilot clock": components.link.synchronise,
             "pilot": components.pilot_loop.run,
             "loop lag": components.lag.run,
             "thermometer": components.thermometer.run,
