@@ -202,7 +202,10 @@ REPLIES = PACKAGE / "telemetry" / "publisher.py"
     ("library", "adapters"),
     [
         ("mavsdk", ["autopilot/mavsdk_link.py"]),
-        ("pymavlink", ["autopilot/fake_autopilot.py", "autopilot/fake_telemetry.py", "sim/ground_station.py"]),
+        (
+            "pymavlink",
+            [f"autopilot/fake_{what}.py" for what in ("autopilot", "checks", "telemetry")] + ["sim/ground_station.py"],
+        ),
         ("rerun", ["view/flock_file.py", "view/rerun_file.py"]),
     ],
 )

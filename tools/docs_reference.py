@@ -16,6 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from flockd.autopilot.refusal_reasons import REASONS
 from flockd.cli import _parser
 from flockd.config import schema_of
 from flockd.config.safety import SafetyParameters
@@ -56,7 +57,30 @@ def pages() -> dict[str, str]:
         "commands.md": commands_page(),
         "messages.md": messages_page(),
         "faults.md": faults_page(),
+        "refusals.md": refusals_page(),
     }
+
+
+# ---------------------------------------------------------------------------------------------------------- refusals
+
+
+def refusals_page() -> str:
+    """Every reason to refuse arming or offboard, with what to do."""
+    lines = [
+        "# Why the autopilot refuses",
+        "",
+        NOTICE,
+        "",
+        "Every reason that flockd knows for which an autopilot refuses to arm or to fly offboard, and what to do, in",
+        "the words of `flockd status`, `flockd doctor` and the log; [Why not offboard](../why_not_offboard.md) shows",
+        "how they are found. Names that begin with `check_` or `commander_` are those of PX4's events; the others are",
+        "flockd's.",
+        "",
+        "| what is the matter | what to do | name |",
+        "|---|---|---|",
+        *(f"| {reason.what} | {reason.remedy} | `{name}` |" for name, reason in REASONS.items()),
+    ]
+    return "\n".join(lines) + "\n"
 
 
 # ----------------------------------------------------------------------------------------------------- configuration

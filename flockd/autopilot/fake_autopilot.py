@@ -23,9 +23,11 @@ import numpy as np
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import development as mavlink
 
+from flockd.autopilot.fake_checks import FakeChecks
 from flockd.autopilot.fake_range_finder import FakeRangeFinder
-from flockd.autopilot.fake_telemetry import ON_GROUND_M, Mode, TelemetryStreams, VehicleSnapshot
+from flockd.autopilot.fake_telemetry import ON_GROUND_M, Mode, TelemetryStreams, VehicleSnapshot, custom_mode
 from flockd.autopilot.fake_vehicle import Demand, Motion, MotionState, PointMass
+from flockd.autopilot.refusal_reasons import CHECKS_FAIL, NO_SETPOINTS
 from flockd.autopilot.sticks import stick_curve
 from flockd.messages import FloatArray, Setpoint
 
@@ -36,6 +38,8 @@ TYPE_MASK = 2531
 """The one kind of setpoint it takes: horizontal velocity, height and yaw."""
 DISARM_AFTER_LANDING_S = 2.0
 ARRIVED_M = 0.3
+TEXT_CHUNK = 50
+"""Characters of a STATUSTEXT."""
 STICKS_FRESH_S = 0.5
 OFFBOARD_LOSS_MODES: dict[int, Mode] = {0: "RTL", 3: "RTL", 4: "LAND", 5: "LOITER"}
 """By COM_OBL_RC_ACT, no others; 0 would be position mode, which needs a remote control, which there is none of."""
@@ -65,6 +69,7 @@ class FakeAutopilot:
         truth_port: int | None = None,
         speed_factor: float = 1.0,
         range_finder: FakeRangeFinder | None = None,
+        clock_ahead_s: float = 0.0,
     ) -> None:
         """Bind a socket; nothing is sent before `start`.
 
@@ -80,10 +85,13 @@ class FakeAutopilot:
                 sends it, and may send commands, as a ground station may.
             speed_factor: how fast its time passes.
             range_finder: its own, which faces down; None: it has none.
+            clock_ahead_s: what its clock shows when it is made.
         """
         self._speed_factor = speed_factor
         self.battery_share = 1.0
         self.estimate_ok = True
+        self.failing: set[str] = set()
+        """PX4's names of further checks that fail; each refuses to arm."""
         self.silent = False
         """True: as if the cable were cut, in both directions."""
         self.parameters: dict[str, float | int] = {
@@ -109,6 +117,7 @@ class FakeAutopilot:
         self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         self._mav = mavlink.MAVLink(self, srcSystem=system_id, srcComponent=1)
         self._mav.robust_parsing = True
+        self.checks = FakeChecks(self._mav)
         truth = mavlink.MAVLink(_Outlet(self._socket, self._ground), srcSystem=system_id, srcComponent=1)
         self._motion = motion or PointMass(np.array([0.0, 0.0, -height_m]), yaw_rad)
         self._state = self._motion(Demand(np.zeros(2), -height_m, yaw_rad), 0.0)
@@ -118,9 +127,13 @@ class FakeAutopilot:
         self._hold_down_m = -height_m
         self._hold_yaw_rad = yaw_rad
         self._landed_s: float | None = None
+        self._texts = 0
+        """Sent so far."""
         self._sticks = -math.inf, np.zeros(2)
         """When a person last moved them, and forward and right from -1 to 1."""
-        self._streams = TelemetryStreams(self._mav, truth, heartbeat_s, home_deg, self._clock(), range_finder)
+        self.clock_offset_s = clock_ahead_s - self._clock()
+        """Its own clock, of its stamps and of TIMESYNC, less the monotonic clock times the speed factor."""
+        self._streams = TelemetryStreams(self._mav, truth, heartbeat_s, home_deg, -self.clock_offset_s, range_finder)
         self._lock = threading.RLock()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fake autopilot", daemon=True)
@@ -199,6 +212,7 @@ class FakeAutopilot:
                 now = self._clock()
                 self._fly(min(now - flown_s, MAX_STEP_S))
                 self._streams.send_due(now, self._snapshot())
+                self.checks.tell_changes(self._failing())
             flown_s = now
 
     def _receive_until(self, deadline: float) -> None:
@@ -240,6 +254,7 @@ class FakeAutopilot:
         """A mode requested over MAVLink: while armed, only one that can run."""
         if mode == "OFFBOARD" and self._armed and not self._signal():
             self._say("Offboard not possible: no offboard signal")
+            self.checks.deny("commander_modeswitch_not_avail", custom_mode(mode))
             return False
         self.pilot_selects(mode)
         return True
@@ -248,11 +263,17 @@ class FakeAutopilot:
         if self._intended == "OFFBOARD" and not self._signal():
             self._say("Arming denied: no offboard signal")
             return False
-        if not self.estimate_ok:
-            self._say("Arming denied: no valid position estimate")
+        if self._failing() - {NO_SETPOINTS}:
+            self._say("Arming denied: Resolve system health failures first")
+            self.checks.deny(CHECKS_FAIL)
             return False
         self._armed, self._landed_s = True, None
         return True
+
+    def _failing(self) -> set[str]:
+        """The checks that fail now."""
+        missing = set() if self._signal() else {NO_SETPOINTS}
+        return missing | self.failing | (set() if self.estimate_ok else {"check_estimator_hor_pos_not_stable"})
 
     def _disarm(self) -> None:
         self._armed = False
@@ -321,6 +342,9 @@ class FakeAutopilot:
                 )
             case "MANUAL_CONTROL" if message.target == self._mav.srcSystem:
                 self._sticks = arrived_s, np.clip([message.x, message.y], -1000, 1000) / 1000
+            case "TIMESYNC" if message.tc1 == 0:
+                own_ns = int(1e9 * (self._clock() + self.clock_offset_s))
+                self._mav.timesync_send(own_ns, message.ts1)
             case "PARAM_REQUEST_READ":
                 self._send_parameter(message.param_id)
             case _:
@@ -348,6 +372,9 @@ class FakeAutopilot:
                 done = int(message.param1) in self._streams.intervals_s
                 if done:
                     self._streams.intervals_s[int(message.param1)] = message.param2 * 1e-6
+            case mavlink.MAV_CMD_RUN_PREARM_CHECKS:
+                self.checks.tell(self._failing())
+                done = True
             case mavlink.MAV_CMD_REQUEST_MESSAGE if message.param1 == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
                 self._streams.send_version()
                 done = True
@@ -356,7 +383,10 @@ class FakeAutopilot:
         return int(mavlink.MAV_RESULT_ACCEPTED if done else mavlink.MAV_RESULT_TEMPORARILY_REJECTED)
 
     def _say(self, text: str) -> None:
-        self._mav.statustext_send(mavlink.MAV_SEVERITY_CRITICAL, text[:50].encode())
+        self._texts += 1
+        for chunk, start in enumerate(range(0, len(text) + 1, TEXT_CHUNK)):
+            part = text[start : start + TEXT_CHUNK].encode()
+            self._mav.statustext_send(mavlink.MAV_SEVERITY_CRITICAL, part, self._texts, chunk)
 
     def _send_parameter(self, name: str) -> None:
         value = self.parameters.get(name)

@@ -99,10 +99,6 @@ class TelemetryStreams:
     def _boot_ms(self) -> int:
         return int((self._now_s - self._started_s) * 1000)
 
-    def _custom_mode(self) -> int:
-        _, main, sub = mavutil.px4_map[self._vehicle.mode]
-        return int(main << 16 | sub << 24)
-
     def _send_heartbeat(self) -> None:
         state = mavlink.MAV_STATE_STANDBY
         if self._vehicle.armed:
@@ -112,14 +108,13 @@ class TelemetryStreams:
             mavlink.MAV_TYPE_QUADROTOR,
             mavlink.MAV_AUTOPILOT_PX4,
             mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | armed,
-            self._custom_mode(),
+            custom_mode(self._vehicle.mode),
             state,
         )
 
     def _send_mode(self) -> None:
         self._sent_mode = self._vehicle.mode
-        _, main, sub = mavutil.px4_map[self._vehicle.intended_mode]
-        self._mav.current_mode_send(0, self._custom_mode(), main << 16 | sub << 24)
+        self._mav.current_mode_send(0, custom_mode(self._vehicle.mode), custom_mode(self._vehicle.intended_mode))
 
     def _send_attitude(self) -> None:
         self._mav.attitude_quaternion_send(
@@ -207,6 +202,12 @@ class TelemetryStreams:
         capabilities = mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2 | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
         nothing = [0] * 8
         self._mav.autopilot_version_send(capabilities, 0x00000100, 0, 0, 0, nothing, nothing, nothing, 0, 0, 0)
+
+
+def custom_mode(mode: Mode) -> int:
+    """As PX4 numbers it in MAVLink."""
+    _, main, sub = mavutil.px4_map[mode]
+    return int(main << 16 | sub << 24)
 
 
 def quaternion_from_rotation(rotation: FloatArray) -> tuple[float, float, float, float]:

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 
 from flockd.autopilot.autopilot_status import AutopilotStatus, FlightMode, LandedState
+from flockd.autopilot.clock_sync import ClockSync
+from flockd.autopilot.refusals import CheckEvents, Refusal, refusals
 from flockd.messages import FloatArray, RangeReading, VehicleState
 
 Fields = Mapping[str, Any]
@@ -72,6 +74,19 @@ QUATERNION_TOLERANCE = 0.1
 """Of its norm from 1; one that is farther off is no attitude."""
 HOME_TOLERANCE_M = 0.5
 """A home that moves less in flight is not reported: estimators drift."""
+STAMPED = frozenset({"ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "DISTANCE_SENSOR"})
+"""Messages whose `time_boot_ms` says when they were true."""
+MOST_JITTER_S = 0.005
+"""Of a clock whose stamps are better than times of arrival."""
+LONGEST_DELAY_S = 1.0
+"""A stamp that is older at its arrival is not believed."""
+MAV_SEVERITY_WARNING = 4
+TEXTS_KEPT = 20
+TEXT_MEMORY_S = 10.0
+"""For how long a text counts as a reason for a refusal; nor is it reported again meanwhile."""
+MAV_TYPE_ONBOARD_CONTROLLER = 18
+OTHER_COMPUTER_S = 5.0
+"""For how long another onboard computer counts as there after its last heartbeat."""
 TEXT_CHUNK = 50
 """Characters of a STATUSTEXT; one with fewer is the last of its text."""
 
@@ -89,7 +104,7 @@ class ReceivedMessages:
 
     def __init__(self, report: Callable[[str], None]) -> None:
         """``report`` is called by `add` with one sentence on the first of each unknown value, of a home that moves in
-        flight, and of a landing."""
+        flight, of a landing, and of what the autopilot says as a warning or worse."""
         self._report = report
         self._newest: dict[str, ReceivedMessage] = {}
         self._unknown_values: Counter[str] = Counter()
@@ -100,17 +115,27 @@ class ReceivedMessages:
         self._home_moved = False
         self._landed = False
         self._text = StatusText()
+        self._texts: deque[tuple[float, str]] = deque(maxlen=TEXTS_KEPT)
+        """Warnings and worse, with their times."""
         self._ranges = RangeMessages()
+        self._other_computer_s = -math.inf
+        self.check_events = CheckEvents()
+        self.clock = ClockSync()
 
     def add(self, name: str, fields: Fields, time_s: float) -> None:
-        """Takes a message by its name and fields, NaN as null, as MAVSDK decodes them to JSON."""
+        """Takes a message by its name and fields, NaN as null, as MAVSDK decodes them to JSON, and when it came."""
         if name == "STATUSTEXT":
             whole = self._text.joined(fields)
             if whole is None:
                 return
             fields = {**fields, "text": whole}
-        if name == "DISTANCE_SENSOR":
-            self._ranges.add(fields, time_s)
+            self._take_text(whole.strip(), int(fields.get("severity") or 0), time_s)
+        if name == "EVENT":
+            self.check_events.add(fields, time_s)
+        if name in STAMPED:
+            arrived_s, time_s = time_s, self._stamped_s(fields, time_s)
+            if name == "DISTANCE_SENSOR":
+                self._ranges.add(fields, time_s, arrived_s)
         self._newest[name] = ReceivedMessage(time_s, self._checked(name, fields))
         if name in ("HEARTBEAT", "EXTENDED_SYS_STATE"):
             status = self.status(time_s)
@@ -119,6 +144,41 @@ class ReceivedMessages:
             self._take_landing(status.landed_state)
         elif name == "HOME_POSITION":
             self._take_home(_vector(fields, "x", "y", "z"), _vector(fields, "latitude", "longitude"))
+
+    def add_other_heartbeat(self, fields: Fields, time_s: float) -> None:
+        """Takes a HEARTBEAT of another component on the link."""
+        if fields.get("type") == MAV_TYPE_ONBOARD_CONTROLLER:
+            self._other_computer_s = time_s
+
+    def recent_texts(self, now_s: float, memory_s: float) -> list[str]:
+        """What the autopilot has said in the last seconds as a warning or worse, each once."""
+        return list(dict.fromkeys(text for time_s, text in list(self._texts) if now_s - time_s < memory_s))
+
+    def refusals(self, now_s: float, *, streams: bool) -> tuple[Refusal, ...]:
+        """Why the autopilot would refuse to arm or to fly offboard; ``streams``: flockd sends setpoints."""
+        return refusals(
+            self.status(now_s),
+            self.check_events,
+            {name: self._fields(name) for name in ("HEARTBEAT", "SYS_STATUS")},
+            self.recent_texts(now_s, TEXT_MEMORY_S),
+            now_s - self._other_computer_s < OTHER_COMPUTER_S,
+            streams=streams,
+        )
+
+    def _take_text(self, text: str, severity: int, time_s: float) -> None:
+        if severity > MAV_SEVERITY_WARNING:
+            return
+        if text not in self.recent_texts(time_s, TEXT_MEMORY_S):
+            self._report(f"the autopilot says: {text}")
+        self._texts.append((time_s, text))
+
+    def _stamped_s(self, fields: Fields, arrived_s: float) -> float:
+        """When it was true on this computer's clock: by the autopilot's stamp, else when it came."""
+        clock, boot_ms = self.clock.estimate, fields.get("time_boot_ms")
+        if clock is None or boot_ms is None or clock.jitter_s > MOST_JITTER_S:
+            return arrived_s
+        time_s = min(clock.local_s(1e-3 * (boot_ms + 0.5)), arrived_s)  # the stamp is cut to a millisecond
+        return time_s if arrived_s - time_s <= LONGEST_DELAY_S else arrived_s
 
     @property
     def home_down_m(self) -> float | None:
@@ -251,10 +311,10 @@ class RangeMessages:
         self.newest: RangeReading | None = None
         self._arrivals_s: dict[int, deque[float]] = {}
 
-    def add(self, fields: Fields, time_s: float) -> None:
+    def add(self, fields: Fields, time_s: float, arrived_s: float) -> None:
         """Takes a message by its fields."""
         orientation = int(fields.get("orientation") or 0)
-        self._arrivals_s.setdefault(orientation, deque(maxlen=self.KEPT)).append(time_s)
+        self._arrivals_s.setdefault(orientation, deque(maxlen=self.KEPT)).append(arrived_s)
         if orientation == FACES_DOWN:
             self.newest = _range_reading(fields, time_s)
 

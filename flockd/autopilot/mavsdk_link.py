@@ -15,6 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any, Self, TypeVar
 
 from mavsdk.component_type import ComponentType
@@ -26,7 +27,10 @@ from mavsdk.plugins.param import Param, ParamError
 from mavsdk.system import System
 
 from flockd.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware, FlightMode
+from flockd.autopilot.clock_sync import ClockEstimate
 from flockd.autopilot.mavlink_messages import MODES, Fields, ReceivedMessages, result_text
+from flockd.autopilot.refusal_reasons import REMEDIES_OF_RESULTS
+from flockd.autopilot.refusals import Refusal
 from flockd.autopilot.throttled_log import ThrottledLog
 from flockd.config.autopilot import AutopilotParameters
 from flockd.messages import RangeReading, Setpoint, VehicleState
@@ -43,6 +47,9 @@ COMMAND_ARM_DISARM = 400
 COMMAND_SET_MODE = 176
 COMMAND_SET_MESSAGE_INTERVAL = 511
 COMMAND_REQUEST_MESSAGE = 512
+COMMAND_RUN_CHECKS = 401
+STARTS = frozenset({COMMAND_ARM_DISARM, COMMAND_SET_MODE})
+"""Commands that the autopilot's checks may refuse."""
 STREAMS_HZ = {
     "ATTITUDE_QUATERNION": (31, 50.0),
     "LOCAL_POSITION_NED": (32, 30.0),
@@ -57,8 +64,15 @@ STREAMS_HZ = {
 }
 """What is asked for, by message number and rate. PX4 sends CURRENT_MODE at once when the mode changes, at this rate at
 most; its heartbeat comes once a second whatever one asks."""
-RECEIVED = (*STREAMS_HZ, "HEARTBEAT", "AUTOPILOT_VERSION", "STATUSTEXT")
+RECEIVED = (*STREAMS_HZ, "HEARTBEAT", "AUTOPILOT_VERSION", "STATUSTEXT", "EVENT")
+TIME_SYNC = "TIMESYNC"
+TIME_SYNC_S = 0.1
+"""Between two exchanges."""
+MOST_OPEN = 20
+"""Exchanges whose reply is waited for; older ones are lost."""
 TEXT_MEMORY_S = 2.0
+STREAMS_S = 0.5
+"""Setpoints that are not farther apart are a stream."""
 MOST_REPORTS = 100
 
 _log = logging.getLogger(__name__)
@@ -83,9 +97,13 @@ class AutopilotLink:
         self._system_id = int(system.get_system_id())
         self._reports: deque[str] = deque(maxlen=MOST_REPORTS)
         self._received = ReceivedMessages(self._reports.append)
+        self._sent_s = -math.inf
+        """When the last setpoint was sent."""
         self._param = Param(system)
         self._direct = MavlinkDirect(system)
-        for name in RECEIVED:
+        self._time_syncs: deque[int] = deque(maxlen=MOST_OPEN)
+        """This computer's times in nanoseconds of exchanges that were not answered yet."""
+        for name in (*RECEIVED, TIME_SYNC):
             self._direct.subscribe_message(name, self._receive)
 
     @classmethod
@@ -144,6 +162,32 @@ class AutopilotLink:
         """See `ReceivedMessages.unknown_values`."""
         return self._received.unknown_values()
 
+    def refusals(self) -> tuple[Refusal, ...]:
+        """Why it would refuse to arm or to fly offboard now, the cause first."""
+        now = self._clock()
+        return self._received.refusals(now, streams=now - self._sent_s < STREAMS_S)
+
+    def knows_checks(self) -> bool:
+        """Whether the autopilot's list of failed checks is here, and whole."""
+        return not self._received.check_events.incomplete
+
+    async def ask_for_checks(self) -> None:
+        """Asks it to send its list of failed checks. Raises AutopilotError where it cannot."""
+        await self._command("for its checks", COMMAND_RUN_CHECKS)
+
+    def clock(self) -> ClockEstimate | None:
+        """The autopilot's clock; None while it is not known. It is measured by `synchronise`."""
+        return self._received.clock.estimate
+
+    async def synchronise(self) -> None:
+        """Exchanges times with the autopilot until cancelled."""
+        while True:
+            sent_ns = int(1e9 * self._clock())
+            self._time_syncs.append(sent_ns)
+            with suppress(MavlinkDirectError):  # a link that cannot send says so where setpoints are sent
+                self._direct.send_message(self._message(TIME_SYNC, {"tc1": 0, "ts1": sent_ns}))
+            await asyncio.sleep(TIME_SYNC_S)
+
     def take_reports(self) -> list[str]:
         """What happened to the messages since the last call that people should know, each in one sentence."""
         return [self._reports.popleft() for _ in range(len(self._reports))]
@@ -168,6 +212,7 @@ class AutopilotLink:
             self._direct.send_message(self._message("SET_POSITION_TARGET_LOCAL_NED", {**unused, **fields}))
         except MavlinkDirectError as error:
             raise AutopilotError(f"MAVSDK could not send a setpoint ({error.result.name.lower()})") from error
+        self._sent_s = self._clock()
 
     async def request_offboard(self) -> None:
         """Asks for offboard flight; setpoints must be streaming by then. Raises AutopilotError when refused."""
@@ -216,9 +261,21 @@ class AutopilotLink:
 
     def _receive(self, message: MavlinkMessage, _: object) -> None:
         """Called on MAVSDK's thread, one message after the other."""
+        now = self._clock()
         if message.system_id != self._system_id or message.component_id != AUTOPILOT_COMPONENT:
-            return
-        self._received.add(message.message_name, json.loads(message.fields_json), self._clock())
+            if message.message_name == "HEARTBEAT":
+                self._received.add_other_heartbeat(json.loads(message.fields_json), now)
+        elif message.message_name == TIME_SYNC:
+            self._take_time(json.loads(message.fields_json), now)
+        else:
+            self._received.add(message.message_name, json.loads(message.fields_json), now)
+
+    def _take_time(self, fields: Fields, now: float) -> None:
+        """Takes the reply to an exchange of ours; the autopilot asks in the same message, which is left to others."""
+        sent_ns = int(fields["ts1"])
+        if fields["tc1"] and sent_ns in self._time_syncs:
+            self._time_syncs.remove(sent_ns)
+            self._received.clock.add(1e-9 * sent_ns, 1e-9 * int(fields["tc1"]), now)
 
     async def _set_mode(self, mode: FlightMode) -> None:
         main, sub = next(numbers for numbers, name in MODES.items() if name == mode)
@@ -251,10 +308,18 @@ class AutopilotLink:
             raise AutopilotError(f"the autopilot was asked {what} and did not respond ({result.name.lower()})")
         verdict = int(json.loads(ack)["result"])
         if verdict != 0:
-            text = self._received.newest("STATUSTEXT")
-            recent = text is not None and self._clock() - text.time_s < TEXT_MEMORY_S
-            why = f": {text.fields['text'].strip()}" if text is not None and recent else ""
-            raise AutopilotError(f"the autopilot was asked {what}, which was {result_text(verdict)}{why}")
+            raise AutopilotError(
+                f"the autopilot was asked {what}, which was {result_text(verdict)}{self._why(command, verdict)}"
+            )
+
+    def _why(self, command: int, verdict: int) -> str:
+        """What is known of a refusal, with what to do."""
+        said = self._received.recent_texts(self._clock(), TEXT_MEMORY_S)
+        checks = self.refusals() if command in STARTS else ()
+        known = [*said, *(f"{refusal.what}; {refusal.remedy}" for refusal in checks)]
+        if known:
+            return f": {'; '.join(known)}"
+        return f"; {REMEDIES_OF_RESULTS[verdict]}" if verdict in REMEDIES_OF_RESULTS else ""
 
     def _message(self, name: str, fields: Fields) -> MavlinkMessage:
         target = {"target_system": self._system_id, "target_component": AUTOPILOT_COMPONENT}

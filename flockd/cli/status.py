@@ -86,6 +86,7 @@ def _table(rows: list[dict[str, Any]]) -> Table:
         "battery",
         "sees",
         "load",
+        "clock",
         "mission",
         "what is the matter",
         box=None,
@@ -100,6 +101,7 @@ def _table(rows: list[dict[str, Any]]) -> Table:
             _number(row["battery_share"], ".0%", ""),
             _number(row["neighbours"], "d", ""),
             _number(row["load"], ".0%", ""),
+            _number(None if row["clock_jitter_s"] is None else 1e3 * row["clock_jitter_s"], ".1f", " ms"),
             cell(row["mission"] or ""),
             cell("; ".join(row["matters"])),
         )

@@ -12,6 +12,7 @@ from flockd.daemon.control import Control
 from flockd.daemon.host_monitors import LoopLag, Thermometer, WallClock
 from flockd.daemon.message_sinks import MessageSinks
 from flockd.daemon.pilot_loop import PilotLoop
+from flockd.daemon.refusal_watch import RefusalWatch
 from flockd.daemon.take_off import TakeOff
 from flockd.daemon.watched_networks import WatchedNetworks
 from flockd.sources import FrameSource
@@ -29,6 +30,7 @@ class Components:
     networks: WatchedNetworks
     control: Control
     requests: AutopilotRequests
+    refusals: RefusalWatch
     take_off: TakeOff
     sinks: MessageSinks
     telemetry: ZenohTelemetry

@@ -159,6 +159,8 @@ class Daemon:
         concerns = {
             "control": components.control.run,
             "requests": components.requests.run,
+            "refusals": components.refusals.run,
+            "autopilot clock": components.link.synchronise,
             "pilot": components.pilot_loop.run,
             "loop lag": components.lag.run,
             "thermometer": components.thermometer.run,

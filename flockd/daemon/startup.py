@@ -23,6 +23,7 @@ from flockd.daemon.mission_orders import MissionOrders
 from flockd.daemon.operator_commands import OperatorRequests, command_handler
 from flockd.daemon.pilot_loop import PilotLoop
 from flockd.daemon.preview import preview
+from flockd.daemon.refusal_watch import RefusalWatch
 from flockd.daemon.stream_gate import StreamGate
 from flockd.daemon.supervisor_inputs import InputCollector
 from flockd.daemon.take_off import TakeOff
@@ -93,7 +94,8 @@ async def open_components(
     telemetry.announce(config.name, _about(config), handle, functools.partial(_preview, pilot_loop))
     return Components(
         link=link, streamer=streamer, source=source, pilot_loop=pilot_loop, networks=networks, control=control,
-        requests=requests, take_off=take_off, sinks=sinks, telemetry=telemetry, lag=lag, thermometer=thermometer,
+        requests=requests, refusals=RefusalWatch(link, sinks.event, clock), take_off=take_off, sinks=sinks,
+        telemetry=telemetry, lag=lag, thermometer=thermometer,
         wall_clock=WallClock(sinks.event, time.monotonic), dead_tasks=dead_tasks,
     )  # fmt: skip
 

@@ -10,7 +10,7 @@ from flockd.daemon.components import Components
 from flockd.daemon.service_manager import ServiceManager
 from flockd.safety import Decision, Event, State
 from flockd.telemetry import TOPICS
-from flockd.telemetry.topics import CameraMessage, ComputerMessage, FlightMessage, ReasonMessage
+from flockd.telemetry.topics import CameraMessage, ClockMessage, ComputerMessage, FlightMessage, ReasonMessage
 
 START_POLL_S = 0.1
 START_MORE_S = 10.0
@@ -42,10 +42,11 @@ async def notify_service_manager(components: Components, service: ServiceManager
 
 
 async def publish_status(components: Components, clock: Callable[[], float]) -> None:
-    """Publishes `flight` and `computer` at the rates of the table of topics, until cancelled."""
+    """Publishes `flight`, `computer` and `clock` at the rates of the table of topics, until cancelled."""
     messages: dict[str, Callable[[float], Mapping[str, object]]] = {
         "flight": lambda now: _flight_message(components, now),
         "computer": lambda now: _computer_message(components, now),
+        "clock": lambda now: _clock_message(components, now),
     }
     due_s = dict.fromkeys(messages, clock())
     while True:
@@ -76,11 +77,14 @@ def _status_line(decision: Decision) -> str:
 
 def _flight_message(components: Components, now: float) -> FlightMessage:
     decision, status, stream = components.control.decision, components.link.status(), components.streamer.report()
-    vehicle = components.link.vehicle_state()
+    vehicle, refusals = components.link.vehicle_state(), components.refusals.current
     return FlightMessage(
         time_s=now,
         state=decision.state.value,
-        reasons=[ReasonMessage(event=reason.event.value, sentence=reason.sentence) for reason in decision.reasons],
+        reasons=[
+            *(ReasonMessage(event=reason.event.value, sentence=reason.sentence) for reason in decision.reasons),
+            *(ReasonMessage(event=refusal.reason, sentence=refusal.sentence) for refusal in refusals),
+        ],
         flight_mode=status.flight_mode,
         armed=None if math.isinf(status.heartbeat_age_s) else status.armed,
         in_air=None if status.landed_state == "unknown" else status.in_air,
@@ -91,6 +95,20 @@ def _flight_message(components: Components, now: float) -> FlightMessage:
         silence=stream.silence,
         setpoints_sent=stream.sent,
         setpoints_missed=stream.missed,
+    )
+
+
+def _clock_message(components: Components, now: float) -> ClockMessage:
+    clock = components.link.clock()
+    if clock is None:
+        return ClockMessage(time_s=now, offset_s=None, drift=None, jitter_s=None, round_trip_s=None, age_s=None)
+    return ClockMessage(
+        time_s=now,
+        offset_s=clock.offset_s,
+        drift=clock.drift,
+        jitter_s=clock.jitter_s,
+        round_trip_s=clock.round_trip_s,
+        age_s=now - clock.time_s,
     )
 
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 
 from flockd.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware
+from flockd.autopilot.clock_sync import ClockEstimate
+from flockd.autopilot.mavlink_messages import MOST_JITTER_S
 from flockd.autopilot.mavsdk_link import AutopilotLink
+from flockd.autopilot.refusals import Refusal
 from flockd.config import DroneConfig
 from flockd.config.autopilot import AutopilotParameters
 from flockd.config.safety import GateParameters
@@ -14,6 +18,11 @@ from flockd.doctor.finding import Finding, Level, failed, failed_from_error, pas
 from flockd.doctor.range_checks import WATCHED_S, judge_range_finder
 
 HEARD_S = 10.0
+CLOCK_S = 2.5
+"""For exchanges of times with it."""
+LONGEST_ROUND_TRIP_S = 0.05
+CHECKS_S = 2.0
+"""For the autopilot to run its checks and to tell them."""
 OLDEST_TRIED = (1, 14)
 """Before PX4 1.14, COM_OBL_RC_ACT held only with a remote control, and COM_OBL_ACT without."""
 LONGEST_LOSS_S = 1.0
@@ -42,11 +51,33 @@ async def _ask(config: DroneConfig, parameters: AutopilotParameters) -> list[Fin
         else:
             found += [failed_from_error("firmware", str(firmware)), *await _parameters(link, config, parameters)]
         if link.status().heartbeat_age_s <= parameters.max_heartbeat_age_s:
+            found += judge_refusals(await _refusals(link))
+            found.append(judge_clock(await _clock(link)))
             found += await _range_finder(link, config)
         found += judge_messages(link.unknown_values())
     finally:
         await link.close()
     return found
+
+
+async def _refusals(link: AutopilotLink) -> tuple[Refusal, ...]:
+    """What the autopilot's checks say when they are run now; without such a list, what its messages say."""
+    try:
+        async with asyncio.timeout(CHECKS_S):
+            await link.ask_for_checks()
+            while not link.knows_checks():
+                await asyncio.sleep(0.02)
+    except (AutopilotError, TimeoutError):
+        pass
+    return link.refusals()
+
+
+async def _clock(link: AutopilotLink) -> ClockEstimate | None:
+    """The autopilot's clock after some exchanges; None where it does not answer them."""
+    with suppress(TimeoutError):
+        async with asyncio.timeout(CLOCK_S):
+            await link.synchronise()
+    return link.clock()
 
 
 async def _range_finder(link: AutopilotLink, config: DroneConfig) -> list[Finding]:
@@ -95,6 +126,31 @@ def judge_signing(responds: bool, heartbeat_age_s: float, parameters: AutopilotP
         return warned("signing", "not known: it is not heard any more", "repair the link first")
     measured = "it is heard and does not respond: nothing reaches it, or it accepts signed messages only"
     return failed("signing", measured, "check the cable's other direction; remove the signing key from its SD card")
+
+
+def judge_refusals(refusals: Sequence[Refusal]) -> list[Finding]:
+    """Why it could not be armed or fly offboard now."""
+    if not refusals:
+        return [passed("arming", "its checks let it be armed and fly offboard")]
+    refused = [(f"refuses {refusal.refused}: " if refusal.refused else "", refusal) for refusal in refusals]
+    return [failed("arming", f"{start}{refusal.what}", refusal.remedy) for start, refusal in refused]
+
+
+def judge_clock(clock: ClockEstimate | None) -> Finding:
+    """Whether its stamps can be placed on this computer's clock."""
+    if clock is None:
+        measured = "it does not answer TIMESYNC: attitudes count from when they arrive"
+        return warned("clock", measured, "update the firmware, and check whether the link loses messages")
+    measured = (
+        f"{clock.offset_s:+.4f} s against this computer's, single measurements {1e3 * clock.jitter_s:.2f} ms apart, "
+        f"round trip {1e3 * clock.round_trip_s:.1f} ms"
+    )
+    fix = "raise the link's baud rate, send fewer streams over it, and take load off this computer"
+    if clock.jitter_s > MOST_JITTER_S:
+        return warned("clock", f"{measured}: so uneven, that attitudes count from when they arrive", fix)
+    if clock.round_trip_s > LONGEST_ROUND_TRIP_S:
+        return warned("clock", f"{measured}: attitudes may be misplaced by half of that", fix)
+    return passed("clock", measured)
 
 
 def judge_messages(unknown_values: Mapping[str, int]) -> list[Finding]:

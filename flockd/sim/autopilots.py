@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -146,19 +146,21 @@ class Px4s:
         environment: Mapping[str, str],
         folder: Path,
         parameters: Mapping[str, str] | None = None,
+        first: int = 0,
     ) -> None:
-        """Each works in a folder under ``folder``; ``parameters`` win over `PARAMETERS`.
+        """Each works in a folder under ``folder``, from number ``first`` on; ``parameters`` win over `PARAMETERS`.
 
         Raises UnavailableError where there is no PX4, or where an instance or a daemon of another flight still runs.
         """
-        if len(scenario.vehicles) > MAX_INSTANCES:
+        if first + len(scenario.vehicles) > MAX_INSTANCES:
             raise UsageError(f"PX4 gives ports to {MAX_INSTANCES} vehicles, not {len(scenario.vehicles)}; fly fewer")
         self._build = px4_folder(environment)
-        _refuse_leftovers(len(scenario.vehicles))
+        self._instances = range(first, first + len(scenario.vehicles))
+        _refuse_leftovers(self._instances)
         self._scenario, self._speed_factor, self._folder = scenario, speed_factor, folder
         self._environment = dict(environment)
         self._parameters = {**PARAMETERS, **(parameters or {})}
-        self.ports = tuple(Ports(OFFBOARD_PORT + i, TRUTH_PORT + i) for i in range(len(scenario.vehicles)))
+        self.ports = tuple(Ports(OFFBOARD_PORT + i, TRUTH_PORT + i) for i in self._instances)
         self._programs = Programs()
 
     def __enter__(self) -> Self:
@@ -171,7 +173,7 @@ class Px4s:
 
     def start(self) -> None:
         """See `Autopilots`."""
-        for i, vehicle in enumerate(self._scenario.vehicles):
+        for i, vehicle in zip(self._instances, self._scenario.vehicles, strict=True):
             position = np.array(vehicle.position_m)
             latitude_deg, longitude_deg = home_deg(position)
             parameters = BY_HAND | self._parameters if vehicle.by_hand else self._parameters
@@ -195,8 +197,8 @@ class Px4s:
         return tuple(self._programs)
 
 
-def _refuse_leftovers(count: int) -> None:
-    for i in range(count):
+def _refuse_leftovers(instances: Iterable[int]) -> None:
+    for i in instances:
         instance = px4_instance(i)
         if instance is not None:
             raise UnavailableError(f"PX4 instance {i} runs already: {described(instance)}")

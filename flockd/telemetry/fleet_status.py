@@ -21,6 +21,7 @@ def status_rows(drones: Iterable[Watched], now_s: float) -> list[dict[str, Any]]
 def _row(drone: Watched, now_s: float) -> dict[str, Any]:
     flight: Mapping[str, Any] = drone.message("flight", now_s) or {}
     computer: Mapping[str, Any] = drone.message("computer", now_s) or {}
+    clock: Mapping[str, Any] = drone.message("clock", now_s) or {}
     neighbours = drone.message("neighbours", now_s)
     pilot: Mapping[str, Any] = drone.message("state", now_s) or {}
     health: Mapping[str, Any] = drone.message("health", now_s) or {}
@@ -42,6 +43,8 @@ def _row(drone: Watched, now_s: float) -> dict[str, Any]:
         if neighbours is None
         else sum(1 for neighbour in neighbours["neighbours"] if neighbour["confirmed"]),
         "load": computer.get("load"),
+        "clock_offset_s": clock.get("offset_s"),
+        "clock_jitter_s": clock.get("jitter_s"),
         "mission": (drone.message("mission", now_s) or {}).get("sentence"),
         "matters": malformed
         + (["it has published nothing yet: it starts, or loads its networks"] if starting else [])

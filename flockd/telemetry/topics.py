@@ -3,7 +3,7 @@
 A key is `flockd/v1/<fleet>/<drone>/<topic>`; a message is a JSON object in UTF-8. Every number is finite or null.
 Vectors are lists: NED is north, east, down. Times are seconds on the drone's monotonic clock.
 
-`state` to `timings` follow from each step of the pilot; `flight` and `computer` come from the daemon, at all times.
+`state` to `timings` follow from each step of the pilot; `flight` to `clock` come from the daemon, at all times.
 Beside the topics, a drone's daemon has a liveliness token `.../alive`, replies to a query for `.../about` with an
 `AboutMessage`, one for `.../ask/hold`, `land`, `resume`, `goto` or `velocity` with an `AnswerMessage`, and one for
 `.../image/<camera>` with a small JPEG of what that camera sees. A query for `goto` or `velocity` carries an
@@ -125,7 +125,8 @@ class ReasonMessage(TypedDict):
     """Something that is the matter."""
 
     event: str
-    """For programs: a value of `flockd.safety.Event`."""
+    """For programs: a value of `flockd.safety.Event`, or the name of an autopilot's reason to refuse, as in
+    `flockd.autopilot.refusal_reasons`."""
     sentence: str
     """For people."""
 
@@ -137,7 +138,7 @@ class FlightMessage(TypedDict):
     state: str
     """`idle`, `ready`, `normal`, `degraded`, `hover`, `asking` (for Hold or worse) or `silent` (handed over)."""
     reasons: list[ReasonMessage]
-    """What is the matter, the worst first."""
+    """What is the matter, the worst first; then why the autopilot would refuse to arm or to fly offboard."""
     flight_mode: str
     """The autopilot's."""
     armed: bool | None
@@ -155,6 +156,22 @@ class FlightMessage(TypedDict):
     setpoints_sent: int
     setpoints_missed: int
     """Deadlines that this computer was too busy to keep."""
+
+
+class ClockMessage(TypedDict):
+    """The autopilot's clock against this computer's, measured by MAVLink's TIMESYNC."""
+
+    time_s: float
+    offset_s: float | None
+    """The autopilot's clock, since its start, less this computer's; null before it is known, as all that follows."""
+    drift: float | None
+    """How much faster the autopilot's clock runs: seconds a second."""
+    jitter_s: float | None
+    """Standard deviation of single measurements."""
+    round_trip_s: float | None
+    """The shortest of the last seconds: there and back."""
+    age_s: float | None
+    """Since the last measurement."""
 
 
 class CameraMessage(TypedDict):
@@ -248,5 +265,6 @@ TOPICS = {
         Topic("timings", TimingsMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
         Topic("flight", FlightMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
         Topic("computer", ComputerMessage, rate_hz=1.0, stale_after_s=3.0, recorded=True),
+        Topic("clock", ClockMessage, rate_hz=1.0, stale_after_s=3.0, recorded=True),
     )
 }

@@ -21,6 +21,7 @@ from flockd.errors import ConfigError, ConfigProblem
 from flockd.pilot import FlockPilot
 from flockd.recording.codec import to_json
 from flockd.recording.reader import Recording
+from flockd.telemetry.fleet_status import status_rows
 from tests.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
 from tests.autopilot.flight import until
 from tests.daemon.aboard import CAMERAS, PATIENT, SECONDS_TO_FAIL, SPEED_M_S, STEP_S, TinyPerceiver, aboard
@@ -371,6 +372,24 @@ def test_arming_and_taking_off_by_itself_where_configured(tmp_path: Path) -> Non
 
 def _wrong() -> DroneConfig:
     raise ConfigError([ConfigProblem("tiny.yaml", 3, "step_s", "is missing")])
+
+
+def test_what_the_autopilot_refuses_is_in_status_word_for_word_and_once_in_the_log(tmp_path: Path, port: int) -> None:
+    sentence = "the autopilot refuses to arm: a gyroscope is not calibrated; calibrate it in the ground station"
+
+    async def story() -> None:
+        async with aboard(fake_autopilot, port, tmp_path) as ship:
+            await ship.until_event(sentence)
+            await until(lambda: "check_gyro_not_calibrated" in ship.matters(), SECONDS_TO_FAIL)
+            (row,) = status_rows(ship.watcher.drones(), time.monotonic())
+            assert sentence in row["matters"]
+            fake_autopilot.failing = set()
+            await until(lambda: "check_gyro_not_calibrated" not in ship.matters(), SECONDS_TO_FAIL)
+            assert ship.events.count(sentence) == 1
+
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
+        fake_autopilot.failing = {"check_gyro_not_calibrated"}
+        tell(story)
 
 
 def test_the_configuration_is_read_again_on_the_ground_only(

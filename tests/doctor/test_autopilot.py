@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from flockd.autopilot.autopilot_status import Firmware
+from flockd.autopilot.clock_sync import ClockEstimate
 from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.autopilot.mavsdk_link import AutopilotLink
@@ -16,7 +17,14 @@ from flockd.config.safety import GateParameters, SafetyParameters
 from flockd.config.scenario import RangeFinderConfig
 from flockd.data import data_path
 from flockd.doctor import Check, Finding, Level, autopilot_checks, run_checks
-from flockd.doctor.autopilot_checks import JUDGES, check_autopilot, judge_firmware, judge_messages, judge_signing
+from flockd.doctor.autopilot_checks import (
+    JUDGES,
+    check_autopilot,
+    judge_clock,
+    judge_firmware,
+    judge_messages,
+    judge_signing,
+)
 from tests.autopilot.conftest import HEARTBEAT_S, free_port
 
 GOOD: dict[str, float | int] = {
@@ -28,7 +36,7 @@ GOOD: dict[str, float | int] = {
     "GF_MAX_VER_DIST": 15.0,
 }
 """For the quadrotor's own fence of 50 m and 10 m of height."""
-LISTENS, REQUESTS_MESSAGE = 511, 512
+LISTENS, REQUESTS_MESSAGE, RUNS_CHECKS = 511, 512, 401
 
 
 def _config(port: int) -> DroneConfig:
@@ -59,8 +67,9 @@ def test_an_autopilot_that_is_set_up_well_and_left_as_it_is(monkeypatch: pytest.
         assert not fake_autopilot.setpoints
         assert fake_autopilot.refused_setpoints == 0
         assert fake_autopilot.parameters == {**fake_autopilot.parameters, **GOOD}
-    assert set(asked) <= {LISTENS, REQUESTS_MESSAGE}, "it listens and asks, and commands nothing"
-    assert found.keys() == {"heartbeat", "firmware", "signing", "range finder", *GOOD}
+    assert set(asked) <= {LISTENS, REQUESTS_MESSAGE, RUNS_CHECKS}, "it listens and asks, and commands nothing"
+    assert found.keys() == {"heartbeat", "firmware", "signing", "arming", "clock", "range finder", *GOOD}
+    del found["clock"]  # how even it is depends on how busy this computer is
     assert {about for about, finding in found.items() if finding.level is not Level.PASS} == {"firmware"}
     assert found["firmware"].measured.startswith("PX4 0.0.1 is older than 1.14"), "the fake autopilot is not PX4"
     assert "system 1 at udpin://127.0.0.1" in found["heartbeat"].measured
@@ -83,6 +92,31 @@ def test_bad_values_are_read_and_reported_with_what_to_do() -> None:
     assert found["GF_ACTION"].level is Level.FAILURE
     assert "GF_ACTION could not be read (timeout)" in found["GF_ACTION"].measured
     assert (found["heartbeat"].level, found["heartbeat"].measured[-9:]) == (Level.WARNING, "and armed")
+
+
+def test_what_keeps_it_from_being_armed_is_a_failure_each_with_what_to_do() -> None:
+    port = free_port()
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
+        fake_autopilot.failing = {"check_gyro_not_calibrated"}
+        found = _examined(port)["arming"]
+    assert (found.level, found.measured, found.fix) == (
+        Level.FAILURE, "refuses to arm: a gyroscope is not calibrated", "calibrate it in the ground station"
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("jitter_s", "round_trip_s", "level", "words"),
+    [
+        (0.0004, 0.003, Level.PASS, "-46765.2500 s against this computer's, single measurements 0.40 ms apart"),
+        (0.02, 0.003, Level.WARNING, "20.00 ms apart, round trip 3.0 ms: so uneven, that attitudes count"),
+        (0.0004, 0.2, Level.WARNING, "round trip 200.0 ms: attitudes may be misplaced by half of that"),
+    ],
+)
+def test_a_clock_is_good_as_its_round_trips(jitter_s: float, round_trip_s: float, level: Level, words: str) -> None:
+    finding = judge_clock(ClockEstimate(47_000.0, -46_765.25, 0.0, jitter_s, round_trip_s, 20))
+    assert finding.level is level
+    assert words in finding.measured
+    assert judge_clock(None).level is Level.WARNING
 
 
 def test_nobody_there_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -85,7 +85,7 @@ def test_a_step_arrives_under_the_documented_keys_and_fields(watched: tuple[Zeno
     publish_step(telemetry, "1", _yawed(-90.0), _output(np.array([1.0, 0.0, np.nan])))
     messages = dict(received.get(timeout=10) for _ in range(6))
 
-    of_a_step = set(TOPICS) - {"events", "flight", "computer"}
+    of_a_step = set(TOPICS) - {"events", "flight", "computer", "clock"}
     assert set(messages) == {f"flockd/v1/meadow/1/{topic}" for topic in of_a_step}
     for topic in of_a_step:
         assert set(messages[f"flockd/v1/meadow/1/{topic}"]) == set(TOPICS[topic].type.__annotations__)
