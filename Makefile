@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help demo docs lint test test-all coverage mutate mutate-all references lock sbom clean
+.PHONY: help demo docs lint test test-all browser coverage mutate mutate-all references lock sbom clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -27,6 +27,9 @@ test: lint ## lint and all tests but the slow ones, on two cores in under 10 min
 
 test-all: lint ## lint and all tests, those too that take minutes each
 	$(BIN)/python -m pytest -n 2
+
+browser: $(VENV)/test.installed ## the fleet page in a headless Chromium: /usr/bin/chromium, or what CHROMIUM names
+	$(BIN)/python -m pytest -m browser -rP tests/fleet_page
 
 coverage: $(VENV)/test.installed ## which branches of the safety layer its tests take; fails below all of them
 	$(BIN)/python -m coverage run --branch --source=flockd/safety -m pytest tests/safety

@@ -66,6 +66,7 @@ MAY_IMPORT = {
     | {"sources", "autopilot"},  # real daemons are fed frames and given autopilots
     "report": BASE | {"flocking", "flight_log", "side_process"},
     "view": BASE | {"geometry", "perception", "pilot", "recording"},
+    "fleet_page": BASE | {"telemetry", "recording"},
     "daemon": BASE
     | {"obstacles"}
     | {"geometry", "inference", "perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"}
@@ -86,6 +87,7 @@ MAY_IMPORT = {
         "view",
         "daemon",
         "doctor",
+        "fleet_page",
     }
     | {"calibration", "geometry", "sources", "pictures"},
 }
@@ -192,6 +194,8 @@ FRAMES_OVER_ZENOH = PACKAGE / "sources" / "shared_memory.py"
 """A drone's own camera frames may come over zenoh, under keys that no telemetry has."""
 WATCHER = PACKAGE / "telemetry" / "watcher.py"
 """Reads telemetry, for the commands that people run."""
+OPERATOR = PACKAGE / "telemetry" / "operator_client.py"
+"""Sends what operators ask, for the commands that people run."""
 FLEET_STATUS = PACKAGE / "telemetry" / "fleet_status.py"
 """The table of `flockd status`."""
 REPLIES = PACKAGE / "telemetry" / "publisher.py"
@@ -230,10 +234,12 @@ def test_no_drone_reads_telemetry_to_fly() -> None:
         text = path.read_text(encoding="utf-8")
         for word, allowed in readers.items():
             assert word not in text or path in allowed, path
-        if _folder(path) not in {"cli", "doctor"} and path != FLEET_STATUS:
+        if _folder(path) not in {"cli", "doctor", "fleet_page"} and path != FLEET_STATUS:
             assert "flockd.telemetry.watcher" not in _imports(path), path
         if _folder(path) != "cli":
             assert "flockd.telemetry.operator_client" not in _imports(path), path
+        if path not in {WATCHER, OPERATOR} and _folder(path) != "fleet_page":
+            assert "flockd.telemetry.drone_queries" not in _imports(path), path
 
 
 def test_one_file_opens_and_closes_sessions() -> None:

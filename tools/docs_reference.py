@@ -235,9 +235,10 @@ def commands_page() -> str:
 
 
 def _leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
-    """The commands that do something, in the order of the help."""
+    """The commands that do something, in the order of the help: some that have commands do so without one too."""
     inner = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
-    if not inner:
+    idle = (argparse._HelpAction, argparse._VersionAction)
+    if not inner or any(action.option_strings and not isinstance(action, idle) for action in parser._actions):
         yield parser
     for action in inner:
         for command in dict.fromkeys(action.choices.values()):
@@ -245,7 +246,8 @@ def _leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser
 
 
 def _command(parser: argparse.ArgumentParser) -> list[str]:
-    shown = [a for a in parser._actions if a.help != argparse.SUPPRESS and not isinstance(a, argparse._HelpAction)]
+    hidden = (argparse._HelpAction, argparse._SubParsersAction)
+    shown = [a for a in parser._actions if a.help != argparse.SUPPRESS and not isinstance(a, hidden)]
     positional = [action for action in shown if not action.option_strings]
     words = [parser.prog, *(_positional(action) for action in positional)]
     words += [_option(action) for action in shown if action.option_strings and action.required]

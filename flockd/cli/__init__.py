@@ -33,6 +33,7 @@ EXTRAS = {
     "pyarrow": "parquet",
     "rerun": "view",
     "argcomplete": "completion",
+    **dict.fromkeys(("aiohttp", "plotly"), "fleet"),
 }
 
 EXIT_CODES = """\

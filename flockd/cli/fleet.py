@@ -1,4 +1,4 @@
-"""`flockd fleet`: asks drones of a fleet to fly somewhere else, to hold, to land, or to go on."""
+"""`flockd fleet`: a page of the fleet, and commands that ask its drones to fly elsewhere, hold, land, or go on."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flockd.cli import fleet_page
 from flockd.cli.output import complain, say, say_json
 from flockd.cli.parser import Commands, Parser, add_commands, positive_number
 from flockd.cli.status import ENDPOINT
@@ -32,15 +33,21 @@ PLAIN = {
 def add(commands: Commands) -> None:
     """Adds the command."""
     examples = (
+        "flockd fleet",
+        "flockd fleet --connect tcp/10.0.0.11:7447 --connect tcp/10.0.0.12:7447",
+        "flockd fleet --recordings out/paper-flight-learned-seed1/recordings",
         "flockd fleet goto all 20 -5 --height 4",
         "flockd fleet velocity drone1 0.5 0 --seconds 10",
         "flockd fleet hold all",
     )
-    parser = commands("fleet", "Ask drones to fly somewhere else, to hold, to land, or to go on.", examples, _NOTES)
+    what = "Show the fleet on a page in the browser; with a command: ask drones to fly elsewhere, hold, land, or go on."
+    parser = commands("fleet", what, examples, _NOTES)
     add_commands(parser, (_add_goto, _add_velocity, *(_plain(command) for command in PLAIN)))
+    fleet_page.add_options(parser)
 
 
 _NOTES = """\
+Without a command it serves the page, and prints its address with a key: who has it may open the page.
 A drone takes only what its `telemetry.commands` allows, and no goal outside its fence. Its answer says that it tries;
 `flockd status` shows what becomes of it. Exit code 1: a drone refused, or did not answer."""
 

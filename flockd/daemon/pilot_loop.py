@@ -69,6 +69,8 @@ class PilotLoop:
         self.frames: FrameSet | None = None
         """The newest; None before the first."""
         self.newest: StepResult | None = None
+        self.stepped: tuple[FrameSet, PilotOutput] | None = None
+        """The frames of the newest result, and its output."""
         self.steps = 0
         self.failed = 0
         """Steps without a result, because a network failed or was late."""
@@ -132,6 +134,7 @@ class PilotLoop:
         number = 1 if self._pilot is None or self.newest is None else self.newest.number + 1
         self._pilot = pilot
         self.newest = StepResult(taken_s, output, flight, number)
+        self.stepped = frames, output
         self._count(self.newest)
         report = self._height_reports.update(output.reasons)
         if report is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import functools
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from contextlib import AsyncExitStack
@@ -22,7 +21,7 @@ from flockd.daemon.message_sinks import MessageSinks
 from flockd.daemon.mission_orders import MissionOrders
 from flockd.daemon.operator_commands import OperatorRequests, command_handler
 from flockd.daemon.pilot_loop import PilotLoop
-from flockd.daemon.preview import preview
+from flockd.daemon.preview import Previews
 from flockd.daemon.refusal_watch import RefusalWatch
 from flockd.daemon.stream_gate import StreamGate
 from flockd.daemon.supervisor_inputs import InputCollector
@@ -30,6 +29,7 @@ from flockd.daemon.take_off import TakeOff
 from flockd.daemon.vehicle_history import VehicleHistory
 from flockd.daemon.watched_networks import InterruptibleNetworks, WatchedNetworks
 from flockd.daemon.worker import BusyError, LateError, Worker
+from flockd.geometry import build_rig
 from flockd.safety import Decision, Gate
 from flockd.sources import FrameSource
 from flockd.telemetry.publisher import ZenohTelemetry
@@ -91,7 +91,8 @@ async def open_components(
     missions = MissionOrders(config, pilot_loop, link.vehicle_state, lambda: control.decision.state)
     loop = asyncio.get_running_loop()
     handle = command_handler(config.telemetry.commands, operator, missions, loop, sinks.event)
-    telemetry.announce(config.name, _about(config), handle, functools.partial(_preview, pilot_loop))
+    previews = Previews(build_rig(config.rig), lambda: (pilot_loop.frames, pilot_loop.stepped))
+    telemetry.announce(config.name, _about(config), handle, previews.picture)
     return Components(
         link=link, streamer=streamer, source=source, pilot_loop=pilot_loop, networks=networks, control=control,
         requests=requests, refusals=RefusalWatch(link, sinks.event, clock), take_off=take_off, sinks=sinks,
@@ -118,11 +119,6 @@ def _about(config: DroneConfig) -> AboutMessage:
         configuration=config.model_dump(mode="json"),
         commands=list(config.telemetry.commands),
     )
-
-
-def _preview(pilot_loop: PilotLoop, camera: str) -> bytes | None:
-    frame = None if pilot_loop.frames is None else pilot_loop.frames.frames.get(camera)
-    return None if frame is None else preview(frame)
 
 
 async def _both(

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from flockd.telemetry.drone_queries import DroneQueries
 from flockd.telemetry.topics import PREFIX, AnswerMessage, checked_name
 from flockd.zenoh_session import SessionOwner, open_session
 
 FIND_S = 3.0
-ANSWER_S = 3.0
 _AGAIN_S = 0.2
 
 
@@ -24,6 +23,7 @@ class FleetOperator(SessionOwner):
         """``fleet``: None for every fleet that is heard."""
         self._fleet = "*" if fleet is None else checked_name(fleet)
         self._session = open_session("telemetry", listen, connect, settings=settings)
+        self._queries = DroneQueries(self._session)
 
     def drones(self, wanted: Sequence[str] | None, find_s: float = FIND_S) -> tuple[str, ...]:
         """The keys `fleet/drone` of the drones that are alive, in order; ``wanted``: of these names, None: of all.
@@ -42,10 +42,4 @@ class FleetOperator(SessionOwner):
 
     def ask(self, drone: str, command: str, message: Mapping[str, object] | None = None) -> AnswerMessage | None:
         """One drone's answer to a command; ``drone`` as of `drones`. None: it gave none in time."""
-        payload = b"" if message is None else json.dumps(message, allow_nan=False).encode()
-        key = f"{PREFIX}/{drone}/ask/{command}"
-        for reply in self._session.get(key, payload=payload, timeout=ANSWER_S):
-            if reply.ok is not None:
-                answer = json.loads(reply.ok.payload.to_bytes())
-                return AnswerMessage(accepted=bool(answer["accepted"]), sentence=str(answer["sentence"]))
-        return None
+        return self._queries.ask(drone, command, message)

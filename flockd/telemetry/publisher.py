@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import zenoh
 
-from flockd.telemetry.topics import PREFIX, TOPICS, AboutMessage, AnswerMessage, checked_name
+from flockd.telemetry.topics import PREFIX, TOPICS, AboutMessage, AnswerMessage, ClockMessage, checked_name
 from flockd.zenoh_session import SessionOwner, open_session
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -60,17 +61,21 @@ class ZenohTelemetry(SessionOwner):
             self._lost += 1
 
     def show_alive(self, drone: str) -> None:
-        """Publishes that a drone is alive for as long as this session is, without a daemon to ask."""
-        self._kept.append(self._session.liveliness().declare_token(f"{self._prefix}/{checked_name(drone)}/alive"))
+        """Publishes that a drone is alive for as long as this session is, and tells its clocks; no daemon to ask."""
+        key = f"{self._prefix}/{checked_name(drone)}"
+        self._kept += [
+            self._session.liveliness().declare_token(f"{key}/alive"),
+            self._session.declare_queryable(f"{key}/clock", _tell_time),
+        ]
 
     def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
         """Publishes that a drone is alive for as long as this session is, and replies to queries.
 
-        Queries are for what it flies with, operators' commands, and a camera's newest image.
+        Queries are for what it flies with, its clocks, operators' commands, and a camera's newest image.
         """
-        key = f"{self._prefix}/{checked_name(drone)}"
+        self.show_alive(drone)
+        key = f"{self._prefix}/{drone}"
         self._kept += [
-            self._session.liveliness().declare_token(f"{key}/alive"),
             self._session.declare_queryable(f"{key}/about", lambda query: _reply(query, about)),
             self._session.declare_queryable(
                 f"{key}/ask/*",
@@ -101,6 +106,10 @@ def _payload(query: zenoh.Query) -> bytes:
 def _reply(query: zenoh.Query, message: Mapping[str, object]) -> None:
     """Replies under the key of the query; a query for several at once, as with `*`, gets one reply."""
     query.reply(query.key_expr, json.dumps(_finite(message), allow_nan=False), encoding=zenoh.Encoding.APPLICATION_JSON)
+
+
+def _tell_time(query: zenoh.Query) -> None:
+    _reply(query, ClockMessage(time_s=time.monotonic(), wall_s=time.time()))
 
 
 def _send_image(query: zenoh.Query, newest_image: NewestImage) -> None:

@@ -18,7 +18,7 @@ def fault(message: object, kind: type) -> str | None:
     own time may not be.
     """
     found = _fault("", message, kind)
-    if found is None and isinstance(message, dict) and message.get("time_s") is None:
+    if found is None and "time_s" in _fields(kind) and isinstance(message, dict) and message["time_s"] is None:
         return "time_s is null"
     return found
 

@@ -6,13 +6,14 @@ import math
 from collections.abc import Mapping
 from typing import Protocol
 
-from flockd.messages import MissionStatus, Neighbour, PilotOutput, VehicleState
+from flockd.messages import MissionStatus, Neighbour, ObstacleRanges, PilotOutput, VehicleState
 from flockd.telemetry.topics import (
     CommandMessage,
     HealthMessage,
     MissionMessage,
     NeighbourMessage,
     NeighboursMessage,
+    ObstaclesMessage,
     StateMessage,
     TimingsMessage,
 )
@@ -29,6 +30,8 @@ def publish_step(sink: TelemetrySink, drone: str, vehicle: VehicleState, output:
     """Publishes all that one step of one drone's pilot has to tell."""
     sink.publish(drone, "state", _state(vehicle, output))
     sink.publish(drone, "neighbours", _neighbours(output))
+    if output.obstacles is not None:
+        sink.publish(drone, "obstacles", _obstacles(output.obstacles))
     sink.publish(drone, "command", _command(output))
     if output.mission is not None:
         sink.publish(drone, "mission", _mission(output.time_s, vehicle, output.mission))
@@ -45,6 +48,8 @@ def _state(vehicle: VehicleState, output: PilotOutput) -> StateMessage:
         pitch_deg=math.degrees(math.asin(max(-1.0, min(1.0, -R[2, 0])))),
         yaw_deg=math.degrees(math.atan2(R[1, 0], R[0, 0])),
         velocity_ned=None if output.velocity is None else output.velocity.tolist(),
+        position_ne=None if vehicle.position is None else vehicle.position.tolist(),
+        home_deg=None if vehicle.home_deg is None else vehicle.home_deg.tolist(),
     )
 
 
@@ -64,6 +69,13 @@ def _neighbour(neighbour: Neighbour) -> NeighbourMessage:
         age_s=neighbour.age_s,
         unseen_s=neighbour.unseen_s,
         confirmed=neighbour.confirmed,
+    )
+
+
+def _obstacles(obstacles: ObstacleRanges) -> ObstaclesMessage:
+    """To the centimetre."""
+    return ObstaclesMessage(
+        time_s=obstacles.time_s, range_m=obstacles.range_m.round(2).tolist(), seen_m=obstacles.seen_m.round(2).tolist()
     )
 
 

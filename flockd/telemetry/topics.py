@@ -5,9 +5,9 @@ Vectors are lists: NED is north, east, down. Times are seconds on the drone's mo
 
 `state` to `timings` follow from each step of the pilot; `flight` to `clock` come from the daemon, at all times.
 Beside the topics, a drone's daemon has a liveliness token `.../alive`, replies to a query for `.../about` with an
-`AboutMessage`, one for `.../ask/hold`, `land`, `resume`, `goto` or `velocity` with an `AnswerMessage`, and one for
-`.../image/<camera>` with a small JPEG of what that camera sees. A query for `goto` or `velocity` carries an
-`OrderMessage`.
+`AboutMessage`, one for `.../clock` with a `ClockMessage`, one for `.../ask/hold`, `land`, `resume`, `goto` or
+`velocity` with an `AnswerMessage`, and one for `.../image/<camera>` with a small JPEG of what that camera sees. A query
+for `goto` or `velocity` carries an `OrderMessage`.
 """
 
 from __future__ import annotations
@@ -44,6 +44,10 @@ class StateMessage(TypedDict):
     """Clockwise from north, -180 to 180."""
     velocity_ned: list[float] | None
     """m/s, as the flock law used it; null before there is one."""
+    position_ne: list[float] | None
+    """Metres from home, as the autopilot has it; null where it has none. For people: the flock law does not use it."""
+    home_deg: list[float] | None
+    """Latitude and longitude of home; null where the autopilot does not know it."""
 
 
 class NeighbourMessage(TypedDict):
@@ -66,6 +70,16 @@ class NeighboursMessage(TypedDict):
 
     time_s: float
     neighbours: list[NeighbourMessage]
+
+
+class ObstaclesMessage(TypedDict):
+    """The nearest obstacle in each of 72 directions, clockwise from north; not sent where none are looked for."""
+
+    time_s: float
+    range_m: list[float]
+    """Level, from the drone's centre; null where nothing was seen."""
+    seen_m: list[float]
+    """How far each direction is known to be free or measured; 0 where it was not looked at."""
 
 
 class CommandMessage(TypedDict):
@@ -215,6 +229,15 @@ class AboutMessage(TypedDict):
     """What operators may ask of it."""
 
 
+class ClockMessage(TypedDict):
+    """The drone's clocks as it replies: for its watchers, who learn from it the delay of the link too."""
+
+    time_s: float
+    """Monotonic."""
+    wall_s: float
+    """Seconds since 1970, UTC."""
+
+
 class OrderMessage(TypedDict, total=False):
     """What `goto` and `velocity` ask: a goal in metres or degrees, or a velocity; what is left out stays as it is."""
 
@@ -258,6 +281,7 @@ TOPICS = {
     for topic in (
         Topic("state", StateMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
         Topic("neighbours", NeighboursMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
+        Topic("obstacles", ObstaclesMessage, rate_hz=2.0, stale_after_s=1.5, recorded=False),
         Topic("command", CommandMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
         Topic("mission", MissionMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
         Topic("health", HealthMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 
 import zenoh
 
+from flockd.telemetry.drone_queries import DroneQueries
 from flockd.telemetry.schema import fault
 from flockd.telemetry.topics import PREFIX, TOPICS, checked_name, is_name
 from flockd.zenoh_session import SessionOwner, open_session
@@ -20,6 +22,10 @@ MAX_BYTES = 1 << 20
 """Of a message; one with every field at its longest has a hundredth of it."""
 MAX_DRONES = 1000
 """Of a bus on which somebody invents drones, so many are remembered."""
+MAX_EVENTS = 500
+"""So many of the newest are remembered."""
+_PERIOD_SHARE = 0.2
+"""Of the newest period in the mean."""
 _SLOWEST = 10.0
 """The smallest speed factor that a daemon's configuration allows is 0.1."""
 
@@ -32,16 +38,29 @@ class Heard:
     message: Mapping[str, Any]
     slowness: float = 1.0
     """Seconds of the watcher's clock in one of the drone's: a simulated drone's time may pass slowly."""
+    period_s: float | None = None
+    """Between new messages, by the watcher's clock, smoothed; None before the second."""
+    new_s: float | None = None
+    """When the newest came that was not sent once more."""
 
 
 def _heard(before: Heard | None, now_s: float, message: Mapping[str, Any]) -> Heard:
     """With how slowly the drone's time passed since its message before."""
     if before is None:
-        return Heard(now_s, message, _SLOWEST)  # not known yet
+        return Heard(now_s, message, _SLOWEST, new_s=now_s)  # not known yet
     own_s = message.get("time_s", 0.0) - before.message.get("time_s", 0.0)
     if own_s <= 0:
-        return Heard(now_s, message, before.slowness)  # sent once more, or begun again
-    return Heard(now_s, message, min(max((now_s - before.time_s) / own_s, 1.0), _SLOWEST))
+        return replace(before, time_s=now_s, message=message)  # sent once more, or begun again
+    slowness = min(max((now_s - before.time_s) / own_s, 1.0), _SLOWEST)
+    return Heard(now_s, message, slowness, _period_s(before, now_s), new_s=now_s)
+
+
+def _period_s(before: Heard, now_s: float) -> float | None:
+    """A moving mean of the time from one new message to the next."""
+    if before.new_s is None:
+        return None
+    period_s = now_s - before.new_s
+    return period_s if before.period_s is None else before.period_s + _PERIOD_SHARE * (period_s - before.period_s)
 
 
 @dataclass(frozen=True)
@@ -66,6 +85,16 @@ class Watched:
         return heard.message
 
 
+@dataclass(frozen=True)
+class HeardEvent:
+    """Something that happened once to one drone, and when it was heard on the watcher's clock."""
+
+    time_s: float
+    fleet: str
+    drone: str
+    sentence: str
+
+
 class FleetWatcher(SessionOwner):
     """Hears all that the drones of a fleet publish. Raises UnavailableError for an endpoint that cannot be used."""
 
@@ -84,7 +113,10 @@ class FleetWatcher(SessionOwner):
         self._drones: dict[tuple[str, str], Watched] = {}
         self.malformed = 0
         """Messages that are none, and those of drones that cannot be."""
+        self._events: deque[HeardEvent] = deque(maxlen=MAX_EVENTS)
         self._session = open_session("telemetry", listen, connect, settings=settings)
+        self.queries = DroneQueries(self._session)
+        """To the same drones."""
         drones = f"{PREFIX}/{'*' if fleet is None else checked_name(fleet)}/*"
         self._subscribers = [
             self._session.declare_subscriber(f"{drones}/{topic}", self._take_message) for topic in TOPICS
@@ -95,6 +127,11 @@ class FleetWatcher(SessionOwner):
         """All that were ever heard of."""
         with self._lock:
             return tuple(drone for drone in self._drones.values() if drone.seen)
+
+    def events(self) -> tuple[HeardEvent, ...]:
+        """The newest, in the order in which they came."""
+        with self._lock:
+            return tuple(self._events)
 
     def reached(self) -> int:
         """How many peers and routers it is connected to."""
@@ -115,6 +152,8 @@ class FleetWatcher(SessionOwner):
                 self._drones[fleet, drone] = replace(watched, malformed=malformed)
                 return
             heard = _heard(watched.topics.get(topic), self._clock(), message)
+            if topic == "events":
+                self._events.append(HeardEvent(heard.time_s, fleet, drone, message["event"]))
             malformed = {name: why for name, why in watched.malformed.items() if name != topic}
             self._drones[fleet, drone] = replace(
                 watched, topics={**watched.topics, topic: heard}, malformed=malformed, seen=True

@@ -14,7 +14,15 @@ import pytest
 import zenoh
 
 from flockd.errors import UnavailableError
-from flockd.messages import MissionStatus, Neighbour, PilotOutput, VehicleState, VelocityCommand
+from flockd.messages import (
+    SECTORS,
+    MissionStatus,
+    Neighbour,
+    ObstacleRanges,
+    PilotOutput,
+    VehicleState,
+    VelocityCommand,
+)
 from flockd.telemetry import TOPICS, publish_step
 from flockd.telemetry.publisher import ZenohTelemetry
 
@@ -63,7 +71,7 @@ def _wait_until_heard(telemetry: ZenohTelemetry, received: Received) -> None:
 def _yawed(yaw_deg: float) -> VehicleState:
     cosine, sine = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
     attitude = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    return VehicleState(time_s=12.5, R_ned_body=attitude, height_m=4.5)
+    return VehicleState(time_s=12.5, R_ned_body=attitude, height_m=4.5, position=np.array([3.0, -4.0]))
 
 
 def _output(velocity: np.ndarray | None) -> PilotOutput:
@@ -77,13 +85,14 @@ def _output(velocity: np.ndarray | None) -> PilotOutput:
         neighbours=(neighbour,), command=command,
         reasons=("no ego-motion: 12 pairs are too few",), counts={"ego": 1}, stages_ms={"flow": 14.0},
         mission=MissionStatus("waypoints", np.array([1.0, 0.0]), "9 m to the goal", goal=np.array([9.0, 2.0])),
+        obstacles=ObstacleRanges(12.5, np.full(SECTORS, np.inf), np.zeros(SECTORS), np.full(SECTORS, 4.0)),
     )  # fmt: skip
 
 
 def test_a_step_arrives_under_the_documented_keys_and_fields(watched: tuple[ZenohTelemetry, Received]) -> None:
     telemetry, received = watched
     publish_step(telemetry, "1", _yawed(-90.0), _output(np.array([1.0, 0.0, np.nan])))
-    messages = dict(received.get(timeout=10) for _ in range(6))
+    messages = dict(received.get(timeout=10) for _ in range(7))
 
     of_a_step = set(TOPICS) - {"events", "flight", "computer", "clock"}
     assert set(messages) == {f"flockd/v1/meadow/1/{topic}" for topic in of_a_step}
@@ -97,6 +106,9 @@ def test_a_step_arrives_under_the_documented_keys_and_fields(watched: tuple[Zeno
     assert neighbours[0]["position_ned"] == [1.0, -2.5, 0.5]
     assert neighbours[0]["velocity_sigma_m_s"] is None
     assert messages["flockd/v1/meadow/1/command"]["yaw_deg"] == pytest.approx(90.0)
+    assert (state["position_ne"], state["home_deg"]) == ([3.0, -4.0], None)
+    obstacles = messages["flockd/v1/meadow/1/obstacles"]
+    assert (obstacles["range_m"], obstacles["seen_m"]) == ([None] * 72, [4.0] * 72)
     health = messages["flockd/v1/meadow/1/health"]
     assert (health["ok"], health["refused"]) == (False, {"ego": 1})
 

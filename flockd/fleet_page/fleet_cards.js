@@ -1,0 +1,155 @@
+// One card a drone, made once and then kept up to date where something has changed.
+import { STATES, colourOf, nameOf, put, state, written } from "./fleet_state.js";
+
+const PICTURES_EVERY_MS = 1000;
+const VALUES = [
+  ["mode", (row) => row.flight_mode || "–"],
+  ["motors", (row) => (row.armed === null ? "–" : row.armed ? (row.in_air ? "in the air" : "armed") : "disarmed")],
+  ["battery", (row) => written(row.battery_share === null ? null : 100 * row.battery_share, 0, " %"), (row) => row.battery_share !== null && row.battery_share < 0.2],
+  ["height", (row) => written(row.height_m, 1, " m")],
+  ["speed", (row) => written(row.speed_m_s, 1, " m/s")],
+  ["sees", (row) => (row.neighbours === null ? "–" : `${row.neighbours}`)],
+  ["steps", (row) => written(row.rate_hz, 1, " /s")],
+  ["load", (row) => written(row.load === null ? null : 100 * row.load, 0, " %"), (row) => row.load > 1],
+  ["temperature", (row) => written(row.temperature_c, 0, " °C"), (row) => row.temperature_c > 85],
+  ["link delay", (row) => written(row.delay_ms, row.delay_ms < 10 ? 1 : 0, " ms")],
+  ["clock", (row) => apart(row.clock_s), (row) => Math.abs(row.clock_s) > 1],
+  ["missed", (row) => written(row.setpoints_missed, 0, "")],
+];
+
+const EXPLAINED = {
+  sees: "drones that it tracks and is sure of",
+  steps: "of its pilot, as they arrive here",
+  load: "how long its steps take over how long they may",
+  "link delay": "from here to the drone and back",
+  clock: "the drone's wall clock less this computer's",
+  missed: "setpoints that its computer was too busy to send in time",
+};
+
+function apart(seconds) {
+  if (seconds === null) return "–";
+  const sign = seconds < 0 ? "−" : "+";
+  const much = Math.abs(seconds);
+  return much < 1 ? `${sign}${(1000 * much).toFixed(0)} ms` : `${sign}${much.toFixed(1)} s`;
+}
+
+export class FleetCards {
+  constructor(section, choose, commands) {
+    [this.section, this.choose, this.commands] = [section, choose, commands];
+    this.template = document.getElementById("card");
+    this.cards = new Map();
+    this.shown = new Map();
+    this.order = "";
+    setInterval(() => this.look(), PICTURES_EVERY_MS);
+  }
+
+  changed(keys) {
+    for (const key of state.order) if (!this.cards.has(key)) this.make(key);
+    for (const [key, card] of this.cards) {
+      if (state.rows.has(key)) continue;
+      card.remove();
+      this.cards.delete(key);
+    }
+    const order = state.order.join(" ");
+    if (order !== this.order) {
+      this.order = order;
+      this.section.append(...state.order.map((key) => this.cards.get(key)));
+      keys = state.order;
+    }
+    for (const key of keys) this.write(key);
+  }
+
+  chosen() {
+    for (const [key, card] of this.cards) card.classList.toggle("chosen", key === state.chosen);
+    const card = this.cards.get(state.chosen);
+    if (card && this.section.scrollHeight > this.section.clientHeight) card.scrollIntoView({ block: "nearest" });
+  }
+
+  make(key) {
+    const card = this.template.content.firstElementChild.cloneNode(true);
+    card.dataset.key = key;
+    card.style.setProperty("--of-drone", colourOf(key));
+    card.querySelector(".name").addEventListener("click", () => this.choose(key));
+    const list = card.querySelector("dl");
+    for (const [label] of VALUES) {
+      const pair = document.createElement("div");
+      pair.title = EXPLAINED[label] || "";
+      pair.append(document.createElement("dt"), document.createElement("dd"));
+      pair.firstChild.textContent = label;
+      list.append(pair);
+    }
+    for (const button of card.querySelectorAll("[data-command]")) {
+      button.addEventListener("click", () => this.commands.confirm(button.dataset.command, [key]));
+    }
+    card.querySelector(".look").addEventListener("click", () => {
+      const pictures = card.querySelector(".pictures");
+      pictures.hidden = !pictures.hidden;
+      this.look();
+    });
+    this.cards.set(key, card);
+  }
+
+  write(key) {
+    const [card, row] = [this.cards.get(key), state.rows.get(key)];
+    const [tone, meaning] = STATES[row.state];
+    card.dataset.tone = tone;
+    put(card.querySelector(".name span"), nameOf(key));
+    put(card.querySelector(".state"), row.state);
+    put(card.querySelector(".meaning"), row.mission ? `${meaning} · mission: ${row.mission}` : meaning);
+    const why = card.querySelector(".why");
+    const told = row.why.join("\n");
+    if (why.dataset.told !== told) {
+      why.dataset.told = told;
+      why.replaceChildren(...row.why.map((sentence) => {
+        const line = document.createElement("li");
+        line.textContent = sentence;
+        return line;
+      }));
+    }
+    const values = card.querySelectorAll("dd");
+    VALUES.forEach(([, text, odd], i) => {
+      put(values[i], text(row));
+      values[i].classList.toggle("odd", Boolean(odd && odd(row)));
+    });
+    for (const button of card.querySelectorAll("[data-command]")) {
+      button.disabled = !this.commands.allowed(button.dataset.command, key);
+    }
+    card.querySelector(".look").disabled = !Object.keys(row.cameras).length;
+    put(card.querySelector(".refusal"), this.commands.refusal(key));
+  }
+
+  // New pictures for the cards that show theirs, one request at a time for each camera.
+  look() {
+    for (const [key, card] of this.cards) {
+      const pictures = card.querySelector(".pictures");
+      if (pictures.hidden || document.hidden) continue;
+      for (const camera of Object.keys(state.rows.get(key).cameras)) this.fetch(key, camera, pictures);
+    }
+  }
+
+  async fetch(key, camera, pictures) {
+    let figure = [...pictures.children].find((one) => one.dataset.camera === camera);
+    if (!figure) {
+      figure = document.createElement("figure");
+      figure.dataset.camera = camera;
+      figure.append(new Image(), document.createElement("figcaption"));
+      figure.firstChild.alt = `what the camera ${camera} sees`;
+      pictures.append(figure);
+    }
+    if (figure.dataset.waits) return;
+    figure.dataset.waits = "1";
+    const [drone, image] = [key.split("/").map(encodeURIComponent).join("/"), figure.firstChild];
+    try {
+      const reply = await fetch(`image/${drone}/${encodeURIComponent(camera)}?at=${state.now}`);
+      put(figure.lastChild, reply.ok ? camera : `${camera}: ${await reply.text()}`);
+      if (reply.ok) {
+        const address = URL.createObjectURL(await reply.blob());
+        URL.revokeObjectURL(image.src);
+        image.src = address;
+      }
+    } catch {
+      put(figure.lastChild, `${camera}: the server cannot be reached`);
+    }
+    delete figure.dataset.waits;
+  }
+}

@@ -1,0 +1,118 @@
+// The fleet page: takes what the server sends, and keeps map, cards, curves and events up to date.
+import { FleetCards } from "./fleet_cards.js";
+import { FleetCommands } from "./fleet_commands.js";
+import { FleetCurves } from "./fleet_curves.js";
+import { FleetMap } from "./fleet_map.js";
+import { ReplayControls } from "./fleet_replay.js";
+import { STATES, nameOf, put, state, take } from "./fleet_state.js";
+
+const token = document.querySelector("meta[name=token]").content;
+const AGAIN_MS = 1000;
+const SILENT_MS = 5000;
+const EVENTS_SHOWN = 200;
+
+const commands = new FleetCommands(token);
+const map = new FleetMap(document.getElementById("map"), choose);
+const cards = new FleetCards(document.getElementById("cards"), choose, commands);
+const curves = new FleetCurves(document.getElementById("curves"));
+const summary = document.getElementById("summary");
+const trouble = document.getElementById("trouble");
+let [socket, heard, lastEvent, told] = [null, 0, null, ""];
+const replay = new ReplayControls(document.getElementById("replay"), (at) => {
+  if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ at }));
+});
+
+function choose(key) {
+  state.chosen = key === state.chosen ? null : key;
+  cards.chosen();
+  map.changed();
+  curves.draw();
+}
+
+async function connect() {
+  socket = new WebSocket(`ws://${location.host}/live`);
+  socket.onopen = () => socket.send(JSON.stringify({ token }));
+  socket.onmessage = async ({ data }) => {
+    heard = performance.now();
+    const message = JSON.parse(data);
+    if (message.kind === "hello") await greeted(message);
+    else show(message);
+  };
+  socket.onclose = ({ code }) => {
+    const ended = code === 4403;
+    complain(ended ? "The server was started again: open the address that it printed." : "The server cannot be reached: what is shown is old.");
+    if (!ended) setTimeout(connect, AGAIN_MS);
+  };
+}
+
+async function greeted(hello) {
+  complain("");
+  state.live = hello.span_s === null;
+  state.mayCommand = hello.may_command && state.live;
+  const reply = await fetch("history");
+  if (!reply.ok) return complain(await reply.text());
+  const { columns, drones } = await reply.json();
+  state.columns = Object.fromEntries(columns.map((name, i) => [name, i]));
+  state.history = new Map(Object.entries(drones));
+  if (!state.live) replay.begin(hello.span_s);
+  return undefined;
+}
+
+function show(message) {
+  const first = !state.order.length && message.order.length;
+  take(message);
+  cards.changed(Object.keys(message.rows));
+  commands.changed();
+  map.changed();
+  replay.shown(state.now);
+  showSummary();
+  showEvents();
+  if (first) curves.draw();
+}
+
+function showSummary() {
+  const counts = new Map();
+  for (const key of state.order) {
+    const now = state.rows.get(key).state;
+    counts.set(now, (counts.get(now) || 0) + 1);
+  }
+  const text = [...counts].map(([name, count]) => `${count} ${name}`).join(" ");
+  if (text === told) return;
+  told = text;
+  const parts = [...counts].map(([name, count]) => {
+    const part = document.createElement("b");
+    part.className = STATES[name][0];
+    part.textContent = `${count} ${name}`;
+    return part;
+  });
+  const drones = `${state.order.length} drone${state.order.length === 1 ? "" : "s"}`;
+  summary.replaceChildren(parts.length ? `${drones}: ` : "No drone was heard yet.", ...parts.flatMap((part, i) => (i ? [", ", part] : [part])));
+}
+
+function showEvents() {
+  const newest = state.events[state.events.length - 1];
+  const mark = newest ? `${newest[0]} ${newest[1]} ${newest[2]} ${state.events.length}` : "";
+  if (mark === lastEvent) return;
+  lastEvent = mark;
+  const list = document.querySelector("#events ol");
+  list.replaceChildren(...state.events.slice(-EVENTS_SHOWN).reverse().map(([time, key, sentence]) => {
+    const line = document.createElement("li");
+    line.append(document.createElement("time"), document.createElement("b"), document.createElement("span"));
+    const clock = new Date(Date.now() - 1000 * (state.now - time));
+    put(line.children[0], state.live ? clock.toLocaleTimeString([], { hour12: false }) : replay.label(time));
+    put(line.children[1], nameOf(key));
+    put(line.children[2], sentence);
+    return line;
+  }));
+}
+
+function complain(sentence) {
+  trouble.hidden = !sentence;
+  put(trouble, sentence);
+}
+
+setInterval(() => {
+  if (state.live && heard && performance.now() - heard > SILENT_MS) complain("Nothing came from the server for seconds: what is shown is old.");
+  else if (socket.readyState === WebSocket.OPEN && heard) complain("");
+}, AGAIN_MS);
+connect();

@@ -1,0 +1,37 @@
+"""Where the page has the fleet from: live telemetry, or recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from flockd.fleet_page.drone_rows import Row
+from flockd.telemetry.topics import AnswerMessage
+
+Event = tuple[float, str, str]
+"""When it was heard, of which drone by its key, and what it says."""
+
+
+class FleetSource(Protocol):
+    """A fleet at any time of its time line. Called on the event loop, except for what says that it waits."""
+
+    span_s: tuple[float, float] | None
+    """Of recordings, their time line from begin to end; None: live."""
+
+    def now_s(self) -> float:
+        """Now on the time line of a live fleet; the end of a recorded one."""
+
+    def rows(self, time_s: float) -> dict[str, Row]:
+        """What is known of each drone, by its key, the worst first."""
+
+    def events(self, time_s: float) -> list[Event]:
+        """What happened up to a time, the newest last."""
+
+    def history(self) -> Mapping[str, list[list[float | None]]]:
+        """Of each drone, by its key: rows of `HISTORY_COLUMNS` in order of time."""
+
+    def ask(self, drone: str, command: str, order: Mapping[str, object] | None) -> AnswerMessage:
+        """A drone's answer to a command. Waits; called on a thread of its own."""
+
+    def image(self, drone: str, camera: str, time_s: float) -> bytes | None:
+        """A JPEG of what a camera sees. Waits; called on a thread of its own."""

@@ -1,0 +1,173 @@
+"""A whole fleet's recordings on one time line."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from flockd.fleet_page.drone_rows import Known, Row, drone_rows, history_row
+from flockd.fleet_page.fleet_source import Event
+from flockd.messages import PilotOutput, VehicleState
+from flockd.recording import RecordingError
+from flockd.recording.codec import from_json, parsed
+from flockd.recording.mcap_file import Entry, read_records
+from flockd.recording.migration import migrate_output
+from flockd.recording.reader import Recording, head_of
+from flockd.recording.streams import OUTPUT, TABLE, VEHICLE
+from flockd.telemetry import publish_step
+from flockd.telemetry.topics import AboutMessage, AnswerMessage
+from flockd.telemetry.watcher import Heard, Watched
+
+ONE_CLOCK_S = 5.0
+"""Clocks that began within this of each other, by the wall clock, are one: of a simulation, or of one computer."""
+HISTORY_EVERY_S = 0.5
+_OWN = {TABLE[topic].topic: topic for topic in ("flight", "computer", "events")}
+"""What does not follow from a step, by its stream."""
+
+
+@dataclass
+class _Story:
+    """One drone's messages in order of time, on its own clock."""
+
+    fleet: str
+    drone: str
+    began_s: float
+    """Wall time at which the recording began."""
+    about: AboutMessage
+    times: dict[str, list[float]] = field(default_factory=dict)
+    messages: dict[str, list[Mapping[str, Any]]] = field(default_factory=dict)
+    offset_s: float = 0.0
+    """Added to its times, they are on the time line."""
+
+    def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
+        """A telemetry sink."""
+        times = self.times.setdefault(topic, [])
+        stamp = message["time_s"]
+        assert isinstance(stamp, int | float)
+        times.append(max(float(stamp), times[-1]) if times else float(stamp))
+        self.messages.setdefault(topic, []).append(message)
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """Of its steps, on the time line."""
+        return self.times["state"][0] + self.offset_s, self.times["state"][-1] + self.offset_s
+
+    def at(self, time_s: float) -> Watched:
+        """What a watcher would have heard by then, on the time line."""
+        own_s = time_s - self.offset_s
+        topics = {}
+        for topic, times in self.times.items():
+            index = bisect_right(times, own_s) - 1
+            if index >= 0:
+                period_s = (times[index] - times[index - 5]) / 5 if index >= 5 else None
+                heard_s = times[index] + self.offset_s
+                topics[topic] = Heard(heard_s, self.messages[topic][index], 1.0, period_s, heard_s)
+        begin_s, end_s = self.span_s
+        alive = time_s <= end_s + self.about_step_s()
+        return Watched(self.fleet, self.drone, alive=alive, topics=topics, seen=time_s >= begin_s)
+
+    def about_step_s(self) -> float:
+        """Two steps: the last one's messages are good until then."""
+        return 2.0 * float(str(self.about["configuration"]["step_s"]))
+
+
+class RecordedFleet:
+    """A `FleetSource`: nothing can be asked of it."""
+
+    def __init__(self, folder: Path, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
+        """Reads every recording of a folder. Raises RecordingError where there is none, or a damaged one.
+
+        ``progress`` is called with (bytes read, bytes in all).
+        """
+        paths = [path for path in sorted(folder.glob("*.mcap")) if head_of(path)[0].facts.get("part", "0") == "0"]
+        if not paths:
+            raise RecordingError(f"{folder}: holds no recording; name a folder with the recordings of a fleet")
+        sizes = [path.stat().st_size for path in paths]
+        self._stories: list[_Story] = []
+        for number, path in enumerate(paths):
+            before, total = sum(sizes[:number]), sum(sizes)
+            self._stories.append(_story(path, lambda done, before=before, total=total: progress(before + done, total)))
+        _align(self._stories)
+        self.span_s = min(s.span_s[0] for s in self._stories), max(s.span_s[1] for s in self._stories)
+        self._known = {f"{story.fleet}/{story.drone}": Known(story.about) for story in self._stories}
+        self._events = sorted(
+            (time_s + story.offset_s, f"{story.fleet}/{story.drone}", str(message["event"]))
+            for story in self._stories
+            for time_s, message in zip(story.times.get("events", ()), story.messages.get("events", ()), strict=True)
+        )
+
+    def now_s(self) -> float:
+        """See `FleetSource`; so all that follow."""
+        return self.span_s[1]
+
+    def rows(self, time_s: float) -> dict[str, Row]:
+        """As if it were then."""
+        watched = [story.at(time_s) for story in self._stories]
+        return drone_rows([drone for drone in watched if drone.seen], self._known, time_s)
+
+    def events(self, time_s: float) -> list[Event]:
+        """Up to then."""
+        return self._events[: bisect_right(self._events, time_s, key=lambda event: event[0])]
+
+    def history(self) -> Mapping[str, list[list[float | None]]]:
+        """Of all."""
+        history: dict[str, list[list[float | None]]] = {}
+        time_s, end_s = self.span_s
+        while time_s <= end_s:
+            for key, row in self.rows(time_s).items():
+                if row["state"] != "gone":
+                    history.setdefault(key, []).append(history_row(row, time_s))
+            time_s += HISTORY_EVERY_S
+        return history
+
+    def ask(self, drone: str, command: str, order: Mapping[str, object] | None) -> AnswerMessage:
+        """Refused."""
+        return AnswerMessage(accepted=False, sentence="this is a recording, which takes no commands")
+
+    def image(self, drone: str, camera: str, time_s: float) -> bytes | None:
+        """None."""
+        return None
+
+
+def _story(path: Path, progress: Callable[[int], None]) -> _Story:
+    recording = Recording(path, lambda done, total: progress(done // 2))
+    config, flight = recording.config, recording.contents.flight
+    about = AboutMessage(version=flight.get("version", ""), configuration=config.model_dump(mode="json"), commands=[])
+    began = flight.get("began")
+    began_s = 0.0 if began is None else datetime.fromisoformat(began).timestamp()
+    story = _Story(config.telemetry.fleet, recording.drone, began_s, about)
+    vehicle: VehicleState | None = None
+    done = 0
+    for part in recording.contents.paths:
+        for record in read_records(part):
+            if not isinstance(record, Entry):
+                continue
+            done += len(record.data)
+            progress(path.stat().st_size // 2 + done // 2)
+            try:
+                if record.stream.topic == VEHICLE.topic:
+                    vehicle = from_json(VehicleState, parsed(record.data))
+                elif record.stream.topic == OUTPUT.topic and vehicle is not None:
+                    output: PilotOutput = from_json(PilotOutput, migrate_output(parsed(record.data)))
+                    publish_step(story, story.drone, vehicle, output)
+                elif record.stream.topic in _OWN:
+                    story.publish(story.drone, _OWN[record.stream.topic], parsed(record.data))
+            except (ValueError, KeyError) as error:
+                raise RecordingError(
+                    f"{part}: a message cannot be read ({error}); `flockd record recover` makes a recording without it"
+                ) from error
+    if "state" not in story.times:
+        raise RecordingError(f"{path}: holds no whole step; take it out of the folder")
+    return story
+
+
+def _align(stories: list[_Story]) -> None:
+    """Puts all on one time line: their own clock where all have one, else wall time, which is written to the second."""
+    apart_s = [story.began_s - story.times["state"][0] for story in stories]
+    if max(apart_s) - min(apart_s) > ONE_CLOCK_S:
+        for story, offset_s in zip(stories, apart_s, strict=True):
+            story.offset_s = offset_s
