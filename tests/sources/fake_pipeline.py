@@ -4,7 +4,7 @@ fake_pipeline.py "WORD..." CAPS
 
 `caps:WxH` and `caps:text` say what the images are; `N` sends N different images of 64x48 in RGB, 20 ms apart, `same:N`
 N equal ones, `short` one that lacks a byte, `flagged` one the driver calls damaged, `old` one of an hour ago, `untimed`
-one without a time; `stall` sends nothing until the other side goes, `fail:text` and `end` say so, `print` prints a line,
+one without a time; `stall` waits until the other side goes, `fail:text` and `end` say so, `print` prints a line,
 `crash` ends by a signal, `once:FILE` skips the word after it if FILE exists, and makes it. Underscores in texts are
 spaces.
 """
@@ -16,6 +16,7 @@ import signal
 import struct
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 WIDTH, HEIGHT = 64, 48
@@ -49,7 +50,7 @@ def say_caps(text: str) -> None:
     send(b"caps", (raw if width.isdigit() else text.replace("_", " ")).encode())
 
 
-WORDS = {
+WORDS: dict[str, Callable[[str], object]] = {
     "caps": say_caps,
     "same": lambda text: images(int(text), same=True),
     "short": lambda _: send(b"imag", picture(0)[:-1], time_ns=time.monotonic_ns()),

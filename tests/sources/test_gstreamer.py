@@ -264,7 +264,7 @@ def _encoded(name: str, image: UInt8Array) -> bytes:
         colours = image if name.startswith("R") else image[..., ::-1]
         return _padded(np.dstack([colours, np.full(image.shape[:2], 255, np.uint8)]))
     if name == "GRAY8":
-        return _padded(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+        return _padded(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8))
     even = np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)), mode="edge")
     # BT.601, luma from 16 to 235.
     weights = np.array([[65.481, 128.553, 24.966], [-37.797, -74.203, 112.0], [112.0, -93.786, -18.214]])
