@@ -38,6 +38,7 @@ MAY_IMPORT = {
     | {"obstacles"}
     | {"geometry", "inference", "perception", "tracking", "flocking", "safety", "mission"},
     "sources": BASE | {"zenoh_session", "image_header"},
+    "cameras": BASE | {"sources"},
     "autopilot": BASE,
     "telemetry": BASE | {"zenoh_session"},
     "recording": BASE
@@ -71,7 +72,8 @@ MAY_IMPORT = {
     | {"obstacles"}
     | {"geometry", "inference", "perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"}
     | {"mission"},
-    "doctor": BASE | {"geometry", "inference", "perception", "pilot", "sources", "autopilot", "telemetry", "daemon"},
+    "doctor": BASE
+    | {"geometry", "inference", "perception", "pilot", "sources", "cameras", "autopilot", "telemetry", "daemon"},
     "cli": BASE
     | {
         "inference",
@@ -89,7 +91,7 @@ MAY_IMPORT = {
         "doctor",
         "fleet_page",
     }
-    | {"calibration", "geometry", "sources", "pictures"},
+    | {"calibration", "geometry", "sources", "cameras", "pictures"},
 }
 """What each folder may import of the others."""
 

@@ -1,6 +1,10 @@
-"""Measure what it takes to get camera frames into the pilot: decoding, putting sets together, shared memory.
+"""Measure what it takes to get camera frames into the pilot: decoding, putting sets together, shared memory, devices.
 
 python -m tools.bench_sources [--size 640 480] [--cameras 4] [--json]
+python -m tools.bench_sources --device /dev/video0 --pipeline "v4l2src device=/dev/video2"
+
+The second form compares cameras instead: rate, jitter, age and what is lost of each, with the processor's time an image
+takes. `python -m tools.device_check.pipelines` tries what can go wrong with pipelines, `tools/check_device.py` both.
 """
 
 from __future__ import annotations
@@ -8,27 +12,33 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import os
 import sys
 import time
 from collections.abc import Callable
 from multiprocessing.synchronize import Event
+from pathlib import Path
 
 import cv2
 import numpy as np
 
+from flockd.cameras.watching import Watched, opener
 from flockd.config.drone import DroneConfig
 from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
-from flockd.config.source import SharedMemoryParameters, SourceParameters
+from flockd.config.source import CameraDeviceParameters, SharedMemoryParameters, SourceParameters
 from flockd.messages import Frame, UInt8Array
 from flockd.sources import FramePublisher
 from flockd.sources.assembler import Assembler
+from flockd.sources.devices import CameraDevice, CapturedBuffer
 from flockd.sources.frames import RawFrame
 from flockd.sources.image_formats import MjpegFormat, RgbFormat, YuyvFormat
 from flockd.sources.shared_memory import SharedMemorySource
+from flockd.sources.v4l2_kernel import LinuxKernel
 
 ENDPOINT = "tcp/127.0.0.1:7458"
 ROUNDS = 100
 PERIOD_S = 0.05
+IMAGES, WARM_UP = 200, 10
 Size = tuple[int, int]
 
 
@@ -39,9 +49,16 @@ def main() -> None:
     parser.add_argument("--cameras", type=int, default=4)
     parser.add_argument("--threads", type=int, default=1, help="that OpenCV may use")
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--device", action="append", default=[], help="of a V4L2 camera; may be repeated")
+    parser.add_argument("--pipeline", action="append", default=[], help="of GStreamer; may be repeated")
+    parser.add_argument("--rate", type=float, default=30.0, help="of the cameras, images a second")
+    parser.add_argument("--format", choices=("mjpeg", "yuyv"), default="mjpeg", help="of the V4L2 cameras")
     arguments = parser.parse_args()
     cv2.setNumThreads(arguments.threads)
     size: Size = (arguments.size[0], arguments.size[1])
+    if arguments.device or arguments.pipeline:
+        compare_cameras(arguments, size)
+        return
     times_ms = measure_decoding(size) | measure_sets(arguments.cameras) | measure_shared_memory(size, arguments.cameras)
     if arguments.json:
         print(json.dumps(times_ms, indent=1))
@@ -49,6 +66,62 @@ def main() -> None:
     print(f"{size[0]}x{size[1]}, {arguments.cameras} cameras, {ROUNDS} rounds{'p50 ms':>32s}{'p95 ms':>9s}")
     for name, (median, high) in times_ms.items():
         print(f"{name:58s}{median:9.3f}{high:9.3f}")
+
+
+def compare_cameras(arguments: argparse.Namespace, size: Size) -> None:
+    """Prints a row a camera, one after the other."""
+    cameras = [
+        *({"device": device, "pixel_format": arguments.format} for device in arguments.device),
+        *({"pipeline": pipeline} for pipeline in arguments.pipeline),
+    ]
+    rows = []
+    for camera in cameras:
+        parameters = CameraDeviceParameters.model_validate({"name": "bench", "rate_hz": arguments.rate, **camera})
+        open_device = opener("gstreamer" if parameters.pipeline else "v4l2", LinuxKernel())
+        with open_device(parameters, size) as device:
+            rows.append({"camera": parameters.place, **measure_camera(device)})
+    if arguments.json:
+        print(json.dumps(rows, indent=1))
+        return
+    print(f"{size[0]}x{size[1]}, {IMAGES} images   rate Hz  jitter ms  age ms p50/p95  lost  processor ms an image")
+    for row in rows:
+        print(
+            f"{row['rate_hz']:33.2f}{row['jitter_ms']:11.2f}{row['age_p50_ms']:10.1f}/{row['age_p95_ms']:<6.1f}"
+            f"{row['lost']:5.0f}{row['processor_ms']:14.2f}   {row['camera']}"
+        )
+
+
+def measure_camera(device: CameraDevice) -> dict[str, float]:
+    """Of the images of one camera, after the first ones, which waited for the start."""
+    watched, ages_ms, began_s = Watched(), [], 0.0
+    last: CapturedBuffer | None = None
+    for number in range(WARM_UP + IMAGES):
+        captured = device.read(device.start_s)
+        if captured is None:
+            sys.exit(f"no image came within {device.start_s:g} s")
+        if number >= WARM_UP and last is not None:
+            watched.stamps_s.append(captured.time_s)
+            watched.lost += captured.sequence - last.sequence - 1
+            ages_ms.append(1e3 * (time.monotonic() - captured.time_s))
+        else:
+            began_s = _processor_s()
+        last = captured
+    spent_s = _processor_s() - began_s
+    p50_ms, p95_ms = _percentiles(ages_ms)
+    return {
+        **{"rate_hz": watched.rate_hz, "jitter_ms": 1e3 * watched.jitter_s(), "age_p50_ms": p50_ms},
+        **{"age_p95_ms": p95_ms, "lost": watched.lost, "processor_ms": 1e3 * spent_s / IMAGES},
+    }
+
+
+def _processor_s() -> float:
+    """Of this process and of those it started that still run."""
+    ticks = 0.0
+    for task in Path("/proc/self/task").iterdir():
+        for pid in (task / "children").read_text(encoding="ascii").split():
+            fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+            ticks += float(fields[11]) + float(fields[12])
+    return time.process_time() + ticks / os.sysconf("SC_CLK_TCK")
 
 
 def measure_decoding(size: Size) -> dict[str, tuple[float, float]]:

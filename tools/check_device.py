@@ -39,6 +39,7 @@ PROGRAMS = {"qemu-system-x86_64": "qemu-system-x86", "mmdebstrap": "mmdebstrap",
 PACKAGES = (
     *("systemd-sysv", "udev", "dbus", "kmod", "sudo", "iproute2", "python3", "python3-venv", "v4l-utils"),
     *("linux-image-amd64", "linux-headers-amd64", "v4l2loopback-dkms", "initramfs-tools", "zstd"),
+    *("gstreamer1.0-plugins-base", "gstreamer1.0-plugins-good", "gstreamer1.0-tools", "gstreamer1.0-plugins-base-apps"),
 )
 BOOT_MODULES = ("virtio_pci", "virtio_blk", "ext4")
 SOURCES = (
@@ -86,7 +87,9 @@ def main() -> int:
     """Builds, boots, listens, and prints."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, metavar="DIR", help="keep the machine's files here, and use those there")
-    parser.add_argument("--only", nargs="+", default=[], metavar="GROUP", help="of capture, sandbox and service")
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="GROUP", help="of capture, pipelines, sandbox and service"
+    )
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     try:

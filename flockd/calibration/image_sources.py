@@ -111,7 +111,7 @@ def from_recording(recording: Recording, every: int) -> tuple[ImageStream, Drone
         for step in recording.steps()
         if step.number % every == 0
     )
-    devices = {} if config.source is None else {camera.name: camera.device for camera in config.source.cameras}
+    devices = {} if config.source is None else {camera.name: camera.place for camera in config.source.cameras}
     identities = {
         camera.name: _known(config, camera.name)
         or f"not known ({camera.name} of {recording.drone}{_at(devices.get(camera.name))})"
@@ -126,7 +126,8 @@ def from_cameras(config: DroneConfig, file: str, seconds: float, enough: Callabl
     Reading raises UnavailableError when no frame comes.
     """
     source = open_source(config, file)
-    devices = {} if config.source is None else {camera.name: camera.device for camera in config.source.cameras}
+    cameras = () if config.source is None else config.source.cameras
+    devices = {camera.name: camera.device for camera in cameras if camera.device}
     identities = {
         camera.name: identity(Path(devices[camera.name])) if camera.name in devices else f"not known ({camera.name})"
         for camera in config.rig.cameras

@@ -92,7 +92,7 @@ class DroneConfig(Section):
 
     @model_validator(mode="after")
     def _every_camera_has_its_device(self) -> Self:
-        if self.source is None or self.source.kind != "v4l2":
+        if self.source is None or self.source.kind == "shared_memory":
             return self
         rig = [camera.name for camera in self.rig.cameras]
         devices = [camera.name for camera in self.source.cameras]

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from flockd.choices import PixelFormat
-from flockd.config.base import Section
+from flockd.config.base import Section, refuse
 
 
 class ControlParameters(Section):
@@ -24,11 +24,20 @@ class CameraDeviceParameters(Section):
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9_-]+$")]
     """The camera's name in the rig."""
-    device: Annotated[str, Field(pattern=r"^/dev/")]
+    device: Annotated[str, Field(pattern=r"^/dev/")] = ""
+    """Of kind `v4l2`: its path, best one of /dev/v4l/by-path."""
+    pipeline: Annotated[str, Field(min_length=1)] = ""
+    """Of kind `gstreamer`: elements as `gst-launch-1.0` takes them, without a sink."""
     pixel_format: PixelFormat = "mjpeg"
+    """Of kind `v4l2`; a pipeline says it itself."""
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 30.0
     controls: tuple[ControlParameters, ...] = ()
-    """Set in this order whenever the camera is opened; what is not named here stays as it was."""
+    """Of kind `v4l2`: set in this order whenever the camera is opened; what is not named here stays as it was."""
+
+    @property
+    def place(self) -> str:
+        """Where its images come from: the device or the pipeline."""
+        return self.device or self.pipeline
 
 
 class SharedMemoryParameters(Section):
@@ -48,9 +57,10 @@ class SharedMemoryParameters(Section):
 class SourceParameters(Section):
     """Where camera frames come from, and how those of several cameras become sets."""
 
-    kind: Literal["v4l2", "shared_memory"]
+    kind: Literal["v4l2", "gstreamer", "shared_memory"]
+    """Cameras of the kernel, those behind a GStreamer pipeline each, or another program's frames."""
     cameras: tuple[CameraDeviceParameters, ...] = ()
-    """Of kind `v4l2`: one for each camera of the rig."""
+    """Of kind `v4l2` and `gstreamer`: one for each camera of the rig."""
     shared_memory: SharedMemoryParameters = SharedMemoryParameters()
     """Of kind `shared_memory`."""
     set_tolerance_s: Annotated[float, Field(gt=0, le=60)] = 0.02
@@ -66,9 +76,10 @@ class SourceParameters(Section):
     def _fits_its_kind(self) -> Self:
         if self.kind == "shared_memory" and self.cameras:
             raise ValueError("a source of kind `shared_memory` has no devices; delete `cameras`")
-        if self.kind == "v4l2" and self.shared_memory.speed_factor != 1.0:
+        if self.kind != "shared_memory" and self.shared_memory.speed_factor != 1.0:
             raise ValueError("real cameras know real time only; delete `shared_memory.speed_factor`")
-        for camera in self.cameras:
+        for number, camera in enumerate(self.cameras):
+            refuse(self, {("cameras", number, *key): text for key, text in _misplaced(camera, self.kind).items()})
             if self.set_tolerance_s * camera.rate_hz < 0.5:
                 raise ValueError(
                     f"set_tolerance_s {self.set_tolerance_s:g} is less than half a frame period of camera "
@@ -79,8 +90,23 @@ class SourceParameters(Section):
                     f"silence_s {self.silence_s:g} is less than two frame periods of camera {camera.name!r}; "
                     f"write {2.0 / camera.rate_hz:.3f} or more"
                 )
-        devices = [camera.device for camera in self.cameras]
+        devices = [camera.device for camera in self.cameras if camera.device]
         doubled = {device for device in devices if devices.count(device) > 1}
         if doubled:
             raise ValueError(f"two cameras share {sorted(doubled)[0]}; give each its own device")
         return self
+
+
+def _misplaced(camera: CameraDeviceParameters, kind: str) -> dict[tuple[str, ...], str]:
+    """What a camera of this kind of source must not have, by its key, or what it lacks."""
+    if kind == "v4l2":
+        wrong = {"pipeline": "is of a source of kind `gstreamer`; delete it, or write `kind: gstreamer`"}
+        lacks = "" if camera.device else "has no `device`; write the camera's path, as `flockd cameras` lists it"
+    else:
+        text = "is of a source of kind `v4l2`; let the pipeline say it, and delete this"
+        wrong = dict.fromkeys(("device", "pixel_format", "controls"), text)
+        lacks = "" if camera.pipeline else "has no `pipeline`; write elements such as `v4l2src device=/dev/video0`"
+    faults: dict[tuple[str, ...], str] = {(key,): text for key, text in wrong.items() if key in camera.model_fields_set}
+    if lacks and not faults:
+        faults[()] = lacks
+    return faults

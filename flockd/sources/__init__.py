@@ -1,4 +1,4 @@
-"""Where camera frames come from: devices of this computer, or another program's shared memory."""
+"""Where camera frames come from: devices of this computer, GStreamer pipelines, or another program's shared memory."""
 
 import time
 from collections.abc import Callable
@@ -7,6 +7,7 @@ from flockd.config import DroneConfig
 from flockd.errors import ConfigError, ConfigProblem
 from flockd.sources.clock import clock_at
 from flockd.sources.frames import CameraStatus, Count, FrameSource
+from flockd.sources.gstreamer import GstreamerSource
 from flockd.sources.shared_memory import FramePublisher, SharedMemorySource
 from flockd.sources.v4l2 import V4l2Source
 
@@ -21,7 +22,9 @@ def open_source(config: DroneConfig, file: str, *, clock: Callable[[], float] = 
     Raises ConfigError if it asks for none.
     """
     if config.source is None:
-        raise ConfigError([ConfigProblem(file, 0, "source", "is missing; add it with kind `v4l2` or `shared_memory`")])
+        raise ConfigError([ConfigProblem(file, 0, "source", "is missing; add one, as in config/quadrotor.yaml")])
     if config.source.kind == "v4l2":
         return V4l2Source(config, config.source)
+    if config.source.kind == "gstreamer":
+        return GstreamerSource(config, config.source)
     return SharedMemorySource(config, config.source, clock=clock)

@@ -67,7 +67,7 @@ class MjpegFormat:
             raise CorruptImageError(f"JPEG cannot be decoded ({error})") from error
         if image is None:
             raise CorruptImageError("JPEG cannot be decoded")
-        return _plausible(np.asarray(image, np.uint8))
+        return plausible(np.asarray(image, np.uint8))
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class YuyvFormat:
 
     def check(self, data: bytes) -> None:
         """See ``ImageFormat``: size."""
-        _check_length(data, self.bytes_per_line * self.size[1])
+        check_length(data, self.bytes_per_line * self.size[1])
 
     def decode(self, data: bytes) -> UInt8Array:
         """See ``ImageFormat``."""
@@ -88,7 +88,7 @@ class YuyvFormat:
         width, height = self.size
         rows = np.frombuffer(data, np.uint8).reshape(height, self.bytes_per_line)
         pixels = np.ascontiguousarray(rows[:, : 2 * width]).reshape(height, width, 2)
-        return _plausible(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_YUV2RGB_YUY2), np.uint8))
+        return plausible(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_YUV2RGB_YUY2), np.uint8))
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class RgbFormat:
 
     def check(self, data: bytes) -> None:
         """See ``ImageFormat``: size."""
-        _check_length(data, self.size[0] * self.size[1] * 3)
+        check_length(data, self.size[0] * self.size[1] * 3)
 
     def decode(self, data: bytes) -> UInt8Array:
         """See ``ImageFormat``; nothing is copied."""
@@ -108,12 +108,13 @@ class RgbFormat:
         return np.frombuffer(data, np.uint8).reshape(self.size[1], self.size[0], 3)
 
 
-def _check_length(data: bytes, length: int) -> None:
+def check_length(data: bytes, length: int) -> None:
+    """Raises CorruptImageError for another length."""
     if len(data) != length:
         raise CorruptImageError(f"{len(data)} bytes instead of {length}")
 
 
-def _plausible(image: UInt8Array) -> UInt8Array:
+def plausible(image: UInt8Array) -> UInt8Array:
     """The same image; raises CorruptImageError for what decodes without complaint and yet shows too little."""
     sample = image[::_SAMPLE_STRIDE, ::_SAMPLE_STRIDE]
     if float(sample.std(axis=(0, 1)).max()) < _FLAT_DEVIATION:

@@ -8,14 +8,14 @@ import errno
 import os
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from types import TracebackType
-from typing import Literal, Self
+from typing import Self
 
 from flockd.choices import PixelFormat
 from flockd.config.source import ControlParameters
-from flockd.errors import UnavailableError
+from flockd.sources.devices import CameraError, CapturedBuffer, Clock
+from flockd.sources.image_formats import ImageFormat, MjpegFormat, YuyvFormat
 from flockd.sources.v4l2_kernel import (
     VIDIOC_DQBUF,
     VIDIOC_G_CTRL,
@@ -41,8 +41,6 @@ from flockd.sources.v4l2_kernel import (
     StreamParameters,
 )
 
-Clock = Literal["monotonic", "copied", "unknown"]
-
 _CAPTURE = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
 _MAPPED = 1  # V4L2_MEMORY_MMAP
 _PROGRESSIVE = 1  # V4L2_FIELD_NONE
@@ -59,24 +57,10 @@ _BUFFERS = 4
 _RATE_TOLERANCE = 0.1
 
 
-class CameraError(UnavailableError):
-    """Why a camera gives no frames, in one sentence."""
-
-
-@dataclass(frozen=True, eq=False)
-class CapturedBuffer:
-    """What the driver handed over: one image, its time and its number."""
-
-    data: bytes
-    time_s: float
-    clock: Clock
-    sequence: int
-    flagged: bool
-    """The driver says that the data may be damaged."""
-
-
 class V4l2Device:
-    """An open camera that streams. Use as a context manager; every method raises CameraError when the camera fails."""
+    """A ``CameraDevice`` of the kernel's."""
+
+    start_s = 3.0
 
     def __init__(
         self,
@@ -92,9 +76,9 @@ class V4l2Device:
         """Opens the device, sets it up as asked, and starts it; what the driver does not grant is a CameraError."""
         self._kernel = kernel or LinuxKernel()
         self._who = f"{name}: {path}"
+        self._size, self._pixel_format = size, pixel_format
         self._maps: list[Mapping] = []
-        self.bytes_per_line = 0
-        """Distance of the rows of an image that is not compressed."""
+        self._bytes_per_line = 0
         with self._telling("cannot be opened"):
             self._descriptor = self._kernel.open(path)
         try:
@@ -129,6 +113,12 @@ class V4l2Device:
         with self._telling("has failed"):
             self._kernel.ioctl(self._descriptor, VIDIOC_QBUF, buffer)
         return captured
+
+    def image_format(self) -> ImageFormat:
+        """See ``CameraDevice``."""
+        if self._pixel_format == "mjpeg":
+            return MjpegFormat(self._size)
+        return YuyvFormat(self._size, self._bytes_per_line)
 
     def close(self) -> None:
         """Stops the camera and gives it back."""
@@ -170,7 +160,7 @@ class V4l2Device:
                 f"{self._who} offers {asked.width}x{asked.height} {offered} instead of {size[0]}x{size[1]} "
                 f"{pixel_format}; choose from what `v4l2-ctl --list-formats-ext` lists"
             )
-        self.bytes_per_line = int(asked.bytesperline) or 2 * size[0]
+        self._bytes_per_line = int(asked.bytesperline) or 2 * size[0]
 
     def _set_rate(self, rate_hz: float) -> None:
         period = 1 / Fraction(rate_hz).limit_denominator(1001)

@@ -11,13 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockd.cameras import watching
 from flockd.config import DroneConfig
 from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.config.source import CameraDeviceParameters, ControlParameters, SharedMemoryParameters, SourceParameters
-from flockd.doctor import Finding, Level, camera_checks
+from flockd.doctor import Finding, Level
 from flockd.doctor.camera_checks import check_cameras
 from flockd.messages import Frame
 from flockd.sources import FramePublisher
+from flockd.sources.v4l2_device import V4l2Device
 from tests.daemon.aboard import free_endpoint
 from tests.sources.camera_images import SIZE, jpeg, scene
 from tests.sources.fake_kernel import FLAG_CLOCK_UNKNOWN, FLAG_ERROR, FakeCamera, FakeKernel
@@ -161,7 +163,7 @@ def test_images_that_are_worth_nothing(film: dict[str, Any], level: Level, told:
 
 def test_time_stamps_of_another_clock_are_no_image_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
     """Some drivers do not name their clock: what counts is whether the stamps are of now."""
-    monkeypatch.setattr(camera_checks, "START_S", 0.3)
+    monkeypatch.setattr(V4l2Device, "start_s", 0.3)
     kernel = FakeKernel(front=FakeCamera())
     with _filming(kernel, "front", flags=lambda number: FLAG_CLOCK_UNKNOWN):
         (finding,) = _examined(_config("front"), kernel)["camera front"]
@@ -204,8 +206,8 @@ def test_cameras_that_do_not_open_are_reported_one_by_one() -> None:
 
 
 def test_a_driver_that_hangs_is_reported_and_the_other_camera_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(camera_checks, "START_S", 1.0)
-    monkeypatch.setattr(camera_checks, "STOP_S", 0.2)
+    monkeypatch.setattr(watching, "LONGEST_START_S", 1.0)
+    monkeypatch.setattr(watching, "STOP_S", 0.2)
     ended = threading.Event()
 
     class Stuck(FakeKernel):
@@ -261,12 +263,12 @@ def test_frames_of_another_program() -> None:
 
 
 def test_frames_of_the_wrong_size_and_none_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(camera_checks, "START_S", 2.0)
+    monkeypatch.setattr(watching, "START_S", 2.0)
     endpoint = free_endpoint()
     with _publishing(endpoint, (32, 48)):
         problem = next(iter(check_cameras(_shared(endpoint), SECONDS)))
     assert (problem.level, problem.measured) == (Level.FAILURE, "frames are 32x48, but the rig has 64x48")
-    monkeypatch.setattr(camera_checks, "START_S", 0.3)
+    monkeypatch.setattr(watching, "START_S", 0.3)
     problem = next(iter(check_cameras(_shared(endpoint), SECONDS)))
     assert problem.level is Level.FAILURE
     assert problem.measured == f"no frame of tiny/front came from {endpoint} within 0.3 s"

@@ -9,6 +9,7 @@ import pytest
 from flockd.config import load_drone
 from flockd.errors import ConfigError
 from flockd.sources import open_source
+from flockd.sources.gstreamer import GstreamerSource
 from flockd.sources.shared_memory import SharedMemorySource
 from flockd.sources.v4l2 import V4l2Source
 
@@ -23,6 +24,11 @@ TWO = """\
   cameras:
     - {name: front, device: /dev/video0}
     - {name: back, device: /dev/video2}
+"""
+PIPELINES = """\
+  cameras:
+    - {name: front, pipeline: nvarguscamerasrc sensor-id=0}
+    - {name: back, pipeline: libcamerasrc}
 """
 
 
@@ -57,12 +63,21 @@ def test_frames_may_come_from_another_program(tmp_path: Path) -> None:
     assert isinstance(open_source(config, str(path)), SharedMemorySource)
 
 
+def test_frames_may_come_from_a_pipeline_a_camera(tmp_path: Path) -> None:
+    path = tmp_path / "drone.yaml"
+    path.write_text(RIG + "source:\n  kind: gstreamer\n" + PIPELINES, encoding="utf-8")
+    config = load_drone(path)
+    assert config.source is not None
+    assert [camera.place for camera in config.source.cameras] == ["nvarguscamerasrc sensor-id=0", "libcamerasrc"]
+    assert isinstance(open_source(config, str(path)), GstreamerSource)
+
+
 def test_a_drone_without_source_can_be_simulated_but_opens_none(tmp_path: Path) -> None:
     path = tmp_path / "drone.yaml"
     path.write_text(RIG, encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
         open_source(load_drone(path), "drone.yaml")
-    assert str(caught.value) == "drone.yaml: source: is missing; add it with kind `v4l2` or `shared_memory`"
+    assert str(caught.value) == "drone.yaml: source: is missing; add one, as in config/quadrotor.yaml"
 
 
 def test_slips_inside_the_optional_section_are_reported_with_what_to_do(tmp_path: Path) -> None:
@@ -102,6 +117,24 @@ def test_slips_inside_the_optional_section_are_reported_with_what_to_do(tmp_path
         (
             "source:\n  kind: shared_memory\n" + TWO,
             "drone.yaml:5: source: a source of kind `shared_memory` has no devices; delete `cameras`",
+        ),
+        (
+            "source:\n  kind: v4l2\n" + TWO.replace("device: /dev/video2", "rate_hz: 20"),
+            "drone.yaml:9: source.cameras[1]: has no `device`; write the camera's path, as `flockd cameras` lists it",
+        ),
+        (
+            "source:\n  kind: v4l2\n" + PIPELINES.replace("back, pipeline", "back, device").replace("lib", "/dev/"),
+            "drone.yaml:8: source.cameras[0].pipeline: is of a source of kind `gstreamer`; delete it, or write "
+            "`kind: gstreamer`",
+        ),
+        (
+            "source:\n  kind: gstreamer\n" + PIPELINES.replace("libcamerasrc", "libcamerasrc, pixel_format: yuyv"),
+            "drone.yaml:9: source.cameras[1].pixel_format: is of a source of kind `v4l2`; let the pipeline say it, "
+            "and delete this",
+        ),
+        (
+            "source:\n  kind: gstreamer\n" + PIPELINES.replace("pipeline: libcamerasrc", "rate_hz: 20"),
+            "drone.yaml:9: source.cameras[1]: has no `pipeline`; write elements such as `v4l2src device=/dev/video0`",
         ),
         (
             "source:\n  kind: v4l2\n  set_tolerance_s: 0.01\n" + TWO,

@@ -13,9 +13,10 @@ from flockd.choices import PixelFormat
 from flockd.config.drone import DroneConfig
 from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.config.source import CameraDeviceParameters, SourceParameters
+from flockd.sources.devices import CameraError, CapturedBuffer
 from flockd.sources.frames import CameraStatus, Count
 from flockd.sources.v4l2 import V4l2Source
-from flockd.sources.v4l2_device import CameraError, CapturedBuffer, V4l2Device
+from flockd.sources.v4l2_device import V4l2Device
 from tools.device_check import camera_images
 from tools.device_check.cameras import CABLE, LOOPBACK, WEBCAM, cable, control, feeding, loopback
 from tools.device_check.findings import Finding

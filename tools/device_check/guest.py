@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from tools.device_check import cameras, capture, sandbox
+from tools.device_check import cameras, capture, pipelines, sandbox
 from tools.device_check.findings import Check, Notebook
 from tools.device_check.service import Service
 
@@ -34,6 +34,7 @@ def main() -> None:
             capture.falls_silent,
             capture.is_taken,
         ),
+        "pipelines": (lambda: pipelines.streams_a_camera(cameras.WEBCAM), *pipelines.CHECKS),
         "sandbox": (sandbox.holds,),
         "service": (
             service.is_installed,

@@ -20,8 +20,9 @@ import numpy as np
 
 from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.recording.reader import Recording
+from flockd.sources.devices import CameraError
 from flockd.sources.image_formats import MjpegFormat
-from flockd.sources.v4l2_device import CameraError, V4l2Device
+from flockd.sources.v4l2_device import V4l2Device
 from flockd.telemetry.watcher import FleetWatcher
 from tools.device_check import camera_images
 from tools.device_check.cameras import WEBCAM, Feeder, control, loopback, run

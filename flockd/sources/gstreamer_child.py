@@ -1,0 +1,252 @@
+"""Runs one GStreamer pipeline and writes its images to standard output; a process of its own, started by this file.
+
+gstreamer_child.py PIPELINE CAPS
+
+It calls the libraries of GStreamer by their C interface, needs nothing of Python but what Python brings, and ends when
+its standard input is closed. What it writes is a row of messages, each a header and its data:
+
+- `caps`: what the images are from now on, as GStreamer writes it; a text.
+- `image`: one image, its time in nanoseconds of CLOCK_MONOTONIC (-1: the buffer has none), and whether it is damaged.
+- `error`: why there will be no more images; a text.
+- `end`: the pipeline has ended by itself.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import struct
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from ctypes import POINTER, byref, c_char_p, c_int, c_size_t, c_uint32, c_uint64, c_void_p
+from typing import Any, ClassVar
+
+HEADER = struct.Struct("<4sIqI4x")
+"""Kind, flags, time in ns, length of the data."""
+CAPS, IMAGE, ERROR, END = b"caps", b"imag", b"fail", b"end\0"
+DAMAGED = 1
+"""A flag of an image."""
+NO_TIME = -1
+NOT_INSTALLED = "GStreamer is not installed"
+
+_SINK = b"flockd_sink"
+_LOOK_NS = 50_000_000
+_PREROLL_NS = 3_000_000_000
+"""A pipeline that has not said by then whether it is live is a file."""
+_END_S = 1.0
+"""Given to the pipeline to close its camera."""
+_PAUSED, _PLAYING, _NULL = 3, 4, 1  # GstState
+_FAILED, _LIVE = 0, 3  # GST_STATE_CHANGE_FAILURE, _NO_PREROLL
+_TIME = 3  # GST_FORMAT_TIME
+_NONE = 2**64 - 1  # GST_CLOCK_TIME_NONE
+_EOS, _ERROR = 1, 2  # GstMessageType
+_CORRUPTED = 1 << 8  # GST_BUFFER_FLAG_CORRUPTED
+_READ = 1  # GST_MAP_READ
+
+
+class Buffer(ctypes.Structure):
+    """The public head of GstBuffer of GStreamer 1.x, on 64-bit machines; GstMiniObject is its first 64 bytes."""
+
+    _fields_: ClassVar = [("object", ctypes.c_uint8 * 64), ("pool", c_void_p), ("pts", c_uint64), ("dts", c_uint64)]
+
+
+class _Map(ctypes.Structure):
+    """GstMapInfo"""
+
+    _fields_: ClassVar = [
+        ("memory", c_void_p),
+        ("flags", c_int),
+        ("data", c_void_p),
+        ("size", c_size_t),
+        ("rest", c_void_p * 9),
+    ]
+
+
+class _Error(ctypes.Structure):
+    """GError"""
+
+    _fields_: ClassVar = [("domain", c_uint32), ("code", c_int), ("message", c_char_p)]
+
+
+class _PipelineError(Exception):
+    """Why there are no images."""
+
+
+def main() -> None:
+    """Runs the pipeline until it ends or the other side goes."""
+    output = os.dup(1)
+    os.dup2(2, 1)  # some drivers print, and this is no place for it
+    stopping = threading.Event()
+    threading.Thread(target=_await_end, args=(stopping,), daemon=True).start()
+    try:
+        try:
+            run(sys.argv[1], sys.argv[2], output, stopping)
+        except _PipelineError as error:
+            send(output, ERROR, data=str(error).encode())
+    except BrokenPipeError:
+        pass  # the other side has gone
+    os._exit(0)  # threads of drivers may hang
+
+
+def _await_end(stopping: threading.Event) -> None:
+    while os.read(0, 1):
+        pass
+    stopping.set()
+    time.sleep(_END_S)
+    os._exit(1)
+
+
+def run(pipeline_text: str, caps: str, output: int, stopping: threading.Event) -> None:
+    """All images to the file descriptor ``output``. Raises _PipelineError."""
+    gst = _library("libgstreamer-1.0.so.0", _GST)
+    app = _library("libgstapp-1.0.so.0", _APP)
+    gst.gst_init(None, None)
+    error = POINTER(_Error)()
+    pipeline = gst.gst_parse_launch(b"%s ! appsink name=%s" % (pipeline_text.encode(), _SINK), byref(error))
+    if error:
+        raise _PipelineError(f"cannot be built ({_text(error)})")
+    sink = gst.gst_bin_get_by_name(pipeline, _SINK)
+    for key, value in (("caps", caps), ("max-buffers", "2"), ("drop", "true"), ("qos", "false")):
+        gst.gst_util_set_object_arg(sink, key.encode(), value.encode())
+    gst.gst_pipeline_use_clock(pipeline, gst.gst_system_clock_obtain())  # CLOCK_MONOTONIC
+    try:
+        _start(gst, pipeline, sink)
+        _forward(gst, app, pipeline, sink, output, stopping)
+    finally:
+        gst.gst_element_set_state(pipeline, _NULL)
+
+
+def _start(gst: ctypes.CDLL, pipeline: int, sink: int) -> None:
+    """Live images are fetched as they come; those of a file at their times."""
+    changed = gst.gst_element_set_state(pipeline, _PAUSED)
+    if changed not in (_FAILED, _LIVE):
+        changed = gst.gst_element_get_state(pipeline, None, None, _PREROLL_NS)
+    if changed == _FAILED:
+        raise _PipelineError(_failure(gst, pipeline) or "cannot be started")
+    gst.gst_util_set_object_arg(sink, b"sync", b"false" if changed == _LIVE else b"true")
+    if gst.gst_element_set_state(pipeline, _PLAYING) == _FAILED:
+        raise _PipelineError(_failure(gst, pipeline) or "cannot be started")
+
+
+def _forward(
+    gst: ctypes.CDLL, app: ctypes.CDLL, pipeline: int, sink: int, output: int, stopping: threading.Event
+) -> None:
+    known = None
+    while not stopping.is_set():
+        failure = _failure(gst, pipeline)
+        if failure is not None:
+            raise _PipelineError(failure)
+        sample = app.gst_app_sink_try_pull_sample(sink, _LOOK_NS)
+        if not sample:
+            if app.gst_app_sink_is_eos(sink):
+                send(output, END)
+                return
+            continue
+        caps = _caps(gst, sample)
+        if caps != known:
+            send(output, CAPS, data=caps)
+            known = caps
+        _send_image(gst, pipeline, sample, output)
+        gst.gst_mini_object_unref(sample)
+
+
+def _send_image(gst: ctypes.CDLL, pipeline: int, sample: int, output: int) -> None:
+    buffer = gst.gst_sample_get_buffer(sample)
+    stamp = Buffer.from_address(buffer).pts
+    running = gst.gst_segment_to_running_time(gst.gst_sample_get_segment(sample), _TIME, stamp)
+    time_ns = NO_TIME if _NONE in (stamp, running) else gst.gst_element_get_base_time(pipeline) + running
+    flags = DAMAGED if gst.gst_buffer_has_flags(buffer, _CORRUPTED) else 0
+    mapped = _Map()
+    if not gst.gst_buffer_map(buffer, byref(mapped), _READ):
+        raise _PipelineError("gives images that cannot be read; end it with an element that copies them to main memory")
+    try:
+        send(output, IMAGE, flags, time_ns, (ctypes.c_char * mapped.size).from_address(mapped.data))
+    finally:
+        gst.gst_buffer_unmap(buffer, byref(mapped))
+
+
+def send(
+    output: int, kind: bytes, flags: int = 0, time_ns: int = 0, data: bytes | ctypes.Array[ctypes.c_char] = b""
+) -> None:
+    """One message. Raises BrokenPipeError when nobody reads any more."""
+    view = memoryview(data).cast("B")
+    _write(output, memoryview(HEADER.pack(kind, flags, time_ns, len(view))))
+    _write(output, view)
+
+
+def _write(output: int, data: memoryview) -> None:
+    while data:
+        data = data[os.write(output, data) :]
+
+
+def _caps(gst: ctypes.CDLL, sample: int) -> bytes:
+    text = gst.gst_caps_to_string(gst.gst_sample_get_caps(sample))
+    try:
+        return bytes(ctypes.cast(text, c_char_p).value or b"")
+    finally:
+        gst.g_free(text)
+
+
+def _failure(gst: ctypes.CDLL, pipeline: int) -> str | None:
+    """Why an element has failed; None while none has."""
+    bus = gst.gst_element_get_bus(pipeline)
+    message = gst.gst_bus_pop_filtered(bus, _ERROR)
+    gst.gst_object_unref(bus)
+    if not message:
+        return None
+    error, detail = POINTER(_Error)(), c_char_p()
+    gst.gst_message_parse_error(message, byref(error), byref(detail))
+    return f"has failed ({_text(error)})"
+
+
+def _text(error: Any) -> str:
+    return bytes(error.contents.message or b"no reason given").decode("utf-8", "replace").strip().rstrip(".")
+
+
+_GST: Mapping[str, tuple[Any, ...]] = {
+    "g_free": (None, c_void_p),
+    "gst_buffer_has_flags": (c_int, c_void_p, c_int),
+    "gst_buffer_map": (c_int, c_void_p, c_void_p, c_int),
+    "gst_buffer_unmap": (None, c_void_p, c_void_p),
+    "gst_bin_get_by_name": (c_void_p, c_void_p, c_char_p),
+    "gst_bus_pop_filtered": (c_void_p, c_void_p, c_int),
+    "gst_caps_to_string": (c_void_p, c_void_p),
+    "gst_element_get_base_time": (c_uint64, c_void_p),
+    "gst_element_get_bus": (c_void_p, c_void_p),
+    "gst_element_get_state": (c_int, c_void_p, c_void_p, c_void_p, c_uint64),
+    "gst_element_set_state": (c_int, c_void_p, c_int),
+    "gst_init": (None, c_void_p, c_void_p),
+    "gst_message_parse_error": (None, c_void_p, c_void_p, c_void_p),
+    "gst_mini_object_unref": (None, c_void_p),
+    "gst_object_unref": (None, c_void_p),
+    "gst_parse_launch": (c_void_p, c_char_p, c_void_p),
+    "gst_pipeline_use_clock": (None, c_void_p, c_void_p),
+    "gst_sample_get_buffer": (c_void_p, c_void_p),
+    "gst_sample_get_caps": (c_void_p, c_void_p),
+    "gst_sample_get_segment": (c_void_p, c_void_p),
+    "gst_segment_to_running_time": (c_uint64, c_void_p, c_int, c_uint64),
+    "gst_system_clock_obtain": (c_void_p,),
+    "gst_util_set_object_arg": (None, c_void_p, c_char_p, c_char_p),
+}
+"""Result and arguments of each function."""
+_APP: Mapping[str, tuple[Any, ...]] = {
+    "gst_app_sink_is_eos": (c_int, c_void_p),
+    "gst_app_sink_try_pull_sample": (c_void_p, c_void_p, c_uint64),
+}
+
+
+def _library(name: str, signatures: Mapping[str, tuple[Any, ...]]) -> ctypes.CDLL:
+    try:
+        library = ctypes.CDLL(name)
+    except OSError as error:
+        raise _PipelineError(NOT_INSTALLED) from error
+    for function, (result, *arguments) in signatures.items():
+        pointer = getattr(library, function)
+        pointer.restype, pointer.argtypes = result, arguments
+    return library
+
+
+if __name__ == "__main__":
+    main()

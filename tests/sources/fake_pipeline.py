@@ -1,0 +1,82 @@
+"""Speaks like the process of a pipeline, by the words of its argument; nothing of flockd's is imported here.
+
+fake_pipeline.py "WORD..." CAPS
+
+`caps:WxH` and `caps:text` say what the images are; `N` sends N different images of 64x48 in RGB, 20 ms apart, `same:N`
+N equal ones, `short` one that lacks a byte, `flagged` one the driver calls damaged, `old` one of an hour ago, `untimed`
+one without a time; `stall` waits until the other side goes, `fail:text` and `end` say so, `print` prints a line,
+`crash` ends by a signal, `once:FILE` skips the word after it if FILE exists, and makes it. Underscores in texts are
+spaces.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import struct
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+WIDTH, HEIGHT = 64, 48
+PERIOD_S = 0.02
+
+
+def send(kind: bytes, data: bytes = b"", flags: int = 0, time_ns: int = 0) -> None:
+    """The header as the protocol has it, by hand: kind, flags, nanoseconds, length, four bytes of nothing."""
+    view = memoryview(struct.pack("<4sIqI", kind, flags, time_ns, len(data)) + bytes(4) + data)
+    while view:
+        view = view[os.write(1, view) :]
+
+
+def picture(number: int) -> bytes:
+    """A gradient whose first pixel is the number."""
+    row = bytes(value % 256 for column in range(WIDTH) for value in (column * 3, column, 255 - column))
+    return bytes([number % 256]) * 3 + row[3:] + row * (HEIGHT - 1)
+
+
+def images(count: int, *, same: bool = False) -> None:
+    """Stamped as they are sent."""
+    for number in range(count):
+        send(b"imag", picture(0 if same else number), time_ns=time.monotonic_ns())
+        time.sleep(PERIOD_S)
+
+
+def say_caps(text: str) -> None:
+    """Of RGB where only a size is given."""
+    width, _, height = text.partition("x")
+    raw = f"video/x-raw, format=(string)RGB, width=(int){width}, height=(int){height}, framerate=(fraction)50/1"
+    send(b"caps", (raw if width.isdigit() else text.replace("_", " ")).encode())
+
+
+WORDS: dict[str, Callable[[str], object]] = {
+    "caps": say_caps,
+    "same": lambda text: images(int(text), same=True),
+    "short": lambda _: send(b"imag", picture(0)[:-1], time_ns=time.monotonic_ns()),
+    "flagged": lambda _: send(b"imag", picture(0), flags=1, time_ns=time.monotonic_ns()),
+    "old": lambda _: send(b"imag", picture(0), time_ns=time.monotonic_ns() - 3600 * 10**9),
+    "untimed": lambda _: send(b"imag", picture(0), time_ns=-1),
+    "stall": lambda _: sys.stdin.read(),
+    "fail": lambda text: send(b"fail", text.replace("_", " ").encode()),
+    "end": lambda _: send(b"end\0"),
+    "print": lambda _: os.write(1, b"GST_ARGUS: Creating output stream, and more of the kind\n"),
+    "crash": lambda _: os.kill(os.getpid(), signal.SIGSEGV),
+}
+
+
+def play(words: list[str]) -> None:
+    """One after the other; then the end of the program."""
+    while words:
+        word, _, text = words.pop(0).partition(":")
+        if word.isdigit():
+            images(int(word))
+        elif word == "once":
+            if Path(text).exists():
+                words.pop(0)
+            Path(text).touch()
+        else:
+            WORDS[word](text)
+
+
+play(sys.argv[1].split())
