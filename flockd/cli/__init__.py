@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from flockd import __version__
 from flockd.cli import (
     calibrate,
+    campaign,
     config,
     detect,
     doctor,
@@ -30,7 +31,9 @@ from flockd.errors import ExitCode, FlockdError, UnavailableError, shortage_of
 # Packages of an extra: without them a command is unavailable, not broken.
 EXTRAS = {
     **dict.fromkeys(("numba", "llvmlite", "matplotlib", "jinja2", "markupsafe"), "sim"),
+    "joblib": "campaign",
     "pyarrow": "parquet",
+    "ray": "ray",
     "rerun": "view",
     "argcomplete": "completion",
     **dict.fromkeys(("aiohttp", "plotly"), "fleet"),
@@ -96,6 +99,6 @@ def _parser() -> Parser:
         notes=EXIT_CODES,
     )
     parser.add_argument("--version", action="version", version=f"flockd {__version__}")
-    commands = (run, status, fleet, doctor, sim, report, record, replay, view, detect, calibrate, config, models)
+    commands = (run, status, fleet, doctor, sim, campaign, report, record, replay, view, detect, calibrate, config, models)
     add_commands(parser, [command.add for command in commands])
     return parser

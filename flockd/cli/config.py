@@ -46,7 +46,7 @@ def _add_show(commands: Commands) -> None:
 def _add_schema(commands: Commands) -> None:
     examples = ("flockd config schema drone", "flockd config schema scenario > scenario.schema.json")
     parser = commands("schema", "Print the JSON schema of a kind of file, for editors and other tools.", examples)
-    parser.add_argument("kind", choices=("drone", "scenario"), help="of the file")
+    parser.add_argument("kind", choices=("drone", "scenario", "campaign"), help="of the file")
     parser.set_defaults(run=_schema)
 
 

@@ -8,7 +8,7 @@ import math
 import re
 import sys
 from collections.abc import Callable, Sequence
-from typing import NoReturn, Protocol
+from typing import Any, NoReturn, Protocol
 
 from flockd.cli.output import complain
 from flockd.errors import ExitCode
@@ -28,6 +28,14 @@ class Parser(argparse.ArgumentParser):
         )
         self.commands: list[str] = []
         """Names of its commands, if it has any."""
+        self.default_command: str | None = None
+        """Which of them is meant where none is named."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As argparse does, with the default command in its place."""
+        if self.default_command is not None and args and args[0] not in {*self.commands, "-h", "--help"}:
+            args = [self.default_command, *args]
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         """Reports what is wrong with the command line, with a suggestion for a misspelt command."""

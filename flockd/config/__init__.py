@@ -1,14 +1,17 @@
 """The typed configuration and its loader."""
 
+from flockd.config.campaign import CampaignConfig
 from flockd.config.drone import DroneConfig
-from flockd.config.loader import Overrides, load, load_drone, load_scenario, load_with_places, schema_of
+from flockd.config.loader import Overrides, load, load_campaign, load_drone, load_scenario, load_with_places, schema_of
 from flockd.config.scenario import ScenarioConfig
 
 __all__ = [
+    "CampaignConfig",
     "DroneConfig",
     "Overrides",
     "ScenarioConfig",
     "load",
+    "load_campaign",
     "load_drone",
     "load_scenario",
     "load_with_places",

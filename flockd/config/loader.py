@@ -10,6 +10,7 @@ from typing import Any, Literal, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from flockd.choices import ROLES
+from flockd.config.campaign import CampaignConfig
 from flockd.config.document import Document, KeyPath, Place, Value, read_document
 from flockd.config.drone import DroneConfig
 from flockd.config.scenario import ScenarioConfig
@@ -23,6 +24,7 @@ _BESIDE_DRONE = ("mission", "obstacles")
 OVERRIDE = "override"
 """Stands where else a file's name does."""
 
+FileKind = Literal["drone", "scenario", "campaign"]
 Model = TypeVar("Model", bound=BaseModel)
 Overrides = Mapping[str, Value]
 
@@ -60,10 +62,16 @@ def load_with_places(path: Path | str) -> tuple[DroneConfig | ScenarioConfig, Ma
     return _validated(ScenarioConfig, document), document.places
 
 
-def schema_of(kind: Literal["drone", "scenario"]) -> dict[str, Any]:
+def load_campaign(path: Path | str) -> tuple[CampaignConfig, Mapping[KeyPath, Place]]:
+    """A campaign's file, and the place of each value in it; of its scenario only the path. Raises ConfigError."""
+    document = read_document(Path(path), "campaign")
+    return _validated(CampaignConfig, document), document.places
+
+
+def schema_of(kind: FileKind) -> dict[str, Any]:
     """The JSON schema of a configuration file, for editors and other tools."""
-    if kind == "drone":
-        return DroneConfig.model_json_schema()
+    if kind != "scenario":
+        return (DroneConfig if kind == "drone" else CampaignConfig).model_json_schema()
     schema = ScenarioConfig.model_json_schema()
     drone = schema["properties"]["drone"]
     inline = {"$ref": drone.pop("$ref")}

@@ -21,7 +21,7 @@ DRONE_FAMILIES = 14
 _LOWEST_M = 0.5
 """A drone that begins lower touches the uneven ground."""
 _HIGHEST_M = 1000.0
-_SMALLEST_DISTANCE_M = 0.7
+MIN_START_DISTANCE_M = 0.7
 """Of two drones at the start, about the size of one: nearer, they touch."""
 
 
@@ -200,10 +200,10 @@ class ScenarioConfig(Section):
                 faults["vehicles", number, "position_m"] = fault
         for one, other in combinations(range(len(self.vehicles)), 2):
             apart_m = dist(self.vehicles[one].position_m, self.vehicles[other].position_m)
-            if apart_m < _SMALLEST_DISTANCE_M:
+            if apart_m < MIN_START_DISTANCE_M:
                 faults.setdefault(
                     ("vehicles", other, "position_m"),
-                    f"is {apart_m:.2g} m from vehicles[{one}], and drones touch below {_SMALLEST_DISTANCE_M:g} m; "
+                    f"is {apart_m:.2g} m from vehicles[{one}], and drones touch below {MIN_START_DISTANCE_M:g} m; "
                     "move one of them",
                 )
         refuse(self, faults)

@@ -50,6 +50,11 @@ class FlightLogBuilder:
         """
         self._position[step], self._velocity[step], self._attitude[step] = position, velocity, R_ned_body
 
+    @property
+    def true_path(self) -> tuple[FloatArray, FloatArray]:
+        """Positions (S, N, 3) m and velocities (S, N, 3) m/s NED: of a flight on exact states its own companion."""
+        return self._position, self._velocity
+
     def add_missions(
         self, step: int, desired: FloatArray, missions: Sequence[MissionStatus | None], homes: FloatArray | None = None
     ) -> None:

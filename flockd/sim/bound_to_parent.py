@@ -22,13 +22,18 @@ def bound(command: list[str]) -> list[str]:
     return [sys.executable, "-m", _MODULE, f"{os.getpid()}", *command]
 
 
-def main() -> None:
-    """Becomes the command. Exits where the parent has ended already."""
-    parent, command = int(sys.argv[1]), sys.argv[2:]
+def bind(parent: int) -> None:
+    """Binds this process to the one that started it. Exits where that has ended already."""
     if ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, int(signal.SIGTERM), 0, 0, 0) != 0:
         raise OSError(ctypes.get_errno(), "the parent's end cannot be watched")
     if os.getppid() != parent:
         sys.exit(128 + signal.SIGTERM)
+
+
+def main() -> None:
+    """Becomes the command. Exits where the parent has ended already."""
+    parent, command = int(sys.argv[1]), sys.argv[2:]
+    bind(parent)
     os.execvp(command[0], command)
 
 

@@ -39,8 +39,11 @@ class FlockPoses(Protocol):
 class CameraSimulator:
     """The world of a scenario, the models of its drones, and their cameras."""
 
-    def __init__(self, scenario: ScenarioConfig) -> None:
-        """Raises UsageError for a camera model that cannot be rendered."""
+    def __init__(self, scenario: ScenarioConfig, threads: int | None = None) -> None:
+        """Draws a drone's images on ``threads``; 0: on the calling one; None: as many as there are processors.
+
+        Raises UsageError for a camera model that cannot be rendered.
+        """
         self.rig = build_rig(scenario.drone.rig)
         for name, mounted in self.rig.cameras.items():
             if not isinstance(mounted.camera, PinholeCamera) or any(mounted.camera.distortion):
@@ -69,7 +72,8 @@ class CameraSimulator:
         self._renderer = Renderer(world, models)
         self._noise = _ImageNoise(scenario.sensors.image_noise, scenario.seed)
         self._faults = CameraFaults(scenario.faults, scenario.seed)
-        self._executor = ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="camera")
+        count = os.cpu_count() if threads is None else threads
+        self._executor = ThreadPoolExecutor(count, thread_name_prefix="camera") if count else None
 
     def ground_height(self, north: FloatArray, east: FloatArray) -> FloatArray:
         """(n,) metres above z = 0 of the ground that is drawn, at points (n,) north and east."""
@@ -91,7 +95,8 @@ class CameraSimulator:
             )  # fmt: skip
 
         # Side by side; noise and faults are drawn in the cameras' order, so that the images do not depend on that.
-        views, frames = dict(zip(cameras, self._executor.map(view, cameras), strict=True)), {}
+        drawn = map(view, cameras) if self._executor is None else self._executor.map(view, cameras)
+        views, frames = dict(zip(cameras, drawn, strict=True)), {}
         for name, seen in views.items():
             image = self._faults.applied(drone, name, time_s, self._noise.add(seen.rgb))
             frames[name] = Frame(name, image, time_s, step)

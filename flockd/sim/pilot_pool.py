@@ -24,10 +24,14 @@ class PilotPool:
     """
 
     def __init__(self, scenario: ScenarioConfig, swap: frozenset[str], processes: int | None) -> None:
-        """In as many ``processes``; 1: in this one; None: as many as there are processors. Never more than drones."""
+        """In as many ``processes``; None: as many as there are processors. Never more than drones.
+
+        1: in this one, beside the caller; 0: on the caller's thread.
+        """
         self.drones = tuple(i for i, vehicle in enumerate(scenario.vehicles) if not vehicle.by_hand)
         """Counted from 0."""
-        count = min(len(self.drones), (os.cpu_count() or 1) if processes is None else processes)
+        self.on_this_thread = processes == 0
+        count = min(len(self.drones), (os.cpu_count() or 1) if processes is None else max(processes, 1))
         self._shares = [self.drones[first::count] for first in range(count)]
         self._scenario = scenario
         self._swap = partial(TruthPerception, swap=swap, rig=build_rig(scenario.drone.rig)) if swap else None
@@ -66,4 +70,9 @@ class PilotPool:
         """Of a drone's pilot, see `Pilots`; it is there once the drone's process has come to it."""
         place = self.drones.index(drone) % len(self._shares)
         pilots = self._here or self._processes[place].ask
-        return self._threads[place].submit(pilots, drone, frames, vehicle, truth if self._swap else None, pictured)
+        order = (drone, frames, vehicle, truth if self._swap else None, pictured)
+        if not self.on_this_thread:
+            return self._threads[place].submit(pilots, *order)
+        stepped: Future[Stepped] = Future()
+        stepped.set_result(pilots(*order))
+        return stepped

@@ -54,6 +54,7 @@ def fly(
     telemetry: TelemetrySink | None = None,
     recorders: Sequence[Recorder] = (),
     processes: int | None = None,
+    pictured: bool = True,
     progress: Callable[[int, int], None] = lambda done, total: None,
     preparing: Callable[[int, int], None] = lambda done, total: None,
 ) -> Flight:
@@ -67,8 +68,10 @@ def fly(
         swap: roles of perception that take the truth instead of a network's estimate.
         telemetry: where every drone's output is published; nothing comes back from there.
         recorders: one a drone, or none; nothing comes back from there either.
-        processes: for pilots that see, beside this one, which draws the images; 0 or 1: they step in this one; None: as
-            many as there are processors, and no more than drones.
+        processes: for pilots that see, beside this one, which draws the images; 1: they step in this one; 0: they step,
+            and the images are drawn, on the calling thread; None: as many as there are processors, and no more than
+            drones.
+        pictured: keep key frames for the report.
         progress: called with (steps done, steps in all).
         preparing: the same, of what is done before the first step: the companion, the networks, the world.
     """
@@ -83,17 +86,16 @@ def fly(
     preparing(0, _PREPARATIONS)
     handover = Handover(scenario)
     vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=start_yaw(scenario), seed=scenario.seed)
-    chosen = key_frame_steps(len(times))
+    chosen = key_frame_steps(len(times)) if pictured else set()
     key_frames: list[KeyFrame] = []
     flown = 0
     with ExitStack() as stack:
         pool = stack.enter_context(PilotPool(scenario, swap, processes)) if perception == "learned" else None
-        companion = fly_exact_states(scenario)[1:]
-        pilots = (
-            _ExactStatePilots(scenario)
-            if pool is None
-            else _VisionPilots(scenario, pool, telemetry, recorders, companion, preparing)
-        )
+        companion = None
+        pilots: _ExactStatePilots | _VisionPilots = _ExactStatePilots(scenario)
+        if pool is not None:
+            companion = fly_exact_states(scenario)[1:]
+            pilots = _VisionPilots(scenario, pool, telemetry, recorders, companion, preparing)
         preparing(_PREPARATIONS, _PREPARATIONS)
         try:
             for step, time_s in enumerate(times):
@@ -111,7 +113,7 @@ def fly(
             if flown < _LEAST_STEPS:
                 raise
             builder.cut(flown)
-            companion = companion[0][:flown], companion[1][:flown]
+            companion = companion and (companion[0][:flown], companion[1][:flown])
     metadata = FlightMetadata.of_configuration(
         scenario.drone,
         scenario=scenario.scenario,
@@ -127,7 +129,7 @@ def fly(
         wall_s=time.perf_counter() - begin,
     )
     key_frames = sorted((frame for frame in key_frames if frame.time_s < metadata.duration_s), key=lambda f: f.drone)
-    return Flight(with_obstacles(builder.build(metadata, companion), scenario), tuple(key_frames))
+    return Flight(with_obstacles(builder.build(metadata, companion or builder.true_path), scenario), tuple(key_frames))
 
 
 _PREPARATIONS = 4
@@ -176,7 +178,7 @@ class _VisionPilots:
         self._companion = companion
         preparing(1, _PREPARATIONS)
         self._telemetry, self._recorders = telemetry, recorders
-        self._cameras = CameraSimulator(scenario)
+        self._cameras = CameraSimulator(scenario, threads=0 if pool.on_this_thread else None)
         preparing(2, _PREPARATIONS)
         pool.wait_until_ready()
         preparing(3, _PREPARATIONS)

@@ -57,9 +57,10 @@ class Vehicles:
         `heights` (n,) m, up positive, are flown to; NaN, or None for all: as high as now.
         """
         substeps = math.ceil(interval_s / _MAX_SUBSTEP_S - 1e-9)
+        climbs = heights is not None and not (np.isnan(heights).all() and self._is_level)
         for _ in range(substeps):
             self._substep(setpoints, yaw_setpoints, interval_s / substeps)
-            if heights is not None:
+            if climbs and heights is not None:
                 self._climb(heights, interval_s / substeps)
         self.R_ned_body = attitude(self._thrust, self._yaw)
 
@@ -93,6 +94,11 @@ class Vehicles:
         sink = np.where(down >= 0.0, np.minimum(sink, 0.0), sink)
         self.position = np.column_stack([self.position[:, :2], np.minimum(down, 0.0)])
         self.velocity = np.column_stack([self.velocity[:, :2], sink])
+
+    @property
+    def _is_level(self) -> bool:
+        """Whether all fly level, off the ground."""
+        return bool((self.velocity[:, 2] == 0.0).all() and (self.position[:, 2] < 0.0).all())
 
     @property
     def _gust_sigma(self) -> float:

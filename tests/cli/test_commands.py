@@ -242,7 +242,7 @@ def test_config_show_fills_in_the_defaults_and_can_be_loaded_again(
     assert json.loads(capsys.readouterr().out) == values
 
 
-@pytest.mark.parametrize("kind", ["drone", "scenario"])
+@pytest.mark.parametrize("kind", ["drone", "scenario", "campaign"])
 def test_config_schema_is_json(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["config", "schema", kind]) == 0
     schema = json.loads(capsys.readouterr().out)

@@ -1,0 +1,95 @@
+"""What a campaign measures of a flight: one number for each figure, or none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from flockd.config.campaign import Figure
+from flockd.flight_log.log import FlightLog
+from flockd.messages import FloatArray
+from flockd.report.summary import TAIL_S, estimation_errors, objective_sums, summarise
+
+Figures = dict[Figure, float | None]
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One figure: how it is called, and which way it is better."""
+
+    name: str
+    unit: str
+    better: Literal["higher", "lower"]
+    of: Callable[[FlightLog, dict[str, Any]], Any]
+    """From a flight's log and its summary."""
+    is_share: bool = False
+    """Of one flight it is 0 or 1, so that its mean is a share of flights."""
+
+
+def _in(*keys: str) -> Callable[[FlightLog, dict[str, Any]], Any]:
+    def found(_: FlightLog, summary: dict[str, Any]) -> Any:
+        value: Any = summary
+        for key in keys:
+            value = value[key]
+        return value
+
+    return found
+
+
+def _tail_mean(name: str) -> Callable[[FlightLog, dict[str, Any]], float]:
+    def mean(log: FlightLog, _: dict[str, Any]) -> float:
+        with np.errstate(invalid="ignore", divide="ignore"):  # a mission may want to stand still
+            sums = objective_sums(log, log.position, log.velocity)[name]
+        return float(np.mean(sums[log.time_s > log.time_s[-1] + log.metadata.step_s - TAIL_S - 1e-6]))
+
+    return mean
+
+
+def _distance_error(percentile: float) -> Callable[[FlightLog, dict[str, Any]], float]:
+    def error(log: FlightLog, _: dict[str, Any]) -> float:
+        errors: FloatArray = np.abs(estimation_errors(log)["distance_m"])
+        known = errors[np.isfinite(errors)]
+        return float(np.percentile(known, percentile)) if log.metadata.by_sight and len(known) else math.nan
+
+    return error
+
+
+MEASURES: dict[Figure, Measure] = {
+    "min_distance_m": Measure("nearest distance", "m", "higher", _in("flock", "min_distance_m")),
+    "min_distance_after_10s_m": Measure(
+        "nearest distance after 10 s", "m", "higher", _in("flock", "min_distance_after_10s_m")
+    ),
+    "order_tail": Measure("order at the end", "", "higher", _in("flock", "order_tail")),
+    "union_tail": Measure("union at the end", "", "higher", _in("flock", "union_tail")),
+    "connectivity_tail": Measure("connectivity at the end", "", "higher", _in("flock", "connectivity_tail")),
+    "safety": Measure("safety", "", "higher", _in("flock", "safety")),
+    "velocity_deviation_tail": Measure("velocity deviation at the end, Σ obj1", "", "lower", _tail_mean("obj1")),
+    "shape_deviation_tail": Measure("shape deviation at the end, Σ obj2", "", "lower", _tail_mean("obj2")),
+    "arrived": Measure("arrived", "of the flights", "higher", _in("mission", "arrived"), is_share=True),
+    "arrival_time_s": Measure("time of arrival", "s", "lower", _in("mission", "time_s")),
+    "final_error_m": Measure("distance from the goal at the end", "m", "lower", _in("mission", "final_error_m")),
+    "collisions": Measure("collisions with obstacles", "", "lower", _in("obstacles", "collisions")),
+    "min_clearance_m": Measure("least clearance", "m", "higher", _in("obstacles", "min_clearance_m")),
+    "time_within_1m_s": Measure("time within 1 m of obstacles", "s", "lower", _in("obstacles", "time_within_1m_s")),
+    "recall_within_10m": Measure("neighbours known within 10 m", "", "higher", _in("neighbours", "recall_within_10m")),
+    "false_per_drone_minute": Measure(
+        "false neighbours a drone and minute", "", "lower", _in("neighbours", "false_per_drone_minute")
+    ),
+    "distance_error_median_m": Measure("distance error, median", "m", "lower", _distance_error(50.0)),
+    "distance_error_p95_m": Measure("distance error, 95th percentile", "m", "lower", _distance_error(95.0)),
+    "own_motion_ratio": Measure("steps with own motion", "", "higher", _in("own_account", "own_motion_ratio")),
+}
+
+
+def figures_of(log: FlightLog, wanted: Iterable[Figure]) -> Figures:
+    """The wanted figures of a flight; None where a flight of its kind has none, or it is not finite."""
+    summary = summarise(log)
+    return {figure: _number(MEASURES[figure].of(log, summary)) for figure in wanted}
+
+
+def _number(value: Any) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(value)

@@ -1,0 +1,132 @@
+"""How the flights of a campaign are flown: one entry a kind, and one function for a task of any kind."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import lru_cache
+
+from flockd.campaign.figures import Figures, figures_of
+from flockd.campaign.plan import Run
+from flockd.campaign.recipe import Recipe
+from flockd.choices import SimulatedPerception
+from flockd.config import ScenarioConfig
+from flockd.config.campaign import Figure, FlightKindName
+from flockd.config.perception import PerceptionConfig
+from flockd.errors import FlockdError
+from flockd.inference.hashes import model_hashes
+from flockd.sim.swarm import fly
+
+Fly = Callable[[Sequence[ScenarioConfig], Sequence[Figure]], Sequence[Figures]]
+"""Flies scenarios of one cell that differ in their seeds, and gives the wanted figures of each."""
+
+
+@dataclass(frozen=True)
+class FlightKind:
+    """A way to fly."""
+
+    fly: Fly
+    perception: SimulatedPerception
+    """With which `flockd sim` flies such a flight, for its full report."""
+    at_once: int = 1
+    """Flights of one task."""
+
+
+def _alone(perception: SimulatedPerception) -> Fly:
+    """Flies one after the other, each on this thread alone, without key frames."""
+
+    def flown(scenarios: Sequence[ScenarioConfig], wanted: Sequence[Figure]) -> list[Figures]:
+        logs = (fly(scenario, perception=perception, processes=0, pictured=False).log for scenario in scenarios)
+        return [figures_of(log, wanted) for log in logs]
+
+    return flown
+
+
+FLIGHT_KINDS: dict[FlightKindName, FlightKind] = {
+    "truth": FlightKind(_alone("truth"), "truth"),
+    "sight": FlightKind(_alone("learned"), "learned"),
+}
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is sent to where it is flown: flights of one cell."""
+
+    kind: FlightKindName
+    wanted: tuple[Figure, ...]
+    runs: tuple[Run, ...]
+    recipes: tuple[Recipe, ...]
+    """As many."""
+
+
+@dataclass(frozen=True)
+class FlownRun:
+    """What came of one flight."""
+
+    run: Run
+    figures: Figures = field(default_factory=dict)
+    reason: str | None = None
+    """Why it failed."""
+    scenario_sha256: str = ""
+    networks: str = ""
+    """SHA-256 of each network, as `name=hash`."""
+    wall_s: float = 0.0
+    """Its share of its task's time."""
+    cpu_s: float = 0.0
+    began: str = ""
+    host: str = ""
+    process: int = 0
+
+
+def fly_task(task: Task) -> list[FlownRun]:
+    """Flies them. A flight that cannot be flown has its reason; of several, each is then tried by itself."""
+    wall_s, cpu_s, began = time.perf_counter(), time.process_time(), datetime.now(UTC).isoformat(timespec="seconds")
+    try:
+        scenarios = [_single_threaded(recipe.scenario()) for recipe in task.recipes]
+        figures = FLIGHT_KINDS[task.kind].fly(scenarios, task.wanted)
+        networks = _networks(scenarios[0].drone.perception) if task.kind == "sight" else ""
+    except Exception as error:  # noqa: BLE001 - whatever it is, it is one flight's result
+        if len(task.runs) > 1:
+            singles = zip(task.runs, task.recipes, strict=True)
+            return [one for run, recipe in singles for one in fly_task(Task(task.kind, task.wanted, (run,), (recipe,)))]
+        return [_failed(task.runs[0], error, began, time.perf_counter() - wall_s)]
+    wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
+    share = len(task.runs)
+    return [
+        FlownRun(
+            run, found, None, _sha256(scenario), networks, wall_s / share, cpu_s / share, began, platform.node(),
+            os.getpid(),
+        )
+        for run, scenario, found in zip(task.runs, scenarios, figures, strict=True)
+    ]  # fmt: skip
+
+
+def _single_threaded(scenario: ScenarioConfig) -> ScenarioConfig:
+    """With networks on one thread: a campaign flies as many flights at once as there are processors."""
+    perception = scenario.drone.perception.model_copy(update={"threads": 1})
+    return scenario.model_copy(update={"drone": scenario.drone.model_copy(update={"perception": perception})})
+
+
+def _failed(run: Run, error: Exception, began: str, wall_s: float) -> FlownRun:
+    """An expected error is its sentence; of another one the place says more."""
+    reason = str(error) if isinstance(error, FlockdError) else f"{type(error).__name__}: {error}"
+    if not isinstance(error, FlockdError):
+        places = traceback.extract_tb(error.__traceback__)
+        reason += f" ({os.path.basename(places[-1].filename)}:{places[-1].lineno})"  # noqa: PTH119 - no file is meant
+    return FlownRun(run, reason=reason, began=began, wall_s=wall_s, host=platform.node(), process=os.getpid())
+
+
+def _sha256(scenario: ScenarioConfig) -> str:
+    """Of all values of a scenario, those that no file gives too."""
+    return hashlib.sha256(scenario.model_dump_json().encode()).hexdigest()
+
+
+@lru_cache(maxsize=64)
+def _networks(perception: PerceptionConfig) -> str:
+    return ", ".join(f"{name}={sha256}" for name, sha256 in sorted(model_hashes(perception).items()))

@@ -1,0 +1,152 @@
+"""The folder of a campaign: every finished flight is in it at once, and it can be gone on with after any end.
+
+`campaign.json` is the plan. A finished task is a file in `parts/`, written beside and renamed; many parts become
+`flights.parquet` and `timings.parquet`, likewise, and are deleted after that. A flight that is in both counts once.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import pyarrow as pa
+
+from flockd.campaign.flight_kinds import FlownRun
+from flockd.campaign.flight_table import FlightTable, read_table, sync_folder, write_table
+from flockd.campaign.plan import Plan, Run
+from flockd.errors import UsageError
+
+PLAN_NAME = "campaign.json"
+FLIGHTS_NAME = "flights.parquet"
+TIMINGS_NAME = "timings.parquet"
+REPORT_NAME = "report.html"
+RERUNS = "reruns"
+_PARTS = "parts"
+_LOCK = ".lock"
+_OURS = {PLAN_NAME, FLIGHTS_NAME, TIMINGS_NAME, REPORT_NAME, RERUNS, _PARTS, _LOCK}
+MOST_PARTS = 500
+"""More are merged: a folder of many small files is slow."""
+
+
+class CampaignFolder:
+    """Between ``__enter__`` and ``__exit__`` for this process alone."""
+
+    def __init__(self, path: Path, plan: Plan) -> None:
+        """Raises UsageError for a folder of another campaign, or with other files."""
+        self.path, self._plan = path, plan
+        self._table = FlightTable(plan)
+        self._lock: int | None = None
+        self._parts = 0
+        _check(path, plan)
+
+    def __enter__(self) -> Self:
+        """Makes the folder, and tidies it. Raises UsageError where another process flies it."""
+        (self.path / _PARTS).mkdir(parents=True, exist_ok=True)
+        self._lock = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(self._lock)
+            raise UsageError(f"{self.path}: another process is flying this campaign; wait, or end that one") from None
+        _write_text(self.path / PLAN_NAME, self._plan.to_json())
+        for leftover in [*self.path.glob(".*.part"), *(self.path / _PARTS).glob(".*.part")]:
+            leftover.unlink()
+        self.merge()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        assert self._lock is not None
+        os.close(self._lock)
+
+    def add(self, flown: Sequence[FlownRun]) -> None:
+        """Keeps finished flights: on the disk when this returns."""
+        write_table(self._table.rows(flown), self.path / _PARTS / f"{flown[0].run.name}.parquet")
+        self._parts += 1
+        if self._parts >= MOST_PARTS:
+            self.merge()
+
+    def merge(self) -> None:
+        """Puts all parts into the two tables, in order of cells and seeds."""
+        parts = sorted((self.path / _PARTS).glob("*.parquet"))
+        tables = [self._whole(), *map(read_table, parts)]
+        whole = self._table.merged(tables)
+        # Timings first: flights decide what is done, and a kill between the two leaves all parts.
+        write_table(self._table.timings(whole), self.path / TIMINGS_NAME)
+        write_table(self._table.flights(whole), self.path / FLIGHTS_NAME)
+        for part in parts:
+            part.unlink()
+        self._parts = 0
+
+    def finished(self, figure: str | None) -> Iterator[tuple[Run, float | None]]:
+        """The flights that are done, each with its value of a figure. Call it before any is added."""
+        columns = ["cell", "number", *([figure] if figure else [])]
+        for row in read_table(self.path / FLIGHTS_NAME, columns).to_pylist():
+            yield Run(row["cell"], row["number"]), row[figure] if figure else None
+
+    def _whole(self) -> pa.Table:
+        """Of both files together. Between writing one and the other, the rows of the shorter one."""
+        flights, timings = self.path / FLIGHTS_NAME, self.path / TIMINGS_NAME
+        if not flights.is_file():
+            return self._table.schema.empty_table()
+        done, times = read_table(flights), read_table(timings)
+        if len(times) != len(done):
+            known = pa.compute.is_in(times["run"], value_set=done["run"].combine_chunks())
+            times = times.filter(known)
+        return self._table.joined(done, times)
+
+
+def load_plan(path: Path) -> Plan:
+    """The plan of a campaign's folder. Raises UsageError where there is none."""
+    try:
+        return Plan.from_json((path / PLAN_NAME).read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise UsageError(f"{path}: holds no campaign, as it has no {PLAN_NAME}; name another folder") from error
+    except (ValueError, KeyError) as error:
+        raise UsageError(f"{path / PLAN_NAME}: is not a plan of this flockd ({error})") from error
+
+
+def _check(path: Path, plan: Plan) -> None:
+    if path.exists() and not path.is_dir():
+        raise UsageError(f"{path}: is a file; name a folder with --out")
+    if not path.is_dir() or not any(path.iterdir()):
+        return
+    if {entry.name for entry in path.iterdir() if not entry.name.endswith(".part")} - _OURS:
+        raise UsageError(f"{path}: holds other files than a campaign's; name a new or empty folder with --out")
+    if not (path / PLAN_NAME).is_file():
+        return
+    old, new = json.loads((path / PLAN_NAME).read_text(encoding="utf-8")), json.loads(plan.to_json())
+    if old != new:
+        key, before, now = next(_changes(old, new))
+        raise UsageError(
+            f"{path}: was begun with other flights, as `{key}` was {before} and is {now} now; name another folder with "
+            "--out, or put the file back as it was to go on"
+        )
+
+
+def _changes(old: Any, new: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
+    """Keys whose values differ, with both values."""
+    if isinstance(old, Mapping) and isinstance(new, Mapping):
+        for name in sorted(old.keys() | new.keys()):
+            yield from _changes(old.get(name), new.get(name), f"{key}.{name}" if key else name)
+    elif old != new:
+        yield key, json.dumps(old), json.dumps(new)
+
+
+def _write_text(path: Path, text: str) -> None:
+    """At once or not at all."""
+    if path.is_file() and path.read_text(encoding="utf-8") == text:
+        return
+    temporary = path.with_name(f".{path.name}.part")
+    with temporary.open("w", encoding="utf-8") as stream:
+        stream.write(text)
+        stream.flush()
+        os.fsync(stream.fileno())
+    temporary.replace(path)
+    sync_folder(path.parent)

@@ -1,0 +1,276 @@
+"""A campaign's flights: its cells, checked before anything flies, and what each flight is made of."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self, get_args
+
+import numpy as np
+from pydantic import ValidationError
+
+from flockd import __version__
+from flockd.campaign.recipe import Recipe, Values, merged
+from flockd.choices import ROLES
+from flockd.config import CampaignConfig, ScenarioConfig, load_campaign, load_with_places
+from flockd.config.campaign import DRONES, Figure, Variation
+from flockd.config.document import KeyPath, Place
+from flockd.config.loader import PATHS
+from flockd.config.scenario import MAX_DRONES
+from flockd.config.validation_messages import problems_of
+from flockd.errors import ConfigError, ConfigProblem, UsageError
+
+CASE = "case"
+"""The parameter whose values are the names of `cases`."""
+MAX_CELLS = 10_000
+Places = Mapping[KeyPath, Place]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One combination of what varies."""
+
+    number: int
+    """From 0, in the order of the file; the last key of `vary` changes fastest."""
+    parameters: Mapping[str, Any]
+    """The value of each key of the grid, and of `case`."""
+
+
+@dataclass(frozen=True, order=True)
+class Run:
+    """One flight: a cell, and which of its seeds, both from 0."""
+
+    cell: int
+    number: int
+
+    @property
+    def name(self) -> str:
+        """By which it is known in results and commands."""
+        return f"c{self.cell}-s{self.number}"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All flights of a campaign, as values only: what it takes is no longer read from files."""
+
+    config: CampaignConfig
+    base: Mapping[str, Any]
+    """The scenario's own values, its drone's within."""
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Of a campaign's file. Raises ConfigError with everything wrong with it, its scenario and each cell."""
+        config, places = load_campaign(path)
+        scenario, of_scenario = load_with_places(path.parent / config.scenario)
+        if not isinstance(scenario, ScenarioConfig):
+            fault = f"names {config.scenario}, which is a drone's own file; name a scenario"
+            raise ConfigError([places["scenario",].problem(fault)])
+        config = _anchored(config, path.parent)
+        check = _Check(places, of_scenario)
+        check.keys(config)
+        plan = cls(config, scenario.model_dump(exclude_unset=True))
+        check.cells(plan)
+        if fault := _idle_seeds(plan):
+            raise ConfigError([places["seeds",].problem(fault)])
+        return plan
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Of `to_json`. Raises ValueError."""
+        values = json.loads(text)
+        config = CampaignConfig.model_validate_json(json.dumps(values["campaign"]))
+        return cls(config, _with_tuples(values["scenario"]))
+
+    def to_json(self) -> str:
+        """All of it, and the version of flockd: what has the same text has the same flights."""
+        config = self.config.model_dump(mode="json")
+        values = {"flockd": __version__, "campaign": config, "scenario": self.base}
+        return json.dumps(values, indent=1, sort_keys=True) + "\n"
+
+    @property
+    def sha256(self) -> str:
+        """Of `to_json`."""
+        return hashlib.sha256(self.to_json().encode()).hexdigest()
+
+    @cached_property
+    def cells(self) -> tuple[Cell, ...]:
+        """All combinations, in order."""
+        return tuple(Cell(number, values) for number, values in enumerate(self._combinations()))
+
+    @cached_property
+    def drawn(self) -> dict[str, Variation]:
+        """What each flight draws."""
+        return {key: variation for key, variation in self.config.vary.items() if variation.is_drawn}
+
+    @property
+    def wanted(self) -> tuple[Figure, ...]:
+        """What is measured."""
+        return self.config.measure or get_args(Figure)
+
+    @property
+    def most_flights(self) -> int:
+        """If no cell is known well enough before."""
+        return len(self.cells) * self.config.seeds
+
+    def parameters(self, cell: Cell, number: int) -> Values:
+        """Of one flight: its cell's, and what it drew."""
+        seed = self.config.seed + number
+        return {**cell.parameters, **{key: _draw(variation, key, seed) for key, variation in self.drawn.items()}}
+
+    def recipe(self, cell: Cell, number: int) -> Recipe:
+        """What one flight is made of."""
+        parameters = self.parameters(cell, number)
+        case = parameters.pop(CASE, None)
+        of_case = {} if case is None else self.config.cases[case]
+        overrides = {**self.config.fixed, **of_case, **parameters}
+        return Recipe(self.base, overrides, self.config.seed + number, self.config.scatter_m)
+
+    def _combinations(self) -> Iterator[Values]:
+        axes = {CASE: tuple(self.config.cases)} if self.config.cases else {}
+        axes |= {key: values_of(variation) for key, variation in self.config.vary.items() if not variation.is_drawn}
+        for values in itertools.product(*axes.values()):
+            yield dict(zip(axes, values, strict=True))
+
+
+def values_of(variation: Variation) -> tuple[Any, ...]:
+    """Of a key of the grid."""
+    if variation.values is not None:
+        return variation.values
+    low, high, steps = variation.low, variation.high, variation.steps
+    assert isinstance(low, float | int) and isinstance(high, float | int) and steps is not None
+    # To 12 digits: 0.3 and not 0.30000000000000004.
+    return tuple(float(f"{value:.12g}") for value in np.linspace(low, high, steps))
+
+
+def _draw(variation: Variation, key: str, seed: int) -> float | tuple[float, ...]:
+    """One flight's own value: by its seed and the key alone."""
+    assert variation.low is not None and variation.high is not None
+    rng = np.random.default_rng([seed, zlib.crc32(key.encode())])
+    drawn = rng.uniform(variation.low, variation.high)
+    return float(drawn) if np.ndim(drawn) == 0 else tuple(drawn.tolist())
+
+
+def _idle_seeds(plan: Plan) -> str | None:
+    """What is wrong where all seeds of a cell fly the very same flight."""
+    config = plan.config
+    if config.seeds == 1 or config.perception != "truth" or config.scatter_m or plan.drawn:
+        return None
+    for cell in plan.cells:
+        scenario = plan.recipe(cell, 0).scenario()
+        if scenario.vehicle.gust_m_s or scenario.world.obstacles is not None:
+            return None
+    return (
+        "are all the same flight: on exact states without gusts and obstacles nothing depends on the seed; "
+        "write `scatter_m: 0.5`, or `vehicle.gust_m_s: 0.3` in `fixed`, or `seeds: 1`"
+    )
+
+
+def _anchored(config: CampaignConfig, folder: Path) -> CampaignConfig:
+    """With absolute paths in the place of those that count from the campaign's folder."""
+
+    def anchored(key: str, value: Any) -> Any:
+        path = tuple(key.split("."))
+        is_path = path[-2:] in PATHS and isinstance(value, str) and (path[-1] not in ROLES or value.endswith(".yaml"))
+        return str((folder / value).resolve()) if is_path else value
+
+    def all_anchored(values: Mapping[str, Any]) -> Values:
+        return {key: anchored(key, value) for key, value in values.items()}
+
+    vary = {
+        key: one if one.values is None else one.model_copy(update={"values": tuple(anchored(key, v) for v in one.values)})
+        for key, one in config.vary.items()
+    }
+    cases = {case: all_anchored(values) for case, values in config.cases.items()}
+    return config.model_copy(update={"fixed": all_anchored(config.fixed), "vary": vary, "cases": cases})
+
+
+def _with_tuples(value: Any) -> Any:
+    """JSON's lists as the tuples that a configuration holds."""
+    if isinstance(value, dict):
+        return {key: _with_tuples(inner) for key, inner in value.items()}
+    return tuple(_with_tuples(inner) for inner in value) if isinstance(value, list) else value
+
+
+class _Check:
+    """Finds what is wrong with the values that a campaign sets, each with its place in the campaign's file."""
+
+    def __init__(self, places: Places, of_scenario: Places) -> None:
+        self._places, self._of_scenario = places, of_scenario
+
+    def keys(self, config: CampaignConfig) -> None:
+        """Raises ConfigError for what needs no scenario: sizes of flocks, and how many cells there are."""
+        counts = {("fixed", DRONES): [config.fixed.get(DRONES, 1)]}
+        counts |= {("cases", case, DRONES): [values.get(DRONES, 1)] for case, values in config.cases.items()}
+        if (sizes := config.vary.get(DRONES)) is not None:
+            counts["vary", DRONES] = list(sizes.values or (None,))
+        wrong = [
+            self._places[path].problem(f"must be whole numbers from 1 to {MAX_DRONES}, as in `values: [5, 10]`")
+            for path, values in counts.items()
+            if not all(isinstance(n, int) and not isinstance(n, bool) and 1 <= n <= MAX_DRONES for n in values)
+        ]
+        cells = max(len(config.cases), 1)
+        for variation in config.vary.values():
+            cells *= 1 if variation.is_drawn else len(values_of(variation))
+        if cells > MAX_CELLS:
+            section = self._places.get(("vary",), self._places[()])
+            wrong.append(section.problem(f"makes {cells} cells; write fewer values, for at most {MAX_CELLS}"))
+        if wrong:
+            raise ConfigError(wrong)
+
+    def cells(self, plan: Plan) -> None:
+        """Raises ConfigError with each problem of any cell, with all that is drawn at its lowest and its highest."""
+        problems: set[ConfigProblem] = set()
+        ends = ("low", "high") if plan.drawn else ("low",)
+        for cell in plan.cells:
+            for end in ends:
+                drawn = {key: getattr(variation, end) for key, variation in plan.drawn.items()}
+                problems |= set(self._problems(plan, cell, drawn, end))
+        if problems:
+            raise ConfigError(sorted(problems))
+
+    def _problems(self, plan: Plan, cell: Cell, drawn: Values, end: str) -> list[ConfigProblem]:
+        recipe = replace(plan.recipe(cell, 0), scatter_m=0.0)
+        places = self._places_of(plan, cell, end)
+        for key, value in {**recipe.overrides, **drawn}.items():
+            try:
+                merged(plan.base, {key: value})
+            except ValueError as error:
+                return [places[tuple(key.split("."))].problem(str(error))]
+        try:
+            replace(recipe, overrides={**recipe.overrides, **drawn}).scenario()
+        except ValidationError as error:
+            return problems_of(error.errors(), ScenarioConfig, places)
+        except UsageError as error:
+            return [places[()].problem(str(error))]
+        return []
+
+    def _places_of(self, plan: Plan, cell: Cell, end: str) -> Places:
+        """Where each value of the cell's scenario stands: in the campaign's file, or in the scenario's or drone's."""
+        config, places = plan.config, dict(self._of_scenario)
+        origins: dict[str, KeyPath] = {key: ("fixed", key) for key in config.fixed}
+        if (case := cell.parameters.get(CASE)) is not None:
+            origins |= {key: ("cases", case, key) for key in config.cases[case]}
+        for key, variation in config.vary.items():
+            if variation.is_drawn:
+                origins[key] = ("vary", key, end)
+            elif variation.values is not None:
+                origins[key] = ("vary", key, "values", variation.values.index(cell.parameters[key]))
+            else:
+                origins[key] = ("vary", key)
+        for key, origin in origins.items():
+            path = tuple(key.split("."))
+            place = self._places[origin]
+            places |= {path[:length]: places.get(path[:length], place) for length in range(1, len(path))}
+            inside = {place_of: None for place_of in places if place_of[: len(path)] == path}
+            for old in inside:
+                del places[old]
+            places[path] = place
+            depth = len(origin)
+            places |= {(*path, *at[depth:]): p for at, p in self._places.items() if at[:depth] == origin and at != origin}
+        return places

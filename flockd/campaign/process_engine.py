@@ -1,0 +1,106 @@
+"""Flies in processes of this computer, with the executor that joblib brings along (loky)."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections import Counter, deque
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures.process import BrokenProcessPool
+from types import TracebackType
+from typing import Self
+
+import cv2
+from joblib.externals.loky import ProcessPoolExecutor
+
+from flockd.campaign.engines import MAX_TRIES, ONE_THREAD, Flown, ended
+from flockd.campaign.flight_kinds import Task, fly_task
+from flockd.campaign.plan import Run
+from flockd.side_process import with_package
+from flockd.sim.bound_to_parent import bind
+
+_QUEUED = 2
+"""Tasks for each worker: one that it flies, and one that it goes on with."""
+
+
+class ProcessEngine:
+    """Between ``__enter__`` and ``__exit__``. Its processes end with this one, however that ends.
+
+    When a process dies, the executor cannot say which task it flew, and all that it had begun are lost. Each of them is
+    then flown by itself, which shows whose flight it was; the processes are new.
+    """
+
+    def __init__(self, workers: int) -> None:
+        self._workers = workers
+        self._executor = self._started()
+        self._flying: dict[Future[Flown], Task] = {}
+        self._suspects: deque[Task] = deque()
+        """Were in an executor that broke."""
+        self._tries: Counter[tuple[Run, ...]] = Counter()
+        """How often a task's flights were the only ones in an executor that broke."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._executor.shutdown(wait=True, kill_workers=True)
+
+    @property
+    def room(self) -> int:
+        """None while suspects fly by themselves."""
+        return 0 if self._suspects else _QUEUED * self._workers - len(self._flying)
+
+    def submit(self, task: Task) -> None:
+        """Takes a task."""
+        try:
+            self._flying[self._executor.submit(fly_task, task)] = task
+        except BrokenProcessPool:  # a process died a moment ago
+            self._suspects.append(task)
+            if not self._flying:
+                self._restarted()
+
+    def wait(self) -> list[Flown]:
+        """What is finished; waits for one at least."""
+        finished: list[Flown] = []
+        while not finished and (self._flying or self._suspects):
+            if not self._flying:
+                self.submit(self._suspects.popleft())
+            done, _ = wait(self._flying, return_when=FIRST_COMPLETED)
+            broken = False
+            for future in done:
+                try:
+                    finished.append(future.result())
+                    del self._flying[future]
+                except BrokenProcessPool:
+                    broken = True
+            if broken:
+                finished += self._restarted()
+        return finished
+
+    def _restarted(self) -> list[Flown]:
+        """With a new executor. Gives the results of tasks that have ended too many processes."""
+        wait(self._flying)  # all of them break
+        lost = [task for future, task in self._flying.items() if future.exception() is not None]
+        finished = [future.result() for future in self._flying if future.exception() is None]
+        self._flying.clear()
+        self._executor.shutdown(wait=True, kill_workers=True)
+        self._executor = self._started()
+        if len(lost) == 1:
+            self._tries[lost[0].runs] += 1
+            if self._tries[lost[0].runs] >= MAX_TRIES:
+                return [*finished, ended(lost[0], MAX_TRIES)]
+        self._suspects.extend(lost)
+        return finished
+
+    def _started(self) -> ProcessPoolExecutor:
+        environment = {**with_package(os.environ), **ONE_THREAD}
+        return ProcessPoolExecutor(self._workers, env=environment, initializer=_begin, initargs=(os.getpid(),))
+
+
+def _begin(parent: int) -> None:
+    """In a new process: it ends with its parent, Ctrl-C is for the parent alone, and OpenCV starts no threads."""
+    bind(parent)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    cv2.setNumThreads(0)

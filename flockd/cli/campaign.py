@@ -1,0 +1,159 @@
+"""`flockd campaign`: many flights of a scenario, their results and their report."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flockd.cli.output import Phases, complain, say, say_json
+from flockd.cli.parser import Commands, add_commands, positive_count
+from flockd.errors import ExitCode, UsageError
+
+if TYPE_CHECKING:
+    from flockd.campaign.plan import Plan
+
+RUN = "run"
+COSTS = """\
+costs: `--dry-run` estimates them. A flight of five drones for 110 s on exact states takes half a second of one core, a
+flight by sight as long as with `flockd sim` on one core. A flight's row takes 1 kB.
+Ctrl-C and every other end lose only flights that are in the air: the same command goes on with what is missing."""
+
+
+def add(commands: Commands) -> None:
+    """Adds the command."""
+    examples = (
+        "flockd campaign config/campaigns/separation.yaml --dry-run",
+        "flockd campaign config/campaigns/separation.yaml",
+        "flockd campaign report out/separation",
+        "flockd campaign rerun out/separation/c3-s12",
+    )
+    description = "Fly many flights of a scenario, rerun one of them, report on all; `campaign FILE` is `campaign run FILE`."
+    parser = commands("campaign", description, examples)
+    parser.default_command = RUN
+    add_commands(parser, (_add_run, _add_rerun, _add_report))
+
+
+def _add_run(commands: Commands) -> None:
+    examples = (
+        "flockd campaign config/campaigns/separation.yaml --dry-run",
+        "flockd campaign config/campaigns/separation.yaml --workers 4 --out out/tonight",
+        "flockd campaign config/campaigns/separation.yaml --engine ray --address 10.0.0.5:6379",
+    )
+    parser = commands(RUN, "Fly what is missing of a campaign, and write its report.", examples, COSTS)
+    parser.add_argument("file", metavar="FILE", type=Path, help="of the campaign")
+    parser.add_argument("--out", metavar="FOLDER", type=Path, help="default: out/NAME, by the campaign's name")
+    parser.add_argument("--workers", metavar="N", type=positive_count, help="flights at once (default: processors)")
+    parser.add_argument(
+        "--engine",
+        choices=("processes", "ray"),
+        default="processes",
+        help="what flies them: processes of this computer, or a Ray cluster (default: processes)",
+    )
+    parser.add_argument("--address", metavar="HOST:PORT", help="with --engine ray: a running cluster (default: a new one)")
+    parser.add_argument("--dry-run", action="store_true", help="print how many flights and hours it is; keep nothing")
+    parser.add_argument("--json", action="store_true", help="print what was flown as JSON")
+    parser.set_defaults(run=_run)
+
+
+def _add_rerun(commands: Commands) -> None:
+    examples = ("flockd campaign rerun out/separation/c3-s12", "flockd campaign rerun out/night/c0-s7 --out out/why --json")
+    parser = commands("rerun", "Fly one flight of a campaign again, with its full report.", examples)
+    parser.add_argument("flight", metavar="RUN", type=Path, help="the campaign's folder and the flight's name")
+    parser.add_argument("--out", metavar="DIR", type=Path, help="default: FOLDER/reruns/NAME")
+    parser.add_argument("--force", action="store_true", help="overwrite an earlier flight in that folder")
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    parser.set_defaults(run=_rerun, quiet=False, verbose=False)
+
+
+def _add_report(commands: Commands) -> None:
+    examples = ("flockd campaign report out/separation", "flockd campaign report out/old_networks out/new_networks")
+    parser = commands("report", "Write the report of a campaign, or compare a second one with it.", examples)
+    parser.add_argument("folder", metavar="FOLDER", type=Path, help="of a campaign")
+    parser.add_argument("other", nargs="?", metavar="OTHER", type=Path, help="is compared with it: is this one better?")
+    parser.add_argument("--out", metavar="FILE", type=Path, help="default: report.html, or OTHER/versus_NAME.html of two")
+    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
+    parser.set_defaults(run=_report)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from flockd.campaign.conduct import conduct
+    from flockd.campaign.engines import ENGINES
+    from flockd.campaign.folder import CampaignFolder
+    from flockd.campaign.plan import Plan
+
+    if args.address is not None and args.engine != "ray":
+        raise UsageError("--address is of a Ray cluster; add --engine ray, or drop it")
+    workers = args.workers or os.cpu_count() or 1
+    plan = Plan.load(args.file)
+    if args.dry_run:
+        return _dry_run(plan, workers, as_json=args.json)
+    path = args.out or Path("out") / plan.config.campaign
+    try:
+        with (
+            CampaignFolder(path, plan) as folder,
+            ENGINES[args.engine](workers, args.address) as engine,
+            Phases() as phases,
+        ):
+            conducted = conduct(plan, folder, engine, phases.of("flying", "flights"))
+    except KeyboardInterrupt:
+        complain(f"interrupted; every finished flight is in {path}, and the same command goes on with the others")
+        return ExitCode.INTERRUPTED
+    if args.json:
+        say_json({"folder": str(path), "flown": conducted.flown, "failed": conducted.failed, "before": conducted.before})
+    else:
+        before = f", {conducted.before} were there already" if conducted.before else ""
+        say(f"{conducted.flown} flights flown, {conducted.failed} of them failed{before}: {path}")
+    return ExitCode.CHECK_FAILED if conducted.failed else ExitCode.DONE
+
+
+def _dry_run(plan: Plan, workers: int, *, as_json: bool) -> int:
+    from flockd.campaign.trial import estimate
+
+    with Phases() as phases:
+        found = estimate(plan, phases.of("trial flights", "cells"))
+    hours = found.core_hours / workers
+    if as_json:
+        say_json({"cells": found.cells, "most_flights": found.flights, "flight_s": found.flight_s, "most_hours": hours})
+        return ExitCode.DONE
+    most = "at most " if plan.config.stop is not None else ""
+    say(f"{found.cells} cells, {most}{found.flights} flights of {found.flight_s:.2g} s on one core")
+    say(f"{most}{hours:.2g} h with {workers} at once, if each has a core of its own")
+    return ExitCode.DONE
+
+
+def _rerun(args: argparse.Namespace) -> int:
+    from flockd.campaign.folder import RERUNS, load_plan
+    from flockd.campaign.plan import Run
+    from flockd.campaign.flight_kinds import FLIGHT_KINDS
+    from flockd.cli.flight_summary import report_flight
+    from flockd.report.flight_folder import prepare_folder
+    from flockd.sim.swarm import fly
+
+    folder, name = args.flight.parent, args.flight.name
+    plan = load_plan(folder)
+    numbers = re.fullmatch(r"c(\d{1,9})-s(\d{1,9})", name)
+    if numbers is None:
+        raise UsageError(f"{name!r} is not the name of a flight; write one as in {folder}/c0-s0")
+    run = Run(int(numbers[1]), int(numbers[2]))
+    if run.cell >= len(plan.cells) or run.number >= plan.config.seeds:
+        last = Run(len(plan.cells) - 1, plan.config.seeds - 1)
+        raise UsageError(f"{folder}: has no flight {name}; the last one is {last.name}")
+    scenario = plan.recipe(plan.cells[run.cell], run.number).scenario()
+    directory = args.out or folder / RERUNS / name
+    prepare_folder(directory, force=args.force)
+    with Phases() as phases:
+        perception = FLIGHT_KINDS[plan.config.perception].perception
+        flight = fly(
+            scenario,
+            perception=perception,
+            progress=phases.of("flying", "steps"),
+            preparing=phases.of("loading networks and building the world", "parts"),
+        )
+    return report_flight(directory, flight, args)
+
+
+def _report(args: argparse.Namespace) -> int:
+    raise UsageError("not yet")
