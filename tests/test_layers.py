@@ -34,6 +34,7 @@ MAY_IMPORT = {
     "safety": BASE,
     "mission": BASE | {"safety"},  # for the fence
     "obstacles": BASE | {"safety", "flocking"},
+    "control_level": BASE | {"flocking", "mission", "obstacles", "safety"},  # neither renderer nor networks
     "pilot": BASE
     | {"obstacles"}
     | {"geometry", "inference", "perception", "tracking", "flocking", "safety", "mission"},
@@ -124,7 +125,7 @@ IMPURE_MODULES = {
 NETWORK_LIBRARIES = {"onnxruntime"}
 """Only inference runs networks."""
 SIMULATOR_LIBRARIES = {"numba", "matplotlib", "jinja2", "markupsafe"}
-"""Of the extra `sim`: only the simulator and its reports may need them."""
+"""Of the extra `sim`: only the simulator, flights at control level and reports may need them."""
 TOOL_LIBRARIES = {"torch", "onnx", "trimesh", "embreex", "pytest"}
 """For training and tests: nothing in the package may need them."""
 
@@ -185,7 +186,7 @@ def test_only_inference_runs_networks() -> None:
 
 def test_what_flies_needs_none_of_the_simulators_libraries() -> None:
     for path in MODULES:
-        if _folder(path) not in {"sim", "report"}:
+        if _folder(path) not in {"sim", "report", "control_level"}:
             assert not _libraries(path) & SIMULATOR_LIBRARIES, path
         assert not _libraries(path) & TOOL_LIBRARIES, path
 
