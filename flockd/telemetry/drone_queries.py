@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import zenoh
 
 from flockd.telemetry.schema import fault
-from flockd.telemetry.topics import PREFIX, AboutMessage, AnswerMessage, ClockMessage
+from flockd.telemetry.topics import PREFIX, AboutMessage, AnswerMessage, TimeMessage
 
 ANSWER_S = 3.0
 
@@ -48,7 +48,7 @@ class DroneQueries:
     def clock(self, drone: str) -> ClockReading | None:
         """How long the link takes, and how far the clocks are apart."""
         sent_s, began_s = time.time(), time.monotonic()
-        reply = self._message(f"{drone}/clock", ClockMessage)
+        reply = self._message(f"{drone}/time", TimeMessage)
         delay_s = time.monotonic() - began_s
         if reply is None or reply["wall_s"] is None:
             return None

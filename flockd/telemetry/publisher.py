@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import zenoh
 
-from flockd.telemetry.topics import PREFIX, TOPICS, AboutMessage, AnswerMessage, ClockMessage, checked_name
+from flockd.telemetry.topics import PREFIX, TOPICS, AboutMessage, AnswerMessage, TimeMessage, checked_name
 from flockd.zenoh_session import SessionOwner, open_session
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -65,7 +65,7 @@ class ZenohTelemetry(SessionOwner):
         key = f"{self._prefix}/{checked_name(drone)}"
         self._kept += [
             self._session.liveliness().declare_token(f"{key}/alive"),
-            self._session.declare_queryable(f"{key}/clock", _tell_time),
+            self._session.declare_queryable(f"{key}/time", _tell_time),
         ]
 
     def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
@@ -109,7 +109,7 @@ def _reply(query: zenoh.Query, message: Mapping[str, object]) -> None:
 
 
 def _tell_time(query: zenoh.Query) -> None:
-    _reply(query, ClockMessage(time_s=time.monotonic(), wall_s=time.time()))
+    _reply(query, TimeMessage(time_s=time.monotonic(), wall_s=time.time()))
 
 
 def _send_image(query: zenoh.Query, newest_image: NewestImage) -> None:

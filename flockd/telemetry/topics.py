@@ -5,7 +5,7 @@ Vectors are lists: NED is north, east, down. Times are seconds on the drone's mo
 
 `state` to `timings` follow from each step of the pilot; `flight` to `clock` come from the daemon, at all times.
 Beside the topics, a drone's daemon has a liveliness token `.../alive`, replies to a query for `.../about` with an
-`AboutMessage`, one for `.../clock` with a `ClockMessage`, one for `.../ask/hold`, `land`, `resume`, `goto` or
+`AboutMessage`, one for `.../time` with a `TimeMessage`, one for `.../ask/hold`, `land`, `resume`, `goto` or
 `velocity` with an `AnswerMessage`, and one for `.../image/<camera>` with a small JPEG of what that camera sees. A query
 for `goto` or `velocity` carries an `OrderMessage`.
 """
@@ -229,7 +229,7 @@ class AboutMessage(TypedDict):
     """What operators may ask of it."""
 
 
-class ClockMessage(TypedDict):
+class TimeMessage(TypedDict):
     """The drone's clocks as it replies: for its watchers, who learn from it the delay of the link too."""
 
     time_s: float
