@@ -23,7 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from pymavlink import mavutil
 
@@ -213,7 +213,7 @@ class Bench:
         """What `flockd status` shows of the autopilot's refusals: sentences by the reason's name."""
         rows = status_rows(self._watcher.drones(), time.monotonic())
         shown = {sentence for row in rows for sentence in row["matters"]}
-        reasons = self._flight().get("reasons", [])
+        reasons = self._flight().get("reasons", ())
         return {
             str(reason["event"]): str(reason["sentence"])
             for reason in reasons
@@ -280,7 +280,7 @@ class Bench:
             time.sleep(POLL_S)
         return time.monotonic() - begun_s
 
-    def _flight(self) -> Mapping[str, object]:
+    def _flight(self) -> Mapping[str, Any]:
         return next(
             (drone.message("flight", time.monotonic()) or {} for drone in self._watcher.drones()), {}
         )  # fmt: skip

@@ -54,16 +54,16 @@ class FakeChecks:
         self._mav.send(_Event(number, self._sequence, level << 4 | level, arguments))
 
 
-class _Event(mavlink.MAVLink_message):
+class _Event:
     """MAVLink's EVENT, which pymavlink does not have."""
 
     ID, CRC_EXTRA = 410, 160
     LAYOUT = struct.Struct("<IIHBBB40s")
 
     def __init__(self, number: int, sequence: int, log_levels: int, arguments: bytes) -> None:
-        super().__init__(self.ID, "EVENT")
         self._data = self.LAYOUT.pack(number, BOOT_MS, sequence, 0, 0, log_levels, arguments)
 
     def pack(self, mav: mavlink.MAVLink, force_mavlink1: bool = False) -> bytes:
         """The whole message as it goes over the link."""
-        return bytes(self._pack(mav, self.CRC_EXTRA, self._data, force_mavlink1=force_mavlink1))
+        message = mavlink.MAVLink_message(self.ID, "EVENT")
+        return bytes(message._pack(mav, self.CRC_EXTRA, self._data, force_mavlink1=force_mavlink1))

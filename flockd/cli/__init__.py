@@ -31,6 +31,7 @@ from flockd.errors import ExitCode, FlockdError, UnavailableError, shortage_of
 EXTRAS = {
     **dict.fromkeys(("numba", "llvmlite", "matplotlib", "jinja2", "markupsafe"), "sim"),
     "pyarrow": "parquet",
+    "pyulog": "ulog",
     "rerun": "view",
     "argcomplete": "completion",
 }
