@@ -134,14 +134,11 @@ def main() -> int:
     if args.json:
         print(json.dumps({"measured": [asdict(one) for one in measured]}, indent=2))
     else:
-        print(
-            "| busy processes | samples | median error | worst error | own bound | jitter | round trip |\n|---|---|---|---|---|---|---|"
-        )
+        print("| busy processes | samples | median error | worst error | own bound | jitter | round trip |")
+        print("|---|---|---|---|---|---|---|")
         for one in measured:
-            print(
-                f"| {one.busy} | {one.samples} | {one.median_ms:.3f} ms | {one.worst_ms:.3f} ms "
-                f"| {one.bound_ms:.3f} ms | {one.jitter_ms:.3f} ms | {one.round_trip_ms:.3f} ms |"
-            )
+            numbers = (one.median_ms, one.worst_ms, one.bound_ms, one.jitter_ms, one.round_trip_ms)
+            print(f"| {one.busy} | {one.samples} | " + " | ".join(f"{number:.3f} ms" for number in numbers) + " |")
     return 0 if all(one.within for one in measured) else 1
 
 

@@ -129,23 +129,23 @@ PROVOCATIONS = (
     _set("COM_ARM_MIS_REQ", "1", "0", "check_modes_mission", "no_mission"),
     _set("COM_ARMABLE", "0", "1", "check_armable_configuration", "not_armable"),
     _set("SYS_HAS_MAG", "3", "1", "check_mag_sys_has_mag_missing", "compass_missing"),
-    _set("SYS_HAS_NUM_DIST", "1", "0", "check_distance_sensor_missing", "range_finder_missing"),
+    _set("SYS_HAS_NUM_DIST", "3", "0", "check_distance_sensor_missing", "range_finder_missing"),
     _set("SYS_HAS_NUM_OF", "1", "0", "check_optical_sensor_missing", "optical_flow_missing"),
-    _set("CBRK_SUPPLY_CHK", "0", "894281", "check_missing_system_power", "power_not_measured"),
     _set("COM_CPU_MAX", "1", "95", "check_cpuload_too_high", "processor_busy"),
     _set("COM_PARACHUTE", "1", "0", "check_parachute_missing", "parachute_missing"),
     _set("COM_ARM_ODID", "2", "0", "check_open_drone_id_missing", "remote_id_missing"),
     _set("COM_ARM_TRAFF", "2", "0", "check_traffic_avoidance_missing", "traffic_missing"),
-    _fail("baro", "check_baro_no_data", {"SYS_FAILURE_EN": "1"}),
-    _fail("mag", "check_mag_no_data", {"SYS_FAILURE_EN": "1"}),
-    _fail("gps", "check_system_no_global_pos", {"SYS_FAILURE_EN": "1"}),
-    _fail("battery", "check_battery_emergency", {"SYS_FAILURE_EN": "1"}),
-    Provocation("no_home", "`COM_HOME_EN` 0", "check_system_no_home_pos", parameters={"COM_HOME_EN": "0"}),
+    _fail("gps", "check_modes_local_pos", {"SYS_FAILURE_EN": "1"}),
+    _fail("battery", "check_battery_critical", {"SYS_FAILURE_EN": "1"}),
+    Provocation(
+        "no_home", "`COM_HOME_EN` 0 and `COM_ARM_WO_GPS` 0", "check_system_no_home_pos",
+        parameters={"COM_HOME_EN": "0", "COM_ARM_WO_GPS": "0"},
+    ),
     Provocation(
         "geofence_without_home", "`COM_HOME_EN` 0 and `GF_ACTION` 3", "check_gf_no_home",
         parameters={"COM_HOME_EN": "0", "GF_ACTION": "3"},
     ),
-    Provocation("no_satellites", "`SIM_GPS_USED` 0", "check_system_no_global_pos", parameters={"SIM_GPS_USED": "0"}),
+    Provocation("no_satellites", "`SIM_GPS_USED` 0", "check_modes_local_pos", parameters={"SIM_GPS_USED": "0"}),
 )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from flockd.flight_log.autopilot_log import AutopilotLog
 from flockd.flight_log.log import FlightLog
 from flockd.flight_log.metadata import FlightMetadata
 from flockd.flight_log.ulog import autopilot_log, drone_of, read_ulog
+from flockd.report.autopilot_figure import autopilot_texts
 from flockd.report.flight_folder import save_flight
 from tests.flight_log.made_ulog import HEADER, write_ulog
 
@@ -166,9 +167,30 @@ def _two_drones() -> FlightLog:
     return FlightLog(**{**vars(log), **twice})
 
 
-def test_the_report_of_a_flights_folder_shows_it_and_keeps_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_reports_table_has_modes_failsafes_and_messages_by_time(tmp_path: Path) -> None:
+    path = _ulog(tmp_path / "log.ulg")
+    texts = autopilot_texts(_log(), autopilot_log(read_ulog(path), path, _log(), 0, _clock()))
+    rows = [(row["begin"], row["end"], row["what"]) for row in texts["autopilot_rows"]]
+    assert rows == [
+        ("0.0", "1.0", "hold"),
+        ("1.0", "25.0", "offboard"),
+        ("25.0", "", "Failsafe activated"),
+        ("25.0", "28.5", "failsafe"),
+        ("25.0", "28.5", "hold"),
+    ]
+    assert (texts["autopilot_drone"], texts["autopilot_source"]) == ("kestrel", "log.ulg")
+
+
+def test_a_bad_file_is_refused_before_anything_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "log.ulg").write_bytes(b"no log")
+    assert main(["report", str(tmp_path / "flight"), "--ulog", str(tmp_path / "log.ulg")]) == 2
+    assert "log.ulg: does not begin as one; name a ULog file" in capsys.readouterr().err
+    assert main(["report", str(tmp_path / "flight"), "--ulog", str(tmp_path / "none.ulg")]) != 0
+    assert "none.ulg" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_report_of_a_flights_folder_shows_it_and_keeps_it(tmp_path: Path) -> None:
     folder = tmp_path / "flight"
     folder.mkdir()
     save_flight(folder, _log(), ())
@@ -179,6 +201,6 @@ def test_the_report_of_a_flights_folder_shows_it_and_keeps_it(
     assert "Failsafe activated" in page
     assert "From log.ulg, laid" in page
     assert (folder / "figures" / "autopilot.png").is_file()
-    capsys.readouterr()
-    assert main(["report", str(folder), "--ulog", str(tmp_path / "flight" / "summary.json")]) == 2
-    assert "summary.json: does not begin as one; name a ULog file" in capsys.readouterr().err
+    ulog.unlink()
+    assert main(["report", str(folder)]) == 0
+    assert "What the autopilot logged" in (folder / "report.html").read_text(encoding="utf-8")
