@@ -45,7 +45,9 @@ START_S, SHOWN_S, GONE_S = 300.0, 60.0, 60.0
 POLL_S = 0.2
 OTHER_PORT = 14030
 """Where PX4's instance 0 looks for a further onboard computer."""
-SAYS = re.compile(r"(Preflight Fail: .*|Arming denied: .*|Switching to .*|Geofence: .*|.*[Bb]attery.*)")
+SAYS = re.compile(
+    r"(Preflight Fail: .*|Arming denied: .*|Switching to .*|Geofence: .*|(Low|Critical|Emergency) battery.*)"
+)
 """Lines of PX4's console that say why it refuses."""
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
