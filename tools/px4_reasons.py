@@ -65,6 +65,8 @@ class Provocation:
     end: Callable[[Bench], None] = lambda bench: None
     parameters: Mapping[str, str] = field(default_factory=dict)
     """From the start, of a PX4 of its own."""
+    lasting: bool = False
+    """It cannot be taken back, nor be waited for to be gone."""
 
 
 def _set(parameter: str, value: str, normal: str, reason: str, name: str) -> Provocation:
@@ -78,7 +80,7 @@ def _set(parameter: str, value: str, normal: str, reason: str, name: str) -> Pro
     )
 
 
-def _fail(unit: str, reason: str, parameters: Mapping[str, str] | None = None) -> Provocation:
+def _fail(unit: str, reason: str, *, lasting: bool = False) -> Provocation:
     """By PX4's own injection of failures."""
     return Provocation(
         f"{unit}_failed",
@@ -86,7 +88,8 @@ def _fail(unit: str, reason: str, parameters: Mapping[str, str] | None = None) -
         reason,
         lambda bench: bench.shell("failure", unit, "off"),
         lambda bench: bench.shell("failure", unit, "ok"),
-        parameters or {},
+        {"SYS_FAILURE_EN": "1"},
+        lasting,
     )
 
 
@@ -137,17 +140,19 @@ PROVOCATIONS = (
     _set("COM_PARACHUTE", "1", "0", "check_parachute_missing", "parachute_missing"),
     _set("COM_ARM_ODID", "2", "0", "check_open_drone_id_missing", "remote_id_missing"),
     _set("COM_ARM_TRAFF", "2", "0", "check_traffic_avoidance_missing", "traffic_missing"),
-    _fail("gps", "check_modes_local_pos", {"SYS_FAILURE_EN": "1"}),
-    _fail("battery", "check_battery_critical", {"SYS_FAILURE_EN": "1"}),
+    _fail("gps", "check_modes_local_pos"),
+    _fail("battery", "check_battery_critical", lasting=True),  # PX4 then shuts down
     Provocation(
         "no_home", "`COM_HOME_EN` 0 and `COM_ARM_WO_GPS` 0", "check_system_no_home_pos",
-        parameters={"COM_HOME_EN": "0", "COM_ARM_WO_GPS": "0"},
+        parameters={"COM_HOME_EN": "0", "COM_ARM_WO_GPS": "0"}, lasting=True,
     ),
     Provocation(
         "geofence_without_home", "`COM_HOME_EN` 0 and `GF_ACTION` 3", "check_gf_no_home",
-        parameters={"COM_HOME_EN": "0", "GF_ACTION": "3"},
+        parameters={"COM_HOME_EN": "0", "GF_ACTION": "3"}, lasting=True,
     ),
-    Provocation("no_satellites", "`SIM_GPS_USED` 0", "check_modes_local_pos", parameters={"SIM_GPS_USED": "0"}),
+    Provocation(
+        "no_satellites", "`SIM_GPS_USED` 0", "check_modes_local_pos", parameters={"SIM_GPS_USED": "0"}, lasting=True
+    ),
 )  # fmt: skip
 
 
@@ -289,7 +294,7 @@ class Bench:
 
     def trial(self, provocation: Provocation) -> Result:
         """Provokes a reason, waits until it is shown, and takes it back."""
-        before = 0 if provocation.parameters and not provocation.how.startswith("`failure") else self.console_length()
+        before = 0 if provocation.lasting else self.console_length()
         provocation.begin(self)
         shown: dict[str, str] = {}
 
@@ -307,7 +312,7 @@ class Bench:
         finally:
             provocation.end(self)
         result.px4_says = self.said(before)
-        if not provocation.parameters or provocation.how.startswith("`failure"):
+        if not provocation.lasting:
             try:
                 self.wait_for(self.ready, GONE_S, "it was not gone again")
             except UnavailableError:
@@ -336,7 +341,7 @@ def run(provocations: Sequence[Provocation], instance: int, told: Callable[[Resu
     results = []
     for parameters in dict.fromkeys(tuple(sorted(one.parameters.items())) for one in provocations):
         chosen = [one for one in provocations if tuple(sorted(one.parameters.items())) == parameters]
-        well = not parameters or dict(parameters) == {"SYS_FAILURE_EN": "1"}
+        well = not chosen[0].lasting
         with Bench(instance, dict(parameters), well=well) as bench:
             for provocation in chosen:
                 results.append(bench.trial(provocation))

@@ -78,5 +78,6 @@ class AutopilotLog:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in SERIES}
             rest = json.loads(str(file["rest"]))
-        spans = {name: tuple(Span(*span) for span in rest.pop(name)) for name in ("modes", "failsafes")}
-        return cls(**arrays, **spans, said=tuple(Said(*said) for said in rest.pop("said")), **rest)
+        rest |= {name: tuple(Span(*span) for span in rest[name]) for name in ("modes", "failsafes")}
+        rest["said"] = tuple(Said(*said) for said in rest["said"])
+        return cls(**arrays, **rest)

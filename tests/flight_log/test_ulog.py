@@ -15,7 +15,7 @@ from flockd.flight_log.metadata import FlightMetadata
 from flockd.flight_log.ulog import autopilot_log, drone_of, read_ulog
 from flockd.report.autopilot_figure import autopilot_texts
 from flockd.report.flight_folder import save_flight
-from tests.flight_log.made_ulog import HEADER, write_ulog
+from tests.flight_log.made_ulog import HEADER, Rows, write_ulog
 
 BOOT_S = 900.0
 """The autopilot's clock at the flight's start."""
@@ -31,7 +31,7 @@ def _commanded(time_s: float) -> tuple[float, float]:
 
 
 def _log() -> FlightLog:
-    times_s = STEP_S * np.arange(STEPS)
+    times_s = np.asarray(STEP_S * np.arange(STEPS), np.float64)
     metadata = FlightMetadata(
         scenario="kestrel", perception="learned", flow="dis", scale="height", drones=1, duration_s=30.0, step_s=STEP_S,
         circle_until_s=0.0, desired_distance_m=3.5, observation_distance_m=10.0, separation_distance_m=2.0,
@@ -55,7 +55,7 @@ def _ulog(path: Path, *, boot_s: float = BOOT_S, system_id: int = 1, without: st
     asked = [(boot_s + 0.05 * i, ((*_commanded(0.05 * i), np.nan), (np.nan, np.nan, -4.0))) for i in range(20, 500)]
     flown = [(boot_s + 0.1 * i, (*_commanded(max(0.1 * i - 0.3, 0.0)), -4.0)) for i in range(300)]
     states = [(boot_s + t, (14 if 1.0 <= t < 25.0 else 4, t >= 25.0)) for t in np.arange(0.0, 29.0, 0.5)]
-    topics = {
+    topics: dict[str, tuple[list[tuple[str, str]], Rows]] = {
         "trajectory_setpoint": ([("float[3]", "velocity"), ("float[3]", "position")], asked),
         "vehicle_local_position": ([("float", "vx"), ("float", "vy"), ("float", "z")], flown),
         "vehicle_status": ([("uint8_t", "nav_state"), ("bool", "failsafe")], states),
@@ -75,15 +75,14 @@ def test_by_the_recorded_clock_everything_is_where_it_happened(tmp_path: Path) -
     path = _ulog(tmp_path / "log.ulg")
     beside = autopilot_log(read_ulog(path), path, _log(), 0, _clock())
     assert beside.placed_by.startswith("the autopilot's clock")
-    assert [(span.what, span.begin_s, span.end_s) for span in beside.modes] == [
-        ("hold", pytest.approx(0.0, abs=1e-3), pytest.approx(1.0, abs=1e-3)),
-        ("offboard", pytest.approx(1.0, abs=1e-3), pytest.approx(25.0, abs=1e-3)),
-        ("hold", pytest.approx(25.0, abs=1e-3), pytest.approx(28.5, abs=1e-3)),
-    ]
+    assert [span.what for span in beside.modes] == ["hold", "offboard", "hold"]
+    assert [span.begin_s for span in beside.modes] == pytest.approx([0.0, 1.0, 25.0], abs=1e-3)
+    assert [span.end_s for span in beside.modes] == pytest.approx([1.0, 25.0, 28.5], abs=1e-3)
     (failsafe,) = beside.failsafes
     assert (failsafe.begin_s, failsafe.end_s) == pytest.approx((25.0, 28.5), abs=1e-3)
     (said,) = beside.said
-    assert (said.time_s, said.text) == (pytest.approx(25.0, abs=1e-3), "Failsafe activated")
+    assert said.time_s == pytest.approx(25.0, abs=1e-3)
+    assert said.text == "Failsafe activated"
     turned_s = beside.setpoint_time_s[np.argmax(beside.setpoint_velocity[:, 1] > 0.5)]
     assert turned_s == pytest.approx(12.0, abs=0.05)
     assert beside.setpoint_height_m[0] == pytest.approx(4.5), "above home, which is half a metre below the origin"
