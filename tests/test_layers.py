@@ -213,6 +213,7 @@ REPLIES = PACKAGE / "telemetry" / "publisher.py"
             "pymavlink",
             [f"autopilot/fake_{what}.py" for what in ("autopilot", "checks", "telemetry")] + ["sim/ground_station.py"],
         ),
+        ("pyulog", ["flight_log/ulog.py"]),
         ("rerun", ["view/flock_file.py", "view/rerun_file.py"]),
     ],
 )

@@ -23,7 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from pymavlink import mavutil
 
@@ -45,7 +45,9 @@ START_S, SHOWN_S, GONE_S = 300.0, 60.0, 60.0
 POLL_S = 0.2
 OTHER_PORT = 14030
 """Where PX4's instance 0 looks for a further onboard computer."""
-SAYS = re.compile(r"(Preflight Fail: .*|Arming denied: .*|Switching to .*|Geofence: .*|.*[Bb]attery.*)")
+SAYS = re.compile(
+    r"(Preflight Fail: .*|Arming denied: .*|Switching to .*|Geofence: .*|(Low|Critical|Emergency) battery.*)"
+)
 """Lines of PX4's console that say why it refuses."""
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
@@ -63,6 +65,8 @@ class Provocation:
     end: Callable[[Bench], None] = lambda bench: None
     parameters: Mapping[str, str] = field(default_factory=dict)
     """From the start, of a PX4 of its own."""
+    lasting: bool = False
+    """It cannot be taken back, nor be waited for to be gone."""
 
 
 def _set(parameter: str, value: str, normal: str, reason: str, name: str) -> Provocation:
@@ -76,7 +80,7 @@ def _set(parameter: str, value: str, normal: str, reason: str, name: str) -> Pro
     )
 
 
-def _fail(unit: str, reason: str, parameters: Mapping[str, str] | None = None) -> Provocation:
+def _fail(unit: str, reason: str, *, lasting: bool = False) -> Provocation:
     """By PX4's own injection of failures."""
     return Provocation(
         f"{unit}_failed",
@@ -84,7 +88,8 @@ def _fail(unit: str, reason: str, parameters: Mapping[str, str] | None = None) -
         reason,
         lambda bench: bench.shell("failure", unit, "off"),
         lambda bench: bench.shell("failure", unit, "ok"),
-        parameters or {},
+        {"SYS_FAILURE_EN": "1"},
+        lasting,
     )
 
 
@@ -129,23 +134,25 @@ PROVOCATIONS = (
     _set("COM_ARM_MIS_REQ", "1", "0", "check_modes_mission", "no_mission"),
     _set("COM_ARMABLE", "0", "1", "check_armable_configuration", "not_armable"),
     _set("SYS_HAS_MAG", "3", "1", "check_mag_sys_has_mag_missing", "compass_missing"),
-    _set("SYS_HAS_NUM_DIST", "1", "0", "check_distance_sensor_missing", "range_finder_missing"),
+    _set("SYS_HAS_NUM_DIST", "3", "0", "check_distance_sensor_missing", "range_finder_missing"),
     _set("SYS_HAS_NUM_OF", "1", "0", "check_optical_sensor_missing", "optical_flow_missing"),
-    _set("CBRK_SUPPLY_CHK", "0", "894281", "check_missing_system_power", "power_not_measured"),
     _set("COM_CPU_MAX", "1", "95", "check_cpuload_too_high", "processor_busy"),
     _set("COM_PARACHUTE", "1", "0", "check_parachute_missing", "parachute_missing"),
     _set("COM_ARM_ODID", "2", "0", "check_open_drone_id_missing", "remote_id_missing"),
     _set("COM_ARM_TRAFF", "2", "0", "check_traffic_avoidance_missing", "traffic_missing"),
-    _fail("baro", "check_baro_no_data", {"SYS_FAILURE_EN": "1"}),
-    _fail("mag", "check_mag_no_data", {"SYS_FAILURE_EN": "1"}),
-    _fail("gps", "check_system_no_global_pos", {"SYS_FAILURE_EN": "1"}),
-    _fail("battery", "check_battery_emergency", {"SYS_FAILURE_EN": "1"}),
-    Provocation("no_home", "`COM_HOME_EN` 0", "check_system_no_home_pos", parameters={"COM_HOME_EN": "0"}),
+    _fail("gps", "check_modes_local_pos"),
+    _fail("battery", "check_battery_critical", lasting=True),  # PX4 then shuts down
+    Provocation(
+        "no_home", "`COM_HOME_EN` 0 and `COM_ARM_WO_GPS` 0", "check_system_no_home_pos",
+        parameters={"COM_HOME_EN": "0", "COM_ARM_WO_GPS": "0"}, lasting=True,
+    ),
     Provocation(
         "geofence_without_home", "`COM_HOME_EN` 0 and `GF_ACTION` 3", "check_gf_no_home",
-        parameters={"COM_HOME_EN": "0", "GF_ACTION": "3"},
+        parameters={"COM_HOME_EN": "0", "GF_ACTION": "3"}, lasting=True,
     ),
-    Provocation("no_satellites", "`SIM_GPS_USED` 0", "check_system_no_global_pos", parameters={"SIM_GPS_USED": "0"}),
+    Provocation(
+        "no_satellites", "`SIM_GPS_USED` 0", "check_modes_local_pos", parameters={"SIM_GPS_USED": "0"}, lasting=True
+    ),
 )  # fmt: skip
 
 
@@ -213,7 +220,7 @@ class Bench:
         """What `flockd status` shows of the autopilot's refusals: sentences by the reason's name."""
         rows = status_rows(self._watcher.drones(), time.monotonic())
         shown = {sentence for row in rows for sentence in row["matters"]}
-        reasons = self._flight().get("reasons", [])
+        reasons = self._flight().get("reasons", ())
         return {
             str(reason["event"]): str(reason["sentence"])
             for reason in reasons
@@ -280,14 +287,14 @@ class Bench:
             time.sleep(POLL_S)
         return time.monotonic() - begun_s
 
-    def _flight(self) -> Mapping[str, object]:
+    def _flight(self) -> Mapping[str, Any]:
         return next(
             (drone.message("flight", time.monotonic()) or {} for drone in self._watcher.drones()), {}
         )  # fmt: skip
 
     def trial(self, provocation: Provocation) -> Result:
         """Provokes a reason, waits until it is shown, and takes it back."""
-        before = 0 if provocation.parameters and not provocation.how.startswith("`failure") else self.console_length()
+        before = 0 if provocation.lasting else self.console_length()
         provocation.begin(self)
         shown: dict[str, str] = {}
 
@@ -305,7 +312,7 @@ class Bench:
         finally:
             provocation.end(self)
         result.px4_says = self.said(before)
-        if not provocation.parameters or provocation.how.startswith("`failure"):
+        if not provocation.lasting:
             try:
                 self.wait_for(self.ready, GONE_S, "it was not gone again")
             except UnavailableError:
@@ -334,7 +341,7 @@ def run(provocations: Sequence[Provocation], instance: int, told: Callable[[Resu
     results = []
     for parameters in dict.fromkeys(tuple(sorted(one.parameters.items())) for one in provocations):
         chosen = [one for one in provocations if tuple(sorted(one.parameters.items())) == parameters]
-        well = not parameters or dict(parameters) == {"SYS_FAILURE_EN": "1"}
+        well = not chosen[0].lasting
         with Bench(instance, dict(parameters), well=well) as bench:
             for provocation in chosen:
                 results.append(bench.trial(provocation))

@@ -1,7 +1,7 @@
 """The autopilot's clock against this computer's, from round trips of MAVLink's TIMESYNC; pure, knows no clock.
 
-A round trip tells the offset between two clocks to half its duration: how long each way took is not known. A busy
-computer delays a message on one way, so that the shortest round trips are the best, and weigh the most.
+A round trip bounds the offset between two clocks by half its duration on either side, as how long each way took is not
+known. What a busy computer delays only makes the bounds of that round trip wider: the offset lies where all overlap.
 """
 
 from __future__ import annotations
@@ -18,9 +18,7 @@ WINDOW_S = 30.0
 MOST_SAMPLES = 300
 LEAST_SAMPLES = 5
 DRIFT = 5e-5
-"""Standard deviation of the rate between two crystals, as known before anything was measured."""
-FLOOR_S = 1e-4
-"""Standard deviation of the offset in the shortest round trip."""
+"""Seconds a second by which two crystals may run apart: the bounds of a round trip widen with its age."""
 JUMP_S = 0.01
 JUMPS = 3
 """So many round trips in a row that contradict the estimate by `JUMP_S` and half their duration begin a new one."""
@@ -36,17 +34,17 @@ class ClockEstimate:
     """Of the newest round trip, on this computer's clock."""
     offset_s: float
     """The autopilot's clock less this computer's, then."""
-    drift: float
-    """How much faster the autopilot's clock runs: seconds a second."""
+    error_s: float
+    """The offset is off by no more, where the clocks run evenly; where they do not, by how much they contradict it."""
     jitter_s: float
     """Robust standard deviation of single round trips' offsets."""
     round_trip_s: float
-    """The shortest of the last seconds; half of it bounds the offset's error where clocks run evenly."""
+    """The shortest of the last seconds."""
     samples: int
 
     def local_s(self, autopilot_s: float) -> float:
         """When on this computer's clock the autopilot's showed that."""
-        return self.time_s + (autopilot_s - self.time_s - self.offset_s) / (1.0 + self.drift)
+        return autopilot_s - self.offset_s
 
 
 class ClockSync:
@@ -65,7 +63,7 @@ class ClockSync:
         if not 0.0 <= duration_s <= LONGEST_S:
             return
         sample = middle_s, autopilot_s - middle_s, duration_s
-        if self.estimate is not None and _contradict(sample, self._expected_s(middle_s)):
+        if self.estimate is not None and _contradict(sample, self.estimate.offset_s):
             self._contradicting = [one for one in self._contradicting if not _contradict(one, sample[1])] + [sample]
             if len(self._contradicting) < JUMPS:
                 return
@@ -76,11 +74,7 @@ class ClockSync:
         self._contradicting = []
         while middle_s - self._samples[0][0] > WINDOW_S:
             self._samples.popleft()
-        self.estimate = _fitted(np.array(self._samples)) if len(self._samples) >= LEAST_SAMPLES else None
-
-    def _expected_s(self, time_s: float) -> float:
-        assert self.estimate is not None
-        return self.estimate.offset_s + self.estimate.drift * (time_s - self.estimate.time_s)
+        self.estimate = _overlap(np.array(self._samples)) if len(self._samples) >= LEAST_SAMPLES else None
 
 
 def _contradict(sample: tuple[float, float, float], offset_s: float) -> bool:
@@ -88,26 +82,16 @@ def _contradict(sample: tuple[float, float, float], offset_s: float) -> bool:
     return abs(sample[1] - offset_s) > 0.5 * sample[2] + JUMP_S
 
 
-def _fitted(samples: FloatArray) -> ClockEstimate:
-    """A line through the offsets (n, 3), each with the deviation that its duration beyond the shortest allows.
-
-    Delays are all on one way while a computer is busy and do not cancel out, so that many poor round trips must not
-    outvote a good one: their deviation grows with the square.
-    """
+def _overlap(samples: FloatArray) -> ClockEstimate:
+    """The middle of what the bounds of all round trips (n, 3) have in common, or of the gap where they have nothing."""
     time_s, offset_s, duration_s = samples.T
-    beyond = 0.5 * (duration_s - duration_s.min()) / FLOOR_S
-    sigma_s = FLOOR_S * (1.0 + beyond**2)
-    since_s, first_s = time_s - time_s[-1], offset_s[-1]
-    # Rows of the least squares: one a sample, and what is known of the drift before.
-    rows = np.vstack([np.column_stack([np.ones_like(since_s), since_s]) / sigma_s[:, None], [0.0, 1.0 / DRIFT]])
-    values = np.append((offset_s - first_s) / sigma_s, 0.0)
-    offset, drift = np.linalg.lstsq(rows, values, rcond=None)[0]
-    residuals = offset_s - first_s - offset - drift * since_s
+    within_s = 0.5 * duration_s + DRIFT * (time_s[-1] - time_s)
+    least_s, most_s = (offset_s - within_s).max(), (offset_s + within_s).min()
     return ClockEstimate(
         time_s=float(time_s[-1]),
-        offset_s=float(first_s + offset),
-        drift=float(drift),
-        jitter_s=1.4826 * float(np.median(np.abs(residuals))),
+        offset_s=float(0.5 * (least_s + most_s)),
+        error_s=float(0.5 * abs(most_s - least_s)),
+        jitter_s=1.4826 * float(np.median(np.abs(offset_s - np.median(offset_s)))),
         round_trip_s=float(duration_s.min()),
         samples=len(samples),
     )

@@ -20,12 +20,19 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-from pymavlink import mavutil
 from pymavlink.dialects.v20 import development as mavlink
 
 from flockd.autopilot.fake_checks import FakeChecks
 from flockd.autopilot.fake_range_finder import FakeRangeFinder
-from flockd.autopilot.fake_telemetry import ON_GROUND_M, Mode, TelemetryStreams, VehicleSnapshot, custom_mode
+from flockd.autopilot.fake_telemetry import (
+    ON_GROUND_M,
+    Mode,
+    Outlet,
+    TelemetryStreams,
+    VehicleSnapshot,
+    custom_mode,
+    mode_by_number,
+)
 from flockd.autopilot.fake_vehicle import Demand, Motion, MotionState, PointMass
 from flockd.autopilot.refusal_reasons import CHECKS_FAIL, NO_SETPOINTS
 from flockd.autopilot.sticks import stick_curve
@@ -38,8 +45,6 @@ TYPE_MASK = 2531
 """The one kind of setpoint it takes: horizontal velocity, height and yaw."""
 DISARM_AFTER_LANDING_S = 2.0
 ARRIVED_M = 0.3
-TEXT_CHUNK = 50
-"""Characters of a STATUSTEXT."""
 STICKS_FRESH_S = 0.5
 OFFBOARD_LOSS_MODES: dict[int, Mode] = {0: "RTL", 3: "RTL", 4: "LAND", 5: "LOITER"}
 """By COM_OBL_RC_ACT, no others; 0 would be position mode, which needs a remote control, which there is none of."""
@@ -118,7 +123,7 @@ class FakeAutopilot:
         self._mav = mavlink.MAVLink(self, srcSystem=system_id, srcComponent=1)
         self._mav.robust_parsing = True
         self.checks = FakeChecks(self._mav)
-        truth = mavlink.MAVLink(_Outlet(self._socket, self._ground), srcSystem=system_id, srcComponent=1)
+        truth = mavlink.MAVLink(Outlet(self._socket, self._ground), srcSystem=system_id, srcComponent=1)
         self._motion = motion or PointMass(np.array([0.0, 0.0, -height_m]), yaw_rad)
         self._state = self._motion(Demand(np.zeros(2), -height_m, yaw_rad), 0.0)
         self._armed = height_m > 0.0
@@ -127,8 +132,6 @@ class FakeAutopilot:
         self._hold_down_m = -height_m
         self._hold_yaw_rad = yaw_rad
         self._landed_s: float | None = None
-        self._texts = 0
-        """Sent so far."""
         self._sticks = -math.inf, np.zeros(2)
         """When a person last moved them, and forward and right from -1 to 1."""
         self.clock_offset_s = clock_ahead_s - self._clock()
@@ -253,7 +256,7 @@ class FakeAutopilot:
     def _select(self, mode: Mode) -> bool:
         """A mode requested over MAVLink: while armed, only one that can run."""
         if mode == "OFFBOARD" and self._armed and not self._signal():
-            self._say("Offboard not possible: no offboard signal")
+            self.checks.say("Offboard not possible: no offboard signal")
             self.checks.deny("commander_modeswitch_not_avail", custom_mode(mode))
             return False
         self.pilot_selects(mode)
@@ -261,10 +264,10 @@ class FakeAutopilot:
 
     def _arm(self) -> bool:
         if self._intended == "OFFBOARD" and not self._signal():
-            self._say("Arming denied: no offboard signal")
+            self.checks.say("Arming denied: no offboard signal")
             return False
         if self._failing() - {NO_SETPOINTS}:
-            self._say("Arming denied: Resolve system health failures first")
+            self.checks.say("Arming denied: Resolve system health failures first")
             self.checks.deny(CHECKS_FAIL)
             return False
         self._armed, self._landed_s = True, None
@@ -362,7 +365,7 @@ class FakeAutopilot:
         done: bool
         match command:
             case mavlink.MAV_CMD_DO_SET_MODE:
-                mode = _mode_by_number(int(message.param2), int(message.param3))
+                mode = mode_by_number(int(message.param2), int(message.param3))
                 if mode is None:
                     return int(mavlink.MAV_RESULT_UNSUPPORTED)
                 done = self._select(mode)
@@ -382,12 +385,6 @@ class FakeAutopilot:
                 return int(mavlink.MAV_RESULT_UNSUPPORTED)
         return int(mavlink.MAV_RESULT_ACCEPTED if done else mavlink.MAV_RESULT_TEMPORARILY_REJECTED)
 
-    def _say(self, text: str) -> None:
-        self._texts += 1
-        for chunk, start in enumerate(range(0, len(text) + 1, TEXT_CHUNK)):
-            part = text[start : start + TEXT_CHUNK].encode()
-            self._mav.statustext_send(mavlink.MAV_SEVERITY_CRITICAL, part, self._texts, chunk)
-
     def _send_parameter(self, name: str) -> None:
         value = self.parameters.get(name)
         if value is None:
@@ -399,27 +396,11 @@ class FakeAutopilot:
         self._mav.param_value_send(name.encode(), wire, kind, len(self.parameters), index)
 
 
-class _Outlet:
-    """Where pymavlink writes the true pose, if a simulator listens."""
-
-    def __init__(self, sender: socket.socket, address: tuple[str, int] | None) -> None:
-        self._socket, self._address = sender, address
-
-    def write(self, data: bytes) -> None:
-        if self._address is not None:
-            self._socket.sendto(data, self._address)
-
-
 def _age(ancillary: list[tuple[int, int, bytes]]) -> float:
     """How long ago a packet came by the kernel's stamp, in real seconds."""
     (stamp,) = (data for level, kind, data in ancillary if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS))
     seconds, nanoseconds = struct.unpack("@ll", stamp)
     return time.time() - float(seconds + nanoseconds * 1e-9)
-
-
-def _mode_by_number(main: int, sub: int) -> Mode | None:
-    modes: tuple[Mode, ...] = ("POSCTL", "LOITER", "TAKEOFF", "LAND", "RTL", "OFFBOARD")
-    return next((mode for mode in modes if mavutil.px4_map[mode][1:] == (main, sub)), None)
 
 
 def main() -> None:

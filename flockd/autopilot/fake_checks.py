@@ -13,16 +13,18 @@ from flockd.autopilot.refusals import ALL_MODES, BEGINS, ENDS, ERROR
 OFFBOARD_BIT = 1 << 14
 PROTOCOL = 8
 """PX4's log level of summaries."""
+TEXT_CHUNK = 50
+"""Characters of a STATUSTEXT."""
 BOOT_MS = 0
 """Events of the fake carry no time."""
 
 
 class FakeChecks:
-    """Which of PX4's checks fail, by their names, and what it has told of them."""
+    """What the fake tells of PX4's checks, by their names, and of requests that it refuses."""
 
     def __init__(self, link: mavlink.MAVLink) -> None:
         self._mav = link
-        self._sequence = 0
+        self._sequence = self._texts = 0
         self._told: frozenset[str] | None = None
 
     def tell_changes(self, failing: Iterable[str]) -> None:
@@ -45,25 +47,28 @@ class FakeChecks:
         """Sends the event of a refused request, by its name."""
         self._send(event_number(what), ERROR, struct.pack(f"<{len(arguments)}I", *arguments))
 
-    def lose_one(self) -> None:
-        """One event is lost on the way."""
-        self._sequence += 1
+    def say(self, text: str) -> None:
+        """Sends a critical STATUSTEXT, in chunks."""
+        self._texts += 1
+        for chunk, start in enumerate(range(0, len(text) + 1, TEXT_CHUNK)):
+            part = text[start : start + TEXT_CHUNK].encode()
+            self._mav.statustext_send(mavlink.MAV_SEVERITY_CRITICAL, part, self._texts, chunk)
 
     def _send(self, number: int, level: int, arguments: bytes) -> None:
         self._sequence = (self._sequence + 1) & 0xFFFF
         self._mav.send(_Event(number, self._sequence, level << 4 | level, arguments))
 
 
-class _Event(mavlink.MAVLink_message):
+class _Event:
     """MAVLink's EVENT, which pymavlink does not have."""
 
     ID, CRC_EXTRA = 410, 160
     LAYOUT = struct.Struct("<IIHBBB40s")
 
     def __init__(self, number: int, sequence: int, log_levels: int, arguments: bytes) -> None:
-        super().__init__(self.ID, "EVENT")
         self._data = self.LAYOUT.pack(number, BOOT_MS, sequence, 0, 0, log_levels, arguments)
 
     def pack(self, mav: mavlink.MAVLink, force_mavlink1: bool = False) -> bytes:
         """The whole message as it goes over the link."""
-        return bytes(self._pack(mav, self.CRC_EXTRA, self._data, force_mavlink1=force_mavlink1))
+        message = mavlink.MAVLink_message(self.ID, "EVENT")
+        return bytes(message._pack(mav, self.CRC_EXTRA, self._data, force_mavlink1=force_mavlink1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import socket
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -27,6 +28,18 @@ UNKNOWN_COVARIANCE = 255
 FULL_SIGNAL, NO_SIGNAL = 100, 1
 """Of DISTANCE_SENSOR's `signal_quality`, whose 0 is for sensors that do not say."""
 ALL_ESTIMATED = 1 | 2 | 4 | 8 | 16 | 32
+
+
+class Outlet:
+    """Where pymavlink writes the true pose, if a simulator listens."""
+
+    def __init__(self, sender: socket.socket, address: tuple[str, int] | None) -> None:
+        self._socket, self._address = sender, address
+
+    def write(self, data: bytes) -> None:
+        """Takes what pymavlink has packed."""
+        if self._address is not None:
+            self._socket.sendto(data, self._address)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,6 +221,12 @@ def custom_mode(mode: Mode) -> int:
     """As PX4 numbers it in MAVLink."""
     _, main, sub = mavutil.px4_map[mode]
     return int(main << 16 | sub << 24)
+
+
+def mode_by_number(main: int, sub: int) -> Mode | None:
+    """The mode of PX4's numbers; None for one that the fake does not fly."""
+    modes: tuple[Mode, ...] = ("POSCTL", "LOITER", "TAKEOFF", "LAND", "RTL", "OFFBOARD")
+    return next((mode for mode in modes if mavutil.px4_map[mode][1:] == (main, sub)), None)
 
 
 def quaternion_from_rotation(rotation: FloatArray) -> tuple[float, float, float, float]:

@@ -76,7 +76,7 @@ HOME_TOLERANCE_M = 0.5
 """A home that moves less in flight is not reported: estimators drift."""
 STAMPED = frozenset({"ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "DISTANCE_SENSOR"})
 """Messages whose `time_boot_ms` says when they were true."""
-MOST_JITTER_S = 0.005
+MOST_ERROR_S = 0.005
 """Of a clock whose stamps are better than times of arrival."""
 LONGEST_DELAY_S = 1.0
 """A stamp that is older at its arrival is not believed."""
@@ -175,7 +175,7 @@ class ReceivedMessages:
     def _stamped_s(self, fields: Fields, arrived_s: float) -> float:
         """When it was true on this computer's clock: by the autopilot's stamp, else when it came."""
         clock, boot_ms = self.clock.estimate, fields.get("time_boot_ms")
-        if clock is None or boot_ms is None or clock.jitter_s > MOST_JITTER_S:
+        if clock is None or boot_ms is None or clock.error_s > MOST_ERROR_S:
             return arrived_s
         time_s = min(clock.local_s(1e-3 * (boot_ms + 0.5)), arrived_s)  # the stamp is cut to a millisecond
         return time_s if arrived_s - time_s <= LONGEST_DELAY_S else arrived_s

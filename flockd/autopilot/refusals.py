@@ -198,7 +198,7 @@ def _of_report(report: CheckReport, status: AutopilotStatus, *, streams: bool, a
     if not report.can_run >> state & 1:
         for check in report.failed:
             silent = NAMES.get(check.number) == NO_SETPOINTS and not streams
-            if check.modes >> state & 1 and check.modes != ALL_MODES and (asked or not silent):
+            if check.modes >> state & 1 and check.modes != ALL_MODES and (status.armed or asked or not silent):
                 yield _named(check, "offboard", streams=streams)
 
 
@@ -219,14 +219,16 @@ def _of_flags(
     status: AutopilotStatus, messages: Mapping[str, Mapping[str, Any]], texts: Sequence[str]
 ) -> Iterator[Refusal]:
     """For a firmware without events: what its texts, its health bits and single messages say."""
+    system = messages["SYS_STATUS"]
+    enabled, healthy = (int(system.get(f"onboard_control_sensors_{what}") or 0) for what in ("enabled", "health"))
+    if healthy & PREARM_CHECK:
+        return
     for text in texts:
         words = text.lower()
         name = next((name for parts, name in TEXTS if all(part in words for part in parts)), SAID)
         if name != SAID or "fail" in words or "denied" in words:
             refusal = _refusal(name, "to arm")
             yield refusal._replace(what=f'{refusal.what} ("{text}")')
-    system = messages["SYS_STATUS"]
-    enabled, healthy = (int(system.get(f"onboard_control_sensors_{what}") or 0) for what in ("enabled", "health"))
     unhealthy = [name for bit, name in SYSTEMS.items() if enabled & bit and not healthy & bit]
     if unhealthy:
         yield _refusal(UNHEALTHY, "to arm")._replace(what=f"not healthy: {', '.join(unhealthy)}")

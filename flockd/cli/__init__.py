@@ -33,6 +33,7 @@ EXTRAS = {
     **dict.fromkeys(("numba", "llvmlite", "matplotlib", "jinja2", "markupsafe"), "sim"),
     "joblib": "campaign",
     "pyarrow": "parquet",
+    "pyulog": "ulog",
     "ray": "ray",
     "rerun": "view",
     "argcomplete": "completion",

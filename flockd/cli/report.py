@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from flockd.flight_log.key_frames import KeyFrame
     from flockd.flight_log.log import FlightLog
+    from flockd.flight_log.ulog import UlogFile
 
 SUFFIX = ".report"
 """Of the folder beside a recording that its report goes to."""
@@ -32,6 +33,7 @@ def add(commands: Commands) -> None:
         "flockd report out/short/recordings",
         "flockd report kestrel-20261120T101500Z.mcap --out reports/kestrel",
         "flockd report drone1.mcap --without-pictures --json",
+        "flockd report drone1.mcap --ulog log_12_2026-11-20-10-15-00.ulg",
         "flockd report out/calm out/windy",
     )
     description = "Write the summary and the report of a flight, from its folder or from recordings; or compare two."
@@ -56,6 +58,9 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="do not run the networks again for the report's images",
     )
+    parser.add_argument(
+        "--ulog", metavar="FILE", type=Path, help="the autopilot's own log of the flight (PX4's ULog), shown beside it"
+    )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     parser.set_defaults(run=_run)
 
@@ -65,14 +70,17 @@ def _run(args: argparse.Namespace) -> int:
 
     if args.other is not None:
         return _compare(args)
+    ulog = None if args.ulog is None else _ulog(args.ulog)
     if (args.flight / LOG_NAME).is_file():
-        return _again(args)
+        return _again(args, ulog)
     paths = _recordings(args.flight)
     directory = args.out or args.flight.with_name(args.flight.resolve().name.removesuffix(".mcap") + SUFFIX)
     check_report_folder(directory, force=args.force)
     log, pictures = _flight(paths, pictured=not args.without_pictures)
     prepare_report_folder(directory, force=args.force)
     save_flight(directory, log, pictures)
+    if ulog is not None:
+        _save_beside(directory, log, paths, ulog, args.ulog)
     return _write(directory, log, args)
 
 
@@ -84,7 +92,28 @@ def _write(directory: Path, log: FlightLog, args: argparse.Namespace) -> int:
     return show_summary(directory, summary, as_json=args.json)
 
 
-def _again(args: argparse.Namespace) -> int:
+def _ulog(path: Path) -> UlogFile:
+    """Read first, so that a bad file costs no waiting."""
+    from flockd.flight_log.ulog import read_ulog
+
+    with progress("reading the autopilot's log", "files") as tell_progress:
+        ulog = read_ulog(path)
+        tell_progress(1, 1)
+    return ulog
+
+
+def _save_beside(directory: Path, log: FlightLog, recordings: Sequence[Path], ulog: UlogFile, path: Path) -> None:
+    """Writes what the autopilot logged, on the flight's time, to where the report finds it."""
+    from flockd.flight_log.from_recordings import autopilot_clock
+    from flockd.flight_log.ulog import autopilot_log, drone_of
+    from flockd.report.flight_folder import AUTOPILOT_LOG_NAME
+
+    drone, recording = drone_of(ulog, path, log, [opened(one) for one in recordings])
+    clock = None if recording is None else autopilot_clock(recording)
+    autopilot_log(ulog, path, log, drone, clock).save(directory / AUTOPILOT_LOG_NAME)
+
+
+def _again(args: argparse.Namespace, ulog: UlogFile | None) -> int:
     """The report of a flight whose folder has its log."""
     for option in ("out", "without_pictures", "force"):
         if getattr(args, option):
@@ -92,12 +121,18 @@ def _again(args: argparse.Namespace) -> int:
                 f"--{option.replace('_', '-')} is for recordings, and {args.flight} is a flight's folder, whose report "
                 "is written into it; drop it"
             )
-    return _write(args.flight, _log_in(args.flight), args)
+    log = _log_in(args.flight)
+    if ulog is not None:
+        from flockd.flight_log.from_recordings import recordings_in
+        from flockd.report.flight_folder import RECORDINGS
+
+        _save_beside(args.flight, log, recordings_in(args.flight / RECORDINGS), ulog, args.ulog)
+    return _write(args.flight, log, args)
 
 
 def _compare(args: argparse.Namespace) -> int:
     """The key figures of two flights side by side."""
-    for option in ("out", "without_pictures", "force"):
+    for option in ("out", "without_pictures", "force", "ulog"):
         if getattr(args, option):
             raise UsageError(f"--{option.replace('_', '-')} has no meaning with two flights; drop it")
     from flockd.report.comparison import compare

@@ -101,7 +101,7 @@ def _table(rows: list[dict[str, Any]]) -> Table:
             _number(row["battery_share"], ".0%", ""),
             _number(row["neighbours"], "d", ""),
             _number(row["load"], ".0%", ""),
-            _number(None if row["clock_jitter_s"] is None else 1e3 * row["clock_jitter_s"], ".1f", " ms"),
+            _number(None if row["clock_error_s"] is None else 1e3 * row["clock_error_s"], ".1f", " ms"),
             cell(row["mission"] or ""),
             cell("; ".join(row["matters"])),
         )

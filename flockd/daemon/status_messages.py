@@ -101,11 +101,11 @@ def _flight_message(components: Components, now: float) -> FlightMessage:
 def _clock_message(components: Components, now: float) -> ClockMessage:
     clock = components.link.clock()
     if clock is None:
-        return ClockMessage(time_s=now, offset_s=None, drift=None, jitter_s=None, round_trip_s=None, age_s=None)
+        return ClockMessage(time_s=now, offset_s=None, error_s=None, jitter_s=None, round_trip_s=None, age_s=None)
     return ClockMessage(
         time_s=now,
         offset_s=clock.offset_s,
-        drift=clock.drift,
+        error_s=clock.error_s,
         jitter_s=clock.jitter_s,
         round_trip_s=clock.round_trip_s,
         age_s=now - clock.time_s,

@@ -18,11 +18,15 @@ from flockd.messages import FloatArray, PilotOutput
 from flockd.mission.circle_then_tangent import desired_of
 from flockd.pilot import FlockPilot, StepTrace
 from flockd.recording import RecordingError
-from flockd.recording.codec import from_json, to_json
+from flockd.recording.codec import from_json, parsed, to_json
+from flockd.recording.mcap_file import Entry, read_records
 from flockd.recording.reader import Recording, head_of
 from flockd.recording.truth import Truth
 
 Progress = Callable[[int, int], None]
+
+CLOCK_TOPIC = "/clock"
+"""Of recordings, with the autopilot's clock."""
 
 
 def recordings_in(folder: Path) -> tuple[Path, ...]:
@@ -86,6 +90,24 @@ def key_frames(
             frames += (replace(one, time_s=one.time_s - zero_s) for one in captured)
         progress(index + 1, steps)
     return tuple(frames)
+
+
+def autopilot_clock(recording: Recording) -> tuple[FloatArray, FloatArray] | None:
+    """The autopilot's clock as it was measured in flight; None where the recording does not hold it.
+
+    (n,) times on the drone's computer, and (n,) seconds by which the autopilot's clock was ahead then.
+    """
+    entries = (record for path in recording.contents.paths for record in read_records(path))
+    messages = [parsed(one.data) for one in entries if isinstance(one, Entry) and one.stream.topic == CLOCK_TOPIC]
+    known = [
+        (float(message["time_s"]), float(message["offset_s"]))
+        for message in messages
+        if isinstance(message, dict) and message.get("offset_s") is not None
+    ]
+    if not known:
+        return None
+    times_s, ahead_s = np.array(known).T
+    return times_s, ahead_s
 
 
 def _read(recordings: Sequence[Recording], progress: Progress) -> tuple[list[str], list[_Step]]:

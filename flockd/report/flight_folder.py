@@ -19,12 +19,22 @@ from flockd.report.summary import summarise, write_summary
 LOG_NAME = "flight.npz"
 KEY_FRAMES_NAME = "filmstrip.npz"
 SUMMARY_NAME = "summary.json"
+AUTOPILOT_LOG_NAME = "autopilot.npz"
 REPORT_NAME = "report.html"
 FIGURES = "figures"
 FLEET_LOGS = "logs"
 """Logs and configurations of the processes of a fleet."""
 RECORDINGS = "recordings"
-OF_A_FLIGHT = (LOG_NAME, KEY_FRAMES_NAME, SUMMARY_NAME, REPORT_NAME, FIGURES, FLEET_LOGS, RECORDINGS)
+OF_A_FLIGHT = (
+    LOG_NAME,
+    KEY_FRAMES_NAME,
+    AUTOPILOT_LOG_NAME,
+    SUMMARY_NAME,
+    REPORT_NAME,
+    FIGURES,
+    FLEET_LOGS,
+    RECORDINGS,
+)
 """All that a flight leaves in its folder."""
 INTERRUPTED = "interrupted"
 MAX_PROCESSES = 4

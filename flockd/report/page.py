@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 import io
 import json
 from collections.abc import Callable
@@ -17,9 +18,11 @@ from markupsafe import Markup
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from flockd.flight_log.autopilot_log import AutopilotLog
 from flockd.flight_log.key_frames import KeyFrame, load_key_frames
 from flockd.flight_log.log import FlightLog
 from flockd.messages import UInt8Array
+from flockd.report.autopilot_figure import autopilot_figure, autopilot_texts
 from flockd.report.curves import account_curves, error_curves, flight_curves
 from flockd.report.figure_files import inline_svg
 from flockd.report.filmstrip import filmstrip_figure
@@ -35,9 +38,9 @@ def write_report(
 ) -> Path:
     """Write `report.html` and `figures/*.png` into a flight's folder and return the page's path.
 
-    The folder holds `flight.npz` (FlightLog), `summary.json` (of `summarise`) and, if key frames were kept,
-    `filmstrip.npz`. Figures are drawn in as many ``processes``, of which this is one. Raises FileNotFoundError if one
-    of the first two is missing.
+    The folder holds `flight.npz` (FlightLog) and `summary.json` (of `summarise`); if key frames were kept
+    `filmstrip.npz`; and `autopilot.npz` (AutopilotLog) with what the autopilot logged, if that is there. Figures are
+    drawn in as many ``processes``, of which this is one. Raises FileNotFoundError if one of the first two is missing.
     """
     for name in ("flight.npz", "summary.json"):
         if not (directory / name).is_file():
@@ -64,13 +67,18 @@ def write_report(
             stack.enter_context(SideProcess("drew figures", _Drawings, log, folder)) for _ in range(1, processes)
         ]
         drawn = shared([*shapes, *strips], draw, helpers, progress)
-    embedded: dict[str, Markup | None] = {"trajectories": None, "obstacles": None, "errors": None}
+    embedded: dict[str, Markup | None] = {"trajectories": None, "obstacles": None, "errors": None, "autopilot": None}
     for (name, _), element in zip(shapes, drawn, strict=False):
         if element is not None:
             embedded[name] = Markup("\n").join(part for part in (embedded.get(name), element) if part)
     plates = drawn[len(shapes) :]
+    beside = directory / "autopilot.npz"
+    autopilot = AutopilotLog.load(beside) if beside.is_file() else None
+    if autopilot is not None:
+        embedded["autopilot"] = _of_autopilot(log, autopilot, folder)
     page = _template().render(
         **page_texts(summary, log),
+        **autopilot_texts(log, autopilot),
         **embedded,
         filmstrip=plates,
         plated=list(dict.fromkeys(plate["drone"] for plate in plates)),
@@ -115,6 +123,14 @@ def _flight_data(log: FlightLog) -> str:
         ],
     }
     return json.dumps(data, separators=(",", ":"))
+
+
+def _of_autopilot(log: FlightLog, autopilot: AutopilotLog, folder: Path) -> Markup:
+    """The figure of the autopilot's own log, for a wide window and for a narrow one."""
+    draw = functools.partial(autopilot_figure, autopilot=autopilot)
+    file, what = folder / "autopilot.png", "Velocities, height and flight modes as the autopilot logged them"
+    shapes = [_embed(log, draw, file, what, narrow=narrow) for narrow in (False, True)]
+    return Markup("\n").join(shape for shape in shapes if shape)
 
 
 def _template() -> jinja2.Template:

@@ -44,6 +44,7 @@ def _row(drone: Watched, now_s: float) -> dict[str, Any]:
         else sum(1 for neighbour in neighbours["neighbours"] if neighbour["confirmed"]),
         "load": computer.get("load"),
         "clock_offset_s": clock.get("offset_s"),
+        "clock_error_s": clock.get("error_s"),
         "clock_jitter_s": clock.get("jitter_s"),
         "mission": (drone.message("mission", now_s) or {}).get("sentence"),
         "matters": malformed

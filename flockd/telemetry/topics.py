@@ -178,8 +178,8 @@ class ClockMessage(TypedDict):
     time_s: float
     offset_s: float | None
     """The autopilot's clock, since its start, less this computer's; null before it is known, as all that follows."""
-    drift: float | None
-    """How much faster the autopilot's clock runs: seconds a second."""
+    error_s: float | None
+    """The offset is off by no more."""
     jitter_s: float | None
     """Standard deviation of single measurements."""
     round_trip_s: float | None

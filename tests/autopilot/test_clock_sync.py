@@ -41,9 +41,9 @@ def test_equal_delays_give_the_offset_whatever_crystals_do(drift: float) -> None
     sync = ClockSync()
     _exchanged(sync, _times(20.0), np.full((100, 2), 0.0015), drift=drift)
     assert sync.estimate is not None
-    assert _error_s(sync, 20.5, drift) == pytest.approx(0.0, abs=5e-5)
+    assert _error_s(sync, 20.5, drift) == pytest.approx(0.0, abs=1e-4)
     assert sync.estimate.round_trip_s == pytest.approx(0.003)
-    assert sync.estimate.jitter_s < 1e-4
+    assert sync.estimate.error_s < 0.0016
 
 
 @pytest.mark.parametrize("way", [0, 1])
@@ -57,7 +57,18 @@ def test_a_busy_computer_that_delays_nine_of_ten_on_one_way_costs_a_third_of_a_m
     plain_s = np.mean((delays_s[:, 0] - delays_s[:, 1]) / 2)
     assert abs(plain_s) > 5e-3, "the mean of all would be off by milliseconds"
     assert sync.estimate is not None
-    assert sync.estimate.jitter_s > 2e-3, "and single round trips are"
+    assert abs(_error_s(sync, 20.0)) <= sync.estimate.error_s < 5e-4
+    assert sync.estimate.jitter_s > 2e-3, "single round trips are so bad"
+
+
+def test_a_clock_that_stands_still_at_times_is_not_known_well_however_short_the_round_trips() -> None:
+    """As a simulated autopilot's on a computer that is too slow for it."""
+    sync = ClockSync()
+    for number in range(60):
+        stands_s = 0.008 * (number // 7 % 2)
+        sync.add(0.2 * number, 0.2 * number + 0.001 + OFFSET_S - stands_s, 0.2 * number + 0.002)
+    assert sync.estimate is not None
+    assert sync.estimate.error_s == pytest.approx(0.003, abs=0.001), "steps of 8 ms, seen to a millisecond each"
 
 
 def test_one_round_trip_that_lies_changes_nothing_and_a_new_start_is_a_new_clock() -> None:
@@ -85,7 +96,7 @@ ATTITUDE = {"q1": 1.0, "q2": 0.0, "q3": 0.0, "q4": 0.0}
 
 
 def test_an_attitude_that_comes_late_is_placed_when_the_autopilot_stamped_it() -> None:
-    received = ReceivedMessages([].append)
+    received = ReceivedMessages(print)
     received.add("LOCAL_POSITION_NED", {**POSITION, "time_boot_ms": 3000}, 103.5)
     received.add("ATTITUDE_QUATERNION", {**ATTITUDE, "time_boot_ms": 3000}, 103.6)
     state = received.vehicle_state()
@@ -106,7 +117,7 @@ def test_an_attitude_that_comes_late_is_placed_when_the_autopilot_stamped_it() -
 
 
 def test_a_stamp_that_cannot_be_is_not_believed() -> None:
-    received = ReceivedMessages([].append)
+    received = ReceivedMessages(print)
     _exchanged(received.clock, 100.0 + _times(3.0), np.full((15, 2), 0.001), offset_s=-100.0)
     for stamp_ms in (0, 900_000):
         received.add("LOCAL_POSITION_NED", {**POSITION, "time_boot_ms": stamp_ms}, 104.0)
@@ -124,7 +135,7 @@ def test_the_fake_autopilots_known_clock_is_found_through_mavsdk(port: int) -> N
         estimate = link.clock()
         assert estimate is not None
         error_s = estimate.offset_s - fake_autopilot.clock_offset_s
-        assert abs(error_s) <= 0.5 * estimate.round_trip_s + estimate.jitter_s + 1e-3
+        assert abs(error_s) <= estimate.error_s + 1e-6
         synchronising.cancel()
         await link.close()
 

@@ -151,7 +151,7 @@ def test_in_the_air_only_what_keeps_it_from_offboard_is_told_and_in_offboard_not
 
 
 def test_who_switches_to_offboard_too_early_is_told_for_a_while() -> None:
-    story = Story(HOLD, ARMED)
+    story = Story()
     story.report(ALL_MODES, ALL_MODES & ~0x4000, (11464574, 0x4000, 3))
     assert story.sentences() == []
     story.event(event_number("commander_modeswitch_not_avail"), struct.pack("<IB", OFFBOARD, 14), 2)
@@ -159,6 +159,8 @@ def test_who_switches_to_offboard_too_early_is_told_for_a_while() -> None:
     assert "as flockd sends none yet; fly in Hold or Position until flockd's state is ready" in sentence
     story.now_s += 20.0
     assert story.sentences() == []
+    story.send("HEARTBEAT", custom_mode=HOLD, base_mode=ARMED, system_status=4)
+    assert story.sentences() == [sentence], "in the air it counts whether somebody tries or not"
 
 
 @pytest.mark.parametrize(
@@ -185,6 +187,9 @@ def test_a_firmware_without_events_is_understood_by_its_texts_and_flags() -> Non
         "the autopilot refuses to arm: not healthy: the compass; check the sensor and its cable, "
         "or correct how many the autopilot's parameters SYS_HAS_... name"
     ]
+    story.send("SYS_STATUS", onboard_control_sensors_enabled=0x10200007, onboard_control_sensors_health=0x10200003)
+    assert story.sentences() == [], "all checks pass: what is not healthy is not needed"
+    story.send("SYS_STATUS", onboard_control_sensors_enabled=0x10200007, onboard_control_sensors_health=0x00200003)
     story.send("STATUSTEXT", severity=2, text="Preflight Fail: Gyro 0 uncalibrated", id=0, chunk_seq=0)
     story.send("ESTIMATOR_STATUS", flags=1)
     sentences = " ".join(story.sentences())

@@ -17,6 +17,7 @@ import numpy as np
 import zenoh
 
 from flockd.autopilot.fake_autopilot import FakeAutopilot
+from flockd.autopilot.refusal_reasons import REASONS
 from flockd.cli import main
 from flockd.config import DroneConfig
 from flockd.config.autopilot import AutopilotParameters
@@ -192,6 +193,14 @@ class Watched:
         return None if heard is None else heard.message[key]
 
     def matters(self) -> set[str]:
+        """The supervisor's events."""
+        return self._reasons() - REASONS.keys()
+
+    def refusals(self) -> set[str]:
+        """Why the autopilot would refuse to arm or to fly offboard."""
+        return self._reasons() & REASONS.keys()
+
+    def _reasons(self) -> set[str]:
         return {reason["event"] for reason in self.heard()["flight"].message["reasons"]}
 
     async def until_state(self, *states: str) -> None:

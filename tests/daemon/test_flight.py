@@ -380,11 +380,11 @@ def test_what_the_autopilot_refuses_is_in_status_word_for_word_and_once_in_the_l
     async def story() -> None:
         async with aboard(fake_autopilot, port, tmp_path) as ship:
             await ship.until_event(sentence)
-            await until(lambda: "check_gyro_not_calibrated" in ship.matters(), SECONDS_TO_FAIL)
+            await until(lambda: ship.refusals() == {"check_gyro_not_calibrated"}, SECONDS_TO_FAIL)
             (row,) = status_rows(ship.watcher.drones(), time.monotonic())
             assert sentence in row["matters"]
             fake_autopilot.failing = set()
-            await until(lambda: "check_gyro_not_calibrated" not in ship.matters(), SECONDS_TO_FAIL)
+            await until(lambda: not ship.refusals(), SECONDS_TO_FAIL)
             assert ship.events.count(sentence) == 1
 
     with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S) as fake_autopilot:

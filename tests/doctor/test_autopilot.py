@@ -105,15 +105,22 @@ def test_what_keeps_it_from_being_armed_is_a_failure_each_with_what_to_do() -> N
 
 
 @pytest.mark.parametrize(
-    ("jitter_s", "round_trip_s", "level", "words"),
+    ("error_s", "level", "words"),
     [
-        (0.0004, 0.003, Level.PASS, "-46765.2500 s against this computer's, single measurements 0.40 ms apart"),
-        (0.02, 0.003, Level.WARNING, "20.00 ms apart, round trip 3.0 ms: so uneven, that attitudes count"),
-        (0.0004, 0.2, Level.WARNING, "round trip 200.0 ms: attitudes may be misplaced by half of that"),
+        (
+            0.0004,
+            Level.PASS,
+            "-46765.2500 s against this computer's, known to 0.40 ms; single measurements 2.00 ms apart",
+        ),
+        (
+            0.02,
+            Level.WARNING,
+            "known to 20.00 ms; single measurements 2.00 ms apart, shortest round trip 3.0 ms: so unc",
+        ),
     ],
 )
-def test_a_clock_is_good_as_its_round_trips(jitter_s: float, round_trip_s: float, level: Level, words: str) -> None:
-    finding = judge_clock(ClockEstimate(47_000.0, -46_765.25, 0.0, jitter_s, round_trip_s, 20))
+def test_a_clock_is_good_as_its_round_trips(error_s: float, level: Level, words: str) -> None:
+    finding = judge_clock(ClockEstimate(47_000.0, -46_765.25, error_s, 0.002, 0.003, 20))
     assert finding.level is level
     assert words in finding.measured
     assert judge_clock(None).level is Level.WARNING
