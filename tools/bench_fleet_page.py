@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 _RUN = "import sys; from flockd.cli import main; sys.exit(main())"
 _ARGUMENTS = ("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking")
@@ -35,6 +35,7 @@ SAMPLER = """seconds => new Promise(done => {
   };
   requestAnimationFrame(tick);
 })"""
+PATIENCE_MS = 120_000
 WIDE, NARROW = {"width": 1440, "height": 900}, {"width": 390, "height": 844}
 
 
@@ -51,10 +52,8 @@ def main() -> int:
     with served_page(endpoint) as (address, server), made_up_drones(endpoint, *options), chromium() as browser:
         page = browser.new_page(viewport=WIDE)
         page.goto(address)
-        page.wait_for_function(
-            "n => document.querySelectorAll('article').length === n", arg=args.drones, timeout=60_000
-        )
-        page.wait_for_function("window.Plotly && document.querySelector('.plot .js-line')", timeout=60_000)
+        expect(page.locator("article")).to_have_count(args.drones, timeout=PATIENCE_MS)
+        expect(page.locator(".plot .js-line").first).to_be_attached(timeout=PATIENCE_MS)
         busy_s, began_s = _processor_s(server), time.monotonic()
         frames_ms = np.array(page.evaluate(SAMPLER, args.seconds))
         share = (_processor_s(server) - busy_s) / (time.monotonic() - began_s)
@@ -125,7 +124,7 @@ def _take_pictures(page: Page, browser: Browser, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     page.locator("article .name").nth(1).click()
     page.locator("article .look:enabled").first.click()
-    page.wait_for_function("document.querySelector('.pictures img')?.naturalWidth > 0")
+    expect(page.locator(".pictures img").first).to_have_js_property("naturalWidth", 320, timeout=PATIENCE_MS)
     page.screenshot(path=folder / "wide.png")
     page.emulate_media(color_scheme="dark")
     page.screenshot(path=folder / "wide-dark.png")
