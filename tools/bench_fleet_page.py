@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, ViewportSize, expect, sync_playwright
 
 _RUN = "import sys; from flockd.cli import main; sys.exit(main())"
 _ARGUMENTS = ("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking")
@@ -36,7 +36,8 @@ SAMPLER = """seconds => new Promise(done => {
   requestAnimationFrame(tick);
 })"""
 PATIENCE_MS = 120_000
-WIDE, NARROW = {"width": 1440, "height": 900}, {"width": 390, "height": 844}
+WIDE = ViewportSize(width=1440, height=900)
+NARROW = ViewportSize(width=390, height=844)
 
 
 def main() -> int:
@@ -129,7 +130,7 @@ def _take_pictures(page: Page, browser: Browser, folder: Path) -> None:
     page.emulate_media(color_scheme="dark")
     page.screenshot(path=folder / "wide-dark.png")
     page.emulate_media(color_scheme="light")
-    page.set_viewport_size(NARROW)  # type: ignore[arg-type]
+    page.set_viewport_size(NARROW)
     page.screenshot(path=folder / "narrow.png")
     page.screenshot(path=folder / "narrow-whole.png", full_page=True)
     page.locator("#all [data-command=hold]").click()

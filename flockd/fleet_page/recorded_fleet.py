@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -93,8 +94,7 @@ class RecordedFleet:
         sizes = [path.stat().st_size for path in paths]
         stories: list[_Story] = []
         for number, path in enumerate(paths):
-            before, total = sum(sizes[:number]), sum(sizes)
-            stories.append(_story(path, lambda done, before=before, total=total: progress(before + done, total)))
+            stories.append(_story(path, functools.partial(_tell, progress, sum(sizes[:number]), sum(sizes))))
         _align(stories)
         self._stories = {f"{story.fleet}/{story.drone}": story for story in stories}
         if len(self._stories) < len(stories):
@@ -193,6 +193,11 @@ class _Taking:
             message = parsed(entry.data)
             if fault(message, TOPICS[_OWN[topic]].type) is None:  # else of an earlier version, or damaged
                 story.publish(story.drone, _OWN[topic], message)
+
+
+def _tell(progress: Callable[[int, int], None], before: int, total: int, done: int) -> None:
+    """Progress in one file of several."""
+    progress(min(before + done, total), total)
 
 
 def _align(stories: list[_Story]) -> None:

@@ -133,7 +133,7 @@ def test_pictures_of_cameras_come_on_request(flock: Flock) -> None:
 
 
 def test_on_a_phone_nothing_is_wider_than_the_screen(flock: Flock) -> None:
-    flock.page.set_viewport_size(NARROW)  # type: ignore[arg-type]
+    flock.page.set_viewport_size(NARROW)
     assert flock.page.evaluate("document.documentElement.scrollWidth") <= NARROW["width"]
     expect(flock.page.locator("#map canvas")).to_be_visible()
 
