@@ -69,7 +69,7 @@ def test_five_drones_appear(flock: Flock) -> None:
     expect(flock.page.locator("article[data-tone=good], article[data-tone=fair]")).to_have_count(5)
     told("from opening the page until five drones fly on it", began_s)
     expect(flock.page.locator("#summary")).to_have_text("5 drones: 1 degraded, 4 normal")
-    expect(flock.page.locator(card(flock.page, "drone3"))).to_contain_text("2 of 4 cameras deliver no frames")
+    expect(flock.page.locator(card(flock.page, "drone3"))).to_contain_text("camera back delivers no frames")
     expect(flock.page.locator(".plot .js-line")).to_have_count(5)
     marked = "c => c.getContext('2d').getImageData(0, 0, c.width, c.height).data.some(value => value > 0)"
     assert flock.page.locator("#map canvas").evaluate(marked)
