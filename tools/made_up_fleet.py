@@ -37,7 +37,7 @@ from flockd.telemetry.publisher import DEFAULT_ENDPOINT, ZenohTelemetry
 from flockd.telemetry.topics import AboutMessage, CameraMessage, ComputerMessage, FlightMessage, ReasonMessage
 
 FLEET = "made-up"
-RADIUS_M, SPEED_M_S, HEIGHT_M, SPACING_M, SIGHT_M = 25.0, 1.5, 5.0, 3.5, 9.0
+RADIUS_M, SPEED_M_S, HEIGHT_M, SPACING_M, SIGHT_M = 25.0, 1.5, 5.0, 3.5, 6.5
 HOME_DEG = np.array([47.3977, 8.5456])
 TREES = np.array([[12.0, 20.0], [-6.0, 33.0], [30.0, 2.0], [-15.0, -22.0], [8.0, -34.0], [35.0, 25.0]])
 """(n, 2) metres north and east."""
