@@ -22,6 +22,7 @@ MAY_IMPORT = {
     "data": {"errors"},
     "earth": set(),
     "image_header": set(),
+    "preview": BASE | {"geometry"},
     "printable": set(),
     "zenoh_session": {"errors"},
     "side_process": {"errors"},
@@ -68,9 +69,9 @@ MAY_IMPORT = {
     | {"sources", "autopilot"},  # real daemons are fed frames and given autopilots
     "report": BASE | {"flocking", "flight_log", "side_process"},
     "view": BASE | {"geometry", "perception", "pilot", "recording"},
-    "fleet_page": BASE | {"telemetry", "recording"},
+    "fleet_page": BASE | {"geometry", "preview", "telemetry", "recording"},
     "daemon": BASE
-    | {"obstacles"}
+    | {"obstacles", "preview"}
     | {"geometry", "inference", "perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"}
     | {"mission"},
     "doctor": BASE

@@ -37,7 +37,7 @@ from flockd.telemetry.publisher import DEFAULT_ENDPOINT, ZenohTelemetry
 from flockd.telemetry.topics import AboutMessage, CameraMessage, ComputerMessage, FlightMessage, ReasonMessage
 
 FLEET = "made-up"
-RADIUS_M, SPEED_M_S, HEIGHT_M, SPACING_M, SIGHT_M = 25.0, 1.5, 5.0, 3.5, 9.0
+RADIUS_M, SPEED_M_S, HEIGHT_M, SPACING_M, SIGHT_M = 25.0, 1.5, 5.0, 3.5, 6.5
 HOME_DEG = np.array([47.3977, 8.5456])
 TREES = np.array([[12.0, 20.0], [-6.0, 33.0], [30.0, 2.0], [-15.0, -22.0], [8.0, -34.0], [35.0, 25.0]])
 """(n, 2) metres north and east."""
@@ -76,9 +76,19 @@ async def _publish(
     began_s = loop.time()
     for step in itertools.count():
         time_s = step / rate_hz
+        places, velocity = flying(time_s, flock)
         for drone in drones:
-            drone.step(time_s)
+            drone.step(time_s, places, velocity)
         await asyncio.sleep(max(0.0, began_s + (step + 1) / rate_hz - loop.time()))
+
+
+def flying(time_s: float, drones: int) -> tuple[FloatArray, FloatArray]:
+    """(n, 2) metres of all, in a grid that flies a circle, and their velocity (2,) in m/s, north and east."""
+    angle, number = time_s * SPEED_M_S / RADIUS_M, np.arange(drones)
+    middle = RADIUS_M * np.array([math.cos(angle), math.sin(angle)])
+    sway = 0.4 * np.stack([np.sin(0.7 * time_s + number), np.cos(0.5 * time_s + 2 * number)], axis=1)
+    grid = SPACING_M * np.stack([number % 7 - 2.0, number // 7 - 1.0 + 0.5 * (number % 2)], axis=1)
+    return middle + grid + sway, SPEED_M_S * np.array([-math.sin(angle), math.cos(angle)])
 
 
 class MadeUpDrone:
@@ -112,45 +122,39 @@ class MadeUpDrone:
     def apply(self, order: MissionOrder) -> None:
         """See `fault`."""
 
-    def step(self, time_s: float) -> None:
-        """Publishes one step."""
+    def step(self, time_s: float, places: FloatArray, velocity: FloatArray) -> None:
+        """Publishes one step, of a flock that is at ``places`` (n, 2) and has one velocity (2,)."""
         self._steps += 1
         wanted = "hold" if self._requests.hold else "land" if self._requests.land else "offboard"
         if wanted != self._was:
             self._event(f"the autopilot flies {wanted}")
             self._was = wanted
-        place, velocity = self._motion(time_s)
+        place = places[self._number - 1]
         if wanted == "offboard":
             self._held = None
         else:
             self._held = place if self._held is None else self._held
             place, velocity = self._held, np.zeros(2)
-        vehicle, output = self._output(time_s, place, velocity)
+        vehicle, output = self._output(time_s, places, place, velocity)
         publish_step(self._telemetry, self.name, vehicle, output)
         self._telemetry.publish(self.name, "flight", {**self._flight(time_s, vehicle.height_m, wanted)})
         if self._steps % 2:
             self._telemetry.publish(self.name, "computer", {**self._computer(time_s)})
 
-    def _motion(self, time_s: float, number: int | None = None) -> tuple[FloatArray, FloatArray]:
-        """(2,) metres and (2,) m/s, north and east, of this drone or of another one."""
-        place = (self._number if number is None else number) - 1
-        angle = time_s * SPEED_M_S / RADIUS_M
-        middle = RADIUS_M * np.array([math.cos(angle), math.sin(angle)])
-        sway = 0.4 * np.array([math.sin(0.7 * time_s + place), math.cos(0.5 * time_s + 2 * place)])
-        offset = SPACING_M * np.array([place % 7 - 2.0, place // 7 - 1.0 + 0.5 * (place % 2)])
-        return middle + offset + sway, SPEED_M_S * np.array([-math.sin(angle), math.cos(angle)])
-
-    def _output(self, time_s: float, place: FloatArray, velocity: FloatArray) -> tuple[VehicleState, PilotOutput]:
+    def _output(
+        self, time_s: float, places: FloatArray, place: FloatArray, velocity: FloatArray
+    ) -> tuple[VehicleState, PilotOutput]:
         yaw = math.atan2(velocity[1], velocity[0]) if velocity.any() else 0.0
         turn = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
         height_m = HEIGHT_M + 0.3 * math.sin(0.4 * time_s + self._number)
         moving = np.array([*velocity, 0.0])
         vehicle = VehicleState(time_s, turn, height_m, moving, place, HOME_DEG)
-        others = ((n, self._motion(time_s, n)[0] - place) for n in range(1, self._flock + 1) if n != self._number)
+        offsets = places - place
+        near = np.flatnonzero(np.hypot(offsets[:, 0], offsets[:, 1]) < SIGHT_M)
         neighbours = tuple(
-            Neighbour(n, np.array([*offset, 0.0]), moving, 0.15, 0.1, 10.0, 0.0, 9, confirmed=True)
-            for n, offset in others
-            if np.hypot(*offset) < SIGHT_M
+            Neighbour(int(i) + 1, np.array([*offsets[i], 0.0]), moving, 0.15, 0.1, 10.0, 0.0, 9, confirmed=True)
+            for i in near
+            if i != self._number - 1
         )
         command = VelocityCommand(velocity, np.zeros(2), yaw)
         mission = MissionStatus("circle_then_tangent", velocity, "circles", goal=np.zeros(2))
@@ -162,7 +166,7 @@ class MadeUpDrone:
     def _flight(self, time_s: float, height_m: float, wanted: str) -> FlightMessage:
         reasons = {"hold": "an operator asked for Hold", "land": "an operator asked for Land"}
         tired = self._number % 5 == 3 and wanted == "offboard"
-        sentence = "2 of 4 cameras deliver no frames; check their cables" if tired else reasons.get(wanted)
+        sentence = "camera back delivers no frames; check its cable" if tired else reasons.get(wanted)
         return FlightMessage(
             time_s=time_s,
             state="degraded" if tired else "normal" if wanted == "offboard" else "asking",

@@ -21,7 +21,6 @@ from flockd.daemon.message_sinks import MessageSinks
 from flockd.daemon.mission_orders import MissionOrders
 from flockd.daemon.operator_commands import OperatorRequests, command_handler
 from flockd.daemon.pilot_loop import PilotLoop
-from flockd.daemon.preview import Previews
 from flockd.daemon.refusal_watch import RefusalWatch
 from flockd.daemon.stream_gate import StreamGate
 from flockd.daemon.supervisor_inputs import InputCollector
@@ -30,6 +29,7 @@ from flockd.daemon.vehicle_history import VehicleHistory
 from flockd.daemon.watched_networks import InterruptibleNetworks, WatchedNetworks
 from flockd.daemon.worker import BusyError, LateError, Worker
 from flockd.geometry import build_rig
+from flockd.preview import Previews
 from flockd.safety import Decision, Gate
 from flockd.sources import FrameSource
 from flockd.telemetry.publisher import ZenohTelemetry

@@ -52,16 +52,16 @@ export class FleetCurves {
       font: { color: ink("muted"), size: 11 },
       showlegend: false,
       hovermode: "closest",
-      xaxis: { ...axis, range: [-this.minutes(), 0], title: { text: "minutes before now", standoff: 4 } },
+      xaxis: { ...axis, range: [-this.seconds(), 0], title: { text: "seconds before now", standoff: 4 } },
       yaxis: { ...axis, rangemode: ["clock", "temperature"].includes(this.select.value) ? "normal" : "tozero" },
     };
     window.Plotly.react(this.plot, this.traces(ink), layout, { displayModeBar: false, displaylogo: false, responsive: true });
   }
 
   // As long as there is something to show, and a minute at least.
-  minutes() {
+  seconds() {
     const begins = state.order.map((key) => recent(key, KEEP_S)[0]).filter(Boolean).map((row) => row[0]);
-    return Math.max(1, (state.now - Math.min(state.now, ...begins)) / 60);
+    return Math.max(60, state.now - Math.min(state.now, ...begins));
   }
 
   traces(ink) {
@@ -83,7 +83,7 @@ export class FleetCurves {
     for (const key of keys) {
       recent(key, KEEP_S).forEach((row, i) => {
         if (i % every) return;
-        x.push((row[0] - state.now) / 60);
+        x.push(row[0] - state.now);
         y.push(row[column] === null ? null : factor * row[column]);
       });
       x.push(null);

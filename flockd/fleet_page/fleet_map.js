@@ -175,6 +175,7 @@ export class FleetMap {
       this.goal(pen, key);
     }
     for (const key of keys) this.drone(pen, key);
+    this.labels(pen, keys);
     this.legend.hidden = !obstacles;
   }
 
@@ -327,11 +328,26 @@ export class FleetMap {
       pen.arc(x, y, 15, 0, 2 * Math.PI);
       pen.stroke();
     }
-    pen.fillStyle = lost ? this.ink("bad") : this.ink("ink");
+    pen.globalAlpha = 1;
+  }
+
+  // The chosen drone's first, then the worst; none over another one.
+  labels(pen, keys) {
+    const taken = [];
     pen.font = "12px system-ui, sans-serif";
     pen.textAlign = "left";
-    const label = `${nameOf(key)}${row.height_m === null ? "" : `  ${row.height_m.toFixed(1)} m`}${lost ? `  ${row.state}` : ""}`;
-    pen.globalAlpha = 1;
-    pen.fillText(label, x + 12, y - 7);
+    const chosen = keys.filter((key) => key === state.chosen);
+    for (const key of [...chosen, ...keys.filter((one) => one !== state.chosen)]) {
+      const row = state.rows.get(key);
+      const lost = row.state === "gone" || row.state === "quiet";
+      const height = row.height_m === null || keys.length > FEW ? "" : `  ${row.height_m.toFixed(1)} m`;
+      const label = `${nameOf(key)}${height}${lost ? `  ${row.state}` : ""}`;
+      const [x, y] = this.pixel(this.places.get(key));
+      const box = [x + 10, y - 20, x + 14 + pen.measureText(label).width, y - 4];
+      if (taken.some((other) => box[0] < other[2] && other[0] < box[2] && box[1] < other[3] && other[1] < box[3])) continue;
+      taken.push(box);
+      pen.fillStyle = lost ? this.ink("bad") : this.ink("ink");
+      pen.fillText(label, x + 12, y - 7);
+    }
   }
 }

@@ -15,8 +15,9 @@ Event = tuple[float, str, str]
 class FleetSource(Protocol):
     """A fleet at any time of its time line. Called on the event loop, except for what says that it waits."""
 
-    span_s: tuple[float, float] | None
-    """Of recordings, their time line from begin to end; None: live."""
+    @property
+    def span_s(self) -> tuple[float, float] | None:
+        """Of recordings, their time line from begin to end; None: live."""
 
     def now_s(self) -> float:
         """Now on the time line of a live fleet; the end of a recorded one."""

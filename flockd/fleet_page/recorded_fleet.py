@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from bisect import bisect_right
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -11,14 +12,17 @@ from typing import Any
 
 from flockd.fleet_page.drone_rows import Known, Row, drone_rows, history_row
 from flockd.fleet_page.fleet_source import Event
+from flockd.fleet_page.recorded_pictures import RecordedPictures
 from flockd.messages import PilotOutput, VehicleState
 from flockd.recording import RecordingError
 from flockd.recording.codec import from_json, parsed
+from flockd.recording.foxglove import image_stream
 from flockd.recording.mcap_file import Entry, read_records
 from flockd.recording.migration import migrate_output
 from flockd.recording.reader import Recording, head_of
 from flockd.recording.streams import OUTPUT, TABLE, VEHICLE
-from flockd.telemetry import publish_step
+from flockd.telemetry import TOPICS, publish_step
+from flockd.telemetry.schema import fault
 from flockd.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.telemetry.watcher import Heard, Watched
 
@@ -38,6 +42,7 @@ class _Story:
     began_s: float
     """Wall time at which the recording began."""
     about: AboutMessage
+    pictures: RecordedPictures
     times: dict[str, list[float]] = field(default_factory=dict)
     messages: dict[str, list[Mapping[str, Any]]] = field(default_factory=dict)
     offset_s: float = 0.0
@@ -87,16 +92,18 @@ class RecordedFleet:
         if not paths:
             raise RecordingError(f"{folder}: holds no recording; name a folder with the recordings of a fleet")
         sizes = [path.stat().st_size for path in paths]
-        self._stories: list[_Story] = []
+        stories: list[_Story] = []
         for number, path in enumerate(paths):
-            before, total = sum(sizes[:number]), sum(sizes)
-            self._stories.append(_story(path, lambda done, before=before, total=total: progress(before + done, total)))
-        _align(self._stories)
-        self.span_s = min(s.span_s[0] for s in self._stories), max(s.span_s[1] for s in self._stories)
-        self._known = {f"{story.fleet}/{story.drone}": Known(story.about) for story in self._stories}
+            stories.append(_story(path, functools.partial(_tell, progress, sum(sizes[:number]), sum(sizes))))
+        _align(stories)
+        self._stories = {f"{story.fleet}/{story.drone}": story for story in stories}
+        if len(self._stories) < len(stories):
+            raise RecordingError(f"{folder}: holds several recordings of one drone; leave one of each in the folder")
+        self.span_s = min(story.span_s[0] for story in stories), max(story.span_s[1] for story in stories)
+        self._known = {key: Known(story.about) for key, story in self._stories.items()}
         self._events = sorted(
-            (time_s + story.offset_s, f"{story.fleet}/{story.drone}", str(message["event"]))
-            for story in self._stories
+            (time_s + story.offset_s, key, str(message["event"]))
+            for key, story in self._stories.items()
             for time_s, message in zip(story.times.get("events", ()), story.messages.get("events", ()), strict=True)
         )
 
@@ -106,8 +113,11 @@ class RecordedFleet:
 
     def rows(self, time_s: float) -> dict[str, Row]:
         """As if it were then."""
-        watched = [story.at(time_s) for story in self._stories]
-        return drone_rows([drone for drone in watched if drone.seen], self._known, time_s)
+        watched = [story.at(time_s) for story in self._stories.values()]
+        rows = drone_rows([drone for drone in watched if drone.seen], self._known, time_s)
+        for key, row in rows.items():
+            row["cameras"] = row["cameras"] or dict.fromkeys(self._stories[key].pictures.cameras)
+        return rows
 
     def events(self, time_s: float) -> list[Event]:
         """Up to then."""
@@ -129,8 +139,9 @@ class RecordedFleet:
         return AnswerMessage(accepted=False, sentence="this is a recording, which takes no commands")
 
     def image(self, drone: str, camera: str, time_s: float) -> bytes | None:
-        """None."""
-        return None
+        """Of the second before."""
+        story = self._stories.get(drone)
+        return None if story is None else story.pictures.at(camera, time_s - story.offset_s)
 
 
 def _story(path: Path, progress: Callable[[int], None]) -> _Story:
@@ -139,9 +150,9 @@ def _story(path: Path, progress: Callable[[int], None]) -> _Story:
     about = AboutMessage(version=flight.get("version", ""), configuration=config.model_dump(mode="json"), commands=[])
     began = flight.get("began")
     began_s = 0.0 if began is None else datetime.fromisoformat(began).timestamp()
-    story = _Story(config.telemetry.fleet, recording.drone, began_s, about)
-    vehicle: VehicleState | None = None
-    done = 0
+    pictures = RecordedPictures(config.rig)
+    story = _Story(config.telemetry.fleet, recording.drone, began_s, about, pictures)
+    done, taking = 0, _Taking(story, (camera.name for camera in config.rig.cameras))
     for part in recording.contents.paths:
         for record in read_records(part):
             if not isinstance(record, Entry):
@@ -149,13 +160,7 @@ def _story(path: Path, progress: Callable[[int], None]) -> _Story:
             done += len(record.data)
             progress(path.stat().st_size // 2 + done // 2)
             try:
-                if record.stream.topic == VEHICLE.topic:
-                    vehicle = from_json(VehicleState, parsed(record.data))
-                elif record.stream.topic == OUTPUT.topic and vehicle is not None:
-                    output: PilotOutput = from_json(PilotOutput, migrate_output(parsed(record.data)))
-                    publish_step(story, story.drone, vehicle, output)
-                elif record.stream.topic in _OWN:
-                    story.publish(story.drone, _OWN[record.stream.topic], parsed(record.data))
+                taking.take(record)
             except (ValueError, KeyError) as error:
                 raise RecordingError(
                     f"{part}: a message cannot be read ({error}); `flockd record recover` makes a recording without it"
@@ -163,6 +168,36 @@ def _story(path: Path, progress: Callable[[int], None]) -> _Story:
     if "state" not in story.times:
         raise RecordingError(f"{path}: holds no whole step; take it out of the folder")
     return story
+
+
+class _Taking:
+    """Turns the entries of a recording, in order, into messages of its drone."""
+
+    def __init__(self, story: _Story, cameras: Iterable[str]) -> None:
+        self._story = story
+        self._vehicle: VehicleState | None = None
+        self._images = {image_stream(camera).topic: camera for camera in cameras}
+
+    def take(self, entry: Entry) -> None:
+        """Raises ValueError and KeyError for what is no message of its stream."""
+        topic, story = entry.stream.topic, self._story
+        if topic == VEHICLE.topic:
+            self._vehicle = from_json(VehicleState, parsed(entry.data))
+        elif topic in self._images:
+            story.pictures.take_image(self._images[topic], entry.data)
+        elif topic == OUTPUT.topic and self._vehicle is not None:
+            output: PilotOutput = from_json(PilotOutput, migrate_output(parsed(entry.data)))
+            publish_step(story, story.drone, self._vehicle, output)
+            story.pictures.take_step(output.time_s, output.detections)
+        elif topic in _OWN:
+            message = parsed(entry.data)
+            if fault(message, TOPICS[_OWN[topic]].type) is None:  # else of an earlier version, or damaged
+                story.publish(story.drone, _OWN[topic], message)
+
+
+def _tell(progress: Callable[[int, int], None], before: int, total: int, done: int) -> None:
+    """Progress in one file of several."""
+    progress(min(before + done, total), total)
 
 
 def _align(stories: list[_Story]) -> None:

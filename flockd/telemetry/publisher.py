@@ -121,8 +121,15 @@ def _send_image(query: zenoh.Query, newest_image: NewestImage) -> None:
         query.reply(query.key_expr, image, encoding=zenoh.Encoding.IMAGE_JPEG)
 
 
+_PLAIN = frozenset({str, int, bool, type(None)})
+
+
 def _finite(value: object) -> object:
     """The same value in plain types, with null for every number that JSON cannot say."""
+    if type(value) is float:  # most are: this runs for every number of every message
+        return value if math.isfinite(value) else None
+    if type(value) in _PLAIN:
+        return value
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, Mapping):

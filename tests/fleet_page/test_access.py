@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 
 import pytest
-from aiohttp import WSMsgType
+from aiohttp import WSMsgType, web
 from aiohttp.test_utils import TestClient, TestServer
 
 from flockd.fleet_page.drone_rows import Row
@@ -20,7 +20,7 @@ from flockd.fleet_page.page_server import PageServer
 from flockd.telemetry.topics import AnswerMessage
 
 HOLD = {"drones": ["f/one"], "command": "hold"}
-Client = TestClient[object, object]
+Client = TestClient[web.Request, web.Application]
 
 
 class Asked:
@@ -109,7 +109,7 @@ def test_a_command_needs_the_sessions_token_and_the_pages_own_origin() -> None:
     async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
         own = await opened(client, access)
         other = await opened(client, access)  # a later session: the cookie is its own now
-        refused = (
+        refused: tuple[dict[str, str], ...] = (
             {},
             {"Origin": own["Origin"]},
             {"X-Flockd-Token": other["X-Flockd-Token"]},

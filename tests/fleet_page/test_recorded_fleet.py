@@ -32,6 +32,11 @@ def test_a_recording_shows_what_its_drone_knew_at_each_time(folder: Path) -> Non
         assert row["height_m"] == pytest.approx(step.vehicle.height_m, abs=0.01)
         places = [one["position"][:2] for one in step.output["neighbours"]]
         assert [one["ne"] for one in row["sees"]] == [pytest.approx(place, abs=0.01) for place in places]
+        assert set(row["cameras"]) == set(step.frames.frames)
+        assert {camera for camera in row["cameras"] if fleet.image(key, camera, step.frames.time_s)} == set(
+            row["cameras"]
+        )
+    assert fleet.image(key, "nothing", fleet.span_s[1]) is None
     assert fleet.rows(fleet.span_s[0] - 1.0) == {}, "before its recording begins there is no drone"
     (row,) = fleet.rows(fleet.span_s[1] + 60.0).values()
     assert row["state"] == "gone"

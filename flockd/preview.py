@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 
 import cv2
+import numpy as np
 
 from flockd.geometry import Rig, RigCamera
 from flockd.messages import Detection, Frame, FrameSet, PilotOutput, UInt8Array
@@ -64,7 +65,7 @@ def preview(frame: Frame, camera: RigCamera | None = None, detections: Sequence[
     height, width = frame.image.shape[:2]
     scale = min(1.0, LARGEST_SIDE_PX / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    small: UInt8Array = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
+    small: UInt8Array = np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA), np.uint8)
     if camera is not None:
         for detection in detections:
             _circle(small, camera, detection, scale)
