@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from flockd import __version__
 from flockd.cli import (
     calibrate,
+    cameras,
     config,
     detect,
     doctor,
@@ -95,6 +96,21 @@ def _parser() -> Parser:
         notes=EXIT_CODES,
     )
     parser.add_argument("--version", action="version", version=f"flockd {__version__}")
-    commands = (run, status, fleet, doctor, sim, report, record, replay, view, detect, calibrate, config, models)
+    commands = (
+        run,
+        status,
+        fleet,
+        doctor,
+        sim,
+        report,
+        record,
+        replay,
+        view,
+        detect,
+        cameras,
+        calibrate,
+        config,
+        models,
+    )
     add_commands(parser, [command.add for command in commands])
     return parser
