@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def write(args: argparse.Namespace, log: FlightLog, recordings: Sequence[Path]) -> int:
     """Writes the video of ``args.video`` from a flight's log and recordings, or from its folder's key frames."""
-    from flockd.report.video import check_video_path, write_video
+    from flockd.report.flight_video import check_video_path, write_video
 
     check_video_path(args.video, force=args.force)
     drone, moments = _of_recordings(args, log, [opened(path) for path in recordings])

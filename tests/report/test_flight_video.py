@@ -17,7 +17,7 @@ from flockd.flight_log.moments import Moment, Outline, held_moments, recorded_mo
 from flockd.messages import FloatArray, UInt8Array
 from flockd.recording.reader import Recording
 from flockd.report.style import DRONE_COLOURS
-from flockd.report.video import write_video
+from flockd.report.flight_video import write_video
 from tests.report.test_page import _flight
 
 NORMAL = Path(__file__).parents[1] / "replay" / "normal.mcap"
