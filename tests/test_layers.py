@@ -45,7 +45,7 @@ MAY_IMPORT = {
     "telemetry": BASE | {"zenoh_session"},
     "recording": BASE
     | {"geometry", "telemetry", "image_header"},  # telemetry for the table of topics, which says what is recorded
-    "flight_log": BASE | {"flocking", "mission", "perception", "pilot", "recording"},
+    "flight_log": BASE | {"geometry", "flocking", "mission", "perception", "pilot", "recording"},
     "pictures": BASE | {"geometry", "inference", "perception", "datasets", "image_header"},
     "calibration": BASE | {"geometry", "recording", "datasets", "sources", "perception", "pictures"},
     "datasets": BASE | {"geometry", "image_header"},

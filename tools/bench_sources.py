@@ -77,8 +77,7 @@ def compare_cameras(arguments: argparse.Namespace, size: Size) -> None:
     rows = []
     for camera in cameras:
         parameters = CameraDeviceParameters.model_validate({"name": "bench", "rate_hz": arguments.rate, **camera})
-        open_device = opener("gstreamer" if parameters.pipeline else "v4l2", LinuxKernel())
-        with open_device(parameters, size) as device:
+        with opener(LinuxKernel())(parameters, size) as device:
             rows.append({"camera": parameters.place, **measure_camera(device)})
     if arguments.json:
         print(json.dumps(rows, indent=1))

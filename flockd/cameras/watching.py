@@ -6,6 +6,7 @@ import statistics
 import threading
 import time
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -64,16 +65,19 @@ class Watched:
         return float(np.percentile(np.abs(intervals - beats * usual), 95))
 
 
-def opener(kind: str, kernel: Kernel) -> OpenDevice:
-    """What opens the cameras of a source of kind `v4l2` or `gstreamer`."""
-    return open_pipeline if kind == "gstreamer" else lambda camera, size: open_v4l2(camera, size, kernel)
+def opener(kernel: Kernel) -> OpenDevice:
+    """What opens cameras, by their pipeline where they have one."""
+
+    def opened(camera: CameraDeviceParameters, size: tuple[int, int]) -> CameraDevice:
+        return open_pipeline(camera, size) if camera.pipeline else open_v4l2(camera, size, kernel)
+
+    return opened
 
 
 def watch_devices(
-    config: DroneConfig, source: SourceParameters, seconds: float, open_device: OpenDevice
+    sizes: Mapping[str, tuple[int, int]], source: SourceParameters, seconds: float, open_device: OpenDevice
 ) -> dict[str, Watched]:
-    """Runs all devices side by side, as a USB bus has to carry them in flight."""
-    sizes = {camera.name: camera.size_px for camera in config.rig.cameras}
+    """Runs all devices of a source side by side, as a USB bus has to carry them in flight; ``sizes`` by camera."""
     stopping = threading.Event()
     watched, threads = {}, {}
     for device in source.cameras:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from flockd import __version__
 from flockd.cli import (
     calibrate,
+    cameras,
     campaign,
     config,
     detect,
@@ -100,6 +101,22 @@ def _parser() -> Parser:
         notes=EXIT_CODES,
     )
     parser.add_argument("--version", action="version", version=f"flockd {__version__}")
-    commands = (run, status, fleet, doctor, sim, campaign, report, record, replay, view, detect, calibrate, config, models)
+    commands = (
+        run,
+        status,
+        fleet,
+        doctor,
+        sim,
+        campaign,
+        report,
+        record,
+        replay,
+        view,
+        detect,
+        cameras,
+        calibrate,
+        config,
+        models,
+    )
     add_commands(parser, [command.add for command in commands])
     return parser

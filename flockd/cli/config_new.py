@@ -46,7 +46,7 @@ def _add_drone(commands: Commands) -> None:
     parser.add_argument(
         "--cameras", metavar="N", type=_camera_count, help="number of cameras, evenly spaced around the drone"
     )
-    parser.add_argument("--size", metavar="WxH", type=_size, help="of an image in pixels")
+    parser.add_argument("--size", metavar="WxH", type=image_size, help="of an image in pixels")
     parser.add_argument("--field-of-view", metavar="DEG", type=_field_of_view, help="of an image's width, 10 to 190")
     parser.add_argument("--source", choices=SOURCES, help="USB cameras, or frames from another program")
     parser.add_argument("--autopilot", metavar="ADDRESS", help="serial:///dev/NAME:BAUD or udpin://0.0.0.0:PORT")
@@ -90,7 +90,9 @@ def _new_drone(args: argparse.Namespace) -> int:
         default,
         name=_asked(args, "name", "name of the drone", default.name, str),
         cameras=_asked(args, "cameras", "number of cameras", default.cameras, _camera_count),
-        size_px=_asked(args, "size", "size of an image", default.size_px, _size, "x".join(map(str, default.size_px))),
+        size_px=_asked(
+            args, "size", "size of an image", default.size_px, image_size, "x".join(map(str, default.size_px))
+        ),
         field_of_view_deg=_asked(
             args, "field_of_view", "field of view in degrees", default.field_of_view_deg, _field_of_view
         ),
@@ -169,7 +171,8 @@ def _drone_count(text: str) -> int:
     return count
 
 
-def _size(text: str) -> tuple[int, int]:
+def image_size(text: str) -> tuple[int, int]:
+    """An option's value as width and height."""
     width, _, height = text.partition("x")
     try:
         return positive_count(width), positive_count(height)
@@ -198,7 +201,15 @@ def _refuse_what_is_there(args: argparse.Namespace) -> None:
 
 
 def _write(file: Path, text: str) -> int:
-    """Writes the file if it checks, else leaves all as it was. The draft stands beside it: paths count from there."""
+    write_checked(file, text)
+    return ExitCode.DONE
+
+
+def write_checked(file: Path, text: str) -> None:
+    """Writes the file if it checks, else leaves all as it was. Raises UsageError.
+
+    The draft stands beside it: paths count from there.
+    """
     from flockd.config import load
 
     draft = file.with_name(f".{file.name}.draft.yaml")
@@ -212,4 +223,3 @@ def _write(file: Path, text: str) -> int:
     finally:
         draft.unlink(missing_ok=True)
     say(f"{file}: written; `flockd config check {file}` checks it again after each change")
-    return ExitCode.DONE

@@ -35,6 +35,7 @@ def add(commands: Commands) -> None:
         "flockd report drone1.mcap --without-pictures --json",
         "flockd report drone1.mcap --ulog log_12_2026-11-20-10-15-00.ulg",
         "flockd report out/calm out/windy",
+        "flockd report out/short --video short.webm --drone drone2",
     )
     description = "Write the summary and the report of a flight, from its folder or from recordings; or compare two."
     parser = commands("report", description, examples)
@@ -61,6 +62,13 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--ulog", metavar="FILE", type=Path, help="the autopilot's own log of the flight (PX4's ULog), shown beside it"
     )
+    parser.add_argument(
+        "--video",
+        metavar="FILE",
+        type=Path,
+        help="write a video instead, .webm or .mp4: a drone's images with its detections, beside the map",
+    )
+    parser.add_argument("--drone", metavar="NAME", help="whose images the video shows; default: the first recorded")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     parser.set_defaults(run=_run)
 
@@ -70,6 +78,10 @@ def _run(args: argparse.Namespace) -> int:
 
     if args.other is not None:
         return _compare(args)
+    if args.video is not None:
+        return _video(args)
+    if args.drone is not None:
+        raise UsageError("--drone is for --video; drop it")
     ulog = None if args.ulog is None else _ulog(args.ulog)
     if (args.flight / LOG_NAME).is_file():
         return _again(args, ulog)
@@ -130,11 +142,26 @@ def _again(args: argparse.Namespace, ulog: UlogFile | None) -> int:
     return _write(args.flight, log, args)
 
 
+def _video(args: argparse.Namespace) -> int:
+    from flockd.cli import report_video
+    from flockd.flight_log.from_recordings import recordings_in
+    from flockd.report.flight_folder import LOG_NAME, RECORDINGS
+
+    _refuse(args, ("out", "without_pictures", "ulog"), "has no meaning with --video")
+    of_a_folder = (args.flight / LOG_NAME).is_file()
+    recordings = recordings_in(args.flight / RECORDINGS) if of_a_folder else _recordings(args.flight)
+    return report_video.write(args, _log_of(args.flight), recordings)
+
+
+def _refuse(args: argparse.Namespace, options: Sequence[str], why: str) -> None:
+    for option in options:
+        if getattr(args, option):
+            raise UsageError(f"--{option.replace('_', '-')} {why}; drop it")
+
+
 def _compare(args: argparse.Namespace) -> int:
     """The key figures of two flights side by side."""
-    for option in ("out", "without_pictures", "force", "ulog"):
-        if getattr(args, option):
-            raise UsageError(f"--{option.replace('_', '-')} has no meaning with two flights; drop it")
+    _refuse(args, ("out", "without_pictures", "force", "ulog", "video", "drone"), "has no meaning with two flights")
     from flockd.report.comparison import compare
     from flockd.report.summary import summarise
 

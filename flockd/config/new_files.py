@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -46,30 +46,15 @@ class NewScenario:
 
 def drone_text(new: NewDrone) -> str:
     """A drone's file: its cameras look evenly around, and have perfect wide-angle lenses until they are calibrated."""
-    names = _camera_names(new.cameras)
-    width, height = new.size_px
-    focal_px = width / 2 / math.radians(new.field_of_view_deg / 2)
+    names = camera_names(new.cameras)
     lines = [
         "# A drone for `flockd run`. Fill in what is marked `fill in`. Then run `flockd config check` on it, and",
         "# `flockd doctor` on the drone. `flockd config schema drone` lists every key there is.",
         f"name: {new.name}    # different for each drone of a fleet",
         "step_s: 0.5",
         "",
-        "rig:",
-        "  # Fill in: intrinsics and extrinsics, by `flockd calibrate camera` and `flockd calibrate rig`. A",
-        "  # lens that is 2 % off puts every neighbour 2 % off. position_m: forward, right, down from the middle.",
-        "  cameras:",
+        *rig_lines(dict.fromkeys(names, new.size_px), new.field_of_view_deg),
     ]
-    for number, name in enumerate(names):
-        yaw_deg = 360.0 * number / len(names)
-        forward_m, right_m = 0.1 * math.cos(math.radians(yaw_deg)), 0.1 * math.sin(math.radians(yaw_deg))
-        lines += [
-            f"    - name: {name}",
-            f"      size_px: [{width}, {height}]",
-            f"      intrinsics: {{model: wide_angle, fx: {focal_px:.1f}, fy: {focal_px:.1f}, cx: {width / 2}, "
-            f"cy: {height / 2}}}",
-            f"      extrinsics: {{position_m: [{_plain(forward_m)}, {_plain(right_m)}, 0.0], yaw_deg: {yaw_deg:g}}}",
-        ]
     lines += ["", *_source(new, names), "", "perception:", "  threads: 2", "  scale: height"]
     lines += ["  height: best    # a range finder that faces down, else the barometer", "own_velocity: vision"]
     lines += ["yaw: course", "", *_mission(new.mission), ""]
@@ -121,7 +106,29 @@ def scenario_text(new: NewScenario) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _camera_names(count: int) -> Sequence[str]:
+def rig_lines(sizes: Mapping[str, tuple[int, int]], field_of_view_deg: float) -> list[str]:
+    """The section `rig`: cameras that look evenly around, with perfect wide-angle lenses. ``sizes`` by name."""
+    lines = [
+        "rig:",
+        "  # Fill in: intrinsics and extrinsics, by `flockd calibrate camera` and `flockd calibrate rig`. A",
+        "  # lens that is 2 % off puts every neighbour 2 % off. position_m: forward, right, down from the middle.",
+        "  cameras:",
+    ]
+    for number, (name, (width, height)) in enumerate(sizes.items()):
+        yaw_deg = 360.0 * number / len(sizes)
+        forward_m, right_m = 0.1 * math.cos(math.radians(yaw_deg)), 0.1 * math.sin(math.radians(yaw_deg))
+        focal_px = width / 2 / math.radians(field_of_view_deg / 2)
+        lines += [
+            f"    - name: {name}",
+            f"      size_px: [{width}, {height}]",
+            f"      intrinsics: {{model: wide_angle, fx: {focal_px:.1f}, fy: {focal_px:.1f}, cx: {width / 2}, "
+            f"cy: {height / 2}}}",
+            f"      extrinsics: {{position_m: [{_plain(forward_m)}, {_plain(right_m)}, 0.0], yaw_deg: {yaw_deg:g}}}",
+        ]
+    return lines
+
+
+def camera_names(count: int) -> Sequence[str]:
     """Clockwise from the one that looks forward."""
     named = {1: ("front",), 2: ("front", "back"), 4: ("front", "right", "back", "left")}
     return named.get(count, tuple(f"camera{number + 1}" for number in range(count)))

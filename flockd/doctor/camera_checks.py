@@ -32,7 +32,8 @@ def check_cameras(config: DroneConfig, seconds: float, kernel: Kernel | None = N
     elif source.kind == "shared_memory":
         watched = watch_shared_memory(config, source, seconds)
     else:
-        watched = watch_devices(config, source, seconds, opener(source.kind, kernel or LinuxKernel()))
+        sizes = {camera.name: camera.size_px for camera in config.rig.cameras}
+        watched = watch_devices(sizes, source, seconds, opener(kernel or LinuxKernel()))
     for camera in config.rig.cameras:
         yield from _judged(camera, config, watched.get(camera.name))
     with contextlib.suppress(ValueError):  # a calibration that makes no camera, which was reported above

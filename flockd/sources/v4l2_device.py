@@ -41,10 +41,10 @@ from flockd.sources.v4l2_kernel import (
     StreamParameters,
 )
 
-_CAPTURE = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
+CAPTURE = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
 _MAPPED = 1  # V4L2_MEMORY_MMAP
 _PROGRESSIVE = 1  # V4L2_FIELD_NONE
-_CAN_CAPTURE = 0x00000001
+CAN_CAPTURE = 0x00000001
 _CAN_STREAM = 0x04000000
 _HAS_DEVICE_CAPABILITIES = 0x80000000
 _FLAG_ERROR = 0x0040
@@ -52,7 +52,7 @@ _CLOCK_MASK = 0xE000
 _CLOCKS: dict[int, Clock] = {0x2000: "monotonic", 0x4000: "copied"}
 _NEXT_CONTROL = 0x80000000
 _CONTROL_DISABLED = 0x0001
-_FOURCC = {name: int.from_bytes(code, "little") for name, code in (("mjpeg", b"MJPG"), ("yuyv", b"YUYV"))}
+FOURCC = {name: int.from_bytes(code, "little") for name, code in (("mjpeg", b"MJPG"), ("yuyv", b"YUYV"))}
 _BUFFERS = 4
 _RATE_TOLERANCE = 0.1
 
@@ -96,7 +96,7 @@ class V4l2Device:
         with self._telling("has failed"):
             if not self._kernel.wait(self._descriptor, timeout_s):
                 return None
-        buffer = Buffer(type=_CAPTURE, memory=_MAPPED)
+        buffer = Buffer(type=CAPTURE, memory=_MAPPED)
         try:
             self._kernel.ioctl(self._descriptor, VIDIOC_DQBUF, buffer)
         except BlockingIOError:
@@ -123,7 +123,7 @@ class V4l2Device:
     def close(self) -> None:
         """Stops the camera and gives it back."""
         with contextlib.suppress(OSError):  # an unplugged camera cannot be stopped any more
-            self._kernel.ioctl(self._descriptor, VIDIOC_STREAMOFF, ctypes.c_int(_CAPTURE))
+            self._kernel.ioctl(self._descriptor, VIDIOC_STREAMOFF, ctypes.c_int(CAPTURE))
         while self._maps:
             self._maps.pop().close()
         self._kernel.close(self._descriptor)
@@ -140,9 +140,8 @@ class V4l2Device:
         capability = Capability()
         with self._telling("is not a V4L2 camera"):
             self._kernel.ioctl(self._descriptor, VIDIOC_QUERYCAP, capability)
-        known = capability.capabilities & _HAS_DEVICE_CAPABILITIES  # those of this device, not of the whole camera
-        flags = capability.device_caps if known else capability.capabilities
-        if not flags & _CAN_CAPTURE or not flags & _CAN_STREAM:
+        flags = camera_flags(capability)
+        if not flags & CAN_CAPTURE or not flags & _CAN_STREAM:
             raise CameraError(
                 f"{self._who} does not capture images; many cameras have a second device for their metadata: "
                 "name the other one"
@@ -150,11 +149,11 @@ class V4l2Device:
 
     def _set_format(self, size: tuple[int, int], pixel_format: PixelFormat) -> None:
         asked = Format(
-            type=_CAPTURE, width=size[0], height=size[1], pixelformat=_FOURCC[pixel_format], field=_PROGRESSIVE
+            type=CAPTURE, width=size[0], height=size[1], pixelformat=FOURCC[pixel_format], field=_PROGRESSIVE
         )
         with self._telling("cannot be set up"):
             self._kernel.ioctl(self._descriptor, VIDIOC_S_FMT, asked)
-        if (asked.width, asked.height) != size or asked.pixelformat != _FOURCC[pixel_format]:
+        if (asked.width, asked.height) != size or asked.pixelformat != FOURCC[pixel_format]:
             offered = int(asked.pixelformat).to_bytes(4, "little").decode("ascii", "replace")
             raise CameraError(
                 f"{self._who} offers {asked.width}x{asked.height} {offered} instead of {size[0]}x{size[1]} "
@@ -164,7 +163,7 @@ class V4l2Device:
 
     def _set_rate(self, rate_hz: float) -> None:
         period = 1 / Fraction(rate_hz).limit_denominator(1001)
-        asked = StreamParameters(type=_CAPTURE, numerator=period.numerator, denominator=period.denominator)
+        asked = StreamParameters(type=CAPTURE, numerator=period.numerator, denominator=period.denominator)
         try:
             self._kernel.ioctl(self._descriptor, VIDIOC_S_PARM, asked)
         except OSError as error:
@@ -179,7 +178,10 @@ class V4l2Device:
             )
 
     def _set_controls(self, controls: Sequence[ControlParameters]) -> None:
-        offered = {control_name(control.name): control for control in self._controls()} if controls else {}
+        if not controls:
+            return
+        with self._telling("cannot list its controls"):
+            offered = controls_of(self._kernel, self._descriptor)
         for wanted in controls:
             control = offered.get(wanted.name)
             if control is None:
@@ -202,30 +204,16 @@ class V4l2Device:
                 f"{self._who} makes {granted.value} of {wanted.name} {wanted.value}; write a value it can keep"
             )
 
-    def _controls(self) -> Iterator[QueryControl]:
-        number = 0
-        while True:
-            control = QueryControl(id=number | _NEXT_CONTROL)
-            try:
-                self._kernel.ioctl(self._descriptor, VIDIOC_QUERYCTRL, control)
-            except OSError as error:
-                if error.errno in {errno.EINVAL, errno.ENOTTY}:
-                    return  # that was the last
-                raise self._fault("cannot list its controls", error) from error
-            number = control.id
-            if not control.flags & _CONTROL_DISABLED:
-                yield control
-
     def _start(self) -> None:
         with self._telling("cannot be started"):
-            wanted = RequestBuffers(count=_BUFFERS, type=_CAPTURE, memory=_MAPPED)
+            wanted = RequestBuffers(count=_BUFFERS, type=CAPTURE, memory=_MAPPED)
             self._kernel.ioctl(self._descriptor, VIDIOC_REQBUFS, wanted)
             for index in range(wanted.count):
-                buffer = Buffer(index=index, type=_CAPTURE, memory=_MAPPED)
+                buffer = Buffer(index=index, type=CAPTURE, memory=_MAPPED)
                 self._kernel.ioctl(self._descriptor, VIDIOC_QUERYBUF, buffer)
                 self._maps.append(self._kernel.map(self._descriptor, buffer.length, buffer.offset & 0xFFFFFFFF))
                 self._kernel.ioctl(self._descriptor, VIDIOC_QBUF, buffer)
-            self._kernel.ioctl(self._descriptor, VIDIOC_STREAMON, ctypes.c_int(_CAPTURE))
+            self._kernel.ioctl(self._descriptor, VIDIOC_STREAMON, ctypes.c_int(CAPTURE))
 
     @contextlib.contextmanager
     def _telling(self, what: str) -> Iterator[None]:
@@ -244,6 +232,29 @@ class V4l2Device:
                 return CameraError(f"{self._who} may not be opened by this user; add the user to the group `video`")
             case _:
                 return CameraError(f"{self._who} {what} ({os.strerror(error.errno or 0)})")
+
+
+def camera_flags(capability: Capability) -> int:
+    """What this device can do; not what the whole camera can, which may have several."""
+    known = capability.capabilities & _HAS_DEVICE_CAPABILITIES
+    return int(capability.device_caps if known else capability.capabilities)
+
+
+def controls_of(kernel: Kernel, descriptor: int) -> dict[str, QueryControl]:
+    """The controls of an open device, by the names that `v4l2-ctl` prints. Raises OSError."""
+    controls: dict[str, QueryControl] = {}
+    number = 0
+    while True:
+        control = QueryControl(id=number | _NEXT_CONTROL)
+        try:
+            kernel.ioctl(descriptor, VIDIOC_QUERYCTRL, control)
+        except OSError as error:
+            if error.errno in {errno.EINVAL, errno.ENOTTY}:
+                return controls  # that was the last
+            raise
+        number = control.id
+        if not control.flags & _CONTROL_DISABLED:
+            controls[control_name(control.name)] = control
 
 
 def control_name(name: bytes) -> str:

@@ -112,6 +112,47 @@ class Control(ctypes.Structure):
     _fields_: ClassVar = [("id", ctypes.c_uint32), ("value", ctypes.c_int32)]
 
 
+class FormatDescription(ctypes.Structure):
+    """struct v4l2_fmtdesc"""
+
+    _fields_: ClassVar = [
+        ("index", ctypes.c_uint32),
+        ("type", ctypes.c_uint32),
+        ("flags", ctypes.c_uint32),
+        ("description", ctypes.c_char * 32),
+        ("pixelformat", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32 * 4),
+    ]
+
+
+class FrameSize(ctypes.Structure):
+    """struct v4l2_frmsizeenum; of a range of sizes the first two numbers are the smallest and the largest width."""
+
+    _fields_: ClassVar = [
+        ("index", ctypes.c_uint32),
+        ("pixel_format", ctypes.c_uint32),
+        ("type", ctypes.c_uint32),
+        ("width", ctypes.c_uint32),
+        ("height", ctypes.c_uint32),
+        ("rest", ctypes.c_uint32 * 6),
+    ]
+
+
+class FrameInterval(ctypes.Structure):
+    """struct v4l2_frmivalenum; of a range the shortest interval."""
+
+    _fields_: ClassVar = [
+        ("index", ctypes.c_uint32),
+        ("pixel_format", ctypes.c_uint32),
+        ("width", ctypes.c_uint32),
+        ("height", ctypes.c_uint32),
+        ("type", ctypes.c_uint32),
+        ("numerator", ctypes.c_uint32),
+        ("denominator", ctypes.c_uint32),
+        ("rest", ctypes.c_uint32 * 6),
+    ]
+
+
 _READ, _WRITE = 2, 1
 
 
@@ -121,6 +162,7 @@ def _request(number: int, argument: type[ctypes.Structure] | type[ctypes.c_int],
 
 
 VIDIOC_QUERYCAP = _request(0, Capability, _READ)
+VIDIOC_ENUM_FMT = _request(2, FormatDescription, _READ | _WRITE)
 VIDIOC_S_FMT = _request(5, Format, _READ | _WRITE)
 VIDIOC_REQBUFS = _request(8, RequestBuffers, _READ | _WRITE)
 VIDIOC_QUERYBUF = _request(9, Buffer, _READ | _WRITE)
@@ -132,6 +174,8 @@ VIDIOC_S_PARM = _request(22, StreamParameters, _READ | _WRITE)
 VIDIOC_G_CTRL = _request(27, Control, _READ | _WRITE)
 VIDIOC_S_CTRL = _request(28, Control, _READ | _WRITE)
 VIDIOC_QUERYCTRL = _request(36, QueryControl, _READ | _WRITE)
+VIDIOC_ENUM_FRAMESIZES = _request(74, FrameSize, _READ | _WRITE)
+VIDIOC_ENUM_FRAMEINTERVALS = _request(75, FrameInterval, _READ | _WRITE)
 
 
 class Mapping(Protocol):

@@ -34,6 +34,9 @@ class Request(IntEnum):
     G_CTRL = 0xC008561B
     S_CTRL = 0xC008561C
     QUERYCTRL = 0xC0445624
+    ENUM_FMT = 0xC0405602
+    ENUM_FRAMESIZES = 0xC02C564A
+    ENUM_FRAMEINTERVALS = 0xC034564B
 
 
 FLAG_ERROR, FLAG_MONOTONIC, FLAG_CLOCK_UNKNOWN = 0x40, 0x2000, 0x0000
@@ -59,6 +62,7 @@ class FakeCamera:
 
     formats: tuple[tuple[int, int, bytes], ...] = ((640, 480, b"MJPG"), (640, 480, b"YUYV"))
     rates: tuple[int, ...] = (30, 15)
+    card: bytes = b"Fake camera"
     padding: int = 0
     """Bytes at the end of each row of an image that is not compressed."""
     capabilities: int = VIDEO_CAPTURE | STREAMING
@@ -179,6 +183,9 @@ class FakeKernel:
             Request.DQBUF: _dequeue,
             Request.STREAMON: _start,
             Request.STREAMOFF: _stop,
+            Request.ENUM_FMT: _list_formats,
+            Request.ENUM_FRAMESIZES: _list_sizes,
+            Request.ENUM_FRAMEINTERVALS: _list_intervals,
         }[Request(request)]
         with self._changed:
             camera = self.open_files[descriptor]
@@ -194,6 +201,7 @@ class FakeKernel:
 
 def _query_capabilities(camera: FakeCamera, memory: memoryview) -> None:
     of_all_devices = 0x80000000 | VIDEO_CAPTURE | METADATA_CAPTURE | STREAMING
+    struct.pack_into("<32s", memory, 16, camera.card)
     struct.pack_into("<III", memory, 80, 6 << 16, of_all_devices, camera.capabilities)
 
 
@@ -221,6 +229,30 @@ def _query_control(camera: FakeCamera, memory: memoryview) -> None:
     control = camera.controls[later[0]]
     struct.pack_into("<II32s", memory, 0, later[0], 1, control.name)
     struct.pack_into("<iii", memory, 40, control.low, control.high, control.step)
+
+
+def _list_formats(camera: FakeCamera, memory: memoryview) -> None:
+    index, kind = struct.unpack_from("<II", memory)
+    codes = list(dict.fromkeys(code for _, _, code in camera.formats))
+    assert kind == 1, "of capture"
+    if index >= len(codes):
+        raise _error(errno.EINVAL)
+    struct.pack_into("<4s", memory, 44, codes[index])
+
+
+def _list_sizes(camera: FakeCamera, memory: memoryview) -> None:
+    index, asked = struct.unpack_from("<I4s", memory)
+    sizes = [(width, height) for width, height, code in camera.formats if code == asked]
+    if index >= len(sizes):
+        raise _error(errno.EINVAL)
+    struct.pack_into("<III", memory, 8, 1, *sizes[index])
+
+
+def _list_intervals(camera: FakeCamera, memory: memoryview) -> None:
+    index, code, width, height = struct.unpack_from("<I4sII", memory)
+    if (width, height, code) not in camera.formats or index >= len(camera.rates):
+        raise _error(errno.EINVAL)
+    struct.pack_into("<III", memory, 16, 1, 1, camera.rates[index])
 
 
 def _set_control(camera: FakeCamera, memory: memoryview) -> None:

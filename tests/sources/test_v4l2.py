@@ -101,6 +101,9 @@ def test_the_structures_are_those_of_the_header() -> None:
         v4l2_kernel.Buffer: 88,
         v4l2_kernel.QueryControl: 68,
         v4l2_kernel.Control: 8,
+        v4l2_kernel.FormatDescription: 64,
+        v4l2_kernel.FrameSize: 44,
+        v4l2_kernel.FrameInterval: 52,
     }
     for structure, size in sizes.items():
         assert ctypes.sizeof(structure) == size, structure
@@ -114,7 +117,7 @@ def test_the_structures_are_those_of_the_header() -> None:
 
 def test_two_cameras_become_one_set_with_the_kernels_times_and_numbers(start: Start) -> None:
     kernel = FakeKernel(front=FakeCamera(), back=FakeCamera())
-    source = start(kernel, _camera("front"), _camera("back"))
+    source = start(kernel, _camera("front"), _camera("back"), silence_s=30.0)
     stamps = {"front": kernel.send("front", JPEGS[0]), "back": kernel.send("back", JPEGS[1])}
     _received(source, front=1, back=1)
     frames = _next(source)

@@ -1,0 +1,197 @@
+"""`flockd cameras`: what is plugged in, what it gives, and the configuration that names it."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flockd.cli.config_new import image_size
+from flockd.cli.output import cell, complain, say, say_json
+from flockd.cli.parser import Commands, positive_number
+from flockd.errors import ExitCode, UnavailableError, UsageError
+
+if TYPE_CHECKING:
+    from flockd.cameras.found import FoundCamera, Mode
+    from flockd.cameras.listing import Computer
+    from flockd.cameras.measuring import Measured
+
+SECONDS = 4.0
+NONE_FOUND = (
+    "no camera is plugged in; check cable and port, for a CSI camera also the overlay or device tree of its board, "
+    "and install gstreamer1.0-plugins-base-apps so that those of libcamera are found"
+)
+
+
+def add(commands: Commands) -> None:
+    """Adds the command."""
+    examples = (
+        "flockd cameras",
+        "flockd cameras --measure --picture pictures",
+        "flockd cameras --size 1280x720 --names front back --write cameras.yaml",
+    )
+    description = "List the cameras of this computer, measure what they give, and write the configuration of them."
+    parser = commands("cameras", description, examples)
+    parser.add_argument("--measure", action="store_true", help="run all cameras and measure what comes")
+    parser.add_argument(
+        "--seconds", metavar="S", type=positive_number, default=SECONDS, help=f"measure this long ({SECONDS:g})"
+    )
+    parser.add_argument("--picture", metavar="FOLDER", type=Path, help="save an image of each camera; measures too")
+    parser.add_argument(
+        "--size", metavar="WxH", type=image_size, default=(640, 480), help="of an image, the nearest to this"
+    )
+    parser.add_argument("--write", metavar="FILE", type=Path, help="write the sections `rig` and `source` for them")
+    parser.add_argument("--names", metavar="NAME", nargs="+", help="of the cameras in the rig, in the listed order")
+    parser.add_argument("--force", action="store_true", help="overwrite the file if it exists")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(run=_run)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from flockd.cameras.listing import Computer
+
+    return run(args, Computer())
+
+
+def run(args: argparse.Namespace, computer: Computer) -> int:
+    """The command on a computer."""
+    from flockd.cameras.listing import list_cameras
+
+    if args.write is not None and args.write.exists() and not args.force:
+        raise UsageError(f"{args.write} exists; name another file, or overwrite it with --force")
+    found = list_cameras(computer)
+    if not found:
+        raise UnavailableError(NONE_FOUND)
+    modes = [camera.best_mode(args.size) for camera in found]
+    usable = [(camera, mode) for camera, mode in zip(found, modes, strict=True) if mode is not None]
+    measured: dict[str, Measured] = {}
+    if args.measure or args.picture is not None:
+        from flockd.cameras.measuring import measure
+
+        complain(f"measuring {len(usable)} cameras for {args.seconds:g} s")
+        rows = measure(usable, args.seconds, computer.kernel)
+        measured = {camera.place: row for (camera, _), row in zip(usable, rows, strict=True)}
+    pictures = _save_pictures(args.picture, found, measured) if args.picture is not None else {}
+    if args.json:
+        say_json([_as_json(camera, mode, measured, pictures) for camera, mode in zip(found, modes, strict=True)])
+    else:
+        _print(found, modes, measured, pictures)
+    if args.write is not None:
+        _write(args.write, usable, args.names)
+    faulty = any(camera.fault for camera in found) or any(row.watched.fault for row in measured.values())
+    return ExitCode.CHECK_FAILED if faulty else ExitCode.DONE
+
+
+def _write(file: Path, usable: Sequence[tuple[FoundCamera, Mode]], names: Sequence[str] | None) -> None:
+    from flockd.cameras.sections import sections_text
+    from flockd.cli.config_new import write_checked
+    from flockd.config.new_files import camera_names
+
+    if not usable:
+        raise UsageError(f"{file} was not written, as no camera can be used; see what is wrong with each above")
+    names = names or camera_names(len(usable))
+    if len(set(names)) != len(usable) or len(names) != len(usable):
+        raise UsageError(f"--names gives {len(set(names))} names for {len(usable)} cameras; give each its own")
+    write_checked(file, sections_text(dict(zip(names, usable, strict=True))))
+
+
+def _save_pictures(folder: Path, found: Sequence[FoundCamera], measured: Mapping[str, Measured]) -> dict[str, Path]:
+    """By the camera's place."""
+    from flockd.cameras.measuring import as_png
+
+    folder.mkdir(parents=True, exist_ok=True)
+    saved = {}
+    for number, camera in enumerate(found):
+        row = measured.get(camera.place)
+        if row is not None and row.watched.image is not None:
+            saved[camera.place] = folder / f"camera{number}.png"
+            saved[camera.place].write_bytes(as_png(row.watched.image))
+    return saved
+
+
+def _print(
+    found: Sequence[FoundCamera],
+    modes: Sequence[Mode | None],
+    measured: Mapping[str, Measured],
+    pictures: Mapping[str, Path],
+) -> None:
+    for number, (camera, mode) in enumerate(zip(found, modes, strict=True)):
+        say(f"camera {number}: {cell(camera.name or 'unknown')}{f' ({camera.node})' if camera.node else ''}")
+        say(f"  {cell(camera.place)}")
+        if camera.fault:
+            say(f"  fault: {cell(camera.fault)}")
+        for line in _offers(camera, mode):
+            say(f"  {line}")
+        if camera.place in measured:
+            for line in _told(measured[camera.place]):
+                say(f"  {line}")
+        if camera.place in pictures:
+            say(f"  picture: {pictures[camera.place]}")
+
+
+def _offers(camera: FoundCamera, chosen: Mode | None) -> list[str]:
+    by_format: dict[str, list[str]] = {}
+    for mode in camera.modes:
+        rates = ", ".join(f"{rate:g}" for rate in mode.rates_hz)
+        by_format.setdefault(mode.pixel_format, []).append(f"{_size(mode)}{f' at {rates}' if rates else ''}")
+    lines = [f"{name}: {'; '.join(sizes)}" for name, sizes in by_format.items()]
+    return [*lines, f"used: {chosen.pixel_format} {_size(chosen)} at {chosen.rates_hz[0]:g}"] if chosen else lines
+
+
+def _told(row: Measured) -> list[str]:
+    watched = row.watched
+    if watched.fault is not None:
+        return [f"fault: {cell(watched.fault)}"]
+    lost = f", {watched.lost} lost" if watched.lost else ""
+    refused = "".join(f", {count} {cell(reason)}" for reason, count in watched.refused.items())
+    lines = [f"rate: {watched.rate_hz:.2f} Hz, jitter {1e3 * watched.jitter_s():.1f} ms (p95){lost}{refused}"]
+    if not math.isnan(row.mean_grey):
+        edges = "no edge with contrast in view" if math.isnan(row.edge_px) else f"edges {row.edge_px:.1f} px wide"
+        lines.append(f"sharpness: {edges} (sharp: under 3)")
+        lines.append(
+            f"exposure: mean {row.mean_grey:.0f} of 255, {row.black_share:.1%} black, {row.white_share:.1%} white"
+        )
+    return lines
+
+
+def _size(mode: Mode) -> str:
+    return "x".join(map(str, mode.size))
+
+
+def _as_json(
+    camera: FoundCamera, chosen: Mode | None, measured: Mapping[str, Measured], pictures: Mapping[str, Path]
+) -> dict[str, object]:
+    def mode_json(mode: Mode) -> dict[str, object]:
+        return {"pixel_format": mode.pixel_format, "size_px": list(mode.size), "rates_hz": list(mode.rates_hz)}
+
+    shown: dict[str, object] = {
+        "name": camera.name,
+        "node": camera.node or None,
+        "device": camera.device or None,
+        "element": camera.element or None,
+        "fault": camera.fault,
+        "modes": [mode_json(mode) for mode in camera.modes],
+        "used": None if chosen is None else mode_json(chosen),
+        "controls": {control.name: [control.low, control.high] for control in camera.controls},
+    }
+    row = measured.get(camera.place)
+    if row is not None:
+        shown["measured"] = {
+            "fault": row.watched.fault,
+            "rate_hz": row.watched.rate_hz,
+            "jitter_s": row.watched.jitter_s(),
+            "lost": row.watched.lost,
+            "refused": dict(row.watched.refused),
+            "edge_width_px": _number(row.edge_px),
+            "mean_grey": _number(row.mean_grey),
+            "black_share": _number(row.black_share),
+            "white_share": _number(row.white_share),
+        }
+        shown["picture"] = str(pictures[camera.place]) if camera.place in pictures else None
+    return shown
+
+
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else value
