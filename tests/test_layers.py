@@ -65,6 +65,7 @@ MAY_IMPORT = {
     }
     | {"sources", "autopilot"},  # real daemons are fed frames and given autopilots
     "report": BASE | {"flocking", "flight_log", "side_process"},
+    "campaign": BASE | {"inference", "flocking", "flight_log", "side_process", "sim", "report"},
     "view": BASE | {"geometry", "perception", "pilot", "recording"},
     "daemon": BASE
     | {"obstacles"}
@@ -83,6 +84,7 @@ MAY_IMPORT = {
         "replay",
         "sim",
         "report",
+        "campaign",
         "view",
         "daemon",
         "doctor",
@@ -120,7 +122,7 @@ IMPURE_MODULES = {
 NETWORK_LIBRARIES = {"onnxruntime"}
 """Only inference runs networks."""
 SIMULATOR_LIBRARIES = {"numba", "matplotlib", "jinja2", "markupsafe"}
-"""Of the extra `sim`: only the simulator and its reports may need them."""
+"""Of the extra `sim`: only the simulator, campaigns and reports may need them."""
 TOOL_LIBRARIES = {"torch", "onnx", "trimesh", "embreex", "pytest"}
 """For training and tests: nothing in the package may need them."""
 
@@ -181,7 +183,7 @@ def test_only_inference_runs_networks() -> None:
 
 def test_what_flies_needs_none_of_the_simulators_libraries() -> None:
     for path in MODULES:
-        if _folder(path) not in {"sim", "report"}:
+        if _folder(path) not in {"sim", "report", "campaign"}:
             assert not _libraries(path) & SIMULATOR_LIBRARIES, path
         assert not _libraries(path) & TOOL_LIBRARIES, path
 
@@ -203,6 +205,8 @@ REPLIES = PACKAGE / "telemetry" / "publisher.py"
     [
         ("mavsdk", ["autopilot/mavsdk_link.py"]),
         ("pymavlink", ["autopilot/fake_autopilot.py", "autopilot/fake_telemetry.py", "sim/ground_station.py"]),
+        ("joblib", ["campaign/process_engine.py"]),
+        ("ray", ["campaign/ray_engine.py"]),
         ("rerun", ["view/flock_file.py", "view/rerun_file.py"]),
     ],
 )

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from flockd.campaign.engines import Engine
-from flockd.campaign.flight_kinds import FLIGHT_KINDS, FlownRun, Task
+from flockd.campaign.flight_kinds import FLIGHT_KINDS, Task
 from flockd.campaign.folder import CampaignFolder
 from flockd.campaign.plan import Plan, Run
 from flockd.campaign.schedule import Schedule

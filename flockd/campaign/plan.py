@@ -83,9 +83,8 @@ class Plan:
     @classmethod
     def from_json(cls, text: str) -> Self:
         """Of `to_json`. Raises ValueError."""
-        values = json.loads(text)
-        config = CampaignConfig.model_validate_json(json.dumps(values["campaign"]))
-        return cls(config, _with_tuples(values["scenario"]))
+        values = _with_tuples(json.loads(text))
+        return cls(CampaignConfig.model_validate(values["campaign"]), values["scenario"])
 
     def to_json(self) -> str:
         """All of it, and the version of flockd: what has the same text has the same flights."""
@@ -183,7 +182,9 @@ def _anchored(config: CampaignConfig, folder: Path) -> CampaignConfig:
         return {key: anchored(key, value) for key, value in values.items()}
 
     vary = {
-        key: one if one.values is None else one.model_copy(update={"values": tuple(anchored(key, v) for v in one.values)})
+        key: one
+        if one.values is None
+        else one.model_copy(update={"values": tuple(anchored(key, v) for v in one.values)})
         for key, one in config.vary.items()
     }
     cases = {case: all_anchored(values) for case, values in config.cases.items()}
@@ -272,5 +273,7 @@ class _Check:
                 del places[old]
             places[path] = place
             depth = len(origin)
-            places |= {(*path, *at[depth:]): p for at, p in self._places.items() if at[:depth] == origin and at != origin}
+            places |= {
+                (*path, *at[depth:]): p for at, p in self._places.items() if at[:depth] == origin and at != origin
+            }
         return places

@@ -96,6 +96,21 @@ def _parser() -> Parser:
         notes=EXIT_CODES,
     )
     parser.add_argument("--version", action="version", version=f"flockd {__version__}")
-    commands = (run, status, fleet, doctor, sim, campaign, report, record, replay, view, detect, calibrate, config, models)
+    commands = (
+        run,
+        status,
+        fleet,
+        doctor,
+        sim,
+        campaign,
+        report,
+        record,
+        replay,
+        view,
+        detect,
+        calibrate,
+        config,
+        models,
+    )
     add_commands(parser, [command.add for command in commands])
     return parser

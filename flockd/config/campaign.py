@@ -44,7 +44,7 @@ _Bound = _Number | Annotated[tuple[_Number, ...], Field(min_length=1, max_length
 
 
 class Variation(Section):
-    """The values of one key: `values`; or `low`, `high` and `steps`; or `low` and `high`, drawn for each flight."""
+    """The values of one key: `values`; or `low`, `high`, `steps`; or `low`, `high`, drawn for each flight."""
 
     values: Annotated[tuple[Any, ...], Field(min_length=1, max_length=MAX_VALUES)] | None = None
     """Each is a part of the grid."""
@@ -109,19 +109,20 @@ class CampaignConfig(Section):
     between cells and between campaigns are of flights with the same gusts and worlds."""
     seeds: Annotated[int, Field(ge=1, le=MAX_SEEDS)]
     """Flights of each cell, at most."""
-    fixed: dict[str, Any] = {}
+    fixed: dict[str, Any] = Field(default_factory=dict)
     """Values of keys for all flights, by dotted key: `drone.flocking.cohesion: 0.2`, `duration_s: 40`. `drones` is the
     size of the flock."""
     scatter_m: NonNegative = 0.0
     """Each flight moves every start by up to this much to the north and to the east, by its seed."""
-    vary: dict[str, Variation] = {}
-    """What varies, by dotted key; see there. All combinations are flown, each is a cell."""
-    cases: dict[_Name, dict[str, Any]] = {}
-    """Named sets of values, each flown in all combinations of `vary`: `new: {drone.perception.models_dir: new_models}`."""
+    vary: dict[str, Variation] = Field(default_factory=dict)
+    """What varies, by dotted key. All combinations are flown, each is a cell."""
+    cases: dict[_Name, dict[str, Any]] = Field(default_factory=dict)
+    """Named sets of values, each flown in all combinations of `vary`, as in
+    `new: {drone.perception.models_dir: new_models}`."""
     measure: Annotated[tuple[Figure, ...], Field(min_length=1)] | None = None
     """Figures to keep; none: all."""
     stop: StopRule | None = None
-    """none: all seeds of all cells are flown."""
+    """When a cell is known well enough, so that no more of its seeds are flown. none: all seeds are flown."""
 
     @model_validator(mode="after")
     def _says_nothing_twice(self) -> Self:

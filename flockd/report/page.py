@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import jinja2
 import numpy as np
 from markupsafe import Markup
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -26,6 +25,7 @@ from flockd.report.filmstrip import filmstrip_figure
 from flockd.report.obstacle_figures import in_the_way, obstacle_figure
 from flockd.report.page_texts import page_texts
 from flockd.report.style import colour_of
+from flockd.report.templates import page_template
 from flockd.report.trajectories import trajectories
 from flockd.side_process import SideProcess, shared
 
@@ -69,7 +69,7 @@ def write_report(
         if element is not None:
             embedded[name] = Markup("\n").join(part for part in (embedded.get(name), element) if part)
     plates = drawn[len(shapes) :]
-    page = _template().render(
+    page = page_template(Path(__file__).with_name("report.html")).render(
         **page_texts(summary, log),
         **embedded,
         filmstrip=plates,
@@ -115,14 +115,6 @@ def _flight_data(log: FlightLog) -> str:
         ],
     }
     return json.dumps(data, separators=(",", ":"))
-
-
-def _template() -> jinja2.Template:
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    environment = jinja2.Environment(
-        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return environment.get_template("report.html")
 
 
 _MAX_SVG_BYTES = 700_000
