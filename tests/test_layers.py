@@ -34,6 +34,7 @@ MAY_IMPORT = {
     "safety": BASE,
     "mission": BASE | {"safety"},  # for the fence
     "obstacles": BASE | {"safety", "flocking"},
+    "control_level": BASE | {"flocking", "mission", "obstacles", "safety"},  # neither renderer nor networks
     "pilot": BASE
     | {"obstacles"}
     | {"geometry", "inference", "perception", "tracking", "flocking", "safety", "mission"},
@@ -65,7 +66,7 @@ MAY_IMPORT = {
     }
     | {"sources", "autopilot"},  # real daemons are fed frames and given autopilots
     "report": BASE | {"flocking", "flight_log", "side_process"},
-    "campaign": BASE | {"inference", "flocking", "flight_log", "side_process", "sim", "report"},
+    "campaign": BASE | {"inference", "flocking", "flight_log", "side_process", "sim", "control_level", "report"},
     "view": BASE | {"geometry", "perception", "pilot", "recording"},
     "daemon": BASE
     | {"obstacles"}
@@ -122,7 +123,7 @@ IMPURE_MODULES = {
 NETWORK_LIBRARIES = {"onnxruntime"}
 """Only inference runs networks."""
 SIMULATOR_LIBRARIES = {"numba", "matplotlib", "jinja2", "markupsafe"}
-"""Of the extra `sim`: only the simulator, campaigns and reports may need them."""
+"""Of the extra `sim`: only the simulator, flights at control level, campaigns and reports may need them."""
 TOOL_LIBRARIES = {"torch", "onnx", "trimesh", "embreex", "pytest"}
 """For training and tests: nothing in the package may need them."""
 
@@ -183,7 +184,7 @@ def test_only_inference_runs_networks() -> None:
 
 def test_what_flies_needs_none_of_the_simulators_libraries() -> None:
     for path in MODULES:
-        if _folder(path) not in {"sim", "report", "campaign"}:
+        if _folder(path) not in {"sim", "report", "control_level", "campaign"}:
             assert not _libraries(path) & SIMULATOR_LIBRARIES, path
         assert not _libraries(path) & TOOL_LIBRARIES, path
 

@@ -4,8 +4,8 @@
     python -m tools.bench_campaign --flights 1000 --workers 1 2 4
 
 Efficiency is the speed with more processes over that with one. Where other programs run beside, wall time says little:
-`cpu_s_a_flight` is processor time, which does not count what others take. `start_s` is until the first flight is done, and
-not counted in the speed.
+`cpu_s_a_flight` is processor time, which does not count what others take. `start_s` is until each worker has done a flight,
+and not counted in the speed.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--flights", type=int, default=40)
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--duration", type=float, default=110.0, metavar="S", help="of each flight; the paper's is 110 s")
+    parser.add_argument(
+        "--duration", type=float, default=110.0, metavar="S", help="of each flight; the paper's is 110 s"
+    )
     parser.add_argument("--engine", choices=sorted(ENGINES), default="processes")
     args = parser.parse_args()
     alone = None

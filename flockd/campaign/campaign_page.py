@@ -104,7 +104,7 @@ def _write(path: Path, **texts: Any) -> None:
 def _lead(results: Results) -> str:
     config = results.plan.config
     varied = ", ".join(results.parameters)
-    how = {"truth": "on exact states", "sight": "by sight"}[config.perception]
+    how = {"truth": "on exact states", "sight": "by sight", "control": "at control level"}[config.perception]
     return f"Each flight lasts {_durations(results)} {how}. " + (f"What varies: {varied}." if varied else "")
 
 

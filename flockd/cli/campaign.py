@@ -147,6 +147,7 @@ def _rerun(args: argparse.Namespace) -> int:
     from flockd.campaign.folder import RERUNS, load_plan
     from flockd.campaign.plan import Run
     from flockd.cli.flight_summary import report_flight
+    from flockd.config.scenario import MAX_DRONES
     from flockd.report.flight_folder import prepare_folder
     from flockd.sim.swarm import fly
 
@@ -160,6 +161,8 @@ def _rerun(args: argparse.Namespace) -> int:
         last = Run(len(plan.cells) - 1, plan.config.seeds - 1)
         raise UsageError(f"{folder}: has no flight {name}; the last one is {last.name}")
     scenario = plan.recipe(plan.cells[run.cell], run.number).scenario()
+    if len(scenario.vehicles) > MAX_DRONES:
+        raise UsageError(f"{folder}: {name} has {len(scenario.vehicles)} drones; reports are of up to {MAX_DRONES}")
     directory = args.out or folder / RERUNS / name
     prepare_folder(directory, force=args.force)
     with Phases() as phases:

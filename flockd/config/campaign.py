@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from flockd.config.base import NonNegative, Positive, Section, refuse
 
-FlightKindName = Literal["truth", "sight"]
+FlightKindName = Literal["truth", "sight", "control"]
 """How the flights of a campaign are flown."""
 
 Figure = Literal[
@@ -31,11 +31,19 @@ Figure = Literal[
     "distance_error_median_m",
     "distance_error_p95_m",
     "own_motion_ratio",
+    "min_distance_tail_m",
+    "min_level_distance_m",
+    "drone_collisions",
+    "first_collision_s",
+    "mean_nearest_tail_m",
+    "rms_radius_tail_m",
 ]
 """What a campaign can measure; `flockd.campaign.figures` says what each is."""
 
 DRONES = "drones"
 """Instead of a key: the size of the flock."""
+MAX_CONTROL_DRONES = 10_000
+"""Of a flight at control level."""
 MAX_VALUES = 1000
 MAX_SEEDS = 1_000_000
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=60)]
@@ -103,7 +111,11 @@ class CampaignConfig(Section):
     scenario: str
     """The path of the scenario's file, relative to this one."""
     perception: FlightKindName = "truth"
-    """`truth`: on exact relative states, without images; `sight`: on networks, from rendered images."""
+    """`truth`: on exact relative states, without images; `sight`: on networks, from rendered images; `control`: at
+    control level, with flocks of any size, many flights at once, on exact states or with `errors`."""
+    errors: str | None = None
+    """For `control`: the path of a file of perception's errors, relative to this one, as `tools.fit_perception` writes
+    it. none: exact states."""
     seed: Annotated[int, Field(ge=0, le=2**53)] = 0
     """Flight n of each cell, from 0, flies with the scenario's seed `seed` + n, in all cells alike: so differences
     between cells and between campaigns are of flights with the same gusts and worlds."""
@@ -139,6 +151,8 @@ class CampaignConfig(Section):
         for case, values in self.cases.items():
             if "seed" in values:
                 faults["cases", case, "seed"] = "is set for each flight; write `seed` and `seeds` at the top level"
+        if self.errors is not None and self.perception != "control":
+            faults["errors",] = "is for `perception: control`; delete one of them"
         if self.stop is not None and self.measure is not None and self.stop.figure not in self.measure:
             faults["stop", "figure"] = f"is not measured; add {self.stop.figure} to `measure`"
         if self.stop is not None and self.stop.batch > self.seeds:

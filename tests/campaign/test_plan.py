@@ -114,7 +114,11 @@ def test_a_plan_is_its_own_copy(tmp_path: Path) -> None:
             "FILE:6: stop.figure: is not measured; add min_distance_m to `measure`",
         ),
         ("fixed: {seed: 3}\n", "FILE:5: fixed.seed: is set for each flight; write `seed` and `seeds` at the top level"),
-        ("perception: guess\n", "FILE:5: perception: guess is not known; write `truth` or `sight`"),
+        (
+            "errors: shipped_networks.yaml\n",
+            "FILE:5: errors: is for `perception: control`; delete one of them",
+        ),
+        ("perception: guess\n", "FILE:5: perception: guess is not known; write `truth` or `sight` or `control`"),
     ],
 )
 def test_a_slip_is_told_with_its_line_and_key(text: str, expected: str, tmp_path: Path) -> None:
