@@ -68,6 +68,7 @@ MAY_IMPORT = {
     }
     | {"sources", "autopilot"},  # real daemons are fed frames and given autopilots
     "report": BASE | {"flocking", "flight_log", "side_process"},
+    "campaign": BASE | {"inference", "flocking", "flight_log", "side_process", "sim", "control_level", "report"},
     "view": BASE | {"geometry", "perception", "pilot", "recording"},
     "fleet_page": BASE | {"geometry", "preview", "telemetry", "recording"},
     "daemon": BASE
@@ -88,6 +89,7 @@ MAY_IMPORT = {
         "replay",
         "sim",
         "report",
+        "campaign",
         "view",
         "daemon",
         "doctor",
@@ -126,7 +128,7 @@ IMPURE_MODULES = {
 NETWORK_LIBRARIES = {"onnxruntime"}
 """Only inference runs networks."""
 SIMULATOR_LIBRARIES = {"numba", "matplotlib", "jinja2", "markupsafe"}
-"""Of the extra `sim`: only the simulator, flights at control level and reports may need them."""
+"""Of the extra `sim`: only the simulator, flights at control level, campaigns and reports may need them."""
 TOOL_LIBRARIES = {"torch", "onnx", "trimesh", "embreex", "pytest"}
 """For training and tests: nothing in the package may need them."""
 
@@ -187,7 +189,7 @@ def test_only_inference_runs_networks() -> None:
 
 def test_what_flies_needs_none_of_the_simulators_libraries() -> None:
     for path in MODULES:
-        if _folder(path) not in {"sim", "report", "control_level"}:
+        if _folder(path) not in {"sim", "report", "control_level", "campaign"}:
             assert not _libraries(path) & SIMULATOR_LIBRARIES, path
         assert not _libraries(path) & TOOL_LIBRARIES, path
 
@@ -215,6 +217,8 @@ REPLIES = PACKAGE / "telemetry" / "publisher.py"
             [f"autopilot/fake_{what}.py" for what in ("autopilot", "checks", "telemetry")] + ["sim/ground_station.py"],
         ),
         ("pyulog", ["flight_log/ulog.py"]),
+        ("joblib", ["campaign/process_engine.py"]),
+        ("ray", ["campaign/ray_engine.py"]),
         ("rerun", ["view/flock_file.py", "view/rerun_file.py"]),
     ],
 )

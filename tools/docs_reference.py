@@ -93,7 +93,7 @@ def configuration_page() -> str:
         "",
         NOTICE,
         "",
-        "Every key of both kinds of file, with its default, its type and limits, and what it means. Units are part of",
+        "Every key of the three kinds of file: its default, its type and limits, and what it means. Units are part of",
         "the names: `_m` metres, `_s` seconds, `_deg` degrees, `_px` pixels, `_hz` per second. Ranges and positions",
         "of a drone are in the body frame, of a scenario in the world frame: see [Frames](../concepts/frames.md).",
         "`required` has no default; `none` means that the key may be left out or be `null`.",
@@ -108,6 +108,8 @@ def configuration_page() -> str:
     lines += _described(drone) + _section(drone, drone, "")
     scenario = schema_of("scenario")
     lines += ["## Scenario files", "", *_described(scenario), *_section(scenario, scenario, "", level=3)]
+    campaign = schema_of("campaign")
+    lines += ["## Campaign files", "", *_described(campaign), *_section(campaign, campaign, "", level=3)]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -121,13 +123,13 @@ def _section(root: Mapping[str, Any], schema: Mapping[str, Any], path: str, leve
     rows, below = [], []
     required = schema.get("required", ())
     for key, value in schema["properties"].items():
-        inner, is_list = _inner(root, value)
+        inner, many = _inner(root, value)
         dotted = f"{path}.{key}" if path else key
         if inner is None:
             rows.append((key, _default(key, value, required), _meaning(value)))
             continue
-        shown = f"{dotted}[]" if is_list else dotted
-        kind = "list of sections" if is_list else "section"
+        shown = f"{dotted}{many}"
+        kind = {"": "section", "[]": "list of sections", ".KEY": "section for each key"}[many]
         rows.append((key, _default(key, value, required), f"{kind}, see [`{shown}`](#{_slug(shown)})"))
         below += [f"{'#' * level} `{shown}`", "", *_described({**inner, **_own_description(value)})]
         below += _section(root, inner, shown, level + 1 if level < 5 else level)
@@ -140,18 +142,16 @@ def _own_description(value: Mapping[str, Any]) -> dict[str, Any]:
     return {"description": value["description"]} if value.get("description") else {}
 
 
-def _inner(root: Mapping[str, Any], value: Mapping[str, Any]) -> tuple[Mapping[str, Any] | None, bool]:
-    """The section that a key holds, or a list of; None: a plain value."""
+def _inner(root: Mapping[str, Any], value: Mapping[str, Any]) -> tuple[Mapping[str, Any] | None, str]:
+    """The section that a key holds, or a list of (`[]`), or one for each key (`.KEY`); None: a plain value."""
     for choice in (value, *value.get("allOf", ()), *value.get("anyOf", ())):
-        if "$ref" in choice:
-            found = _resolve(root, choice)
-            if "properties" in found:
-                return found, False
-        if "$ref" in choice.get("items", {}):
-            found = _resolve(root, choice["items"])
-            if "properties" in found:
-                return found, True
-    return None, False
+        others = choice.get("additionalProperties")
+        for many, one in (("", choice), ("[]", choice.get("items")), (".KEY", others)):
+            if isinstance(one, Mapping) and "$ref" in one:
+                found = _resolve(root, one)
+                if "properties" in found:
+                    return found, many
+    return None, ""
 
 
 def _resolve(root: Mapping[str, Any], value: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from flockd.campaign.engines import Engine
-from flockd.campaign.flight_kinds import FLIGHT_KINDS, FlownRun, Task
+from flockd.campaign.flight_kinds import FLIGHT_KINDS, Task
 from flockd.campaign.folder import CampaignFolder
 from flockd.campaign.plan import Plan, Run
 from flockd.campaign.schedule import Schedule
@@ -58,4 +58,4 @@ def conduct(plan: Plan, folder: CampaignFolder, engine: Engine, progress: Progre
 def task_of(plan: Plan, runs: tuple[Run, ...]) -> Task:
     """The task that flies these flights of one cell."""
     recipes = tuple(plan.recipe(plan.cells[run.cell], run.number) for run in runs)
-    return Task(plan.config.perception, plan.wanted, runs, recipes)
+    return Task(plan.config.perception, plan.wanted, runs, recipes, plan.errors)

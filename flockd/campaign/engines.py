@@ -9,9 +9,7 @@ from typing import Literal, Protocol
 from flockd.campaign.flight_kinds import FlownRun, Task
 
 EngineName = Literal["processes", "ray"]
-ONE_THREAD = {
-    name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-}
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 """Environment of a process that flies: a library that starts threads of its own takes the others' processors."""
 MAX_TRIES = 3
 """How often a flight may end the process that flies it."""

@@ -58,6 +58,10 @@ def _distance_error(percentile: float) -> Callable[[FlightLog, dict[str, Any]], 
     return error
 
 
+def _of_control_level(_: FlightLog, __: dict[str, Any]) -> None:
+    """Nothing: only `flockd.control_level` has this figure."""
+
+
 MEASURES: dict[Figure, Measure] = {
     "min_distance_m": Measure("nearest distance", "m", "higher", _in("flock", "min_distance_m")),
     "min_distance_after_10s_m": Measure(
@@ -81,6 +85,12 @@ MEASURES: dict[Figure, Measure] = {
     ),
     "distance_error_median_m": Measure("distance error, median", "m", "lower", _distance_error(50.0)),
     "distance_error_p95_m": Measure("distance error, 95th percentile", "m", "lower", _distance_error(95.0)),
+    "min_distance_tail_m": Measure("nearest distance at the end", "m", "higher", _of_control_level),
+    "min_level_distance_m": Measure("nearest level distance", "m", "higher", _of_control_level),
+    "drone_collisions": Measure("collisions of drones", "", "lower", _of_control_level),
+    "first_collision_s": Measure("time of the first collision", "s", "higher", _of_control_level),
+    "mean_nearest_tail_m": Measure("mean distance to the nearest at the end", "m", "higher", _of_control_level),
+    "rms_radius_tail_m": Measure("radius of the flock at the end, RMS", "m", "lower", _of_control_level),
     "own_motion_ratio": Measure("steps with own motion", "", "higher", _in("own_account", "own_motion_ratio")),
 }
 

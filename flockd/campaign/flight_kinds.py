@@ -8,7 +8,7 @@ import platform
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import lru_cache
 
@@ -18,13 +18,15 @@ from flockd.campaign.recipe import Recipe
 from flockd.choices import SimulatedPerception
 from flockd.config import ScenarioConfig
 from flockd.config.campaign import Figure, FlightKindName
+from flockd.config.perceived import PerceivedErrors
 from flockd.config.perception import PerceptionConfig
+from flockd.control_level import fly_flocks
 from flockd.errors import FlockdError
 from flockd.inference.hashes import model_hashes
 from flockd.sim.swarm import fly
 
-Fly = Callable[[Sequence[ScenarioConfig], Sequence[Figure]], Sequence[Figures]]
-"""Flies scenarios of one cell that differ in their seeds, and gives the wanted figures of each."""
+Fly = Callable[[Sequence[ScenarioConfig], Sequence[Figure], PerceivedErrors | None], Sequence[Figures]]
+"""Flies scenarios of one cell that differ in what follows from their seeds, and gives the wanted figures of each."""
 
 
 @dataclass(frozen=True)
@@ -41,16 +43,30 @@ class FlightKind:
 def _alone(perception: SimulatedPerception) -> Fly:
     """Flies one after the other, each on this thread alone, without key frames."""
 
-    def flown(scenarios: Sequence[ScenarioConfig], wanted: Sequence[Figure]) -> list[Figures]:
+    def flown(
+        scenarios: Sequence[ScenarioConfig], wanted: Sequence[Figure], _: PerceivedErrors | None
+    ) -> list[Figures]:
         logs = (fly(scenario, perception=perception, processes=0, pictured=False).log for scenario in scenarios)
         return [figures_of(log, wanted) for log in logs]
 
     return flown
 
 
+def _at_control_level(
+    scenarios: Sequence[ScenarioConfig], wanted: Sequence[Figure], errors: PerceivedErrors | None
+) -> list[Figures]:
+    """All at once, on this thread."""
+    flown = fly_flocks(scenarios, errors=errors)
+    return [
+        {figure: None if one.get(figure) is None else float(one[figure]) for figure in wanted}  # type: ignore[arg-type]
+        for one in flown
+    ]
+
+
 FLIGHT_KINDS: dict[FlightKindName, FlightKind] = {
     "truth": FlightKind(_alone("truth"), "truth"),
     "sight": FlightKind(_alone("learned"), "learned"),
+    "control": FlightKind(_at_control_level, "truth", at_once=16),
 }
 
 
@@ -63,6 +79,7 @@ class Task:
     runs: tuple[Run, ...]
     recipes: tuple[Recipe, ...]
     """As many."""
+    errors: PerceivedErrors | None = None
 
 
 @dataclass(frozen=True)
@@ -89,12 +106,13 @@ def fly_task(task: Task) -> list[FlownRun]:
     wall_s, cpu_s, began = time.perf_counter(), time.process_time(), datetime.now(UTC).isoformat(timespec="seconds")
     try:
         scenarios = [_single_threaded(recipe.scenario()) for recipe in task.recipes]
-        figures = FLIGHT_KINDS[task.kind].fly(scenarios, task.wanted)
+        figures = FLIGHT_KINDS[task.kind].fly(scenarios, task.wanted, task.errors)
         networks = _networks(scenarios[0].drone.perception) if task.kind == "sight" else ""
     except Exception as error:  # noqa: BLE001 - whatever it is, it is one flight's result
         if len(task.runs) > 1:
             singles = zip(task.runs, task.recipes, strict=True)
-            return [one for run, recipe in singles for one in fly_task(Task(task.kind, task.wanted, (run,), (recipe,)))]
+            alone = [replace(task, runs=(run,), recipes=(recipe,)) for run, recipe in singles]
+            return [flown for one in alone for flown in fly_task(one)]
         return [_failed(task.runs[0], error, began, time.perf_counter() - wall_s)]
     wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
     share = len(task.runs)

@@ -126,7 +126,9 @@ def read_table(path: Path, columns: Iterable[str] | None = None) -> pa.Table:
     try:
         return pq.read_table(path, columns=None if columns is None else list(columns), partitioning=None)
     except (pa.ArrowInvalid, OSError) as error:
-        raise UnavailableError(f"{path}: cannot be read ({error}); delete it, and its flights are flown again") from error
+        raise UnavailableError(
+            f"{path}: cannot be read ({error}); delete it, and its flights are flown again"
+        ) from error
 
 
 def _columns(table: pa.Table) -> dict[str, Any]:

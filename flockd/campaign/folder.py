@@ -9,13 +9,15 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import pyarrow as pa
 
+from flockd.campaign.differences import differences
 from flockd.campaign.flight_kinds import FlownRun
 from flockd.campaign.flight_table import FlightTable, read_table, sync_folder, write_table
 from flockd.campaign.plan import Plan, Run
@@ -40,30 +42,31 @@ class CampaignFolder:
         """Raises UsageError for a folder of another campaign, or with other files."""
         self.path, self._plan = path, plan
         self._table = FlightTable(plan)
-        self._lock: int | None = None
+        self._stack = ExitStack()
         self._parts = 0
         _check(path, plan)
 
     def __enter__(self) -> Self:
         """Makes the folder, and tidies it. Raises UsageError where another process flies it."""
         (self.path / _PARTS).mkdir(parents=True, exist_ok=True)
-        self._lock = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(self._lock)
-            raise UsageError(f"{self.path}: another process is flying this campaign; wait, or end that one") from None
-        _write_text(self.path / PLAN_NAME, self._plan.to_json())
-        for leftover in [*self.path.glob(".*.part"), *(self.path / _PARTS).glob(".*.part")]:
-            leftover.unlink()
-        self.merge()
+        with ExitStack() as stack:
+            lock = stack.enter_context((self.path / _LOCK).open("w", encoding="utf-8"))
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                fault = "another process is flying this campaign; wait, or end that one"
+                raise UsageError(f"{self.path}: {fault}") from None
+            _write_text(self.path / PLAN_NAME, self._plan.to_json())
+            for leftover in [*self.path.glob(".*.part"), *(self.path / _PARTS).glob(".*.part")]:
+                leftover.unlink()
+            self.merge()
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        assert self._lock is not None
-        os.close(self._lock)
+        self._stack.close()
 
     def add(self, flown: Sequence[FlownRun]) -> None:
         """Keeps finished flights: on the disk when this returns."""
@@ -117,26 +120,18 @@ def _check(path: Path, plan: Plan) -> None:
         raise UsageError(f"{path}: is a file; name a folder with --out")
     if not path.is_dir() or not any(path.iterdir()):
         return
-    if {entry.name for entry in path.iterdir() if not entry.name.endswith(".part")} - _OURS:
+    others = {entry.name for entry in path.iterdir() if entry.suffix != ".part" and not entry.match("versus_*.html")}
+    if others - _OURS:
         raise UsageError(f"{path}: holds other files than a campaign's; name a new or empty folder with --out")
     if not (path / PLAN_NAME).is_file():
         return
     old, new = json.loads((path / PLAN_NAME).read_text(encoding="utf-8")), json.loads(plan.to_json())
     if old != new:
-        key, before, now = next(_changes(old, new))
+        key, before, now = next(differences(old, new))
         raise UsageError(
             f"{path}: was begun with other flights, as `{key}` was {before} and is {now} now; name another folder with "
             "--out, or put the file back as it was to go on"
         )
-
-
-def _changes(old: Any, new: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
-    """Keys whose values differ, with both values."""
-    if isinstance(old, Mapping) and isinstance(new, Mapping):
-        for name in sorted(old.keys() | new.keys()):
-            yield from _changes(old.get(name), new.get(name), f"{key}.{name}" if key else name)
-    elif old != new:
-        yield key, json.dumps(old), json.dumps(new)
 
 
 def _write_text(path: Path, text: str) -> None:

@@ -19,9 +19,10 @@ from flockd import __version__
 from flockd.campaign.recipe import Recipe, Values, merged
 from flockd.choices import ROLES
 from flockd.config import CampaignConfig, ScenarioConfig, load_campaign, load_with_places
-from flockd.config.campaign import DRONES, Figure, Variation
+from flockd.config.campaign import DRONES, MAX_CONTROL_DRONES, Figure, Variation
 from flockd.config.document import KeyPath, Place
-from flockd.config.loader import PATHS
+from flockd.config.loader import PATHS, load_perceived_errors
+from flockd.config.perceived import PerceivedErrors
 from flockd.config.scenario import MAX_DRONES
 from flockd.config.validation_messages import problems_of
 from flockd.errors import ConfigError, ConfigProblem, UsageError
@@ -62,6 +63,8 @@ class Plan:
     config: CampaignConfig
     base: Mapping[str, Any]
     """The scenario's own values, its drone's within."""
+    errors: PerceivedErrors | None = None
+    """Of perception, at control level."""
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -74,7 +77,8 @@ class Plan:
         config = _anchored(config, path.parent)
         check = _Check(places, of_scenario)
         check.keys(config)
-        plan = cls(config, scenario.model_dump(exclude_unset=True))
+        errors = None if config.errors is None else load_perceived_errors(path.parent / config.errors)
+        plan = cls(config, scenario.model_dump(exclude_unset=True), errors)
         check.cells(plan)
         if fault := _idle_seeds(plan):
             raise ConfigError([places["seeds",].problem(fault)])
@@ -83,14 +87,15 @@ class Plan:
     @classmethod
     def from_json(cls, text: str) -> Self:
         """Of `to_json`. Raises ValueError."""
-        values = json.loads(text)
-        config = CampaignConfig.model_validate_json(json.dumps(values["campaign"]))
-        return cls(config, _with_tuples(values["scenario"]))
+        values = _with_tuples(json.loads(text))
+        errors = values["errors"] and PerceivedErrors.model_validate(values["errors"])
+        return cls(CampaignConfig.model_validate(values["campaign"]), values["scenario"], errors)
 
     def to_json(self) -> str:
         """All of it, and the version of flockd: what has the same text has the same flights."""
         config = self.config.model_dump(mode="json")
-        values = {"flockd": __version__, "campaign": config, "scenario": self.base}
+        errors = self.errors and self.errors.model_dump(mode="json")
+        values = {"flockd": __version__, "campaign": config, "scenario": self.base, "errors": errors}
         return json.dumps(values, indent=1, sort_keys=True) + "\n"
 
     @property
@@ -159,7 +164,7 @@ def _draw(variation: Variation, key: str, seed: int) -> float | tuple[float, ...
 def _idle_seeds(plan: Plan) -> str | None:
     """What is wrong where all seeds of a cell fly the very same flight."""
     config = plan.config
-    if config.seeds == 1 or config.perception != "truth" or config.scatter_m or plan.drawn:
+    if config.seeds == 1 or config.perception == "sight" or config.scatter_m or plan.drawn or plan.errors:
         return None
     for cell in plan.cells:
         scenario = plan.recipe(cell, 0).scenario()
@@ -183,7 +188,9 @@ def _anchored(config: CampaignConfig, folder: Path) -> CampaignConfig:
         return {key: anchored(key, value) for key, value in values.items()}
 
     vary = {
-        key: one if one.values is None else one.model_copy(update={"values": tuple(anchored(key, v) for v in one.values)})
+        key: one
+        if one.values is None
+        else one.model_copy(update={"values": tuple(anchored(key, v) for v in one.values)})
         for key, one in config.vary.items()
     }
     cases = {case: all_anchored(values) for case, values in config.cases.items()}
@@ -209,10 +216,11 @@ class _Check:
         counts |= {("cases", case, DRONES): [values.get(DRONES, 1)] for case, values in config.cases.items()}
         if (sizes := config.vary.get(DRONES)) is not None:
             counts["vary", DRONES] = list(sizes.values or (None,))
+        most = MAX_CONTROL_DRONES if config.perception == "control" else MAX_DRONES
         wrong = [
-            self._places[path].problem(f"must be whole numbers from 1 to {MAX_DRONES}, as in `values: [5, 10]`")
+            self._places[path].problem(f"must be whole numbers from 1 to {most}, as in `values: [5, 10]`")
             for path, values in counts.items()
-            if not all(isinstance(n, int) and not isinstance(n, bool) and 1 <= n <= MAX_DRONES for n in values)
+            if not all(isinstance(n, int) and not isinstance(n, bool) and 1 <= n <= most for n in values)
         ]
         cells = max(len(config.cases), 1)
         for variation in config.vary.values():
@@ -272,5 +280,7 @@ class _Check:
                 del places[old]
             places[path] = place
             depth = len(origin)
-            places |= {(*path, *at[depth:]): p for at, p in self._places.items() if at[:depth] == origin and at != origin}
+            places |= {
+                (*path, *at[depth:]): p for at, p in self._places.items() if at[:depth] == origin and at != origin
+            }
         return places

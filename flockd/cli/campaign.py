@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,8 @@ from flockd.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from flockd.campaign.plan import Plan
+    from flockd.campaign.results import Results
+    from flockd.campaign.verdicts import Verdict
 
 RUN = "run"
 COSTS = """\
@@ -30,7 +33,9 @@ def add(commands: Commands) -> None:
         "flockd campaign report out/separation",
         "flockd campaign rerun out/separation/c3-s12",
     )
-    description = "Fly many flights of a scenario, rerun one of them, report on all; `campaign FILE` is `campaign run FILE`."
+    description = (
+        "Fly many flights of a scenario, rerun one of them, report on all; `campaign FILE` is `campaign run FILE`."
+    )
     parser = commands("campaign", description, examples)
     parser.default_command = RUN
     add_commands(parser, (_add_run, _add_rerun, _add_report))
@@ -52,14 +57,19 @@ def _add_run(commands: Commands) -> None:
         default="processes",
         help="what flies them: processes of this computer, or a Ray cluster (default: processes)",
     )
-    parser.add_argument("--address", metavar="HOST:PORT", help="with --engine ray: a running cluster (default: a new one)")
+    parser.add_argument(
+        "--address", metavar="HOST:PORT", help="with --engine ray: a running cluster (default: a new one)"
+    )
     parser.add_argument("--dry-run", action="store_true", help="print how many flights and hours it is; keep nothing")
     parser.add_argument("--json", action="store_true", help="print what was flown as JSON")
     parser.set_defaults(run=_run)
 
 
 def _add_rerun(commands: Commands) -> None:
-    examples = ("flockd campaign rerun out/separation/c3-s12", "flockd campaign rerun out/night/c0-s7 --out out/why --json")
+    examples = (
+        "flockd campaign rerun out/separation/c3-s12",
+        "flockd campaign rerun out/night/c0-s7 --out out/why --json",
+    )
     parser = commands("rerun", "Fly one flight of a campaign again, with its full report.", examples)
     parser.add_argument("flight", metavar="RUN", type=Path, help="the campaign's folder and the flight's name")
     parser.add_argument("--out", metavar="DIR", type=Path, help="default: FOLDER/reruns/NAME")
@@ -73,16 +83,20 @@ def _add_report(commands: Commands) -> None:
     parser = commands("report", "Write the report of a campaign, or compare a second one with it.", examples)
     parser.add_argument("folder", metavar="FOLDER", type=Path, help="of a campaign")
     parser.add_argument("other", nargs="?", metavar="OTHER", type=Path, help="is compared with it: is this one better?")
-    parser.add_argument("--out", metavar="FILE", type=Path, help="default: report.html, or OTHER/versus_NAME.html of two")
+    parser.add_argument(
+        "--out", metavar="FILE", type=Path, help="default: report.html, or OTHER/versus_NAME.html of two"
+    )
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
     parser.set_defaults(run=_report)
 
 
 def _run(args: argparse.Namespace) -> int:
+    from flockd.campaign.campaign_page import write_campaign_page
     from flockd.campaign.conduct import conduct
     from flockd.campaign.engines import ENGINES
-    from flockd.campaign.folder import CampaignFolder
+    from flockd.campaign.folder import REPORT_NAME, CampaignFolder
     from flockd.campaign.plan import Plan
+    from flockd.campaign.results import Results
 
     if args.address is not None and args.engine != "ray":
         raise UsageError("--address is of a Ray cluster; add --engine ray, or drop it")
@@ -101,11 +115,15 @@ def _run(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         complain(f"interrupted; every finished flight is in {path}, and the same command goes on with the others")
         return ExitCode.INTERRUPTED
+    write_campaign_page(Results.load(path), path / REPORT_NAME)
     if args.json:
-        say_json({"folder": str(path), "flown": conducted.flown, "failed": conducted.failed, "before": conducted.before})
+        say_json(
+            {"folder": str(path), "flown": conducted.flown, "failed": conducted.failed, "before": conducted.before}
+        )
     else:
         before = f", {conducted.before} were there already" if conducted.before else ""
-        say(f"{conducted.flown} flights flown, {conducted.failed} of them failed{before}: {path}")
+        say(f"{conducted.flown} flights flown, {conducted.failed} of them failed{before}")
+        say(f"report: {path / REPORT_NAME}")
     return ExitCode.CHECK_FAILED if conducted.failed else ExitCode.DONE
 
 
@@ -125,10 +143,11 @@ def _dry_run(plan: Plan, workers: int, *, as_json: bool) -> int:
 
 
 def _rerun(args: argparse.Namespace) -> int:
+    from flockd.campaign.flight_kinds import FLIGHT_KINDS
     from flockd.campaign.folder import RERUNS, load_plan
     from flockd.campaign.plan import Run
-    from flockd.campaign.flight_kinds import FLIGHT_KINDS
     from flockd.cli.flight_summary import report_flight
+    from flockd.config.scenario import MAX_DRONES
     from flockd.report.flight_folder import prepare_folder
     from flockd.sim.swarm import fly
 
@@ -142,6 +161,8 @@ def _rerun(args: argparse.Namespace) -> int:
         last = Run(len(plan.cells) - 1, plan.config.seeds - 1)
         raise UsageError(f"{folder}: has no flight {name}; the last one is {last.name}")
     scenario = plan.recipe(plan.cells[run.cell], run.number).scenario()
+    if len(scenario.vehicles) > MAX_DRONES:
+        raise UsageError(f"{folder}: {name} has {len(scenario.vehicles)} drones; reports are of up to {MAX_DRONES}")
     directory = args.out or folder / RERUNS / name
     prepare_folder(directory, force=args.force)
     with Phases() as phases:
@@ -156,4 +177,49 @@ def _rerun(args: argparse.Namespace) -> int:
 
 
 def _report(args: argparse.Namespace) -> int:
-    raise UsageError("not yet")
+    from flockd.campaign.campaign_page import write_campaign_page, write_comparison_page
+    from flockd.campaign.folder import REPORT_NAME
+    from flockd.campaign.results import Results
+    from flockd.campaign.verdicts import compare
+
+    results = Results.load(args.folder)
+    if args.other is None:
+        path = args.out or args.folder / REPORT_NAME
+        write_campaign_page(results, path)
+        if args.json:
+            say_json(_cell_figures(results))
+        else:
+            say(f"report: {path}")
+        return ExitCode.DONE
+    comparison = compare(results, Results.load(args.other))
+    path = args.out or args.other / f"versus_{args.folder.resolve().name}.html"
+    write_comparison_page(comparison, path)
+    if args.json:
+        say_json(
+            [{**asdict(one), "difference": one.difference._asdict(), "says": one.says} for one in comparison.verdicts]
+        )
+    else:
+        say(f"{comparison.sentence}.")
+        for one in comparison.verdicts:
+            say(f"  {_verdict_line(one)}")
+        say(f"report: {path}")
+    return ExitCode.DONE
+
+
+def _verdict_line(verdict: Verdict) -> str:
+    from flockd.campaign.campaign_figures import label_of
+
+    low, high = verdict.difference.low, verdict.difference.high
+    means = f"{verdict.first:.4g} and {verdict.second:.4g}"
+    return (
+        f"{label_of(verdict.figure)}: {verdict.says}, {means}, difference {low:+.3g} to {high:+.3g}, p {verdict.p:.2g}"
+    )
+
+
+def _cell_figures(results: Results) -> list[dict[str, object]]:
+    cells = []
+    for cell in results.plan.cells:
+        intervals = {figure: results.interval(figure, [cell.number]) for figure in results.figures}
+        figures = {figure: found and found._asdict() for figure, found in intervals.items()}
+        cells.append({"cell": cell.number, "parameters": dict(cell.parameters), "figures": figures})
+    return cells

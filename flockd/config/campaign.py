@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from flockd.config.base import NonNegative, Positive, Section, refuse
 
-FlightKindName = Literal["truth", "sight"]
+FlightKindName = Literal["truth", "sight", "control"]
 """How the flights of a campaign are flown."""
 
 Figure = Literal[
@@ -31,11 +31,19 @@ Figure = Literal[
     "distance_error_median_m",
     "distance_error_p95_m",
     "own_motion_ratio",
+    "min_distance_tail_m",
+    "min_level_distance_m",
+    "drone_collisions",
+    "first_collision_s",
+    "mean_nearest_tail_m",
+    "rms_radius_tail_m",
 ]
 """What a campaign can measure; `flockd.campaign.figures` says what each is."""
 
 DRONES = "drones"
 """Instead of a key: the size of the flock."""
+MAX_CONTROL_DRONES = 10_000
+"""Of a flight at control level."""
 MAX_VALUES = 1000
 MAX_SEEDS = 1_000_000
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=60)]
@@ -44,7 +52,7 @@ _Bound = _Number | Annotated[tuple[_Number, ...], Field(min_length=1, max_length
 
 
 class Variation(Section):
-    """The values of one key: `values`; or `low`, `high` and `steps`; or `low` and `high`, drawn for each flight."""
+    """The values of one key: `values`; or `low`, `high`, `steps`; or `low`, `high`, drawn for each flight."""
 
     values: Annotated[tuple[Any, ...], Field(min_length=1, max_length=MAX_VALUES)] | None = None
     """Each is a part of the grid."""
@@ -103,25 +111,30 @@ class CampaignConfig(Section):
     scenario: str
     """The path of the scenario's file, relative to this one."""
     perception: FlightKindName = "truth"
-    """`truth`: on exact relative states, without images; `sight`: on networks, from rendered images."""
+    """`truth`: on exact relative states, without images; `sight`: on networks, from rendered images; `control`: at
+    control level, with flocks of any size, many flights at once, on exact states or with `errors`."""
+    errors: str | None = None
+    """For `control`: the path of a file of perception's errors, relative to this one, as `tools.fit_perception` writes
+    it. none: exact states."""
     seed: Annotated[int, Field(ge=0, le=2**53)] = 0
     """Flight n of each cell, from 0, flies with the scenario's seed `seed` + n, in all cells alike: so differences
     between cells and between campaigns are of flights with the same gusts and worlds."""
     seeds: Annotated[int, Field(ge=1, le=MAX_SEEDS)]
     """Flights of each cell, at most."""
-    fixed: dict[str, Any] = {}
+    fixed: dict[str, Any] = Field(default_factory=dict)
     """Values of keys for all flights, by dotted key: `drone.flocking.cohesion: 0.2`, `duration_s: 40`. `drones` is the
     size of the flock."""
     scatter_m: NonNegative = 0.0
     """Each flight moves every start by up to this much to the north and to the east, by its seed."""
-    vary: dict[str, Variation] = {}
-    """What varies, by dotted key; see there. All combinations are flown, each is a cell."""
-    cases: dict[_Name, dict[str, Any]] = {}
-    """Named sets of values, each flown in all combinations of `vary`: `new: {drone.perception.models_dir: new_models}`."""
+    vary: dict[str, Variation] = Field(default_factory=dict)
+    """What varies, by dotted key. All combinations are flown, each is a cell."""
+    cases: dict[_Name, dict[str, Any]] = Field(default_factory=dict)
+    """Named sets of values, each flown in all combinations of `vary`, as in
+    `new: {drone.perception.models_dir: new_models}`."""
     measure: Annotated[tuple[Figure, ...], Field(min_length=1)] | None = None
     """Figures to keep; none: all."""
     stop: StopRule | None = None
-    """none: all seeds of all cells are flown."""
+    """When a cell is known well enough, so that no more of its seeds are flown. none: all seeds are flown."""
 
     @model_validator(mode="after")
     def _says_nothing_twice(self) -> Self:
@@ -138,6 +151,8 @@ class CampaignConfig(Section):
         for case, values in self.cases.items():
             if "seed" in values:
                 faults["cases", case, "seed"] = "is set for each flight; write `seed` and `seeds` at the top level"
+        if self.errors is not None and self.perception != "control":
+            faults["errors",] = "is for `perception: control`; delete one of them"
         if self.stop is not None and self.measure is not None and self.stop.figure not in self.measure:
             faults["stop", "figure"] = f"is not measured; add {self.stop.figure} to `measure`"
         if self.stop is not None and self.stop.batch > self.seeds:

@@ -13,6 +13,7 @@ from flockd.choices import ROLES
 from flockd.config.campaign import CampaignConfig
 from flockd.config.document import Document, KeyPath, Place, Value, read_document
 from flockd.config.drone import DroneConfig
+from flockd.config.perceived import PerceivedErrors
 from flockd.config.scenario import ScenarioConfig
 from flockd.config.validation_messages import path_in_file, problems_of
 from flockd.errors import ConfigError, ConfigProblem
@@ -45,6 +46,11 @@ def load_scenario(path: Path | str, overrides: Overrides | None = None) -> Scena
     Raises ConfigError with every problem found in both files.
     """
     return _validated(ScenarioConfig, _scenario_document(Path(path), overrides or {}))
+
+
+def load_perceived_errors(path: Path | str) -> PerceivedErrors:
+    """How perception errs, as `tools.fit_perception` writes it. Raises ConfigError with every problem found."""
+    return _validated(PerceivedErrors, read_document(Path(path)))
 
 
 def load(path: Path | str) -> DroneConfig | ScenarioConfig:

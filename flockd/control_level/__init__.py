@@ -1,11 +1,11 @@
 """Flocks without images: the law, the missions and the vehicles of many drones and many flights at once.
 
 For questions that need hundreds of drones or thousands of flights. Each drone is given the others' exact states, or
-those with the errors that the networks' flights have (`PerceptionModel`).
+what it would perceive with the errors of the networks' flights (`flockd.config.perceived`).
 """
 
 from __future__ import annotations
 
-from flockd.control_level.flock_flights import fly_flocks
+from flockd.control_level.flock_flights import fly_flocks, scattered
 
-__all__ = ["fly_flocks"]
+__all__ = ["fly_flocks", "scattered"]

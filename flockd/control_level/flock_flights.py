@@ -10,15 +10,15 @@ from contextlib import ExitStack
 
 import numpy as np
 
+from flockd.config.perceived import PerceivedErrors
 from flockd.config.scenario import ScenarioConfig
-from flockd.control_level import flock_figures, law_sums, motion
+from flockd.control_level import flock_figures, law_sums, motion, perceived_sums
 from flockd.control_level.cells import CELLS_A_DRONE, sort_flights
 from flockd.control_level.flock_figures import FlightFigures
 from flockd.control_level.many_missions import ManyMissions
 from flockd.messages import FloatArray
 
 Figures = dict[str, float | int | bool | None]
-START_SPREAD_M = 0.5
 _LEAST_DRONES = 250
 """Of a thread: fewer are computed sooner than handed over."""
 _SMALLEST_SHARE = 0.25
@@ -26,91 +26,103 @@ _SMALLEST_SHARE = 0.25
 
 
 def fly_flocks(
-    scenario: ScenarioConfig,
-    seeds: Sequence[int],
+    scenarios: Sequence[ScenarioConfig],
     *,
-    start_spread_m: float = START_SPREAD_M,
-    height_m: float | None = None,
+    errors: PerceivedErrors | None = None,
     threads: int = 1,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Figures]:
-    """Flies a scenario once with each seed; the figures of each flight, in the order of the seeds.
+    """Flies each scenario once; the figures of each flight, in their order.
 
-    A flight is the same bit for bit whatever other flights are in the batch and however many threads there are.
+    Those that differ in nothing but seed, start positions and start velocities fly side by side. A flight is the same
+    bit for bit whatever others are flown with it, in however many threads.
 
     Args:
-        scenario: what to fly, with any number of vehicles (`flockd.sim.start.with_drones`). Its own seed, sensors,
-            world and rig do not count, nor do the safety gate and obstacles.
-        seeds: of the gusts, and of the start positions.
-        start_spread_m: each drone starts up to so far from its place, drawn from the seed, and no farther than a
-            quarter of the way to the next; 0: at the scenario's own places, as in `flockd sim`.
-        height_m: at which all drones start; None: as the scenario says.
+        scenarios: with any number of vehicles (`flockd.sim.start.with_drones`, `scattered`). The seed rules gusts and
+            the errors of perception. Rig, sensors, world, obstacles and the safety gate do not count.
+        errors: of what the drones perceive of each other; None: they are given exact states.
         threads: to compute in.
-        progress: called with (steps done, steps in all).
+        progress: called with (flights done, flights in all).
 
     Raises UsageError for what cannot be flown without images.
     """
-    flights = FlockFlights(scenario, seeds, start_spread_m=start_spread_m, height_m=height_m)
-    with ExitStack() as stack:
-        pool = stack.enter_context(ThreadPoolExecutor(threads)) if threads > 1 else None
-        for step in range(flights.steps):
-            flights.step(step, pool, threads)
-            progress(step + 1, flights.steps)
-    return flights.figures()
+    found: dict[int, Figures] = {}
+    for numbers in _alike(scenarios):
+        flights = FlockFlights([scenarios[number] for number in numbers], errors)
+        with ExitStack() as stack:
+            pool = stack.enter_context(ThreadPoolExecutor(threads)) if threads > 1 else None
+            for step in range(flights.steps):
+                flights.step(step, pool, threads)
+        found |= zip(numbers, flights.figures(), strict=True)
+        progress(len(found), len(scenarios))
+    return [found[number] for number in range(len(scenarios))]
+
+
+def scattered(scenario: ScenarioConfig, spread_m: float, height_m: float | None = None) -> ScenarioConfig:
+    """The scenario with each start moved by up to `spread_m`, by its seed, and no farther than a quarter of the way to
+    the next, so that none come near each other; all at one height where that is given, m, up positive."""
+    places = np.array([vehicle.position_m for vehicle in scenario.vehicles], dtype=float)
+    if height_m is not None:
+        places[:, 2] = -height_m
+    random = np.random.default_rng([scenario.seed, 1])
+    angle, radius = random.uniform(0.0, 2 * math.pi, len(places)), np.sqrt(random.uniform(0.0, 1.0, len(places)))
+    most_m = np.minimum(spread_m, _SMALLEST_SHARE * _nearest(places[:, :2]))
+    places[:, 0] += most_m * radius * np.cos(angle)
+    places[:, 1] += most_m * radius * np.sin(angle)
+    moved = zip(scenario.vehicles, places.tolist(), strict=True)
+    vehicles = tuple(vehicle.model_copy(update={"position_m": tuple(place)}) for vehicle, place in moved)
+    return scenario.model_copy(update={"vehicles": vehicles})
 
 
 class FlockFlights:
-    """A batch of flights, all at the same time; see `fly_flocks`."""
+    """A batch of flights that differ in seeds and starts only, all at the same time; see `fly_flocks`."""
 
-    def __init__(
-        self,
-        scenario: ScenarioConfig,
-        seeds: Sequence[int],
-        *,
-        start_spread_m: float = START_SPREAD_M,
-        height_m: float | None = None,
-    ) -> None:
-        drone, vehicle = scenario.drone, scenario.vehicle
-        self._drone, self._shape = drone, (len(seeds), len(scenario.vehicles))
+    def __init__(self, scenarios: Sequence[ScenarioConfig], errors: PerceivedErrors | None = None) -> None:
+        scenario = scenarios[0]
+        drone, vehicle, seeds = scenario.drone, scenario.vehicle, [one.seed for one in scenarios]
+        self._drone, self._shape = drone, (len(scenarios), len(scenario.vehicles))
         self.steps = round(scenario.duration_s / drone.step_s)
         self._times = np.arange(self.steps) * drone.step_s
         f, n = self._shape
-        self.states = np.empty((6, f, n))
-        """Position and velocity, NED."""
-        for k, seed in enumerate(seeds):
-            self.states[:, k] = _starts(scenario, seed, start_spread_m, height_m)
+        self.states = np.ascontiguousarray(np.stack([_start(one) for one in scenarios], axis=1))
+        """(6, flights, n) m and m/s: position and velocity, NED."""
         self._law = law_sums.law_figures(drone.flocking)
         self._missions = ManyMissions(scenario, f)
+        self._errors = None
+        if errors is not None:
+            tables = perceived_sums.by_distance(errors), perceived_sums.constants(errors, drone.step_s)
+            self._errors = (*tables, np.array(seeds, dtype=np.int64))
         self._substeps = motion.Substeps.of(vehicle, drone.step_s)
         self._gusts = [motion.Gusts(vehicle, n, seed) for seed in seeds] if vehicle.gust_m_s else []
         self._figures = FlightFigures(f, n, self._times, drone.step_s, vehicle.radius_m)
-        self._goal_times = np.full(f, np.nan)
+        self._arrival_s, self._away_m = np.full(f, np.nan), np.full(f, np.nan)
         self._by_slot = np.empty((6, f, n))
         self._grids = np.empty((f, 5))
         self._starts = np.zeros((f, max(CELLS_A_DRONE * n, 16) + 1), np.int64)
         self._order = np.empty((f, n), np.int64)
         self.sums = np.zeros((2, f, n))
         """u of Eq. 38 without u_vf, m/s^2, as last perceived."""
-        self._middles, self._commands = np.zeros((2, f, n)), np.zeros((2, f, n))
+        self._middles, self._own, self._commands = (np.zeros((2, f, n)) for _ in range(3))
         self._level, self._straight, self._unsafe = (np.empty((f, n)) for _ in range(3))
 
     def step(self, step: int, pool: ThreadPoolExecutor | None, threads: int) -> None:
         """One step of all flights."""
         f, n = self._shape
         drones = _parts(f * n, threads, _LEAST_DRONES)
-        self.perceive(pool, threads)
+        self.perceive(step, pool, threads)
         self._measure(step, pool, threads)
         desired, height_m = self._missions.step(float(self._times[step]), self.states[:2], self._middles)
         self._note_goal(step)
         gusts = self._next_gusts()
         climbs = bool(np.isfinite(height_m).any())
         states, flat = self.states.reshape(6, -1), height_m.reshape(-1)
+        own = states[3:5] if self._errors is None else self._own.reshape(2, -1)
 
         def fly(a: int, b: int) -> None:
             p = self._drone.flocking
             commands = self._commands.reshape(2, -1)
             motion.commands(
-                a, b, self.sums.reshape(2, -1), desired.reshape(2, -1), p.velocity * p.own_weight, states[3:5],
+                a, b, self.sums.reshape(2, -1), desired.reshape(2, -1), p.velocity * p.own_weight, own,
                 self._drone.step_s, p.max_acceleration_m_s2, p.max_speed_m_s, commands,
             )  # fmt: skip
             motion.fly(a, b, states, commands, gusts, self._substeps)
@@ -119,17 +131,24 @@ class FlockFlights:
 
         _run(pool, drones, fly)
 
-    def perceive(self, pool: ThreadPoolExecutor | None = None, threads: int = 1) -> None:
+    def perceive(self, step: int, pool: ThreadPoolExecutor | None = None, threads: int = 1) -> None:
         """What each drone sees of the others now, and what the law makes of it: `sums`."""
         f, n = self._shape
         flights = _parts(f, threads, least=max(_LEAST_DRONES // n, 1))
         cells = self._grids, self._starts, self._order, self._by_slot
         _run(pool, flights, lambda a, b: sort_flights(a, b, self.states, *cells))
-        _run(pool, _parts(f * n, threads, _LEAST_DRONES), self._perceive)
+        _run(pool, _parts(f * n, threads, _LEAST_DRONES), lambda a, b: self._perceive(a, b, step))
 
-    def _perceive(self, a: int, b: int) -> None:
+    def _perceive(self, a: int, b: int, step: int) -> None:
         cells = self._by_slot, self._grids, self._starts, self._order
         weight = self._drone.flocking.weight
+        if self._errors is not None:
+            nearest = weight.nearest if weight.kind == "nearest" else 0
+            perceived_sums.perceived_sums(
+                a, b, *cells, self._law, nearest, *self._errors, step, self._missions.goal() is not None, self.sums,
+                self._middles, self._own,
+            )  # fmt: skip
+            return
         if weight.kind == "uniform" or self._missions.goal() is not None:
             law_sums.uniform_sums(a, b, *cells, self._law, self.sums, self._middles)
         if weight.kind == "nearest":
@@ -161,8 +180,8 @@ class FlockFlights:
         if goal is not None:
             place, last = goal
             self._away_m = np.hypot(*(self.states[:2].mean(axis=2) - place[:, None]))
-            there = last & (self._away_m <= self._missions.reached_m) & np.isnan(self._goal_times)
-            self._goal_times[there] = self._times[step]
+            there = last & (self._away_m <= self._missions.reached_m) & np.isnan(self._arrival_s)
+            self._arrival_s[there] = self._times[step]
 
     def figures(self) -> list[Figures]:
         """Of each flight."""
@@ -170,27 +189,34 @@ class FlockFlights:
 
     def _of_goal(self, flight: int) -> Figures:
         if self._missions.goal() is None:
-            return {"arrived": None, "time_s": None, "final_error_m": None}
-        since_s, away_m = float(self._goal_times[flight]), float(self._away_m[flight])
+            return {"arrived": None, "arrival_time_s": None, "final_error_m": None}
+        since_s, away_m = float(self._arrival_s[flight]), float(self._away_m[flight])
         return {
             "arrived": away_m <= self._missions.reached_m,
-            "time_s": None if math.isnan(since_s) else since_s,
+            "arrival_time_s": None if math.isnan(since_s) else since_s,
             "final_error_m": away_m,
         }
 
 
-def _starts(scenario: ScenarioConfig, seed: int, spread_m: float, height_m: float | None) -> FloatArray:
+def _start(scenario: ScenarioConfig) -> FloatArray:
     """States (6, n) NED at the start."""
-    places = np.array([vehicle.position_m for vehicle in scenario.vehicles], dtype=float)
-    if height_m is not None:
-        places[:, 2] = -height_m
-    velocities = np.array([[*vehicle.velocity_m_s, 0.0] for vehicle in scenario.vehicles], dtype=float)
-    random = np.random.default_rng([seed, 1])
-    angle, radius = random.uniform(0.0, 2 * math.pi, len(places)), np.sqrt(random.uniform(0.0, 1.0, len(places)))
-    most_m = np.minimum(spread_m, _SMALLEST_SHARE * _nearest(places[:, :2]))
-    places[:, 0] += most_m * radius * np.cos(angle)
-    places[:, 1] += most_m * radius * np.sin(angle)
-    return np.vstack([places.T, velocities.T])
+    rows = [[*vehicle.position_m, *vehicle.velocity_m_s, 0.0] for vehicle in scenario.vehicles]
+    return np.array(rows, dtype=float).T
+
+
+def _alike(scenarios: Sequence[ScenarioConfig]) -> list[list[int]]:
+    """Numbers of scenarios that can be flown side by side."""
+    groups: list[tuple[object, list[int]]] = []
+    for number, scenario in enumerate(scenarios):
+        missions = [(vehicle.mission, vehicle.by_hand) for vehicle in scenario.vehicles]
+        key = scenario.model_copy(update={"seed": 0, "vehicles": ()}), missions
+        for known, numbers in groups:
+            if known == key:
+                numbers.append(number)
+                break
+        else:
+            groups.append((key, [number]))
+    return [numbers for _, numbers in groups]
 
 
 def _nearest(places: FloatArray) -> FloatArray:

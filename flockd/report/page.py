@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import jinja2
 import numpy as np
 from markupsafe import Markup
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -29,6 +28,7 @@ from flockd.report.filmstrip import filmstrip_figure
 from flockd.report.obstacle_figures import in_the_way, obstacle_figure
 from flockd.report.page_texts import page_texts
 from flockd.report.style import colour_of
+from flockd.report.templates import page_template
 from flockd.report.trajectories import trajectories
 from flockd.side_process import SideProcess, shared
 
@@ -76,7 +76,7 @@ def write_report(
     autopilot = AutopilotLog.load(beside) if beside.is_file() else None
     if autopilot is not None:
         embedded["autopilot"] = _of_autopilot(log, autopilot, folder)
-    page = _template().render(
+    page = page_template(Path(__file__).with_name("report.html")).render(
         **page_texts(summary, log),
         **autopilot_texts(log, autopilot),
         **embedded,
@@ -131,14 +131,6 @@ def _of_autopilot(log: FlightLog, autopilot: AutopilotLog, folder: Path) -> Mark
     file, what = folder / "autopilot.png", "Velocities, height and flight modes as the autopilot logged them"
     shapes = [_embed(log, draw, file, what, narrow=narrow) for narrow in (False, True)]
     return Markup("\n").join(shape for shape in shapes if shape)
-
-
-def _template() -> jinja2.Template:
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    environment = jinja2.Environment(
-        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return environment.get_template("report.html")
 
 
 _MAX_SVG_BYTES = 700_000

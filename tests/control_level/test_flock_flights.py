@@ -9,7 +9,7 @@ import pytest
 
 from flockd.config import load_scenario
 from flockd.config.scenario import ScenarioConfig
-from flockd.control_level import fly_flocks
+from flockd.control_level import fly_flocks, scattered
 from flockd.control_level.flock_figures import orders
 from flockd.control_level.flock_flights import FlockFlights
 from flockd.data import data_path
@@ -24,6 +24,10 @@ from flockd.sim.start import with_drones
 def _scenario(name: str = "paper_flight", **overrides: Any) -> ScenarioConfig:
     keys = {key.replace("__", "."): value for key, value in overrides.items()}
     return load_scenario(data_path("config") / f"{name}.yaml", keys)
+
+
+def _seeded(scenario: ScenarioConfig, seed: int) -> ScenarioConfig:
+    return scattered(scenario.model_copy(update={"seed": seed}), 0.5)
 
 
 def _flown(flights: FlockFlights, threads: int = 1) -> tuple[FloatArray, FloatArray]:
@@ -53,11 +57,11 @@ def _flown(flights: FlockFlights, threads: int = 1) -> tuple[FloatArray, FloatAr
 def test_each_drone_accelerates_as_the_law_says(parameters: FlockingParameters, drones: int, spread_m: float) -> None:
     scenario = with_drones(_scenario(), drones)
     drone = scenario.drone.model_copy(update={"flocking": parameters})
-    flights = FlockFlights(scenario.model_copy(update={"drone": drone}), seeds=[0, 1])
+    flights = FlockFlights([scenario.model_copy(update={"drone": drone})] * 2)
     random = np.random.default_rng(drones)
     flights.states[:] = random.normal(0.0, spread_m, flights.states.shape)
     flights.states[:2, 1, 1] = flights.states[:2, 1, 0] + [0.0, 4e-4]  # nearer than the law's pole
-    flights.perceive()
+    flights.perceive(0)
     following = parameters.velocity * parameters.own_weight
     law = FlockingLaw(parameters)
     for flight in range(2):
@@ -73,9 +77,9 @@ def test_two_drones_at_one_spot_are_pushed_as_the_law_pushes_them() -> None:
     for parameters in (FlockingParameters(), FlockingParameters(weight=WeightParameters(kind="nearest"))):
         scenario = with_drones(_scenario(), 2)
         drone = scenario.drone.model_copy(update={"flocking": parameters})
-        flights = FlockFlights(scenario.model_copy(update={"drone": drone}), seeds=[0])
+        flights = FlockFlights([scenario.model_copy(update={"drone": drone})])
         flights.states[:] = 0.0
-        flights.perceive()
+        flights.perceive(0)
         u = FlockingLaw(parameters).acceleration([0.0, 0.0], [[0.0, 0.0]], [[0.0, 0.0]], [0.0, 0.0])
         np.testing.assert_allclose(flights.sums[:, 0], np.column_stack([u, u]))
 
@@ -93,7 +97,7 @@ def test_two_drones_at_one_spot_are_pushed_as_the_law_pushes_them() -> None:
 )
 def test_a_flight_is_the_simulators_flight_with_exact_states(scenario: ScenarioConfig, drones: int) -> None:
     scenario = with_drones(scenario, drones)
-    positions, velocities = _flown(FlockFlights(scenario, [scenario.seed], start_spread_m=0.0))
+    positions, velocities = _flown(FlockFlights([scenario]))
     _, true_positions, true_velocities = fly_exact_states(scenario)
     np.testing.assert_allclose(positions[:, 0], true_positions, atol=1e-9)
     np.testing.assert_allclose(velocities[:, 0], true_velocities, atol=1e-9)
@@ -101,7 +105,7 @@ def test_a_flight_is_the_simulators_flight_with_exact_states(scenario: ScenarioC
 
 def test_the_figures_are_those_of_the_metrics() -> None:
     scenario = with_drones(_scenario(duration_s=15.0), 9)
-    flights = FlockFlights(scenario, [4, 5])
+    flights = FlockFlights([_seeded(scenario, seed) for seed in (4, 5)])
     positions, velocities = _flown(flights)
     for flight, figures in enumerate(flights.figures()):
         x, v = positions[:, flight], velocities[:, flight]
@@ -117,7 +121,7 @@ def test_the_figures_are_those_of_the_metrics() -> None:
 
 def test_a_flock_that_has_fallen_apart_is_told_by_its_union() -> None:
     scenario = with_drones(_scenario(duration_s=1.0), 4)
-    flights = FlockFlights(scenario, [0])
+    flights = FlockFlights([scenario])
     flights.states[0, 0] = [0.0, 15.0, 300.0, 310.0]
     flights.states[1, 0] = 0.0
     _flown(flights)
@@ -126,7 +130,7 @@ def test_a_flock_that_has_fallen_apart_is_told_by_its_union() -> None:
 
 def test_contacts_are_counted_from_touch_to_free() -> None:
     scenario = with_drones(_scenario(duration_s=4.0, drone__flocking__max_acceleration_m_s2=0.001), 2)
-    flights = FlockFlights(scenario, [0], height_m=4.0)
+    flights = FlockFlights([scenario])
     flights.states[:, 0] = np.array([[0.0, 0.0, -4.0, 1.0, 0.0, 0.0], [3.0, 0.0, -4.0, -1.0, 0.0, 0.0]]).T
     figures = _and_fly(flights)  # 3 m apart, at 2 m/s towards each other: within 0.7 m at 1.5 s only
     assert figures["drone_collisions"] == 2  # each of the two drones has one
@@ -147,17 +151,19 @@ def test_order_of_one_that_stands_still_counts_as_in_the_metrics() -> None:
 @pytest.mark.parametrize("weight", ["uniform", "nearest"])
 def test_a_flight_is_the_same_in_any_batch_and_in_any_number_of_threads(weight: str) -> None:
     scenario = with_drones(_scenario(duration_s=5.0, drone__flocking__weight__kind=weight), 300)
-    alone = [fly_flocks(scenario, [seed])[0] for seed in (7, 8)]
-    assert fly_flocks(scenario, [3, 8, 7], threads=2)[1:] == alone[::-1]
+    flown = [_seeded(scenario, seed) for seed in (7, 8, 3)]
+    alone = [fly_flocks([one])[0] for one in flown[:2]]
+    shorter = scenario.model_copy(update={"duration_s": 1.0})
+    assert fly_flocks([flown[2], flown[1], shorter, flown[0]], threads=2)[1::2] == alone[::-1]
     assert alone[0] != alone[1]  # the seed moves the starts
 
 
 def test_a_flight_that_arrives_says_when() -> None:
-    figures = fly_flocks(_scenario("square", duration_s=190.0), [0], start_spread_m=0.0)[0]
+    figures = fly_flocks([_scenario("square", duration_s=190.0)])[0]
     assert figures["arrived"] is True
-    assert figures["time_s"] == 160.0  # as `flockd sim config/square.yaml --perception truth` says
+    assert figures["arrival_time_s"] == 160.0  # as `flockd sim config/square.yaml --perception truth` says
 
 
 def test_drones_flown_by_hand_are_refused() -> None:
     with pytest.raises(UsageError, match=r"vehicles\[0\] is flown by hand"):
-        fly_flocks(_scenario("led_by_hand"), [0])
+        fly_flocks([_scenario("led_by_hand")])

@@ -1,0 +1,181 @@
+"""Two campaigns compared, figure by figure, with a test that takes nothing for granted about the distribution."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any, Literal
+
+import numpy as np
+
+from flockd.campaign.differences import differences
+from flockd.campaign.figures import MEASURES
+from flockd.campaign.intervals import Interval, mean_interval
+from flockd.campaign.recipe import merged
+from flockd.campaign.results import Results
+from flockd.config import ScenarioConfig
+from flockd.config.campaign import DRONES, Figure
+from flockd.errors import UsageError
+from flockd.messages import FloatArray
+
+LEVEL = 0.05
+"""Of all figures together: so often one at most is called different where none is."""
+_EXACT_UP_TO = 13
+"""Of so many pairs all signs are tried."""
+_DRAWS = 10_000
+_NUMBERS_AT_ONCE = 500_000
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """On one figure."""
+
+    figure: Figure
+    first: float
+    second: float
+    """Means."""
+    difference: Interval
+    """Second less first, with its 95 % confidence interval."""
+    pairs: int
+    """Seeds that both flew; 0: they have none in common, and were compared as they are."""
+    p: float
+    """How often a difference so large would come up if there were none, adjusted for all figures (Holm, 1979)."""
+
+    @property
+    def says(self) -> Literal["better", "worse", "no difference shown"]:
+        """Of the second campaign."""
+        if self.p > LEVEL:
+            return "no difference shown"
+        return "better" if (self.difference.mean > 0) == (MEASURES[self.figure].better == "higher") else "worse"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Of two campaigns."""
+
+    first: Results
+    second: Results
+    cells: int
+    """That both have."""
+    verdicts: tuple[Verdict, ...]
+    changes: tuple[tuple[str, str, str], ...]
+    """Keys whose values differ for all flights, with both values."""
+
+    @property
+    def sentence(self) -> str:
+        """Whether the second is better, in words."""
+        better = [MEASURES[verdict.figure].name for verdict in self.verdicts if verdict.says == "better"]
+        worse = [MEASURES[verdict.figure].name for verdict in self.verdicts if verdict.says == "worse"]
+        name = f"{self.second.path}"
+        if better and worse:
+            return f"{name} is better in {_listed(better)}, but worse in {_listed(worse)}"
+        if better or worse:
+            return f"{name} is {'better' if better else 'worse'} in {_listed(better or worse)}"
+        return f"No difference is shown between {self.first.path} and {name}"
+
+
+def compare(first: Results, second: Results) -> Comparison:
+    """Over the cells that both have; seeds that both flew are pairs. Raises UsageError if nothing can be compared."""
+    theirs = {_key(cell.parameters): cell.number for cell in second.plan.cells}
+    cells = [(c.number, theirs[_key(c.parameters)]) for c in first.plan.cells if _key(c.parameters) in theirs]
+    figures = [figure for figure in first.figures if figure in second.figures]
+    verdicts = [verdict for figure in figures if (verdict := _verdict(first, second, figure, cells)) is not None]
+    if not verdicts:
+        raise UsageError(
+            f"{first.path} and {second.path} cannot be compared, without a cell and a figure that both have of two "
+            "seeds; vary and measure the same in both"
+        )
+    return Comparison(
+        first, second, len(cells), _adjusted(verdicts), tuple(differences(_values(first), _values(second)))
+    )
+
+
+def _verdict(first: Results, second: Results, figure: Figure, cells: list[tuple[int, int]]) -> Verdict | None:
+    mine = first.by_seed(figure, [one for one, _ in cells])
+    theirs = second.by_seed(figure, [other for _, other in cells])
+    # Flight n of both is a pair only where the seeds are the same.
+    offset = first.plan.config.seed - second.plan.config.seed
+    common = [number for number in mine if number + offset in theirs]
+    if len(common) >= 2:
+        a = np.array([mine[number] for number in common])
+        b = np.array([theirs[number + offset] for number in common])
+        difference = mean_interval((b - a).tolist())
+        assert difference is not None
+        return Verdict(figure, float(a.mean()), float(b.mean()), difference, len(common), paired_p(b - a))
+    a, b = np.array(list(mine.values())), np.array(list(theirs.values()))
+    if min(len(a), len(b)) < 2:
+        return None
+    return Verdict(figure, float(a.mean()), float(b.mean()), _of_two(a, b), 0, unpaired_p(a, b))
+
+
+def paired_p(differences: FloatArray) -> float:
+    """By flipping signs: of (n,) differences, how often their mean is as far from zero if each could be either way."""
+    n = len(differences)
+    if n <= _EXACT_UP_TO:
+        signs = np.array(list(product((1.0, -1.0), repeat=n)))
+        return float(np.mean(_as_far(signs @ differences, differences.sum())))
+    rng = np.random.default_rng(0)
+    far = sum(
+        int(_as_far(rng.choice((1.0, -1.0), (draws, n)) @ differences, differences.sum()).sum()) for draws in _blocks(n)
+    )
+    return (far + 1) / (_DRAWS + 1)
+
+
+def unpaired_p(first: FloatArray, second: FloatArray) -> float:
+    """By exchanging values: how often two sets drawn from all of them have means as far apart."""
+    rng = np.random.default_rng(0)
+    together, n = np.concatenate([first, second]), len(first)
+    far = 0
+    for draws in _blocks(len(together)):
+        mixed = rng.permuted(np.tile(together, (draws, 1)), axis=1)
+        apart = mixed[:, n:].mean(axis=1) - mixed[:, :n].mean(axis=1)
+        far += int(_as_far(apart, second.mean() - first.mean()).sum())
+    return (far + 1) / (_DRAWS + 1)
+
+
+def _blocks(length: int) -> list[int]:
+    """Of all draws, so many at once that they need little memory."""
+    block = max(_NUMBERS_AT_ONCE // length, 1)
+    return [min(block, _DRAWS - begin) for begin in range(0, _DRAWS, block)]
+
+
+def _as_far(found: FloatArray, seen: float) -> FloatArray:
+    """Whether each is; sums of the same numbers in another order differ by rounding."""
+    return np.abs(found) >= abs(seen) * (1 - 1e-9)
+
+
+def _of_two(first: FloatArray, second: FloatArray) -> Interval:
+    """The difference of two means, taken as normal."""
+    mean = float(second.mean() - first.mean())
+    reach = 1.96 * float(np.sqrt(first.var(ddof=1) / len(first) + second.var(ddof=1) / len(second)))
+    return Interval(mean, mean - reach, mean + reach)
+
+
+def _adjusted(verdicts: list[Verdict]) -> tuple[Verdict, ...]:
+    """With Holm's adjustment: the smallest p counts as many times as there are figures, the next one time less, ..."""
+    order = sorted(range(len(verdicts)), key=lambda i: verdicts[i].p)
+    adjusted, largest = list(verdicts), 0.0
+    for rank, i in enumerate(order):
+        largest = max(largest, min(verdicts[i].p * (len(verdicts) - rank), 1.0))
+        adjusted[i] = replace(verdicts[i], p=largest)
+    return tuple(adjusted)
+
+
+def _key(parameters: Mapping[str, Any]) -> str:
+    return json.dumps(dict(parameters), sort_keys=True)
+
+
+def _values(results: Results) -> Mapping[str, Any]:
+    """What holds for all flights, with every default."""
+    config = results.plan.config
+    fixed = {key: value for key, value in config.fixed.items() if key != DRONES}
+    scenario = ScenarioConfig.model_validate(merged(results.plan.base, fixed)).model_dump(mode="json")
+    own = {"perception": config.perception, "scatter_m": config.scatter_m, DRONES: config.fixed.get(DRONES)}
+    own["errors"] = None if results.plan.errors is None else results.plan.errors.perception
+    return {"campaign": own, **scenario}
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -1,0 +1,75 @@
+"""Campaigns for the tests: short files, and flights that cost nothing."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from pathlib import Path
+
+from flockd.campaign.conduct import Conducted, conduct
+from flockd.campaign.engines import Flown
+from flockd.campaign.figures import Figures
+from flockd.campaign.flight_kinds import Task, fly_task
+from flockd.campaign.folder import CampaignFolder
+from flockd.campaign.plan import Plan
+from flockd.config import ScenarioConfig
+from flockd.config.campaign import Figure
+from flockd.data import data_path
+
+PAPER = data_path("config") / "paper_flight.yaml"
+HEAD = f"""\
+campaign: test
+scenario: {PAPER}
+seeds: 6
+scatter_m: 0.5
+"""
+
+
+def campaign_file(folder: Path, text: str, head: str = HEAD) -> Path:
+    """A campaign's file with these lines below its first ones."""
+    path = folder / "test.yaml"
+    path.write_text(head + text, encoding="utf-8")
+    return path
+
+
+class Shuffled:
+    """An engine that flies in this process, one task after the other, in an order drawn from a seed."""
+
+    def __init__(self, seed: int, room: int = 5, until: int | None = None) -> None:
+        """After ``until`` tasks it is interrupted."""
+        self._random, self._room, self._left = random.Random(seed), room, until
+        self._waiting: list[Task] = []
+
+    @property
+    def room(self) -> int:
+        return self._room - len(self._waiting)
+
+    def submit(self, task: Task) -> None:
+        self._waiting.append(task)
+
+    def wait(self) -> Sequence[Flown]:
+        if self._left == 0:
+            raise KeyboardInterrupt
+        if self._left is not None:
+            self._left -= 1
+        self._random.shuffle(self._waiting)
+        return [fly_task(self._waiting.pop())]
+
+
+def flown(plan: Plan, folder: Path, engine: Shuffled) -> Conducted:
+    with CampaignFolder(folder, plan) as campaign:
+        return conduct(plan, campaign, engine, lambda done, total: None)
+
+
+def made_up(scenarios: Sequence[ScenarioConfig], wanted: Sequence[Figure], _: object) -> list[Figures]:
+    """Figures that follow from a flight's scenario alone, in no time; seed 3 cannot be flown."""
+    if any(scenario.seed == 3 for scenario in scenarios):
+        raise ArithmeticError("no flight today")
+    values = [
+        one.drone.flocking.cohesion
+        + one.vehicles[0].position_m[0]
+        + 0.01 * one.seed
+        + 0.1 * one.drone.flocking.separation
+        for one in scenarios
+    ]
+    return [dict.fromkeys(wanted, value) for value in values]

@@ -1,0 +1,195 @@
+"""The engines give what flying in this process gives, also when processes, nodes or the campaign itself are killed."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+from flockd.campaign.conduct import conduct, task_of
+from flockd.campaign.engines import ENGINES, Engine
+from flockd.campaign.flight_kinds import FlownRun
+from flockd.campaign.folder import CampaignFolder
+from flockd.campaign.plan import Plan, Run
+from flockd.side_process import with_package
+from tests.campaign.flights import PAPER, Shuffled, campaign_file, flown
+
+FEW = f"campaign: test\nscenario: {PAPER}\nseeds: 3\nscatter_m: 0.5\nfixed: {{duration_s: 2}}\n"
+
+
+def few(folder: Path, seeds: int = 3, duration_s: float = 2.0) -> Plan:
+    text = FEW.replace("seeds: 3", f"seeds: {seeds}").replace("duration_s: 2", f"duration_s: {duration_s}")
+    return Plan.load(campaign_file(folder, "", text))
+
+
+def expected(plan: Plan, folder: Path) -> bytes:
+    flown(plan, folder / "expected", Shuffled(1))
+    return (folder / "expected" / "flights.parquet").read_bytes()
+
+
+def flown_on(plan: Plan, folder: Path, engine: Engine) -> bytes:
+    with CampaignFolder(folder, plan) as campaign:
+        conduct(plan, campaign, engine, lambda done, total: None)
+    return (folder / "flights.parquet").read_bytes()
+
+
+def test_a_process_gives_the_same_flights(tmp_path: Path) -> None:
+    plan = few(tmp_path)
+    with ENGINES["processes"](1, None) as engine:
+        assert flown_on(plan, tmp_path / "out", engine) == expected(plan, tmp_path)
+    timings = pq.read_table(tmp_path / "out" / "timings.parquet").to_pylist()
+    assert os.getpid() not in {row["process"] for row in timings}
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_is_replaced(tmp_path: Path) -> None:
+    """Both processes are killed as soon as they fly, and one again; all flights are there once."""
+    plan = few(tmp_path, seeds=12, duration_s=10.0)
+    killed: list[int] = []
+
+    def kill_some() -> None:
+        while len(killed) < 3:
+            for pid in workers_of(os.getpid()) - set(killed):
+                if len(killed) < 3:
+                    killed.append(pid)
+                    os.kill(pid, signal.SIGKILL)
+            time.sleep(0.2)
+
+    with ENGINES["processes"](2, None) as engine:
+        threading.Thread(target=kill_some, daemon=True).start()
+        assert flown_on(plan, tmp_path / "out", engine) == expected(plan, tmp_path)
+    assert len(killed) == 3
+
+
+def workers_of(parent: int) -> set[int]:
+    """Processes that a process has started to fly."""
+    found = set()
+    for entry in Path("/proc").iterdir():
+        try:
+            fields = (entry / "stat").read_text().rpartition(")")[2].split()
+            words = (entry / "cmdline").read_text()
+        except (OSError, ValueError):
+            continue
+        if entry.name.isdigit() and int(fields[1]) == parent and "popen_loky" in words:
+            found.add(int(entry.name))
+    return found
+
+
+@pytest.mark.slow
+def test_a_flight_that_ends_its_process_is_a_row(tmp_path: Path) -> None:
+    """Of one that always does; the others, which were lost with it, are flown."""
+    plan = few(tmp_path)
+    with ENGINES["processes"](2, None) as engine:
+        submit = engine._executor.submit  # type: ignore[attr-defined]
+
+        def submitted(work: Callable[..., Any], task: Any) -> Any:
+            return submit(_end if task.runs == (Run(0, 1),) else work, task)
+
+        engine._executor.submit = submitted  # type: ignore[attr-defined]
+        started = engine._started  # type: ignore[attr-defined]
+
+        def again() -> Any:
+            nonlocal submit
+            executor = started()
+            submit, executor.submit = executor.submit, submitted
+            return executor
+
+        engine._started = again  # type: ignore[attr-defined]
+        results: list[FlownRun] = []
+        for number in range(3):
+            engine.submit(task_of(plan, (Run(0, number),)))
+        while len(results) < 3:
+            results += [one for flown_task in engine.wait() for one in flown_task]
+    reasons = {one.run: one.reason for one in results}
+    assert reasons[Run(0, 0)] is reasons[Run(0, 2)] is None
+    assert "the process that flew it ended, 3 times" in (reasons[Run(0, 1)] or "")
+
+
+def _end(_: object) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@contextmanager
+def command(path: Path, out: Path, *more: str) -> Iterator[subprocess.Popen[bytes]]:
+    """`flockd campaign` of a file, as a person runs it."""
+    program = "import sys; from flockd.cli import main; sys.exit(main())"
+    words = [sys.executable, "-c", program, "campaign", str(path), "--out", str(out), *more]
+    with subprocess.Popen(words, env=with_package(os.environ), stderr=subprocess.DEVNULL) as process:
+        yield process
+
+
+@pytest.mark.slow
+def test_20_kills_lose_nothing_and_double_nothing(tmp_path: Path) -> None:
+    """Each kill comes at a random moment after the campaign has flown some more; its processes end with it."""
+    plan = few(tmp_path, seeds=200, duration_s=5.0)
+    path, out = tmp_path / "test.yaml", tmp_path / "out"
+    random_moment = random.Random(5)
+    finished: set[str] = set()
+    for kill in range(20):
+        with command(path, out, "--workers", "2") as process:
+            aim = len(finished) + random_moment.randrange(0, 8)
+            while process.poll() is None and len(names_in(out)) <= aim:
+                time.sleep(0.05)
+            time.sleep(random_moment.random())
+            workers = workers_of(process.pid)
+            process.kill()
+        now = names_in(out)
+        assert finished <= now, f"kill {kill} lost flights"
+        finished = now
+        until = time.monotonic() + 60
+        while any(Path(f"/proc/{pid}/cmdline").exists() for pid in workers) and time.monotonic() < until:
+            time.sleep(0.1)
+        assert not any(Path(f"/proc/{pid}/cmdline").exists() for pid in workers), "its processes fly on"
+    assert 0 < len(finished) < 200
+    with command(path, out, "--workers", "2") as process:
+        assert process.wait() == 0
+    rows = pq.read_table(out / "flights.parquet")["run"].to_pylist()
+    assert rows == [f"c0-s{number}" for number in range(200)]
+    assert (out / "flights.parquet").read_bytes() == expected(plan, tmp_path)
+
+
+def names_in(out: Path) -> set[str]:
+    """Flights that a folder holds, merged or not."""
+    names: set[str] = set()
+    for path in [out / "flights.parquet", *out.glob("parts/*.parquet")]:
+        try:
+            names |= set(pq.read_table(path, columns=["run"], partitioning=None)["run"].to_pylist())
+        except FileNotFoundError:
+            continue  # merged meanwhile, or not there yet
+    return names
+
+
+@pytest.mark.slow
+def test_a_ray_cluster_of_two_nodes_of_which_one_is_killed(tmp_path: Path) -> None:
+    """The rest of its flights is flown on the other one; the results are those of this process."""
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    plan = few(tmp_path, seeds=30, duration_s=10.0)
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    try:
+        second = cluster.add_node(num_cpus=1)
+        cluster.wait_for_nodes()
+
+        def kill_one() -> None:
+            while len(names_in(tmp_path / "out")) < 6:
+                time.sleep(0.2)
+            cluster.remove_node(second, allow_graceful=False)
+
+        threading.Thread(target=kill_one, daemon=True).start()
+        with ENGINES["ray"](2, cluster.address) as engine:
+            assert flown_on(plan, tmp_path / "out", engine) == expected(plan, tmp_path)
+        assert len({node["NodeID"] for node in cluster.list_all_nodes()} if hasattr(cluster, "x") else {1}) == 1
+    finally:
+        cluster.shutdown()

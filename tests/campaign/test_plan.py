@@ -1,0 +1,138 @@
+"""A person writes a campaign, makes a slip, and is told where it is; what is right becomes cells and seeds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flockd.campaign.plan import Plan, Run
+from flockd.data import data_path
+from flockd.errors import ConfigError
+from tests.campaign.flights import HEAD, PAPER, campaign_file
+
+EXAMPLES = sorted((data_path("config") / "campaigns").glob("*.yaml"))
+
+
+def problems(folder: Path, text: str, head: str = HEAD) -> list[str]:
+    path = campaign_file(folder, text, head)
+    with pytest.raises(ConfigError) as caught:
+        Plan.load(path)
+    return [str(problem).replace(str(path), "FILE") for problem in caught.value.problems]
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_the_examples_can_be_flown(path: Path) -> None:
+    plan = Plan.load(path)
+    assert plan.most_flights == len(plan.cells) * plan.config.seeds
+    assert plan.config.campaign == path.stem
+
+
+def test_a_grid_is_all_combinations_in_the_order_of_the_file(tmp_path: Path) -> None:
+    text = """\
+vary:
+  drone.flocking.cohesion: {low: 0.1, high: 0.3, steps: 3}
+  drones: {values: [2, 7]}
+cases:
+  calm: {}
+  windy: {vehicle.wind_m_s: [4, -1]}
+"""
+    plan = Plan.load(campaign_file(tmp_path, text))
+    assert [tuple(cell.parameters.values()) for cell in plan.cells] == [
+        (case, cohesion, drones) for case in ("calm", "windy") for cohesion in (0.1, 0.2, 0.3) for drones in (2, 7)
+    ]
+    last = plan.recipe(plan.cells[-1], 4).scenario()
+    assert (last.drone.flocking.cohesion, len(last.vehicles), last.vehicle.wind_m_s) == (0.3, 7, (4, -1))
+    assert last.seed == 4
+    first = plan.recipe(plan.cells[0], 0).scenario()
+    assert (first.vehicle.wind_m_s, first.drone.flocking.separation) == ((0.0, 0.0), 10.0)
+
+
+def test_a_flight_draws_its_own_values_from_its_seed_alone(tmp_path: Path) -> None:
+    text = "vary:\n  vehicle.gust_m_s: {low: 0.1, high: 0.5}\n  vehicle.wind_m_s: {low: [0, -2], high: [3, 0]}\n"
+    plan = Plan.load(campaign_file(tmp_path, text))
+    flights = [plan.recipe(plan.cells[0], number).scenario() for number in range(6)]
+    gusts = [flight.vehicle.gust_m_s for flight in flights]
+    assert len(plan.cells) == 1
+    assert len(set(gusts)) == 6
+    assert all(0.1 <= gust <= 0.5 for gust in gusts)
+    assert all(0 <= north <= 3 and -2 <= east <= 0 for north, east in (flight.vehicle.wind_m_s for flight in flights))
+    starts = [flight.vehicles[1].position_m for flight in flights]
+    assert len(set(starts)) == 6
+    assert all(abs(north - 0.5) <= 0.5 and abs(east + 2.8) <= 0.5 and down == -4.0 for north, east, down in starts)
+    later = Plan.load(campaign_file(tmp_path, "seed: 2\n" + text))
+    assert later.recipe(later.cells[0], 0) == plan.recipe(plan.cells[0], 2)
+
+
+def test_a_plan_is_its_own_copy(tmp_path: Path) -> None:
+    """What is rerun months later needs no file but the folder's."""
+    text = "fixed: {vehicle.wind_m_s: [1, 2]}\nvary: {drone.flocking.cohesion: {values: [0.1, 0.2]}}\n"
+    plan = Plan.load(campaign_file(tmp_path, text))
+    again = Plan.from_json(plan.to_json())
+    assert again.to_json() == plan.to_json()
+    assert again.recipe(again.cells[1], 5).scenario() == plan.recipe(plan.cells[1], 5).scenario()
+    assert Run(1, 5).name == "c1-s5"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            "vary:\n  drone.flocking.cohesoin: {values: [1]}\n",
+            "FILE:6: vary.drone.flocking.cohesoin.values[0]: is not a known key; did you mean `cohesion`?",
+        ),
+        (
+            "vary:\n  drone.flocking.cohesion:\n    values:\n      - 0.1\n      - -1\n",
+            "FILE:9: vary.drone.flocking.cohesion.values[1]: -1 is not at least 0; write a number, 0 or more",
+        ),
+        (
+            "vary:\n  vehicle.gust_m_s:\n    low: -0.5\n    high: 1\n",
+            "FILE:7: vary.vehicle.gust_m_s.low: -0.5 is not at least 0; write a number of metres a second, 0 or more",
+        ),
+        (
+            "fixed:\n  vehicles.0: 4\n",
+            "FILE:6: fixed.vehicles.0: `vehicles` is not a section, so that it has no `0`; set `vehicles` itself",
+        ),
+        (
+            "fixed: {drones: 5.5}\n",
+            "FILE:5: fixed.drones: must be whole numbers from 1 to 100, as in `values: [5, 10]`",
+        ),
+        (
+            "vary:\n  duration_s: {low: 5, high: 3, steps: 4}\n",
+            "FILE:6: vary.duration_s.high: 3 is not above `low`, 5; write a larger number",
+        ),
+        (
+            "vary:\n  duration_s: {values: [5], steps: 4}\n",
+            "FILE:6: vary.duration_s.steps: has no meaning beside `values`; delete one of them",
+        ),
+        (
+            "stop: {figure: min_distance, half_width: 1}\n",
+            "FILE:5: stop.figure: min_distance is not known; did you mean `min_distance_m`?",
+        ),
+        (
+            "measure: [order_tail]\nstop: {figure: min_distance_m, half_width: 1, batch: 5}\n",
+            "FILE:6: stop.figure: is not measured; add min_distance_m to `measure`",
+        ),
+        ("fixed: {seed: 3}\n", "FILE:5: fixed.seed: is set for each flight; write `seed` and `seeds` at the top level"),
+        (
+            "errors: shipped_networks.yaml\n",
+            "FILE:5: errors: is for `perception: control`; delete one of them",
+        ),
+        ("perception: guess\n", "FILE:5: perception: guess is not known; write `truth` or `sight` or `control`"),
+    ],
+)
+def test_a_slip_is_told_with_its_line_and_key(text: str, expected: str, tmp_path: Path) -> None:
+    assert any(problem.startswith(expected) for problem in problems(tmp_path, text)), problems(tmp_path, text)
+
+
+def test_seeds_that_change_nothing_are_refused(tmp_path: Path) -> None:
+    head = f"campaign: test\nscenario: {PAPER}\nseeds: 6\n"
+    (problem,) = problems(tmp_path, "", head)
+    assert problem.startswith("FILE:3: seeds: are all the same flight")
+    Plan.load(campaign_file(tmp_path, "fixed: {vehicle.gust_m_s: 0.2}\n", head))
+
+
+def test_a_drones_file_is_no_scenario(tmp_path: Path) -> None:
+    head = f"campaign: test\nscenario: {PAPER.with_name('simulator.yaml')}\nseeds: 6\n"
+    (problem,) = problems(tmp_path, "", head)
+    assert problem.startswith("FILE:2: scenario: names ")

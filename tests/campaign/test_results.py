@@ -1,0 +1,158 @@
+"""Flights are kept as they are finished, whatever flies them, and nothing is lost or flown twice."""
+
+from __future__ import annotations
+
+import fcntl
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from flockd.campaign import folder as folder_module
+from flockd.campaign.campaign_page import write_campaign_page, write_comparison_page
+from flockd.campaign.flight_kinds import FLIGHT_KINDS, FlightKind
+from flockd.campaign.folder import CampaignFolder
+from flockd.campaign.plan import Plan
+from flockd.campaign.results import Results
+from flockd.campaign.verdicts import compare
+from flockd.errors import UsageError
+from tests.campaign.flights import HEAD, Shuffled, campaign_file, flown, made_up
+
+GRID = "vary: {drone.flocking.cohesion: {values: [0.1, 0.2]}}\nmeasure: [min_distance_m, order_tail]\n"
+
+
+@pytest.fixture
+def made_up_flights(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(FLIGHT_KINDS, "truth", FlightKind(made_up, "truth"))
+
+
+@pytest.fixture
+def plan(tmp_path: Path) -> Plan:
+    return Plan.load(campaign_file(tmp_path, GRID))
+
+
+@pytest.mark.usefixtures("made_up_flights")
+def test_the_same_results_in_any_order_and_after_any_interruption(plan: Plan, tmp_path: Path) -> None:
+    """12 flights; of one folder interrupted twice, and one whose parts are merged all the time."""
+    assert flown(plan, tmp_path / "a", Shuffled(1)).flown == 12
+    for until in (2, 4):
+        with pytest.raises(KeyboardInterrupt):
+            flown(plan, tmp_path / "b", Shuffled(until, until=until))
+    last = flown(plan, tmp_path / "b", Shuffled(3, room=1))
+    assert (last.flown, last.failed, last.before) == (6, 1, 6)
+    assert flown(plan, tmp_path / "b", Shuffled(4)).before == 12
+    a, b = ((tmp_path / name / "flights.parquet").read_bytes() for name in "ab")
+    assert a == b
+    assert len(pq.read_table(tmp_path / "b" / "timings.parquet")) == 12
+
+
+@pytest.mark.usefixtures("made_up_flights")
+def test_a_kill_leaves_what_was_finished(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three flights, killed before they are merged, then in the middle of merging, then before parts are deleted."""
+    path = tmp_path / "out"
+    for step in (0, 1, 2):
+        with monkeypatch.context() as patch:
+            patch.setattr(CampaignFolder, "merge", _merge_that_ends_at(step))
+            with pytest.raises((KeyboardInterrupt, InterruptedError)):
+                flown(plan, path, Shuffled(step, until=3))
+    (path / "parts" / ".c0-s0.parquet.part").write_bytes(b"half")
+    conducted = flown(plan, path, Shuffled(9))
+    assert (conducted.before, conducted.flown) == (3, 9)
+    rows = pq.read_table(path / "flights.parquet").to_pylist()
+    assert [(row["cell"], row["number"]) for row in rows] == [(cell, seed) for cell in (0, 1) for seed in range(6)]
+    assert sorted(entry.name for entry in (path / "parts").iterdir()) == []
+
+
+def _merge_that_ends_at(step: int) -> object:
+    """After 0, 1 or 2 of the files that merging writes; once there is something to merge."""
+    merge = CampaignFolder.merge
+
+    def ended(self: CampaignFolder) -> None:
+        if not list((self.path / "parts").iterdir()):
+            return merge(self)
+        if step == 0:
+            raise InterruptedError
+        written = folder_module.write_table
+        left = [step]
+
+        def write(table: object, path: Path) -> None:
+            written(table, path)
+            left[0] -= 1
+            if left[0] == 0:
+                raise InterruptedError
+
+        folder_module.write_table = write
+        try:
+            return merge(self)
+        finally:
+            folder_module.write_table = written
+
+    return ended
+
+
+@pytest.mark.usefixtures("made_up_flights")
+def test_a_flight_that_fails_is_a_row_with_its_reason(plan: Plan, tmp_path: Path) -> None:
+    conducted = flown(plan, tmp_path / "out", Shuffled(1))
+    assert conducted.failed == 2
+    rows = pq.read_table(tmp_path / "out" / "flights.parquet").to_pylist()
+    failed = [row for row in rows if row["status"] == "failed"]
+    assert [row["run"] for row in failed] == ["c0-s3", "c1-s3"]
+    assert all(row["reason"].startswith("ArithmeticError: no flight today (flights.py:") for row in failed)
+    assert all(row["min_distance_m"] is None for row in failed)
+    assert {row["drone.flocking.cohesion"] for row in rows} == {0.1, 0.2}
+
+
+@pytest.mark.usefixtures("made_up_flights")
+def test_another_campaign_is_refused(plan: Plan, tmp_path: Path) -> None:
+    flown(plan, tmp_path / "out", Shuffled(1))
+    changed = Plan.load(campaign_file(tmp_path, GRID.replace("0.2]", "0.3]")))
+    with pytest.raises(
+        UsageError, match=r"`campaign\.vary\.drone\.flocking\.cohesion\.values` was \[0\.1, 0\.2\] and is"
+    ):
+        flown(changed, tmp_path / "out", Shuffled(1))
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "thesis.txt").write_text("the only copy")
+    with pytest.raises(UsageError, match="holds other files than a campaign's"):
+        flown(plan, tmp_path / "thesis", Shuffled(1))
+    with (tmp_path / "out" / ".lock").open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(UsageError, match="another process is flying this campaign"):
+            flown(plan, tmp_path / "out", Shuffled(1))
+
+
+@pytest.mark.usefixtures("made_up_flights")
+def test_the_report_says_what_was_flown(plan: Plan, tmp_path: Path) -> None:
+    flown(plan, tmp_path / "out", Shuffled(1))
+    results = Results.load(tmp_path / "out")
+    write_campaign_page(results, tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "12 flights of paper_flight in 2 cells" in page
+    assert f"flockd campaign rerun {tmp_path / 'out' / 'c1-s3'}" in page
+    assert "no flight today" in page
+    assert page.count("<svg") == 3, "two figures over a parameter, and the distribution of distances"
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    mean = results.interval("min_distance_m", [1])
+    assert mean is not None
+    assert sorted(results.by_seed("min_distance_m", [0, 1])) == [0, 1, 2, 4, 5]
+
+
+@pytest.mark.usefixtures("made_up_flights")
+def test_two_campaigns_are_compared_by_pairs(tmp_path: Path) -> None:
+    """Of 12 seeds one fails; in the other 11 all figures are 0.1 larger: of 2^11 ways to give signs 2 are as far."""
+    text = "vary: {drone.flocking.separation: {values: [5, 10]}}\nmeasure: [min_distance_m, collisions]\n"
+    head = HEAD.replace("seeds: 6", "seeds: 12")
+    for name, more in (("old", ""), ("same", "seed: 0\n"), ("new", "fixed: {drone.flocking.cohesion: 0.2}\n")):
+        flown(Plan.load(campaign_file(tmp_path, text + more, head)), tmp_path / name, Shuffled(1))
+    old, same, new = (Results.load(tmp_path / name) for name in ("old", "same", "new"))
+    equal = compare(old, same)
+    assert {verdict.says for verdict in equal.verdicts} == {"no difference shown"}
+    assert equal.sentence.startswith("No difference is shown")
+    found = compare(old, new)
+    assert [verdict.says for verdict in found.verdicts] == ["better", "worse"]
+    assert [verdict.pairs for verdict in found.verdicts] == [11, 11]
+    assert [verdict.difference.mean for verdict in found.verdicts] == pytest.approx([0.1, 0.1])
+    assert [verdict.p for verdict in found.verdicts] == [2 * 2 / 2**11] * 2, "adjusted for two figures"
+    assert found.changes == (("drone.flocking.cohesion", "0.1", "0.2"),)
+    assert found.sentence == f"{tmp_path / 'new'} is better in nearest distance, but worse in collisions with obstacles"
+    write_comparison_page(found, tmp_path / "page.html")
+    assert found.sentence in (tmp_path / "page.html").read_text(encoding="utf-8")
