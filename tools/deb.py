@@ -3,10 +3,11 @@
 python -m tools.deb --arch arm64                          # dist/flockd_..._arm64.deb, for Debian 12
 python -m tools.deb --arch amd64 --system ubuntu24.04 --out packages
 
-Needs no root, no compiler and no computer of that architecture: pip, `dpkg-deb`, and a package index for the wheels that
-requirements/service.txt names, each checked against its hash. The package is a virtual environment in /usr/lib/flockd
-that uses the distribution's Python, so each distribution needs its own. Nothing of it runs while it is installed but the
-scripts of packaging/deb. The same commit gives the same bytes: times are those of the commit, or SOURCE_DATE_EPOCH.
+Needs no root, no compiler and no computer of that architecture: pip, `dpkg-deb`, and a package index for the wheels
+that requirements/service.txt names, each checked against its hash. The package is a virtual environment in
+/usr/lib/flockd that uses the distribution's Python, so each distribution needs its own. Nothing of it runs while it is
+installed but the scripts of packaging/deb. The same commit gives the same bytes: times are those of the commit, or
+SOURCE_DATE_EPOCH.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import sys
 import tempfile
 import time
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,7 +36,6 @@ HOME = "usr/lib/flockd"
 UNIT_FOLDER = "usr/lib/systemd/system"
 HAND_MADE, PACKAGED = "/opt/flockd/bin/flockd", "/usr/bin/flockd"
 """What the units of systemd/ start, and what those of the package do."""
-BUILD_ONLY = "setuptools"
 COMMAND = f"""\
 #!/{HOME}/bin/python
 import sys
@@ -90,9 +90,10 @@ def main() -> int:
     return DONE
 
 
-def build(out: Path, arch: str, system: str, version: str) -> Path:
+def build(out: Path, arch: str, system: str, version: str, *, shelf: Path | None = None, level: int = 9) -> Path:
     """Writes the package into ``out`` and gives its path.
 
+    ``shelf``: a folder that has the lock's wheels for that system already. ``level``: of compression, 1 to 19.
     Raises UnavailableError where dpkg or a time is missing, CalledProcessError where pip or dpkg fails.
     """
     if shutil.which("dpkg-deb") is None:
@@ -102,9 +103,12 @@ def build(out: Path, arch: str, system: str, version: str) -> Path:
     out.mkdir(parents=True, exist_ok=True)
     file = out / f"flockd_{full_version}_{arch}.deb"
     with tempfile.TemporaryDirectory() as scratch:
-        tree = Path(scratch) / "tree"
+        tree, own = Path(scratch) / "tree", Path(scratch) / "own"
         python = SYSTEMS[system].python
-        _environment(tree, Path(scratch) / "wheels", machine=MACHINES[arch], python=python)
+        if shelf is None:
+            shelf = Path(scratch) / "wheels"
+            wheels.download_locked(shelf, machine=MACHINES[arch], python=python)
+        _environment(tree, [*wheels.locked(shelf), wheels.build_own(own, shelf)], python)
         _system_files(tree)
         _documents(tree, full_version, epoch_s)
         _set_modes(tree)
@@ -117,23 +121,18 @@ def build(out: Path, arch: str, system: str, version: str) -> Path:
             "SIZE_KB": str(sum(path.stat().st_size for path in tree.rglob("*") if path.is_file()) // 1024),
         }
         _control(tree, values)
-        command = ["dpkg-deb", "--root-owner-group", "-Zzstd", "-z9", "--build", str(tree), str(file)]
-        subprocess.run(
-            command, check=True, stdout=subprocess.DEVNULL, env={**os.environ, "SOURCE_DATE_EPOCH": str(epoch_s)}
-        )
+        command = ["dpkg-deb", "--root-owner-group", "-Zzstd", f"-z{level}", "--build", str(tree), str(file)]
+        environment = {**os.environ, "SOURCE_DATE_EPOCH": str(epoch_s)}
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=environment)
     return file
 
 
-def _environment(tree: Path, downloads: Path, *, machine: str, python: str) -> None:
+def _environment(tree: Path, contents: Sequence[Path], python: str) -> None:
     """The virtual environment: what `python -m venv` and pip make of the wheels, made without running them."""
     home = tree / HOME
-    packages = home / "lib" / f"python{python}" / "site-packages"
     (home / "bin").mkdir(parents=True)
-    wheels.download_locked(downloads, machine=machine, python=python)
-    wheels.build_own(downloads, wheels.of_package(downloads, BUILD_ONLY))
-    for wheel in sorted(downloads.glob("*.whl")):
-        if wheel != wheels.of_package(downloads, BUILD_ONLY):
-            wheels.unpack(wheel, packages)
+    for wheel in contents:
+        wheels.unpack(wheel, home / "lib" / f"python{python}" / "site-packages")
     (home / "pyvenv.cfg").write_text("home = /usr/bin\ninclude-system-site-packages = false\n", encoding="utf-8")
     (home / "bin/python").symlink_to(f"/usr/bin/python{python}")
     _write(home / "bin/flockd", COMMAND)

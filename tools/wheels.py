@@ -14,13 +14,14 @@ import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from tools.lock import LOCK, ROOT
+from tools.lock import LOCK, ROOT, pins
 
 SOURCES = (
     *("flockd", "models", "config", "systemd", "requirements"),
     *("pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE", "NOTICE"),
 )
 """What building flockd needs of the tree."""
+BUILD_ONLY = "setuptools"
 OLDEST_GLIBC, NEWEST_GLIBC = 17, 28
 """2.17 is the oldest that wheels are made for, 2.28 the newest that the locked ones need: Debian 10 has it."""
 
@@ -50,8 +51,14 @@ def download_locked(folder: Path, *, machine: str, python: str) -> None:
     download(folder, ["--require-hashes", f"--requirement={LOCK}"], machine=machine, python=python)
 
 
-def build_own(folder: Path, setuptools: Path) -> Path:
-    """Builds flockd's wheel with the locked setuptools, whose wheel is given. Raises CalledProcessError.
+def locked(shelf: Path) -> list[Path]:
+    """The wheels in a folder that the lock names, but for what only builds flockd. Raises StopIteration without one."""
+    names = [pin.name for pin in pins(LOCK.read_text(encoding="utf-8")) if pin.name != BUILD_ONLY]
+    return [_of_package(shelf, name) for name in names]
+
+
+def build_own(folder: Path, shelf: Path) -> Path:
+    """Builds flockd's wheel into ``folder`` with the locked setuptools of ``shelf``. Raises CalledProcessError.
 
     The tree is copied first: setuptools takes into a wheel whatever an earlier build left in `build/`.
     """
@@ -59,10 +66,10 @@ def build_own(folder: Path, setuptools: Path) -> Path:
         source, tools = Path(scratch) / "source", Path(scratch) / "tools"
         source.mkdir()
         copy_sources(source)
-        unpack(setuptools, tools)
+        unpack(_of_package(shelf, BUILD_ONLY), tools)
         options = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index", f"--wheel-dir={folder}"]
         _pip("wheel", *options, str(source), PYTHONPATH=str(tools))
-    return next(folder.glob("flockd-*.whl"))
+    return _of_package(folder, "flockd")
 
 
 def unpack(wheel: Path, target: Path) -> None:
@@ -74,9 +81,8 @@ def unpack(wheel: Path, target: Path) -> None:
         archive.extractall(target)
 
 
-def of_package(wheels: Path, name: str) -> Path:
-    """The wheel of a package, by its name in the lock."""
-    return next(wheels.glob(f"{name.replace('-', '_')}-*.whl"))
+def _of_package(shelf: Path, name: str) -> Path:
+    return next(shelf.glob(f"{name.replace('-', '_')}-*.whl"))
 
 
 def _pip(*arguments: str, **environment: str) -> None:
