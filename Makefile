@@ -1,11 +1,12 @@
 # `make` prints the targets. Each makes its own virtual environment in .venv first; PYTHON names the interpreter for it.
 
 PYTHON ?= python3
+SYSTEM ?= debian12
 VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help demo docs lint test test-all browser coverage mutate mutate-all references lock sbom clean
+.PHONY: help demo docs lint test test-all browser coverage mutate mutate-all references deb lock sbom clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -43,6 +44,10 @@ mutate-all: $(VENV)/test.installed ## try them on every mutant, in about a quart
 
 references: $(VENV)/test.installed ## write what the recorded flights of tests/replay are expected to give again
 	$(BIN)/python -m tools.record_regressions --only references
+
+deb: $(BIN)/pip ## build Debian packages for amd64 and arm64 in dist; SYSTEM=debian13 or ubuntu24.04 for others than Debian 12
+	$(BIN)/python -m tools.deb --arch amd64 --system $(SYSTEM) --out dist
+	$(BIN)/python -m tools.deb --arch arm64 --system $(SYSTEM) --out dist
 
 lock: $(VENV)/release.installed ## write requirements/service.txt again, with the newest versions that pyproject.toml permits
 	$(BIN)/python -m tools.lock

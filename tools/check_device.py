@@ -1,13 +1,15 @@
 """Check flockd on a real kernel and a real init: virtual cameras and systemd, in a virtual machine made for it.
 
-sudo python tools/check_device.py                               # from nothing; downloads about 300 MB
-sudo python tools/check_device.py --cache /var/cache/flockd     # keeps what it built for the next time
+sudo python3 -m tools.check_device                              # from nothing; downloads about 300 MB
+sudo python3 -m tools.check_device --cache /var/cache/flockd    # keeps what it built for the next time
+sudo python3 -m tools.check_device --package                    # the Debian package: installed, upgraded, removed
 
 Needs Linux on x86-64 with qemu-system-x86, mmdebstrap and e2fsprogs, and no KVM: the processor is emulated. The machine
 runs Debian 12 with its own kernel and systemd; flockd is installed by the lines of docs/real_drone.md, and its unit
 runs `flockd run` with the shipped networks. The autopilot is flockd's fake; as an emulated processor is slow, the
 images are small and the steps far apart. The machine's clock counts instructions, a nanosecond each: how busy this
-computer is changes how long the check takes, and nothing of what it measures.
+computer is changes how long the check takes, and nothing of what it measures. With --package, which installs half a
+gigabyte twice, KVM is used where there is one, and the machine's clock is that of this computer.
 
 Exit code 0, 1 a check failed, 69 something needed is not there. A check that is a row of the catalogue of faults
 (`python -m tools.faults --list`) says which.
@@ -27,13 +29,17 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
+from tools import deb
+from tools.lock import LOCK, ROOT
+from tools.wheels import copy_sources, download, download_locked
+
 PROGRAMS = {"qemu-system-x86_64": "qemu-system-x86", "mmdebstrap": "mmdebstrap", "mkfs.ext4": "e2fsprogs"}
 """And the Debian package of each."""
 PACKAGES = (
@@ -42,17 +48,13 @@ PACKAGES = (
     *("gstreamer1.0-plugins-base", "gstreamer1.0-plugins-good", "gstreamer1.0-tools", "gstreamer1.0-plugins-base-apps"),
 )
 BOOT_MODULES = ("virtio_pci", "virtio_blk", "ext4")
-SOURCES = (
-    *("flockd", "models", "config", "systemd", "requirements"),
-    *("pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE"),
-)
-"""What the documentation's lines need of this folder."""
 PAGE, SECTION = ROOT / "docs" / "real_drone.md", "## Install it as a service"
 FAKE_AUTOPILOT = "pymavlink>=2.4.40"
 COMPILE = "import flockd.autopilot.fake_autopilot"
 """What it needs of a dozen MAVLink dialects, and no more."""
-PYTHON = "3.11"
-"""Debian's."""
+ARCH, DEBIAN = "amd64", "debian12"
+VERSIONS = ("1", "2")
+"""Of the package, before and after it is upgraded."""
 SYSTEM_PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 IMAGE_MB, MEMORY_MB = 4096, 2048
 PATIENCE_S = 3600.0
@@ -90,25 +92,37 @@ def main() -> int:
     parser.add_argument(
         "--only", nargs="+", default=[], metavar="GROUP", help="of capture, pipelines, sandbox and service"
     )
+    parser.add_argument("--package", action="store_true", help="check the Debian package, and that alone")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     try:
         _need_all()
         signal.signal(signal.SIGTERM, _end)
         with _folder(arguments.cache) as folder:
-            return _check(folder, arguments.only, as_json=arguments.json)
-    except UnavailableError as error:
+            part = _package() if arguments.package else _by_hand(arguments.only)
+            return _check(folder, part, as_json=arguments.json)
+    except (UnavailableError, deb.UnavailableError) as error:
         print(f"check_device: {error}", file=sys.stderr)
         return UNAVAILABLE
 
 
-def _check(folder: Path, only: Sequence[str], *, as_json: bool) -> int:
+@dataclass(frozen=True)
+class Part:
+    """What is checked."""
+
+    install: Callable[[Path, Path], None]
+    """Makes the machine's files ready, with a folder of wheels."""
+    share: Callable[[Path, Path], str]
+    """Puts what the checks need into a folder that the machine sees, likewise; their command."""
+    processor: tuple[str, ...]
+    """For QEMU."""
+
+
+def _check(folder: Path, part: Part, *, as_json: bool) -> int:
     begun_s = time.monotonic()
     rows: list[dict[str, Any]] = []
-    install, start = _documented_lines()
-    image = _build(folder, install)
-    _note("booting")
-    for line in _run(folder, image, start, only):
+    image, wheels = _build(folder, part)
+    for line in _run(folder, image, wheels, part):
         if "check" in line:
             rows.append(line)
             if not as_json:
@@ -153,8 +167,32 @@ def _documented_lines() -> tuple[str, str]:
     return blocks[0], blocks[1]
 
 
-def _build(folder: Path, install: str) -> Path:
-    """The machine's disk, with flockd installed. Raises UnavailableError when something cannot be fetched."""
+def _by_hand(groups: list[str]) -> Part:
+    """flockd installed by the documentation's lines; all groups of checks, or these."""
+    install, start = _documented_lines()
+
+    def share(shared: Path, _wheels: Path) -> str:
+        (shared / "start.sh").write_text(start, encoding="utf-8")
+        return " ".join(["/opt/flockd/bin/python -m tools.device_check.guest /mnt/findings/lines start.sh", *groups])
+
+    emulated = ("-machine", "pc,accel=tcg", "-cpu", "Nehalem", "-icount", "shift=0,sleep=off", "-rtc", "clock=vm")
+    return Part(lambda system, wheels: _install(system, wheels, install), share, emulated)
+
+
+def _package() -> Part:
+    """The Debian package in two versions, on a Debian without flockd."""
+
+    def share(shared: Path, wheels: Path) -> str:
+        _note("building the package in two versions")
+        files = [deb.build(shared, ARCH, DEBIAN, version, shelf=wheels, level=1).name for version in VERSIONS]
+        paths = (f"/mnt/check/{name}" for name in files)
+        return " ".join(["python3 -m tools.device_check.package /mnt/findings/lines", *paths])
+
+    return Part(_install_fake_autopilot, share, ("-machine", "pc,accel=kvm:tcg", "-cpu", "max"))
+
+
+def _build(folder: Path, part: Part) -> tuple[Path, Path]:
+    """The machine's disk, and the wheels for it. Raises UnavailableError when something cannot be fetched."""
     system = folder / "system"
     with ThreadPoolExecutor(1) as aside:
         wheels = aside.submit(_wheels, folder)
@@ -163,13 +201,14 @@ def _build(folder: Path, install: str) -> Path:
             shutil.rmtree(system, ignore_errors=True)
             _debian(system)
             (folder / "system.done").touch()
-        _note("installing flockd")
-        _install(system, wheels.result(), install)
+        _note("installing")
+        _empty(system)
+        part.install(system, wheels.result())
     _note("writing the disk")
     image = folder / "disk.img"
     image.unlink(missing_ok=True)
     _command("mkfs.ext4", "-q", "-O", "^has_journal", "-d", str(system), str(image), f"{IMAGE_MB}M")
-    return image
+    return image, wheels.result()
 
 
 def _debian(system: Path) -> None:
@@ -188,47 +227,56 @@ def _debian(system: Path) -> None:
 
 def _wheels(folder: Path) -> Path:
     """What the lock names and the fake autopilot needs, from the package index, for the machine's Python."""
-    lock = ROOT / "requirements/service.txt"
-    wheels = folder / f"wheels-{hashlib.sha256(lock.read_bytes() + FAKE_AUTOPILOT.encode()).hexdigest()[:8]}"
+    wheels = folder / f"wheels-{hashlib.sha256(LOCK.read_bytes() + FAKE_AUTOPILOT.encode()).hexdigest()[:8]}"
     if wheels.exists():
         return wheels
+    machine, python = deb.MACHINES[ARCH], deb.SYSTEMS[DEBIAN].python
     with tempfile.TemporaryDirectory(dir=folder) as fresh:
-        kinds = [f"--platform=manylinux_2_{minor}_x86_64" for minor in range(17, 37)]
-        options = ["--quiet", "--only-binary=:all:", f"--python-version={PYTHON}", "--platform=manylinux2014_x86_64"]
-        download = (sys.executable, "-m", "pip", "download", *options, *kinds, f"--dest={fresh}")
-        _command(*download, "--require-hashes", f"--requirement={lock}")
-        _command(*download, FAKE_AUTOPILOT)
+        try:
+            download_locked(Path(fresh), machine=machine, python=python)
+            download(Path(fresh), [FAKE_AUTOPILOT], machine=machine, python=python)
+        except subprocess.CalledProcessError as error:
+            raise UnavailableError("pip could not download the wheels; what it printed stands above") from error
         Path(fresh).rename(wheels)
         Path(fresh).mkdir()
     return wheels
 
 
-def _install(system: Path, wheels: Path, install: str) -> None:
-    """Runs the documentation's lines in the machine's files, as on a drone, but for where pip finds its packages."""
-    for old in ("opt/flockd", "opt/fake-autopilot", "etc/flockd", "root/flockd"):
+def _empty(system: Path) -> None:
+    """A Debian without flockd that runs the checks when it starts."""
+    for old in ("opt/flockd", "opt/fake-autopilot", "etc/flockd", "root/flockd", "root/wheels"):
         shutil.rmtree(system / old, ignore_errors=True)
-    source, shelf = system / "root/flockd", system / "root/wheels"
-    source.mkdir()
-    for name in SOURCES:
-        origin = ROOT / name
-        if origin.is_dir():
-            shutil.copytree(origin, source / name, ignore=shutil.ignore_patterns("__pycache__"))
-        else:
-            shutil.copy(origin, source / name)
-    shutil.copytree(wheels, shelf)
-    pip_finds = f"[global]\nno-index = true\nfind-links = /{shelf.relative_to(system)}\n"
-    (system / "etc/pip.conf").write_text(pip_finds, encoding="utf-8")
+    for old in ("usr/lib/sysusers.d/flockd.conf", "etc/systemd/system/flockd.service"):
+        (system / old).unlink(missing_ok=True)
     (system / "etc/fstab").write_text(FSTAB, encoding="utf-8")
     (system / "etc/hostname").write_text("drone\n", encoding="utf-8")
     (system / "etc/hosts").write_text("127.0.0.1 localhost drone\n", encoding="utf-8")
-    _inside(system, f"cd /{source.relative_to(system)}\n{install}")
-    install = f"pip install --quiet --no-compile --target /opt/fake-autopilot '{FAKE_AUTOPILOT}'"
-    _inside(system, f"/opt/flockd/bin/{install}\nPYTHONPATH=/opt/fake-autopilot /opt/flockd/bin/python -c '{COMPILE}'")
-    shutil.copy(ROOT / "tools/device_check/drone.yaml", system / "etc/flockd/drone.yaml")
+    (system / "etc/pip.conf").write_text("[global]\nno-index = true\nfind-links = /root/wheels\n", encoding="utf-8")
     (system / "etc/systemd/system/device-check.service").write_text(UNIT, encoding="utf-8")
     wanted = system / "etc/systemd/system/multi-user.target.wants/device-check.service"
     wanted.unlink(missing_ok=True)
     wanted.symlink_to("../device-check.service")
+
+
+def _install(system: Path, wheels: Path, install: str) -> None:
+    """Runs the documentation's lines in the machine's files, as on a drone, but for where pip finds its packages."""
+    source, shelf = system / "root/flockd", system / "root/wheels"
+    source.mkdir()
+    copy_sources(source)
+    shutil.copytree(wheels, shelf)
+    _inside(system, f"cd /{source.relative_to(system)}\n{install}")
+    install = f"pip install --quiet --no-compile --target /opt/fake-autopilot '{FAKE_AUTOPILOT}'"
+    _inside(system, f"/opt/flockd/bin/{install}\nPYTHONPATH=/opt/fake-autopilot /opt/flockd/bin/python -c '{COMPILE}'")
+    shutil.copy(ROOT / "tools/device_check/drone.yaml", system / "etc/flockd/drone.yaml")
+    shutil.rmtree(shelf)
+
+
+def _install_fake_autopilot(system: Path, wheels: Path) -> None:
+    """What it needs beyond flockd."""
+    shelf = system / "root/wheels"
+    shutil.copytree(wheels, shelf)
+    install = f"pip install --quiet --no-compile --target /opt/fake-autopilot '{FAKE_AUTOPILOT}'"
+    _inside(system, f"python3 -m venv /root/pip\n/root/pip/bin/{install}\nrm -r /root/pip")
     shutil.rmtree(shelf)
 
 
@@ -237,17 +285,16 @@ def _inside(system: Path, lines: str) -> None:
     _command("chroot", str(system), "env", "-i", f"PATH={SYSTEM_PATH}", "HOME=/root", "bash", "-ec", lines)
 
 
-def _run(folder: Path, image: Path, start: str, only: Sequence[str]) -> Iterator[dict[str, Any]]:
+def _run(folder: Path, image: Path, wheels: Path, part: Part) -> Iterator[dict[str, Any]]:
     """Boots, and gives what the machine writes down, line by line, until it has switched itself off."""
     shared, findings = folder / "check", folder / "findings"
     for fresh in (shared, findings):
         shutil.rmtree(fresh, ignore_errors=True)
         fresh.mkdir()
     shutil.copytree(ROOT / "tools/device_check", shared / "tools/device_check")
-    (shared / "start.sh").write_text(start, encoding="utf-8")
-    command = "exec /opt/flockd/bin/python -m tools.device_check.guest /mnt/findings/lines start.sh"
-    (shared / "check.sh").write_text(" ".join([command, *only]), encoding="utf-8")
-    machine = subprocess.Popen(_qemu(folder, image, shared, findings), stdin=subprocess.DEVNULL)
+    (shared / "check.sh").write_text(f"exec {part.share(shared, wheels)}\n", encoding="utf-8")
+    _note("booting")
+    machine = subprocess.Popen([*_qemu(folder, image, shared, findings), *part.processor], stdin=subprocess.DEVNULL)
     try:
         yield from _lines(findings / "lines", machine)
     finally:
@@ -258,8 +305,7 @@ def _run(folder: Path, image: Path, start: str, only: Sequence[str]) -> Iterator
 def _qemu(folder: Path, image: Path, shared: Path, findings: Path) -> list[str]:
     boot = folder / "system/boot"
     return [
-        "qemu-system-x86_64", "-nodefaults", "-no-reboot", "-display", "none", "-machine", "pc,accel=tcg",
-        "-cpu", "Nehalem", "-m", str(MEMORY_MB), "-icount", "shift=0,sleep=off", "-rtc", "clock=vm",
+        "qemu-system-x86_64", "-nodefaults", "-no-reboot", "-display", "none", "-m", str(MEMORY_MB),
         "-kernel", str(next(boot.glob("vmlinuz-*"))), "-initrd", str(next(boot.glob("initrd.img-*"))),
         "-append", "root=/dev/vda rw console=ttyS0 quiet",
         "-drive", f"file={image},format=raw,if=virtio,snapshot=on",

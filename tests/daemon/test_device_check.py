@@ -10,12 +10,16 @@ from pathlib import Path
 from flockd.config import load_drone
 
 ROOT = Path(__file__).parents[2]
-TOOL = ROOT / "tools" / "check_device.py"
 
 
 def test_without_its_programs_it_says_what_to_install(tmp_path: Path) -> None:
     result = subprocess.run(
-        [sys.executable, str(TOOL)], env={"PATH": str(tmp_path)}, capture_output=True, text=True, check=False
+        [sys.executable, "-m", "tools.check_device"],
+        env={"PATH": str(tmp_path)},
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert (result.returncode, result.stdout) == (69, "")
     assert result.stderr == (
