@@ -49,10 +49,12 @@ WARNING = 4
 BEFORE_S, AFTER_S = 10.0, 20.0
 """Of the log, around the flight."""
 GRID_S = 0.05
-FITS_M_S = 0.15
-"""Two records of the same commands differ by no more, root mean square, where they are laid on each other."""
+LEAST_SHARE = 0.6
+"""Of the commands' squares, which the log's setpoints explain at least where they are laid on each other."""
 LEAST_MOTION_M_S = 0.1
-LEAST_OVERLAP_S = 5.0
+NEARLY = 0.9
+FRESH_S = 0.5
+"""For how long a setpoint of the log counts."""
 
 UlogFile = ULog
 """A file that was read."""
@@ -219,17 +221,23 @@ def _by_setpoints(ulog: UlogFile, path: Path, log: FlightLog, drone: int) -> Cal
     times_s = np.arange(command_s[0], command_s[-1], GRID_S)
     held = command[np.searchsorted(command_s, times_s, side="right") - 1]
     shifts_s = np.arange(logged_s[0] - times_s[-1], logged_s[-1] - times_s[0], GRID_S)
-    errors = np.array([_mismatch(times_s + shift_s, held, logged_s, logged) for shift_s in shifts_s])
-    if not len(errors) or not errors.min() < FITS_M_S:
+    fits = np.array([_fit(times_s + shift_s, held, logged_s, logged) for shift_s in shifts_s])
+    shares, differences = fits.T if len(fits) else np.zeros((2, 1))
+    if shares.max() < LEAST_SHARE:
         raise _unusable(path, f"{refusal}its setpoints are not those of the flight")
-    shift_s = float(shifts_s[errors.argmin()])
+    # Steady flight explains as much at many shifts; of those the one that differs least, as commands change there.
+    shift_s = float(shifts_s[np.where(shares > NEARLY * shares.max(), differences, np.inf).argmin()])
     return lambda autopilot_s: autopilot_s - shift_s
 
 
-def _mismatch(times_s: FloatArray, held: FloatArray, logged_s: FloatArray, logged: FloatArray) -> float:
-    """Root mean square of the difference, m/s, where both are known; infinite where that is too short."""
+def _fit(times_s: FloatArray, held: FloatArray, logged_s: FloatArray, logged: FloatArray) -> tuple[float, float]:
+    """Which share of the commands' squares the log's setpoints explain, and their mean square difference.
+
+    Where the log has no setpoint it explains nothing, and does not differ.
+    """
     at = np.searchsorted(logged_s, times_s, side="right") - 1
-    near = (at >= 0) & (times_s - logged_s[np.maximum(at, 0)] < 1.0)
-    if near.sum() * GRID_S < min(LEAST_OVERLAP_S, 0.5 * len(times_s) * GRID_S):
-        return np.inf
-    return float(np.sqrt(np.mean((held[near] - logged[at[near]]) ** 2)))
+    known = (at >= 0) & (times_s - logged_s[np.maximum(at, 0)] < FRESH_S)
+    if not known.any():
+        return 0.0, np.inf
+    differs = float(np.sum((held - logged[at])[known] ** 2))
+    return float(np.sum(held[known] ** 2) - differs) / float(np.sum(held**2)), differs / int(known.sum())
