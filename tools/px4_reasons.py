@@ -129,7 +129,6 @@ PROVOCATIONS = (
         lambda bench: bench.begin_other_computer(), lambda bench: bench.end_other_computer(),
     ),
     _set("NAV_DLL_ACT", "2", "0", "check_rc_dl_no_dllink", "no_ground_station"),
-    _set("GF_MAX_VER_DIST", "0.0001", "0", "check_gf_violation_max_alt", "geofence_height"),
     _set("GF_MAX_HOR_DIST", "0.0001", "0", "check_gf_violation_max_hor_dist", "geofence_distance"),
     _set("COM_ARM_MIS_REQ", "1", "0", "check_modes_mission", "no_mission"),
     _set("COM_ARMABLE", "0", "1", "check_armable_configuration", "not_armable"),

@@ -6,7 +6,7 @@ import argparse
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
 
 from flockd.cli.flight_summary import show_summary
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from flockd.flight_log.key_frames import KeyFrame
     from flockd.flight_log.log import FlightLog
-    from flockd.flight_log.ulog import UlogFile
 
 SUFFIX = ".report"
 """Of the folder beside a recording that its report goes to."""
@@ -104,7 +103,7 @@ def _write(directory: Path, log: FlightLog, args: argparse.Namespace) -> int:
     return show_summary(directory, summary, as_json=args.json)
 
 
-def _ulog(path: Path) -> UlogFile:
+def _ulog(path: Path) -> Any:
     """Read first, so that a bad file costs no waiting."""
     from flockd.flight_log.ulog import read_ulog
 
@@ -114,7 +113,7 @@ def _ulog(path: Path) -> UlogFile:
     return ulog
 
 
-def _save_beside(directory: Path, log: FlightLog, recordings: Sequence[Path], ulog: UlogFile, path: Path) -> None:
+def _save_beside(directory: Path, log: FlightLog, recordings: Sequence[Path], ulog: Any, path: Path) -> None:
     """Writes what the autopilot logged, on the flight's time, to where the report finds it."""
     from flockd.flight_log.from_recordings import autopilot_clock
     from flockd.flight_log.ulog import autopilot_log, drone_of
@@ -125,7 +124,7 @@ def _save_beside(directory: Path, log: FlightLog, recordings: Sequence[Path], ul
     autopilot_log(ulog, path, log, drone, clock).save(directory / AUTOPILOT_LOG_NAME)
 
 
-def _again(args: argparse.Namespace, ulog: UlogFile | None) -> int:
+def _again(args: argparse.Namespace, ulog: Any | None) -> int:
     """The report of a flight whose folder has its log."""
     for option in ("out", "without_pictures", "force"):
         if getattr(args, option):

@@ -49,18 +49,18 @@ WARNING = 4
 BEFORE_S, AFTER_S = 10.0, 20.0
 """Of the log, around the flight."""
 GRID_S = 0.05
-FITS_M_S = 0.15
-"""Two records of the same commands differ by no more, root mean square, where they are laid on each other."""
+LEAST_SHARE = 0.6
+"""Of the commands' squares, which the log's setpoints explain at least where they are laid on each other."""
 LEAST_MOTION_M_S = 0.1
-LEAST_OVERLAP_S = 5.0
+NEARLY = 0.9
+FRESH_S = 0.5
+"""For how long a setpoint of the log counts."""
 
-UlogFile = ULog
-"""A file that was read."""
 Clock = tuple[FloatArray, FloatArray]
 """(n,) times on the drone's computer, and (n,) how far the autopilot's clock was ahead of it then."""
 
 
-def read_ulog(path: Path) -> UlogFile:
+def read_ulog(path: Path) -> ULog:
     """A ULog file. Raises UsageError for what is none, or too damaged, and OSError."""
     with path.open("rb") as file:
         begins = file.read(len(ULog.HEADER_BYTES))
@@ -78,15 +78,13 @@ def read_ulog(path: Path) -> UlogFile:
     return ulog
 
 
-def system_id(ulog: UlogFile) -> int | None:
+def system_id(ulog: ULog) -> int | None:
     """Of the autopilot that wrote it; None where it does not say."""
     number = ulog.initial_parameters.get("MAV_SYS_ID")
     return None if number is None else int(number)
 
 
-def drone_of(
-    ulog: UlogFile, path: Path, log: FlightLog, recordings: Sequence[Recording]
-) -> tuple[int, Recording | None]:
+def drone_of(ulog: ULog, path: Path, log: FlightLog, recordings: Sequence[Recording]) -> tuple[int, Recording | None]:
     """The number of the drone whose autopilot wrote it, and that drone's recording, if it is one of these.
 
     Of several by `autopilot.system_id`; in a simulated fleet autopilots count from 1 as the drones do. Raises
@@ -106,7 +104,7 @@ def drone_of(
     return drone, recording
 
 
-def autopilot_log(ulog: UlogFile, path: Path, log: FlightLog, drone: int, clock: Clock | None) -> AutopilotLog:
+def autopilot_log(ulog: ULog, path: Path, log: FlightLog, drone: int, clock: Clock | None) -> AutopilotLog:
     """What it holds of a drone's flight, on the flight's time.
 
     Args:
@@ -152,7 +150,7 @@ def _unusable(path: Path, why: str) -> UsageError:
     return UsageError(f"{path}: {why}; name a ULog file of this flight, as from the log folder of PX4's SD card")
 
 
-def _topic(ulog: UlogFile, name: str) -> Mapping[str, Any]:
+def _topic(ulog: ULog, name: str) -> Mapping[str, Any]:
     """Its first instance's fields, empty where it was not logged."""
     return next((found.data for found in ulog.data_list if found.name == name and found.multi_id == 0), {})
 
@@ -161,7 +159,7 @@ def _columns(topic: Mapping[str, Any], *names: str) -> FloatArray:
     return np.column_stack([np.asarray(topic[name], float) for name in names])
 
 
-def _home_down_m(ulog: UlogFile) -> float:
+def _home_down_m(ulog: ULog) -> float:
     """Down from the estimator's origin, at the end; 0 where home was not logged."""
     down = _topic(ulog, HOME).get("z", ())
     return float(down[-1]) if len(down) and np.isfinite(down[-1]) else 0.0
@@ -180,7 +178,7 @@ def _spans(times_s: FloatArray, what: Sequence[str]) -> tuple[Span, ...]:
     )
 
 
-def _said(ulog: UlogFile, to_flight: Callable[[FloatArray], FloatArray], end_s: float) -> tuple[Said, ...]:
+def _said(ulog: ULog, to_flight: Callable[[FloatArray], FloatArray], end_s: float) -> tuple[Said, ...]:
     said = [one for one in ulog.logged_messages if one.log_level & 0xF <= WARNING]  # the level is a digit in ASCII
     times_s = to_flight(np.array([1e-6 * one.timestamp for one in said]))
     inside = _around(times_s, end_s)
@@ -205,7 +203,7 @@ def _by_clock(clock: Clock, log: FlightLog) -> Callable[[FloatArray], FloatArray
     return to_flight
 
 
-def _by_setpoints(ulog: UlogFile, path: Path, log: FlightLog, drone: int) -> Callable[[FloatArray], FloatArray]:
+def _by_setpoints(ulog: ULog, path: Path, log: FlightLog, drone: int) -> Callable[[FloatArray], FloatArray]:
     """The same where the clock is not known: the shift at which both records of the commands agree best."""
     setpoints = _topic(ulog, SETPOINTS)
     logged_s, logged = 1e-6 * np.asarray(setpoints["timestamp"], float), _columns(setpoints, *NEEDED[SETPOINTS][:2])
@@ -219,17 +217,23 @@ def _by_setpoints(ulog: UlogFile, path: Path, log: FlightLog, drone: int) -> Cal
     times_s = np.arange(command_s[0], command_s[-1], GRID_S)
     held = command[np.searchsorted(command_s, times_s, side="right") - 1]
     shifts_s = np.arange(logged_s[0] - times_s[-1], logged_s[-1] - times_s[0], GRID_S)
-    errors = np.array([_mismatch(times_s + shift_s, held, logged_s, logged) for shift_s in shifts_s])
-    if not len(errors) or not errors.min() < FITS_M_S:
+    fits = np.array([_fit(times_s + shift_s, held, logged_s, logged) for shift_s in shifts_s])
+    shares, differences = fits.T if len(fits) else np.zeros((2, 1))
+    if shares.max() < LEAST_SHARE:
         raise _unusable(path, f"{refusal}its setpoints are not those of the flight")
-    shift_s = float(shifts_s[errors.argmin()])
+    # Steady flight explains as much at many shifts; of those the one that differs least, as commands change there.
+    shift_s = float(shifts_s[np.where(shares > NEARLY * shares.max(), differences, np.inf).argmin()])
     return lambda autopilot_s: autopilot_s - shift_s
 
 
-def _mismatch(times_s: FloatArray, held: FloatArray, logged_s: FloatArray, logged: FloatArray) -> float:
-    """Root mean square of the difference, m/s, where both are known; infinite where that is too short."""
+def _fit(times_s: FloatArray, held: FloatArray, logged_s: FloatArray, logged: FloatArray) -> tuple[float, float]:
+    """Which share of the commands' squares the log's setpoints explain, and their mean square difference.
+
+    Where the log has no setpoint it explains nothing, and does not differ.
+    """
     at = np.searchsorted(logged_s, times_s, side="right") - 1
-    near = (at >= 0) & (times_s - logged_s[np.maximum(at, 0)] < 1.0)
-    if near.sum() * GRID_S < min(LEAST_OVERLAP_S, 0.5 * len(times_s) * GRID_S):
-        return np.inf
-    return float(np.sqrt(np.mean((held[near] - logged[at[near]]) ** 2)))
+    known = (at >= 0) & (times_s - logged_s[np.maximum(at, 0)] < FRESH_S)
+    if not known.any():
+        return 0.0, np.inf
+    differs = float(np.sum((held - logged[at])[known] ** 2))
+    return float(np.sum(held[known] ** 2) - differs) / float(np.sum(held**2)), differs / int(known.sum())
