@@ -1,5 +1,5 @@
 // The fleet from above: north is up. Drawn when something has changed.
-import { colourOf, nameOf, placeOf, recent, state } from "./fleet_state.js";
+import { colourOf, lastPlaceOf, nameOf, placeOf, recent, state } from "./fleet_state.js";
 
 const TRAIL_S = 60;
 const FEW = 10; // up to so many drones show their neighbours all at once
@@ -18,6 +18,7 @@ export class FleetMap {
     this.follow.addEventListener("input", () => this.changed());
     section.querySelector("[name=in]").addEventListener("click", () => this.zoom(0.7));
     section.querySelector("[name=out]").addEventListener("click", () => this.zoom(1 / 0.7));
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.changed());
     new ResizeObserver(() => this.changed()).observe(this.canvas);
     this.listen();
   }
@@ -106,11 +107,11 @@ export class FleetMap {
     this.choose(nearest);
   }
 
-  // Where each drone is; without any position one drone's own view, with it in the middle.
+  // Where each drone is, or was last; without any position one drone's own view, with it in the middle.
   located() {
     const places = new Map();
     for (const key of state.order) {
-      const place = placeOf(state.rows.get(key));
+      const place = placeOf(state.rows.get(key)) || lastPlaceOf(key);
       if (place) places.set(key, place);
     }
     this.alone = null;

@@ -50,6 +50,12 @@ export function placeOf(row) {
   return [row.position_ne[0] + home[0], row.position_ne[1] + home[1]];
 }
 
+// Of one that is silent now.
+export function lastPlaceOf(key) {
+  const last = recent(key, KEEP_S).findLast((row) => row[1] !== null);
+  return last ? [last[1], last[2]] : null;
+}
+
 export function take(message) {
   state.now = message.time_s;
   state.order = message.order;
