@@ -109,7 +109,7 @@ def _silence(drone: Watched, state: str, now_s: float) -> list[str]:
     since = "" if last_s is None else f"; its last message came {_ago(now_s - last_s)} ago"
     if state == GONE:
         return [f"its process has ended or cannot be reached{since}"]
-    return [f"it can be reached and publishes nothing new{since}"]
+    return [f"it can be reached and publishes nothing new{since}"] if since else []  # its status says that it starts
 
 
 def _ago(seconds: float) -> str:

@@ -38,7 +38,7 @@ export class FleetCards {
     [this.section, this.choose, this.commands] = [section, choose, commands];
     this.template = document.getElementById("card");
     this.cards = new Map();
-    this.shown = new Map();
+    this.parts = new WeakMap();
     this.order = "";
     setInterval(() => this.look(), PICTURES_EVERY_MS);
   }
@@ -87,41 +87,48 @@ export class FleetCards {
       this.look();
     });
     this.cards.set(key, card);
+    const one = (name) => card.querySelector(name);
+    this.parts.set(card, {
+      name: one(".name span"), state: one(".state"), meaning: one(".meaning"), why: one(".why"), look: one(".look"),
+      refusal: one(".refusal"), pictures: one(".pictures"), values: [...list.querySelectorAll("dd")],
+      buttons: [...card.querySelectorAll("[data-command]")],
+    });
   }
 
   write(key) {
     const [card, row] = [this.cards.get(key), state.rows.get(key)];
+    const parts = this.parts.get(card);
     const [tone, meaning] = STATES[row.state];
-    card.dataset.tone = tone;
-    put(card.querySelector(".name span"), nameOf(key));
-    put(card.querySelector(".state"), row.state);
-    put(card.querySelector(".meaning"), row.mission ? `${meaning} · mission: ${row.mission}` : meaning);
-    const why = card.querySelector(".why");
+    if (card.dataset.tone !== tone) card.dataset.tone = tone;
+    put(parts.name, nameOf(key));
+    put(parts.state, row.state);
+    put(parts.meaning, row.mission ? `${meaning} · mission: ${row.mission}` : meaning);
     const told = row.why.join("\n");
-    if (why.dataset.told !== told) {
-      why.dataset.told = told;
-      why.replaceChildren(...row.why.map((sentence) => {
+    if (parts.told !== told) {
+      parts.told = told;
+      parts.why.replaceChildren(...row.why.map((sentence) => {
         const line = document.createElement("li");
         line.textContent = sentence;
         return line;
       }));
     }
-    const values = card.querySelectorAll("dd");
     VALUES.forEach(([, text, odd], i) => {
-      put(values[i], text(row));
-      values[i].classList.toggle("odd", Boolean(odd && odd(row)));
+      put(parts.values[i], text(row));
+      if (odd) parts.values[i].classList.toggle("odd", Boolean(odd(row)));
     });
-    for (const button of card.querySelectorAll("[data-command]")) {
-      button.disabled = !this.commands.allowed(button.dataset.command, key);
+    for (const button of parts.buttons) {
+      const off = !this.commands.allowed(button.dataset.command, key);
+      if (button.disabled !== off) button.disabled = off;
     }
-    card.querySelector(".look").disabled = !Object.keys(row.cameras).length;
-    put(card.querySelector(".refusal"), this.commands.refusal(key));
+    const blind = !Object.keys(row.cameras).length;
+    if (parts.look.disabled !== blind) parts.look.disabled = blind;
+    put(parts.refusal, this.commands.refusal(key));
   }
 
   // New pictures for the cards that show theirs, one request at a time for each camera.
   look() {
     for (const [key, card] of this.cards) {
-      const pictures = card.querySelector(".pictures");
+      const { pictures } = this.parts.get(card);
       if (pictures.hidden || document.hidden) continue;
       for (const camera of Object.keys(state.rows.get(key).cameras)) this.fetch(key, camera, pictures);
     }

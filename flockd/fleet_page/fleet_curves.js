@@ -12,6 +12,7 @@ const MEASURES = {
   clock: ["drone's clock less this computer's, s", 1],
 };
 const EVERY_MS = 2000;
+const MOST_POINTS = 2000; // of a line, with two a second in the history
 const FEW = 8; // more drones than this are one grey bundle, with the chosen one in front
 
 export class FleetCurves {
@@ -79,7 +80,7 @@ export class FleetCurves {
   points(keys) {
     const [x, y] = [[], []];
     const [column, factor] = [state.columns[this.select.value], MEASURES[this.select.value][1]];
-    const every = keys.length > 1 ? 4 : 1;
+    const every = Math.ceil((keys.length * 2 * KEEP_S) / MOST_POINTS);
     for (const key of keys) {
       recent(key, KEEP_S).forEach((row, i) => {
         if (i % every) return;

@@ -1,7 +1,7 @@
 // The fleet from above: north is up. Drawn when something has changed.
-import { colourOf, nameOf, placeOf, recent, state } from "./fleet_state.js";
+import { colourOf, lastPlaceOf, nameOf, placeOf, recent, state } from "./fleet_state.js";
 
-const TRAIL_S = 60;
+const [TRAIL_S, SHORT_TRAIL_S] = [60, 20];
 const FEW = 10; // up to so many drones show their neighbours all at once
 
 export class FleetMap {
@@ -18,6 +18,7 @@ export class FleetMap {
     this.follow.addEventListener("input", () => this.changed());
     section.querySelector("[name=in]").addEventListener("click", () => this.zoom(0.7));
     section.querySelector("[name=out]").addEventListener("click", () => this.zoom(1 / 0.7));
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.changed());
     new ResizeObserver(() => this.changed()).observe(this.canvas);
     this.listen();
   }
@@ -106,11 +107,11 @@ export class FleetMap {
     this.choose(nearest);
   }
 
-  // Where each drone is; without any position one drone's own view, with it in the middle.
+  // Where each drone is, or was last; without any position one drone's own view, with it in the middle.
   located() {
     const places = new Map();
     for (const key of state.order) {
-      const place = placeOf(state.rows.get(key));
+      const place = placeOf(state.rows.get(key)) || lastPlaceOf(key);
       if (place) places.set(key, place);
     }
     this.alone = null;
@@ -167,7 +168,7 @@ export class FleetMap {
     const keys = [...this.places.keys()];
     const all = this.neighbours.checked && keys.length <= FEW;
     this.fences(pen);
-    for (const key of keys) this.trail(pen, key);
+    for (const key of keys) this.trail(pen, key, keys.length <= FEW || key === state.chosen ? TRAIL_S : SHORT_TRAIL_S);
     let obstacles = false;
     for (const key of keys) {
       if (all || key === state.chosen || key === this.alone) this.sight(pen, key);
@@ -246,11 +247,11 @@ export class FleetMap {
     pen.setLineDash([]);
   }
 
-  trail(pen, key) {
+  trail(pen, key, seconds) {
     pen.strokeStyle = colourOf(key);
     pen.lineWidth = 1.5;
     pen.globalAlpha = 0.45;
-    const path = recent(key, TRAIL_S).filter((point) => point[1] !== null).map((point) => [point[1], point[2]]);
+    const path = recent(key, seconds).filter((point) => point[1] !== null).map((point) => [point[1], point[2]]);
     this.line(pen, [...path, this.places.get(key)]);
     pen.globalAlpha = 1;
   }

@@ -17,7 +17,7 @@ const cards = new FleetCards(document.getElementById("cards"), choose, commands)
 const curves = new FleetCurves(document.getElementById("curves"));
 const summary = document.getElementById("summary");
 const trouble = document.getElementById("trouble");
-let [socket, heard, lastEvent, told] = [null, 0, null, ""];
+let [socket, heard, lastEvent, told] = [null, 0, "", ""];
 const replay = new ReplayControls(document.getElementById("replay"), (at) => {
   if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ at }));
 });
@@ -47,6 +47,7 @@ async function connect() {
 
 async function greeted(hello) {
   complain("");
+  document.querySelector("#events ol").replaceChildren();
   state.live = hello.span_s === null;
   state.mayCommand = hello.may_command && state.live;
   const reply = await fetch("history");
@@ -66,7 +67,7 @@ function show(message) {
   map.changed();
   replay.shown(state.now);
   showSummary();
-  showEvents();
+  showEvents(message);
   if (first) curves.draw();
 }
 
@@ -89,21 +90,26 @@ function showSummary() {
   summary.replaceChildren(parts.length ? `${drones}: ` : "No drone was heard yet.", ...parts.flatMap((part, i) => (i ? [", ", part] : [part])));
 }
 
-function showEvents() {
-  const newest = state.events[state.events.length - 1];
-  const mark = newest ? `${newest[0]} ${newest[1]} ${newest[2]} ${state.events.length}` : "";
-  if (mark === lastEvent) return;
+// Live only what is new; of recordings all up to the time that is shown.
+function showEvents({ events, all_events: all }) {
+  const mark = all ? JSON.stringify(events) : "";
+  if (all ? mark === lastEvent : !events.length) return;
   lastEvent = mark;
   const list = document.querySelector("#events ol");
-  list.replaceChildren(...state.events.slice(-EVENTS_SHOWN).reverse().map(([time, key, sentence]) => {
-    const line = document.createElement("li");
-    line.append(document.createElement("time"), document.createElement("b"), document.createElement("span"));
-    const clock = new Date(Date.now() - 1000 * (state.now - time));
-    put(line.children[0], state.live ? clock.toLocaleTimeString([], { hour12: false }) : replay.label(time));
-    put(line.children[1], nameOf(key));
-    put(line.children[2], sentence);
-    return line;
-  }));
+  if (all) list.replaceChildren();
+  list.prepend(...events.slice(-EVENTS_SHOWN).reverse().map(eventLine));
+  while (list.children.length > EVENTS_SHOWN) list.lastChild.remove();
+}
+
+function eventLine([time, key, sentence]) {
+  const line = document.createElement("li");
+  line.append(document.createElement("time"), document.createElement("b"), document.createElement("span"));
+  const clock = new Date(Date.now() - 1000 * (state.now - time));
+  const parts = [clock.getHours(), clock.getMinutes(), clock.getSeconds()];
+  put(line.children[0], state.live ? parts.map((part) => String(part).padStart(2, "0")).join(":") : replay.label(time));
+  put(line.children[1], nameOf(key));
+  put(line.children[2], sentence);
+  return line;
 }
 
 function complain(sentence) {

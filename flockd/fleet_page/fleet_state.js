@@ -6,9 +6,9 @@ export const state = {
   now: 0,
   rows: new Map(),
   order: [],
+  fleets: 0,
   history: new Map(),
   columns: {},
-  events: [],
   chosen: null,
 };
 
@@ -40,8 +40,7 @@ export const STATES = {
 
 // A fleet's name is shown where there are several.
 export function nameOf(key) {
-  const fleets = new Set(state.order.map((one) => one.split("/")[0]));
-  return fleets.size > 1 ? key : key.split("/")[1];
+  return state.fleets > 1 ? key : key.split("/")[1];
 }
 
 export function placeOf(row) {
@@ -50,16 +49,22 @@ export function placeOf(row) {
   return [row.position_ne[0] + home[0], row.position_ne[1] + home[1]];
 }
 
+// Of one that is silent now.
+export function lastPlaceOf(key) {
+  const last = recent(key, KEEP_S).findLast((row) => row[1] !== null);
+  return last ? [last[1], last[2]] : null;
+}
+
 export function take(message) {
   state.now = message.time_s;
   state.order = message.order;
+  state.fleets = new Set(state.order.map((one) => one.split("/")[0])).size;
   for (const key of [...message.order].sort(byName)) if (!numbers.has(key)) numbers.set(key, numbers.size);
   for (const [key, row] of Object.entries(message.rows)) {
     state.rows.set(key, row);
     if (state.live) remember(key, row);
   }
   for (const key of state.rows.keys()) if (!message.order.includes(key)) state.rows.delete(key);
-  state.events = message.all_events ? message.events : [...state.events, ...message.events].slice(-500);
 }
 
 export const KEEP_S = 300;
@@ -98,6 +103,11 @@ export function written(value, digits, unit) {
   return value === null || value === undefined ? "–" : `${value.toFixed(digits)}${unit}`;
 }
 
+const texts = new WeakMap();
+
+// Writes an element's text where it has changed.
 export function put(element, text) {
-  if (element.textContent !== text) element.textContent = text;
+  if (texts.get(element) === text) return;
+  texts.set(element, text);
+  element.textContent = text;
 }
