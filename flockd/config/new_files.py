@@ -148,8 +148,8 @@ def _source(new: NewDrone, names: Sequence[str]) -> list[str]:
     lines = [
         "source:",
         "  kind: v4l2",
-        "  # Fill in: the socket of each camera, which `ls /dev/v4l/by-path` shows as an entry that ends in",
-        "  # index0, and its own controls (`v4l2-ctl -d DEVICE --list-ctrls`): a short, fixed exposure.",
+        "  # Fill in: the socket of each camera and its own controls, for a short, fixed exposure: `flockd cameras",
+        "  # --write FILE` writes this section for what is plugged in.",
         "  cameras:",
     ]
     for number, name in enumerate(names):

@@ -16,8 +16,8 @@ from flockd.flight_log.log import FlightLog
 from flockd.flight_log.moments import Moment, Outline, held_moments, recorded_moments
 from flockd.messages import FloatArray, UInt8Array
 from flockd.recording.reader import Recording
-from flockd.report.style import DRONE_COLOURS
 from flockd.report.flight_video import write_video
+from flockd.report.style import DRONE_COLOURS
 from tests.report.test_page import _flight
 
 NORMAL = Path(__file__).parents[1] / "replay" / "normal.mcap"
