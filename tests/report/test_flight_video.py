@@ -119,7 +119,7 @@ def test_key_frames_stand_in_for_a_recording_until_the_next_one() -> None:
     assert [moment.taken_s for moment in moments] == [1.0, 1.0, 1.0, 2.0]
     (outline,) = moments[0].outlines["front"]
     assert (outline.track, outline.range_m) == (7, 3.0)
-    assert outline.pixels.tolist() == [[30, 10], [50, 10], [50, 20], [30, 20]]
+    assert outline.pixels.tolist() == [[30, 10], [50, 10], [50, 20], [30, 20], [30, 10]]
     assert [moment.images for moment in held_moments([0.0, 1.0], [])] == [{}, {}]
 
 
