@@ -152,8 +152,8 @@ def _source(new: NewDrone, names: Sequence[str]) -> list[str]:
         return [
             "source:",
             "  kind: gstreamer",
-            "  # Fill in: what `gst-launch-1.0` takes, without a sink. `flockd cameras --write FILE` writes this section",
-            "  # for what is plugged in.",
+            "  # Fill in: what `gst-launch-1.0` takes, without a sink. `flockd cameras --write FILE` writes this",
+            "  # section for what is plugged in.",
             "  cameras:",
             *(
                 f"    - {{name: {name}, pipeline: nvarguscamerasrc sensor-id={number} ! nvvidconv, rate_hz: 30}}"
