@@ -4,7 +4,7 @@ python -m tools.bench_sources [--size 640 480] [--cameras 4] [--json]
 python -m tools.bench_sources --device /dev/video0 --pipeline "v4l2src device=/dev/video2"
 
 The second form compares cameras instead: rate, jitter, age and what is lost of each, with the processor's time an image
-takes. `python -m tools.device_check.pipelines` tries what can go wrong with pipelines, `tools/check_device.py` both.
+takes. `python -m tools.check_pipelines` tries what can go wrong with pipelines, `tools/check_device.py` with both.
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@
     python -m tools.docs_pictures seen SHORT docs/pictures/seen.webp         # what a drone sees
     python -m tools.docs_pictures law docs/pictures/law_curve.svg            # Eq. 39 and 41 over distance
     python -m tools.docs_pictures world config/forest.yaml docs/pictures/forest.webp      # what stands at the start
+    python -m tools.docs_pictures clip tests/replay/crossing.mcap docs/pictures/crossing.webm
 
 detected.webp is what `flockd detect` draws; the other pictures in docs/pictures are drawn by hand.
 """
@@ -24,12 +25,16 @@ from PIL import Image
 
 from flockd.config import load_scenario
 from flockd.config.flocking import FlockingParameters
+from flockd.flight_log.from_recordings import flight_log
 from flockd.flight_log.key_frames import load_key_frames
 from flockd.flight_log.log import FlightLog
+from flockd.flight_log.moments import recorded_moments
 from flockd.flocking import FlockingLaw
 from flockd.messages import FloatArray
+from flockd.recording.reader import Recording
 from flockd.report.filmstrip import filmstrip_figure
 from flockd.report.flight_folder import KEY_FRAMES_NAME, LOG_NAME
+from flockd.report.flight_video import write_video
 from flockd.report.style import GRID, INK, MUTED, PAPER, STYLE, colour_of
 
 FRAME_MS = 50
@@ -40,6 +45,7 @@ TRAIL_STEPS = 24
 ARM_M = 0.8
 """Of a drone as drawn, larger than it is."""
 COLOURS = 48
+CLIP_SCALE = 0.75
 WORLD_ROWS = slice(80, 480)
 """Of the images of a world, without much sky and ground."""
 
@@ -55,6 +61,9 @@ def main() -> None:
         of_flight = kinds.add_parser(kind)
         of_flight.add_argument("flight", type=Path, help="folder of a flight of `flockd sim`")
         of_flight.add_argument("out", type=Path)
+    clip = kinds.add_parser("clip")
+    clip.add_argument("recording", type=Path)
+    clip.add_argument("out", type=Path)
     kinds.add_parser("law").add_argument("out", type=Path)
     args = parser.parse_args()
     if args.kind == "flock":
@@ -63,9 +72,17 @@ def main() -> None:
         save_seen(args.flight / KEY_FRAMES_NAME, args.out)
     elif args.kind == "world":
         save_world(args.scenario, args.out)
+    elif args.kind == "clip":
+        save_clip(args.recording, args.out)
     else:
         save_law(args.out)
     print(f"{args.out}: {args.out.stat().st_size / 1e3:.0f} kB")
+
+
+def save_clip(recording_file: Path, path: Path) -> None:
+    """A recording's video, small enough for a page."""
+    recording = Recording(recording_file)
+    write_video(path, flight_log([recording]), 0, recorded_moments(recording), scale=CLIP_SCALE)
 
 
 def save_world(scenario_file: Path, path: Path) -> None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 MISSIONS = ("circle_then_tangent", "hover", "velocity", "waypoints", "follow", "operator")
 OBSTACLES = ("none", "forest", "village")
-SOURCES = ("v4l2", "shared_memory")
+SOURCES = ("v4l2", "gstreamer", "shared_memory")
 MOST_CAMERAS = 16
 
 
@@ -48,7 +48,9 @@ def _add_drone(commands: Commands) -> None:
     )
     parser.add_argument("--size", metavar="WxH", type=image_size, help="of an image in pixels")
     parser.add_argument("--field-of-view", metavar="DEG", type=_field_of_view, help="of an image's width, 10 to 190")
-    parser.add_argument("--source", choices=SOURCES, help="USB cameras, or frames from another program")
+    parser.add_argument(
+        "--source", choices=SOURCES, help="USB cameras, others through GStreamer, or frames from another program"
+    )
     parser.add_argument("--autopilot", metavar="ADDRESS", help="serial:///dev/NAME:BAUD or udpin://0.0.0.0:PORT")
     parser.add_argument("--fleet", metavar="NAME", help="the fleet's name in telemetry")
     parser.add_argument("--mission", choices=MISSIONS, help="kind of mission")

@@ -17,6 +17,9 @@ LAYERS_M = (4.5, 3.5, 5.0, 3.0, 4.0)
 """Heights in turn, so that no two neighbours on the ring are at one."""
 
 
+_SETS = ("  set_tolerance_s: 0.02", "  set_wait_s: 0.1")
+
+
 @dataclass(frozen=True)
 class NewDrone:
     """What is asked of somebody who configures a drone."""
@@ -26,7 +29,7 @@ class NewDrone:
     size_px: tuple[int, int] = (640, 480)
     field_of_view_deg: float = 120.0
     """Of an image's width."""
-    source: Literal["v4l2", "shared_memory"] = "v4l2"
+    source: Literal["v4l2", "gstreamer", "shared_memory"] = "v4l2"
     autopilot: str = "serial:///dev/ttyAMA0:921600"
     fleet: str = "fleet"
     mission: MissionKind = "hover"
@@ -145,11 +148,24 @@ def _source(new: NewDrone, names: Sequence[str]) -> list[str]:
             "    connect: [tcp/127.0.0.1:7448]    # fill in: where that program listens",
             "    rate_hz: 10.0",
         ]
+    if new.source == "gstreamer":
+        return [
+            "source:",
+            "  kind: gstreamer",
+            "  # Fill in: what `gst-launch-1.0` takes, without a sink. `flockd cameras --write FILE` writes this",
+            "  # section for what is plugged in.",
+            "  cameras:",
+            *(
+                f"    - {{name: {name}, pipeline: nvarguscamerasrc sensor-id={number} ! nvvidconv, rate_hz: 30}}"
+                for number, name in enumerate(names)
+            ),
+            *_SETS,
+        ]
     lines = [
         "source:",
         "  kind: v4l2",
-        "  # Fill in: the socket of each camera, which `ls /dev/v4l/by-path` shows as an entry that ends in",
-        "  # index0, and its own controls (`v4l2-ctl -d DEVICE --list-ctrls`): a short, fixed exposure.",
+        "  # Fill in: the socket of each camera and its own controls, for a short, fixed exposure: `flockd cameras",
+        "  # --write FILE` writes this section for what is plugged in.",
         "  cameras:",
     ]
     for number, name in enumerate(names):
@@ -159,7 +175,7 @@ def _source(new: NewDrone, names: Sequence[str]) -> list[str]:
             "      pixel_format: mjpeg",
             "      rate_hz: 30",
         ]
-    return [*lines, "  set_tolerance_s: 0.02", "  set_wait_s: 0.1"]
+    return [*lines, *_SETS]
 
 
 def _mission(kind: MissionKind) -> list[str]:

@@ -18,6 +18,7 @@ SLOW, TOO_SLOW = 0.95, 0.8
 UNEVEN, TOO_UNEVEN = 0.2, 0.5
 """Of a frame period, the 95th percentile of how far a frame is from its beat. By half a period sets fall apart."""
 FIX_RATE = "try another cable and port, fewer cameras on one USB bus, or a shorter exposure that is set by hand"
+FIX_PIPELINE = "try the pipeline with `gst-launch-1.0`, and ask it for a rate and size that it can keep"
 DARK, BRIGHT = 12.0, 243.0
 """Of 0-255, the mean grey of an image in which little can be seen."""
 
@@ -46,7 +47,7 @@ def _judged(camera: CameraConfig, config: DroneConfig, watched: Watched | None) 
     if watched is not None and config.source is not None:
         device = next((entry for entry in config.source.cameras if entry.name == camera.name), None)
         rate_hz = device.rate_hz if device else config.source.shared_memory.rate_hz
-        fix_rate = FIX_RATE if device else "check why the program that publishes them is late"
+        fix_rate = _fix_rate(device)
         problems += stream_problems(camera.name, watched, rate_hz, config.safety.max_dropped_share, fix_rate)
         problems += [] if device is None or device.pipeline else _exposure_problems(device)
         measured = [
@@ -59,6 +60,13 @@ def _judged(camera: CameraConfig, config: DroneConfig, watched: Watched | None) 
     else:
         calibration = f"calibration fits {size}, {width_deg(camera):.0f} degrees wide"
         yield passed(f"camera {camera.name}", ", ".join(part for part in [*measured, calibration] if part))
+
+
+def _fix_rate(device: CameraDeviceParameters | None) -> str:
+    """What to do about frames that are too few, uneven or damaged."""
+    if device is None:
+        return "check why the program that publishes them is late"
+    return FIX_PIPELINE if device.pipeline else FIX_RATE
 
 
 def stream_problems(

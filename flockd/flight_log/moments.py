@@ -23,7 +23,7 @@ class Outline:
     """A detected drone in one image."""
 
     pixels: FloatArray
-    """(n, 2) of a ring of the drone's size around its place, as far as it is in the image."""
+    """(n, 2) along a line around the drone, as far as it is in the image; it ends where it began if all of it is."""
     track: int | None
     """The track it belongs to; None for one that has none yet."""
     range_m: float | None
@@ -69,10 +69,19 @@ def _outlines(rig: Rig, output: PilotOutput) -> dict[str, list[Outline]]:
     found: dict[str, list[Outline]] = {}
     for detection, track in zip(output.detections, output.detection_tracks, strict=True):
         for camera, pixels in rig.pixels_of(_ring(detection)).items():
-            inside = pixels[np.isfinite(pixels[:, 0])]
-            if len(inside):
-                found.setdefault(camera, []).append(Outline(inside, track, detection.range_m))
+            line = _within(pixels)
+            if len(line):
+                found.setdefault(camera, []).append(Outline(line, track, detection.range_m))
     return found
+
+
+def _within(ring: FloatArray) -> FloatArray:
+    """The known points of a ring as one line, whose gap is where the ring has its own."""
+    known = np.isfinite(ring[:, 0])
+    if known.all():
+        return np.concatenate([ring, ring[:1]])
+    begins = np.flatnonzero(known & ~np.roll(known, 1))
+    return np.roll(ring, -int(begins[0]), axis=0)[np.roll(known, -int(begins[0]))] if len(begins) else ring[:0]
 
 
 def _ring(detection: Detection) -> FloatArray:
@@ -91,7 +100,7 @@ def _masks(frame: KeyFrame) -> dict[str, list[Outline]]:
         for label in (int(one) for one in np.unique(labels) if one):
             rows, columns = np.nonzero(labels == label)
             left, right, top, bottom = columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
-            corners = np.array([(left, top), (right, top), (right, bottom), (left, bottom)], np.float64)
+            corners = np.array([(left, top), (right, top), (right, bottom), (left, bottom), (left, top)], np.float64)
             outline = Outline(corners, frame.track_ids.get(label), frame.ranges.get(label))
             found.setdefault(camera, []).append(outline)
     return found

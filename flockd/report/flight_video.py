@@ -50,17 +50,19 @@ def write_video(
     drone: int,
     moments: Iterable[Moment],
     progress: Progress = lambda done, total: None,
+    *,
+    scale: float = 1.0,
 ) -> int:
     """Writes the video, a frame a step in real time, and gives the number of frames.
 
-    ``drone`` (from 0) is whose ``moments`` these are. The file appears when it is whole. Raises UnavailableError where
-    OpenCV has no encoder.
+    ``drone`` (from 0) is whose ``moments`` these are; ``scale`` makes the frames smaller. The file appears when it is
+    whole. Raises UnavailableError where OpenCV has no encoder.
     """
     draft = path.with_name(f".{path.stem}.part{path.suffix}")
     plate, count, video = _Plate(log, drone), 0, None
     try:
         for moment in moments:
-            frame = plate.draw(moment)
+            frame = _scaled(plate.draw(moment), scale)
             video = video or _opened(draft, 1.0 / log.metadata.step_s, (frame.shape[1], frame.shape[0]))
             video.write(np.ascontiguousarray(frame[..., ::-1]))
             count += 1
@@ -72,6 +74,14 @@ def write_video(
     finally:
         draft.unlink(missing_ok=True)
     return count
+
+
+def _scaled(image: UInt8Array, scale: float) -> UInt8Array:
+    """Both sides stay even, as encoders want them."""
+    if scale == 1.0:
+        return image
+    height, width = (2 * round(side * scale / 2) for side in image.shape[:2])
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _opened(path: Path, rate_hz: float, size: tuple[int, int]) -> cv2.VideoWriter:
@@ -203,7 +213,7 @@ def _tile(image: UInt8Array, camera: str, outlines: Mapping[str, Iterable[Outlin
     for outline in outlines.get(camera, ()):
         colour = _rgb(colour_of(outline.track, FEW)) if outline.track is not None else (255, 255, 255)
         pixels = scale * outline.pixels
-        _line(tile, np.concatenate([pixels, pixels[:1]]), colour, 2)
+        _line(tile, pixels, colour, 2)
         name = "new" if outline.track is None else f"#{outline.track}"
         caption = name if outline.range_m is None else f"{name} {outline.range_m:.1f} m"
         wide = 8 * len(caption)

@@ -32,6 +32,16 @@ def test_a_drone_has_its_cameras_evenly_around(tmp_path: Path) -> None:
     assert (drone.name, drone.mission.kind) == ("kite", "follow")
 
 
+@pytest.mark.parametrize("source", ["v4l2", "gstreamer", "shared_memory"])
+def test_a_drones_frames_come_from_where_is_asked(tmp_path: Path, source: str) -> None:
+    file = tmp_path / "kite.yaml"
+    assert main(["config", "new", "drone", str(file), "--cameras", "2", "--source", source, "--defaults"]) == 0
+    written = load_drone(file).source
+    assert written is not None
+    assert written.kind == source
+    assert [camera.name for camera in written.cameras] == ([] if source == "shared_memory" else ["front", "back"])
+
+
 def test_on_a_terminal_it_asks_until_the_answer_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     answers = iter(["", "a hundred", "3", "", "waypoints", "", ""])
     monkeypatch.setattr("sys.stdin.isatty", lambda: True)

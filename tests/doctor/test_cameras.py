@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,7 @@ from flockd.doctor import Finding, Level
 from flockd.doctor.camera_checks import check_cameras
 from flockd.messages import Frame
 from flockd.sources import FramePublisher
+from flockd.sources.gstreamer import open_pipeline
 from flockd.sources.v4l2_device import V4l2Device
 from tests.daemon.aboard import free_endpoint
 from tests.sources.camera_images import SIZE, jpeg, scene
@@ -222,6 +225,23 @@ def test_a_driver_that_hangs_is_reported_and_the_other_camera_is_seen(monkeypatc
     ended.set()
     assert found["camera front"][0].level is Level.PASS
     _problem(found, Level.FAILURE, "its driver does not respond", "camera back")
+
+
+def test_a_pipeline_is_watched_as_a_device_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = (sys.executable, "-IS", str(Path(__file__).parents[1] / "sources" / "fake_pipeline.py"))
+    monkeypatch.setattr(watching, "open_pipeline", lambda camera, size: open_pipeline(camera, size, fake))
+    lens = IntrinsicsConfig(model="wide_angle", fx=30.0, fy=30.0, cx=32.0, cy=24.0)
+    names = {"front": "caps:64x48 500 stall", "back": "fail:has_failed_(no_such_sensor)"}
+    rig = RigConfig(cameras=tuple(CameraConfig(name=name, size_px=(64, 48), intrinsics=lens) for name in names))
+    cameras = tuple(CameraDeviceParameters(name=n, pipeline=text, rate_hz=40.0) for n, text in names.items())
+    config = DroneConfig(rig=rig, source=SourceParameters(kind="gstreamer", cameras=cameras))
+    found: dict[str, list[Finding]] = {}
+    for finding in check_cameras(config, SECONDS):
+        found.setdefault(finding.about, []).append(finding)
+    told = " ".join(finding.measured for finding in found["camera front"])
+    assert "images a second" in told
+    assert "exposure is not configured" not in told, "a pipeline sets its own"
+    _problem(found, Level.FAILURE, "its pipeline has failed (no such sensor)", "camera back")
 
 
 def _shared(endpoint: str) -> DroneConfig:

@@ -58,6 +58,7 @@ CATALOGUE = (
         (
             f"{_HERE}cameras.py::test_no_camera_delivers_any_more",
             "tests/sources/test_v4l2.py::test_an_unplugged_camera_is_reported_at_once_and_comes_back_when_plugged_in",
+            "tests/sources/test_gstreamer.py::test_a_crash_is_followed_by_images_when_the_driver_is_back",
         ),
         within_s=3.0,
     ),
@@ -66,6 +67,7 @@ CATALOGUE = (
         (
             f"{_HERE}cameras.py::test_all_cameras_freeze",
             "tests/sources/test_v4l2.py::test_a_frozen_camera_counts_as_silent",
+            "tests/sources/test_gstreamer.py::test_a_frozen_pipeline_counts_as_silent",
         ),
         within_s=3.0,
     ),
@@ -74,6 +76,7 @@ CATALOGUE = (
         (
             f"{_HERE}cameras.py::test_images_are_damaged",
             "tests/sources/test_v4l2.py::test_what_is_worth_nothing_is_dropped_and_counted_and_the_next_is_fine",
+            "tests/sources/test_gstreamer.py::test_what_is_worth_nothing_is_dropped_and_counted_and_the_next_is_fine",
         ),
         within_s=6.0,
     ),

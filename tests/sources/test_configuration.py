@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -70,6 +71,22 @@ def test_frames_may_come_from_a_pipeline_a_camera(tmp_path: Path) -> None:
     assert config.source is not None
     assert [camera.place for camera in config.source.cameras] == ["nvarguscamerasrc sensor-id=0", "libcamerasrc"]
     assert isinstance(open_source(config, str(path)), GstreamerSource)
+
+
+def test_the_pipelines_of_the_documentation_check(tmp_path: Path) -> None:
+    page = (QUADROTOR.parents[1] / "docs" / "cameras.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```yaml\n(source:.*?)```", page, re.DOTALL)
+    names = re.findall(r"- name: (\w+)", example)
+    rig = "".join(RIG.splitlines(keepends=True)[:2]) + "".join(
+        RIG.splitlines(keepends=True)[2].replace("front", name) for name in names
+    )
+    path = tmp_path / "drone.yaml"
+    path.write_text(rig + example, encoding="utf-8")
+    source = load_drone(path).source
+    assert source is not None
+    assert [camera.pipeline.split()[0] for camera in source.cameras] == [
+        "nvarguscamerasrc", "libcamerasrc", "rtspsrc", "v4l2src",
+    ]  # fmt: skip
 
 
 def test_a_drone_without_source_can_be_simulated_but_opens_none(tmp_path: Path) -> None:

@@ -1,16 +1,9 @@
-"""Checks of cameras behind GStreamer, with its own elements: rate, time stamps, and all that can go wrong.
-
-python -m tools.device_check.pipelines [DEVICE]
-
-runs them on this computer, where GStreamer is installed; with the one of a V4L2 camera, if one is named.
-"""
+"""Checks of cameras behind GStreamer, with its own elements: rate, time stamps, and all that can go wrong."""
 
 from __future__ import annotations
 
-import argparse
 import os
 import signal
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -220,23 +213,3 @@ def _child() -> int:
     ]
     (pid,) = children
     return pid
-
-
-def main() -> int:
-    """Prints a line a check."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("device", nargs="?", help="/dev/video0 or another")
-    arguments = parser.parse_args()
-    checks: list[Check] = list(CHECKS)
-    if arguments.device:
-        checks.insert(1, lambda: streams_a_camera(arguments.device))
-    passed = True
-    for check in checks:
-        for finding in check():
-            passed = passed and finding.passed
-            print(f"{'PASS' if finding.passed else 'FAIL'}  {finding.check:28s} {finding.measured}", flush=True)
-    return 0 if passed else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())
