@@ -53,7 +53,7 @@ def test_a_kill_leaves_what_was_finished(plan: Plan, tmp_path: Path, monkeypatch
     path = tmp_path / "out"
     for files in (0, 1, 2):
         with monkeypatch.context() as patch:
-            patch.setattr(CampaignFolder, "merge", _merge_that_ends_at(step))
+            _end_after(patch, files)
             with pytest.raises((KeyboardInterrupt, InterruptedError)):
                 flown(plan, path, Shuffled(files, until=3))
     (path / "parts" / ".c0-s0.parquet.part").write_bytes(b"half")
