@@ -4,8 +4,8 @@
     python -m tools.bench_campaign --flights 1000 --workers 1 2 4
 
 Efficiency is the speed with more processes over that with one. Where other programs run beside, wall time says little:
-`cpu_s_a_flight` is processor time, which does not count what others take. `start_s` is until each worker has done a flight,
-and not counted in the speed.
+`cpu_s_a_flight` is processor time, which does not count what others take. `start_s` is until each worker has done a
+flight, and not counted in the speed.
 """
 
 from __future__ import annotations

@@ -222,7 +222,9 @@ def _comparison_parts(comparison: Comparison) -> list[Part]:
         Part("The test", _TEST),
     ]
     if comparison.changes:
-        rows = [[key, TableCell(was, kind="text"), TableCell(now, kind="text")] for key, was, now in comparison.changes]
+        rows: list[list[str | TableCell]] = [
+            [key, TableCell(was, kind="text"), TableCell(now, kind="text")] for key, was, now in comparison.changes
+        ]
         parts.append(Part("What differs for all flights", "", (), ["key", *names], rows))
     return parts
 

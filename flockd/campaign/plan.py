@@ -80,8 +80,8 @@ class Plan:
         errors = None if config.errors is None else load_perceived_errors(path.parent / config.errors)
         plan = cls(config, scenario.model_dump(exclude_unset=True), errors)
         check.cells(plan)
-        if fault := _idle_seeds(plan):
-            raise ConfigError([places["seeds",].problem(fault)])
+        if idle := _idle_seeds(plan):
+            raise ConfigError([places["seeds",].problem(idle)])
         return plan
 
     @classmethod
@@ -212,7 +212,7 @@ class _Check:
 
     def keys(self, config: CampaignConfig) -> None:
         """Raises ConfigError for what needs no scenario: sizes of flocks, and how many cells there are."""
-        counts = {("fixed", DRONES): [config.fixed.get(DRONES, 1)]}
+        counts: dict[KeyPath, list[Any]] = {("fixed", DRONES): [config.fixed.get(DRONES, 1)]}
         counts |= {("cases", case, DRONES): [values.get(DRONES, 1)] for case, values in config.cases.items()}
         if (sizes := config.vary.get(DRONES)) is not None:
             counts["vary", DRONES] = list(sizes.values or (None,))

@@ -18,7 +18,7 @@ from flockd.campaign.results import Results
 from flockd.config import ScenarioConfig
 from flockd.config.campaign import DRONES, Figure
 from flockd.errors import UsageError
-from flockd.messages import FloatArray
+from flockd.messages import BoolArray, FloatArray
 
 LEVEL = 0.05
 """Of all figures together: so often one at most is called different where none is."""
@@ -141,9 +141,9 @@ def _blocks(length: int) -> list[int]:
     return [min(block, _DRAWS - begin) for begin in range(0, _DRAWS, block)]
 
 
-def _as_far(found: FloatArray, seen: float) -> FloatArray:
+def _as_far(found: FloatArray, seen: float) -> BoolArray:
     """Whether each is; sums of the same numbers in another order differ by rounding."""
-    return np.abs(found) >= abs(seen) * (1 - 1e-9)
+    return np.asarray(np.abs(found) >= abs(seen) * (1 - 1e-9))
 
 
 def _of_two(first: FloatArray, second: FloatArray) -> Interval:

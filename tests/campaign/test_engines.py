@@ -173,7 +173,6 @@ def names_in(out: Path) -> set[str]:
 @pytest.mark.slow
 def test_a_ray_cluster_of_two_nodes_of_which_one_is_killed(tmp_path: Path) -> None:
     """The rest of its flights is flown on the other one; the results are those of this process."""
-    pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
 
     plan = few(tmp_path, seeds=30, duration_s=10.0)
@@ -190,6 +189,6 @@ def test_a_ray_cluster_of_two_nodes_of_which_one_is_killed(tmp_path: Path) -> No
         threading.Thread(target=kill_one, daemon=True).start()
         with ENGINES["ray"](2, cluster.address) as engine:
             assert flown_on(plan, tmp_path / "out", engine) == expected(plan, tmp_path)
-        assert len({node["NodeID"] for node in cluster.list_all_nodes()} if hasattr(cluster, "x") else {1}) == 1
+        assert len(cluster.list_all_nodes()) == 1, "the other one was killed while they flew"
     finally:
         cluster.shutdown()

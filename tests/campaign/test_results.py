@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import fcntl
 from pathlib import Path
+from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
 
-from flockd.campaign import folder as folder_module
 from flockd.campaign.campaign_page import write_campaign_page, write_comparison_page
 from flockd.campaign.flight_kinds import FLIGHT_KINDS, FlightKind
+from flockd.campaign.flight_table import write_table
 from flockd.campaign.folder import CampaignFolder
 from flockd.campaign.plan import Plan
 from flockd.campaign.results import Results
@@ -50,11 +51,11 @@ def test_the_same_results_in_any_order_and_after_any_interruption(plan: Plan, tm
 def test_a_kill_leaves_what_was_finished(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Three flights, killed before they are merged, then in the middle of merging, then before parts are deleted."""
     path = tmp_path / "out"
-    for step in (0, 1, 2):
+    for files in (0, 1, 2):
         with monkeypatch.context() as patch:
-            patch.setattr(CampaignFolder, "merge", _merge_that_ends_at(step))
+            _end_after(patch, files)
             with pytest.raises((KeyboardInterrupt, InterruptedError)):
-                flown(plan, path, Shuffled(step, until=3))
+                flown(plan, path, Shuffled(files, until=3))
     (path / "parts" / ".c0-s0.parquet.part").write_bytes(b"half")
     conducted = flown(plan, path, Shuffled(9))
     assert (conducted.before, conducted.flown) == (3, 9)
@@ -63,31 +64,27 @@ def test_a_kill_leaves_what_was_finished(plan: Plan, tmp_path: Path, monkeypatch
     assert sorted(entry.name for entry in (path / "parts").iterdir()) == []
 
 
-def _merge_that_ends_at(step: int) -> object:
-    """After 0, 1 or 2 of the files that merging writes; once there is something to merge."""
+def _end_after(patch: pytest.MonkeyPatch, files: int) -> None:
+    """Lets merging end after so many of the two files that it writes, once there is something to merge."""
     merge = CampaignFolder.merge
 
-    def ended(self: CampaignFolder) -> None:
-        if not list((self.path / "parts").iterdir()):
-            return merge(self)
-        if step == 0:
-            raise InterruptedError
-        written = folder_module.write_table
-        left = [step]
+    def ended(folder: CampaignFolder) -> None:
+        left = files
 
-        def write(table: object, path: Path) -> None:
-            written(table, path)
-            left[0] -= 1
-            if left[0] == 0:
+        def write(table: Any, path: Path) -> None:
+            nonlocal left
+            if left == 0:
+                raise InterruptedError
+            write_table(table, path)
+            left -= 1
+            if left == 0:
                 raise InterruptedError
 
-        folder_module.write_table = write
-        try:
-            return merge(self)
-        finally:
-            folder_module.write_table = written
+        if list((folder.path / "parts").iterdir()):
+            patch.setattr("flockd.campaign.folder.write_table", write)
+        merge(folder)
 
-    return ended
+    patch.setattr(CampaignFolder, "merge", ended)
 
 
 @pytest.mark.usefixtures("made_up_flights")
