@@ -24,9 +24,11 @@ from flockd.flight_log.truth_matching import match_neighbours
 from flockd.messages import BoolArray, FloatArray
 from flockd.report.flight_folder import LOG_NAME
 
-EDGES_M = (0.0, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 10.0, 13.0, 16.0, 20.0)
+EDGES_M = (0.0, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 9.5, 13.0, 17.0, 20.0)
 LEAST_SAMPLES = 30
 """A distance with fewer is left out."""
+LEAST_SEEN = 10
+"""Where fewer of them were perceived, errors are as at the distance before."""
 SETTLED_S = 3.0
 MAX_LAG_S = 60.0
 LEAST_RATIO = 2.91
@@ -35,6 +37,14 @@ HIDDEN_EDGES = (0.02, 0.2, 0.4, 0.6, 0.8, 1.01)
 DRONE_RADIUS_M, ELEVATION_DEG = 0.35, 45.0
 HIDDEN_LIMIT = 0.5
 """Where flights have too few hidden neighbours to tell."""
+
+
+class _Plain(yaml.SafeDumper):
+    """Writes what several entries share in each of them."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        """Always."""
+        return True
 
 
 class Samples(NamedTuple):
@@ -73,7 +83,9 @@ def main() -> None:
     provenance = [_provenance(log) for log in logs]
     args.out.parent.mkdir(parents=True, exist_ok=True)
     head = "# Written by `python -m tools.fit_perception`; do not edit.\n"
-    text = yaml.safe_dump({"perception": args.name, "provenance": provenance, **fitted}, sort_keys=False, width=120)
+    named = {"perception": args.name, "provenance": provenance}
+    text = yaml.safe_dump(named, sort_keys=False, width=120)
+    text += yaml.dump(fitted, Dumper=_Plain, sort_keys=False, width=120, default_flow_style=None)
     args.out.write_text(head + text, encoding="utf-8")
     load_perceived_errors(args.out)
     print(f"{args.out}: {sum(int(s.counts.sum()) for s in samples)} neighbours in steps of {len(logs)} flights")
@@ -145,22 +157,23 @@ def fit(samples: Sequence[Samples]) -> dict[str, Any]:
         )
     )  # fmt: skip
     velocity = np.concatenate([s.velocity[c] for s, c in zip(samples, clear, strict=True)])
-    entries = []
+    entries: list[dict[str, Any]] = []
+    spreads: dict[str, Any] = {}
     for low, high in itertools.pairwise(EDGES_M):
         here = (distance >= low) & (distance < high)
         seen = here & ~missed
-        if seen.sum() < LEAST_SAMPLES:
+        if here.sum() < LEAST_SAMPLES:
             continue
-        bias = float(np.median(log_range[seen]))
-        entries.append({
-            "distance_m": round(float(distance[here].mean()), 2),
-            "missed": round(float(missed[here].mean()), 5),
-            "range_bias": round(bias, 5),
-            "range_error": _spread(log_range[seen] - bias),
-            "bearing_error_deg": _spread(bearing[seen]),
-            "velocity_error_m_s": _spread(velocity[seen]),
-            "samples": int(here.sum()),
-        })  # fmt: skip
+        if seen.sum() >= LEAST_SEEN or not entries:
+            bias = float(np.median(log_range[seen]))
+            spreads = {
+                "range_bias": round(bias, 5),
+                "range_error": _spread(log_range[seen] - bias),
+                "bearing_error_deg": _spread(bearing[seen]),
+                "velocity_error_m_s": _spread(velocity[seen]),
+            }
+        mean_m, share = round(float(distance[here].mean()), 2), round(float(missed[here].mean()), 5)
+        entries.append({"distance_m": mean_m, "missed": share, **spreads, "samples": int(here.sum())})
     step_s = samples[0].step_s
     own = np.concatenate([s.own.reshape(-1, 2) for s in samples])
     ranges = [np.where(s.counts, s.log_range, np.nan) for s in samples]
@@ -225,7 +238,7 @@ def _time_constant(series: Sequence[FloatArray], step_s: float) -> float:
 def _provenance(log: FlightLog) -> str:
     m = log.metadata
     began = "" if m.began is None else f", {m.began[:10]}"
-    return f"{m.scenario}, seed {m.seed}, {m.drones} drones, {m.duration_s:g} s, {m.flow}, version {m.version}{began}"
+    return f"{m.scenario}, seed {m.seed}, {m.drones} drones, {m.duration_s:g} s, {m.flow}, version {m.version or 'unknown'}{began}"
 
 
 if __name__ == "__main__":

@@ -12,9 +12,10 @@ from flockd.config.base import Distance, NonNegative, Section
 class WeightParameters(Section):
     """The influence weight W of Eq. 39 and 40."""
 
-    kind: Literal["uniform", "nearest"] = "uniform"
-    nearest: Annotated[int, Field(ge=1)] = 3
-    """With kind `nearest`: weight 1 on this many, 0 on the others."""
+    kind: Literal["uniform", "nearest"] = "nearest"
+    """`nearest`: 1 on the nearest, 0 on the others; `uniform`: 1 on all, with which more than ten drones crowd."""
+    nearest: Annotated[int, Field(ge=1)] = 6
+    """With kind `nearest`: on how many. Seven drones or fewer fly with 6 as with `uniform`."""
 
 
 class FlockingParameters(Section):

@@ -26,7 +26,7 @@ _BLOCK = 128
 class Substeps(NamedTuple):
     """How a step is divided."""
 
-    count: int
+    times: int
     dt_s: float
     answer_per_s: float
     """The mean acceleration over `dt_s` for each m/s between setpoint and velocity."""
@@ -123,8 +123,8 @@ class Gusts:
     def step(self, substeps: Substeps) -> FloatArray:
         """Accelerations (substeps, 2, n) m/s^2 of one step."""
         keep = math.exp(-substeps.dt_s / GUST_TIME_S)
-        out = np.empty((substeps.count, 2, len(self._now)))
-        for s in range(substeps.count):
+        out = np.empty((substeps.times, 2, len(self._now)))
+        for s in range(substeps.times):
             out[s] = self._now.T
             kick = math.sqrt(1 - keep**2) * self._sigma * self._random.normal(size=self._now.shape)
             self._now = keep * self._now + kick

@@ -20,6 +20,8 @@ from flockd.messages import FloatArray
 from flockd.sim.exact_states import fly_exact_states
 from flockd.sim.start import with_drones
 
+UNIFORM = WeightParameters(kind="uniform")
+
 
 def _scenario(name: str = "paper_flight", **overrides: Any) -> ScenarioConfig:
     keys = {key.replace("__", "."): value for key, value in overrides.items()}
@@ -44,13 +46,14 @@ def _flown(flights: FlockFlights, threads: int = 1) -> tuple[FloatArray, FloatAr
     "parameters",
     [
         FlockingParameters(),
+        FlockingParameters(weight=UNIFORM),
         FlockingParameters(weight=WeightParameters(kind="nearest", nearest=3)),
         FlockingParameters(weight=WeightParameters(kind="nearest", nearest=12), observation_distance_m=6.0),
-        FlockingParameters(separation_distance_m=4.0, observation_distance_m=3.0),
+        FlockingParameters(weight=UNIFORM, separation_distance_m=4.0, observation_distance_m=3.0),
         FlockingParameters(
             weight=WeightParameters(kind="nearest", nearest=2), separation_distance_m=4.0, observation_distance_m=3.0
         ),
-        FlockingParameters(cohesion=0.3, alignment=0.7, separation=2.0, velocity=0.5, own_weight=3.0),
+        FlockingParameters(weight=UNIFORM, cohesion=0.3, alignment=0.7, separation=2.0, velocity=0.5, own_weight=3.0),
     ],
 )
 @pytest.mark.parametrize(("drones", "spread_m"), [(2, 1.0), (7, 3.0), (60, 1.5), (60, 12.0), (40, 200.0)])
@@ -74,7 +77,7 @@ def test_each_drone_accelerates_as_the_law_says(parameters: FlockingParameters, 
 
 
 def test_two_drones_at_one_spot_are_pushed_as_the_law_pushes_them() -> None:
-    for parameters in (FlockingParameters(), FlockingParameters(weight=WeightParameters(kind="nearest"))):
+    for parameters in (FlockingParameters(weight=UNIFORM), FlockingParameters()):
         scenario = with_drones(_scenario(), 2)
         drone = scenario.drone.model_copy(update={"flocking": parameters})
         flights = FlockFlights([scenario.model_copy(update={"drone": drone})])
@@ -87,11 +90,11 @@ def test_two_drones_at_one_spot_are_pushed_as_the_law_pushes_them() -> None:
 @pytest.mark.parametrize(
     ("scenario", "drones"),
     [
-        (_scenario(duration_s=60.0), 5),
-        (_scenario(duration_s=20.0, vehicle__gust_m_s=0.2, seed=3), 5),
-        (_scenario(duration_s=20.0, drone__flocking__weight__kind="nearest"), 12),
+        (_scenario(duration_s=40.0, drone__flocking__weight__kind="uniform"), 5),
+        (_scenario(duration_s=15.0, vehicle__gust_m_s=0.2, seed=3), 5),
+        (_scenario(duration_s=10.0, drone__flocking__weight__nearest=3), 12),
         (_scenario("square", duration_s=50.0), 5),
-        (_scenario("one_knows", duration_s=30.0), 5),
+        (_scenario("one_knows", duration_s=15.0), 5),
         (_scenario(duration_s=15.0, drone__mission__height_m=9.0), 3),
     ],
 )

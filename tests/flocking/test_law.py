@@ -214,5 +214,16 @@ def test_twenty_stay_apart_with_weight_on_three_and_crowd_with_weight_on_all() -
     nearest = FlockingLaw(FlockingParameters(weight=WeightParameters(kind="nearest", nearest=3)))
     apart = [min_distance(positions) for positions, _ in _flight(nearest, start, duration_s=60.0)]
     assert min(apart) > 1.5
-    uniform = [min_distance(positions) for positions, _ in _flight(FlockingLaw(), start, duration_s=60.0)]
+    on_all = FlockingLaw(FlockingParameters(weight=WeightParameters(kind="uniform")))
+    uniform = [min_distance(positions) for positions, _ in _flight(on_all, start, duration_s=60.0)]
     assert max(uniform[60:]) < 1.5  # held apart by Eq. 41 alone
+
+
+def test_up_to_seven_drones_fly_by_default_as_with_weight_on_all() -> None:
+    rng = np.random.default_rng(5)
+    uniform = FlockingLaw(FlockingParameters(weight=WeightParameters(kind="uniform")))
+    for neighbours in (1, 4, 6, 7):
+        places, velocities = rng.normal(0, 4, (neighbours, 2)), rng.normal(0, 1, (neighbours, 2))
+        by_default = FlockingLaw().acceleration(STILL, places, velocities, STILL)
+        on_all = uniform.acceleration(STILL, places, velocities, STILL)
+        assert np.array_equal(by_default, on_all) == (neighbours <= 6)
