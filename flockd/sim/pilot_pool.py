@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from functools import partial
@@ -69,7 +70,7 @@ class PilotPool:
     ) -> Future[Stepped]:
         """Of a drone's pilot, see `Pilots`; it is there once the drone's process has come to it."""
         place = self.drones.index(drone) % len(self._shares)
-        pilots = self._here or self._processes[place].ask
+        pilots: Callable[..., Stepped] = self._here or self._processes[place].ask
         order = (drone, frames, vehicle, truth if self._swap else None, pictured)
         if not self.on_this_thread:
             return self._threads[place].submit(pilots, *order)
