@@ -81,7 +81,8 @@ async def _serve(args: argparse.Namespace, source: FleetSource) -> None:
     from flockd.fleet_page.page_server import PageServer
 
     access = PageAccess()
-    runner = web.AppRunner(PageServer(source, access, may_command=not args.watch_only).application(), access_log=None)
+    application = PageServer(source, access, may_command=not args.watch_only).application()
+    runner = web.AppRunner(application, access_log=None, shutdown_timeout=1.0)
     await runner.setup()
     try:
         port = await _listen(runner, args.page_address, args.port)
@@ -98,7 +99,7 @@ async def _listen(runner: web.AppRunner, address: str, port: int) -> int:
     from aiohttp import web
 
     try:
-        await web.TCPSite(runner, address, port, shutdown_timeout=1.0).start()
+        await web.TCPSite(runner, address, port).start()
     except OSError as error:
         raise UnavailableError(f"the page cannot use {address} port {port} ({error.strerror}); name others") from error
     bound: int = runner.addresses[0][1]

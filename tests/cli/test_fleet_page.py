@@ -1,0 +1,62 @@
+"""`flockd fleet` without a command: what it refuses, and the address that it prints."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+from pathlib import Path
+
+import pytest
+
+from flockd.cli import main
+from flockd.cli.fleet_page import _told
+
+RECORDING = Path(__file__).parents[1] / "replay" / "crossing.mcap"
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--port", "99999"], "'99999' is not a port, a whole number from 0 to 65535"),
+        (["--listen", "tcp/0.0.0.0:7447"], "for zenoh endpoints there is --drones-at"),
+        (["--recordings", "x", "--connect", "tcp/127.0.0.1:1"], "--recordings goes without telemetry"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(
+    options: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        code = main(["fleet", *options])
+    except SystemExit as error:
+        assert isinstance(error.code, int)
+        code = error.code
+    assert code == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_taken_port_is_reported_in_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copy(RECORDING, tmp_path)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert main(["fleet", "--recordings", str(tmp_path), "--port", str(port)]) == 69
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.startswith(f"the page cannot use 127.0.0.1 port {port} (")
+    assert error.endswith("); name others")
+
+
+@pytest.mark.parametrize(
+    ("address", "shown", "warns"),
+    [
+        ("127.0.0.1", "http://127.0.0.1:80/?key=k", False),
+        ("::1", "http://[::1]:80/?key=k", False),
+        ("0.0.0.0", "http://127.0.0.1:80/?key=k", True),
+        ("10.0.0.7", "http://10.0.0.7:80/?key=k", True),
+    ],
+)
+def test_an_address_that_others_reach_comes_with_a_warning(
+    address: str, shown: str, warns: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert _told(address, 80, "k")[0] == f"the fleet page is at {shown}"
+    assert ("travels unencrypted" in capsys.readouterr().err) == warns
