@@ -14,7 +14,7 @@ from flockd.cli.parser import Commands, add_commands, positive_count
 from flockd.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.campaign.plan import Plan
+    from flockd.campaign.flight_plan import Plan
     from flockd.campaign.results import Results
     from flockd.campaign.verdicts import Verdict
 
@@ -94,8 +94,8 @@ def _run(args: argparse.Namespace) -> int:
     from flockd.campaign.campaign_page import write_campaign_page
     from flockd.campaign.conduct import conduct
     from flockd.campaign.engines import ENGINES
+    from flockd.campaign.flight_plan import Plan
     from flockd.campaign.folder import REPORT_NAME, CampaignFolder
-    from flockd.campaign.plan import Plan
     from flockd.campaign.results import Results
 
     if args.address is not None and args.engine != "ray":
@@ -144,8 +144,8 @@ def _dry_run(plan: Plan, workers: int, *, as_json: bool) -> int:
 
 def _rerun(args: argparse.Namespace) -> int:
     from flockd.campaign.flight_kinds import FLIGHT_KINDS
+    from flockd.campaign.flight_plan import Run
     from flockd.campaign.folder import RERUNS, load_plan
-    from flockd.campaign.plan import Run
     from flockd.cli.flight_summary import report_flight
     from flockd.config.scenario import MAX_DRONES
     from flockd.report.flight_folder import prepare_folder
