@@ -21,8 +21,8 @@ import pyarrow.parquet as pq
 
 from flockd.campaign.conduct import conduct
 from flockd.campaign.engines import ENGINES, EngineName
+from flockd.campaign.flight_plan import Plan
 from flockd.campaign.folder import FLIGHTS_NAME, TIMINGS_NAME, CampaignFolder
-from flockd.campaign.plan import Plan
 from flockd.data import data_path
 
 

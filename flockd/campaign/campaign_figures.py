@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from flockd.campaign.figures import MEASURES
+from flockd.campaign.flight_plan import CASE
 from flockd.campaign.intervals import mean_interval
-from flockd.campaign.plan import CASE
 from flockd.campaign.results import Results
 from flockd.campaign.verdicts import Comparison
 from flockd.config.campaign import Figure as FigureName

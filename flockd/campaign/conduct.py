@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from flockd.campaign.engines import Engine
 from flockd.campaign.flight_kinds import FLIGHT_KINDS, Task
+from flockd.campaign.flight_plan import Plan, Run
 from flockd.campaign.folder import CampaignFolder
-from flockd.campaign.plan import Plan, Run
 from flockd.campaign.schedule import Schedule
 
 Progress = Callable[[int, int], None]

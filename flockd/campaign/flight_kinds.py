@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from functools import lru_cache
 
 from flockd.campaign.figures import Figures, figures_of
-from flockd.campaign.plan import Run
+from flockd.campaign.flight_plan import Run
 from flockd.campaign.recipe import Recipe
 from flockd.choices import SimulatedPerception
 from flockd.config import ScenarioConfig

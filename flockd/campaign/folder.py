@@ -19,8 +19,8 @@ import pyarrow as pa
 
 from flockd.campaign.differences import differences
 from flockd.campaign.flight_kinds import FlownRun
+from flockd.campaign.flight_plan import Plan, Run
 from flockd.campaign.flight_table import FlightTable, read_table, sync_folder, write_table
-from flockd.campaign.plan import Plan, Run
 from flockd.errors import UsageError
 
 PLAN_NAME = "campaign.json"

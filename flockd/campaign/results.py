@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from flockd.campaign.figures import MEASURES
+from flockd.campaign.flight_plan import Plan
 from flockd.campaign.flight_table import read_table
 from flockd.campaign.folder import FLIGHTS_NAME, TIMINGS_NAME, load_plan
 from flockd.campaign.intervals import Interval, mean_interval
-from flockd.campaign.plan import Plan
 from flockd.config.campaign import Figure
 from flockd.errors import UsageError
 

@@ -6,8 +6,8 @@ from collections import deque
 from collections.abc import Iterable
 
 from flockd.campaign.figures import MEASURES
+from flockd.campaign.flight_plan import Plan, Run
 from flockd.campaign.intervals import mean_interval
-from flockd.campaign.plan import Plan, Run
 from flockd.config.campaign import StopRule
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from flockd.campaign.conduct import task_of
 from flockd.campaign.flight_kinds import FLIGHT_KINDS
-from flockd.campaign.plan import Plan, Run
+from flockd.campaign.flight_plan import Plan, Run
 
 SHORT_STEPS = 3
 """Of the first trial flight of a cell. The second one is longer: the difference is what its steps take, the rest what a

@@ -10,8 +10,8 @@ from flockd.campaign.conduct import Conducted, conduct
 from flockd.campaign.engines import Flown
 from flockd.campaign.figures import Figures
 from flockd.campaign.flight_kinds import Task, fly_task
+from flockd.campaign.flight_plan import Plan
 from flockd.campaign.folder import CampaignFolder
-from flockd.campaign.plan import Plan
 from flockd.config import ScenarioConfig
 from flockd.config.campaign import Figure
 from flockd.data import data_path

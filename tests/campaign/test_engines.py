@@ -20,8 +20,8 @@ import pytest
 from flockd.campaign.conduct import conduct, task_of
 from flockd.campaign.engines import ENGINES, Engine
 from flockd.campaign.flight_kinds import FlownRun
+from flockd.campaign.flight_plan import Plan, Run
 from flockd.campaign.folder import CampaignFolder
-from flockd.campaign.plan import Plan, Run
 from flockd.side_process import with_package
 from tests.campaign.flights import PAPER, Shuffled, campaign_file, flown
 

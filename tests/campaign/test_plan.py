@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flockd.campaign.plan import Plan, Run
+from flockd.campaign.flight_plan import Plan, Run
 from flockd.data import data_path
 from flockd.errors import ConfigError
 from tests.campaign.flights import HEAD, PAPER, campaign_file

@@ -11,9 +11,9 @@ import pytest
 
 from flockd.campaign.campaign_page import write_campaign_page, write_comparison_page
 from flockd.campaign.flight_kinds import FLIGHT_KINDS, FlightKind
+from flockd.campaign.flight_plan import Plan
 from flockd.campaign.flight_table import write_table
 from flockd.campaign.folder import CampaignFolder
-from flockd.campaign.plan import Plan
 from flockd.campaign.results import Results
 from flockd.campaign.verdicts import compare
 from flockd.errors import UsageError

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flockd.campaign.flight_plan import Plan, Run
 from flockd.campaign.intervals import mean_interval
-from flockd.campaign.plan import Plan, Run
 from flockd.campaign.schedule import Schedule
 from flockd.campaign.verdicts import paired_p, unpaired_p
 from tests.campaign.flights import HEAD, campaign_file

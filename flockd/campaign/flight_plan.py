@@ -26,6 +26,7 @@ from flockd.config.perceived import PerceivedErrors
 from flockd.config.scenario import MAX_DRONES
 from flockd.config.validation_messages import problems_of
 from flockd.errors import ConfigError, ConfigProblem, UsageError
+from flockd.inference.hashes import model_hashes
 
 CASE = "case"
 """The parameter whose values are the names of `cases`."""
@@ -68,7 +69,11 @@ class Plan:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Of a campaign's file. Raises ConfigError with everything wrong with it, its scenario and each cell."""
+        """Of a campaign's file.
+
+        Raises ConfigError with everything wrong with it, its scenario and each cell, and ModelError for networks that
+        are not there.
+        """
         config, places = load_campaign(path)
         scenario, of_scenario = load_with_places(path.parent / config.scenario)
         if not isinstance(scenario, ScenarioConfig):
@@ -82,6 +87,9 @@ class Plan:
         check.cells(plan)
         if idle := _idle_seeds(plan):
             raise ConfigError([places["seeds",].problem(idle)])
+        if config.perception == "sight":
+            for perception in {plan.recipe(cell, 0).scenario().drone.perception for cell in plan.cells}:
+                model_hashes(perception)
         return plan
 
     @classmethod
