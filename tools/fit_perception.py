@@ -238,7 +238,8 @@ def _time_constant(series: Sequence[FloatArray], step_s: float) -> float:
 def _provenance(log: FlightLog) -> str:
     m = log.metadata
     began = "" if m.began is None else f", {m.began[:10]}"
-    return f"{m.scenario}, seed {m.seed}, {m.drones} drones, {m.duration_s:g} s, {m.flow}, version {m.version or 'unknown'}{began}"
+    version = m.version or "unknown"
+    return f"{m.scenario}, seed {m.seed}, {m.drones} drones, {m.duration_s:g} s, {m.flow}, version {version}{began}"
 
 
 if __name__ == "__main__":
