@@ -49,13 +49,16 @@ class Commands(Protocol):
 
 
 def add_commands(parser: Parser, additions: Sequence[Callable[[Commands], None]]) -> None:
-    """Gives a parser its commands; without one it prints its help and exits with a usage error."""
+    """Gives a parser its commands; without one it prints its help and exits with a usage error.
+
+    What is parsed has `run`, the command's function, and `parser`, the command's own.
+    """
     subparsers = parser.add_subparsers(metavar="COMMAND", parser_class=Parser)
-    parser.set_defaults(run=lambda _: _print_help(parser))
+    parser.set_defaults(run=lambda _: _print_help(parser), parser=parser)
 
     def add(name: str, description: str, examples: Sequence[str], notes: str = "") -> Parser:
         parser.commands.append(name)
-        return subparsers.add_parser(
+        command: Parser = subparsers.add_parser(
             name,
             prog=f"{parser.prog} {name}",
             help=description,
@@ -63,6 +66,8 @@ def add_commands(parser: Parser, additions: Sequence[Callable[[Commands], None]]
             examples=examples,
             notes=notes,
         )
+        command.set_defaults(parser=command)
+        return command
 
     for addition in additions:
         addition(add)

@@ -28,6 +28,7 @@ def _row(drone: Watched, now_s: float) -> dict[str, Any]:
     simulated = drone.alive and "flight" not in drone.topics and bool(health)  # the simulator's own pilot: no daemon
     if simulated:
         state = "normal" if health["ok"] else "degraded"
+    starting = drone.alive and not drone.topics and not drone.malformed
     malformed = [f"its message `{topic}` is malformed: {why}" for topic, why in sorted(drone.malformed.items())]
     blind = [camera["fault"] for camera in computer.get("cameras", {}).values() if camera["fault"]]
     return {
@@ -43,6 +44,7 @@ def _row(drone: Watched, now_s: float) -> dict[str, Any]:
         "load": computer.get("load"),
         "mission": (drone.message("mission", now_s) or {}).get("sentence"),
         "matters": malformed
+        + (["it has published nothing yet: it starts, or loads its networks"] if starting else [])
         + [reason["sentence"] for reason in flight.get("reasons", ())]
         + [str(reason) for reason in (health.get("reasons", ()) if simulated else ())]
         + blind,

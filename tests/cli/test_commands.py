@@ -90,6 +90,11 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     ("arguments", "told"),
     [
         (["sims"], "flockd: 'sims' is not a command; did you mean `flockd sim`?; see flockd --help"),
+        (["status", "--once"], "flockd status: unknown argument --once; see flockd status --help"),
+        (
+            ["calibrate", "rig", "--once", "2"],
+            "flockd calibrate rig: unknown argument --once; see flockd calibrate rig --help",
+        ),
         (["record", "xyz"], "flockd record: 'xyz' is not a command, of info, recover, cut, export; see "),
         (["sim", "--duration", "-3"], "flockd sim: argument --duration: '-3' is not a positive number"),
         (["sim", "--duration", "nan"], "flockd sim: argument --duration: 'nan' is not a positive number"),

@@ -55,6 +55,16 @@ def test_the_worst_stands_first() -> None:
     ]
 
 
+def test_a_drone_that_has_published_nothing_yet_is_said_to_start() -> None:
+    new, broken = Watched("meadow", "a", True), Watched("meadow", "b", True, malformed={"flight": "no JSON"})
+    first, second = status_rows([new, broken], NOW_S)
+    assert (first["state"], first["matters"]) == (
+        "quiet",
+        ["it has published nothing yet: it starts, or loads its networks"],
+    )
+    assert second["matters"] == ["its message `flight` is malformed: no JSON"]
+
+
 def test_a_row_tells_what_is_the_matter() -> None:
     drone = _drone("a", "degraded", reasons=[{"event": "hot", "sentence": "the computer is at 90 °C"}])
     computer = ComputerMessage(
