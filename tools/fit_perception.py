@@ -104,7 +104,7 @@ def samples_of(log: FlightLog) -> Samples:
     turn = np.arctan2(level[..., 1], level[..., 0]) - np.arctan2(true_level[..., 1], true_level[..., 0])
     with np.errstate(divide="ignore", invalid="ignore"):
         log_range = np.log(np.linalg.norm(estimated, axis=-1) / distance)
-    false_m = [_false_distances(log, step) for step in np.flatnonzero(later)]
+    false_m = [_false_distances(log, int(step)) for step in np.flatnonzero(later)]
     return Samples(
         distance=distance,
         hidden=_hidden_shares(relative, distance),

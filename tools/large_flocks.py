@@ -3,6 +3,7 @@
     python -m tools.large_flocks out/large_flocks.jsonl                          # flies what is missing there
     python -m tools.large_flocks out/large_flocks.jsonl --table                  # the figures, in Markdown
     python -m tools.large_flocks out/large_flocks.jsonl --pictures docs/pictures
+    python -m tools.large_flocks out/large_flocks.jsonl --sampling               # what a shorter step changes
 
 The paper's flight, a circle and its tangent, by drones that start on a grid of 3.5 m, all at one height; each start is
 moved by up to 0.5 m by the seed. Perception is exact or as config/perceived/shipped_networks.yaml says. Every flight is
@@ -63,12 +64,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("results", type=Path)
     parser.add_argument("--table", action="store_true")
+    parser.add_argument("--sampling", action="store_true")
     parser.add_argument("--pictures", type=Path, metavar="DIR")
     parser.add_argument("--perception", choices=PERCEPTIONS, help="of this only")
     parser.add_argument("--most", type=int, default=max(SEEDS.values()), help="flights of a cell")
     args = parser.parse_args()
     if args.table:
         print(table(read(args.results)))
+    elif args.sampling:
+        print_sampling()
     elif args.pictures:
         draw(read(args.results), args.pictures / "large_flocks.webp")
         draw_snapshots(args.pictures / "large_flocks_seen.webp")
@@ -137,6 +141,16 @@ def _summary(rows: Sequence[dict[str, Any]], cell: Cell) -> str:
     least, order = min(row["min_level_distance_m"] for row in of), statistics.fmean(row["order_tail"] for row in of)
     contacts = statistics.fmean(row["drone_collisions"] for row in of) / cell.drones
     return f"{least:.2f} m, {order:.3f}, {contacts:.1f}"
+
+
+def print_sampling() -> None:
+    """With weight on all, exact states, two flights of a minute: the paper's step and one a fifth as long."""
+    for step_s in (0.5, 0.1):
+        for drones in (25, 50):
+            cell, keys = Cell("exact", "uniform", drones), {"drone.step_s": step_s, "duration_s": 60.0}
+            found = fly_flocks([scenario_of(cell, seed, **keys) for seed in range(2)])
+            means = [statistics.fmean(float(one[key] or 0.0) for one in found) for key in list(SHOWN)[1:]]
+            print(f"step {step_s} s, {drones} drones: {means[0]:.2f} m to the nearest, order {means[1]:.2f}")
 
 
 def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
