@@ -104,7 +104,7 @@ def samples_of(log: FlightLog) -> Samples:
     turn = np.arctan2(level[..., 1], level[..., 0]) - np.arctan2(true_level[..., 1], true_level[..., 0])
     with np.errstate(divide="ignore", invalid="ignore"):
         log_range = np.log(np.linalg.norm(estimated, axis=-1) / distance)
-    false_m = [_false_distances(log, step) for step in np.flatnonzero(later)]
+    false_m = [_false_distances(log, int(step)) for step in np.flatnonzero(later)]
     return Samples(
         distance=distance,
         hidden=_hidden_shares(relative, distance),
@@ -238,7 +238,8 @@ def _time_constant(series: Sequence[FloatArray], step_s: float) -> float:
 def _provenance(log: FlightLog) -> str:
     m = log.metadata
     began = "" if m.began is None else f", {m.began[:10]}"
-    return f"{m.scenario}, seed {m.seed}, {m.drones} drones, {m.duration_s:g} s, {m.flow}, version {m.version or 'unknown'}{began}"
+    version = m.version or "unknown"
+    return f"{m.scenario}, seed {m.seed}, {m.drones} drones, {m.duration_s:g} s, {m.flow}, version {version}{began}"
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
     python -m tools.large_flocks out/large_flocks.jsonl                          # flies what is missing there
     python -m tools.large_flocks out/large_flocks.jsonl --table                  # the figures, in Markdown
     python -m tools.large_flocks out/large_flocks.jsonl --pictures docs/pictures
+    python -m tools.large_flocks out/large_flocks.jsonl --sampling               # what a shorter step changes
 
 The paper's flight, a circle and its tangent, by drones that start on a grid of 3.5 m, all at one height; each start is
 moved by up to 0.5 m by the seed. Perception is exact or as config/perceived/shipped_networks.yaml says. Every flight is
@@ -42,10 +43,9 @@ WEIGHTS: dict[str, dict[str, Any]] = {
 PERCEPTIONS = ("exact", "measured")
 HEIGHT_M, SPREAD_M = 4.5, 0.5
 SHOWN = {
-    "min_level_distance_m": ("nearest distance in the flight", "m"),
-    "mean_nearest_tail_m": ("distance to the nearest, mean of the last 10 s", "m"),
-    "order_tail": ("order of the last 10 s", ""),
-    "union_tail": ("union of the last 10 s", ""),
+    "min_level_distance_m": ("nearest distance, m", (0.0, 3.5)),
+    "mean_nearest_tail_m": ("mean distance to the nearest, last 10 s, m", (0.0, 4.0)),
+    "order_tail": ("order, last 10 s", (-0.05, 1.05)),
 }
 SNAPSHOT_DRONES, SNAPSHOT_S = 250, 60.0
 ERRORS = data_path("config") / "perceived" / "shipped_networks.yaml"
@@ -64,16 +64,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("results", type=Path)
     parser.add_argument("--table", action="store_true")
+    parser.add_argument("--sampling", action="store_true")
     parser.add_argument("--pictures", type=Path, metavar="DIR")
     parser.add_argument("--perception", choices=PERCEPTIONS, help="of this only")
+    parser.add_argument("--most", type=int, default=max(SEEDS.values()), help="flights of a cell")
     args = parser.parse_args()
     if args.table:
         print(table(read(args.results)))
+    elif args.sampling:
+        print_sampling()
     elif args.pictures:
         draw(read(args.results), args.pictures / "large_flocks.webp")
         draw_snapshots(args.pictures / "large_flocks_seen.webp")
     else:
-        fly_missing(args.results, [args.perception] if args.perception else PERCEPTIONS)
+        fly_missing(args.results, [args.perception] if args.perception else PERCEPTIONS, args.most)
 
 
 def cells(perceptions: Sequence[str]) -> Iterator[Cell]:
@@ -87,18 +91,17 @@ def cells(perceptions: Sequence[str]) -> Iterator[Cell]:
 def scenario_of(cell: Cell, seed: int, **overrides: Any) -> ScenarioConfig:
     """One flight."""
     keys = {f"drone.flocking.weight.{key}": value for key, value in WEIGHTS[cell.weight].items()}
-    scenario = load_scenario(data_path("config") / "paper_flight.yaml", {"seed": seed, **keys, **overrides})
-    alone = scenario.model_copy(update={"vehicles": scenario.vehicles[:1]})  # the others start on the grid around it
-    return scattered(with_drones(alone, cell.drones), SPREAD_M, HEIGHT_M)
+    scenario = load_scenario(data_path("config") / "large_flock.yaml", {"seed": seed, **keys, **overrides})
+    return scattered(with_drones(scenario, cell.drones), SPREAD_M, HEIGHT_M)
 
 
-def fly_missing(path: Path, perceptions: Sequence[str]) -> None:
+def fly_missing(path: Path, perceptions: Sequence[str], most: int) -> None:
     """Flies what is not in the file, a cell at a time, and adds it."""
     known = {(Cell(row["perception"], row["weight"], row["drones"]), row["seed"]) for row in read(path)}
     errors = load_perceived_errors(ERRORS)
     path.parent.mkdir(parents=True, exist_ok=True)
     for cell in cells(perceptions):
-        seeds = [seed for seed in range(SEEDS[cell.drones]) if (cell, seed) not in known]
+        seeds = [seed for seed in range(min(SEEDS[cell.drones], most)) if (cell, seed) not in known]
         if not seeds:
             continue
         scenarios = [scenario_of(cell, seed) for seed in seeds]
@@ -115,42 +118,55 @@ def read(path: Path) -> list[dict[str, Any]]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """Means over the flights; of the nearest distance the least of all too."""
-    lines = [
-        "| perception | weight | drones | flights | nearest distance, least | to the nearest, last 10 s "
-        "| order | union | contacts a drone |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    """For each perception, sizes by weights: nearest distance (least of all flights), order, and contacts a drone."""
+    lines = []
     for perception in PERCEPTIONS:
-        for weight in WEIGHTS:
-            for drones in SEEDS:
-                of = [r for r in rows if (r["perception"], r["weight"], r["drones"]) == (perception, weight, drones)]
-                if of:
-                    least = min(r["min_level_distance_m"] for r in of)
-                    nearest, order, union = (
-                        statistics.fmean(r[key] for r in of)
-                        for key in ("mean_nearest_tail_m", "order_tail", "union_tail")
-                    )
-                    collisions = statistics.fmean(r["drone_collisions"] for r in of) / drones
-                    values = f"{least:.2f} m | {nearest:.2f} m | {order:.3f} | {union:.3f} | {collisions:.2f}"
-                    lines.append(f"| {perception} | {weight} | {drones} | {len(of)} | {values} |")
-    return "\n".join(lines)
+        lines += [
+            f"\n{perception} perception:\n",
+            f"| drones | {' | '.join(WEIGHTS)} |",
+            "|---" * (len(WEIGHTS) + 1) + "|",
+        ]
+        for drones in SEEDS:
+            found = [_summary(rows, Cell(perception, weight, drones)) for weight in WEIGHTS]
+            lines.append(f"| {drones} | {' | '.join(found)} |")
+    union = min((row["union_tail"] for row in rows), default=1.0)
+    return "\n".join([*lines, f"\n{len(rows)} flights; least union {union:.3f}"])
+
+
+def _summary(rows: Sequence[dict[str, Any]], cell: Cell) -> str:
+    """Of a cell's flights."""
+    of = [row for row in rows if (row["perception"], row["weight"], row["drones"]) == cell]
+    if not of:
+        return "-"
+    least, order = min(row["min_level_distance_m"] for row in of), statistics.fmean(row["order_tail"] for row in of)
+    contacts = statistics.fmean(row["drone_collisions"] for row in of) / cell.drones
+    return f"{least:.2f} m, {order:.3f}, {contacts:.1f}"
+
+
+def print_sampling() -> None:
+    """With weight on all, exact states, two flights of a minute: the paper's step and one a fifth as long."""
+    for step_s in (0.5, 0.1):
+        for drones in (25, 50):
+            cell, keys = Cell("exact", "uniform", drones), {"drone.step_s": step_s, "duration_s": 60.0}
+            found = fly_flocks([scenario_of(cell, seed, **keys) for seed in range(2)])
+            means = [statistics.fmean(float(one[key] or 0.0) for one in found) for key in list(SHOWN)[1:]]
+            print(f"step {step_s} s, {drones} drones: {means[0]:.2f} m to the nearest, order {means[1]:.2f}")
 
 
 def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """Each figure over the size of the flock, exact and measured."""
     with rc_context(STYLE):
-        figure = Figure(figsize=(9.0, 9.6), layout="constrained")
-        grid = figure.subplots(len(SHOWN), len(PERCEPTIONS), sharex=True, sharey="row", squeeze=False)
-        for axes_of_figure, (key, (name, unit)) in zip(grid, SHOWN.items(), strict=True):
+        figure = Figure(figsize=(9.0, 7.2), layout="constrained")
+        grid = figure.subplots(len(SHOWN), len(PERCEPTIONS), sharex=True, sharey="row")
+        for axes_of_figure, (key, (name, limits)) in zip(grid, SHOWN.items(), strict=True):
             for axes, perception in zip(axes_of_figure, PERCEPTIONS, strict=True):
                 _draw_lines(axes, [row for row in rows if row["perception"] == perception], key)
-                axes.set_title(f"{name}, {perception} perception", fontsize=9)
-                axes.set_ylabel(unit)
+                axes.set(ylim=limits)
+                axes.set_title(f"{name}, {perception}", fontsize=9)
         for axes in grid[-1]:
             axes.set(xlabel="drones", xscale="log", xticks=LABELLED, xticklabels=[str(n) for n in LABELLED])
             axes.minorticks_off()
-        grid[0][0].legend(fontsize=8)
+        grid[0][0].legend(fontsize=8, ncols=2)
         _save(figure, path)
 
 

@@ -82,7 +82,7 @@ class FlockFlights:
         drone, vehicle, seeds = scenario.drone, scenario.vehicle, [one.seed for one in scenarios]
         self._drone, self._shape = drone, (len(scenarios), len(scenario.vehicles))
         self.steps = round(scenario.duration_s / drone.step_s)
-        self._times = np.arange(self.steps) * drone.step_s
+        self._times = np.arange(self.steps, dtype=float) * drone.step_s
         f, n = self._shape
         self.states = np.ascontiguousarray(np.stack([_start(one) for one in scenarios], axis=1))
         """(6, flights, n) m and m/s: position and velocity, NED."""

@@ -66,7 +66,7 @@ class ManyMissions:
         if not led:
             return None
         mission = max(led, key=lambda pair: pair[0])[1]
-        return mission.places[-1], mission.last().any(axis=1)
+        return mission.places[-1], np.asarray(mission.last().any(axis=1))
 
 
 class _Shared:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from flockd.sim.start import with_drones
 UNIFORM = WeightParameters(kind="uniform")
 
 
+@lru_cache
 def _scenario(name: str = "paper_flight", **overrides: Any) -> ScenarioConfig:
     keys = {key.replace("__", "."): value for key, value in overrides.items()}
     return load_scenario(data_path("config") / f"{name}.yaml", keys)
@@ -90,12 +92,12 @@ def test_two_drones_at_one_spot_are_pushed_as_the_law_pushes_them() -> None:
 @pytest.mark.parametrize(
     ("scenario", "drones"),
     [
-        (_scenario(duration_s=40.0, drone__flocking__weight__kind="uniform"), 5),
-        (_scenario(duration_s=15.0, vehicle__gust_m_s=0.2, seed=3), 5),
+        (_scenario(duration_s=20.0, drone__flocking__weight__kind="uniform"), 5),
+        (_scenario(duration_s=15.0, vehicle__gust_m_s=0.2, seed=3), 3),
         (_scenario(duration_s=10.0, drone__flocking__weight__nearest=3), 12),
-        (_scenario("square", duration_s=50.0), 5),
-        (_scenario("one_knows", duration_s=15.0), 5),
-        (_scenario(duration_s=15.0, drone__mission__height_m=9.0), 3),
+        (_scenario("square", duration_s=50.0), 2),
+        (_scenario("one_knows", duration_s=15.0), 3),
+        (_scenario(duration_s=15.0, drone__mission__height_m=9.0), 2),
     ],
 )
 def test_a_flight_is_the_simulators_flight_with_exact_states(scenario: ScenarioConfig, drones: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,7 @@ def _errors(entry: dict[str, Any] | None = None, **keys: Any) -> PerceivedErrors
     return PerceivedErrors.model_validate(values, strict=False)
 
 
+@lru_cache
 def _scenario(drones: int, **keys: Any) -> ScenarioConfig:
     overrides = {key.replace("__", "."): value for key, value in keys.items()}
     return with_drones(load_scenario(data_path("config") / "paper_flight.yaml", overrides), drones)
@@ -93,9 +95,9 @@ def test_errors_are_as_large_as_measured() -> None:
 
 
 def test_a_share_is_missed_for_about_the_time_that_was_measured() -> None:
-    flights = FlockFlights(_pair(7.0, 2000), _errors({"missed": 0.2}, missed_time_s=4.0))
+    flights = FlockFlights(_pair(7.0, 800), _errors({"missed": 0.2}, missed_time_s=4.0))
     missed = np.array([_seen(flights, step)[0] == 0.0 for step in range(24)])
-    assert missed.mean() == pytest.approx(0.2, abs=0.02)
+    assert missed.mean() == pytest.approx(0.2, abs=0.03)
     again = missed[1:][missed[:-1]].mean()  # half a second after a step in which it was missed
     assert 0.6 < again < 0.95
     assert missed[16:][missed[:8]].mean() < 0.35  # eight seconds after
@@ -122,14 +124,14 @@ def test_nobody_is_seen_beyond_the_range_or_too_far_above() -> None:
 
 def test_false_neighbours_are_as_many_as_measured() -> None:
     errors = _errors(range_limit_m=30.0, false_neighbours={**FAULTLESS["false_neighbours"], "at_once": 0.4})
-    flights = FlockFlights(_pair(40.0, 3000), errors)
+    flights = FlockFlights(_pair(40.0, 2000), errors)
     pulled = [np.any(_seen(flights, step) != 0.0, axis=0).mean() for step in (0, 40)]
-    assert np.mean(pulled) == pytest.approx(1 - 0.9**4, abs=0.03)  # none of four that are there one time in ten
+    assert np.mean(pulled) == pytest.approx(1 - 0.9**4, abs=0.04)  # none of four that are there one time in ten
 
 
 def test_its_own_velocity_errs_too() -> None:
     errors = _errors(own_velocity_error_m_s={"median": 0.05, "p95": 0.2}, range_limit_m=1.0)
-    own = _seen(FlockFlights(_pair(40.0, 3000), errors), 0)  # -V of Eq. 38, nothing else
+    own = _seen(FlockFlights(_pair(40.0, 2000), errors), 0)  # -V of Eq. 38, nothing else
     assert np.median(np.abs(own)) == pytest.approx(0.05, rel=0.08)
     assert np.percentile(np.abs(own), 95) == pytest.approx(0.2, rel=0.08)
 
