@@ -17,7 +17,7 @@ _TICK_S = 0.01
 """How often a waiting reader checks whether a set that is not complete has waited long enough."""
 
 _USELESS_AFTER = 3
-"""So many images in a row that cannot be decoded, or show nothing, are a fault of their camera."""
+"""So many frames in a row that are worth nothing are a fault of their camera; the drone flies on by the others."""
 
 MAX_AHEAD_S = 0.02
 """Drivers that work out time stamps from the camera's own clock may be this much ahead."""
@@ -33,7 +33,9 @@ class FrameReceiver:
         self._assembler = Assembler(cameras, parameters)
         self._faults: dict[str, str | None] = dict.fromkeys(cameras)
         self._useless: Counter[str] = Counter()
-        """Images in a row, by camera."""
+        """Images in a row that could not be decoded, by camera."""
+        self._refused: Counter[str] = Counter()
+        """Frames in a row that `refuse` was called for, by camera."""
         self._changed = threading.Condition()
         self._stopped = False
 
@@ -50,6 +52,7 @@ class FrameReceiver:
             refused = self._assembler.offer(frame, self._clock())
             if refused is None:
                 self._faults[frame.camera] = None
+                self._refused[frame.camera] = 0
                 self._changed.notify_all()
             elif refused == "frozen":
                 self._faults[frame.camera] = f"{frame.camera}: the image is frozen; restart its camera or program"
@@ -60,6 +63,15 @@ class FrameReceiver:
         with self._changed:
             for one in what:
                 self._assembler.count(camera, one)
+
+    def refuse(self, camera: str, what: Count, sentence: str) -> None:
+        """Counts a frame that is worth nothing; with `_USELESS_AFTER` in a row the sentence says why none comes."""
+        with self._changed:
+            self._assembler.count(camera, "received")
+            self._assembler.count(camera, what)
+            self._refused[camera] += 1
+            if self._refused[camera] >= _USELESS_AFTER:
+                self._faults[camera] = sentence
 
     def fault(self, camera: str, sentence: str) -> None:
         """Says why a camera gives nothing, until it gives something."""

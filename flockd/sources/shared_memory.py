@@ -148,13 +148,13 @@ class SharedMemorySource:
             self._receiver.count(camera, "received", "malformed")
             return
         if (width, height) != image_format.size:
-            self._receiver.count(camera, "received", "corrupt")
             asked = "x".join(map(str, image_format.size))
-            self._receiver.fault(camera, f"{camera}: frames are {width}x{height}, but the rig has {asked}; correct one")
+            why = f"{camera}: frames are {width}x{height}, but the rig has {asked}; correct one"
+            self._receiver.refuse(camera, "corrupt", why)
             return
         if not self._receiver.is_of_now(time_s, MAX_AGE_S):
-            self._receiver.count(camera, "received", "time_stamp")
-            self._receiver.fault(camera, f"{camera}: a time stamp is not of this computer's clock; correct the program")
+            why = f"{camera}: a time stamp is not of this computer's clock; correct the program"
+            self._receiver.refuse(camera, "time_stamp", why)
             return
         self._receiver.offer(RawFrame(camera, sample.payload.to_bytes(), image_format.decode, time_s, sequence))
 

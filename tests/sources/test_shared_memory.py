@@ -193,13 +193,15 @@ def test_messages_that_are_no_frames_are_counted_and_ignored(endpoint: str, sour
         stranger.put(b"hello")
         stranger.put(b"hello", attachment=b"hello")
         stranger.put(scene().tobytes(), attachment=header.pack(b"bgr8", 640, 480, 1, 1e6))
-        stranger.put(scene()[::2, ::2].tobytes(), attachment=header.pack(b"rgb8", 320, 240, 1, 1e6))
-        until_s = time.monotonic() + 5.0
-        while (status := source.status()["front"]).counts.get("corrupt") != 1:
-            assert time.monotonic() < until_s
-            time.sleep(0.01)
+        wrong_size = "front: frames are 320x240, but the rig has 640x480; correct one"
+        for corrupt, fault in enumerate([None, None, wrong_size]):
+            stranger.put(scene()[::2, ::2].tobytes(), attachment=header.pack(b"rgb8", 320, 240, 1, 1e6))
+            until_s = time.monotonic() + 5.0
+            while (status := source.status()["front"]).counts.get("corrupt") != corrupt + 1:
+                assert time.monotonic() < until_s
+                time.sleep(0.01)
+            assert status.fault == fault, "one bad frame is no lost camera"
         assert status.counts["malformed"] == 3
-        assert status.fault == "front: frames are 320x240, but the rig has 640x480; correct one"
         stranger.put(b"too short", attachment=header.pack(b"rgb8", 640, 480, number, time.monotonic()))
         publisher.publish("3", Frame("back", scene(), time.monotonic(), number))
         frames = source.newest(5.0)
@@ -215,10 +217,12 @@ def test_stamps_of_another_clock_are_dropped_and_good_frames_go_on_at_once(
         _, number = _first(publisher, source)
         while source.newest(0.1) is not None:
             pass
-        publisher.publish("3", Frame("front", scene(), time.monotonic() + wrong_by_s, number))
-        assert source.newest(0.2) is None
-        status = source.status()["front"]
-        assert status.counts["time_stamp"] == 1
+        for bad in range(3):
+            publisher.publish("3", Frame("front", scene(), time.monotonic() + wrong_by_s, number))
+            assert source.newest(0.2) is None
+            status = source.status()["front"]
+            assert status.counts["time_stamp"] == bad + 1
+            assert (status.fault is not None) == (bad == 2), "one bad frame is no lost camera"
         assert status.fault == "front: a time stamp is not of this computer's clock; correct the program"
         _send(publisher, number + 1)
         received = source.newest(5.0)
