@@ -111,7 +111,6 @@ def build(out: Path, arch: str, system: str, version: str, *, shelf: Path | None
         _environment(tree, [*wheels.locked(shelf), wheels.build_own(own, shelf)], python)
         _system_files(tree)
         _documents(tree, full_version, epoch_s)
-        _set_modes(tree)
         values = {
             "VERSION": full_version,
             "ARCH": arch,
@@ -121,6 +120,7 @@ def build(out: Path, arch: str, system: str, version: str, *, shelf: Path | None
             "SIZE_KB": str(sum(path.stat().st_size for path in tree.rglob("*") if path.is_file()) // 1024),
         }
         _control(tree, values)
+        _set_modes(tree)
         command = ["dpkg-deb", "--root-owner-group", "-Zzstd", f"-z{level}", "--build", str(tree), str(file)]
         environment = {**os.environ, "SOURCE_DATE_EPOCH": str(epoch_s)}
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=environment)
@@ -134,7 +134,7 @@ def _environment(tree: Path, contents: Sequence[Path], python: str) -> None:
     for wheel in contents:
         wheels.unpack(wheel, home / "lib" / f"python{python}" / "site-packages")
     (home / "pyvenv.cfg").write_text("home = /usr/bin\ninclude-system-site-packages = false\n", encoding="utf-8")
-    (home / "bin/python").symlink_to(f"/usr/bin/python{python}")
+    (home / "bin/python").symlink_to(f"../../../bin/python{python}")
     _write(home / "bin/flockd", COMMAND)
     command = tree / PACKAGED.lstrip("/")
     command.parent.mkdir()
@@ -172,7 +172,6 @@ def _control(tree: Path, values: Mapping[str, str]) -> None:
         for key, value in values.items():
             text = text.replace(f"@{key}@", value)
         _write(folder / name, text)
-        (folder / name).chmod(0o755 if name in SCRIPTS else 0o644)
     files = sorted(path for path in tree.rglob("*") if path.is_file() and not path.is_symlink())
     listed = [path.relative_to(tree) for path in files if folder not in path.parents]
     settings = [path for path in listed if path.parts[0] == "etc"]
@@ -185,9 +184,10 @@ def _control(tree: Path, values: Mapping[str, str]) -> None:
 
 def _set_modes(tree: Path) -> None:
     """Whatever the umask here and the modes in the wheels are."""
+    programs = {tree / HOME / "bin/flockd", *(tree / "DEBIAN" / name for name in SCRIPTS)}
     for path in [tree, *tree.rglob("*")]:
         if not path.is_symlink():
-            path.chmod(0o755 if path.is_dir() or path.parent == tree / HOME / "bin" else 0o644)
+            path.chmod(0o755 if path.is_dir() or path in programs else 0o644)
 
 
 def _write(path: Path, text: str) -> None:
