@@ -45,6 +45,8 @@ OFFBOARD_MAIN_MODE = 6
 ALL_MODES = 0xFFFFFFFF
 ERROR, WARNING = 3, 4
 """Of PX4's log levels, which are worse the smaller."""
+MOST_CHECKS = 300
+"""That a report may name as failed: PX4 has fewer."""
 PREARM_CHECK = 1 << 28
 """Of MAV_SYS_STATUS_SENSOR."""
 QUIET_ERRORS = frozenset({"check_system_safety_button", "check_modes_mission"})
@@ -112,9 +114,12 @@ class CheckEvents:
         self._failed: list[FailedCheck] = []
 
     def add(self, fields: Mapping[str, Any], time_s: float) -> None:
-        """Takes an EVENT."""
-        number, sequence = int(fields["id"]), int(fields["sequence"])
-        arguments = bytes(int(byte) for byte in fields["arguments"])
+        """Takes an EVENT; one that is none is ignored."""
+        try:
+            number, sequence = int(fields["id"]), int(fields["sequence"])
+            arguments, level = bytes(fields["arguments"]), int(fields["log_levels"]) & 0xF
+        except (KeyError, TypeError, ValueError, OverflowError):
+            return
         if self._sequence is not None and sequence == self._sequence:
             return
         if self._sequence is not None and sequence != (self._sequence + 1) & 0xFFFF:
@@ -132,8 +137,8 @@ class CheckEvents:
         elif number == MODE_DENIED:
             if _word(arguments, 0) >> 16 & 0xFF == OFFBOARD_MAIN_MODE:
                 self.denied = time_s, NO_SETPOINTS
-        elif self._begun is not None:
-            self._failed.append(FailedCheck(number, _word(arguments, 0), int(fields["log_levels"]) & 0xF))
+        elif self._begun is not None and len(self._failed) < MOST_CHECKS:
+            self._failed.append(FailedCheck(number, _word(arguments, 0), level))
 
 
 def refusals(

@@ -201,7 +201,8 @@ class Watched:
         return self._reasons() & REASONS.keys()
 
     def _reasons(self) -> set[str]:
-        return {reason["event"] for reason in self.heard()["flight"].message["reasons"]}
+        flight = self.heard().get("flight")
+        return set() if flight is None else {reason["event"] for reason in flight.message["reasons"]}
 
     async def until_state(self, *states: str) -> None:
         await until(lambda: self.state() in states, SECONDS_TO_FAIL)

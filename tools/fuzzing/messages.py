@@ -52,7 +52,11 @@ def _mavlink(folder: Path) -> Check:
             now_s += random.choice((0.0, 0.02, 1.0, 3.0))
             name = random.choice(RECEIVED)
             received.add(name, {field: _value(random, kind) for field, kind in kinds[name].items()}, now_s)
+            if random.random() < 0.1:
+                received.add_other_heartbeat({"type": random.choice((2, 18, None, "18", 1e300))}, now_s)
         status, state = received.status(now_s), received.vehicle_state()
+        for refusal in received.refusals(now_s, streams=random.random() < 0.5):
+            assert_readable(refusal.sentence)
         assert status.battery_share is None or 0.0 <= status.battery_share <= 1.0, status.battery_share
         for vector in (status.position_ned, status.home_ned):
             assert vector is None or np.isfinite(vector).all()
@@ -67,7 +71,21 @@ def _mavlink(folder: Path) -> Check:
     return check
 
 
+_EVENT = {
+    "id": "uint32_t",
+    "event_time_boot_ms": "uint32_t",
+    "sequence": "uint16_t",
+    "destination_component": "uint8_t",
+    "destination_system": "uint8_t",
+    "log_levels": "uint8_t",
+    "arguments": "bytes",
+}
+"""MAVLink's EVENT, which pymavlink does not have."""
+
+
 def _fields(name: str) -> dict[str, str]:
+    if name == "EVENT":
+        return _EVENT
     kind = getattr(dialect, f"MAVLink_{name.lower()}_message")
     return dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
 
@@ -79,6 +97,8 @@ def _value(random: Random, kind: str) -> Any:
     if kind in ("float", "double"):
         number = any_float(random)
         return None if math.isnan(number) else max(min(number, 3.4e38), -3.4e38)
+    if kind == "bytes":
+        return random.choice(([random.randrange(256) for _ in range(random.choice((40, 40, 0, 3)))], None, [-1], ["a"]))
     bits, signed = int("".join(filter(str.isdigit, kind))), not kind.startswith("u")
     low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
     return random.choice((0, 1, 2, 3, 4, 5, 6, 8, low, high, random.randint(low, high)))
