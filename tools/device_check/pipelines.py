@@ -48,7 +48,7 @@ def stamps() -> Iterator[Finding]:
     with DatagramCamera(RATE_HZ) as camera, _opened(camera.pipeline, datagrams.SIZE) as device:
         frames = [frame for frame, _ in _read(device)]
     errors_ms = [1e3 * (frame.time_s - datagrams.sent_s(frame.data)) for frame in frames]
-    low, usual, high = np.percentile(errors_ms, [0, 50, 95])
+    low, usual, high = np.percentile(errors_ms, [0, 50, 95]).tolist()
     yield Finding(
         "pipeline's time stamps",
         low >= 0.0 and usual < 1e3 * STAMP_ERROR_S,
@@ -153,7 +153,7 @@ def _streams(name: str, pipeline: str) -> Iterator[Finding]:
     with _opened(pipeline, SIZE) as device:
         got = _read(device)
     periods = np.array([after.time_s - before.time_s for (before, _), (after, _) in pairwise(got)])
-    ages_ms = np.percentile([1e3 * (came_s - frame.time_s) for frame, came_s in got], [0, 50, 95])
+    ages_ms = np.percentile([1e3 * (came_s - frame.time_s) for frame, came_s in got], [0, 50, 95]).tolist()
     gaps = sum(after.sequence - before.sequence - 1 for (before, _), (after, _) in pairwise(got))
     hz, off_ms = 1.0 / float(np.median(periods)), 1e3 * float(np.percentile(np.abs(periods - 1.0 / RATE_HZ), 95))
     yield Finding(
