@@ -10,12 +10,16 @@ import pytest
 from flockd.cli import main
 from flockd.errors import UsageError
 from flockd.flight_log.autopilot_log import AutopilotLog
+from flockd.flight_log.from_recordings import autopilot_clock
 from flockd.flight_log.log import FlightLog
 from flockd.flight_log.metadata import FlightMetadata
 from flockd.flight_log.ulog import autopilot_log, drone_of, read_ulog
+from flockd.recording import Recorder
+from flockd.recording.reader import Recording
 from flockd.report.autopilot_figure import autopilot_texts
 from flockd.report.flight_folder import save_flight
 from tests.flight_log.made_ulog import HEADER, Rows, write_ulog
+from tests.recording.made_up import MadeUpPilot, drone_config, inputs
 
 BOOT_S = 900.0
 """The autopilot's clock at the flight's start."""
@@ -95,6 +99,19 @@ def test_without_a_recorded_clock_the_commands_tell_the_time(tmp_path: Path) -> 
     assert beside.placed_by.startswith("its setpoints")
     assert beside.modes[1].begin_s == pytest.approx(1.0, abs=0.1)
     assert beside.modes[1].end_s == pytest.approx(25.0, abs=0.1)
+
+
+def test_the_autopilots_clock_comes_from_the_recording(tmp_path: Path) -> None:
+    config = drone_config()
+    with Recorder(tmp_path / "drone1.mcap", drone="drone1", config=config) as recorder:
+        for frames, vehicle in inputs(2):
+            recorder.step(frames, vehicle, MadeUpPilot(config).step(frames, vehicle))
+        for time_s, offset_s in ((100.0, None), (101.0, -46_100.25), (102.0, -46_100.26)):
+            others = {"error_s": None, "jitter_s": None, "round_trip_s": None, "age_s": None}
+            recorder.publish("drone1", "clock", {"time_s": time_s, "offset_s": offset_s, **others})
+    clock = autopilot_clock(Recording(tmp_path / "drone1.mcap"))
+    assert clock is not None
+    assert (clock[0].tolist(), clock[1].tolist()) == ([101.0, 102.0], [-46_100.25, -46_100.26])
 
 
 def test_what_was_saved_is_read_again(tmp_path: Path) -> None:
