@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 RUN = "run"
 COSTS = """\
-costs: `--dry-run` estimates them. A flight of five drones for 110 s on exact states takes a second of one core (November
-2026, a computer with much else to do), a flight by sight 12 s a simulated second. A flight's row takes 1 kB.
+costs: `--dry-run` estimates them. A flight of five drones for 110 s on exact states takes one core a second (November
+2026, a busy computer), a flight by sight 12 s a simulated second. A flight's row takes 1 kB.
 Ctrl-C and every other end lose only flights that are in the air: the same command goes on with what is missing."""
 
 
