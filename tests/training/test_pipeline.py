@@ -30,6 +30,7 @@ def run(tool: str, *options: str | Path) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_a_network_is_trained_resumed_and_exported_by_one_command_each(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
