@@ -75,7 +75,8 @@ class Package:
         shutil.copy(DRONE, CONFIG)
         checked = _run("flockd", "config", "check", str(CONFIG))
         yield Finding("flockd config check", str(CONFIG) in checked, checked.strip().splitlines()[-1], "accepted")
-        _run("systemctl", "enable", "--now", UNIT)
+        _run("systemctl", "enable", UNIT)
+        _run("systemctl", "start", "--no-block", UNIT)  # it begins anew until the autopilot beside it is up
         until(lambda: _shown("ActiveState") == "active", "the service to be ready")
         took_s = time.monotonic() - self._begun_s - others_s
         yield Finding(
