@@ -25,7 +25,7 @@ import sys
 import tempfile
 import time
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -272,12 +272,11 @@ def _watched(
     samples: dict[str, array[float]] = {}
     program, until_s = daemons.programs()[0], time.monotonic() + seconds
     resumed, session = 0, open_session("soak", (), (endpoint,))
+    resume = f"flockd/v1/*/{program.name}/ask/resume"
     try:
         while time.monotonic() < until_s:
             if autopilot.mode != "OFFBOARD":  # the first time; and again when this computer was too busy to fly
-                resumed += 1
-                list(session.get(f"flockd/v1/*/{program.name}/ask/resume", timeout=1.0))
-                autopilot.pilot_selects("OFFBOARD")
+                resumed += _fly(autopilot, watcher, lambda: session.get(resume, timeout=1.0))
             time.sleep(SAMPLE_S)
             if program.ended is not None:
                 raise SystemExit(f"soak: the daemon has ended: {program.last_output()}")
@@ -285,6 +284,20 @@ def _watched(
     finally:
         close_session(session)
     return samples
+
+
+def _fly(autopilot: FakeAutopilot, watcher: FleetWatcher, resume: Callable[[], Iterable[object]]) -> bool:
+    """As people do it: in Hold until the drone is ready, and offboard then; whether that was selected.
+
+    With the switch left at offboard the autopilot stays in its failsafe, into which flockd sends nothing.
+    """
+    drones = watcher.drones()
+    flight = (drones[0].message("flight", time.monotonic()) if drones else None) or {}
+    ready = flight.get("state") == "ready" and flight.get("flight_mode") == "hold"
+    autopilot.pilot_selects("OFFBOARD" if ready else "LOITER")
+    if not ready:
+        list(resume())
+    return ready
 
 
 def _told(watcher: FleetWatcher) -> Mapping[str, float]:
