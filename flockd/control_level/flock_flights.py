@@ -16,6 +16,7 @@ from flockd.control_level import flock_figures, gate_limits, law_sums, motion, p
 from flockd.control_level.cells import CELLS_A_DRONE, sort_flights
 from flockd.control_level.flock_figures import FlightFigures
 from flockd.control_level.many_missions import ManyMissions
+from flockd.errors import UsageError
 from flockd.messages import FloatArray, IntArray
 
 Figures = dict[str, float | int | bool | None]
@@ -42,7 +43,7 @@ def fly_flocks(
 
     Args:
         scenarios: with any number of vehicles (`flockd.sim.start`). The seed rules gusts and
-            the errors of perception. Rig, sensors, world and obstacles do not count.
+            the errors of perception. Rig and sensors do not count.
         errors: of what the drones perceive of each other; None: they are given exact states.
         gated: whether each drone's safety gate limits how fast it flies towards its neighbours (`gate_limits`).
         threads: to compute in.
@@ -69,6 +70,10 @@ class FlockFlights:
         self, scenarios: Sequence[ScenarioConfig], errors: PerceivedErrors | None = None, *, gated: bool = False
     ) -> None:
         scenario = scenarios[0]
+        if scenario.world.obstacles is not None:
+            raise UsageError(
+                "flights at control level have no obstacles; fly this scenario with `flockd sim --perception truth`"
+            )
         drone, vehicle, seeds = scenario.drone, scenario.vehicle, [one.seed for one in scenarios]
         self._drone, self._shape = drone, (len(scenarios), len(scenario.vehicles))
         self.steps = round(scenario.duration_s / drone.step_s)
