@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -39,15 +39,18 @@ def main() -> None:
     """Reads the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folder", type=Path, help="of the campaign")
-    parser.add_argument("figures", nargs="*", choices=get_args(Figure), metavar="FIGURE", help="of its `measure`")
+    parser.add_argument("figures", nargs="*", metavar="FIGURE", help="of its `measure`; default: all")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the first figure there instead")
     parser.add_argument("--places", nargs=2, type=int, metavar=("DRONES", "SECONDS"), help="draw where they are")
     args = parser.parse_args()
     results = Results.load(args.folder)
+    if unknown := set(args.figures) - set(results.figures):
+        parser.error(f"{args.folder} has no {', '.join(sorted(unknown))}; choose from {', '.join(results.figures)}")
+    figures = args.figures or results.figures
     if args.picture is None:
-        print(table(results, args.figures))
+        print(table(results, figures))
     else:
-        drawing = places(results, *args.places) if args.places else parameter_curves(results, args.figures[0])
+        drawing = places(results, *args.places) if args.places else parameter_curves(results, figures[0])
         drawing.savefig(args.picture, dpi=DPI, pil_kwargs={"quality": QUALITY})
         print(f"{args.picture}: {args.picture.stat().st_size / 1e3:.0f} kB")
 
