@@ -112,7 +112,7 @@ def _needed_m(speed: float, comes: float, gate: Any) -> float:
     """The distance left from which on a neighbour that comes as fast limits nothing up to this speed."""
     b, lag = gate[BRAKING], gate[BRAKING] * gate[REACTION]
     own = speed * speed + 2.0 * speed * lag
-    return max((own + comes * comes) / (2.0 * b) + comes * gate[REACTION], own / b)
+    return float(max((own + comes * comes) / (2.0 * b) + comes * gate[REACTION], own / b))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

@@ -28,7 +28,7 @@ TICKS, TICK_S = 10, 0.05
 def _scenario(drones: int, **overrides: Any) -> ScenarioConfig:
     """A flock that is too dense: its gates have to limit it."""
     keys = {key.replace("__", "."): value for key, value in overrides.items()}
-    keys |= {"duration_s": 8.0, "drone.safety.gate.fence_radius_m": None, "drone.flocking.weight.kind": "uniform"}
+    keys |= {"duration_s": 6.0, "drone.safety.gate.fence_radius_m": None, "drone.flocking.weight.kind": "uniform"}
     scenario = with_drones(load_scenario(data_path("config") / "paper_flight.yaml", keys), drones)
     level = [v.model_copy(update={"position_m": (*v.position_m[:2], -4.0)}) for v in scenario.vehicles]
     return scattered(scenario.model_copy(update={"vehicles": tuple(level)}), 0.8)
@@ -96,7 +96,7 @@ def test_the_velocity_within_half_planes_is_the_gates() -> None:
             directions = np.column_stack([np.cos(angles), np.sin(angles)])
             velocity = random.normal(size=2)
             expected = half_planes.nearest_within(velocity, directions, most)
-            found = nearest_within(*velocity, np.column_stack([directions, most]), count)
+            found = nearest_within(velocity[0], velocity[1], np.column_stack([directions, most]), count)
             np.testing.assert_allclose(found, expected, atol=1e-8)
 
 
