@@ -19,13 +19,14 @@ from typing import Any, NamedTuple
 
 from flockd.config import ScenarioConfig, load_scenario
 from flockd.config.loader import load_perceived_errors
-from flockd.control_level import fly_flocks, scattered
+from flockd.control_level import fly_flocks
 from flockd.data import data_path
 from flockd.sim.exact_states import fly_exact_states
-from flockd.sim.start import with_drones
+from flockd.sim.start import scattered, with_drones
 
 UNIFORM: dict[str, Any] = {"kind": "uniform"}
 NEAREST: dict[str, Any] = {"kind": "nearest", "nearest": 6}
+HEIGHT_M, SCATTER_M = 4.5, 0.5
 ERRORS = data_path("config") / "perceived" / "shipped_networks.yaml"
 
 
@@ -95,7 +96,9 @@ def _scenarios(case: Case) -> list[ScenarioConfig]:
     keys = {f"drone.flocking.weight.{key}": value for key, value in case.weight.items()}
     scenario = load_scenario(data_path("config") / "paper_flight.yaml", {"duration_s": case.duration_s, **keys})
     flock = with_drones(scenario, case.drones)
-    return [scattered(flock.model_copy(update={"seed": seed}), 0.5, 4.5) for seed in range(case.flights)]
+    starts = [v.model_copy(update={"position_m": (*v.position_m[:2], -HEIGHT_M)}) for v in flock.vehicles]
+    flock = flock.model_copy(update={"vehicles": tuple(starts)})
+    return [scattered(flock.model_copy(update={"seed": seed}), SCATTER_M) for seed in range(case.flights)]
 
 
 def _print(how: str, case: Case, cpu_s: float, wall_s: float, processes: int) -> float:

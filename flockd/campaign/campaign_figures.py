@@ -23,6 +23,8 @@ BINS: Final = 8
 """Of what each flight draws: flights with neighbouring values are taken together."""
 MOST_PAIRS: Final = 6
 """Of parameters that get heat maps."""
+_DECADES: Final = 30.0
+"""A parameter whose largest value is so many times its smallest gets a logarithmic axis."""
 _COLUMNS: Final = 3
 _PANEL_IN: Final = (3.6, 2.5)
 Points = list[tuple[Any, Sequence[float]]]
@@ -50,6 +52,8 @@ def parameter_curves(results: Results, figure: FigureName) -> Figure:
                 points = _points(results, figure, parameter, case)
                 _band(axes, points, colour, case, is_share=MEASURES[figure].is_share)
             axes.set_xlabel(parameter)
+            if parameter not in results.plan.drawn:
+                _spread_out(axes, results.values_of(parameter))
         for axes in panels.flat[len(parameters) :]:
             axes.set_axis_off()
         for axes in panels[:, 0]:
@@ -176,6 +180,21 @@ def _band(axes: Axes, points: Points, colour: str, label: str | None, *, is_shar
     if not numeric:
         axes.set_xticks(places, [shown(value) for value in values])
         axes.set_xlim(-0.5, len(values) - 0.5)
+
+
+def _spread_out(axes: Axes, values: Sequence[Any]) -> None:
+    """Of numbers over decades the logarithm is drawn, with a tick at every value that has room."""
+    if not all(isinstance(value, int | float) and not isinstance(value, bool) and value > 0 for value in values):
+        return
+    if max(values) < _DECADES * min(values):
+        return
+    ticks: list[Any] = []
+    for value in sorted(values):
+        if not ticks or value >= 1.9 * ticks[-1]:
+            ticks.append(value)
+    axes.set_xscale("log")
+    axes.set_xticks(ticks, [shown(value) for value in ticks])
+    axes.minorticks_off()
 
 
 def _heat_map(drawing: Figure, axes: Axes, results: Results, figure: FigureName, across: str, up: str) -> None:

@@ -58,4 +58,4 @@ def conduct(plan: Plan, folder: CampaignFolder, engine: Engine, progress: Progre
 def task_of(plan: Plan, runs: tuple[Run, ...]) -> Task:
     """The task that flies these flights of one cell."""
     recipes = tuple(plan.recipe(plan.cells[run.cell], run.number) for run in runs)
-    return Task(plan.config.perception, plan.wanted, runs, recipes, plan.errors)
+    return Task(plan.config.perception, plan.wanted, runs, recipes, plan.control)

@@ -13,19 +13,18 @@ from datetime import UTC, datetime
 from functools import lru_cache
 
 from flockd.campaign.figures import Figures, figures_of
-from flockd.campaign.flight_plan import Run
+from flockd.campaign.flight_plan import ControlLevel, Run
 from flockd.campaign.recipe import Recipe
 from flockd.choices import SimulatedPerception
 from flockd.config import ScenarioConfig
 from flockd.config.campaign import Figure, FlightKindName
-from flockd.config.perceived import PerceivedErrors
 from flockd.config.perception import PerceptionConfig
 from flockd.control_level import fly_flocks
 from flockd.errors import FlockdError
 from flockd.inference.hashes import model_hashes
 from flockd.sim.swarm import fly
 
-Fly = Callable[[Sequence[ScenarioConfig], Sequence[Figure], PerceivedErrors | None], Sequence[Figures]]
+Fly = Callable[[Sequence[ScenarioConfig], Sequence[Figure], ControlLevel], Sequence[Figures]]
 """Flies scenarios of one cell that differ in what follows from their seeds, and gives the wanted figures of each."""
 
 
@@ -43,9 +42,7 @@ class FlightKind:
 def _alone(perception: SimulatedPerception) -> Fly:
     """Flies one after the other, each on this thread alone, without key frames."""
 
-    def flown(
-        scenarios: Sequence[ScenarioConfig], wanted: Sequence[Figure], _: PerceivedErrors | None
-    ) -> list[Figures]:
+    def flown(scenarios: Sequence[ScenarioConfig], wanted: Sequence[Figure], _: ControlLevel) -> list[Figures]:
         logs = (fly(scenario, perception=perception, processes=0, pictured=False).log for scenario in scenarios)
         return [figures_of(log, wanted) for log in logs]
 
@@ -53,10 +50,10 @@ def _alone(perception: SimulatedPerception) -> Fly:
 
 
 def _at_control_level(
-    scenarios: Sequence[ScenarioConfig], wanted: Sequence[Figure], errors: PerceivedErrors | None
+    scenarios: Sequence[ScenarioConfig], wanted: Sequence[Figure], control: ControlLevel
 ) -> list[Figures]:
     """All at once, on this thread."""
-    flown = fly_flocks(scenarios, errors=errors)
+    flown = fly_flocks(scenarios, errors=control.errors, gated=control.gated)
     return [
         {figure: None if one.get(figure) is None else float(one[figure]) for figure in wanted}  # type: ignore[arg-type]
         for one in flown
@@ -79,7 +76,7 @@ class Task:
     runs: tuple[Run, ...]
     recipes: tuple[Recipe, ...]
     """As many."""
-    errors: PerceivedErrors | None = None
+    control: ControlLevel
 
 
 @dataclass(frozen=True)
@@ -106,7 +103,7 @@ def fly_task(task: Task) -> list[FlownRun]:
     wall_s, cpu_s, began = time.perf_counter(), time.process_time(), datetime.now(UTC).isoformat(timespec="seconds")
     try:
         scenarios = [_single_threaded(recipe.scenario()) for recipe in task.recipes]
-        figures = FLIGHT_KINDS[task.kind].fly(scenarios, task.wanted, task.errors)
+        figures = FLIGHT_KINDS[task.kind].fly(scenarios, task.wanted, task.control)
         networks = _networks(scenarios[0].drone.perception) if task.kind == "sight" else ""
     except Exception as error:  # noqa: BLE001 - whatever it is, it is one flight's result
         if len(task.runs) > 1:

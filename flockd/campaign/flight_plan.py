@@ -58,6 +58,16 @@ class Run:
 
 
 @dataclass(frozen=True)
+class ControlLevel:
+    """What only flights at control level have."""
+
+    errors: PerceivedErrors | None = None
+    """Of perception; None: exact states."""
+    gated: bool = False
+    """Whether safety gates limit how fast drones fly towards their neighbours."""
+
+
+@dataclass(frozen=True)
 class Plan:
     """All flights of a campaign, as values only: what it takes is no longer read from files."""
 
@@ -100,11 +110,14 @@ class Plan:
         return cls(CampaignConfig.model_validate(values["campaign"]), values["scenario"], errors)
 
     def to_json(self) -> str:
-        """All of it, and the version of flockd: what has the same text has the same flights."""
+        """All of it, and the version of flockd: what has the same text has the same flights.
+
+        In the order of the file, by which the cells are numbered.
+        """
         config = self.config.model_dump(mode="json")
         errors = self.errors and self.errors.model_dump(mode="json")
         values = {"flockd": __version__, "campaign": config, "scenario": self.base, "errors": errors}
-        return json.dumps(values, indent=1, sort_keys=True) + "\n"
+        return json.dumps(values, indent=1) + "\n"
 
     @property
     def sha256(self) -> str:
@@ -125,6 +138,11 @@ class Plan:
     def wanted(self) -> tuple[Figure, ...]:
         """What is measured."""
         return self.config.measure or get_args(Figure)
+
+    @property
+    def control(self) -> ControlLevel:
+        """How flights at control level are flown."""
+        return ControlLevel(self.errors, self.config.gated)
 
     @property
     def most_flights(self) -> int:
@@ -259,11 +277,13 @@ class _Check:
             except ValueError as error:
                 return [places[tuple(key.split("."))].problem(str(error))]
         try:
-            replace(recipe, overrides={**recipe.overrides, **drawn}).scenario()
+            scenario = replace(recipe, overrides={**recipe.overrides, **drawn}).scenario()
         except ValidationError as error:
             return problems_of(error.errors(), ScenarioConfig, places)
         except UsageError as error:
             return [places[()].problem(str(error))]
+        if plan.config.perception == "control" and scenario.world.obstacles is not None:
+            return [self._places["perception",].problem("control has no obstacles, this scenario has; write `truth`")]
         return []
 
     def _places_of(self, plan: Plan, cell: Cell, end: str) -> Places:

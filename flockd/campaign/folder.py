@@ -132,6 +132,12 @@ def _check(path: Path, plan: Plan) -> None:
             f"{path}: was begun with other flights, as `{key}` was {before} and is {now} now; name another folder with "
             "--out, or put the file back as it was to go on"
         )
+    for key in ("vary", "cases"):
+        if list(old["campaign"][key]) != list(new["campaign"][key]):
+            raise UsageError(
+                f"{path}: was begun with the entries of `{key}` in another order, by which flights are numbered; name "
+                "another folder with --out, or put them back to go on"
+            )
 
 
 def _write_text(path: Path, text: str) -> None:

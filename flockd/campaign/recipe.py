@@ -6,19 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from flockd.config import ScenarioConfig
 from flockd.config.campaign import DRONES
-from flockd.config.scenario import MIN_START_DISTANCE_M, StartConfig
-from flockd.errors import UsageError
-from flockd.flocking.metrics import min_distance
-from flockd.sim.start import with_drones
+from flockd.sim.start import scattered, with_drones
 
 Values = dict[str, Any]
-_SCATTER = 7
-"""Tells the generator of the starts from the others of the same seed."""
-_TRIES = 200
 
 
 @dataclass(frozen=True)
@@ -39,7 +31,7 @@ class Recipe:
         if count is not None:
             scenario = with_drones(scenario, count)
         if self.scatter_m:
-            scenario = scenario.model_copy(update={"vehicles": _scattered(scenario, self.scatter_m)})
+            scenario = scattered(scenario, self.scatter_m)
         return scenario
 
 
@@ -57,18 +49,3 @@ def merged(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> Values:
             inside = inside[section]
         inside[last] = value
     return values
-
-
-def _scattered(scenario: ScenarioConfig, scatter_m: float) -> tuple[StartConfig, ...]:
-    """The starts, each moved by up to ``scatter_m`` to the north and to the east, drawn again until they are apart."""
-    rng = np.random.default_rng([scenario.seed, _SCATTER])
-    starts = np.array([vehicle.position_m for vehicle in scenario.vehicles])
-    for _ in range(_TRIES):
-        moved = starts.copy()
-        moved[:, :2] += rng.uniform(-scatter_m, scatter_m, (len(starts), 2))
-        if min_distance(moved) >= MIN_START_DISTANCE_M:
-            return tuple(
-                vehicle.model_copy(update={"position_m": tuple(place)})
-                for vehicle, place in zip(scenario.vehicles, moved.tolist(), strict=True)
-            )
-    raise UsageError(f"no starts of seed {scenario.seed} were {MIN_START_DISTANCE_M:g} m apart; write less scatter_m")

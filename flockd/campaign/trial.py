@@ -68,5 +68,5 @@ def _trial(plan: Plan, cell: int, steps: int) -> float:
     scenarios = [recipe.scenario() for recipe in recipes]
     scenarios = [one.model_copy(update={"duration_s": steps * one.drone.step_s}) for one in scenarios]
     begin_s = time.process_time()
-    kind.fly(scenarios, plan.wanted, plan.errors)
+    kind.fly(scenarios, plan.wanted, plan.control)
     return (time.process_time() - begin_s) / len(scenarios)

@@ -172,7 +172,8 @@ def _values(results: Results) -> Mapping[str, Any]:
     config = results.plan.config
     fixed = {key: value for key, value in config.fixed.items() if key != DRONES}
     scenario = ScenarioConfig.model_validate(merged(results.plan.base, fixed)).model_dump(mode="json")
-    own = {"perception": config.perception, "scatter_m": config.scatter_m, DRONES: config.fixed.get(DRONES)}
+    own: dict[str, Any] = {"perception": config.perception, "gated": config.gated, "scatter_m": config.scatter_m}
+    own[DRONES] = config.fixed.get(DRONES)
     own["errors"] = None if results.plan.errors is None else results.plan.errors.perception
     return {"campaign": own, **scenario}
 

@@ -165,6 +165,8 @@ def _rerun(args: argparse.Namespace) -> int:
         raise UsageError(f"{folder}: {name} has {len(scenario.vehicles)} drones; reports are of up to {MAX_DRONES}")
     directory = args.out or folder / RERUNS / name
     prepare_folder(directory, force=args.force)
+    if plan.errors is not None or plan.config.gated:
+        complain(f"{name} is flown again by exact states and without a gate; the campaign has others at control level")
     with Phases() as phases:
         perception = FLIGHT_KINDS[plan.config.perception].perception
         flight = fly(

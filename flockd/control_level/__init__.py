@@ -6,6 +6,6 @@ what it would perceive with the errors of the networks' flights (`flockd.config.
 
 from __future__ import annotations
 
-from flockd.control_level.flock_flights import fly_flocks, scattered
+from flockd.control_level.flock_flights import fly_flocks
 
-__all__ = ["fly_flocks", "scattered"]
+__all__ = ["fly_flocks"]

@@ -12,23 +12,27 @@ import numpy as np
 
 from flockd.config.perceived import PerceivedErrors
 from flockd.config.scenario import ScenarioConfig
-from flockd.control_level import flock_figures, law_sums, motion, perceived_sums
+from flockd.control_level import flock_figures, gate_limits, law_sums, motion, perceived_sums
 from flockd.control_level.cells import CELLS_A_DRONE, sort_flights
 from flockd.control_level.flock_figures import FlightFigures
 from flockd.control_level.many_missions import ManyMissions
-from flockd.messages import FloatArray
+from flockd.errors import UsageError
+from flockd.messages import FloatArray, IntArray
 
 Figures = dict[str, float | int | bool | None]
+_Errors = tuple[FloatArray, FloatArray, IntArray]
+_NO_ERRORS: _Errors = (np.empty((0, 9)), np.empty(12), np.empty(0, np.int64))
+_SETPOINT_RATE_HZ = 20.0
+"""Of a drone without an autopilot's section, as by default in one."""
 _LEAST_DRONES = 250
 """Of a thread: fewer are computed sooner than handed over."""
-_SMALLEST_SHARE = 0.25
-"""Of the distance to the nearest other start: no start is moved farther, so that none comes near another."""
 
 
 def fly_flocks(
     scenarios: Sequence[ScenarioConfig],
     *,
     errors: PerceivedErrors | None = None,
+    gated: bool = False,
     threads: int = 1,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Figures]:
@@ -38,9 +42,10 @@ def fly_flocks(
     bit for bit whatever others are flown with it, in however many threads.
 
     Args:
-        scenarios: with any number of vehicles (`flockd.sim.start.with_drones`, `scattered`). The seed rules gusts and
-            the errors of perception. Rig, sensors, world, obstacles and the safety gate do not count.
+        scenarios: with any number of vehicles (`flockd.sim.start`). The seed rules gusts and
+            the errors of perception. Rig and sensors do not count.
         errors: of what the drones perceive of each other; None: they are given exact states.
+        gated: whether each drone's safety gate limits how fast it flies towards its neighbours (`gate_limits`).
         threads: to compute in.
         progress: called with (flights done, flights in all).
 
@@ -48,7 +53,7 @@ def fly_flocks(
     """
     found: dict[int, Figures] = {}
     for numbers in _alike(scenarios):
-        flights = FlockFlights([scenarios[number] for number in numbers], errors)
+        flights = FlockFlights([scenarios[number] for number in numbers], errors, gated=gated)
         with ExitStack() as stack:
             pool = stack.enter_context(ThreadPoolExecutor(threads)) if threads > 1 else None
             for step in range(flights.steps):
@@ -58,27 +63,17 @@ def fly_flocks(
     return [found[number] for number in range(len(scenarios))]
 
 
-def scattered(scenario: ScenarioConfig, spread_m: float, height_m: float | None = None) -> ScenarioConfig:
-    """The scenario with each start moved by up to `spread_m`, by its seed, and no farther than a quarter of the way to
-    the next, so that none come near each other; all at one height where that is given, m, up positive."""
-    places = np.array([vehicle.position_m for vehicle in scenario.vehicles], dtype=float)
-    if height_m is not None:
-        places[:, 2] = -height_m
-    random = np.random.default_rng([scenario.seed, 1])
-    angle, radius = random.uniform(0.0, 2 * math.pi, len(places)), np.sqrt(random.uniform(0.0, 1.0, len(places)))
-    most_m = np.minimum(spread_m, _SMALLEST_SHARE * _nearest(places[:, :2]))
-    places[:, 0] += most_m * radius * np.cos(angle)
-    places[:, 1] += most_m * radius * np.sin(angle)
-    moved = zip(scenario.vehicles, places.tolist(), strict=True)
-    vehicles = tuple(vehicle.model_copy(update={"position_m": tuple(place)}) for vehicle, place in moved)
-    return scenario.model_copy(update={"vehicles": vehicles})
-
-
 class FlockFlights:
     """A batch of flights that differ in seeds and starts only, all at the same time; see `fly_flocks`."""
 
-    def __init__(self, scenarios: Sequence[ScenarioConfig], errors: PerceivedErrors | None = None) -> None:
+    def __init__(
+        self, scenarios: Sequence[ScenarioConfig], errors: PerceivedErrors | None = None, *, gated: bool = False
+    ) -> None:
         scenario = scenarios[0]
+        if scenario.world.obstacles is not None:
+            raise UsageError(
+                "flights at control level have no obstacles; fly this scenario with `flockd sim --perception truth`"
+            )
         drone, vehicle, seeds = scenario.drone, scenario.vehicle, [one.seed for one in scenarios]
         self._drone, self._shape = drone, (len(scenarios), len(scenario.vehicles))
         self.steps = round(scenario.duration_s / drone.step_s)
@@ -88,11 +83,14 @@ class FlockFlights:
         """(6, flights, n) m and m/s: position and velocity, NED."""
         self._law = law_sums.law_figures(drone.flocking)
         self._missions = ManyMissions(scenario, f)
-        self._errors = None
+        self._errors: _Errors | None = None
         if errors is not None:
             tables = perceived_sums.by_distance(errors), perceived_sums.constants(errors, drone.step_s)
             self._errors = (*tables, np.array(seeds, dtype=np.int64))
-        self._substeps = motion.Substeps.of(vehicle, drone.step_s)
+        rate_hz = _SETPOINT_RATE_HZ if drone.autopilot is None else drone.autopilot.setpoint_rate_hz
+        self._ticks = max(round(drone.step_s * rate_hz), 1) if gated else 1
+        self._gate = gate_limits.gate_figures(drone.safety.gate) if gated else None
+        self._substeps = motion.Substeps.of(vehicle, drone.step_s / self._ticks)
         self._gusts = [motion.Gusts(vehicle, n, seed) for seed in seeds] if vehicle.gust_m_s else []
         self._figures = FlightFigures(f, n, self._times, drone.step_s, vehicle.radius_m)
         self._arrival_s, self._away_m = np.full(f, np.nan), np.full(f, np.nan)
@@ -103,6 +101,7 @@ class FlockFlights:
         self.sums = np.zeros((2, f, n))
         """u of Eq. 38 without u_vf, m/s^2, as last perceived."""
         self._middles, self._own, self._commands = (np.zeros((2, f, n)) for _ in range(3))
+        self._sent = np.full((2, f, n), np.nan)
         self._level, self._straight, self._unsafe = (np.empty((f, n)) for _ in range(3))
 
     def step(self, step: int, pool: ThreadPoolExecutor | None, threads: int) -> None:
@@ -117,17 +116,41 @@ class FlockFlights:
         climbs = bool(np.isfinite(height_m).any())
         states, flat = self.states.reshape(6, -1), height_m.reshape(-1)
         own = states[3:5] if self._errors is None else self._own.reshape(2, -1)
+        commands = self._commands.reshape(2, -1)
 
         def fly(a: int, b: int) -> None:
             p = self._drone.flocking
-            commands = self._commands.reshape(2, -1)
             motion.commands(
                 a, b, self.sums.reshape(2, -1), desired.reshape(2, -1), p.velocity * p.own_weight, own,
                 self._drone.step_s, p.max_acceleration_m_s2, p.max_speed_m_s, commands,
             )  # fmt: skip
-            motion.fly(a, b, states, commands, gusts, self._substeps)
+            if self._gate is None:
+                motion.fly(a, b, states, commands, gusts, self._substeps)
+                climb(a, b)
+
+        def climb(a: int, b: int) -> None:
             if climbs:
-                motion.climb(a, b, states, flat, self._substeps)
+                motion.climb(a, b, states, flat, self._substeps._replace(times=self._ticks * self._substeps.times))
+
+        _run(pool, drones, fly)
+        if self._gate is not None:
+            self._fly_gated(step, gusts, pool, drones)
+            _run(pool, drones, climb)
+
+    def _fly_gated(
+        self, step: int, gusts: FloatArray, pool: ThreadPoolExecutor | None, drones: list[tuple[int, int]]
+    ) -> None:
+        """Towards the commands of a step, as far as the gates let each drone."""
+        cells = self._by_slot, self._grids, self._starts, self._order
+        fastest = np.hypot(self.states[3], self.states[4]).max(axis=1)
+        errors = self._errors or _NO_ERRORS
+        tick_s = self._drone.step_s / self._ticks
+
+        def fly(a: int, b: int) -> None:
+            gate_limits.fly_gated(
+                a, b, *cells, self.states.reshape(6, -1), self._commands.reshape(2, -1), self._sent.reshape(2, -1),
+                fastest, self._gate, self._ticks, tick_s, gusts, self._substeps, errors, step,
+            )  # fmt: skip
 
         _run(pool, drones, fly)
 
@@ -172,7 +195,8 @@ class FlockFlights:
         """(substeps, 2, flights * n) m/s^2."""
         if not self._gusts:
             return np.empty((0, 2, 0))
-        return np.concatenate([gusts.step(self._substeps) for gusts in self._gusts], axis=2)
+        substeps = self._substeps._replace(times=self._ticks * self._substeps.times)
+        return np.concatenate([gusts.step(substeps) for gusts in self._gusts], axis=2)
 
     def _note_goal(self, step: int) -> None:
         """When each flock's true middle first was at the last goal, once that was the one to fly to."""
@@ -217,15 +241,6 @@ def _alike(scenarios: Sequence[ScenarioConfig]) -> list[list[int]]:
         else:
             groups.append((key, [number]))
     return [numbers for _, numbers in groups]
-
-
-def _nearest(places: FloatArray) -> FloatArray:
-    """(n,) m from each of (n, 2) places to the nearest other."""
-    if len(places) < 2:
-        return np.full(len(places), np.inf)
-    away = np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1))
-    np.fill_diagonal(away, np.inf)
-    return np.asarray(away.min(axis=1))
 
 
 def _parts(count: int, threads: int, least: int) -> list[tuple[int, int]]:

@@ -38,7 +38,7 @@ _STRETCHES = 1.7
 """An error's time constant times this is the stretch whose errors are alike for as long, taken over all lags."""
 _Z50, _Z95 = 0.674490, 1.959964
 """Half of all normal numbers, and 95 %, are nearer to 0."""
-_MOST_FALSE = 4
+MOST_FALSE = 4
 """False neighbours of a drone at one time, at most."""
 _ENLARGE = 0.8
 """The k nearest are known once the k-th is nearer than this times how far was looked."""
@@ -66,7 +66,7 @@ def constants(errors: PerceivedErrors, step_s: float) -> FloatArray:
             errors.range_limit_m, math.sin(math.radians(errors.elevation_limit_deg)), errors.hidden_limit,
             errors.drone_radius_m, _STRETCHES * errors.error_time_s / step_s,
             _STRETCHES * errors.missed_time_s / step_s, *_cubic(errors.own_velocity_error_m_s),
-            _STRETCHES * errors.own_velocity_time_s / step_s, min(false.at_once / _MOST_FALSE, 1.0),
+            _STRETCHES * errors.own_velocity_time_s / step_s, min(false.at_once / MOST_FALSE, 1.0),
             false.lifetime_s / step_s, *false.distances_m,
         ]
     )  # fmt: skip
@@ -188,8 +188,8 @@ def perceived_sums(
     """
     n = by_slot.shape[2]
     slots, ranges, rays = np.empty(n, np.int64), np.empty(n), np.empty((n, 4))
-    room = n + _MOST_FALSE
-    seen = np.empty((room, 4))
+    room = n + MOST_FALSE
+    seen = np.empty((room, 6))
     keys, numbers = np.empty(max(nearest, 1)), np.empty(max(nearest, 1), np.int64)
     z, sums = np.empty(2), np.empty(2)
     limit = min(figures[RANGE_LIMIT], max(law[OBSERVATION_M], law[SEPARATION_M]) * 2.0)
@@ -204,7 +204,7 @@ def perceived_sums(
         whole = nearest == 0 or all_seen
         reach = limit if whole else min(limit, max(4.0 * grids[f, 2], 2.0 * law[SEPARATION_M]))
         while True:
-            count = _perceive(f, slot, by_slot, grids[f], starts[f], order, table, figures, seeds[f], step, reach,
+            count = perceive(f, slot, by_slot, grids[f], starts[f], order, table, figures, seeds[f], step, reach,
                               slots, ranges, rays, seen, z)  # fmt: skip
             kept = 0
             for k in range(count):
@@ -237,11 +237,14 @@ def perceived_sums(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _perceive(
+def perceive(
     f: int, slot: int, by_slot: Any, grid: Any, starts: Any, order: Any, table: Any, figures: Any, seed: Any, step: int,
     reach: float, slots: Any, ranges: Any, rays: Any, seen: Any, z: Any,
 ) -> int:  # fmt: skip
-    """Fills `seen` (.., 4) with the neighbours that one drone perceives: places and velocities; how many."""
+    """Fills `seen` (.., 6) with the neighbours that one drone perceives; how many.
+
+    A row is the level place, m from the drone, and velocity, m/s; and, without errors, how far below it is and sinks.
+    """
     n = by_slot.shape[2]
     x, y, depth = by_slot[0, f], by_slot[1, f], by_slot[2, f]
     drone = order[f, slot]
@@ -271,8 +274,9 @@ def _perceive(
         seen[count, 0], seen[count, 1] = px, py
         seen[count, 2] = by_slot[3, f, j] + _error(table, d, VELOCITY, z[0])
         seen[count, 3] = by_slot[4, f, j] + _error(table, d, VELOCITY, z[1])
+        seen[count, 4], seen[count, 5] = dz, by_slot[5, f, j]
         count += 1
-    for k in range(_MOST_FALSE):
+    for k in range(MOST_FALSE):
         at = step / figures[LIFETIME] + _uniform(_mixed(seed, drone, 4 + k, -1))
         bits = _mixed(seed, drone, 4 + k, math.floor(at))
         if _uniform(bits) > figures[FALSE]:
@@ -288,5 +292,6 @@ def _perceive(
         if d <= reach:
             seen[count, 0], seen[count, 1] = d * math.cos(bearing), d * math.sin(bearing)
             seen[count, 2], seen[count, 3] = by_slot[3, f, slot], by_slot[4, f, slot]
+            seen[count, 4], seen[count, 5] = 0.0, by_slot[5, f, slot]
             count += 1
     return count

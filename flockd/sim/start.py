@@ -1,4 +1,4 @@
-"""Makes a scenario's flock larger or smaller, with start positions that keep apart."""
+"""Makes a scenario's flock larger or smaller, and moves its starts, such that all keep apart."""
 
 from __future__ import annotations
 
@@ -6,11 +6,18 @@ import itertools
 import math
 from collections.abc import Iterator
 
-from flockd.config.scenario import ScenarioConfig, StartConfig
+import numpy as np
+
+from flockd.config.scenario import MIN_START_DISTANCE_M, ScenarioConfig, StartConfig
+from flockd.errors import UsageError
+from flockd.flocking.metrics import min_distance
 
 SPACING_M = 3.5
 MIN_DISTANCE_M = 3.0
 LAYERS_DOWN_M = (-3.0, -4.0, -5.0, -6.0)
+_SCATTER = 7
+"""Tells the generator of the starts from the others of the same seed."""
+_TRIES = 200
 
 
 def with_drones(scenario: ScenarioConfig, count: int) -> ScenarioConfig:
@@ -23,6 +30,23 @@ def with_drones(scenario: ScenarioConfig, count: int) -> ScenarioConfig:
         raise ValueError(f"{count} drones cannot fly; ask for at least 1")
     given = scenario.vehicles[:count]
     return scenario.model_copy(update={"vehicles": given + _further(scenario.vehicles, count - len(given))})
+
+
+def scattered(scenario: ScenarioConfig, scatter_m: float) -> ScenarioConfig:
+    """The scenario with each start moved by up to `scatter_m` to the north and to the east, by its seed.
+
+    Drawn again until no two are too near each other. Raises UsageError where that does not come about.
+    """
+    rng = np.random.default_rng([scenario.seed, _SCATTER])
+    starts = np.array([vehicle.position_m for vehicle in scenario.vehicles])
+    for _ in range(_TRIES):
+        moved = starts.copy()
+        moved[:, :2] += rng.uniform(-scatter_m, scatter_m, (len(starts), 2))
+        if min_distance(moved) >= MIN_START_DISTANCE_M:
+            places = zip(scenario.vehicles, moved.tolist(), strict=True)
+            vehicles = tuple(vehicle.model_copy(update={"position_m": tuple(place)}) for vehicle, place in places)
+            return scenario.model_copy(update={"vehicles": vehicles})
+    raise UsageError(f"no starts of seed {scenario.seed} were {MIN_START_DISTANCE_M:g} m apart; write less scatter_m")
 
 
 def _further(given: tuple[StartConfig, ...], count: int) -> tuple[StartConfig, ...]:

@@ -66,10 +66,14 @@ def test_a_flight_draws_its_own_values_from_its_seed_alone(tmp_path: Path) -> No
 
 def test_a_plan_is_its_own_copy(tmp_path: Path) -> None:
     """What is rerun months later needs no file but the folder's."""
-    text = "fixed: {vehicle.wind_m_s: [1, 2]}\nvary: {drone.flocking.cohesion: {values: [0.1, 0.2]}}\n"
+    text = (
+        "fixed: {vehicle.wind_m_s: [1, 2]}\ncases: {new: {}, before: {drones: 3}}\n"
+        "vary: {drone.flocking.separation: {values: [9.0]}, drone.flocking.cohesion: {values: [0.1, 0.2]}}\n"
+    )
     plan = Plan.load(campaign_file(tmp_path, text))
     again = Plan.from_json(plan.to_json())
     assert again.to_json() == plan.to_json()
+    assert again.cells == plan.cells  # neither cases nor keys are in the order of the alphabet
     assert again.recipe(again.cells[1], 5).scenario() == plan.recipe(plan.cells[1], 5).scenario()
     assert Run(1, 5).name == "c1-s5"
 
@@ -117,6 +121,14 @@ def test_a_plan_is_its_own_copy(tmp_path: Path) -> None:
         (
             "errors: shipped_networks.yaml\n",
             "FILE:5: errors: is for `perception: control`; delete one of them",
+        ),
+        (
+            "gated: true\n",
+            "FILE:5: gated: is for `perception: control`; delete one of them",
+        ),
+        (
+            "perception: control\nfixed: {world.obstacles: {kind: forest}}\n",
+            "FILE:5: perception: control has no obstacles, this scenario has; write `truth`",
         ),
         ("perception: guess\n", "FILE:5: perception: guess is not known; write `truth` or `sight` or `control`"),
     ],

@@ -9,6 +9,7 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
+from flockd.campaign.campaign_figures import parameter_curves
 from flockd.campaign.campaign_page import write_campaign_page, write_comparison_page
 from flockd.campaign.flight_kinds import FLIGHT_KINDS, FlightKind
 from flockd.campaign.flight_plan import Plan
@@ -18,6 +19,7 @@ from flockd.campaign.results import Results
 from flockd.campaign.verdicts import compare
 from flockd.errors import UsageError
 from tests.campaign.flights import HEAD, Shuffled, campaign_file, flown, made_up
+from tools.docs_campaign import table
 
 GRID = "vary: {drone.flocking.cohesion: {values: [0.1, 0.2]}}\nmeasure: [min_distance_m, order_tail]\n"
 
@@ -107,6 +109,12 @@ def test_another_campaign_is_refused(plan: Plan, tmp_path: Path) -> None:
         UsageError, match=r"`campaign\.vary\.drone\.flocking\.cohesion\.values` was \[0\.1, 0\.2\] and is"
     ):
         flown(changed, tmp_path / "out", Shuffled(1))
+    cases = [
+        Plan.load(campaign_file(tmp_path, GRID + f"cases: {{{order}}}\n")) for order in ("b: {}, a: {}", "a: {}, b: {}")
+    ]
+    flown(cases[0], tmp_path / "cases", Shuffled(1))
+    with pytest.raises(UsageError, match="entries of `cases` in another order"):
+        flown(cases[1], tmp_path / "cases", Shuffled(1))
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "thesis.txt").write_text("the only copy")
     with pytest.raises(UsageError, match="holds other files than a campaign's"):
@@ -131,6 +139,25 @@ def test_the_report_says_what_was_flown(plan: Plan, tmp_path: Path) -> None:
     mean = results.interval("min_distance_m", [1])
     assert mean is not None
     assert sorted(results.by_seed("min_distance_m", [0, 1])) == [0, 1, 2, 4, 5]
+
+
+@pytest.mark.usefixtures("made_up_flights")
+def test_figures_stand_under_the_case_and_the_value_that_were_flown(tmp_path: Path) -> None:
+    """Neither cases nor values are in the order of the alphabet."""
+    text = (
+        "vary: {drone.flocking.separation: {values: [50, 1]}}\nmeasure: [order_tail]\n"
+        "cases: {weak: {drone.flocking.cohesion: 1}, strong: {drone.flocking.cohesion: 9}}\n"
+    )
+    flown(Plan.load(campaign_file(tmp_path, text)), tmp_path / "out", Shuffled(1))
+    results = Results.load(tmp_path / "out")
+    _, _, head, _, *rows = table(results, ["order_tail"]).splitlines()
+    assert head == "| drone.flocking.separation | weak | strong |"
+    found = [[float(cell.split(" ± ")[0]) for cell in row.strip("| ").split(" | ")] for row in rows]
+    assert [row[0] for row in found] == [50, 1]
+    # `made_up`: cohesion + 0.1 separation + what cells have in common
+    assert [row[2] - row[1] for row in found] == [pytest.approx(8.0), pytest.approx(8.0)]
+    assert found[0][1] - found[1][1] == pytest.approx(4.9)
+    assert [axes.get_xscale() for axes in parameter_curves(results, "order_tail").axes] == ["log"]
 
 
 @pytest.mark.usefixtures("made_up_flights")

@@ -10,7 +10,7 @@ import pytest
 
 from flockd.config import load_scenario
 from flockd.config.scenario import ScenarioConfig
-from flockd.control_level import fly_flocks, scattered
+from flockd.control_level import fly_flocks
 from flockd.control_level.flock_figures import orders
 from flockd.control_level.flock_flights import FlockFlights
 from flockd.data import data_path
@@ -19,7 +19,7 @@ from flockd.flocking import FlockingLaw, FlockingParameters, WeightParameters
 from flockd.flocking.metrics import min_distance, order, safety, union
 from flockd.messages import FloatArray
 from flockd.sim.exact_states import fly_exact_states
-from flockd.sim.start import with_drones
+from flockd.sim.start import scattered, with_drones
 
 UNIFORM = WeightParameters(kind="uniform")
 

@@ -13,12 +13,12 @@ from flockd.config import load_scenario
 from flockd.config.loader import load_perceived_errors
 from flockd.config.perceived import PerceivedErrors
 from flockd.config.scenario import ScenarioConfig
-from flockd.control_level import fly_flocks, scattered
+from flockd.control_level import fly_flocks
 from flockd.control_level.flock_flights import FlockFlights
 from flockd.data import data_path
 from flockd.errors import ConfigError
 from flockd.messages import FloatArray
-from flockd.sim.start import with_drones
+from flockd.sim.start import scattered, with_drones
 
 NONE = {"median": 0.0, "p95": 0.0}
 FAULTLESS: dict[str, Any] = {
@@ -73,7 +73,10 @@ def _seen(flights: FlockFlights, step: int) -> FloatArray:
 @pytest.mark.parametrize("weight", ["uniform", "nearest"])
 def test_without_errors_a_drone_flies_as_by_exact_states(weight: str) -> None:
     scenario = _scenario(30, drone__flocking__weight__kind=weight, duration_s=5.0)
-    one_height = scattered(scenario, 0.5, height_m=4.0)
+    same_height = [
+        vehicle.model_copy(update={"position_m": (*vehicle.position_m[:2], -4.0)}) for vehicle in scenario.vehicles
+    ]
+    one_height = scattered(scenario.model_copy(update={"vehicles": tuple(same_height)}), 0.5)
     exact, seen = FlockFlights([one_height]), FlockFlights([one_height], _errors())
     for flights in (exact, seen):
         flights.perceive(0)
@@ -115,7 +118,7 @@ def test_a_neighbour_behind_another_is_hidden() -> None:
 def test_nobody_is_seen_beyond_the_range_or_too_far_above() -> None:
     assert _seen(FlockFlights(_pair(7.0, 1), _errors(range_limit_m=6.9)), 0)[0, 0] == 0.0
     above = _pair(1.0, 1)[0]
-    above = scattered(above, 0.0).model_copy(
+    above = above.model_copy(
         update={"vehicles": (above.vehicles[0], above.vehicles[1].model_copy(update={"position_m": (1.0, 0.0, -6.0)}))}
     )
     assert _seen(FlockFlights([above], _errors(elevation_limit_deg=45.0)), 0)[0, 0] == 0.0
