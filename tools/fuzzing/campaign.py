@@ -147,6 +147,7 @@ def _work(target: Target, bounds: Bounds, seed: int, first: int, end: int, progr
                 signal.setitimer(signal.ITIMER_PROF, 0.0)
         there.send(max(_peak_mb() - usual_mb, 0.0) if usual_mb else 0.0)
     there.close()
+    os._exit(0)  # an open zenoh session now and then holds up a process's end for ever
 
 
 def _hang(number: int, frame: object) -> None:
