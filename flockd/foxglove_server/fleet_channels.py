@@ -1,0 +1,81 @@
+"""Every topic that the server publishes, made when there is something for it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+from foxglove import Channel, Context, Schema
+from foxglove.channels import (
+    CompressedImageChannel,
+    FrameTransformsChannel,
+    ImageAnnotationsChannel,
+    LocationFixChannel,
+    LogChannel,
+    SceneUpdateChannel,
+)
+from foxglove.messages import CameraCalibration
+
+from flockd.foxglove_server.camera_messages import frame_of
+from flockd.foxglove_server.fleet_message import FleetMessage
+from flockd.foxglove_server.json_schemas import json_schema
+from flockd.foxglove_server.scene_messages import SCENE_TOPICS
+from flockd.telemetry.topics import TOPICS
+
+FLEET, LOG, TRANSFORMS = "/fleet", "/log", "/tf"
+JSON_TOPICS = tuple(topic for topic in TOPICS if topic != "events")
+"""Of each drone, as telemetry has them; events go to `LOG`."""
+_Channel = TypeVar("_Channel")
+
+
+class FleetChannels:
+    """Channels by topic, of one context."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self.fleet = self._json(FLEET, FleetMessage)
+        self.log = LogChannel(LOG, context=context)
+        self.transforms = FrameTransformsChannel(TRANSFORMS, context=context)
+        self.scene = {topic: SceneUpdateChannel(topic, context=context) for topic in SCENE_TOPICS}
+        self._made: dict[str, Any] = {}
+
+    def message(self, drone: str, topic: str) -> Channel:
+        """Of one topic of `JSON_TOPICS`."""
+        return self._get(f"/{drone}/{topic}", lambda name: self._json(name, TOPICS[topic].type))
+
+    def fix(self, drone: str) -> LocationFixChannel:
+        """Where a drone is on the earth."""
+        return self._get(f"/{drone}/fix", lambda name: LocationFixChannel(name, context=self._context))
+
+    def image(self, drone: str, camera: str) -> CompressedImageChannel:
+        """A camera's pictures."""
+        topic = f"/{frame_of(drone, camera)}/image"
+        return self._get(topic, lambda name: CompressedImageChannel(name, context=self._context))
+
+    def tracks(self, drone: str, camera: str) -> ImageAnnotationsChannel:
+        """Drones in a camera's pictures."""
+        topic = f"/{frame_of(drone, camera)}/tracks"
+        return self._get(topic, lambda name: ImageAnnotationsChannel(name, context=self._context))
+
+    def calibration(self, drone: str, camera: str) -> Channel:
+        """Of a camera's pictures; takes serialized messages."""
+        topic, schema = f"/{frame_of(drone, camera)}/calibration", CameraCalibration.get_schema()
+        make: Callable[[str], Channel] = lambda name: Channel(  # noqa: E731
+            name, schema=schema, message_encoding="protobuf", context=self._context
+        )
+        return self._get(topic, make)
+
+    def _get(self, topic: str, make: Callable[[str], _Channel]) -> _Channel:
+        if topic not in self._made:
+            self._made[topic] = make(topic)
+        channel: _Channel = self._made[topic]
+        return channel
+
+    def _json(self, topic: str, kind: type) -> Channel:
+        schema = Schema(name=f"flockd.{kind.__name__}", encoding="jsonschema", data=_bytes(json_schema(kind)))
+        return Channel(topic, schema=schema, message_encoding="json", context=self._context)
+
+
+def _bytes(value: Mapping[str, object]) -> bytes:
+    return json.dumps(value, separators=(",", ":")).encode()
