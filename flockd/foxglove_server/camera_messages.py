@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -39,7 +40,7 @@ class Cameras:
         self._rig: Rig | None = None
         configuration: Mapping[str, Any] = {} if known.about is None else known.about["configuration"]
         try:
-            config = RigConfig.model_validate(configuration.get("rig"))
+            config = RigConfig.model_validate_json(json.dumps(configuration.get("rig")))
             self._rig = build_rig(config)
         except (ValidationError, ValueError):  # of a peer of another version
             return

@@ -29,6 +29,17 @@ JSON_TOPICS = tuple(topic for topic in TOPICS if topic != "events")
 _Channel = TypeVar("_Channel")
 
 
+class CameraChannels:
+    """A camera's pictures, their calibration (as serialized messages), and the drones in them."""
+
+    def __init__(self, topic: str, context: Context) -> None:
+        self.image = CompressedImageChannel(f"{topic}/image", context=context)
+        self.calibration = Channel(
+            f"{topic}/calibration", schema=CameraCalibration.get_schema(), message_encoding="protobuf", context=context
+        )
+        self.tracks = ImageAnnotationsChannel(f"{topic}/tracks", context=context)
+
+
 class FleetChannels:
     """Channels by topic, of one context."""
 
@@ -48,23 +59,9 @@ class FleetChannels:
         """Where a drone is on the earth."""
         return self._get(f"/{drone}/fix", lambda name: LocationFixChannel(name, context=self._context))
 
-    def image(self, drone: str, camera: str) -> CompressedImageChannel:
-        """A camera's pictures."""
-        topic = f"/{frame_of(drone, camera)}/image"
-        return self._get(topic, lambda name: CompressedImageChannel(name, context=self._context))
-
-    def tracks(self, drone: str, camera: str) -> ImageAnnotationsChannel:
-        """Drones in a camera's pictures."""
-        topic = f"/{frame_of(drone, camera)}/tracks"
-        return self._get(topic, lambda name: ImageAnnotationsChannel(name, context=self._context))
-
-    def calibration(self, drone: str, camera: str) -> Channel:
-        """Of a camera's pictures; takes serialized messages."""
-        topic, schema = f"/{frame_of(drone, camera)}/calibration", CameraCalibration.get_schema()
-        make: Callable[[str], Channel] = lambda name: Channel(  # noqa: E731
-            name, schema=schema, message_encoding="protobuf", context=self._context
-        )
-        return self._get(topic, make)
+    def camera(self, drone: str, camera: str) -> CameraChannels:
+        """Of one camera."""
+        return self._get(f"/{frame_of(drone, camera)}", lambda name: CameraChannels(name, self._context))
 
     def _get(self, topic: str, make: Callable[[str], _Channel]) -> _Channel:
         if topic not in self._made:

@@ -133,8 +133,8 @@ class FleetPublisher:
     def _look(self, key: str, row: Row, messages: Mapping[str, Message], time_s: float) -> None:
         """Asks for a picture of each camera that somebody has subscribed to, once a second."""
         for camera in row["cameras"]:
-            channel = self._channels.image(self._names[key], camera)
-            if channel.has_sinks() and abs(time_s - self._asked_s.get((key, camera), -EVERY_S)) >= EVERY_S:
+            channels = self._channels.camera(self._names[key], camera)
+            if channels.image.has_sinks() and abs(time_s - self._asked_s.get((key, camera), -EVERY_S)) >= EVERY_S:
                 self._asked_s[key, camera] = time_s
                 self._threads.submit(self._publish_picture, key, camera, messages, time_s)
 
@@ -144,13 +144,12 @@ class FleetPublisher:
         picture = self._source.image(key, camera, time_s)
         if picture is None:
             return
-        stamp, now_ns = self._stamp(time_s), self._ns(time_s)
+        stamp, now_ns, channels = self._stamp(time_s), self._ns(time_s), self._channels.camera(name, camera)
         calibration = cameras.calibration(now_ns, name, camera, picture)
         if calibration is not None:
-            self._channels.calibration(name, camera).log(calibration, log_time=now_ns)
-        self._channels.image(name, camera).log(image(stamp, name, camera, picture), log_time=now_ns)
-        tracks = cameras.tracks(stamp, camera, picture, messages)
-        self._channels.tracks(name, camera).log(tracks, log_time=now_ns)
+            channels.calibration.log(calibration, log_time=now_ns)
+        channels.image.log(image(stamp, name, camera, picture), log_time=now_ns)
+        channels.tracks.log(cameras.tracks(stamp, camera, picture, messages), log_time=now_ns)
 
     def _cameras_of(self, key: str) -> Cameras:
         known = self._source.known().get(key, Known())

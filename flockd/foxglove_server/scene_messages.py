@@ -38,7 +38,8 @@ COURSE_S = 2.0
 PATH_POINTS = 240
 """A minute of updates."""
 _BODY_M = 0.5
-_COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#ee8866", "#bbbbbb")
+COLOURS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#a39400", "#808890")
+"""Of drones, in the order in which they appear: the page's."""
 _FENCE = Color(r=0.8, g=0.2, b=0.2, a=0.8)
 _OBSTACLE = Color(r=0.45, g=0.45, b=0.45, a=1.0)
 _LABEL = Color(r=1.0, g=1.0, b=1.0, a=1.0)
@@ -77,7 +78,7 @@ class Scene:
         path = self._paths.setdefault(name, deque(maxlen=PATH_POINTS))
         if not path or not np.array_equal(path[-1], place):
             path.append(place)
-        colour = self._colours.setdefault(name, _COLOURS[len(self._colours) % len(_COLOURS)])
+        colour = self._colours.setdefault(name, COLOURS[len(self._colours) % len(COLOURS)])
         return SceneDrone(name, row, place, colour, tuple(path), messages)
 
 
