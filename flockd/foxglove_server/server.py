@@ -63,5 +63,6 @@ def _listening(context: foxglove.Context, address: str, port: int, replay: Repla
             name="flockd recordings", host=address, port=port, context=context, server_listener=replay,
             capabilities=[Capability.Time, Capability.PlaybackControl], playback_time_range=replay.range_ns,
         )  # fmt: skip
-    except (RuntimeError, OSError, ValueError) as error:
-        raise UnavailableError(f"the server cannot use {address} port {port} ({error}); name others") from error
+    except RuntimeError as error:  # of which FoxgloveError is a kind
+        reason = str(error).rpartition(": ")[2]
+        raise UnavailableError(f"the server cannot use {address} port {port} ({reason}); name others") from error

@@ -251,6 +251,7 @@ def test_the_schemas_are_of_the_kind_that_the_app_reads(app: App) -> None:
                 )
 
 
+@pytest.mark.slow
 def test_recordings_are_played_and_the_app_goes_where_it_wants(tmp_path: Path) -> None:
     shutil.copy(FLOWN, tmp_path)
     source, drone = RecordedFleet(tmp_path), Recording(FLOWN).drone
