@@ -22,7 +22,7 @@ from flockd.recording.migration import migrate_output
 from flockd.recording.reader import Recording, head_of
 from flockd.recording.streams import OUTPUT, TABLE, VEHICLE
 from flockd.telemetry import TOPICS, publish_step
-from flockd.telemetry.schema import fault
+from flockd.telemetry.schema import completed, fault
 from flockd.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.telemetry.watcher import Heard, Watched
 
@@ -203,8 +203,9 @@ class _Taking:
             publish_step(story, story.drone, self._vehicle, output)
             story.pictures.take_step(output.time_s, output.detections)
         elif topic in _OWN:
-            message = parsed(entry.data)
-            if fault(message, TOPICS[_OWN[topic]].type) is None:  # else of an earlier version, or damaged
+            kind = TOPICS[_OWN[topic]].type
+            message = completed(parsed(entry.data), kind)
+            if fault(message, kind) is None:  # else of another version, or damaged
                 story.publish(story.drone, _OWN[topic], message)
 
 
