@@ -9,7 +9,7 @@ import sys
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING
 
-from flockd.cli.fleet_source import add_source_options, ip_address, open_source, port_number
+from flockd.cli.fleet_source import add_source_options, ip_address, open_source, places, port_number
 from flockd.cli.output import complain, say
 from flockd.cli.parser import Parser
 from flockd.errors import ExitCode, UnavailableError
@@ -60,7 +60,7 @@ async def _serve(args: argparse.Namespace, source: FleetSource) -> None:
     await runner.setup()
     try:
         port = await _listen(runner, args.page_address, args.port)
-        for line in _told(args.page_address, port, access.key):
+        for line in [*_told(args.page_address, port, access.key), *places(args), "Ctrl-C ends it"]:
             say(line)
         sys.stdout.flush()  # whoever reads a pipe needs the address now
         await asyncio.Event().wait()
@@ -91,4 +91,4 @@ def _told(address: str, port: int, key: str) -> list[str]:
             "network that you trust"
         )
         lines.append(f"on other computers: the same with this computer's address in the place of {shown}")
-    return [*lines, "Ctrl-C ends it"]
+    return lines

@@ -50,6 +50,16 @@ def open_source(args: argparse.Namespace, stack: ExitStack) -> FleetSource:
     return stack.enter_context(LiveFleet(stack.enter_context(watcher)))
 
 
+def places(args: argparse.Namespace) -> list[str]:
+    """What stands on the terminal about where drones are looked for; nothing where the options say it."""
+    if args.recordings is not None or args.connect or args.drones_at:
+        return []
+    return [
+        f"it looks for drones at {ENDPOINT}; for those that connect to this computer, as those of "
+        f"`flockd sim --autopilot` do, start it with --drones-at {ENDPOINT}"
+    ]
+
+
 def port_number(text: str) -> int:
     """Of an option."""
     if not (text.isascii() and text.isdecimal() and int(text) < 1 << 16):

@@ -8,7 +8,7 @@ import sys
 import threading
 from contextlib import ExitStack, suppress
 
-from flockd.cli.fleet_source import add_source_options, ip_address, open_source, port_number
+from flockd.cli.fleet_source import add_source_options, ip_address, open_source, places, port_number
 from flockd.cli.output import complain, say
 from flockd.cli.parser import Commands
 from flockd.errors import ExitCode
@@ -45,7 +45,7 @@ def _run(args: argparse.Namespace) -> int:
     with ExitStack() as stack, suppress(KeyboardInterrupt):
         source = open_source(args, stack)
         server = stack.enter_context(FoxgloveServer(source, args.server_address, args.port))
-        for line in _told(args.server_address, server.port):
+        for line in [*_told(args.server_address, server.port), *places(args), "Ctrl-C ends it"]:
             say(line)
         sys.stdout.flush()  # whoever reads a pipe needs the address now
         threading.Event().wait()
@@ -60,4 +60,4 @@ def _told(address: str, port: int) -> list[str]:
     if not where.is_loopback:
         complain("whoever reaches this address sees the fleet; it travels unencrypted, so use a network that you trust")
         lines.append(f"on other computers: the same with this computer's address in the place of {shown}")
-    return [*lines, "Ctrl-C ends it"]
+    return lines
