@@ -56,7 +56,8 @@ def migrate_configuration(
     """
     migrated, notes = json.loads(json.dumps(document)), []
     for old, new in renamed.items():
-        if not _knows(model, old) and _knows(model, new) and _holds(migrated, old) and not _holds(migrated, new):
+        is_old = not _knows(model, old) and _holds(migrated, old)
+        if is_old and _knows(model, new) and _may_get(migrated, new):
             _put(migrated, new, _take(migrated, old))
             notes.append(f"{old} is now {new}")
     for key, reason in dropped.items():
@@ -65,7 +66,7 @@ def migrate_configuration(
             notes.append(f"{key} ({json.dumps(value)}) was dropped: {reason}")
     for key, value in ADDED.items():
         section = key.rpartition(".")[0]
-        if _knows(model, key) and _holds(migrated, section) and not _holds(migrated, key):
+        if _knows(model, key) and _holds(migrated, section) and _may_get(migrated, key):
             _put(migrated, key, value)
             notes.append(f"{key} is {json.dumps(value)}, as before there was this key")
     return Migrated(migrated, tuple(notes))
@@ -121,6 +122,16 @@ def _holds(document: Json, key: str) -> bool:
             return False
         document = document[name]
     return True
+
+
+def _may_get(document: Json, key: str) -> bool:
+    """Whether the key is not there, and its sections are sections where they are there; else the model's checks say."""
+    *sections, name = key.split(".")
+    for section in sections:
+        if not isinstance(document, Mapping):
+            return False
+        document = document.get(section, {})
+    return isinstance(document, Mapping) and name not in document
 
 
 def _take(document: Json, key: str) -> Json:

@@ -87,6 +87,15 @@ def test_a_key_that_is_still_known_is_never_dropped() -> None:
     assert migrate_configuration(document, Later, {"tracking.gate_sigma": "no reason"}, {}).document == document
 
 
+@pytest.mark.parametrize("damaged", [0, "x", [], None])
+def test_a_section_that_is_none_stays_for_the_checks_of_the_configuration(damaged: object) -> None:
+    """Found by tools/fuzz.py: what came later was put into it."""
+    document = {"perception": damaged}
+    assert migrate_configuration(document) == Migrated(document, ())
+    document = {"mission": damaged, "autopilot": {"trim_m_s": 0.5}}
+    assert migrated(document).document["mission"] == damaged
+
+
 def test_unknown_keys_beyond_the_table_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     document = json.loads(head_of(FLIGHTS[0])[2].data)
     document["tracking"]["colour"] = "red"
