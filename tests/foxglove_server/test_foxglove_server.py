@@ -159,7 +159,12 @@ def test_each_topic_of_telemetry_is_passed_on_as_it_was_published(app: App) -> N
 
 def test_the_fleet_has_a_row_a_drone(app: App) -> None:
     (row,) = app[0].json("/fleet")["drones"]
-    known = {"drone": "drone1", "fleet": "meadow", "state": "degraded", "why": "the battery is low; land"}
+    known: dict[str, Any] = {
+        "drone": "drone1",
+        "fleet": "meadow",
+        "state": "degraded",
+        "why": "the battery is low; land",
+    }
     known |= {"north_m": 10.0, "east_m": 20.0, "speed_m_s": 1.5, "battery_share": 0.4, "neighbours": 1, "load": 0.5}
     assert {name: row[name] for name in known} == known
 
