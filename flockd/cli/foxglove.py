@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import ipaddress
 import sys
-import threading
 from contextlib import ExitStack, suppress
 
 from flockd.cli.fleet_source import add_source_options, ip_address, open_source, places, port_number
@@ -48,7 +47,7 @@ def _run(args: argparse.Namespace) -> int:
         for line in [*_told(args.server_address, server.port), *places(args), "Ctrl-C ends it"]:
             say(line)
         sys.stdout.flush()  # whoever reads a pipe needs the address now
-        threading.Event().wait()
+        server.wait()
     return ExitCode.DONE
 
 

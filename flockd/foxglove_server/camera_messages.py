@@ -102,7 +102,7 @@ def _in_camera(camera: RigCamera, messages: Mapping[str, Message]) -> Iterator[t
     """Each neighbour in this camera's image, and its pixel there."""
     turn = R_ned_body(messages.get("state"))
     for one in messages.get("neighbours", {}).get("neighbours", ()):
-        if None in one["position_ned"]:
+        if len(one["position_ned"]) != 3 or None in one["position_ned"]:
             continue
         ((u, v),) = camera.pixels_of_points(np.array([one["position_ned"]]) @ turn).tolist()
         if math.isfinite(u):

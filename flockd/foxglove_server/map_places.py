@@ -21,8 +21,8 @@ Message = Mapping[str, Any]
 
 
 def enu(ned: Iterable[float | None]) -> FloatArray:
-    """(3,) east, north, up of north, east, down; what is null counts as 0."""
-    north, east, down = (0.0 if value is None else value for value in ned)
+    """(3,) east, north, up of north, east, down, as a peer has them: what is null or missing counts as 0."""
+    north, east, down = ([0.0 if value is None else value for value in ned] + [0.0] * 3)[:3]
     return np.array([east, north, -down])
 
 
@@ -73,8 +73,8 @@ def vector(values: FloatArray) -> Vector3:
 
 def location_fix(stamp: Timestamp, frame: str, state: Message) -> LocationFix | None:
     """Of a `state` message; None where the drone or its home has no position."""
-    home, position = state.get("home_deg"), state.get("position_ne")
-    if not home or not position or None in (*home[:2], *position[:2]):
+    home, position = state.get("home_deg") or [], state.get("position_ne") or []
+    if min(len(home), len(position)) < 2 or None in (*home[:2], *position[:2]):
         return None
     a_degree = metres_a_degree(home[0])
     latitude, longitude = (home[i] + position[i] / a_degree[i] for i in range(2))

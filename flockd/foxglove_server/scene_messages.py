@@ -121,7 +121,7 @@ def _course(drone: SceneDrone) -> dict[str, Any]:
         lines.append(_line([drone.place, drone.place + COURSE_S * enu(velocity)], _colour(drone.colour), 0.08))
     command = drone.messages.get("command", {}).get("velocity_ne")
     if command is not None:
-        end = drone.place + COURSE_S * enu((*command, 0.0))
+        end = drone.place + COURSE_S * enu(command[:2])
         lines.append(_line([drone.place, end], _colour(drone.colour, 0.5), 0.03))
     return {"frame_id": MAP, "lines": lines, "spheres": list(_goal(drone))}
 
@@ -130,10 +130,10 @@ def _goal(drone: SceneDrone) -> Iterator[SpherePrimitive]:
     mission = drone.messages.get("mission", {})
     if mission.get("goal_ne") is None:
         return
-    north, east = np.add(mission["goal_ne"], drone.row["home_ne"] or (0.0, 0.0))
     height = mission["goal_height_m"]
     up = drone.place[2] if height is None else height
-    yield _sphere(np.array([east, north, up]), 0.5, _colour(drone.colour, 0.6))
+    place = enu((*mission["goal_ne"][:2], -up)) + enu(drone.row["home_ne"] or ())
+    yield _sphere(place, 0.5, _colour(drone.colour, 0.6))
 
 
 def _path(drone: SceneDrone) -> dict[str, Any]:

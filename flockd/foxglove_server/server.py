@@ -27,6 +27,7 @@ class FoxgloveServer:
         self._server = _listening(context, address, port, self._replay)
         self.port = self._server.port
         self._publisher = FleetPublisher(source, self._replay or LiveTime(source), context)
+        self._failure: Exception | None = None
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="Foxglove server", daemon=True)
 
@@ -42,7 +43,19 @@ class FoxgloveServer:
         self._server.stop()
         self._publisher.close()
 
+    def wait(self) -> None:
+        """Until it is closed. Raises what ended it before."""
+        self._thread.join()
+        if self._failure is not None:
+            raise self._failure
+
     def _run(self) -> None:
+        try:
+            self._publish()
+        except Exception as error:  # noqa: BLE001 - raised again by `wait`
+            self._failure = error
+
+    def _publish(self) -> None:
         status = PlaybackStatus.Paused
         while not self._over.wait(UPDATE_EVERY_S):
             self._publisher.update()
