@@ -16,6 +16,7 @@ DISTRIBUTIONS = {
     "zenoh": "eclipse-zenoh",
     "rerun": "rerun-sdk",
     "google": "protobuf",
+    "foxglove": "foxglove-sdk",
     "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",
     "pydantic_core": "pydantic-core",
 }

@@ -71,6 +71,8 @@ MAY_IMPORT = {
     "campaign": BASE | {"inference", "flocking", "flight_log", "side_process", "sim", "control_level", "report"},
     "view": BASE | {"geometry", "perception", "pilot", "recording"},
     "fleet_page": BASE | {"geometry", "preview", "telemetry", "recording"},
+    "foxglove_server": BASE
+    | {"geometry", "preview", "image_header", "telemetry", "recording", "fleet_page"},  # the page has the fleet's rows
     "daemon": BASE
     | {"obstacles", "preview"}
     | {"geometry", "inference", "perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"}
@@ -94,6 +96,7 @@ MAY_IMPORT = {
         "daemon",
         "doctor",
         "fleet_page",
+        "foxglove_server",
     }
     | {"calibration", "geometry", "sources", "cameras", "pictures"},
 }
@@ -219,6 +222,14 @@ REPLIES = PACKAGE / "telemetry" / "publisher.py"
         ("pyulog", ["flight_log/ulog.py"]),
         ("joblib", ["campaign/process_engine.py"]),
         ("ray", ["campaign/ray_engine.py"]),
+        (
+            "foxglove",
+            [
+                f"foxglove_server/{what}.py"
+                for what in ("camera_messages", "fleet_channels", "fleet_publisher", "map_places", "scene_messages")
+            ]
+            + ["foxglove_server/server.py", "foxglove_server/time_line.py"],
+        ),
         ("rerun", ["view/flock_file.py", "view/rerun_file.py"]),
     ],
 )
@@ -243,7 +254,7 @@ def test_no_drone_reads_telemetry_to_fly() -> None:
         text = path.read_text(encoding="utf-8")
         for word, allowed in readers.items():
             assert word not in text or path in allowed, path
-        if _folder(path) not in {"cli", "doctor", "fleet_page"} and path != FLEET_STATUS:
+        if _folder(path) not in {"cli", "doctor", "fleet_page", "foxglove_server"} and path != FLEET_STATUS:
             assert "flockd.telemetry.watcher" not in _imports(path), path
         if _folder(path) != "cli":
             assert "flockd.telemetry.operator_client" not in _imports(path), path

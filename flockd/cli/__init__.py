@@ -16,6 +16,7 @@ from flockd.cli import (
     detect,
     doctor,
     fleet,
+    foxglove,
     models,
     record,
     replay,
@@ -39,6 +40,7 @@ EXTRAS = {
     "rerun": "view",
     "argcomplete": "completion",
     **dict.fromkeys(("aiohttp", "plotly"), "fleet"),
+    "foxglove": "foxglove",
 }
 
 EXIT_CODES = """\
@@ -105,6 +107,7 @@ def _parser() -> Parser:
         run,
         status,
         fleet,
+        foxglove,
         doctor,
         sim,
         campaign,

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 ALL = "all"
 REPEAT_S = 1.0
 """Half of the time for which an operator's velocity holds."""
+NO_ANSWER = "did not answer; this computer may not command it, or it is one of the simulator's own pilots"
 PLAIN = {
     "hold": "Make the drones' autopilots hold position: the drones stop, and flockd hands over.",
     "land": "Make the drones' autopilots land them where they are.",
@@ -190,7 +191,7 @@ def _answers(
     answers: dict[str, dict[str, object]] = {}
     for drone in drones:
         answer = operator.ask(drone, command, None if order is None else order_message(order))
-        answers[drone] = {"accepted": False, "sentence": "did not answer"} if answer is None else {**answer}
+        answers[drone] = {"accepted": False, "sentence": NO_ANSWER} if answer is None else {**answer}
     return answers
 
 

@@ -7,13 +7,12 @@ import asyncio
 import ipaddress
 import sys
 from contextlib import ExitStack, suppress
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.output import complain, progress, say
+from flockd.cli.fleet_source import add_source_options, ip_address, open_source, places, port_number
+from flockd.cli.output import complain, say
 from flockd.cli.parser import Parser
-from flockd.cli.status import ENDPOINT
-from flockd.errors import ExitCode, UnavailableError, UsageError
+from flockd.errors import ExitCode, UnavailableError
 
 if TYPE_CHECKING:
     from aiohttp import web
@@ -26,21 +25,15 @@ HERE = "127.0.0.1"
 
 def add_options(parser: Parser) -> None:
     """Of the page, and where its data come from."""
-    parser.add_argument("--port", metavar="N", type=_port, default=PORT, help=f"of the page (default: {PORT}; 0: any)")
     parser.add_argument(
-        "--listen", metavar="ADDRESS", type=_address, default=HERE, dest="page_address",
+        "--port", metavar="N", type=port_number, default=PORT, help=f"of the page (default: {PORT}; 0: any)"
+    )
+    parser.add_argument(
+        "--listen", metavar="ADDRESS", type=ip_address, default=HERE, dest="page_address",
         help=f"of the page, such as 0.0.0.0 for other computers too (default: {HERE})",
     )  # fmt: skip
     parser.add_argument("--watch-only", action="store_true", help="the page passes no command on")
-    parser.add_argument(
-        "--recordings", metavar="FOLDER", type=Path, help="show the recordings in it on one time line, not telemetry"
-    )
-    parser.add_argument("--fleet", metavar="NAME", help="only this one; by default every fleet that publishes")
-    parser.add_argument(
-        "--connect", metavar="ENDPOINT", action="append", help=f"of a drone or a router; by default {ENDPOINT}"
-    )
-    parser.add_argument("--drones-at", metavar="ENDPOINT", action="append", help="where drones connect to")
-    parser.add_argument("--zenoh-config", metavar="FILE", type=Path, help="zenoh's own settings, as for TLS")
+    add_source_options(parser)
     parser.set_defaults(run=_run)
 
 
@@ -48,29 +41,10 @@ def _run(args: argparse.Namespace) -> int:
     import aiohttp.web  # noqa: F401 - before anything is opened: it is of an extra
 
     with ExitStack() as stack:
-        source = _source(args, stack)
+        source = open_source(args, stack)
         with suppress(KeyboardInterrupt):
             asyncio.run(_serve(args, source))
     return ExitCode.DONE
-
-
-def _source(args: argparse.Namespace, stack: ExitStack) -> FleetSource:
-    from flockd.fleet_page.live_fleet import LiveFleet
-    from flockd.fleet_page.recorded_fleet import RecordedFleet
-    from flockd.telemetry.watcher import FleetWatcher
-
-    if args.recordings is not None:
-        if args.connect or args.drones_at or args.fleet or args.zenoh_config:
-            raise UsageError(
-                "--recordings goes without telemetry; drop --connect, --drones-at, --fleet, --zenoh-config"
-            )
-        with progress("reading", "MB") as tell_progress:
-            return RecordedFleet(args.recordings, lambda done, total: tell_progress(done >> 20, total >> 20))
-    connect, listen = args.connect or [], args.drones_at or []
-    if not connect and not listen:
-        connect = [ENDPOINT]
-    watcher = FleetWatcher(args.fleet, listen=listen, connect=connect, settings=args.zenoh_config)
-    return stack.enter_context(LiveFleet(stack.enter_context(watcher)))
 
 
 async def _serve(args: argparse.Namespace, source: FleetSource) -> None:
@@ -86,7 +60,7 @@ async def _serve(args: argparse.Namespace, source: FleetSource) -> None:
     await runner.setup()
     try:
         port = await _listen(runner, args.page_address, args.port)
-        for line in _told(args.page_address, port, access.key):
+        for line in [*_told(args.page_address, port, access.key), *places(args), "Ctrl-C ends it"]:
             say(line)
         sys.stdout.flush()  # whoever reads a pipe needs the address now
         await asyncio.Event().wait()
@@ -117,19 +91,4 @@ def _told(address: str, port: int, key: str) -> list[str]:
             "network that you trust"
         )
         lines.append(f"on other computers: the same with this computer's address in the place of {shown}")
-    return [*lines, "Ctrl-C ends it"]
-
-
-def _port(text: str) -> int:
-    if not (text.isascii() and text.isdecimal() and int(text) < 1 << 16):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a port, a whole number from 0 to 65535")
-    return int(text)
-
-
-def _address(text: str) -> str:
-    try:
-        return str(ipaddress.ip_address(text))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not an IP address such as 127.0.0.1 or 0.0.0.0; for zenoh endpoints there is --drones-at"
-        ) from error
+    return lines

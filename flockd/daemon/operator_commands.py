@@ -71,6 +71,6 @@ def command_handler(
         else:
             loop.call_soon_threadsafe(requests.apply, command)
         log_event(f"an operator asked for {command}")
-        return AnswerMessage(accepted=True, sentence=f"{command} is being tried; the topic `flight` shows the result")
+        return AnswerMessage(accepted=True, sentence=f"{command} is being tried; the drone's state shows the result")
 
     return handle

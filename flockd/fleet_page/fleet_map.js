@@ -175,7 +175,7 @@ export class FleetMap {
       if (keys.length <= FEW || key === state.chosen) obstacles = this.obstacles(pen, key) || obstacles;
       this.goal(pen, key);
     }
-    for (const key of keys) this.drone(pen, key);
+    for (const key of [...keys].reverse()) this.drone(pen, key); // the first one, which gets the label, on top
     this.labels(pen, keys);
     this.legend.hidden = !obstacles;
   }

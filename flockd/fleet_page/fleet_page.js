@@ -97,8 +97,20 @@ function showEvents({ events, all_events: all }) {
   lastEvent = mark;
   const list = document.querySelector("#events ol");
   if (all) list.replaceChildren();
-  list.prepend(...events.slice(-EVENTS_SHOWN).reverse().map(eventLine));
+  for (const event of events.slice(-EVENTS_SHOWN)) showEvent(list, event);
   while (list.children.length > EVENTS_SHOWN) list.lastChild.remove();
+}
+
+// What a drone says again and again, such as an order that is repeated, is one line with a count.
+function showEvent(list, event) {
+  const [line, newest, said] = [eventLine(event), list.firstChild, JSON.stringify(event.slice(1))];
+  line.dataset.said = said;
+  if (newest && newest.dataset.said === said) {
+    line.dataset.times = Number(newest.dataset.times || 1) + 1;
+    put(line.children[2], `${event[2]} (${line.dataset.times} times)`);
+    newest.remove();
+  }
+  list.prepend(line);
 }
 
 function eventLine([time, key, sentence]) {

@@ -1,12 +1,13 @@
-"""Where the page has the fleet from: live telemetry, or recordings."""
+"""Where the page and the Foxglove server have the fleet from: live telemetry, or recordings."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Protocol
 
-from flockd.fleet_page.drone_rows import Row
+from flockd.fleet_page.drone_rows import Known, Row
 from flockd.telemetry.topics import AnswerMessage
+from flockd.telemetry.watcher import Watched
 
 Event = tuple[float, str, str]
 """When it was heard, of which drone by its key, and what it says."""
@@ -22,6 +23,15 @@ class FleetSource(Protocol):
     def now_s(self) -> float:
         """Now on the time line of a live fleet; the end of a recorded one."""
 
+    def wall_s(self, time_s: float) -> float:
+        """Seconds since 1970 at a time of the time line, as far as it is known."""
+
+    def drones(self, time_s: float) -> tuple[Watched, ...]:
+        """The newest messages of each drone."""
+
+    def known(self) -> Mapping[str, Known]:
+        """What each drone flies with, by its key."""
+
     def rows(self, time_s: float) -> dict[str, Row]:
         """What is known of each drone, by its key, the worst first."""
 
@@ -36,3 +46,11 @@ class FleetSource(Protocol):
 
     def image(self, drone: str, camera: str, time_s: float) -> bytes | None:
         """A JPEG of what a camera sees. Waits; called on a thread of its own."""
+
+
+def events_after(events: list[Event], last: Event | None) -> list[Event]:
+    """Those that came later than one; all where that is no longer remembered."""
+    for index in range(len(events) - 1, -1, -1):
+        if events[index] == last:
+            return events[index + 1 :]
+    return events

@@ -15,7 +15,7 @@ from flockd.fleet_page.drone_rows import Known, Row, drone_rows, history_row
 from flockd.fleet_page.fleet_source import Event
 from flockd.telemetry.drone_queries import ClockReading
 from flockd.telemetry.topics import AnswerMessage
-from flockd.telemetry.watcher import FleetWatcher
+from flockd.telemetry.watcher import FleetWatcher, Watched
 
 ASK_EVERY_S = 5.0
 """Each drone for its clocks, and for what it flies with until it has told."""
@@ -59,11 +59,22 @@ class LiveFleet:
         """See `FleetSource`; so all that follow."""
         return time.monotonic()
 
+    def wall_s(self, time_s: float) -> float:
+        """By this computer's clock."""
+        return time.time() - time.monotonic() + time_s
+
+    def drones(self, time_s: float) -> tuple[Watched, ...]:
+        """All that were ever heard."""
+        return self._watcher.drones()
+
+    def known(self) -> Mapping[str, Known]:
+        """As far as queries have found it."""
+        with self._lock:
+            return dict(self._known)
+
     def rows(self, time_s: float) -> dict[str, Row]:
         """Of all that were ever heard."""
-        with self._lock:
-            known = dict(self._known)
-        return drone_rows(self._watcher.drones(), known, time_s)
+        return drone_rows(self.drones(time_s), self.known(), time_s)
 
     def events(self, time_s: float) -> list[Event]:
         """All that are remembered."""

@@ -17,7 +17,7 @@ from typing import Any
 from aiohttp import WSMsgType, web
 
 from flockd.fleet_page.drone_rows import HISTORY_COLUMNS, Row
-from flockd.fleet_page.fleet_source import Event, FleetSource
+from flockd.fleet_page.fleet_source import Event, FleetSource, events_after
 from flockd.fleet_page.page_access import HEADERS, PageAccess, is_own_host, is_own_origin
 from flockd.telemetry.order_messages import parse_order
 from flockd.telemetry.topics import AnswerMessage
@@ -205,7 +205,7 @@ class _Feed:
         self._sent = rows
         events = self._source.events(time_s)
         replay = self._source.span_s is not None
-        new = events[-100:] if replay else _after(events, self._event)
+        new = events[-100:] if replay else events_after(events, self._event)
         self._event = events[-1] if events else self._event
         await self._send(
             {
@@ -220,14 +220,6 @@ class _Feed:
 
     async def _send(self, message: dict[str, Any]) -> None:
         await self._socket.send_str(_json(message))
-
-
-def _after(events: list[Event], last: Event | None) -> list[Event]:
-    """Those that came later than one; all where that is no longer remembered."""
-    for index in range(len(events) - 1, -1, -1):
-        if events[index] == last:
-            return events[index + 1 :]
-    return events
 
 
 def _asked(body: object) -> tuple[list[str], str, dict[str, object] | None]:

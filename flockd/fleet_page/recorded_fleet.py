@@ -22,7 +22,7 @@ from flockd.recording.migration import migrate_output
 from flockd.recording.reader import Recording, head_of
 from flockd.recording.streams import OUTPUT, TABLE, VEHICLE
 from flockd.telemetry import TOPICS, publish_step
-from flockd.telemetry.schema import fault
+from flockd.telemetry.schema import completed, fault
 from flockd.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.telemetry.watcher import Heard, Watched
 
@@ -99,6 +99,7 @@ class RecordedFleet:
         self._stories = {f"{story.fleet}/{story.drone}": story for story in stories}
         if len(self._stories) < len(stories):
             raise RecordingError(f"{folder}: holds several recordings of one drone; leave one of each in the folder")
+        self._wall_s = min(story.began_s - story.span_s[0] for story in stories)
         self.span_s = min(story.span_s[0] for story in stories), max(story.span_s[1] for story in stories)
         self._known = {key: Known(story.about) for key, story in self._stories.items()}
         self._events = sorted(
@@ -111,10 +112,22 @@ class RecordedFleet:
         """See `FleetSource`; so all that follow."""
         return self.span_s[1]
 
+    def wall_s(self, time_s: float) -> float:
+        """By the clock of the computer whose recording began first."""
+        return self._wall_s + time_s
+
+    def drones(self, time_s: float) -> tuple[Watched, ...]:
+        """Those whose recordings have begun by then."""
+        watched = [story.at(time_s) for story in self._stories.values()]
+        return tuple(drone for drone in watched if drone.seen)
+
+    def known(self) -> Mapping[str, Known]:
+        """As their recordings tell."""
+        return self._known
+
     def rows(self, time_s: float) -> dict[str, Row]:
         """As if it were then."""
-        watched = [story.at(time_s) for story in self._stories.values()]
-        rows = drone_rows([drone for drone in watched if drone.seen], self._known, time_s)
+        rows = drone_rows(self.drones(time_s), self._known, time_s)
         for key, row in rows.items():
             row["cameras"] = row["cameras"] or dict.fromkeys(self._stories[key].pictures.cameras)
         return rows
@@ -190,8 +203,9 @@ class _Taking:
             publish_step(story, story.drone, self._vehicle, output)
             story.pictures.take_step(output.time_s, output.detections)
         elif topic in _OWN:
-            message = parsed(entry.data)
-            if fault(message, TOPICS[_OWN[topic]].type) is None:  # else of an earlier version, or damaged
+            kind = TOPICS[_OWN[topic]].type
+            message = completed(parsed(entry.data), kind)
+            if fault(message, kind) is None:  # else of another version, or damaged
                 story.publish(story.drone, _OWN[topic], message)
 
 

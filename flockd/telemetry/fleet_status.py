@@ -30,7 +30,7 @@ def _row(drone: Watched, now_s: float) -> dict[str, Any]:
     if simulated:
         state = "normal" if health["ok"] else "degraded"
     starting = drone.alive and not drone.topics and not drone.malformed
-    malformed = [f"its message `{topic}` is malformed: {why}" for topic, why in sorted(drone.malformed.items())]
+    malformed = [f"its message `{topic}` is malformed: {_told(why)}" for topic, why in sorted(drone.malformed.items())]
     blind = [camera["fault"] for camera in computer.get("cameras", {}).values() if camera["fault"]]
     return {
         "fleet": drone.fleet,
@@ -53,3 +53,8 @@ def _row(drone: Watched, now_s: float) -> dict[str, Any]:
         + [str(reason) for reason in (health.get("reasons", ()) if simulated else ())]
         + blind,
     }
+
+
+def _told(why: str) -> str:
+    """What is wrong with a message, and what it may come from."""
+    return f"{why}; it may run another version of flockd" if why.endswith("is missing") else why

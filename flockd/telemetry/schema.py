@@ -23,6 +23,27 @@ def fault(message: object, kind: type) -> str | None:
     return found
 
 
+def completed(value: Any, kind: Any) -> Any:
+    """A message of a drone of an earlier version, with null for each key that it lacks and that may be null.
+
+    ``kind``: the TypedDict that it should be of. What is of another kind stays as it is, for `fault` to find.
+    """
+    if typing.is_typeddict(kind) and isinstance(value, dict):
+        fields = _fields(kind)
+        known = {name: completed(one, fields[name]) if name in fields else one for name, one in value.items()}
+        return {**{name: None for name, of_field in fields.items() if _may_be_null(of_field)}, **known}
+    origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if origin is list and typing.is_typeddict(inner[0]) and isinstance(value, list):
+        return [completed(one, inner[0]) for one in value]
+    if origin is dict and typing.is_typeddict(inner[1]) and isinstance(value, dict):
+        return {name: completed(one, inner[1]) for name, one in value.items()}
+    return value
+
+
+def _may_be_null(kind: Any) -> bool:
+    return types.NoneType in typing.get_args(kind)
+
+
 @functools.cache
 def _fields(kind: type) -> dict[str, Any]:
     return typing.get_type_hints(kind)

@@ -14,7 +14,7 @@ from typing import Any
 import zenoh
 
 from flockd.telemetry.drone_queries import DroneQueries
-from flockd.telemetry.schema import fault
+from flockd.telemetry.schema import completed, fault
 from flockd.telemetry.topics import PREFIX, TOPICS, checked_name, is_name
 from flockd.zenoh_session import SessionOwner, open_session
 
@@ -187,4 +187,5 @@ def _parsed(payload: zenoh.ZBytes, topic: str) -> tuple[dict[str, Any], str | No
         message = json.loads(raw)
     except (ValueError, RecursionError):
         return {}, "it is not JSON"
+    message = completed(message, TOPICS[topic].type)
     return message, fault(message, TOPICS[topic].type)

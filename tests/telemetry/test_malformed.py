@@ -15,8 +15,8 @@ from flockd.config import load_drone
 from flockd.errors import ConfigError
 from flockd.printable import printable
 from flockd.telemetry.fleet_status import status_rows
-from flockd.telemetry.schema import fault
-from flockd.telemetry.topics import TOPICS, ComputerMessage, FlightMessage, NeighboursMessage
+from flockd.telemetry.schema import completed, fault
+from flockd.telemetry.topics import TOPICS, ComputerMessage, FlightMessage, NeighboursMessage, StateMessage
 from flockd.telemetry.watcher import MAX_BYTES, MAX_DRONES, FleetWatcher, Watched
 from flockd.zenoh_session import close_session, open_session
 from tests.daemon.aboard import free_endpoint
@@ -61,6 +61,25 @@ def test_what_is_nested_is_looked_into() -> None:
     assert fault({**computer, "cameras": [camera]}, ComputerMessage) == "cameras is no object"
     assert fault({"time_s": 0.0, "neighbours": [3]}, NeighboursMessage) == "neighbours[0] is no object"
     assert fault([], NeighboursMessage) == "it is no object"
+
+
+def test_a_drone_of_an_earlier_version_is_shown_without_what_it_lacks() -> None:
+    """Its `state` has neither position nor home; a camera of its `computer` has no fault."""
+    old: dict[str, Any] = {
+        "time_s": 5.0, "height_m": 4.0, "roll_deg": 0.0, "pitch_deg": 0.0, "yaw_deg": 90.0, "velocity_ned": None
+    }  # fmt: skip
+    state, places = completed(old, StateMessage), {"position_ne": None, "home_deg": None}
+    assert state == {**old, **places}
+    assert fault(state, StateMessage) is None
+    computer = completed({"cameras": {"front": {"counts": {}}}, "steps": 3}, ComputerMessage)
+    assert computer["cameras"] == {"front": {"counts": {}, "age_s": None, "fault": None}}
+    assert fault(computer, ComputerMessage) == "time_s is missing", "what cannot be null has to be there"
+    assert completed([], StateMessage) == []
+    assert completed({"cameras": 3}, ComputerMessage)["cameras"] == 3
+    drone = Watched("f", "d", alive=True, malformed={"computer": "load is missing"}, seen=True)
+    (row,) = status_rows([drone], 0.0)
+    told = "its message `computer` is malformed: load is missing; it may run another version of flockd"
+    assert row["matters"] == [told]
 
 
 def test_every_topic_can_be_checked() -> None:

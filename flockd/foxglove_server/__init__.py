@@ -1,0 +1,1 @@
+"""The fleet in Foxglove's app, over its WebSocket protocol: read-only."""

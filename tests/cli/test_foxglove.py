@@ -1,0 +1,55 @@
+"""`flockd foxglove`: what it refuses, and the address that it prints."""
+
+from __future__ import annotations
+
+import socket
+import sys
+
+import pytest
+
+from flockd.cli import main
+from flockd.cli.foxglove import _told
+
+
+def test_without_its_extra_it_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in [name for name in sys.modules if name.partition(".")[0] == "foxglove"]:
+        monkeypatch.delitem(sys.modules, name)
+    for name in [name for name in sys.modules if name.startswith("flockd.foxglove_server.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    assert main(["foxglove", "--recordings", "nowhere"]) == 69
+    assert capsys.readouterr().err == "foxglove is not installed; run: pip install 'flockd[foxglove]'\n"
+
+
+def test_a_taken_port_is_reported_in_one_sentence() -> None:
+    from flockd.errors import UnavailableError
+    from flockd.foxglove_server.server import FoxgloveServer
+
+    class Nothing:
+        span_s = None
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(UnavailableError) as refused:
+            FoxgloveServer(Nothing(), "127.0.0.1", port)  # type: ignore[arg-type]
+    assert str(refused.value).startswith(f"the server cannot use 127.0.0.1 port {port} (Address already in use")
+    assert str(refused.value).endswith("); name others")
+
+
+@pytest.mark.parametrize(
+    ("address", "shown", "warns"),
+    [
+        ("127.0.0.1", "ws://127.0.0.1:80", False),
+        ("::1", "ws://[::1]:80", False),
+        ("0.0.0.0", "ws://127.0.0.1:80", True),
+    ],
+)
+def test_an_address_that_others_reach_comes_with_a_warning(
+    address: str, shown: str, warns: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert _told(address, 80)[0].endswith(f" {shown}")
+    assert ("sees the fleet" in capsys.readouterr().err) == warns
