@@ -13,11 +13,12 @@ import pytest
 from aiohttp import WSMsgType, web
 from aiohttp.test_utils import TestClient, TestServer
 
-from flockd.fleet_page.drone_rows import Row
+from flockd.fleet_page.drone_rows import Known, Row
 from flockd.fleet_page.fleet_source import Event
 from flockd.fleet_page.page_access import MAX_SESSIONS, PageAccess, is_own_host
 from flockd.fleet_page.page_server import PageServer
 from flockd.telemetry.topics import AnswerMessage
+from flockd.telemetry.watcher import Watched
 
 HOLD = {"drones": ["f/one"], "command": "hold"}
 Client = TestClient[web.Request, web.Application]
@@ -33,6 +34,15 @@ class Asked:
 
     def now_s(self) -> float:
         return 1.0
+
+    def wall_s(self, time_s: float) -> float:
+        return time_s
+
+    def drones(self, time_s: float) -> tuple[Watched, ...]:
+        return ()
+
+    def known(self) -> Mapping[str, Known]:
+        return {}
 
     def rows(self, time_s: float) -> dict[str, Row]:
         return {"f/one": {"state": "normal"}}
