@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import inspect
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -136,7 +137,8 @@ TOOL_LIBRARIES = {"torch", "onnx", "trimesh", "embreex", "pytest"}
 """For training and tests: nothing in the package may need them."""
 
 
-def _imports(path: Path) -> set[str]:
+@cache
+def _imports(path: Path) -> frozenset[str]:
     """All modules that a file imports, anywhere in it; `from a.b import c` counts as `a.b` and `a.b.c`."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -147,7 +149,7 @@ def _imports(path: Path) -> set[str]:
             assert node.module is not None
             found.add(node.module)
             found.update(f"{node.module}.{alias.name}" for alias in node.names)
-    return found
+    return frozenset(found)
 
 
 def _folder(path: Path) -> str:
