@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 
 from foxglove import Context
 from foxglove.messages import FrameTransforms, Log, LogLevel, Timestamp
@@ -34,6 +34,7 @@ class FleetPublisher:
         self._cameras: dict[str, tuple[Known, Cameras]] = {}
         self._threads = ThreadPoolExecutor(_THREADS, "pictures for Foxglove")
         self._asked_s: dict[tuple[str, str], float] = {}
+        self._failure: BaseException | None = None
         self._forget()
 
     def close(self) -> None:
@@ -41,7 +42,9 @@ class FleetPublisher:
         self._threads.shutdown(cancel_futures=True)
 
     def update(self) -> None:
-        """Publishes the fleet as it is now on the time line."""
+        """Publishes the fleet as it is now on the time line. Raises what a picture's thread met."""
+        if self._failure is not None:
+            raise self._failure
         time_s = self._time.now_s()
         if self._time.jumped():
             self._forget()
@@ -136,7 +139,8 @@ class FleetPublisher:
             channels = self._channels.camera(self._names[key], camera)
             if channels.image.has_sinks() and abs(time_s - self._asked_s.get((key, camera), -EVERY_S)) >= EVERY_S:
                 self._asked_s[key, camera] = time_s
-                self._threads.submit(self._publish_picture, key, camera, messages, time_s)
+                asked = self._threads.submit(self._publish_picture, key, camera, messages, time_s)
+                asked.add_done_callback(self._note_failure)
 
     def _publish_picture(self, key: str, camera: str, messages: Mapping[str, Message], time_s: float) -> None:
         """On a thread of its own: the drone may take seconds to answer."""
@@ -150,6 +154,10 @@ class FleetPublisher:
             channels.calibration.log(calibration, log_time=now_ns)
         channels.image.log(image(stamp, name, camera, picture), log_time=now_ns)
         channels.tracks.log(cameras.tracks(stamp, camera, picture, messages), log_time=now_ns)
+
+    def _note_failure(self, asked: Future[None]) -> None:
+        if not asked.cancelled():
+            self._failure = self._failure or asked.exception()
 
     def _cameras_of(self, key: str) -> Cameras:
         known = self._source.known().get(key, Known())
