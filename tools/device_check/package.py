@@ -28,13 +28,19 @@ from tools.device_check import cameras
 cameras.load()
 cameras.loopback((160, 120), 5.0)._process.wait()
 """
-AUTOPILOT = """
+AUTOPILOT_IS_UP = Path("/run/autopilot_is_up")
+AUTOPILOT = f"""
+import pathlib
 import time
 from flockd.autopilot.fake_autopilot import FakeAutopilot
 FakeAutopilot(14540).start()
+pathlib.Path("{AUTOPILOT_IS_UP}").touch()
 time.sleep(1e6)
 """
 """As in drone.yaml."""
+PATIENT = Path("/run/systemd/system/flockd.service.d/patient.conf")
+"""An emulated processor takes minutes to load flockd, and is not always back within the watchdog's two seconds."""
+PATIENCE_S = 900.0
 
 
 class Package:
@@ -70,14 +76,18 @@ class Package:
         """Configured, checked, enabled; the time of the cameras' and the autopilot's start is not the user's."""
         others_s = time.monotonic()
         self._others = [_python(CAMERAS), _python(AUTOPILOT)]
-        until(lambda: Path("/dev/video20").exists(), "the cameras")
+        until(lambda: Path("/dev/video20").exists(), "the cameras", within_s=PATIENCE_S)
+        until(AUTOPILOT_IS_UP.exists, "the autopilot", within_s=PATIENCE_S)
         others_s = time.monotonic() - others_s
         shutil.copy(DRONE, CONFIG)
         checked = _run("flockd", "config", "check", str(CONFIG))
         yield Finding("flockd config check", str(CONFIG) in checked, checked.strip().splitlines()[-1], "accepted")
+        PATIENT.parent.mkdir(parents=True)
+        PATIENT.write_text(f"[Service]\nTimeoutStartSec={PATIENCE_S:g}\nWatchdogSec=60\n", encoding="ascii")
+        _run("systemctl", "daemon-reload")
         _run("systemctl", "enable", UNIT)
-        _run("systemctl", "start", "--no-block", UNIT)  # it begins anew until the autopilot beside it is up
-        until(lambda: _shown("ActiveState") == "active", "the service to be ready")
+        _run("systemctl", "start", "--no-block", UNIT)  # should it begin anew, that is waited for too
+        _until_active()
         took_s = time.monotonic() - self._begun_s - others_s
         yield Finding(
             "from apt install to a ready service",
@@ -96,8 +106,9 @@ class Package:
         yield Finding("says what to restart", told, "it does" if told else said[-200:], "the command to restart it")
         kept = CONFIG.read_bytes() == settings
         yield Finding("configuration kept", kept, "as it was" if kept else "changed", "every byte")
-        _run("systemctl", "restart", UNIT)
-        until(lambda: _shown("ActiveState") == "active", "the service of the new version to be ready")
+        _run("systemctl", "restart", "--no-block", UNIT)
+        until(lambda: _shown("MainPID") != process, "the old process to end", within_s=PATIENCE_S)
+        _until_active()
         version = _run("dpkg-query", "-W", "-f", "${Version}", "flockd")
         yield Finding("new version runs", version in self._new, version, "that of the newer file")
 
@@ -148,6 +159,15 @@ def _run(*command: str) -> str:
 def _shown(what: str) -> str:
     """A property of the unit."""
     return _run("systemctl", "show", UNIT, "--value", "-p", what).strip()
+
+
+def _until_active() -> None:
+    """The service is ready. Raises RuntimeError with the end of its journal where it does not get so."""
+    try:
+        until(lambda: _shown("ActiveState") == "active", "the service to be ready", within_s=PATIENCE_S)
+    except TimeoutError as error:
+        journal = _run("journalctl", "--unit", UNIT, "--lines", "12", "--output", "cat")
+        raise RuntimeError(f"{error}: {journal}") from None
 
 
 def _which() -> str:

@@ -9,11 +9,11 @@ PATIENCE_S = 180.0
 LOOK_S = 0.1
 
 
-def until(condition: Callable[[], bool], what: str, *, look_s: float = LOOK_S) -> float:
+def until(condition: Callable[[], bool], what: str, *, look_s: float = LOOK_S, within_s: float = PATIENCE_S) -> float:
     """When it became so, on the monotonic clock. Raises TimeoutError, which names what was waited for."""
     begun_s = time.monotonic()
     while not condition():
-        if time.monotonic() - begun_s > PATIENCE_S:
-            raise TimeoutError(f"waited {PATIENCE_S:g} s for {what}")
+        if time.monotonic() - begun_s > within_s:
+            raise TimeoutError(f"waited {within_s:g} s for {what}")
         time.sleep(look_s)
     return time.monotonic()
