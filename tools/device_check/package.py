@@ -101,7 +101,8 @@ class Package:
         process, settings = _shown("MainPID"), CONFIG.read_bytes()
         said = _apt("install", self._new)
         after = _shown("MainPID")
-        yield Finding("upgraded under way", after == process, f"process {process}, then {after}", "the same process")
+        same = after == process != "0"
+        yield Finding("upgraded under way", same, f"process {process}, then {after}", "the same process")
         told = "sudo systemctl restart flockd.service" in said
         yield Finding("says what to restart", told, "it does" if told else said[-200:], "the command to restart it")
         kept = CONFIG.read_bytes() == settings
