@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import ipaddress
 import sys
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING
 
-from flockd.cli.fleet_source import add_source_options, ip_address, open_source, places, port_number
-from flockd.cli.output import complain, say
+from flockd.cli.fleet_source import (
+    HERE,
+    add_source_options,
+    for_others,
+    in_a_link,
+    ip_address,
+    open_source,
+    places,
+    port_number,
+)
+from flockd.cli.output import say
 from flockd.cli.parser import Parser
 from flockd.errors import ExitCode, UnavailableError
 
@@ -20,7 +28,6 @@ if TYPE_CHECKING:
     from flockd.fleet_page.fleet_source import FleetSource
 
 PORT = 8470
-HERE = "127.0.0.1"
 
 
 def add_options(parser: Parser) -> None:
@@ -82,13 +89,5 @@ async def _listen(runner: web.AppRunner, address: str, port: int) -> int:
 
 def _told(address: str, port: int, key: str) -> list[str]:
     """What stands on the terminal once the page can be opened."""
-    where = ipaddress.ip_address(address)
-    shown = HERE if where.is_unspecified else f"[{address}]" if where.version == 6 else address
-    lines = [f"the fleet page is at http://{shown}:{port}/?key={key}"]
-    if not where.is_loopback:
-        complain(
-            "whoever has this address with its key may do what this computer may; it travels unencrypted, so use a "
-            "network that you trust"
-        )
-        lines.append(f"on other computers: the same with this computer's address in the place of {shown}")
-    return lines
+    warning = "whoever has this address with its key may do what this computer may"
+    return [f"the fleet page is at http://{in_a_link(address)}:{port}/?key={key}", *for_others(address, warning)]

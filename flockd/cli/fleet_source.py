@@ -8,13 +8,17 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.output import progress
+from flockd.cli.output import complain, progress
 from flockd.cli.parser import Parser
 from flockd.cli.status import ENDPOINT
 from flockd.errors import UsageError
 
 if TYPE_CHECKING:
     from flockd.fleet_page.fleet_source import FleetSource
+
+
+HERE = "127.0.0.1"
+"""Where they serve unless told otherwise: for this computer alone."""
 
 
 def add_source_options(parser: Parser) -> None:
@@ -58,6 +62,20 @@ def places(args: argparse.Namespace) -> list[str]:
         f"it looks for drones at {ENDPOINT}; for those that connect to this computer, as those of "
         f"`flockd sim --autopilot` do, start it with --drones-at {ENDPOINT}"
     ]
+
+
+def in_a_link(address: str) -> str:
+    """An IP address as it stands there; for all addresses of this computer, the one at which it reaches itself."""
+    where = ipaddress.ip_address(address)
+    return HERE if where.is_unspecified else f"[{address}]" if where.version == 6 else address
+
+
+def for_others(address: str, warning: str) -> list[str]:
+    """What stands on the terminal where other computers reach this address, too; `warning`: who may do what then."""
+    if ipaddress.ip_address(address).is_loopback:
+        return []
+    complain(f"{warning}; it travels unencrypted, so use a network that you trust")
+    return [f"on other computers: the same with this computer's address in the place of {in_a_link(address)}"]
 
 
 def port_number(text: str) -> int:

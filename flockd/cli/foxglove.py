@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import argparse
-import ipaddress
 import sys
 from contextlib import ExitStack, suppress
 
-from flockd.cli.fleet_source import add_source_options, ip_address, open_source, places, port_number
-from flockd.cli.output import complain, say
+from flockd.cli.fleet_source import (
+    HERE,
+    add_source_options,
+    for_others,
+    in_a_link,
+    ip_address,
+    open_source,
+    places,
+    port_number,
+)
+from flockd.cli.output import say
 from flockd.cli.parser import Commands
 from flockd.errors import ExitCode
 
 PORT = 8765
 """Which the app proposes."""
-HERE = "127.0.0.1"
 _NOTES = """\
 In the app: Open connection, Foxglove WebSocket, the printed address; then import `config/foxglove_layout.json` as a
 layout. The app can only watch. Pictures come from daemons, on a drone or with `flockd sim --autopilot`."""
@@ -53,10 +60,5 @@ def _run(args: argparse.Namespace) -> int:
 
 def _told(address: str, port: int) -> list[str]:
     """What stands on the terminal once the app can connect."""
-    where = ipaddress.ip_address(address)
-    shown = HERE if where.is_unspecified else f"[{address}]" if where.version == 6 else address
-    lines = [f"Foxglove finds the fleet at ws://{shown}:{port}"]
-    if not where.is_loopback:
-        complain("whoever reaches this address sees the fleet; it travels unencrypted, so use a network that you trust")
-        lines.append(f"on other computers: the same with this computer's address in the place of {shown}")
-    return lines
+    warning = "whoever reaches this address sees the fleet"
+    return [f"Foxglove finds the fleet at ws://{in_a_link(address)}:{port}", *for_others(address, warning)]
