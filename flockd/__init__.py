@@ -1,3 +1,3 @@
 """flockd: drones that flock by sight alone."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
