@@ -36,7 +36,8 @@ MAY_IMPORT = {
     "safety": BASE,
     "mission": BASE | {"safety"},  # for the fence
     "obstacles": BASE | {"safety", "flocking"},
-    "control_level": BASE | {"flocking", "mission", "obstacles", "safety"},  # neither renderer nor networks
+    "worlds": BASE,
+    "control_level": BASE | {"flocking", "mission", "obstacles", "safety", "worlds"},  # neither renderer nor networks
     "pilot": BASE
     | {"obstacles"}
     | {"geometry", "inference", "perception", "tracking", "flocking", "safety", "mission"},
@@ -66,6 +67,7 @@ MAY_IMPORT = {
         "recording",
         "flight_log",
         "side_process",
+        "worlds",
     }
     | {"sources", "autopilot"},  # real daemons are fed frames and given autopilots
     "report": BASE | {"flocking", "flight_log", "side_process"},

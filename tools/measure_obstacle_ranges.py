@@ -24,10 +24,10 @@ from flockd.perception import Perception, load_networks
 from flockd.perception.obstacles import ObstacleRanging
 from flockd.pilot.motions import ego_motion
 from flockd.sim.camera_simulator import CameraSimulator
-from flockd.sim.obstacle_worlds import obstacles_of
-from flockd.sim.obstacles import true_ranges
 from flockd.sim.truth_perception import TruthPerception
 from flockd.sim.vehicles import SimulatedAutopilot, Vehicles
+from flockd.worlds.obstacle_worlds import obstacles_of
+from flockd.worlds.obstacles import true_ranges
 
 BINS_M = (0.0, 3.0, 6.0, 10.0)
 LEAST_CLEARANCE_M = 1.0

@@ -31,10 +31,10 @@ from flockd.perception import Observation
 from flockd.perception.detection.detector import DetectionTrace
 from flockd.pilot import FlockPilot
 from flockd.safety import Action, Gate, Permission, Surroundings, Wanted
-from flockd.sim.obstacle_worlds import generate_obstacles
-from flockd.sim.obstacles import Box, Obstacles, true_ranges
 from flockd.sim.vehicles import Vehicles
 from flockd.tracking import Prediction
+from flockd.worlds.obstacle_worlds import generate_obstacles
+from flockd.worlds.obstacles import Box, Obstacles, true_ranges
 
 SCENARIO = Path(__file__).resolve().parent.parent / "config" / "square.yaml"
 TICK_S = 0.1

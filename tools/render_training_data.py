@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from flockd.sim.airframe import DroneModel
 from flockd.sim.drone_models import drone_model
-from flockd.sim.obstacle_worlds import LOWEST_CROWN_M, generate_obstacles
+from flockd.worlds.obstacle_worlds import LOWEST_CROWN_M, generate_obstacles
 from tools.training import worlds
 from tools.training.dataset import FOCAL_PX, HEIGHT, MAX_DRONES, R_BODY_CAMERA, WIDTH, create_part, note
 from tools.training.drone_generator import generated_drone

@@ -12,12 +12,14 @@ import numpy as np
 
 from flockd.config.perceived import PerceivedErrors
 from flockd.config.scenario import ScenarioConfig
-from flockd.control_level import flock_figures, gate_limits, law_sums, motion, perceived_sums
+from flockd.control_level import flock_figures, gate_limits, law_sums, motion, perceived_sums, ways_around
 from flockd.control_level.cells import CELLS_A_DRONE, sort_flights
 from flockd.control_level.flock_figures import FlightFigures
 from flockd.control_level.many_missions import ManyMissions
-from flockd.errors import UsageError
-from flockd.messages import FloatArray, IntArray
+from flockd.control_level.many_obstacles import FIGURES, ManyObstacles, Run
+from flockd.control_level.ways_around import Rules
+from flockd.messages import SECTORS, FloatArray, IntArray
+from flockd.obstacles.local_map import DIRECTIONS
 
 Figures = dict[str, float | int | bool | None]
 _Errors = tuple[FloatArray, FloatArray, IntArray]
@@ -70,10 +72,6 @@ class FlockFlights:
         self, scenarios: Sequence[ScenarioConfig], errors: PerceivedErrors | None = None, *, gated: bool = False
     ) -> None:
         scenario = scenarios[0]
-        if scenario.world.obstacles is not None:
-            raise UsageError(
-                "flights at control level have no obstacles; fly this scenario with `flockd sim --perception truth`"
-            )
         drone, vehicle, seeds = scenario.drone, scenario.vehicle, [one.seed for one in scenarios]
         self._drone, self._shape = drone, (len(scenarios), len(scenario.vehicles))
         self.steps = round(scenario.duration_s / drone.step_s)
@@ -89,7 +87,12 @@ class FlockFlights:
             self._errors = (*tables, np.array(seeds, dtype=np.int64))
         rate_hz = _SETPOINT_RATE_HZ if drone.autopilot is None else drone.autopilot.setpoint_rate_hz
         self._ticks = max(round(drone.step_s * rate_hz), 1) if gated else 1
-        self._gate = gate_limits.gate_figures(drone.safety.gate) if gated else None
+        gate = drone.safety.gate
+        self._gate = gate_limits.gate_figures(gate, gate.min_separation_m) if gated else None
+        self._gate_obstacles = gate_limits.obstacle_figures(drone.obstacles, gate.obstacle_clearance_m)
+        self._obstacles = None if scenario.world.obstacles is None else ManyObstacles(scenarios)
+        self._avoids = self._obstacles is not None and drone.obstacles.enabled
+        self._rules, self._last_rad = Rules.of(drone), np.full(f * n, np.nan)
         self._substeps = motion.Substeps.of(vehicle, drone.step_s / self._ticks)
         self._gusts = [motion.Gusts(vehicle, n, seed) for seed in seeds] if vehicle.gust_m_s else []
         self._figures = FlightFigures(f, n, self._times, drone.step_s, vehicle.radius_m)
@@ -118,24 +121,45 @@ class FlockFlights:
         own = states[3:5] if self._errors is None else self._own.reshape(2, -1)
         commands = self._commands.reshape(2, -1)
 
-        def fly(a: int, b: int) -> None:
+        def ask(a: int, b: int) -> None:
             p = self._drone.flocking
             motion.commands(
                 a, b, self.sums.reshape(2, -1), desired.reshape(2, -1), p.velocity * p.own_weight, own,
                 self._drone.step_s, p.max_acceleration_m_s2, p.max_speed_m_s, commands,
             )  # fmt: skip
-            if self._gate is None:
-                motion.fly(a, b, states, commands, gusts, self._substeps)
-                climb(a, b)
 
         def climb(a: int, b: int) -> None:
             if climbs:
                 motion.climb(a, b, states, flat, self._substeps._replace(times=self._ticks * self._substeps.times))
 
-        _run(pool, drones, fly)
-        if self._gate is not None:
+        def fly(a: int, b: int) -> None:
+            motion.fly(a, b, states, commands, gusts, self._substeps)
+            climb(a, b)
+
+        _run(pool, drones, ask)
+        if self._avoids:
+            self._fly_around(step, desired, own, lambda work: _run(pool, drones, work))
+        if self._gate is None:
+            _run(pool, drones, fly)
+        else:
             self._fly_gated(step, gusts, pool, drones)
             _run(pool, drones, climb)
+
+    def _fly_around(self, step: int, desired: FloatArray, own: FloatArray, run: Run) -> None:
+        """Turns the commands of a step aside from obstacles."""
+        assert self._obstacles is not None
+        cells = self._by_slot, self._grids, self._starts, self._order
+        self._obstacles.look(self.states.reshape(6, -1), run)
+        to_obstacles = self._obstacles.ranges, self._obstacles.first
+        errors = self._errors or _NO_ERRORS
+
+        def around(a: int, b: int) -> None:
+            ways_around.fly_around(
+                a, b, *cells, self.sums.reshape(2, -1), desired.reshape(2, -1), own, *to_obstacles, self._rules, errors,
+                step, self._last_rad, self._commands.reshape(2, -1),
+            )  # fmt: skip
+
+        run(around)
 
     def _fly_gated(
         self, step: int, gusts: FloatArray, pool: ThreadPoolExecutor | None, drones: list[tuple[int, int]]
@@ -145,11 +169,14 @@ class FlockFlights:
         fastest = np.hypot(self.states[3], self.states[4]).max(axis=1)
         errors = self._errors or _NO_ERRORS
         tick_s = self._drone.step_s / self._ticks
+        ranges = np.empty((0, SECTORS)) if self._obstacles is None or not self._avoids else self._obstacles.ranges
+        obstacles = self._gate_obstacles, DIRECTIONS, ranges
 
         def fly(a: int, b: int) -> None:
             gate_limits.fly_gated(
                 a, b, *cells, self.states.reshape(6, -1), self._commands.reshape(2, -1), self._sent.reshape(2, -1),
                 fastest, self._gate, self._ticks, tick_s, gusts, self._substeps, errors, step,
+                obstacles,
             )  # fmt: skip
 
         _run(pool, drones, fly)
@@ -185,6 +212,9 @@ class FlockFlights:
         parts = _parts(f * n, threads, _LEAST_DRONES)
         _run(pool, parts, lambda a, b: flock_figures.nearest_distances(a, b, *cells, self._order, *found))
         self._figures.add(step, *found)
+        if self._obstacles is not None:
+            flat, ends = self.states.reshape(6, -1), step == self.steps - 1
+            self._obstacles.measure(flat, lambda work: _run(pool, parts, work), ends=ends)
         if self._figures.needs_union(step):
             unions, reach = np.empty(f), self._drone.flocking.observation_distance_m
             parts = _parts(f, threads, least=max(_LEAST_DRONES // n, 1))
@@ -209,7 +239,9 @@ class FlockFlights:
 
     def figures(self) -> list[Figures]:
         """Of each flight."""
-        return [{**self._figures.of_flight(k), **self._of_goal(k)} for k in range(self._shape[0])]
+        flights, obstacles = range(self._shape[0]), self._obstacles
+        of_obstacles = [dict.fromkeys(FIGURES) if obstacles is None else obstacles.of_flight(k) for k in flights]
+        return [{**self._figures.of_flight(k), **self._of_goal(k), **of_obstacles[k]} for k in flights]
 
     def _of_goal(self, flight: int) -> Figures:
         if self._missions.goal() is None:

@@ -2,8 +2,8 @@
 
 As `flockd.safety.gate.Gate` with `flockd.safety.approach.towards_neighbours` and `flockd.safety.half_planes`, which a
 test holds equal, at the rate of setpoints: each setpoint is as near to the command as the last one sent, the
-acceleration limit and the neighbours allow. Those are known from the step's begin and go on as they flew then. Fence,
-obstacles, heights, and commands that are late are left out.
+acceleration limit, the neighbours and the obstacles allow. Neighbours are known from the step's begin and go on as they
+flew then; obstacles too, where drones look for them. Fence, heights, and commands that are late are left out.
 """
 
 from __future__ import annotations
@@ -14,44 +14,57 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from flockd.config.avoidance import ObstacleParameters
 from flockd.config.safety import GateParameters
 from flockd.control_level.cells import row_of, slice_of_row
 from flockd.control_level.motion import fly
 from flockd.control_level.perceived_sums import MOST_FALSE, perceive
 from flockd.messages import FloatArray
+from flockd.obstacles.local_map import NEAREST_M
 from flockd.safety.approach import SAME_SPOT_M
+from flockd.worlds.obstacles import EXACT_SIGMA_M
 
 MAX_SPEED, MAX_ACCELERATION, SEPARATION_M, ABOUT_M, BRAKING, REACTION = range(6)
 """Where in the array of `gate_figures`."""
+CLEARANCE_M, NEARER_M, LEAST_M = range(3)
+"""Where in the array of `obstacle_figures`."""
 _ROUNDING_M_S = 1e-9
 _PARALLEL = 1e-6
 _GUSTS_M_S = 1.0
 """Faster than it was asked to fly, a drone may be by this at most: more would be no ordinary gust."""
 
 
-def gate_figures(p: GateParameters) -> FloatArray:
-    """The gate's parameters as the compiled functions take them."""
-    about_m = max(p.min_separation_m, p.vertical_separation_m)
-    return np.array(
-        [p.max_speed_m_s, p.max_acceleration_m_s2, p.min_separation_m, about_m, p.braking_m_s2, p.reaction_s]
-    )
+def gate_figures(p: GateParameters, separation_m: float) -> FloatArray:
+    """The gate's parameters as the compiled functions take them, with the distance to keep from neighbours."""
+    about_m = max(separation_m, p.vertical_separation_m)
+    return np.array([p.max_speed_m_s, p.max_acceleration_m_s2, separation_m, about_m, p.braking_m_s2, p.reaction_s])
+
+
+def obstacle_figures(obstacles: ObstacleParameters, clearance_m: float) -> FloatArray:
+    """What the compiled functions take of obstacles with exact ranges, with the distance to keep from them."""
+    return np.array([clearance_m, obstacles.sigmas * EXACT_SIGMA_M, NEAREST_M])
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def fly_gated(
     begin: int, end: int, by_slot: Any, grids: Any, starts: Any, order: Any, states: Any, commands: Any, sent: Any,
     fastest: Any, gate: Any, ticks: int, tick_s: float, gusts: Any, substeps: Any, errors: Any, step: int,
+    obstacles: Any,
 ) -> None:  # fmt: skip
     """Moves the drones `begin` to before `end`, counted slot by slot through all flights, on by one step.
 
     `states` (6, flights * n) are moved in place towards `commands` (2, flights * n) m/s, by `ticks` setpoints
     `tick_s` apart; `sent` (2, flights * n) m/s is the last one sent, NaN before the first. `fastest` (flights,) m/s is
     the speed of each flight's fastest drone. `gusts` are of all substeps, and `substeps` those of one tick. `errors`
-    are `by_distance`, `constants` and seeds as of `perceived_sums`; without rows the neighbours are exact.
+    are `by_distance`, `constants` and seeds as of `perceived_sums`; without rows the neighbours are exact. `obstacles`
+    are `obstacle_figures`, the sectors' directions (sectors, 2), and how far obstacles are in each of them (flights *
+    n, sectors) m, without rows where drones do not look for any.
     """
     n = by_slot.shape[2]
     table, figures, seeds = errors
-    seen, planes = np.empty((n + MOST_FALSE, 6)), np.empty((n + MOST_FALSE, 3))
+    of_obstacles, directions, to_obstacles = obstacles
+    seen, planes = np.empty((n + MOST_FALSE, 6)), np.empty((n + MOST_FALSE + len(directions), 3))
+    points, known = np.empty((len(directions), 2)), 0
     slots, ranges, rays, z = np.empty(n, np.int64), np.empty(n), np.empty((n, 4)), np.empty(2)
     asked = np.empty(2)
     for i in range(begin, end):
@@ -63,21 +76,28 @@ def fly_gated(
             asked[:] = 0.0  # refused
         elapsed_s = tick_s
         if math.isnan(sent[0, d]):
-            sent[0, d], sent[1, d] = _limited(states[3, d], states[4, d], gate[MAX_SPEED])
+            sent[0, d], sent[1, d] = limited(states[3, d], states[4, d], gate[MAX_SPEED])
             elapsed_s = 0.0
         most = max(math.sqrt(asked[0] ** 2 + asked[1] ** 2), math.sqrt(sent[0, d] ** 2 + sent[1, d] ** 2))
         own = max(math.sqrt(states[3, d] ** 2 + states[4, d] ** 2), most) + _GUSTS_M_S
         others = fastest[f] + _GUSTS_M_S
-        reach = gate[SEPARATION_M] + _needed_m(most, others, gate) + (own + others) * ticks * tick_s
+        reach = gate[SEPARATION_M] + needed_m(most, others, gate) + (own + others) * ticks * tick_s
         if table.shape[0] > 0:
             count = perceive(f, slot, by_slot, grids[f], starts[f], order, table, figures, seeds[f], step, reach,
                              slots, ranges, rays, seen, z)  # fmt: skip
         else:
-            count = _exact(slot, by_slot[:, f], grids[f], starts[f], reach, seen)
+            count = exact_neighbours(slot, by_slot[:, f], grids[f], starts[f], reach, seen)
         count = _that_may_bind(seen, count, most, own * ticks * tick_s, ticks * tick_s, gate)
+        if len(to_obstacles) > 0:
+            known = obstacle_points(to_obstacles[d], of_obstacles, directions, points)
         for tick in range(ticks):
-            velocity = _limited(asked[0] - sent[0, d], asked[1] - sent[1, d], gate[MAX_ACCELERATION] * elapsed_s)
-            bound = _limits(seen, count, tick * tick_s, states[:, d], gate, planes)
+            velocity = limited(asked[0] - sent[0, d], asked[1] - sent[1, d], gate[MAX_ACCELERATION] * elapsed_s)
+            age_s = tick * tick_s
+            bound = neighbour_limits(seen, count, age_s, states[:, d], gate, planes)
+            bound = obstacle_limits(
+                points, known, age_s * states[3, d], age_s * states[4, d], of_obstacles[CLEARANCE_M], gate[BRAKING],
+                gate[REACTION], planes, bound,
+            )  # fmt: skip
             sent[0, d], sent[1, d] = nearest_within(sent[0, d] + velocity[0], sent[1, d] + velocity[1], planes, bound)
             of_tick = gusts[tick * substeps[0] : (tick + 1) * substeps[0]]
             fly(d, d + 1, states, sent, of_tick, substeps)
@@ -85,13 +105,14 @@ def fly_gated(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _limited(vn: float, ve: float, most: float) -> Any:
+def limited(vn: float, ve: float, most: float) -> Any:
+    """The vector itself if it is no longer than `most`, else the one of that length in its direction."""
     length = math.sqrt(vn * vn + ve * ve)
     return (vn, ve) if length <= most else (vn * (most / length), ve * (most / length))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _exact(slot: int, flight: Any, grid: Any, starts: Any, reach: float, seen: Any) -> int:
+def exact_neighbours(slot: int, flight: Any, grid: Any, starts: Any, reach: float, seen: Any) -> int:
     """Fills `seen` as `perceive` does with all within `reach` m in the plane; how many."""
     x, y = flight[0], flight[1]
     count = 0
@@ -108,7 +129,7 @@ def _exact(slot: int, flight: Any, grid: Any, starts: Any, reach: float, seen: A
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _needed_m(speed: float, comes: float, gate: Any) -> float:
+def needed_m(speed: float, comes: float, gate: Any) -> float:
     """The distance left from which on a neighbour that comes as fast limits nothing up to this speed."""
     b, lag = gate[BRAKING], gate[BRAKING] * gate[REACTION]
     own = speed * speed + 2.0 * speed * lag
@@ -123,14 +144,14 @@ def _that_may_bind(seen: Any, count: int, speed: float, way_m: float, step_s: fl
         away = math.sqrt(seen[k, 0] ** 2 + seen[k, 1] ** 2)
         flies = math.sqrt(seen[k, 2] ** 2 + seen[k, 3] ** 2)
         left = away - gate[SEPARATION_M] - way_m - flies * step_s
-        if left < _needed_m(speed, min(flies, gate[MAX_SPEED]), gate):
+        if left < needed_m(speed, min(flies, gate[MAX_SPEED]), gate):
             seen[kept] = seen[k]
             kept += 1
     return kept
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _limits(seen: Any, count: int, age_s: float, state: Any, gate: Any, planes: Any) -> int:
+def neighbour_limits(seen: Any, count: int, age_s: float, state: Any, gate: Any, planes: Any) -> int:
     """Fills `planes` (.., 3) with directions to neighbours and speeds, `age_s` after they were seen; how many."""
     bound = 0
     b, lag = gate[BRAKING], gate[BRAKING] * gate[REACTION]
@@ -139,7 +160,7 @@ def _limits(seen: Any, count: int, age_s: float, state: Any, gate: Any, planes: 
         y = seen[k, 1] + age_s * (seen[k, 3] - state[4])
         z = seen[k, 4] + age_s * (seen[k, 5] - state[5])
         away = math.sqrt(x * x + y * y)
-        if away < SAME_SPOT_M or abs(z) >= gate[ABOUT_M]:
+        if away <= SAME_SPOT_M or abs(z) >= gate[ABOUT_M]:  # `perceive` moves one above or below that far off
             continue
         ex, ey = x / away, y / away
         comes = -min(max(seen[k, 2] * ex + seen[k, 3] * ey, -gate[MAX_SPEED]), gate[MAX_SPEED])
@@ -151,6 +172,38 @@ def _limits(seen: Any, count: int, age_s: float, state: Any, gate: Any, planes: 
             most = min(math.sqrt(max(square, lag * lag)) - lag, max(both, -comes))
         planes[bound, 0], planes[bound, 1], planes[bound, 2] = ex, ey, most
         bound += 1
+    return bound
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def obstacle_points(ranges: Any, figures: Any, directions: Any, points: Any) -> int:
+    """Fills `points` (.., 2) as `flockd.obstacles.nearest_points` from exact ranges (sectors,); how many."""
+    count = 0
+    for sector in range(ranges.size):
+        if ranges[sector] < math.inf:
+            away = max(ranges[sector] - figures[NEARER_M], figures[LEAST_M])
+            points[count, 0], points[count, 1] = away * directions[sector, 0], away * directions[sector, 1]
+            count += 1
+    return count
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def obstacle_limits(
+    points: Any, count: int, way_n: float, way_e: float, clearance_m: float, braking: float, reaction_s: float,
+    planes: Any, bound: int,
+) -> int:  # fmt: skip
+    """Adds to the first `bound` of `planes` what `flockd.safety.approach.towards_obstacles` says; how many then.
+
+    Of obstacles seen at `points` (.., 2) m before the drone flew the way (`way_n`, `way_e`) m.
+    """
+    lag = braking * reaction_s
+    for k in range(count):
+        north, east = points[k, 0] - way_n, points[k, 1] - way_e
+        away = math.sqrt(north * north + east * east)
+        if away > 0.0:
+            most = math.sqrt(lag * lag + 2.0 * braking * max(away - clearance_m, 0.0)) - lag
+            planes[bound, 0], planes[bound, 1], planes[bound, 2] = north / away, east / away, most
+            bound += 1
     return bound
 
 

@@ -192,7 +192,7 @@ def perceived_sums(
     seen = np.empty((room, 6))
     keys, numbers = np.empty(max(nearest, 1)), np.empty(max(nearest, 1), np.int64)
     z, sums = np.empty(2), np.empty(2)
-    limit = min(figures[RANGE_LIMIT], max(law[OBSERVATION_M], law[SEPARATION_M]) * 2.0)
+    limit = farthest(figures, law)
     for i in range(begin, end):
         f = i // n
         slot = i - f * n
@@ -234,6 +234,12 @@ def perceived_sums(
         out[1, f, drone] = sums[1] - ve
         middles[0, f, drone] = middle_n / (count + 1)
         middles[1, f, drone] = middle_e / (count + 1)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def farthest(figures: Any, law: Any) -> float:
+    """How far away a neighbour is that counts at all, m."""
+    return float(min(figures[RANGE_LIMIT], max(law[OBSERVATION_M], law[SEPARATION_M]) * 2.0))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

@@ -15,7 +15,7 @@ from flockd.obstacles.steering import Steering
 from flockd.safety.approach import stopping_speed, towards_neighbours, towards_obstacles
 from flockd.safety.half_planes import nearest_within
 
-_AWAY_PER_S = 1.0
+AWAY_PER_S = 1.0
 """Nearer than the clearance, away from an obstacle at this much of what is missing each second."""
 
 
@@ -85,5 +85,5 @@ class Avoidance:
             return np.zeros(2)
         nearest = int(np.argmin(away_m))
         missing_m = self._parameters.clearance_m - away_m[nearest]
-        away: FloatArray = -_AWAY_PER_S * missing_m * points[nearest] / away_m[nearest]
+        away: FloatArray = -AWAY_PER_S * missing_m * points[nearest] / away_m[nearest]
         return away

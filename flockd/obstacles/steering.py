@@ -15,20 +15,19 @@ from flockd.config.avoidance import ObstacleParameters
 from flockd.messages import FloatArray, ObstacleRanges
 from flockd.obstacles.local_map import AZIMUTHS, nearest_points
 
-_CANDIDATES = 144
-_TURNS = np.linspace(-math.pi, math.pi, _CANDIDATES, endpoint=False)
+TURNS = np.linspace(-math.pi, math.pi, 144, endpoint=False)
 """(n,) radians, clockwise from the wanted direction; 0 is one of them."""
-_LAST = 0.5
+LAST = 0.5
 """How much a turn away from the last direction counts, relative to one away from the wanted direction."""
-_FLOCK = 0.15
+FLOCK = 0.15
 """The same, away from where the neighbours fly."""
-_RIGHT_RAD = 0.02
+RIGHT_RAD = 0.02
 """To the left costs this much more: of two ways alike all drones take the same."""
-_SHORTER = (1.0, 0.6, 0.3)
+SHORTER = (1.0, 0.6, 0.3)
 """Where no direction is free as far as it should be: shares of that way that do too."""
-_BESIDE_M = 0.02
+BESIDE_M = 0.02
 """Beside an obstacle that is nearer than the margin, the margin is smaller by this than what there is."""
-_TURNED_RAD = 0.1
+TURNED_RAD = 0.1
 """A turn smaller than this is not worth remembering."""
 
 
@@ -50,31 +49,31 @@ class Steering:
             return wanted, 0.0
         wanted_rad = math.atan2(wanted[1], wanted[0])
         points = nearest_points(ranges, p.sigmas)
-        azimuths = wanted_rad + _TURNS
+        azimuths = wanted_rad + TURNS
         cost = self._cost(azimuths, flock)
         nearest_m = float(np.hypot(*points.T).min(initial=np.inf))
-        with_margin_m = min(max(nearest_m - _BESIDE_M, p.clearance_m), p.clearance_m + p.margin_m)
+        with_margin_m = min(max(nearest_m - BESIDE_M, p.clearance_m), p.clearance_m + p.margin_m)
         for radius_m in (with_margin_m, p.clearance_m):
             free_m = free_way(points, radius_m, azimuths)
             free_m = np.minimum(free_m, seen_way(ranges, azimuths) - radius_m)
-            for share in _SHORTER:
+            for share in SHORTER:
                 is_free = free_m >= min(share * speed * p.horizon_s, p.range_m - radius_m)
                 if is_free.any():
                     return self._taken(int(np.argmin(np.where(is_free, cost, np.inf))), wanted, free_m)
         return self._taken(int(np.argmax(free_m - cost)), wanted, free_m)
 
     def _cost(self, azimuths: FloatArray, flock: FloatArray) -> FloatArray:
-        cost = np.abs(_TURNS) + np.where(_TURNS < 0, _RIGHT_RAD, 0.0)
+        cost = np.abs(TURNS) + np.where(TURNS < 0, RIGHT_RAD, 0.0)
         if self._last_rad is not None:
-            cost = cost + _LAST * np.abs(_wrapped(azimuths - self._last_rad))
+            cost = cost + LAST * np.abs(_wrapped(azimuths - self._last_rad))
         if flock.any():
-            cost = cost + _FLOCK * np.abs(_wrapped(azimuths - math.atan2(flock[1], flock[0])))
+            cost = cost + FLOCK * np.abs(_wrapped(azimuths - math.atan2(flock[1], flock[0])))
         return cost
 
     def _taken(self, index: int, wanted: FloatArray, free_m: FloatArray) -> tuple[FloatArray, float]:
-        turn = float(_TURNS[index])
+        turn = float(TURNS[index])
         velocity: FloatArray = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ wanted
-        self._last_rad = math.atan2(velocity[1], velocity[0]) if abs(turn) > _TURNED_RAD else None
+        self._last_rad = math.atan2(velocity[1], velocity[0]) if abs(turn) > TURNED_RAD else None
         return velocity, max(float(free_m[index]), 0.0)
 
 

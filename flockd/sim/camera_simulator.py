@@ -17,11 +17,11 @@ from flockd.messages import FloatArray, Frame, FrameSet, UInt8Array
 from flockd.mission import Moment, Navigator
 from flockd.sim.camera_faults import CameraFaults
 from flockd.sim.drone_models import FAMILIES, drone_model
-from flockd.sim.obstacle_worlds import obstacles_of
 from flockd.sim.renderer import Renderer, View
 from flockd.sim.truth_perception import RenderTruth
 from flockd.sim.vehicles import REFERENCE_DEG
 from flockd.sim.world import World
+from flockd.worlds.obstacle_worlds import obstacles_of
 
 
 class FlockPoses(Protocol):

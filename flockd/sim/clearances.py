@@ -9,11 +9,8 @@ import numpy as np
 from flockd.config.scenario import ScenarioConfig
 from flockd.flight_log.log import FlightLog
 from flockd.messages import FloatArray
-from flockd.sim.obstacle_worlds import obstacles_of
-from flockd.sim.obstacles import Obstacles
-
-_BETWEEN = 10
-"""Points on the way from one step to the next: 8 cm apart at 1.5 m/s and a step of 0.5 s."""
+from flockd.worlds.obstacle_worlds import obstacles_of
+from flockd.worlds.obstacles import POINTS_A_STEP, Obstacles
 
 
 def with_obstacles(log: FlightLog, scenario: ScenarioConfig) -> FlightLog:
@@ -35,7 +32,7 @@ def clearances(obstacles: Obstacles, times: FloatArray, position: FloatArray, ve
     Between them each drone is taken to fly on the cubic through both states.
     """
     interval = np.diff(times)[:, None, None]
-    share = np.arange(_BETWEEN)[:, None, None, None] / _BETWEEN
+    share = np.arange(POINTS_A_STEP)[:, None, None, None] / POINTS_A_STEP
     a, b = position[:-1], position[1:]
     run, end_run = interval * velocity[:-1], interval * velocity[1:]
     path = (

@@ -14,9 +14,9 @@ from flockd.mission import Moment, Navigator
 from flockd.mission.navigator import middle_of
 from flockd.obstacles import Avoidance
 from flockd.sim.handover import Handover
-from flockd.sim.obstacle_worlds import obstacles_of
-from flockd.sim.obstacles import true_ranges
 from flockd.sim.vehicles import REFERENCE_DEG, Vehicles
+from flockd.worlds.obstacle_worlds import obstacles_of
+from flockd.worlds.obstacles import true_ranges
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,8 @@ from flockd.messages import FloatArray, ObstacleRanges
 from flockd.obstacles import Avoidance
 from flockd.obstacles.steering import Steering, free_way
 from flockd.sim.exact_states import ExactFlock
-from flockd.sim.obstacles import Box, Frustum, Obstacles, Solid, true_ranges
 from flockd.sim.vehicles import Vehicles
+from flockd.worlds.obstacles import Box, Frustum, Obstacles, Solid, true_ranges
 
 PARAMETERS = ObstacleParameters(enabled=True)
 GATE = GateParameters()

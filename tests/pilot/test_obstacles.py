@@ -15,7 +15,7 @@ from flockd.messages import SECTORS, FloatArray, FrameSet, ObstacleRanges, Pilot
 from flockd.perception import Observation
 from flockd.pilot import FlockPilot
 from flockd.recording.codec import from_json, parsed, to_json
-from flockd.sim.obstacles import Box, Obstacles, true_ranges
+from flockd.worlds.obstacles import Box, Obstacles, true_ranges
 
 WALL = Obstacles([Box(3.0, 0.0, 0.2, 30.0, 0.0, -0.5, 8.0)])
 """Its surface is 2.8 m north."""

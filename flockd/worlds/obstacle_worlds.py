@@ -12,7 +12,7 @@ from flockd.config.obstacle_field import ObstaclesConfig
 from flockd.config.scenario import ScenarioConfig
 from flockd.errors import UsageError
 from flockd.messages import FloatArray
-from flockd.sim.obstacles import Box, Capsule, Frustum, Material, Obstacles, Solid
+from flockd.worlds.obstacles import Box, Capsule, Frustum, Material, Obstacles, Solid
 
 DEPTH_M = 0.6
 """How far everything reaches below z = 0, where the ground may lie lower."""
