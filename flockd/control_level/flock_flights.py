@@ -103,7 +103,9 @@ class FlockFlights:
         self._order = np.empty((f, n), np.int64)
         self.sums = np.zeros((2, f, n))
         """u of Eq. 38 without u_vf, m/s^2, as last perceived."""
-        self._middles, self._own, self._commands = (np.zeros((2, f, n)) for _ in range(3))
+        self.commands = np.zeros((2, f, n))
+        """Velocities that drones were asked to fly with in the last step, m/s."""
+        self._middles, self._own = (np.zeros((2, f, n)) for _ in range(2))
         self._sent = np.full((2, f, n), np.nan)
         self._level, self._straight, self._unsafe = (np.empty((f, n)) for _ in range(3))
 
@@ -119,7 +121,7 @@ class FlockFlights:
         climbs = bool(np.isfinite(height_m).any())
         states, flat = self.states.reshape(6, -1), height_m.reshape(-1)
         own = states[3:5] if self._errors is None else self._own.reshape(2, -1)
-        commands = self._commands.reshape(2, -1)
+        commands = self.commands.reshape(2, -1)
 
         def ask(a: int, b: int) -> None:
             p = self._drone.flocking
@@ -156,7 +158,7 @@ class FlockFlights:
         def around(a: int, b: int) -> None:
             ways_around.fly_around(
                 a, b, *cells, self.sums.reshape(2, -1), desired.reshape(2, -1), own, *to_obstacles, self._rules, errors,
-                step, self._last_rad, self._commands.reshape(2, -1),
+                step, self._last_rad, self.commands.reshape(2, -1),
             )  # fmt: skip
 
         run(around)
@@ -174,7 +176,7 @@ class FlockFlights:
 
         def fly(a: int, b: int) -> None:
             gate_limits.fly_gated(
-                a, b, *cells, self.states.reshape(6, -1), self._commands.reshape(2, -1), self._sent.reshape(2, -1),
+                a, b, *cells, self.states.reshape(6, -1), self.commands.reshape(2, -1), self._sent.reshape(2, -1),
                 fastest, self._gate, self._ticks, tick_s, gusts, self._substeps, errors, step,
                 obstacles,
             )  # fmt: skip
