@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from flockd.control_level.flock_flights import FlockFlights
 from flockd.control_level.gate_limits import nearest_within
 from flockd.data import data_path
 from flockd.messages import FloatArray, VelocityCommand
+from flockd.obstacles import nearest_points
 from flockd.safety import half_planes
 from flockd.safety.gate import Gate, Objection, Permission, Surroundings, Wanted
 from flockd.safety.policy import Action
@@ -34,8 +36,8 @@ def _scenario(drones: int, **overrides: Any) -> ScenarioConfig:
     return scattered(scenario.model_copy(update={"vehicles": tuple(level)}), 0.8)
 
 
-def _flown_by_gates(scenario: ScenarioConfig) -> tuple[FloatArray, int]:
-    """Positions (S, n, 2) m as each step begins, and how often a neighbour was objected to."""
+def _flown_by_gates(scenario: ScenarioConfig) -> tuple[FloatArray, Counter[Objection]]:
+    """Positions (S, n, 2) m as each step begins, and how often the gates objected to what."""
     drone, n = scenario.drone, len(scenario.vehicles)
     flock, gates = ExactFlock(scenario), [Gate(drone.safety.gate) for _ in range(n)]
     vehicles = Vehicles(scenario.vehicles, scenario.vehicle, seed=scenario.seed)
@@ -50,7 +52,8 @@ def _flown_by_gates(scenario: ScenarioConfig) -> tuple[FloatArray, int]:
             setpoints = np.zeros((n, 2))
             for i, gate in enumerate(gates):
                 others = np.arange(n) != i
-                own = vehicles.velocity[i]
+                own, seen = vehicles.velocity[i], commands.obstacles[i]
+                points = np.empty((0, 2)) if seen is None else nearest_points(seen, drone.obstacles.sigmas)
                 setpoint = gate.step(
                     now_s,
                     Permission(Action.FLY, now_s),
@@ -62,12 +65,13 @@ def _flown_by_gates(scenario: ScenarioConfig) -> tuple[FloatArray, int]:
                         position[others] - position[i] + age_s * (velocity[others] - own),
                         velocity[others, :2],
                         4.0,
+                        points - age_s * own[:2],
                     ),
                 ).setpoint
                 assert setpoint is not None
                 setpoints[i] = setpoint.velocity
             vehicles.step(setpoints, np.zeros(n), TICK_S)
-    return np.array(found), sum(gate.counts[Objection.SEPARATION] for gate in gates)
+    return np.array(found), sum((gate.counts for gate in gates), Counter())
 
 
 @pytest.mark.parametrize(
@@ -76,12 +80,19 @@ def _flown_by_gates(scenario: ScenarioConfig) -> tuple[FloatArray, int]:
         {},
         {"drone__flocking__cohesion": 0.5, "drone__safety__gate__min_separation_m": 1.4},
         {"vehicle__gust_m_s": 0.3, "seed": 4, "drone__safety__gate__max_acceleration_m_s2": 1.0},
+        {
+            "world__obstacles__kind": "forest",
+            "world__obstacles__trees_per_hectare": 400.0,
+            "world__obstacles__free_start_m": 1.0,
+            "drone__obstacles__enabled": True,
+            "drone__safety__gate__obstacle_clearance_m": 1.5,
+        },
     ],
 )
 def test_each_drone_flies_as_its_gate_says(keys: dict[str, Any]) -> None:
     scenario = _scenario(9, **keys)
     expected, objections = _flown_by_gates(scenario)
-    assert objections > 50
+    assert objections[Objection.SEPARATION if scenario.world.obstacles is None else Objection.OBSTACLE] > 50
     flights = FlockFlights([scenario], gated=True)
     for step in range(flights.steps):
         np.testing.assert_allclose(flights.states[:2, 0].T, expected[step], atol=1e-9)
