@@ -126,10 +126,6 @@ def test_a_plan_is_its_own_copy(tmp_path: Path) -> None:
             "gated: true\n",
             "FILE:5: gated: is for `perception: control`; delete one of them",
         ),
-        (
-            "perception: control\nfixed: {world.obstacles: {kind: forest}}\n",
-            "FILE:5: perception: control has no obstacles, this scenario has; write `truth`",
-        ),
         ("perception: guess\n", "FILE:5: perception: guess is not known; write `truth` or `sight` or `control`"),
     ],
 )
