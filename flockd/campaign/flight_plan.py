@@ -64,7 +64,7 @@ class ControlLevel:
     errors: PerceivedErrors | None = None
     """Of perception; None: exact states."""
     gated: bool = False
-    """Whether safety gates limit how fast drones fly towards their neighbours."""
+    """Whether safety gates limit how fast drones fly towards neighbours and obstacles."""
 
 
 @dataclass(frozen=True)

@@ -115,9 +115,9 @@ class CampaignConfig(Section):
     control level, with flocks of any size, many flights at once, on exact states or with `errors`."""
     errors: str | None = None
     """For `control`: the path of a file of perception's errors, relative to this one, as `tools.fit_perception` writes
-    it. none: exact states."""
+    it. none: exact states. Ranges to obstacles are exact in any case."""
     gated: bool = False
-    """For `control`: whether each drone's safety gate limits how fast it flies towards its neighbours."""
+    """For `control`: whether each drone's safety gate limits how fast it flies towards neighbours and obstacles."""
     seed: Annotated[int, Field(ge=0, le=2**53)] = 0
     """Flight n of each cell, from 0, flies with the scenario's seed `seed` + n, in all cells alike: so differences
     between cells and between campaigns are of flights with the same gusts and worlds."""

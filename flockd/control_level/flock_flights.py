@@ -44,14 +44,16 @@ def fly_flocks(
     bit for bit whatever others are flown with it, in however many threads.
 
     Args:
-        scenarios: with any number of vehicles (`flockd.sim.start`). The seed rules gusts and
-            the errors of perception. Rig and sensors do not count.
-        errors: of what the drones perceive of each other; None: they are given exact states.
-        gated: whether each drone's safety gate limits how fast it flies towards its neighbours (`gate_limits`).
+        scenarios: with any number of vehicles (`flockd.sim.start`). The seed rules gusts,
+            obstacles and the errors of perception. Rig and sensors do not count.
+        errors: of what the drones perceive of each other; None: they are given exact states. Ranges to obstacles are
+            exact in any case.
+        gated: whether each drone's safety gate limits how fast it flies towards neighbours and obstacles
+            (`gate_limits`).
         threads: to compute in.
         progress: called with (flights done, flights in all).
 
-    Raises UsageError for what cannot be flown without images.
+    Raises UsageError for what cannot be flown without images, and for obstacles that do not fit into their world.
     """
     found: dict[int, Figures] = {}
     for numbers in _alike(scenarios):
