@@ -52,7 +52,6 @@ CASES = (
     Case(1000, 1, NEAREST, 20.0, measured=True),
     Case(5, 200, NEAREST, 60.0, forest=True),
     Case(100, 10, NEAREST, 60.0, forest=True),
-    Case(5, 200, UNIFORM, 10.0, measured=True, forest=True),
 )
 ANCHORS = (
     Case(5, 1, UNIFORM, 30.0),

@@ -62,17 +62,16 @@ def sector_ranges(
         ranges = out[i]
         ranges[:] = math.inf
         for k in range(first[i // n], first[i // n + 1]):
-            row = solids[k]
-            if row[LOW_M] > high or row[HIGH_M] < low:
+            if solids[k, LOW_M] > high or solids[k, HIGH_M] < low:
                 continue
-            reach = row[REACH_M] + limit_m
-            if (row[NORTH] - x) ** 2 + (row[EAST] - y) ** 2 > reach * reach:
+            reach = solids[k, REACH_M] + limit_m
+            if (solids[k, NORTH] - x) ** 2 + (solids[k, EAST] - y) ** 2 > reach * reach:
                 continue
-            own = row[OWN:]
-            if row[KIND] == FRUSTUM:
+            own = solids[k, OWN:]
+            if solids[k, KIND] == FRUSTUM:
                 wide = max(_radius_at(own, max(own[4], low)), _radius_at(own, min(own[5], high)))
                 _disc_ranges(own[0] - x, own[1] - y, wide, ranges)
-            elif row[KIND] == BOX:
+            elif solids[k, KIND] == BOX:
                 _rectangle_ranges(own[0] - x, own[1] - y, own[2], own[3], own[4], ranges)
             else:
                 _capsule_ranges(own, x, y, low, high, ranges)
@@ -189,18 +188,20 @@ def way_clearances(
                     + (s**3 - s**2) * step_s * now[axis + 3, i]
                 )
             path[p, 2] = -path[p, 2]
-        middle = path[points // 2]
+        middle, low, high = path[points // 2], path[:, 2].min(), path[:, 2].max()
         around = 0.0
         for p in range(points + 1):
             around = max(around, math.sqrt((path[p, 0] - middle[0]) ** 2 + (path[p, 1] - middle[1]) ** 2))
         least = math.inf
         for k in range(first[i // n], first[i // n + 1]):
-            row = solids[k]
-            reach = least + row[REACH_M] + around
-            if reach < 0.0 or (row[NORTH] - middle[0]) ** 2 + (row[EAST] - middle[1]) ** 2 > reach * reach:
+            reach = least + solids[k, REACH_M] + around
+            if solids[k, LOW_M] - high > least or low - solids[k, HIGH_M] > least or reach < 0.0:
                 continue
+            if (solids[k, NORTH] - middle[0]) ** 2 + (solids[k, EAST] - middle[1]) ** 2 > reach * reach:
+                continue
+            kind, own = solids[k, KIND], solids[k, OWN:]
             for p in range(points + 1):
-                least = min(least, _clearance(row[KIND], row[OWN:], path[p, 0], path[p, 1], path[p, 2]))
+                least = min(least, _clearance(kind, own, path[p, 0], path[p, 1], path[p, 2]))
         out[i] = least
 
 
@@ -216,7 +217,7 @@ def _clearance(kind: float, own: Any, x: float, y: float, height: float) -> floa
         b = abs(-north * sine + east * cosine) - own[3]
         c = abs(height - (own[5] + own[6]) / 2) - (own[6] - own[5]) / 2
         outside = math.sqrt(max(a, 0.0) ** 2 + max(b, 0.0) ** 2 + max(c, 0.0) ** 2)
-        return outside + min(max(a, b, c), 0.0)
+        return float(outside + min(max(a, b, c), 0.0))
     ln, le, lu = own[3] - own[0], own[4] - own[1], own[5] - own[2]
     along = (x - own[0]) * ln + (y - own[1]) * le + (height - own[2]) * lu
     share = min(max(along / max(ln * ln + le * le + lu * lu, _LEAST_SQUARE), 0.0), 1.0)

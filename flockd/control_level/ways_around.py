@@ -260,7 +260,7 @@ def _free_way(azimuth: float, radius_m: float, ranges: Any, points: Any) -> floa
             if square > 0.0:
                 free_m = min(free_m, max(ahead - math.sqrt(square), 0.0))
     sector = int(np.rint(azimuth / (2.0 * math.pi / ranges.size))) % ranges.size
-    return min(free_m, min(ranges[sector], RANGE_LIMIT_M) - radius_m)
+    return float(min(free_m, min(ranges[sector], RANGE_LIMIT_M) - radius_m))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
