@@ -136,6 +136,26 @@ def test_the_figures_are_those_of_a_flight_on_exact_states(enabled: bool) -> Non
     assert (max(one["collisions"] or 0 for one in flown) > 0) is not enabled
 
 
+@pytest.mark.slow  # the simulator's flights take 2.5 s each
+@pytest.mark.parametrize("seed", range(4))
+def test_the_shipped_forest_is_flown_as_the_simulator_flies_it(seed: int) -> None:
+    scenario = load_scenario(data_path("config") / "forest.yaml", {"seed": seed})
+    flights, log = FlockFlights([scenario]), fly(scenario, perception="truth", pictured=False).log
+    for step in range(flights.steps):
+        np.testing.assert_allclose(flights.states[:3, 0].T, log.position[step], atol=1e-9)
+        flights.step(step, None, 1)
+    expected = obstacle_figures(log)
+    assert {key: flights.figures()[0][key] for key in expected} == pytest.approx(expected, abs=1e-8)
+
+
+def test_a_flight_among_obstacles_is_the_same_in_any_batch_and_in_any_number_of_threads() -> None:
+    keys = {"world__obstacles__trees_per_hectare": 400.0, "duration_s": 1.0}
+    flown = [_scenario("forest", 150, seed=seed, **keys) for seed in (4, 5)]
+    alone = [fly_flocks([one])[0] for one in flown]
+    assert fly_flocks(flown[::-1], threads=2) == alone[::-1]
+    assert alone[0]["min_clearance_m"] != alone[1]["min_clearance_m"]  # each seed has its own forest
+
+
 def test_a_flight_without_obstacles_has_no_figures_of_them() -> None:
     scenario = load_scenario(data_path("config") / "paper_flight.yaml", {"duration_s": 1.0})
     assert fly_flocks([scenario])[0]["collisions"] is None
