@@ -8,8 +8,8 @@ Needs Linux on x86-64 with qemu-system-x86, mmdebstrap and e2fsprogs, and no KVM
 runs Debian 12 with its own kernel and systemd; flockd is installed by the lines of docs/real_drone.md, and its unit
 runs `flockd run` with the shipped networks. The autopilot is flockd's fake; as an emulated processor is slow, the
 images are small and the steps far apart. The machine's clock counts instructions, a nanosecond each: how busy this
-computer is changes how long the check takes, and nothing of what it measures. With --package, which installs half a
-gigabyte three times, it has two processors instead, and the clock of this computer.
+computer is changes how long the check takes, and nothing of what it measures. --package installs half a gigabyte three
+times.
 
 Exit code 0, 1 a check failed, 69 something needed is not there. A check that is a row of the catalogue of faults
 (`python -m tools.faults --list`) says which.
@@ -114,8 +114,6 @@ class Part:
     """Makes the machine's files ready, with a folder of wheels."""
     share: Callable[[Path, Path], str]
     """Puts what the checks need into a folder that the machine sees, likewise; their command."""
-    processor: tuple[str, ...]
-    """For QEMU."""
 
 
 def _check(folder: Path, part: Part, *, as_json: bool) -> int:
@@ -175,8 +173,7 @@ def _by_hand(groups: list[str]) -> Part:
         (shared / "start.sh").write_text(start, encoding="utf-8")
         return " ".join(["/opt/flockd/bin/python -m tools.device_check.guest /mnt/findings/lines start.sh", *groups])
 
-    emulated = ("-machine", "pc,accel=tcg", "-cpu", "Nehalem", "-icount", "shift=0,sleep=off", "-rtc", "clock=vm")
-    return Part(lambda system, wheels: _install(system, wheels, install), share, emulated)
+    return Part(lambda system, wheels: _install(system, wheels, install), share)
 
 
 def _package() -> Part:
@@ -188,7 +185,7 @@ def _package() -> Part:
         paths = (f"/mnt/check/{name}" for name in files)
         return " ".join(["python3 -m tools.device_check.package /mnt/findings/lines", *paths])
 
-    return Part(_install_fake_autopilot, share, ("-machine", "pc,accel=tcg", "-cpu", "Nehalem", "-smp", "2"))
+    return Part(_install_fake_autopilot, share)
 
 
 def _build(folder: Path, part: Part) -> tuple[Path, Path]:
@@ -294,7 +291,7 @@ def _run(folder: Path, image: Path, wheels: Path, part: Part) -> Iterator[dict[s
     shutil.copytree(ROOT / "tools/device_check", shared / "tools/device_check")
     (shared / "check.sh").write_text(f"exec {part.share(shared, wheels)}\n", encoding="utf-8")
     _note("booting")
-    machine = subprocess.Popen([*_qemu(folder, image, shared, findings), *part.processor], stdin=subprocess.DEVNULL)
+    machine = subprocess.Popen(_qemu(folder, image, shared, findings), stdin=subprocess.DEVNULL)
     try:
         yield from _lines(findings / "lines", machine)
     finally:
@@ -306,6 +303,7 @@ def _qemu(folder: Path, image: Path, shared: Path, findings: Path) -> list[str]:
     boot = folder / "system/boot"
     return [
         "qemu-system-x86_64", "-nodefaults", "-no-reboot", "-display", "none", "-m", str(MEMORY_MB),
+        "-machine", "pc,accel=tcg", "-cpu", "Nehalem", "-icount", "shift=0,sleep=off", "-rtc", "clock=vm",
         "-kernel", str(next(boot.glob("vmlinuz-*"))), "-initrd", str(next(boot.glob("initrd.img-*"))),
         "-append", "root=/dev/vda rw console=ttyS0 quiet",
         "-drive", f"file={image},format=raw,if=virtio,snapshot=on",
