@@ -1,7 +1,8 @@
-"""Flocks without images: the law, the missions and the vehicles of many drones and many flights at once.
+"""Flocks without images: law, missions, avoidance and vehicles of many drones and many flights at once.
 
 For questions that need hundreds of drones or thousands of flights. Each drone is given the others' exact states, or
-what it would perceive with the errors of the networks' flights (`flockd.config.perceived`).
+what it would perceive with the errors of the networks' flights (`flockd.config.perceived`), and exact ranges to
+obstacles.
 """
 
 from __future__ import annotations
