@@ -152,6 +152,7 @@ def rows_of_pairs(found: Findings) -> Iterator[Row]:
     for low, high, name in ((12, np.inf, "at least 12"), (6, 12, "6 to 12")):
         count = sum(low <= drone.width_px < high for drone in found.drones)
         yield Row(f"drones whose box is {name} px wide, found", 100 * found.found(low, high), "%", count)
+        yield Row(f"drones whose box is {name} px wide, proposed", 100 * found.proposed(low, high), "%", count)
     yield Row("false drones in 500 images", 500 * found.false / found.images, "", found.images)
     for on_drones, where in ((False, "background"), (True, "drones")):
         for network, name in (("network", "flow"), ("dis", "OpenCV DIS medium")):

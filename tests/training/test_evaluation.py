@@ -6,7 +6,7 @@ import numpy as np
 
 from flockd.geometry import log_polar, log_polar_covariance
 from flockd.messages import Detection
-from tools.evaluation.on_pairs import _pairings, _view
+from tools.evaluation.on_pairs import Findings, _pairings, _view, compare_drones
 from tools.training.dataset import HEIGHT, WIDTH, PairSet
 
 
@@ -48,3 +48,25 @@ def test_a_grey_drone_before_the_sky_seen_from_below_is_said_to_be_that() -> Non
     assert np.isclose(below_deg, 45.0)
     assert sky_share == 1.0
     assert np.isclose(contrast, 60.0)
+
+
+def test_a_drone_is_proposed_where_the_second_stage_was_asked_about_its_direction() -> None:
+    """Of two drones 10 m ahead and 2 m apart, without a detection, only the one is that a proposal points to."""
+    depth, ids = np.full((HEIGHT // 2, WIDTH // 2), 80.0, np.float32), np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8)
+    pairs = PairSet(
+        {
+            "focal": np.array([320.0]),
+            "drone_pixels": np.array([[[50, 50]]]),
+            "drone_family": np.array([[0, 0]]),
+            "drone_box": np.array([[[[310, 230, 330, 250], [374, 230, 394, 250]]]]),
+            "drone_centre": np.array([[[[0.0, 0.0, 10.0], [2.0, 0.0, 10.0]]]]),
+            "drone_rotation": np.broadcast_to(np.eye(3), (1, 1, 2, 3, 3)),
+            "image": np.zeros((1, 1, HEIGHT, WIDTH, 3), np.uint8),
+        },
+        1,
+    )
+    found = Findings()
+    compare_drones((), pairs, 0, depth, ids, found, [np.array([1.0, 0.0, 0.0])])
+    assert [drone.proposed for drone in found.drones] == [True, False]
+    assert found.proposed(12, np.inf) == 0.5
+    assert found.found(12, np.inf) == 0.0

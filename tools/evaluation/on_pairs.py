@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from flockd.config.perception import PerceptionConfig
 from flockd.geometry import Rig
 from flockd.messages import UNCLASSED, Detection, Frame, FrameSet, VehicleState
 from flockd.perception import DisFlow, Networks, Perception
+from flockd.perception.detection.detector import DetectionTrace
 from flockd.sim.drone_models import FAMILIES, drone_model
 from tools.training.dataset import HEIGHT, R_BODY_CAMERA, WIDTH, PairSet, rig_camera
 from tools.training.scenes import outline_of
@@ -50,6 +51,8 @@ class Drone:
     """Of what surrounds the drone in the image."""
     contrast: float = 0.0
     """Between the drone's mean colour and that of what surrounds it, grey levels."""
+    proposed: bool = True
+    """Whether the second stage was asked about it: some proposal is no farther from it than the drone is large."""
 
 
 class Findings:
@@ -80,6 +83,10 @@ class Findings:
         """Share of the drones whose box is so wide."""
         return float(np.mean([d.found for d in self.drones if low_px <= d.width_px < high_px]))
 
+    def proposed(self, low_px: float, high_px: float) -> float:
+        """The same of those that the first stage proposed, or that were found."""
+        return float(np.mean([d.found or d.proposed for d in self.drones if low_px <= d.width_px < high_px]))
+
     def flow_errors(self, name: str, *, on_drones: bool) -> Array:
         """All of them."""
         return np.concatenate(self.flow[name, on_drones])
@@ -103,13 +110,15 @@ def look_at_pairs(pairs: PairSet, networks: Networks, indices: Iterable[int]) ->
             scale: ScaleSource = "network" if given is None else "height"
             measured_m = height + HEIGHT_SIGMAS_M.get(given or "", 0.0) * wrong
             vehicle = VehicleState(0.0, R_ned_camera @ R_BODY_CAMERA.T, measured_m)
-            view = Perception(rig, networks, PerceptionConfig(scale=scale)).observe(frames, vehicle)
+            trace = DetectionTrace()
+            view = Perception(rig, networks, PerceptionConfig(scale=scale)).observe(frames, vehicle, trace=trace)
             off = _depth_errors(view.cameras["camera"].depth[1::2, 1::2], depth, ids)
             found.depth[given].append(float(off.mean()) if off.size else 0.0)
             found.depth_pixels[given].append(off[::16])
         labels = view.cameras["camera"].labels
         _masks(((labels > 0) & (labels != UNCLASSED))[1::2, 1::2], ids, pairs, index, found)
-        compare_drones(view.detections, pairs, index, depth, ids, found)
+        proposed = [proposal.roi.direction for proposal in trace.proposals]
+        compare_drones(view.detections, pairs, index, depth, ids, found, proposed)
         flow = np.asarray(pairs["flow"][index], np.float32)
         valid = np.asarray(pairs["flow_valid"][index])
         first, second = (Frame("camera", images[k], 0.5 * k, k) for k in (0, 1))
@@ -139,14 +148,24 @@ def _masks(guess: Array, ids: Array, pairs: PairSet, index: int, found: Findings
 
 
 def compare_drones(
-    detections: tuple[Detection, ...], pairs: PairSet, index: int, depth: Array, ids: Array, found: Findings
+    detections: tuple[Detection, ...],
+    pairs: PairSet,
+    index: int,
+    depth: Array,
+    ids: Array,
+    found: Findings,
+    proposed: Sequence[Array] = (),
 ) -> None:
-    """Note every drone of a pair's first image: a detection is a drone's if it lies in its direction, at any range."""
+    """Note every drone of a pair's first image: a detection is a drone's if it lies in its direction, at any range.
+
+    ``proposed``: unit vectors (3,) towards what the second stage was asked about.
+    """
     found.images += 1
     seen = np.flatnonzero(pairs["drone_pixels"][index, 0] >= MIN_PIXELS)
     places = [R_BODY_CAMERA @ np.asarray(pairs["drone_centre"][index, 0, drone], np.float64) for drone in seen]
-    detection_of = _pairings(detections, places, [SIZES_M[int(pairs["drone_family"][index, drone])] for drone in seen])
-    for row, (drone, true) in enumerate(zip(seen, places, strict=True)):
+    sizes_m = [SIZES_M[int(pairs["drone_family"][index, drone])] for drone in seen]
+    detection_of = _pairings(detections, places, sizes_m)
+    for row, (drone, true, size_m) in enumerate(zip(seen, places, sizes_m, strict=True)):
         range_m, best = float(np.linalg.norm(true)), detection_of.get(row)
         left, top, right, bottom = pairs["drone_box"][index, 0, drone]
         inside = left > 1 and top > 1 and right < WIDTH - 1 and bottom < HEIGHT - 1
@@ -156,8 +175,8 @@ def compare_drones(
             error, sigma = distance / range_m - 1.0, best.range_sigma_m / distance
         whole = inside and _hidden_share(pairs, index, int(drone), depth, ids) < WHOLE_HIDES
         view = _view(pairs, index, int(drone), depth, ids)
-        drone_found = best is not None
-        found.drones.append(Drone(range_m, float(right - left), bool(whole), drone_found, error, sigma, *view))
+        drone_found, asked = best is not None, any(_angle(one, true) <= size_m / range_m for one in proposed)
+        found.drones.append(Drone(range_m, float(right - left), bool(whole), drone_found, error, sigma, *view, asked))
     found.false += len(detections) - len(detection_of)
 
 
