@@ -1,6 +1,6 @@
 """Inject every fault that a drone must survive, and print what became of each, and how quickly it was reacted to.
 
-python -m tools.faults                                    # all; takes about ten minutes
+python -m tools.faults                                    # all; takes about ten minutes, with PX4 twenty
 python -m tools.faults --only camera-unplugged sigterm
 python -m tools.faults --list
 python -m tools.faults --json
