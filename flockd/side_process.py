@@ -27,6 +27,9 @@ from typing import Any, Self
 import flockd
 from flockd.errors import UnavailableError
 
+PATIENCE_S = 600.0
+"""For one answer: longer than a step or a plate takes on a busy computer."""
+
 
 class SideProcess:
     """Between ``__enter__`` and ``__exit__``. For one thread at a time; what passes is pickled.
@@ -34,9 +37,14 @@ class SideProcess:
     Ctrl-C does not reach the process, which has a session of its own.
     """
 
-    def __init__(self, task: str, make: Callable[..., Callable[..., object]], *setup: object) -> None:
-        """Starts it: it calls ``make(*setup)``, while the caller goes on, for what answers. ``task`` is for errors."""
-        self._task = task
+    def __init__(
+        self, task: str, make: Callable[..., Callable[..., object]], *setup: object, patience_s: float = PATIENCE_S
+    ) -> None:
+        """Starts it: it calls ``make(*setup)``, while the caller goes on, for what answers. ``task`` is for errors.
+
+        What takes longer than ``patience_s`` is taken for one that hangs.
+        """
+        self._task, self._patience_s = task, patience_s
         self._connection, others = Pipe()
         with others:
             self._process = subprocess.Popen(
@@ -65,13 +73,13 @@ class SideProcess:
         return self._process.pid
 
     def wait_until_ready(self) -> None:
-        """Until it can answer. Raises what ``make`` did, and UnavailableError when the process has ended."""
+        """Until it can answer. Raises what ``make`` did, and UnavailableError when the process has ended or hangs."""
         if not self._ready:
             self._receive()
             self._ready = True
 
     def ask(self, *order: object) -> Any:
-        """The answer. Raises what the answering did, and UnavailableError when the process has ended."""
+        """The answer. Raises what the answering did, and UnavailableError when the process has ended or hangs."""
         self.wait_until_ready()
         self._send(*order)
         return self._receive()
@@ -82,6 +90,11 @@ class SideProcess:
 
     def _receive(self) -> Any:
         try:
+            if not self._connection.poll(self._patience_s):
+                raise UnavailableError(
+                    f"the process that {self._task} has not answered for {self._patience_s:g} s; try again, "
+                    "with less else for this computer to do"
+                )
             answer = self._connection.recv()
         except (EOFError, ConnectionError):
             raise self._ended() from None

@@ -5,6 +5,8 @@ from __future__ import annotations
 import operator
 import os
 import signal
+import time
+from functools import partial
 
 import pytest
 
@@ -39,6 +41,18 @@ def test_one_that_was_killed_is_named_with_its_task() -> None:
             process.ask(255)
     assert str(caught.value) == (
         "the process that flew drone1, drone3 was ended by SIGKILL; if nobody ended it, free some memory, and try again"
+    )
+
+
+def test_one_that_hangs_is_named_with_its_task() -> None:
+    with (
+        SideProcess("flew drone2", partial, time.sleep, patience_s=2.0) as process,
+        pytest.raises(UnavailableError) as caught,
+    ):
+        assert process.ask(0.0) is None
+        process.ask(60.0)
+    assert str(caught.value) == (
+        "the process that flew drone2 has not answered for 2 s; try again, with less else for this computer to do"
     )
 
 
