@@ -49,7 +49,8 @@ class VehicleConfig(Section):
     wind_m_s: tuple[float, float] = (0.0, 0.0)
     """Mean wind, north and east."""
     gust_m_s: NonNegative = 0.0
-    """Standard deviation of the velocity that gusts add, each axis."""
+    """Standard deviation of the velocity that gusts add, each axis, to that of a drone whose setpoint stays the same.
+    The flocking law begins its setpoint at the own velocity: there drones are carried farther."""
     radius_m: Annotated[float, Field(gt=0, le=5)] = 0.35
     """Of the sphere around its centre that holds the whole drone: nearer to an obstacle it collides."""
 

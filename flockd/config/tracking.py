@@ -15,10 +15,13 @@ class TrackingParameters(Section):
     """Neighbours over time: motion model, association and existence probability."""
 
     acceleration_sigma_m_s2: Positive = 0.2
-    """How hard a neighbour may manoeuvre, standard deviation an axis."""
+    """How hard a neighbour may manoeuvre at least, standard deviation an axis."""
     manoeuvre_time_s: Duration = 0.5
     """How long an acceleration lasts. The white acceleration noise of the motion model has the spectral density
     acceleration_sigma_m_s2^2 * manoeuvre_time_s (Bar-Shalom, Li & Kirubarajan 2001, section 6.2)."""
+    own_manoeuvre_memory_s: Duration = 3.0
+    """Neighbours are taken to manoeuvre as hard as this drone did of late, if that is more: gusts and turns move them
+    all. Time constant of that average."""
     relative_speed_sigma_m_s: Positive = 0.7
     """Standard deviation an axis of a flock mate's velocity relative to the own drone's, before it is measured."""
     speed_sigma_m_s: Positive = 1.5

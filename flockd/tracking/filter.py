@@ -85,9 +85,10 @@ def predict(
     interval_s: float,
     own_displacement: FloatArray | None,
     own_displacement_sigma_m: float,
+    density: FloatArray,
     parameters: TrackingParameters,
 ) -> State:
-    """The state `interval_s` later, at constant velocity with white acceleration noise.
+    """The state `interval_s` later, at constant velocity with white acceleration noise of `density` (3,) m^2/s^3.
 
     `own_displacement` (3,) NED metres is the way the own drone went meanwhile, with its standard deviation an axis.
     None: not known; the neighbour then stays where it is relative to the own drone, as flock mates move alike.
@@ -97,8 +98,7 @@ def predict(
     if own_displacement is not None:
         transition[:3, 3:] = dt * np.eye(3)
         displacement, sigma_m = own_displacement, own_displacement_sigma_m
-    density = parameters.acceleration_sigma_m_s2**2 * parameters.manoeuvre_time_s
-    noise = np.kron(density * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), np.eye(3))
+    noise = np.kron(np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), np.diag(density))
     noise[:3, :3] += sigma_m**2 * np.eye(3)
     return State(
         mean=transition @ state.mean - np.concatenate([displacement, np.zeros(3)]),

@@ -12,6 +12,7 @@ from flockd.messages import BoolArray, FloatArray, Neighbour
 from flockd.tracking import existence, filter  # noqa: A004 - the field's word
 from flockd.tracking.association import assign
 from flockd.tracking.filter import Innovation, State
+from flockd.tracking.manoeuvres import Manoeuvres
 from flockd.tracking.measurement import Measurement
 
 Blind = Callable[[FloatArray], BoolArray]
@@ -40,6 +41,7 @@ class Tracker:
     def __init__(self, parameters: TrackingParameters) -> None:
         self.parameters = parameters
         self._tracks: list[_Track] = []
+        self._manoeuvres = Manoeuvres(parameters)
         self._time_s = 0.0
         self._created = 0
 
@@ -50,11 +52,14 @@ class Tracker:
 
         `own_displacement` (3,) NED metres is the way the own drone went meanwhile, with its standard deviation an axis.
         None: not known; the tracks then stay where they are relative to the own drone, as flock mates move alike, and
-        grow uncertain by `relative_speed_sigma_m_s`.
+        grow uncertain by `relative_speed_sigma_m_s`. The own drone's changes of velocity say how hard its neighbours
+        manoeuvre (`Manoeuvres`).
         """
+        self._manoeuvres.see(own_displacement, own_displacement_sigma_m, interval_s)
+        density = self._manoeuvres.density
         for track in self._tracks:
             track.state = filter.predict(
-                track.state, interval_s, own_displacement, own_displacement_sigma_m, self.parameters
+                track.state, interval_s, own_displacement, own_displacement_sigma_m, density, self.parameters
             )
             track.existence = existence.predicted(track.existence, interval_s, self.parameters)
 
@@ -98,7 +103,10 @@ class Tracker:
         """
         displacement = None if own_velocity is None else interval_s * own_velocity
         known = [track for track in self._tracks if track.was_confirmed]
-        states = [filter.predict(track.state, interval_s, displacement, 0.0, self.parameters) for track in known]
+        density = self._manoeuvres.density
+        states = [
+            filter.predict(track.state, interval_s, displacement, 0.0, density, self.parameters) for track in known
+        ]
         return tuple(
             Prediction(
                 position=state.position,

@@ -275,9 +275,9 @@ def test_the_first_update_is_the_textbook_kalman_filter() -> None:
 
 def test_prediction_in_two_halves_is_prediction_in_one() -> None:
     whole, halves = _settled()[0], _settled()[0]
-    whole.predict(0.5, np.array([0.4, 0.2, 0.0]))
-    halves.predict(0.2, np.array([0.1, 0.2, 0.0]))
-    halves.predict(0.3, np.array([0.3, 0.0, 0.0]))
+    whole.predict(0.5, 0.5 * CRUISE)
+    halves.predict(0.2, 0.2 * CRUISE)
+    halves.predict(0.3, 0.3 * CRUISE)
     (a,), (b,) = whole.neighbours(), halves.neighbours()
     np.testing.assert_allclose(a.position, b.position, atol=1e-12)
     assert a.position_sigma_m == pytest.approx(b.position_sigma_m)
