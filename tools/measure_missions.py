@@ -1,7 +1,8 @@
-"""Flies a scenario's missions on exact states over many seeds, and prints how the flock kept to them.
+"""Prints how flocks kept to their missions: scenarios, flown on exact states over many seeds, and flights flown before.
 
     python -m tools.measure_missions config/square.yaml --seeds 10
     python -m tools.measure_missions config/one_knows.yaml --seeds 10 --gust 0.3
+    flockd sim config/square.yaml --out out/square; python -m tools.measure_missions out/square
 
 Each seed moves every start by up to half a metre and draws other gusts; seed 0 of --jitter 0 is the scenario as it is.
 A waypoint's distance is the nearest that the true middle of the flock came to it, in order of the waypoints. Order is
@@ -20,8 +21,11 @@ from typing import Any
 import numpy as np
 
 from flockd.config import ScenarioConfig, load_scenario
+from flockd.flight_log.log import FlightLog
 from flockd.flocking.metrics import min_distance, order, union
 from flockd.messages import FloatArray
+from flockd.report.flight_folder import LOG_NAME
+from flockd.report.summary import summarise
 from flockd.sim.exact_states import fly_exact_states
 
 TAIL_S = 10.0
@@ -34,30 +38,43 @@ TURN_S = 8.0
 
 
 def main() -> None:
-    """Prints a JSON object a seed, and one of all."""
+    """Prints a JSON object a flight, and one of all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenario", type=Path)
-    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("flown", type=Path, nargs="+", metavar="SCENARIO|FLIGHT")
+    parser.add_argument("--seeds", type=int, default=10, help="of each scenario")
     parser.add_argument("--gust", type=float, default=0.0, metavar="M_S", help="deviation of the gusts' velocity")
     parser.add_argument("--jitter", type=float, default=0.5, metavar="M", help="of each start, north and east")
     args = parser.parse_args()
-    rows = [measured(varied(load_scenario(args.scenario), seed, args.jitter, args.gust)) for seed in range(args.seeds)]
+    rows: list[dict[str, Any]] = []
+    for path in args.flown:
+        if path.is_dir():
+            try:
+                rows.append(of_flight(path))
+            except (OSError, ValueError) as error:
+                parser.error(f"{path} is not the folder of a flight that `flockd sim` wrote: {error}")
+        else:
+            scenario = load_scenario(path)
+            rows += [on_exact_states(varied(scenario, seed, args.jitter, args.gust)) for seed in range(args.seeds)]
     for row in rows:
         print(json.dumps(row))
-    print(
-        json.dumps(
-            {
-                "seeds": args.seeds,
-                "farthest_from_a_waypoint_m": max((max(row["waypoints_m"], default=0.0) for row in rows), default=0.0),
-                "widest_at_the_end_m": max(row["widest_at_the_end_m"] for row in rows),
-                "closest_m": min(row["closest_m"] for row in rows),
-                "least_order_flying": min(row["order_flying"] for row in rows),
-                "mean_order_flying": round(float(np.mean([row["order_flying"] for row in rows])), 4),
-                "mean_order_turning": _mean([row["order_turning"] for row in rows]),
-                "least_union": min(row["union_tail"] for row in rows),
-            }
-        )
-    )
+    print(json.dumps(_of_all(rows)))
+
+
+def _of_all(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The worst of all flights, and the means of their orders."""
+    orders = [row["order_flying"] for row in rows if row["order_flying"] is not None]
+    return {
+        "flights": len(rows),
+        "farthest_from_a_waypoint_m": max((max(row["waypoints_m"], default=0.0) for row in rows), default=0.0),
+        "widest_at_the_end_m": max(row["widest_at_the_end_m"] for row in rows),
+        "closest_m": min(row["closest_m"] for row in rows),
+        "least_order_flying": min(
+            (row["order_flying"] for row in rows if row["order_flying"] is not None), default=None
+        ),
+        "mean_order_flying": _mean(orders),
+        "mean_order_turning": _mean([row["order_turning"] for row in rows]),
+        "least_union": min(row["union_tail"] for row in rows),
+    }
 
 
 def varied(scenario: ScenarioConfig, seed: int, jitter_m: float, gust_m_s: float) -> ScenarioConfig:
@@ -72,21 +89,48 @@ def varied(scenario: ScenarioConfig, seed: int, jitter_m: float, gust_m_s: float
     return scenario.model_copy(update={"vehicles": tuple(vehicles), "vehicle": vehicle, "seed": seed})
 
 
-def measured(scenario: ScenarioConfig) -> dict[str, Any]:
-    """How one flight on exact states went."""
-    times, position, velocity = fly_exact_states(scenario)
+def on_exact_states(scenario: ScenarioConfig) -> dict[str, Any]:
+    """Flies a scenario on exact states, and measures that."""
+    reach_m = scenario.drone.flocking.observation_distance_m
+    return {
+        "seed": scenario.seed,
+        **measured(*fly_exact_states(scenario), _waypoints(scenario), reach_m),
+    }
+
+
+def of_flight(folder: Path) -> dict[str, Any]:
+    """Measures a flight that `flockd sim` left in ``folder``, and adds what its summary says of its perception."""
+    log = FlightLog.load(folder / LOG_NAME)
+    goals = log.goal[np.isfinite(log.goal).all(axis=1)]
+    waypoints = np.array(list(dict.fromkeys(map(tuple, goals.tolist())))).reshape(-1, 2)
+    summary = summarise(log)
+    return {
+        "flight": folder.name,
+        "seed": log.metadata.seed,
+        **measured(log.time_s, log.position, log.velocity, waypoints, log.metadata.observation_distance_m),
+        "mission": summary["mission"],
+        "obstacles": summary["obstacles"],
+        "neighbours": summary["neighbours"],
+    }
+
+
+def measured(
+    times: FloatArray, position: FloatArray, velocity: FloatArray, waypoints: FloatArray, reach_m: float
+) -> dict[str, Any]:
+    """How a flight of true states (S, N, 3) at ``times`` (S,) went along waypoints (n, 2) metres.
+
+    ``reach_m``: how far drones see each other, for the union.
+    """
     middle = position[..., :2].mean(axis=1)
     tail = np.flatnonzero(times >= times[-1] - TAIL_S)
-    nearest_m, passed = _passed(middle, _waypoints(scenario))
+    nearest_m, passed = _passed(middle, waypoints)
     moving = np.linalg.norm(velocity[..., :2].mean(axis=1), axis=1) > FLYING_M_S
     under_way = moving & (np.arange(len(times)) < (passed[-1] if len(passed) else len(times)))
     turning = np.zeros(len(times), dtype=bool)
     for step in passed[:-1]:
         turning |= (times >= times[step]) & (times < times[step] + TURN_S)
     orders = np.array([order(velocities[:, :2]) for velocities in velocity])
-    reach_m = scenario.drone.flocking.observation_distance_m
     return {
-        "seed": scenario.seed,
         "waypoints_m": nearest_m,
         "widest_at_the_end_m": round(_widest(position[-1]), 3),
         "widest_m": round(max(_widest(places) for places in position), 3),
