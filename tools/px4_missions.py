@@ -4,9 +4,10 @@
     python -m tools.px4_missions --only led_by_hand --speed-factor 0.1 --out out/px4_missions
     python -m tools.px4_missions --autopilot standin --json
 
-Flights: `waypoints`, after which `flockd fleet goto` sends all drones somewhere else, and `led_by_hand`: a person flies
-one drone in Position mode with MAVLink's MANUAL_CONTROL, and no flockd runs for it. Exit code 1: a drone left the mode
-that it was to fly in, the middle of the flock was not at a goal, or two drones came too close.
+Flights: `waypoints`, after which `flockd fleet goto` sends all drones somewhere else; `led_by_hand`: a person flies
+one drone in Position mode with MAVLink's MANUAL_CONTROL, and no flockd runs for it; `one_knows`: one drone has a
+waypoint, the others follow what they see. Exit code 1: a drone left the mode that it was to fly in, the middle of the
+flock was not at a goal, or two drones came too close.
 """
 
 from __future__ import annotations
@@ -64,6 +65,7 @@ class Mission:
 MISSIONS = (
     Mission("waypoints", "px4_waypoints.yaml", 60.0, 3, order_at_s=38.0, order=(2.0, 10.0)),
     Mission("led_by_hand", "led_by_hand.yaml", 64.0, 3),
+    Mission("one_knows", "one_knows.yaml", 50.0, 3),
 )
 
 
