@@ -15,6 +15,7 @@ from flockd.messages import BoolArray, FloatArray
 from flockd.mission import Moment, Navigator
 from flockd.mission.guidance import SLOW_DOWN_S
 from flockd.mission.places import place_of_waypoint
+from flockd.mission.waypoints import PATIENCE_S, PROGRESS
 from flockd.safety.fence import outside_fence
 
 HOME_DEG = (1.0, 1.0)
@@ -103,20 +104,35 @@ class _Waypoints:
         self._height_m = np.where(np.isnan(heights), default, heights) + mission.height_offset_m
         self._next = np.zeros((flights, drones), np.int64)
         self._arrived = np.zeros((flights, drones), dtype=bool)
+        # Of the waypoint flown to: how far it was, the nearest since, and when that was; inf before the first step.
+        self._first_m, self._nearest_m = np.full((2, flights, drones), np.inf)
+        self._since_s = np.zeros((flights, drones))
 
     def step(self, time_s: float, flock: FloatArray) -> tuple[FloatArray, FloatArray]:
         p, final = self._mission, len(self.places) - 1
         for _ in self.places:  # one that is at several waypoints at once passes them all
-            way = self.places[self._next].transpose(2, 0, 1) - flock
-            there = (np.hypot(*way) <= p.reached_m) & ~self._arrived
+            away_m = np.hypot(*(self.places[self._next].transpose(2, 0, 1) - flock))
+            there = ((away_m <= p.reached_m) | self._come_no_nearer(time_s, away_m)) & ~self._arrived
             self._arrived |= there & (self._next == final)
             self._next = np.where(there, np.minimum(self._next + 1, final), self._next)
+            self._first_m[there] = self._nearest_m[there] = np.inf
         way = self.places[self._next].transpose(2, 0, 1) - flock
         distance = np.hypot(*way)
         speed = self._speed[self._next]
         speed = np.where(self._next == final, np.minimum(speed, distance / SLOW_DOWN_S), speed)
         share = np.divide(speed, distance, out=np.zeros_like(distance), where=distance > 0)
         return way * share * p.pull, self._height_m[self._next]
+
+    def _come_no_nearer(self, time_s: float, away_m: FloatArray) -> BoolArray:
+        """Whose flock has come near to its waypoint and comes no nearer, (flights, n); see `Waypoints`."""
+        reach_m = PATIENCE_S * self._speed[self._next]
+        first = np.isinf(self._first_m)
+        self._first_m = np.where(first, away_m, self._first_m)
+        nearer = first | (away_m <= self._nearest_m - PROGRESS * reach_m)
+        self._nearest_m = np.where(nearer, away_m, self._nearest_m)
+        self._since_s = np.where(nearer, time_s, self._since_s)
+        moved, near = self._nearest_m < self._first_m, self._nearest_m <= self._mission.reached_m + reach_m
+        return np.asarray(moved & near & (time_s - self._since_s >= PATIENCE_S))
 
     def last(self) -> BoolArray:
         """Who flies to the last waypoint, (flights, n)."""

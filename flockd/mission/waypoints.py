@@ -13,18 +13,28 @@ from flockd.mission.guidance import Guidance, Moment, course_of, towards
 from flockd.mission.places import place_of_waypoint
 from flockd.safety.fence import outside_fence
 
+PATIENCE_S = 5.0
+"""A flock that comes no nearer for so long has been at its waypoint, if that is no farther than it flies in as long."""
+PROGRESS = 0.05
+"""Share of its speed; a flock that is slower on the way to a waypoint comes no nearer."""
+
 
 class Waypoints:
     """Leads the middle of the flock to one waypoint after the other, and stays at the last one.
 
     The middle is of the drone and of the neighbours that it sees. Drones that fly the same waypoints see nearly the
     same middle and so want the same velocity, as on the paper's circle, instead of all wanting to be at one spot.
+
+    Drones that see different neighbours see different middles: one may see its own at a waypoint and turn to the next
+    while another still flies to this one, and both hold the flock where it is. So a waypoint counts as reached, too,
+    where the flock has come near to it and comes no nearer.
     """
 
     def __init__(self, parameters: MissionParameters, gate: GateParameters) -> None:
         self._parameters, self._gate = parameters, gate
         self._origin = np.array(parameters.origin_m)
         self._next = 0
+        self._approach: _Approach | None = None
         self._height_m: float | None = None
         self._arrived = False
 
@@ -34,8 +44,8 @@ class Waypoints:
         if here is None:
             return self._stands("waits for the autopilot's position")
         goal = self._goal(moment)
-        while goal is not None and not self._arrived and math.dist(here, goal) <= self._parameters.reached_m:
-            self._height_m = self._height(self._next)
+        while goal is not None and not self._arrived and self._is_reached(moment.time_s, math.dist(here, goal)):
+            self._height_m, self._approach = self._height(self._next), None
             if self._next + 1 < len(self._parameters.waypoints):
                 self._next += 1
                 goal = self._goal(moment)
@@ -47,11 +57,17 @@ class Waypoints:
             return self._stands(f"{self._name} is outside the fence")
         return self._towards(goal, here)
 
+    def _is_reached(self, time_s: float, away_m: float) -> bool:
+        """Whether the waypoint that is flown to counts as reached, with the flock's middle so far from it."""
+        reached_m = self._parameters.reached_m
+        if self._approach is None:
+            self._approach = _Approach(time_s, away_m)
+        return away_m <= reached_m or self._approach.ended(time_s, away_m, self._speed_m_s, reached_m)
+
     def _towards(self, goal: FloatArray, here: FloatArray) -> Guidance:
-        p, waypoint = self._parameters, self._parameters.waypoints[self._next]
+        p = self._parameters
         last = self._next + 1 == len(p.waypoints)
-        speed_m_s = p.speed_m_s if waypoint.speed_m_s is None else waypoint.speed_m_s
-        velocity = towards(goal, here, speed_m_s, stops=last)
+        velocity = towards(goal, here, self._speed_m_s, stops=last)
         left_m = math.dist(here, goal)
         takeover = p.at_end if self._arrived and p.at_end != "hold" else None
         sentence = f"at {self._name}" if self._arrived else f"{left_m:.0f} m to {self._name}"
@@ -64,6 +80,11 @@ class Waypoints:
             arrived=self._arrived,
             takeover=takeover,
         )
+
+    @property
+    def _speed_m_s(self) -> float:
+        speed_m_s = self._parameters.waypoints[self._next].speed_m_s
+        return self._parameters.speed_m_s if speed_m_s is None else speed_m_s
 
     @property
     def _name(self) -> str:
@@ -80,3 +101,19 @@ class Waypoints:
 
     def _stands(self, why: str) -> Guidance:
         return Guidance(np.zeros(2), why, height_m=self._height_m)
+
+
+class _Approach:
+    """How near the middle of the flock has come to a waypoint, and since when it has not come nearer."""
+
+    def __init__(self, time_s: float, away_m: float) -> None:
+        self._first_m = self._nearest_m = away_m
+        self._since_s = time_s
+
+    def ended(self, time_s: float, away_m: float, speed_m_s: float, reached_m: float) -> bool:
+        """Whether it came near, and comes no nearer; of one that has not moved yet, it is not known."""
+        reach_m = PATIENCE_S * speed_m_s
+        if away_m <= self._nearest_m - PROGRESS * reach_m:
+            self._nearest_m, self._since_s = away_m, time_s
+        moved, near = self._nearest_m < self._first_m, self._nearest_m <= reached_m + reach_m
+        return moved and near and time_s - self._since_s >= PATIENCE_S

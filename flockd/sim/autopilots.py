@@ -37,7 +37,12 @@ PARAMETERS = {
     "EKF2_GYR_NOISE": "0.1",
     "EKF2_ACC_NOISE": "1.0",
     "EKF2_MAG_NOISE": "0.02",
-    "COM_OF_LOSS_T": "1.0",  # simulated seconds; PX4's start script would multiply its default by the speed factor
+    # Simulated seconds, as by default: PX4's start script multiplies them by the speed factor, and a slow simulator
+    # would disarm before it takes off.
+    "COM_OF_LOSS_T": "1.0",
+    "COM_RC_LOSS_T": "0.5",
+    "COM_DL_LOSS_T": "10",
+    "COM_DISARM_PRFLT": "10.0",
     "COM_OBL_RC_ACT": "5",
     "SDLOG_BACKEND": "0",
 }

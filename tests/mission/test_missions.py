@@ -72,6 +72,30 @@ def test_waypoints_are_flown_to_in_order_at_their_speed_and_the_last_is_held() -
     np.testing.assert_allclose(point.step().velocity, [0.0, -1.5])  # 3 m in SLOW_DOWN_S
 
 
+def test_a_flock_whose_drones_see_different_middles_does_not_stop_between_two_waypoints() -> None:
+    """Two drones pull a flock, each where it wants; one misses neighbours and sees the middle 1.6 m east of it."""
+    route = to((20.0, 0.0), (20.0, 20.0), (0.0, 20.0))
+    drones = [(Navigator(route, GATE), np.zeros(2)), (Navigator(route, GATE), np.array([0.0, 1.6]))]
+    middle, nearest_m = ORIGIN, {(20.0, 0.0): math.inf, (20.0, 20.0): math.inf, (0.0, 20.0): math.inf}
+    for step in range(200):
+        wanted = [drone.step(Moment(0.5 * step, middle, off)) for drone, off in drones]
+        middle = middle + 0.5 * np.mean([guidance.velocity for guidance in wanted], axis=0)
+        nearest_m = {goal: min(best, math.dist(goal, middle)) for goal, best in nearest_m.items()}
+    assert all(guidance.arrived for guidance in wanted)
+    assert max(nearest_m.values()) < 2.0
+
+
+@pytest.mark.parametrize("stops_at_m", [0.0, 10.0])
+def test_a_drone_that_has_not_come_near_has_not_been_there(stops_at_m: float) -> None:
+    """It waits on the ground, 4 m from its first waypoint, or is held 10 m before it, and knows where it is to go."""
+    begins_m = 4.0 if stops_at_m == 0.0 else 30.0
+    point = Point(to((begins_m, 0.0), (40.0, 40.0)))
+    for _ in range(240):
+        guidance = point.step()
+        point.position = np.minimum(point.position, [stops_at_m if stops_at_m == 0.0 else begins_m - stops_at_m, 0.0])
+    assert guidance.sentence.endswith("to waypoint 1 of 2")
+
+
 def test_the_middle_of_the_flock_is_led_not_the_drone() -> None:
     neighbours = np.array([[3.0, 0.0], [3.0, 3.0]])
     np.testing.assert_allclose(middle_of(neighbours), [2.0, 1.0])
