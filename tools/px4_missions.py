@@ -65,7 +65,7 @@ class Mission:
 MISSIONS = (
     Mission("waypoints", "px4_waypoints.yaml", 60.0, 3, order_at_s=38.0, order=(2.0, 10.0)),
     Mission("led_by_hand", "led_by_hand.yaml", 64.0, 3),
-    Mission("one_knows", "one_knows.yaml", 50.0, 3),
+    Mission("one_knows", "one_knows.yaml", 60.0, 5),
 )
 
 

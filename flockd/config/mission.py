@@ -70,8 +70,8 @@ class MissionParameters(Section):
     at_end: AtEnd = "hold"
     """After the last of the `waypoints`: hold the flock there, or have the autopilot land, or return home."""
     reached_m: Distance = 1.0
-    """A goal is reached when the middle of the flock, of this drone and of the neighbours that it sees, is as near. For
-    flocks of ten and more about the radius of the flock, as each drone sees the middle of a part of it."""
+    """A goal is reached when the middle of the flock, of this drone and of the neighbours that it sees, is as near, or
+    has come near and comes no nearer. For flocks of a hundred about the radius of the flock."""
     timeout_s: Annotated[float, Field(gt=0, le=60)] = 2.0
     """An operator's velocity holds for this long, and with kind `operator` a goal does too; then the drone hovers."""
     pull: NonNegative = 1.0
