@@ -128,10 +128,11 @@ class _Waypoints:
         reach_m = PATIENCE_S * self._speed[self._next]
         first = np.isinf(self._first_m)
         self._first_m = np.where(first, away_m, self._first_m)
-        nearer = first | (away_m <= self._nearest_m - PROGRESS * reach_m)
-        self._nearest_m = np.where(nearer, away_m, self._nearest_m)
-        self._since_s = np.where(nearer, time_s, self._since_s)
-        moved, near = self._nearest_m < self._first_m, self._nearest_m <= self._mission.reached_m + reach_m
+        reached_m = self._mission.reached_m
+        anew = first | (away_m > reached_m + 2 * reach_m) | (away_m <= self._nearest_m - PROGRESS * reach_m)
+        self._nearest_m = np.where(anew, away_m, self._nearest_m)
+        self._since_s = np.where(anew, time_s, self._since_s)
+        moved, near = self._nearest_m < self._first_m, self._nearest_m <= reached_m + reach_m
         return np.asarray(moved & near & (time_s - self._since_s >= PATIENCE_S))
 
     def last(self) -> BoolArray:

@@ -113,7 +113,8 @@ class _Approach:
     def ended(self, time_s: float, away_m: float, speed_m_s: float, reached_m: float) -> bool:
         """Whether it came near, and comes no nearer; of one that has not moved yet, it is not known."""
         reach_m = PATIENCE_S * speed_m_s
-        if away_m <= self._nearest_m - PROGRESS * reach_m:
+        far = away_m > reached_m + 2 * reach_m  # than it can have flown from near within its patience
+        if far or away_m <= self._nearest_m - PROGRESS * reach_m:
             self._nearest_m, self._since_s = away_m, time_s
         moved, near = self._nearest_m < self._first_m, self._nearest_m <= reached_m + reach_m
         return moved and near and time_s - self._since_s >= PATIENCE_S

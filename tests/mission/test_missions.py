@@ -96,6 +96,19 @@ def test_a_drone_that_has_not_come_near_has_not_been_there(stops_at_m: float) ->
     assert guidance.sentence.endswith("to waypoint 1 of 2")
 
 
+def test_a_position_that_jumps_near_a_waypoint_for_one_step_has_not_been_there() -> None:
+    """30 m away for the autopilot's estimate, 3 m for one step, and then 30 m again."""
+    point = Point(to((40.0, 0.0), (40.0, 40.0)))
+    point.fly(10.0)
+    before, point.position = point.position, np.array([37.0, 0.0])
+    point.step()
+    point.position = before
+    for _ in range(40):
+        guidance = point.step()
+        point.position = before
+    assert guidance.sentence == "30 m to waypoint 1 of 2"
+
+
 def test_the_middle_of_the_flock_is_led_not_the_drone() -> None:
     neighbours = np.array([[3.0, 0.0], [3.0, 3.0]])
     np.testing.assert_allclose(middle_of(neighbours), [2.0, 1.0])
