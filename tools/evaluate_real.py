@@ -31,13 +31,12 @@ from flockd.perception import OnnxNetworks
 from flockd.pictures import Labelled, PictureDetector, PictureFile, camera_with_fov, find_pictures, summary
 from flockd.pictures.scoring import WIDTH_CLASSES
 from flockd.pictures.single_frame import Box
+from tools.training.skydrones import SPLITS, split_of
 
 Image = NDArray[np.uint8]
 Picture = tuple[str, Callable[[], Image], tuple[Box, ...]]
 """Its name, what reads it (RGB), and the drones in it."""
 
-VALIDATION_BLOCKS = (3, 9)
-"""Of ten clips each; neighbouring clips show the same scene."""
 PROBABILITIES = (0.0, 0.9, 0.95, 0.98, 0.99)
 """What is counted when only detections at least so probable count; 0: all that the pipeline reports."""
 
@@ -53,14 +52,14 @@ def main() -> None:
     parser.add_argument("--neighbours", default="neighbours_int8")
     parser.add_argument("--fov", type=float, default=90.0, metavar="DEG", help="across the longer side")
     parser.add_argument("--scale", type=float, default=1.0, help="resize every picture first")
-    parser.add_argument("--split", choices=("validation", "training"), default="validation", help="of the clips")
+    parser.add_argument("--split", choices=SPLITS, default="validation", help="of the clips")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--detections", type=Path, help="write every detection of every picture as JSON")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     sets: dict[str, list[Picture]] = {}
     if arguments.data:
-        sets |= sky_pictures(arguments.data, is_validation=arguments.split == "validation")
+        sets |= sky_pictures(arguments.data, arguments.split)
     for given in arguments.without_drones:
         name, _, folder = given.partition("=")
         sets[name] = list(free_pictures(Path(folder)))
@@ -109,14 +108,13 @@ def main() -> None:
         _print_table(results)
 
 
-def sky_pictures(folder: Path, *, is_validation: bool) -> dict[str, list[Picture]]:
+def sky_pictures(folder: Path, split: str) -> dict[str, list[Picture]]:
     """The labelled frames by kind of object; drones whose box is not known are left out."""
     sets: dict[str, list[Picture]] = {}
     clips = _Clips()
     for label in json.loads((folder / "labels.json").read_text(encoding="utf-8")):
         kind, box = label["object"], label["box"]
-        block = (int(Path(label["clip"]).stem.split("_")[-1]) - 1) // 10
-        if (block in VALIDATION_BLOCKS) != is_validation or (kind == "drone" and box is None):
+        if split_of(label["clip"]) != split or (kind == "drone" and box is None):
             continue
         boxes: tuple[Box, ...] = (tuple(box),) if kind == "drone" else ()
         clip, frame = folder / "clips" / label["clip"], int(label["frame"])

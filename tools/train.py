@@ -15,6 +15,8 @@ import math
 import os
 import shutil
 import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -128,13 +130,14 @@ def train(task: Task, out: Path, budget_s: float, seed: int) -> None:
     net.train()
     last_save = last_print = spent
     recent: list[dict[str, float]] = []
+    batches = _batches(task, rng, device)
     while spent < budget_s:
         begin = time.monotonic()
         share = spent / budget_s
         rate = task.rate * min(1.0, (step + 1) / 300) * (0.5 + 0.5 * math.cos(math.pi * share)) + 1e-6
         for group in optimiser.param_groups:
             group["lr"] = rate
-        batch = _stack(task.batch_samples(rng), device)
+        batch = next(batches)
         with torch.autocast(device.type, dtype=torch.bfloat16, enabled=in_16_bits):
             loss, figures = task.loss(batch)
         if torch.isfinite(loss):
@@ -185,6 +188,15 @@ def _recent_mean(mean: Tensor, new: Tensor, count: Tensor) -> Tensor:
         return new
     share = max(1e-3, 1.0 / (1.0 + 0.1 * float(count)))
     return mean + share * (new - mean)
+
+
+def _batches(task: Task, rng: np.random.Generator, device: torch.device) -> Iterator[Batch]:
+    """Without end; the next one is made while the last one is learnt from."""
+    with ThreadPoolExecutor(1) as loader:
+        upcoming = loader.submit(task.batch_samples, rng)
+        while True:
+            samples, upcoming = upcoming.result(), loader.submit(task.batch_samples, rng)
+            yield _stack(samples, device)
 
 
 def _stack(samples: list[Sample], device: torch.device) -> Batch:

@@ -29,7 +29,7 @@ from tools.training.real_patches import RealPatches
 from tools.training.samples import Sample
 from tools.training.tasks import Batch, Task
 
-MIX = {"rendered": 34, "composite": 16, "real drone": 8, "cut out": 4, "negative": 34}
+MIX = {"rendered": 30, "composite": 16, "real drone": 10, "cut out": 6, "negative": 34}
 """Samples of a batch."""
 KINDS = tuple(MIX)
 SOFTENED_SHARE = 0.5
@@ -43,6 +43,9 @@ NEGATIVE_WEIGHTS = {"skyothers": 130.0, "rendered": 80.0}
 than the number of their patches says."""
 HARD_PROBABILITY, HARD_SHARE, HARD_ONES, FEWEST_HARD = 0.3, 0.35, 4000, 200
 """A negative of more than this probability is remembered, the last so many are, and drawn so often."""
+
+NO_PLACE = np.array([-1, -1])
+"""Of a sample that is no negative patch."""
 
 
 class VerificationTask(Task):
@@ -59,14 +62,12 @@ class VerificationTask(Task):
         self.places = RealPatches(patches, "place", weights={"skydrones": 8.0, "skyothers": 8.0})
         self.drones = RealPatches(patches, "drone")
         self.hard: deque[tuple[int, int]] = deque(maxlen=HARD_ONES)
-        self._shown: list[tuple[int, int] | None] = []
 
     def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
         """As many of each kind as the mix says."""
         self.rendered.look_for_more()
-        self._shown = []
         kinds = [(number, kind) for number, kind in enumerate(KINDS) for _ in range(self.mix.get(kind, 0))]
-        return [self._of_kind(kind, rng) | {"kind": np.array(number)} for number, kind in kinds]
+        return [{"place": NO_PLACE} | self._of_kind(kind, rng) | {"kind": np.array(number)} for number, kind in kinds]
 
     def _of_kind(self, kind: str, rng: np.random.Generator) -> Sample:
         if kind == "negative":
@@ -89,15 +90,12 @@ class VerificationTask(Task):
     def _negative(self, rng: np.random.Generator) -> Sample:
         """Often one that was taken for a drone when it was shown before."""
         if rng.random() < NOISE_SHARE:
-            self._shown.append(None)
             return real_samples.noise(*self.places.draw(rng)[:2], rng)
         if rng.random() < PLACES_SHARE:
-            self._shown.append(None)
             return real_samples.negative(*self.places.draw(rng)[:2], rng)
         is_hard = len(self.hard) >= FEWEST_HARD and rng.random() < HARD_SHARE
         place = self.hard[int(rng.integers(len(self.hard)))] if is_hard else self.negatives.draw_place(rng)
-        self._shown.append(place)
-        return real_samples.negative(*self.negatives.at(place)[:2], rng)
+        return real_samples.negative(*self.negatives.at(place)[:2], rng) | {"place": np.array(place)}
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         """See ``Task``. A drone that can hardly be seen has little weight."""
@@ -106,11 +104,8 @@ class VerificationTask(Task):
         logits, there, kind = self.net(crops)[:, 0], batch["drone"], batch["kind"]
         loss = F.binary_cross_entropy_with_logits(logits, there, weight=batch["exists_weight"])
         probability = torch.sigmoid(logits.detach())
-        shown = probability[kind == KINDS.index("negative")].tolist()
-        if len(shown) == len(self._shown):
-            self.hard.extend(
-                p for p, s in zip(self._shown, shown, strict=True) if p is not None and s > HARD_PROBABILITY
-            )
+        mistaken = (batch["place"][:, 0] >= 0) & (probability > HARD_PROBABILITY)
+        self.hard.extend((source, row) for source, row in batch["place"][mistaken].tolist())
         figures = {"rendered none": float((probability[(kind == 0) & (there < 0.5)] > 0.8).float().mean())}
         for number, name in enumerate(KINDS):
             if name not in self.mix:
