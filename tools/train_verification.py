@@ -129,7 +129,7 @@ def main() -> None:
     parser.add_argument("--rendered", type=Path, required=True)
     parser.add_argument("--patches", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--start", type=Path, help="checkpoint.pt of another run, or models/distance.onnx")
+    parser.add_argument("--start", type=Path, help="another run's checkpoint.pt, or verification.onnx or distance.onnx")
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--rate", type=float, help="learning rate to begin with")
     parser.add_argument("--threads", type=int, default=2)
@@ -143,6 +143,7 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     if arguments.start and not (arguments.out / "checkpoint.pt").is_file():
         _start(task, arguments.start, arguments.seed)
+        torch.save({"net": task.net.state_dict()}, arguments.out / "start.pt")
     train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed)
 
 
@@ -154,9 +155,12 @@ def _start(task: VerificationTask, weights: Path, seed: int) -> None:
     samples = task.batch_samples(np.random.default_rng(seed))
     crops = torch.from_numpy(np.stack([sample["picture"] for sample in samples]))
     try:
-        begin_with_encoder(net, weights, lambda other: other(crops))
-    except ValueError as error:
-        raise SystemExit(f"--start: {error}") from None
+        begin_with_onnx(net, weights, lambda: net(crops))
+    except ValueError:
+        try:
+            begin_with_encoder(net, weights, lambda other: other(crops))
+        except ValueError as error:
+            raise SystemExit(f"--start: {error}") from None
 
 
 if __name__ == "__main__":
