@@ -38,7 +38,7 @@ from tools.training.own_mesh import painted
 from tools.training.samples import no_drone_sample
 from tools.training.tasks import DistanceTask
 
-RATE = 8e-4
+RATE = 4e-4
 """Learning rate to begin with: less than of a network that knows nothing yet."""
 PAINTS = 12
 """Of the drone in one world."""
