@@ -30,7 +30,7 @@ def crops() -> list[Crop]:
     matrix = np.array([[100.0, 0.0, 48.0], [0.0, 100.0, 48.0], [0.0, 0.0, 1.0]])
     R_ned_camera = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     taken = []
-    for down_m, shown in ((-0.25, True), (0.35, True), (0.35, False)):
+    for down_m, shown in ((-0.25, True), (0.35, True), (0.8, False)):
         pitch, _ = cv2.Rodrigues(np.array([0.0, -math.atan2(down_m, 1.5), 0.0]))
         view = Renderer(World.generate(11), [drone_model(0, 0)]).render(
             matrix, (96, 96), pitch @ R_ned_camera, np.array([0.0, 0.0, -4.0]),
