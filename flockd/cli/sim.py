@@ -82,9 +82,7 @@ def add(commands: Commands) -> None:
         "--height", choices=get_args(HeightSource), help="what measures the height above ground that gives the scale"
     )
     parser.add_argument("--drones", metavar="N", type=_flock_size, help="size of the flock")
-    parser.add_argument(
-        "--duration", metavar="S", type=positive_number, help="seconds to fly; it changes the world"
-    )
+    parser.add_argument("--duration", metavar="S", type=positive_number, help="seconds to fly; it changes the world")
     parser.add_argument("--wind", metavar="N,E", type=_wind, help="mean wind in m/s, to the north and to the east")
     parser.add_argument("--speed", metavar="V", type=positive_number, help="desired speed of the flock in m/s")
     parser.add_argument(

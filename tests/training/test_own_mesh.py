@@ -86,20 +86,6 @@ def test_colours_of_a_file_are_kept_and_a_drone_without_is_painted_part_by_part(
     assert len({paint.tobytes() for paint in paints}) == len(paints)
 
 
-def test_parts_of_one_shape_mostly_have_one_colour(tmp_path: Path) -> None:
-    """Four blades of the same shape, two of them mirrored, on a bar."""
-    bar, blades = trimesh.creation.box((0.6, 0.1, 0.05)), []
-    for x, y in ((0.25, 0.2), (-0.25, 0.2), (-0.25, -0.2), (0.25, -0.2)):
-        blade = trimesh.creation.cone(0.02, 0.15)
-        blade.vertices *= (np.sign(x), np.sign(y), 1.0)
-        blade.apply_translation((x, y, 0.1))
-        blades.append(blade)
-    drone = read(written(tmp_path, "blades.stl", trimesh.util.concatenate([bar, *blades])), 0.7)
-    is_blade = drone.vertices[drone.triangles].mean(1)[:, 2] < drone.extent[1, 2] - 0.06
-    alike = [len(np.unique(painted(drone, seed).colours[is_blade], axis=0)) == 1 for seed in range(100)]
-    assert 70 <= sum(alike) <= 95
-
-
 def test_a_mesh_of_very_many_triangles_is_simplified_to_what_a_camera_sees(tmp_path: Path) -> None:
     dense = cross_of_boxes().subdivide_to_size(0.006)
     assert len(dense.faces) > MOST_TRIANGLES

@@ -36,10 +36,6 @@ MOST_TRIANGLES_READ, MOST_TRIANGLES = 4_000_000, 40_000
 CELLS = (320, 160, 80)
 """A mesh of too many triangles is simplified to so many cells from tip to tip, in turn: at first a fifth of a
 crop's pixel each."""
-ALIKE_SHARE = 0.8
-"""Of the painted drones: parts of the same shape share a colour."""
-SAME_AREA = 0.02
-"""Parts of the same shape differ in area by less, as a share."""
 UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 
 
@@ -79,16 +75,10 @@ def _surface(path: Path, size_m: float, up: str | None) -> tuple[Array, Array, A
 
 
 def painted(model: DroneModel, seed: int) -> DroneModel:
-    """The same drone in another light and wear.
-
-    One whose file says no colours is painted, each part in one colour. Parts of the same shape, as all propellers,
-    mostly share it: a drone whose parts all differ stands out before everything by one of them.
-    """
+    """The same drone in another light and wear; one whose file says no colours is painted, each part in one colour."""
     rng = np.random.default_rng([model.family, seed])
     if np.isnan(model.colours).any():
         parts = _parts(model)
-        if rng.random() < ALIKE_SHARE:
-            parts = _kinds(model, parts)[parts]
         craft = Airframe(rng)
         paints = np.array([craft.body, craft.frame, craft.metal, craft.front, craft.rear])
         colours = paints[rng.choice(len(paints), int(parts.max()) + 1, p=_SHARES)][parts]
@@ -105,18 +95,6 @@ def _parts(model: DroneModel) -> Array:
     edges = (np.ones(2 * len(a)), (np.concatenate([a, b]), np.concatenate([b, c])))
     _, part = connected_components(coo_matrix(edges, shape=(len(places), len(places))), directed=False)
     return np.asarray(part[a])
-
-
-def _kinds(model: DroneModel, parts: Array) -> Array:
-    """(parts,) numbers from 0 up, the same of parts with as many triangles and about the same area."""
-    a, b, c = model.vertices[model.triangles].transpose(1, 0, 2).astype(np.float64)
-    area = np.bincount(parts, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
-    triangles = np.bincount(parts)
-    order = np.lexsort((area, triangles))
-    grew = np.diff(area[order]) > SAME_AREA * area[order][1:]
-    kinds = np.empty(len(order), np.int64)
-    kinds[order] = np.cumsum(np.concatenate([[0], grew | (np.diff(triangles[order]) > 0)]))
-    return kinds
 
 
 _SHARES = (0.35, 0.35, 0.1, 0.1, 0.1)
