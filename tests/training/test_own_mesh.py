@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
+from trimesh.visual.material import PBRMaterial
 
 from flockd.sim.airframe import DroneModel
 from tools.training.own_mesh import MOST_TRIANGLES, UP_AXES, _upright, painted, read_meshes
@@ -84,6 +86,70 @@ def test_colours_of_a_file_are_kept_and_a_drone_without_is_painted_part_by_part(
     assert all(np.isfinite(paint).all() and paint.min() > 0 and paint.max() <= 0.9 for paint in paints)
     assert max(len(np.unique(paint, axis=0)) for paint in paints) == 3, "two bars and a post"
     assert len({paint.tobytes() for paint in paints}) == len(paints)
+
+
+BROWN = (128, 64, 32)
+BROWN_OF_SRGB = (0.2159, 0.0513, 0.0144)
+"""IEC 61966-2-1, by hand."""
+BROWN_OF_LINEAR = (0.502, 0.251, 0.1255)
+PICTURE = Image.new("RGB", (4, 4), BROWN)
+
+
+def of_material(mesh: Any, **said: Any) -> Any:
+    # Both come without types.
+    material: Any = PBRMaterial
+    texture: Any = trimesh.visual.TextureVisuals
+    mesh.visual = texture(uv=np.full((len(mesh.vertices), 2), 0.5), material=material(**said))
+    return mesh
+
+
+@pytest.mark.parametrize(
+    ("said", "albedo"),
+    [
+        ({"baseColorFactor": [*BROWN, 255]}, BROWN_OF_LINEAR),
+        ({"baseColorTexture": PICTURE}, BROWN_OF_SRGB),
+        ({"baseColorFactor": [255, 0, 255, 255], "baseColorTexture": PICTURE}, (0.2159, 0.0, 0.0144)),
+        ({}, (1.0, 1.0, 1.0)),
+    ],
+    ids=["colour", "picture", "both", "neither"],
+)  # fmt: skip
+def test_materials_of_gltf_are_read_as_its_specification_says(
+    tmp_path: Path, said: dict[str, Any], albedo: tuple[float, ...]
+) -> None:
+    drone = read(written(tmp_path, "drone.glb", of_material(cross_of_boxes(), **said)), 0.6, "z")
+    assert np.unique(drone.colours.round(4), axis=0) == pytest.approx(np.array([albedo]), abs=2e-4)
+
+
+def test_parts_of_different_materials_keep_theirs_and_one_without_is_painted(tmp_path: Path) -> None:
+    bars = [trimesh.creation.box((0.6, 0.1, 0.05)), trimesh.creation.box((0.1, 0.4, 0.05))]
+    bars[0] = of_material(bars[0], baseColorFactor=[*BROWN, 255])
+    drone = read(written(tmp_path, "drone.glb", trimesh.Scene(bars)), 0.6, "z")
+    own = np.isfinite(drone.colours).all(axis=1)
+    assert own.mean() == 0.5
+    assert drone.colours[own] == pytest.approx(np.tile(BROWN_OF_LINEAR, (24, 1)), abs=1e-3)
+    looks = [painted(drone, seed).colours for seed in range(8)]
+    assert len({look[~own].tobytes() for look in looks}) > 1
+    assert all(len(np.unique(look[~own], axis=0)) == 1 for look in looks), "one part, one colour"
+    shades = np.array([look[own][0] / BROWN_OF_LINEAR for look in looks])
+    assert shades.min() > 0.5
+    assert shades.max() < 2.0, "the file's colour in another light"
+
+
+OBJ = "v 0 0 0\nv 0.6 0 0\nv 0 0.6 0.02\nv 0 0.6 0\nvt 0.5 0.5\n{}f 1/1 2/1 3/1\n{}f 1/1 2/1 4/1\n"
+
+
+def test_materials_of_obj_and_none_where_the_file_names_one_that_is_missing(tmp_path: Path) -> None:
+    PICTURE.save(tmp_path / "brown.png")
+    (tmp_path / "drone.mtl").write_text(
+        "newmtl a\nKd 0.502 0.251 0.1255\nnewmtl b\nmap_Kd brown.png\n", encoding="utf-8"
+    )
+    (tmp_path / "drone.obj").write_text("mtllib drone.mtl\n" + OBJ.format("usemtl a\n", "usemtl b\n"), encoding="utf-8")
+    drone = read(tmp_path / "drone.obj", 0.85)
+    assert drone.colours == pytest.approx(np.tile(BROWN_OF_SRGB, (4, 1)), abs=2e-3)
+    (tmp_path / "bare.obj").write_text("mtllib none.mtl\n" + OBJ.format("usemtl a\n", "usemtl b\n"), encoding="utf-8")
+    (tmp_path / "plain.obj").write_text(OBJ.format("", ""), encoding="utf-8")
+    for name in ("bare.obj", "plain.obj"):
+        assert np.isnan(read(tmp_path / name, 0.85).colours).all()
 
 
 def test_a_mesh_of_very_many_triangles_is_simplified_to_what_a_camera_sees(tmp_path: Path) -> None:

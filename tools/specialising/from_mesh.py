@@ -76,6 +76,8 @@ def claim_mesh(arguments: argparse.Namespace) -> None:
 def specialise_range(arguments: argparse.Namespace, drones: list[DroneModel], begin: float) -> None:
     """Render, train, export and measure; ``begin``: when the command began, monotonic."""
     work = arguments.out / "work"
+    for path, drone in zip(arguments.mesh, drones, strict=True):
+        print(f"{path}: {_colours_of(drone)}", flush=True)
     for line in _rendered(work, drones, Workload.of(arguments.minutes), arguments.processes):
         print(f"{line}, {time.monotonic() - begin:.0f} s", flush=True)
     negatives = _negatives(work / "pairs", work / "negatives.npy")
@@ -93,6 +95,14 @@ def _drone_of(arguments: argparse.Namespace) -> dict[str, Any]:
     """By what one drone is told from another."""
     meshes = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in arguments.mesh}
     return {"meshes": meshes, "size_m": arguments.size_m, "up": arguments.up}
+
+
+def _colours_of(drone: DroneModel) -> str:
+    plain = np.isnan(drone.colours).any(axis=1).mean()
+    if plain == 0:
+        return "in its own colours"
+    share = "has no colours" if plain == 1 else f"has no colours for {plain:.0%} of its triangles"
+    return f"{share}; they are painted at random, part by part"
 
 
 def own_drone(drones: list[DroneModel], rng: np.random.Generator) -> list[list[DroneModel]]:

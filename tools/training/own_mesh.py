@@ -15,6 +15,8 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from trimesh.visual.color import uv_to_color
+from trimesh.visual.material import PBRMaterial
 
 from flockd.config.perception import MAX_DRONE_SIZE_M, MIN_DRONE_SIZE_M
 from flockd.sim.airframe import MACHINE_TEXTURES, Airframe, DroneModel
@@ -54,36 +56,40 @@ def read_meshes(paths: Sequence[Path], size_m: float, up: str | None = None) -> 
     return [_model(vertices - middle, triangles, colours, size_m) for vertices, triangles, colours in surfaces]
 
 
-def _surface(path: Path, size_m: float, up: str | None) -> tuple[Array, Array, Array | None]:
-    """Corners in metres, triangles, and their colours."""
-    mesh = _loaded(path)
+def _surface(path: Path, size_m: float, up: str | None) -> tuple[Array, Array, Array]:
+    """Corners in metres, triangles, and their colours as of ``_colours``."""
+    pieces = _loaded(path)
     is_gltf = path.suffix.lower() in GLTF
-    vertices = _upright(np.asarray(mesh.vertices, np.float64), up or ("y" if is_gltf else "z"))
+    counts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
+    vertices = np.vstack([np.asarray(piece.vertices, np.float64) for piece in pieces])
+    triangles = np.vstack([np.asarray(piece.faces) + first for piece, first in zip(pieces, counts, strict=False)])
+    colours = np.vstack([_colours(piece, is_gltf) for piece in pieces])
+    vertices = _upright(vertices, up or ("y" if is_gltf else "z"))
     vertices = _in_metres(path, vertices, size_m, {"m": 1.0} if is_gltf else UNITS_M)
-    triangles, colours = np.asarray(mesh.faces), _colours(mesh)
     for cells in CELLS:
         if len(triangles) > MOST_TRIANGLES:
             vertices, triangles, kept = _simplified(vertices, triangles, size_m / cells)
-            colours = None if colours is None else colours[kept]
+            colours = colours[kept]
     if len(triangles) > MOST_TRIANGLES:
         raise ValueError(
             f"{path}: has {len(triangles)} triangles without small details, and at most {MOST_TRIANGLES} are drawn; "
             "simplify it where it was modelled"
         )
     has_area = np.linalg.norm(face_normals(vertices, triangles), axis=1) > 0.5
-    return vertices, triangles[has_area], None if colours is None else colours[has_area]
+    return vertices, triangles[has_area], colours[has_area]
 
 
 def painted(model: DroneModel, seed: int) -> DroneModel:
-    """The same drone in another light and wear; one whose file says no colours is painted, each part in one colour."""
+    """The same drone in another light and wear; what has no colour in its file is painted, each part in one colour."""
     rng = np.random.default_rng([model.family, seed])
-    if np.isnan(model.colours).any():
+    colours = model.colours * np.exp(rng.normal(0, 0.15)) * np.exp(rng.normal(0, 0.04, 3))
+    plain = np.isnan(model.colours).any(axis=1)
+    if plain.any():
         parts = _parts(model)
         craft = Airframe(rng)
         paints = np.array([craft.body, craft.frame, craft.metal, craft.front, craft.rear])
-        colours = paints[rng.choice(len(paints), int(parts.max()) + 1, p=_SHARES)][parts]
-    else:
-        colours = model.colours * np.exp(rng.normal(0, 0.15)) * np.exp(rng.normal(0, 0.04, 3))
+        drawn = rng.choice(len(paints), int(parts.max()) + 1, p=_SHARES)
+        colours[plain] = paints[drawn][parts[plain]]
     texture = np.full(len(model.triangles), int(rng.integers(MACHINE_TEXTURES)), np.int32)
     return replace(model, seed=seed, colours=np.clip(colours, 0.01, 0.9).astype(np.float32), texture=texture)
 
@@ -101,8 +107,8 @@ _SHARES = (0.35, 0.35, 0.1, 0.1, 0.1)
 """Of body, frame, metal, front and rear colours."""
 
 
-def _loaded(path: Path) -> Any:
-    """One mesh of all that the file shows."""
+def _loaded(path: Path) -> list[Any]:
+    """All meshes that the file shows, in the same axes."""
     ending = path.suffix.lower()
     if ending not in ENDINGS:
         raise ValueError(f"{path}: a mesh is read from {', '.join(ENDINGS)}; export it as one of these")
@@ -111,21 +117,22 @@ def _loaded(path: Path) -> Any:
     if path.stat().st_size > MOST_BYTES:
         raise ValueError(f"{path}: is larger than {MOST_BYTES >> 20} MB; simplify it where it was modelled")
     try:
-        mesh: Any = trimesh.load_mesh(path, process=False)
-        if isinstance(mesh, trimesh.Scene):
-            mesh = mesh.to_mesh()
+        pieces: list[Any] = [
+            piece for piece in trimesh.load_scene(path, process=False).dump() if len(getattr(piece, "faces", ()))
+        ]
     except Exception as error:  # noqa: BLE001 - whatever a parser of foreign files raises, the file is at fault
         raise ValueError(f"{path}: is no mesh that can be read ({str(error) or type(error).__name__})") from None
-    if not len(getattr(mesh, "faces", ())):
+    if not pieces:
         raise ValueError(f"{path}: holds no triangles; export the drone's surface as a mesh")
-    if len(mesh.faces) > MOST_TRIANGLES_READ:
+    count = sum(len(piece.faces) for piece in pieces)
+    if count > MOST_TRIANGLES_READ:
         raise ValueError(
-            f"{path}: has {len(mesh.faces)} triangles, and at most {MOST_TRIANGLES_READ} are read; "
+            f"{path}: has {count} triangles, and at most {MOST_TRIANGLES_READ} are read; "
             "simplify it where it was modelled"
         )
-    if not np.isfinite(mesh.vertices).all():
+    if not all(np.isfinite(piece.vertices).all() for piece in pieces):
         raise ValueError(f"{path}: has places that are no numbers; export it again")
-    return mesh
+    return pieces
 
 
 def _upright(vertices: Array, up: str) -> Array:
@@ -178,22 +185,53 @@ def _simplified(vertices: Array, triangles: Array, cell_m: float) -> tuple[Array
     return vertices[which], coarse[kept], kept
 
 
-def _colours(mesh: Any) -> Array | None:
-    """(m, 3) linear albedo of each triangle, where the file says one."""
-    visual = mesh.visual
-    if visual.kind == "texture":
-        visual = visual.to_color()
-    if not visual.defined:
-        return None
-    grey = np.asarray(visual.face_colors, np.float64)[:, :3] / 255.0
+def _colours(piece: Any, is_gltf: bool) -> Array:
+    """(m, 3) linear albedo of each triangle, NaN where the file says none.
+
+    Of glTF, pictures are sRGB and all other colours linear, and a material without a colour is white (glTF 2.0, 3.7.2.1
+    and 3.9.2); of other files, all are sRGB.
+    """
+    visual, of_numbers = piece.visual, (lambda grey: grey) if is_gltf else _linear
+    if visual.kind == "vertex":
+        return np.asarray(of_numbers(np.asarray(visual.face_colors, np.float64)[:, :3] / 255.0))
+    if visual.kind != "texture":
+        return np.full((len(piece.faces), 3), np.nan)
+    factor, image = _paint(visual.material)
+    colours = np.full((len(piece.faces), 3), 1.0 if is_gltf else np.nan)
+    if image is not None and visual.uv is not None:
+        middles = np.asarray(visual.uv, np.float64)[piece.faces].mean(axis=1)
+        colours = _linear(uv_to_color(middles, image)[:, :3] / 255.0)
+    elif factor is not None:
+        colours[:] = 1.0
+    if factor is not None:
+        colours = colours * of_numbers(np.asarray(factor, np.float64)[:3] / 255.0)
+    shades = visual.vertex_attributes.get("color")
+    if shades is not None:
+        most = np.iinfo(shades.dtype).max if np.issubdtype(shades.dtype, np.integer) else 1.0
+        colours = colours * (np.asarray(shades, np.float64)[:, :3] / most)[piece.faces].mean(axis=1)
+    return np.asarray(colours)
+
+
+def _paint(material: Any) -> tuple[Any, Any]:
+    """One colour (r, g, b, a), 0 to 255, and a picture, each None where the file says none."""
+    if isinstance(material, PBRMaterial):
+        return material.baseColorFactor, material.baseColorTexture
+    if material.image is not None and "file_path" in material.image.info:
+        # Without its Kd: many programs write one that is not meant to darken the picture.
+        return None, material.image
+    # What the reader puts in place of a material that is nowhere described has no "kd".
+    return material.diffuse if "kd" in material.kwargs else None, None
+
+
+def _linear(grey: Array) -> Array:
+    """IEC 61966-2-1: sRGB, 0 to 1 -> linear."""
     return np.where(grey <= 0.04045, grey / 12.92, ((grey + 0.055) / 1.055) ** 2.4)
 
 
-def _model(vertices: Array, triangles: Array, colours: Array | None, size_m: float) -> DroneModel:
+def _model(vertices: Array, triangles: Array, colours: Array, size_m: float) -> DroneModel:
     """Each triangle is seen from both sides: in files of many programs, some face the wrong way."""
     mesh, both = Mesh(), np.vstack([triangles, triangles[:, ::-1]])
-    tint = np.full((len(triangles), 3), np.nan) if colours is None else colours
-    mesh.add(vertices, both, 0, np.vstack([tint, tint]), (0.3, 0.3))
+    mesh.add(vertices, both, 0, np.vstack([colours, colours]), (0.3, 0.3))
     return DroneModel(
         family=OWN_FAMILY,
         seed=0,
