@@ -207,7 +207,8 @@ def _stack(samples: list[Sample], device: torch.device) -> Batch:
 
 
 def _note(out: Path, step: int, spent: float, recent: list[dict[str, float]]) -> None:
-    means = {name: float(np.nanmean([figures[name] for figures in recent])) for name in recent[0]}
+    known = {name: [figures[name] for figures in recent if not np.isnan(figures[name])] for name in recent[0]}
+    means = {name: float(np.mean(values)) if values else float("nan") for name, values in known.items()}
     print(f"step {step:6d} {spent:6.0f} s  " + "  ".join(f"{n} {v:.4f}" for n, v in means.items()), flush=True)
     curve = out / "curve.csv"
     if not curve.is_file():
