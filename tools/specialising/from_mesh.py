@@ -1,7 +1,7 @@
 """Range of a fleet's own drone from a mesh: rendered in training worlds, `distance` learns its shape.
 
-Only the shape has to be right. The network is measured against the general one in crops, with the drone and without,
-of worlds that it has not seen.
+The weights are drawn back a third of the way to the general network's: it learnt what is no drone from far more places.
+The network is measured against the general one in crops, with the drone and without, of worlds that it has not seen.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from flockd.inference import OnnxModel, load_manifest
 from flockd.perception.requirements import check_roles
 from flockd.sim.airframe import DroneModel
 from tools.evaluation.on_crops import HeldOut, measured
-from tools.export import export
+from tools.export import draw_back, export
 from tools.mine_negatives import mined
 from tools.quantise import quantise
 from tools.render_drone_crops import CropJob, render_crops
@@ -84,10 +84,14 @@ def specialise_range(arguments: argparse.Namespace, drones: list[DroneModel], be
     held_out = _held_out(work, arguments.size_m)
     task = DistanceTask(open_pairs(work / "pairs"), negatives, work / "crops")
     task.rate, task.pool_size = RATE, NONE_IN_POOL
-    if not (work / "run" / "checkpoint.pt").is_file():
+    run = work / "run"
+    run.mkdir(exist_ok=True)
+    if not (run / "start.pt").is_file():
         start(task, data_path("models") / "distance.onnx", arguments.seed)
-    (work / "run").mkdir(exist_ok=True)
-    train(task, work / "run", training_s(arguments.minutes, begin), arguments.seed)
+        torch.save({"net": task.net.state_dict()}, run / "start.pt")
+    else:
+        task.net.load_state_dict(torch.load(run / "start.pt", map_location="cpu")["net"])
+    train(task, run, training_s(arguments.minutes, begin), arguments.seed)
     _write(arguments, held_out)
 
 
@@ -157,6 +161,7 @@ def _write(arguments: argparse.Namespace, held_out: HeldOut) -> None:
     state = torch.load(work / "run" / "checkpoint.pt", map_location="cpu")
     net = DistanceNet()
     net.load_state_dict(state["net"])
+    draw_back(net, torch.load(work / "run" / "start.pt", map_location="cpu")["net"])
     meshes = ", ".join(f"{name} (SHA-256 {digest})" for name, digest in _drone_of(arguments)["meshes"].items())
     path = export(
         "distance", net, out,
