@@ -12,7 +12,7 @@ from PIL import Image
 from trimesh.visual.material import PBRMaterial
 
 from flockd.sim.airframe import DroneModel
-from tools.training.own_mesh import MOST_TRIANGLES, UP_AXES, _upright, painted, read_meshes
+from tools.training.own_mesh import MOST_TRIANGLES, UP_AXES, _colours, _upright, painted, read_meshes
 
 RED = [255, 0, 0, 255]
 
@@ -133,6 +133,13 @@ def test_parts_of_different_materials_keep_theirs_and_one_without_is_painted(tmp
     shades = np.array([look[own][0] / BROWN_OF_LINEAR for look in looks])
     assert shades.min() > 0.5
     assert shades.max() < 2.0, "the file's colour in another light"
+
+
+def test_colours_of_faces_are_as_those_of_corners() -> None:
+    mesh = cross_of_boxes()
+    mesh.visual.face_colors = [*BROWN, 255]
+    assert mesh.visual.kind == "face"
+    assert _colours(mesh, is_gltf=False) == pytest.approx(np.tile(BROWN_OF_SRGB, (36, 1)), abs=2e-4)
 
 
 OBJ = "v 0 0 0\nv 0.6 0 0\nv 0 0.6 0.02\nv 0 0.6 0\nvt 0.5 0.5\n{}f 1/1 2/1 3/1\n{}f 1/1 2/1 4/1\n"

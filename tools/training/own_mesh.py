@@ -192,7 +192,7 @@ def _colours(piece: Any, is_gltf: bool) -> Array:
     and 3.9.2); of other files, all are sRGB.
     """
     visual, of_numbers = piece.visual, (lambda grey: grey) if is_gltf else _linear
-    if visual.kind == "vertex":
+    if visual.kind in ("vertex", "face"):
         return np.asarray(of_numbers(np.asarray(visual.face_colors, np.float64)[:, :3] / 255.0))
     if visual.kind != "texture":
         return np.full((len(piece.faces), 3), np.nan)
