@@ -34,7 +34,7 @@ def main() -> None:
         "--mesh",
         type=Path,
         nargs="+",
-        help="of the drone, with propellers (.glb, .gltf, .stl, .obj); several: any of them",
+        help="of the drone, with propellers and its colours (.glb, .gltf, .stl, .obj); several: any of them",
     )
     source.add_argument("--pictures", type=Path, help="photographs of the drone: a folder")
     parser.add_argument("--size-m", type=float, help="of --mesh: widest horizontal distance, propeller tip to tip, m")

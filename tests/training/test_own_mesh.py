@@ -120,6 +120,24 @@ def test_materials_of_gltf_are_read_as_its_specification_says(
     assert np.unique(drone.colours.round(4), axis=0) == pytest.approx(np.array([albedo]), abs=2e-4)
 
 
+def test_colours_of_corners_and_of_their_material_in_gltf_are_multiplied(tmp_path: Path) -> None:
+    mesh = of_material(cross_of_boxes(), baseColorFactor=[*BROWN, 255])
+    shades = np.tile(np.array([128, 255, 64, 255], np.uint8), (len(mesh.vertices), 1))
+    mesh.visual.vertex_attributes["color"] = shades
+    drone = read(written(tmp_path, "drone.glb", mesh), 0.6, "z")
+    assert np.unique(drone.colours.round(4), axis=0) == pytest.approx(np.array([(0.252, 0.251, 0.0315)]), abs=2e-4)
+
+
+def test_a_part_is_where_its_node_puts_it(tmp_path: Path) -> None:
+    """One bar in the file, twice in the scene: along, and turned and 0.1 m higher."""
+    turn = np.array([[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.1], [0.0, 0.0, 0.0, 1.0]])
+    scene: Any = trimesh.Scene()
+    scene.add_geometry(trimesh.creation.box((0.6, 0.1, 0.05)), geom_name="bar")
+    scene.graph.update("again", matrix=turn, geometry="bar")
+    drone = read(written(tmp_path, "drone.glb", scene), 0.62, "z")
+    assert drone.extent[1] - drone.extent[0] == pytest.approx([0.6, 0.6, 0.15], abs=1e-6)
+
+
 def test_parts_of_different_materials_keep_theirs_and_one_without_is_painted(tmp_path: Path) -> None:
     bars = [trimesh.creation.box((0.6, 0.1, 0.05)), trimesh.creation.box((0.1, 0.4, 0.05))]
     bars[0] = of_material(bars[0], baseColorFactor=[*BROWN, 255])

@@ -7,7 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import onnx
 import pytest
+import torch
 import trimesh
 import yaml
 
@@ -56,6 +58,12 @@ def test_a_mesh_becomes_a_distance_network_that_a_configuration_can_name(tmp_pat
     assert networks.second_stage is not None
     ours, theirs = ((folder / "distance.onnx").read_bytes() for folder in (out, MODELS))
     assert ours != theirs, "it learnt"
+    begun, learnt = (
+        torch.load(out / "work" / "run" / f"{name}.pt")["net"]["head.bias"] for name in ("start", "checkpoint")
+    )
+    (written,) = [one for one in onnx.load(str(out / "distance.onnx")).graph.initializer if one.name == "head.bias"]
+    assert onnx.numpy_helper.to_array(written) == pytest.approx((0.65 * learnt + 0.35 * begun).numpy(), abs=1e-6)
+    assert onnx.numpy_helper.to_array(written) != pytest.approx(learnt.numpy(), abs=1e-6), "drawn back"
     assert {path.name: path.read_bytes() for path in MODELS.iterdir()} == before, "the general networks stay"
     again = run(*options)
     assert again.returncode == 2

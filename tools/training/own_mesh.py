@@ -60,10 +60,10 @@ def _surface(path: Path, size_m: float, up: str | None) -> tuple[Array, Array, A
     """Corners in metres, triangles, and their colours as of ``_colours``."""
     pieces = _loaded(path)
     is_gltf = path.suffix.lower() in GLTF
-    counts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
-    vertices = np.vstack([np.asarray(piece.vertices, np.float64) for piece in pieces])
-    triangles = np.vstack([np.asarray(piece.faces) + first for piece, first in zip(pieces, counts, strict=False)])
-    colours = np.vstack([_colours(piece, is_gltf) for piece in pieces])
+    counts = np.cumsum([0, *(len(places) for _, places in pieces)])
+    vertices = np.vstack([places for _, places in pieces])
+    triangles = np.vstack([np.asarray(piece.faces) + first for (piece, _), first in zip(pieces, counts, strict=False)])
+    colours = np.vstack([_colours(piece, is_gltf) for piece, _ in pieces])
     vertices = _upright(vertices, up or ("y" if is_gltf else "z"))
     vertices = _in_metres(path, vertices, size_m, {"m": 1.0} if is_gltf else UNITS_M)
     for cells in CELLS:
@@ -107,8 +107,8 @@ _SHARES = (0.35, 0.35, 0.1, 0.1, 0.1)
 """Of body, frame, metal, front and rear colours."""
 
 
-def _loaded(path: Path) -> list[Any]:
-    """All meshes that the file shows, in the same axes."""
+def _loaded(path: Path) -> list[tuple[Any, Array]]:
+    """All meshes that the file shows, and their corners (n, 3) in the same axes."""
     ending = path.suffix.lower()
     if ending not in ENDINGS:
         raise ValueError(f"{path}: a mesh is read from {', '.join(ENDINGS)}; export it as one of these")
@@ -117,20 +117,25 @@ def _loaded(path: Path) -> list[Any]:
     if path.stat().st_size > MOST_BYTES:
         raise ValueError(f"{path}: is larger than {MOST_BYTES >> 20} MB; simplify it where it was modelled")
     try:
-        pieces: list[Any] = [
-            piece for piece in trimesh.load_scene(path, process=False).dump() if len(getattr(piece, "faces", ()))
+        scene: Any = trimesh.load_scene(path, process=False)
+        # Scene.dump would lose the colours of corners that have a material as well.
+        placed = [(scene.geometry[name], turn) for turn, name in map(scene.graph.get, scene.graph.nodes_geometry)]
+        pieces = [
+            (piece, np.asarray(trimesh.transform_points(piece.vertices, turn), np.float64))
+            for piece, turn in placed
+            if len(getattr(piece, "faces", ()))
         ]
     except Exception as error:  # noqa: BLE001 - whatever a parser of foreign files raises, the file is at fault
         raise ValueError(f"{path}: is no mesh that can be read ({str(error) or type(error).__name__})") from None
     if not pieces:
         raise ValueError(f"{path}: holds no triangles; export the drone's surface as a mesh")
-    count = sum(len(piece.faces) for piece in pieces)
+    count = sum(len(piece.faces) for piece, _ in pieces)
     if count > MOST_TRIANGLES_READ:
         raise ValueError(
             f"{path}: has {count} triangles, and at most {MOST_TRIANGLES_READ} are read; "
             "simplify it where it was modelled"
         )
-    if not all(np.isfinite(piece.vertices).all() for piece in pieces):
+    if not all(np.isfinite(places).all() for _, places in pieces):
         raise ValueError(f"{path}: has places that are no numbers; export it again")
     return pieces
 
@@ -197,12 +202,10 @@ def _colours(piece: Any, is_gltf: bool) -> Array:
     if visual.kind != "texture":
         return np.full((len(piece.faces), 3), np.nan)
     factor, image = _paint(visual.material)
-    colours = np.full((len(piece.faces), 3), 1.0 if is_gltf else np.nan)
+    colours = np.full((len(piece.faces), 3), 1.0 if is_gltf or factor is not None else np.nan)
     if image is not None and visual.uv is not None:
         middles = np.asarray(visual.uv, np.float64)[piece.faces].mean(axis=1)
         colours = _linear(uv_to_color(middles, image)[:, :3] / 255.0)
-    elif factor is not None:
-        colours[:] = 1.0
     if factor is not None:
         colours = colours * of_numbers(np.asarray(factor, np.float64)[:3] / 255.0)
     shades = visual.vertex_attributes.get("color")
