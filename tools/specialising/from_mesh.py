@@ -1,12 +1,14 @@
 """Range of a fleet's own drone from a mesh: rendered in training worlds, `distance` learns its shape.
 
-The weights are drawn back a third of the way to the general network's: it learnt what is no drone from far more places.
+The general network learnt what is no drone from far more places. It teaches that along, and the weights are drawn back
+a third of the way to its own.
 The network is measured against the general one in crops, with the drone and without, of worlds that it has not seen.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import hashlib
 import time
 from collections.abc import Iterator
@@ -91,6 +93,7 @@ def specialise_range(arguments: argparse.Namespace, drones: list[DroneModel], be
         torch.save({"net": task.net.state_dict()}, run / "start.pt")
     else:
         task.net.load_state_dict(torch.load(run / "start.pt", map_location="cpu")["net"])
+    task.teacher = copy.deepcopy(task.net).eval()
     train(task, run, training_s(arguments.minutes, begin), arguments.seed)
     _write(arguments, held_out)
 

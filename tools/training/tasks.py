@@ -115,6 +115,9 @@ class DistanceTask(Task):
     pool_size = 8_000
     renewed_in_a_batch = 3
     no_drone_share = 0.25
+    teacher: DistanceNet | None = None
+    """A network that saw more places: what it is sure is no drone, this one is to be as sure of (learning without
+    forgetting, Li and Hoiem 2016)."""
 
     def __init__(self, pairs: PairSet, negatives: Path, pictures: Path) -> None:
         super().__init__(DistanceNet(), 64, 2e-3)
@@ -146,6 +149,8 @@ class DistanceTask(Task):
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
         """See ``Task``."""
         batch = _flipped(batch)
+        if self.teacher is not None:
+            batch = _patched(batch)
         out, masks, families, motors = self.net(batch["picture"])
         there = batch["drone"]
         error = (out[:, 0] - batch["target"][:, 0]).abs()
@@ -171,7 +176,15 @@ class DistanceTask(Task):
         }
         exists = F.binary_cross_entropy_with_logits(out[:, 4], there)
         mask_loss, figures["iou"] = _mask_loss(masks.float(), batch["mask"].float() / 255, there)
-        return (each * there).sum() / there.sum().clamp(min=1) + 0.5 * exists + mask_loss, figures
+        loss = (each * there).sum() / there.sum().clamp(min=1) + 0.5 * exists + mask_loss
+        if self.teacher is not None and (~seen).any():
+            with torch.no_grad():
+                picture = batch["picture"][~seen]
+                sure = self.teacher.to(picture.device)(picture)[0][:, 4]
+            forgotten = F.relu(out[~seen, 4] - sure)
+            figures["forgotten"] = float(forgotten.mean().detach())
+            loss = loss + 0.1 * F.smooth_l1_loss(forgotten, torch.zeros_like(forgotten))
+        return loss, figures
 
 
 def _mask_loss(logits: Tensor, mask: Tensor, drone: Tensor) -> tuple[Tensor, float]:
@@ -201,6 +214,17 @@ def _flipped(batch: Batch) -> Batch:
     target[:, 1] *= sign
     motors[:, :, 0] *= sign[:, None]
     return {**batch, "picture": picture, "mask": mask, "target": target, "motors": motors}
+
+
+def _patched(batch: Batch) -> Batch:
+    """Half of the crops without a drone get a rectangle of another one of them: more kinds of what is no drone."""
+    none = torch.nonzero(batch["drone"] < 0.5)[:, 0]
+    picture = batch["picture"].clone()
+    size = picture.shape[1]
+    for k, other in zip(none.tolist()[::2], none[torch.randperm(len(none))].tolist(), strict=False):
+        (top, bottom), (left, right) = torch.randint(0, size + 1, (2, 2)).sort(1).values.tolist()
+        picture[k, top:bottom, left:right] = batch["picture"][other, top:bottom, left:right]
+    return {**batch, "picture": picture}
 
 
 def _motor_maps(motors: Tensor, sigma: float = 1.5) -> Tensor:
