@@ -58,6 +58,8 @@ def test_a_mesh_becomes_a_distance_network_that_a_configuration_can_name(tmp_pat
     assert networks.second_stage is not None
     ours, theirs = ((folder / "distance.onnx").read_bytes() for folder in (out, MODELS))
     assert ours != theirs, "it learnt"
+    curve = (out / "work" / "run" / "curve.csv").read_text(encoding="utf-8")
+    assert "forgotten" in curve.splitlines()[0], "the general network teaches along"
     begun, learnt = (
         torch.load(out / "work" / "run" / f"{name}.pt")["net"]["head.bias"] for name in ("start", "checkpoint")
     )
