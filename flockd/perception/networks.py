@@ -33,8 +33,6 @@ CROPS_PER_RUN = 24
 """Crops in one run of a network, so that an image full of false proposals does not take more memory."""
 _MIN_DEPTH_M, _MAX_DEPTH_M = 1e-3, 1e3
 """Where a reciprocal of depth is taken: nearer than the lens, and where flow and height measure nothing any more."""
-_MIN_AREA_ALONE_PX = 10.0
-"""Smaller specks are no drones where no second stage looks at them; drones a few pixels wide are lost with them."""
 _MIN_RAY_Z = 0.1
 """Of a unit ray, for its tangents to stay finite: 84 degrees off the optical axis."""
 
@@ -126,12 +124,10 @@ class OnnxNetworks:
         # A second stage weeds out false proposals, so that the first may propose more.
         threshold = self._segmentation.manifest.threshold
         alone = threshold("proposal_logit_alone")
-        proposal, certain, min_area_px = alone, alone, _MIN_AREA_ALONE_PX
+        proposal, certain = alone, alone
         if self._distance is not None:
-            proposal, certain, min_area_px = threshold("proposal_logit"), threshold("mask_logit"), 0.0
-        labels, instances = group_instances(
-            logit - np.float32(proposal), offset, scale=self.map_stride, min_area_px=min_area_px
-        )
+            proposal, certain = threshold("proposal_logit"), threshold("mask_logit")
+        labels, instances = group_instances(logit - np.float32(proposal), offset, scale=self.map_stride)
         labels = np.asarray(cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
         low = cv2.resize((logit < certain).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
         peak = self._segmentation.manifest.thresholds.get("proposal_peak_logit", proposal) - proposal

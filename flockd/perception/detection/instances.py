@@ -31,7 +31,7 @@ class Instance:
 
 
 def group_instances(
-    drone_logit: Float32Array, offset: Float32Array, *, scale: int, min_area_px: float = 0.0
+    drone_logit: Float32Array, offset: Float32Array, *, scale: int, min_area_px: float = 10.0
 ) -> tuple[UInt8Array, tuple[Instance, ...]]:
     """Split a mask into drones by the centres its pixels point to.
 
@@ -39,7 +39,7 @@ def group_instances(
         drone_logit: (h, w) at a ``scale``-th of the image's size; above 0 is drone.
         offset: (2, h, w) map pixels from each pixel to its drone's centre, right and down.
         scale: image pixels per map pixel.
-        min_area_px: smaller groups, in image pixels, are dropped; by default none is.
+        min_area_px: smaller groups, in image pixels, are dropped.
 
     Returns:
         labels (h, w), 0 for background and then 1, 2, ...; and the drones, largest first.

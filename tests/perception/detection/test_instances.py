@@ -55,12 +55,8 @@ def test_a_drone_cut_by_the_border_points_outside() -> None:
     assert instances[0].box[0] == 0.0
 
 
-def test_a_speck_is_an_instance_unless_it_is_asked_to_be_larger() -> None:
+def test_specks_are_dropped() -> None:
     logit, offset = painted((60, 80), [(30.5, 30.5, 0.6)])
-    labels, (speck,) = group_instances(logit, offset, scale=2)
-    assert speck.area_px == 4.0, "one pixel of the map is two by two of the image"
-    assert speck.box.tolist() == [60.0, 60.0, 62.0, 62.0]
-    assert labels.sum() == labels[30, 30] == speck.label
-    labels, instances = group_instances(logit, offset, scale=2, min_area_px=10.0)
+    labels, instances = group_instances(logit, offset, scale=2)
     assert instances == ()
     assert not labels.any()

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
-from flockd.config.perception import DetectionParameters, PerceptionConfig
-from flockd.data import data_path
+from flockd.config.perception import DetectionParameters
 from flockd.geometry import Rig
-from flockd.messages import UNCLASSED, Frame
-from flockd.perception import Instance, OnnxNetworks, SceneMaps, group_instances
+from flockd.messages import UNCLASSED
+from flockd.perception import Instance, SceneMaps, group_instances
 from flockd.perception.detection.proposals import propose_instances, propose_residuals
 from tests.perception.cameras import camera_of
 from tests.perception.shipped import SECOND_STAGE
@@ -46,21 +44,6 @@ def test_the_score_is_the_highest_logit_over_the_threshold() -> None:
     offset = np.stack([12.5 - np.arange(40.0) * np.ones((30, 1)), 12.5 - np.arange(30.0)[:, None] * np.ones((1, 40))])
     _, (one,) = group_instances(logit, offset.astype(np.float32), scale=2)
     assert one.score == 3.5
-
-
-@pytest.mark.parametrize(("distance", "instances"), [("distance_int8", 1), ("none", 0)])
-def test_a_drone_of_one_pixel_of_the_map_goes_to_the_second_stage_and_is_none_without_it(
-    distance: str, instances: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    networks = OnnxNetworks(PerceptionConfig(flow="dis", distance=distance, scale="network"), data_path("models"))
-    logit = np.full((1, SIZE[1] // 2, SIZE[0] // 2), -5.0, np.float32)
-    logit[0, 20, 30] = 3.0
-    maps = {"depth": np.full_like(logit, 9.0), "drone": logit, "offset": np.zeros((2, *logit.shape[1:]), np.float32)}
-    monkeypatch.setattr(networks, "_run", lambda *_: maps)
-    picture = Frame("front", np.zeros((SIZE[1], SIZE[0], 3), np.uint8), 0.0, 0)
-    scene = networks.scene(picture, camera_of(100.0, SIZE), None)
-    assert len(scene.instances) == instances
-    assert np.count_nonzero(scene.labels) == 4 * instances, "image pixels"
 
 
 def test_of_too_many_the_best_are_proposed_in_their_order() -> None:
