@@ -27,20 +27,29 @@ class TrackingParameters(Section):
     speed_sigma_m_s: Positive = 1.5
     """Standard deviation an axis of a neighbour's velocity where the own velocity is not known."""
     robust_sigma: Positive = 2.5
-    """Innovations beyond this many standard deviations count less and less; 90 % of those of the motion and measurement
-    model are nearer (chi-square with 3 degrees of freedom)."""
+    """Innovations beyond this many standard deviations count less and less; of those of the motion and measurement
+    model 82 % are nearer, of measured velocities 90 % (chi-square with 4 and 3 degrees of freedom)."""
+
+    size_variance_share: Probability = 0.7
+    """Of the variance of a detection's log range, how much is that of its log size: a range is the size, which the
+    appearance tells, over the apparent size."""
+    size_drift: Positive = 0.05
+    """How far the log size of one drone drifts, as the network sees it in changing views: standard deviation after one
+    second, growing with the square root of the time."""
 
     gate_sigma: Positive = 6.0
-    """Association gate: the largest Mahalanobis distance of a detection from a track, in standard deviations. Wider
-    than a Gaussian needs, as range errors have heavier tails: a detection left out begins a second track."""
+    """Association gate: the largest Mahalanobis distance of a detection from a track, in place and size, in standard
+    deviations. Wider than a Gaussian needs, as range errors have heavier tails: a detection left out begins a second
+    track."""
 
     detection_probability: Probability = 0.7
     """P_D: of a neighbour that the cameras can show being detected in one frame set. The shipped networks detect 93 %
     of drones at least 12 px wide and 34 % at 6 to 12 px (docs/networks.md), and misses come in runs. At 0.7 a track
     stays confirmed through three frame sets in a row without a detection."""
     clutter_density: Positive = 0.01
-    """False detections in one frame set, per steradian and unit of log range. The shipped networks give 18 in 500
-    images (docs/networks.md), each of about 1.5 sr and 0.5 to 20 m, thus 0.0065; rounded up."""
+    """False detections in one frame set, per steradian, unit of log range and unit of log size. The shipped networks
+    give 9 in 500 images (docs/networks.md), each of about 1.5 sr, at 0.5 to 20 m and 0.15 to 1.2 m large, thus 0.0016
+    on average; taken larger, as they crowd where trees are."""
     survival_time_s: Duration = 60.0
     """Mean time that a neighbour stays within sight: existence probability decays with this time constant."""
     birth_probability: Probability = 0.5
@@ -51,7 +60,10 @@ class TrackingParameters(Section):
     """Time constant of the average of the network's drone probabilities over a track; its existence probability is
     multiplied by it."""
     confirm_hits: Annotated[int, Field(ge=1)] = 3
-    """No track is confirmed with fewer detections."""
+    """No track is confirmed with fewer detections that agree with it."""
+    confirm_sigma: Positive = 3.6
+    """A detection farther off than this many standard deviations does not agree: 99 % of those of the motion and
+    measurement model are nearer (chi-square with 4 degrees of freedom)."""
     confirm_probability: Probability = 0.925
     """A track is confirmed when its existence probability is above this."""
     keep_probability: Probability = 0.6

@@ -1,4 +1,4 @@
-"""Which measurement is of which track: gate and optimal assignment in log-polar coordinates."""
+"""Which measurement is of which track: gate and optimal assignment in log-polar coordinates and size."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def assign(
     unassigned = np.full((len(measurements), len(measurements)), _FORBIDDEN)
     np.fill_diagonal(unassigned, -_FORBIDDEN)
     for row, column in np.argwhere(_near(measurements, states, parameters.gate_sigma)).tolist():
-        pair = innovation(states[column], measurements[row])
+        pair = innovation(states[column], measurements[row], parameters)
         squared, log_determinant = pair.squared_distance, pair.log_determinant
         if squared <= gate:
             pairs[row, column] = pair

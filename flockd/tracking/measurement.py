@@ -75,6 +75,11 @@ class Measurement:
         return math.exp(self.log_range)
 
     @property
+    def log_range_variance(self) -> float:
+        """The part of `covariance` along the bearing."""
+        return float(self.bearing @ self.covariance @ self.bearing)
+
+    @property
     def position(self) -> FloatArray:
         """(3,) metres, NED, own drone at the origin."""
         return self.range_m * self.bearing

@@ -111,7 +111,7 @@ class Tracker:
             Prediction(
                 position=state.position,
                 covariance=state.position_covariance,
-                size_m=track.size_m,
+                size_m=state.size_m,
                 existence_probability=track.drone_probability
                 * existence.predicted(track.existence, interval_s, self.parameters),
             )
@@ -125,8 +125,8 @@ class Tracker:
                 track=track.number,
                 position=track.state.position,
                 velocity=track.state.velocity,
-                position_sigma_m=float(np.sqrt(np.trace(track.state.covariance[:3, :3]) / 3)),
-                velocity_sigma_m_s=float(np.sqrt(np.trace(track.state.covariance[3:, 3:]) / 3)),
+                position_sigma_m=float(np.sqrt(np.trace(track.state.position_covariance) / 3)),
+                velocity_sigma_m_s=float(np.sqrt(np.trace(track.state.velocity_covariance) / 3)),
                 age_s=self._time_s - track.first_seen_s,
                 unseen_s=self._time_s - track.last_seen_s,
                 hits=track.hits,
@@ -149,12 +149,12 @@ class Tracker:
     def _detect(self, track: _Track, measurement: Measurement, innovation: Innovation, weight: float) -> None:
         interval_s = max(0.0, self._time_s - track.last_seen_s)
         track.hits += 1
+        track.agreed += innovation.squared_distance <= self.parameters.confirm_sigma**2
         track.existence = existence.detected(track.existence, innovation, weight, self.parameters)
         track.drone_probability = existence.averaged(
             track.drone_probability, measurement.drone_probability, track.hits, interval_s, self.parameters
         )
         track.state = filter.update(track.state, measurement, self.parameters)
-        track.size_m = measurement.size_m
         track.last_seen_s = self._time_s
 
     def _begin(self, measurement: Measurement, own_velocity: FloatArray | None) -> _Track:
@@ -164,7 +164,6 @@ class Tracker:
             state=filter.initial(measurement, own_velocity, self.parameters),
             existence=self.parameters.birth_probability,
             drone_probability=measurement.drone_probability,
-            size_m=measurement.size_m,
             first_seen_s=self._time_s,
             last_seen_s=self._time_s,
         )
@@ -172,7 +171,7 @@ class Tracker:
     def _confirm(self, track: _Track) -> None:
         needed = self.parameters.keep_probability if track.confirmed else self.parameters.confirm_probability
         track.confirmed = (
-            track.hits >= self.parameters.confirm_hits and track.existence * track.drone_probability > needed
+            track.agreed >= self.parameters.confirm_hits and track.existence * track.drone_probability > needed
         )
         track.was_confirmed |= track.confirmed
 
@@ -191,10 +190,10 @@ class _Track:
     """Probability of being anything that persists."""
     drone_probability: float
     """Of being a drone if it exists."""
-    size_m: float
-    """As last detected."""
     first_seen_s: float
     last_seen_s: float
     hits: int = 1
+    agreed: int = 1
+    """Of the hits, those within `confirm_sigma`."""
     confirmed: bool = False
     was_confirmed: bool = False

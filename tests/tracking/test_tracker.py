@@ -84,15 +84,15 @@ def test_existence_depends_on_time_and_not_on_the_rate_of_frame_sets() -> None:
 
 
 def test_dense_clutter_makes_a_detection_say_less() -> None:
-    """The innovation's own density is at most 1 / (2 pi)^1.5 / 0.09^3 = 87 per steradian and unit of log range."""
+    """The innovation's own density is at most 1 / (2 pi)^2 / 0.09^3 / (0.0125 sqrt(2)) = 1,965."""
     probability = {}
-    for density in (1e-3, 1e3):
+    for density in (1e-3, 1e5):
         tracker = Tracker(TrackingParameters(clutter_density=density, birth_probability=0.5))
         _step(tracker, 0.0, AHEAD)
         _step(tracker, STEP_S, AHEAD)
         probability[density] = tracker.neighbours()[0].existence_probability
     assert probability[1e-3] > 0.99
-    assert probability[1e3] < 0.5
+    assert probability[1e5] < 0.5
 
 
 def test_a_dropout_of_three_frame_sets_keeps_a_confirmed_track() -> None:
@@ -180,6 +180,20 @@ def test_confirmation_takes_the_number_of_hits_asked_for() -> None:
     assert found == [0, 0, 1, 1]
 
 
+def test_a_detection_that_contradicts_a_track_does_not_confirm_it() -> None:
+    """A third detection within the gate, at half the size and half the range as the track has it, but not near."""
+    tracker = Tracker(TrackingParameters())
+    _step(tracker, 0.0, AHEAD, sigma_m=0.5)
+    _step(tracker, STEP_S, AHEAD, sigma_m=0.5)
+    tracker.predict(STEP_S, CRUISE * STEP_S)
+    assert tracker.update(2 * STEP_S, [_seen(0.5 * AHEAD, 0.25, size_m=0.3)], CRUISE) == (1,)
+    assert tracker.neighbours()[0].hits == 3
+    assert not tracker.neighbours()[0].confirmed
+    _step(tracker, 3 * STEP_S, AHEAD, sigma_m=0.5)
+    (neighbour,) = _confirmed(tracker)
+    assert neighbour.position[0] > 3.0
+
+
 def test_a_single_detection_is_dropped_after_two_misses_and_two_survive_one_miss() -> None:
     tracker = Tracker(TrackingParameters(birth_probability=0.5, detection_probability=0.7, drop_probability=0.1))
     (first,) = _step(tracker, 0.0, AHEAD)
@@ -258,7 +272,7 @@ def test_a_track_follows_a_jump_that_stays() -> None:
 
 def test_the_first_update_is_the_textbook_kalman_filter() -> None:
     """By hand: 0.1 m at first sight, velocity +-0.7 m/s, 1 s on: 0.01 + 0.49 + 0.4^2 * 0.5 / 3 = 0.526667 m^2."""
-    tracker = Tracker(TrackingParameters(acceleration_sigma_m_s2=0.4))
+    tracker = Tracker(TrackingParameters(acceleration_sigma_m_s2=0.4, size_variance_share=1e-6))  # of the range alone
     tracker.update(0.0, [_seen(AHEAD, 0.1)], CRUISE)
     tracker.predict(1.0, np.array([0.6, 0.0, 0.0]))
     (before,) = tracker.neighbours()
@@ -362,13 +376,13 @@ def test_the_filter_knows_its_own_error() -> None:
 
 
 def test_a_wrong_range_moves_a_track_by_the_share_that_its_covariance_says() -> None:
-    """Log ranges of 4 m and 5 m, equally sure: the mean is halfway in the logarithm, thus sqrt(4 * 5)."""
+    """Log ranges of 4 m and 4.5 m, equally sure: the mean is halfway in the logarithm, thus sqrt(4 * 4.5)."""
     tracker = Tracker(TrackingParameters(acceleration_sigma_m_s2=1e-6))
     covariance = log_polar_covariance(np.array([1.0, 0.0, 0.0]), 0.2, 0.001)
     ahead = Measurement(np.array([1.0, 0.0, 0.0]), math.log(4.0), covariance, 0.6)
     tracker.update(0.0, [ahead], CRUISE)
-    assert tracker.update(1e-6, [replace(ahead, log_range=math.log(5.0))], CRUISE) == (1,)
-    np.testing.assert_allclose(tracker.neighbours()[0].position, [math.sqrt(20.0), 0.0, 0.0], rtol=0.02)
+    assert tracker.update(1e-6, [replace(ahead, log_range=math.log(4.5))], CRUISE) == (1,)
+    np.testing.assert_allclose(tracker.neighbours()[0].position, [math.sqrt(18.0), 0.0, 0.0], rtol=0.02)
 
 
 def test_a_vague_prediction_ends_at_a_sharp_measurement_far_to_the_side() -> None:
@@ -395,6 +409,42 @@ def test_assignment_is_the_best_of_all_and_not_the_nearest_pair_first() -> None:
 def test_what_is_outside_the_gate_of_all_tracks_begins_a_new_one() -> None:
     tracker, now_s = _settled(sigma_m=0.05)
     assert _step(tracker, now_s + STEP_S, AHEAD + np.array([0.0, 3.0, 0.0])) == (2,)
+
+
+def test_a_detection_of_another_size_is_of_another_drone() -> None:
+    """The range of a drone that is taken for one of half its size is halved; a vague young track would follow it."""
+    tracker = Tracker(TrackingParameters())
+    for k, sigma_m in enumerate((0.4, 1.0)):
+        _step(tracker, k * STEP_S, AHEAD, sigma_m=sigma_m)
+    tracker.predict(STEP_S, CRUISE * STEP_S)
+    small = _seen(0.5 * AHEAD, 0.1, size_m=0.3)
+    assert tracker.update(2 * STEP_S, [small], CRUISE) == (2,)
+    assert tracker.update(2 * STEP_S, [replace(small, size_m=0.6)], CRUISE) == (1,), "the same range, the track's size"
+
+
+def test_the_size_predicted_is_averaged_over_the_detections() -> None:
+    """Equally sure: the mean of the logarithms, sqrt(0.5 * 0.7)."""
+    tracker = Tracker(TrackingParameters(confirm_hits=2, size_drift=1e-6))
+    for k, size_m in enumerate((0.5, 0.7)):
+        tracker.predict(STEP_S, CRUISE * STEP_S)
+        tracker.update(k * STEP_S, [_seen(AHEAD, 0.2 * 4, size_m)], CRUISE)
+    (prediction,) = tracker.predictions(STEP_S, CRUISE)
+    assert prediction.size_m == pytest.approx(math.sqrt(0.5 * 0.7), rel=0.01)
+
+
+def test_a_range_is_the_track_s_size_over_the_apparent_size() -> None:
+    """Twenty looks tell 0.6 m. A last one takes the drone for one of 0.72 m at 1.2 times its range: it looks as large
+    as before, so that it has not moved. Where it looks smaller by as much and of the same size, it has moved."""
+    parameters = TrackingParameters(size_variance_share=0.999, size_drift=1e-3, relative_speed_sigma_m_s=3.0)
+    found = []
+    for size_m in (0.72, 0.6):
+        tracker = Tracker(parameters)
+        for k in range(20):
+            _step(tracker, k * STEP_S, AHEAD, sigma_m=0.4)
+        tracker.predict(10 * STEP_S, 10 * STEP_S * CRUISE)  # vague by now
+        assert tracker.update(20 * STEP_S, [_seen(1.2 * AHEAD, 0.4, size_m)], CRUISE) == (1,)
+        found.append(tracker.neighbours()[0].position[0])
+    assert found == pytest.approx([4.0, 4.8], abs=0.1)
 
 
 def test_a_track_at_the_own_position_is_no_error() -> None:
