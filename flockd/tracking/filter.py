@@ -144,12 +144,11 @@ def update(state: State, measurement: Measurement, parameters: TrackingParameter
 def _noise(measurement: Measurement, parameters: TrackingParameters) -> FloatArray:
     """(4, 4) covariance of a measurement's log-polar coordinates and log size.
 
-    A range is a size over an apparent size. The two err by themselves, and the range by both: `size_variance_share` of
-    its variance is the size's.
+    A range is a size over an apparent size, so that the two err together: by as much, with `size_correlation`.
     """
-    of_size = parameters.size_variance_share * measurement.log_range_variance
-    across = of_size * measurement.bearing[:, None]
-    return np.block([[measurement.covariance, across], [across.T, np.array([[of_size]])]])
+    variance = measurement.log_range_variance
+    across = parameters.size_correlation * variance * measurement.bearing[:, None]
+    return np.block([[measurement.covariance, across], [across.T, np.array([[variance]])]])
 
 
 def _at(measurement: Measurement, velocity: FloatArray) -> FloatArray:

@@ -272,7 +272,7 @@ def test_a_track_follows_a_jump_that_stays() -> None:
 
 def test_the_first_update_is_the_textbook_kalman_filter() -> None:
     """By hand: 0.1 m at first sight, velocity +-0.7 m/s, 1 s on: 0.01 + 0.49 + 0.4^2 * 0.5 / 3 = 0.526667 m^2."""
-    tracker = Tracker(TrackingParameters(acceleration_sigma_m_s2=0.4, size_variance_share=1e-6))  # of the range alone
+    tracker = Tracker(TrackingParameters(acceleration_sigma_m_s2=0.4, size_correlation=1e-6))  # of the range alone
     tracker.update(0.0, [_seen(AHEAD, 0.1)], CRUISE)
     tracker.predict(1.0, np.array([0.6, 0.0, 0.0]))
     (before,) = tracker.neighbours()
@@ -435,7 +435,7 @@ def test_the_size_predicted_is_averaged_over_the_detections() -> None:
 def test_a_range_is_the_track_s_size_over_the_apparent_size() -> None:
     """Twenty looks tell 0.6 m. A last one takes the drone for one of 0.72 m at 1.2 times its range: it looks as large
     as before, so that it has not moved. Where it looks smaller by as much and of the same size, it has moved."""
-    parameters = TrackingParameters(size_variance_share=0.999, size_drift=1e-3, relative_speed_sigma_m_s=3.0)
+    parameters = TrackingParameters(size_correlation=0.999, size_drift=1e-3, relative_speed_sigma_m_s=3.0)
     found = []
     for size_m in (0.72, 0.6):
         tracker = Tracker(parameters)
