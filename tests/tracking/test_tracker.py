@@ -139,7 +139,7 @@ def test_a_prediction_is_where_the_flock_mate_flies_to() -> None:
     now = AHEAD + np.array((1.9, 0.0, 0.0))
     (prediction,) = tracker.predictions(1.0, CRUISE)
     np.testing.assert_allclose(prediction.position, now + np.array((0.2, 0.0, 0.0)), atol=0.03)
-    assert prediction.size_m == 0.6
+    assert prediction.size_m == pytest.approx(0.6)
     before = tracker.neighbours()[0]
     assert prediction.covariance.shape == (3, 3)
     assert np.trace(prediction.covariance) > 3 * before.position_sigma_m**2
@@ -430,6 +430,16 @@ def test_the_size_predicted_is_averaged_over_the_detections() -> None:
         tracker.update(k * STEP_S, [_seen(AHEAD, 0.2 * 4, size_m)], CRUISE)
     (prediction,) = tracker.predictions(STEP_S, CRUISE)
     assert prediction.size_m == pytest.approx(math.sqrt(0.5 * 0.7), rel=0.01)
+
+
+def test_a_size_that_was_last_seen_long_ago_counts_little() -> None:
+    """After 100 s the log size has drifted by 0.5, and is seen to 0.1: 26 parts of the new to one of the old."""
+    tracker = Tracker(TrackingParameters(confirm_hits=2, survival_time_s=3600.0, clutter_density=1e-9))
+    tracker.update(0.0, [_seen(AHEAD, 0.4, 0.5)], CRUISE)
+    tracker.predict(100.0, 100.0 * CRUISE)
+    assert tracker.update(100.0, [_seen(AHEAD, 0.4, 0.7)], CRUISE) == (1,)
+    (prediction,) = tracker.predictions(STEP_S, CRUISE)
+    assert prediction.size_m == pytest.approx(0.7 * (0.5 / 0.7) ** (1 / 27), rel=0.01)
 
 
 def test_a_range_is_the_track_s_size_over_the_apparent_size() -> None:
