@@ -2,7 +2,7 @@
 
 python -m tools.render_training_data OUT --worlds 120 --pairs 30 --split training
 
-A third of the scenes have birds and the like in them. Two thirds of the drones of training worlds are of generated
+A third of the scenes have birds and the like in them. Half of the drones of training worlds are of generated
 shapes. With ``--families unseen`` the drones are of the families that no network is trained on. With
 ``--obstacles 0.4`` four in ten worlds have a forest or a village, with the camera between trunks and before walls.
 """

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from tools.training.crop_files import CropFiles
 
@@ -27,6 +28,30 @@ def test_a_family_of_few_images_is_drawn_as_often_as_one_of_many(tmp_path: Path)
     assert shares == pytest.approx([0.46, 0.46, 0.08], abs=0.04)
     lonely = [sample for sample in drawn if sample["family"] == 1 and sample["drone"] > 0.5]
     assert {float(sample["apparent"]) for sample in lonely} == {0.0} | {float(n) for n in range(90, 95)}
+
+
+def test_hundreds_of_shapes_do_not_crowd_out_the_families(tmp_path: Path) -> None:
+    family = np.concatenate([np.arange(12), 1000 + np.arange(400)])
+    _write(tmp_path / "a.npz", family)
+    files, rng = CropFiles(tmp_path), np.random.default_rng(0)
+    drawn = np.array([files.draw(rng)["family"] for _ in range(3000)])
+    assert np.mean(drawn < 12) == pytest.approx(0.5, abs=0.04)
+    assert np.bincount(drawn[drawn < 12], minlength=12).min() > 0.5 * 1500 / 12
+    assert len(np.unique(drawn[drawn >= 1000])) > 350
+
+
+def test_where_there_are_only_shapes_nothing_else_is_drawn(tmp_path: Path) -> None:
+    _write(tmp_path / "a.npz", 1000 + np.arange(3))
+    files, rng = CropFiles(tmp_path), np.random.default_rng(0)
+    assert {int(files.draw(rng)["family"]) for _ in range(300)} == {1000, 1001, 1002}
+
+
+def _write(file: Path, family: NDArray[np.int64]) -> None:
+    zeros = np.zeros(len(family))
+    np.savez(
+        file, family=family, drone=zeros + 1.0, apparent=zeros, target=np.zeros((len(family), 3)),
+        mask=np.zeros((len(family), 1, 1)),
+    )  # fmt: skip
 
 
 def test_images_like_the_last_crop_of_a_drone_are_drawn_more_often_than_others(tmp_path: Path) -> None:

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tools.training import worlds
+from tools.training.networks import MAX_FAMILIES
 from tools.training.samples import Sample
 
 _LOOK_EVERY = 200
@@ -48,15 +50,20 @@ class CropFiles:
         self._ends = np.cumsum([len(file["drone"]) for file in self._files.values()])
         family = np.concatenate([np.where(file["drone"] > 0.5, file["family"], -1) for file in self._files.values()])
         aimed = np.concatenate([is_aimed(file) for file in self._files.values()])
-        names = np.unique(family)
+        names: NDArray[np.int64] = np.unique(family)
         self._of_family = [np.flatnonzero(family == one) for one in names]
         self._aimed_of_family = [np.flatnonzero((family == one) & aimed) for one in names]
-        none = names == -1
-        share = _NONE_SHARE if none.any() and not none.all() else float(none.all())
-        self._shares = np.where(none, share, (1 - share) / max(1, int(np.count_nonzero(~none))))
+        is_none, is_family, is_shape = names == -1, (names >= 0) & (names < MAX_FAMILIES), names >= MAX_FAMILIES
+        of_drones = np.zeros(len(names))
+        for which, of in ((is_family, 1 - worlds.SHAPES_SHARE), (is_shape, worlds.SHAPES_SHARE)):
+            of_drones[which] = of / max(1, int(np.count_nonzero(which)))
+        drones = float(of_drones.sum())
+        share = _NONE_SHARE if is_none.any() and drones > 0 else float(is_none.any())
+        self._shares = np.where(is_none, share, (1 - share) * of_drones / max(drones, 1e-9))
 
     def draw(self, rng: np.random.Generator) -> Sample:
-        """Any of them: every family as often, however many crops there are of it, and now and then what is none."""
+        """Any of them, and now and then what is none: every family as often as any other, however many crops there are
+        of it, every shape as any other, and all shapes together ``worlds.SHAPES_SHARE`` of the drones."""
         one = int(rng.choice(len(self._shares), p=self._shares))
         rows = self._of_family[one]
         if rng.random() < _AIMED_SHARE and len(self._aimed_of_family[one]):

@@ -19,8 +19,8 @@ TEST = range(3_000_000, 4_000_000)
 FAMILIES = range(12)
 UNSEEN_FAMILIES = range(12, 14)
 SHAPES = range(400)
-SHAPES_SHARE = 2 / 3
-"""Of the drones of training worlds."""
+SHAPES_SHARE = 1 / 2
+"""Of the drones of training worlds, and of the drones that a training draws."""
 
 
 def drawn_obstacles(seed: int, share: float) -> ObstaclesConfig | None:
