@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -68,11 +69,7 @@ class MaskRenderer:
     def __init__(self, camera: RigCamera, stride: int) -> None:
         """``stride``: image pixels per pixel of the first stage's map."""
         self._camera, self._stride = camera, stride
-        width, height = camera.camera.size
-        # A pixel of the map stands for the last one of its block: those are the ones that networks are trained on.
-        u, v = np.meshgrid(*(np.arange(stride, size + 1, stride) - 0.5 for size in (width, height)))
-        rays = camera.camera.rays(np.stack([u.ravel(), v.ravel()], 1)) @ camera.T_body_camera.rotation.T
-        self._rays: Float32Array = np.asarray(rays.reshape(*u.shape, 3), dtype=np.float32)
+        self._rays = _block_rays(camera, stride)
 
     def render(
         self,
@@ -126,6 +123,16 @@ class MaskRenderer:
         return box, np.asarray(fine, np.float32)
 
 
+@lru_cache(maxsize=32)
+def _block_rays(camera: RigCamera, stride: int) -> Float32Array:
+    """(h / stride, w / stride, 3) unit vectors in the body, of the map's pixels."""
+    width, height = camera.camera.size
+    # A pixel of the map stands for the last one of its block: those are the ones that networks are trained on.
+    u, v = np.meshgrid(*(np.arange(stride, size + 1, stride) - 0.5 for size in (width, height)))
+    rays = camera.camera.rays(np.stack([u.ravel(), v.ravel()], 1)) @ camera.T_body_camera.rotation.T
+    return np.asarray(rays.reshape(*u.shape, 3), dtype=np.float32)
+
+
 def _draw(labels: UInt8Array, drones: Iterable[DroneLogits]) -> UInt8Array:
     """Each drone where its logit is above 0; a pixel of several is the one's with the highest."""
     drawn, highest = labels.copy(), np.zeros(labels.shape, np.float32)
@@ -147,7 +154,7 @@ def first_stage_labels(scene: SceneMaps, label_of: Mapping[int, int], rejected: 
     for instance in scene.instances:
         otherwise = 0 if instance in rejected else UNCLASSED
         table[instance.label] = label_of.get(instance.label, otherwise)
-    labels = table[scene.labels]
+    labels = np.asarray(cv2.LUT(scene.labels, table), np.uint8)
     if scene.uncertain is not None:
         labels[scene.uncertain & (labels > 0)] = UNCLASSED
     return labels

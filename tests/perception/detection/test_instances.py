@@ -60,3 +60,18 @@ def test_specks_are_dropped() -> None:
     labels, instances = group_instances(logit, offset, scale=2)
     assert instances == ()
     assert not labels.any()
+
+
+def test_a_dozen_drones_keep_their_own_pixels() -> None:
+    discs = [(30.0 + 50 * (i % 4), 30.0 + 50 * (i // 4), 6.0 + i) for i in range(12)]
+    logit, offset = painted((160, 220), discs)
+    v, u = np.mgrid[:160, :220] + 0.5
+    labels, instances = group_instances(logit, offset, scale=2)
+    assert len(instances) == 12
+    for instance, (cu, cv, radius) in zip(instances, reversed(discs), strict=True):  # the largest first
+        own = (u - cu) ** 2 + (v - cv) ** 2 < radius**2
+        assert np.array_equal(labels == instance.label, own)
+        assert instance.area_px == 4 * own.sum()
+        assert instance.centre.tolist() == [2 * cu, 2 * cv]
+        rows, columns = np.nonzero(own)
+        assert instance.box.tolist() == [2 * columns.min(), 2 * rows.min(), 2 * columns.max() + 2, 2 * rows.max() + 2]
