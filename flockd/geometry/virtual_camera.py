@@ -51,7 +51,7 @@ class VirtualCrop:
             drawn = _draw(images[name], where, self._minification(self.rig.cameras[name]))
             if seen.all():
                 return drawn, seen
-            crop[seen] = drawn[seen]
+            cv2.copyTo(drawn, seen.view(np.uint8), crop)
             valid |= seen
         return crop, valid
 
