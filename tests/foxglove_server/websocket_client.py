@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import struct
 from collections.abc import Callable
 from typing import Any, Self
@@ -78,10 +79,18 @@ class FoxgloveClient:
         if message["op"] == "serverInfo":
             self.server = message
         elif message["op"] == "status":
-            self.statuses.append(message)
+            refused = re.fullmatch(r"Unknown channel ID: (\d+)", message["message"])
+            if refused and int(refused[1]) in self._topics:
+                await asyncio.sleep(0.05)
+                await self._subscribe(int(refused[1]))
+            else:
+                self.statuses.append(message)
         elif message["op"] == "advertise":
             for channel in message["channels"]:
                 self.channels[channel["topic"]] = channel
                 self._topics[channel["id"]] = channel["topic"]
-                wanted = [{"id": channel["id"], "channelId": channel["id"]}]
-                await self.socket.send_json({"op": "subscribe", "subscriptions": wanted})
+                await self._subscribe(channel["id"])
+
+    async def _subscribe(self, channel: int) -> None:
+        """The server's library advertises a channel before it takes subscriptions to it, and refuses one too early."""
+        await self.socket.send_json({"op": "subscribe", "subscriptions": [{"id": channel, "channelId": channel}]})
