@@ -241,14 +241,14 @@ def _wheels(folder: Path) -> Path:
 
 def _empty(system: Path) -> None:
     """A Debian without flockd that runs the checks when it starts."""
-    for old in ("opt/flockd", "opt/fake-autopilot", "etc/flockd", "root/flockd", "root/wheels"):
+    for old in ("opt/flockd", "opt/fake-autopilot", "etc/flockd", "srv/flockd", "srv/wheels"):
         shutil.rmtree(system / old, ignore_errors=True)
     for old in ("usr/lib/sysusers.d/flockd.conf", "etc/systemd/system/flockd.service"):
         (system / old).unlink(missing_ok=True)
     (system / "etc/fstab").write_text(FSTAB, encoding="utf-8")
     (system / "etc/hostname").write_text("drone\n", encoding="utf-8")
     (system / "etc/hosts").write_text("127.0.0.1 localhost drone\n", encoding="utf-8")
-    (system / "etc/pip.conf").write_text("[global]\nno-index = true\nfind-links = /root/wheels\n", encoding="utf-8")
+    (system / "etc/pip.conf").write_text("[global]\nno-index = true\nfind-links = /srv/wheels\n", encoding="utf-8")
     (system / "etc/systemd/system/device-check.service").write_text(UNIT, encoding="utf-8")
     wanted = system / "etc/systemd/system/multi-user.target.wants/device-check.service"
     wanted.unlink(missing_ok=True)
@@ -257,8 +257,8 @@ def _empty(system: Path) -> None:
 
 def _install(system: Path, wheels: Path, install: str) -> None:
     """Runs the documentation's lines in the machine's files, as on a drone, but for where pip finds its packages."""
-    source, shelf = system / "root/flockd", system / "root/wheels"
-    source.mkdir()
+    source, shelf = system / "srv/flockd", system / "srv/wheels"
+    source.mkdir(0o700, parents=True)  # what is installed must not need it: the service cannot read it
     copy_sources(source)
     shutil.copytree(wheels, shelf)
     _inside(system, f"cd /{source.relative_to(system)}\n{install}")
@@ -270,10 +270,10 @@ def _install(system: Path, wheels: Path, install: str) -> None:
 
 def _install_fake_autopilot(system: Path, wheels: Path) -> None:
     """What it needs beyond flockd."""
-    shelf = system / "root/wheels"
+    shelf = system / "srv/wheels"
     shutil.copytree(wheels, shelf)
     install = f"pip install --quiet --no-compile --target /opt/fake-autopilot '{FAKE_AUTOPILOT}'"
-    _inside(system, f"python3 -m venv /root/pip\n/root/pip/bin/{install}\nrm -r /root/pip")
+    _inside(system, f"python3 -m venv /srv/pip\n/srv/pip/bin/{install}\nrm -r /srv/pip")
     shutil.rmtree(shelf)
 
 

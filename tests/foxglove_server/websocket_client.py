@@ -80,7 +80,7 @@ class FoxgloveClient:
             self.server = message
         elif message["op"] == "status":
             refused = re.fullmatch(r"Unknown channel ID: (\d+)", message["message"])
-            if refused and int(refused[1]) in self._topics:
+            if refused and int(refused[1]) in self._topics:  # advertised, but the server was not ready for it
                 await asyncio.sleep(0.05)
                 await self._subscribe(int(refused[1]))
             else:
@@ -92,5 +92,4 @@ class FoxgloveClient:
                 await self._subscribe(channel["id"])
 
     async def _subscribe(self, channel: int) -> None:
-        """The server's library advertises a channel before it takes subscriptions to it, and refuses one too early."""
         await self.socket.send_json({"op": "subscribe", "subscriptions": [{"id": channel, "channelId": channel}]})
