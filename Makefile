@@ -15,7 +15,7 @@ demo: $(VENV)/sim.installed ## fly the paper's flight in the simulator and write
 	$(BIN)/flockd sim
 
 docs: $(VENV)/docs.installed ## build the documentation as a site in out/site
-	$(BIN)/python -m tools.docs_reference
+	$(BIN)/python -m tools.docs.docs_reference
 	$(BIN)/mkdocs build --strict
 
 lint: $(VENV)/test.installed ## ruff and mypy
@@ -30,31 +30,31 @@ test-all: lint ## lint and all tests, those too that take minutes each
 	$(BIN)/python -m pytest -n 2
 
 browser: $(VENV)/test.installed ## the fleet page in a headless Chromium: /usr/bin/chromium, or what CHROMIUM names
-	$(BIN)/python -m pytest -m browser -rP tests/fleet_page
+	$(BIN)/python -m pytest -m browser -rP tests/fleet/page
 
 coverage: $(VENV)/test.installed ## which branches of the safety layer its tests take; fails below all of them
-	$(BIN)/python -m coverage run --branch --source=flockd/safety -m pytest tests/safety
+	$(BIN)/python -m coverage run --branch --source=flockd/flight/safety -m pytest tests/flight/safety
 	$(BIN)/python -m coverage report --show-missing --fail-under=100
 
 mutate: $(VENV)/test.installed ## try the safety layer's tests on a sample of its mutants, in about a minute
-	$(BIN)/python -m tools.mutate_safety --sample 60
+	$(BIN)/python -m tools.checks.mutate_safety --sample 60
 
 mutate-all: $(VENV)/test.installed ## try them on every mutant, in about a quarter of an hour
-	$(BIN)/python -m tools.mutate_safety
+	$(BIN)/python -m tools.checks.mutate_safety
 
-references: $(VENV)/test.installed ## write what the recorded flights of tests/replay are expected to give again
-	$(BIN)/python -m tools.record_regressions --only references
+references: $(VENV)/test.installed ## write what the recorded flights of tests/review/replay are expected to give again
+	$(BIN)/python -m tools.checks.record_regressions --only references
 
 deb: $(BIN)/pip ## build Debian packages for amd64 and arm64 in dist; SYSTEM=debian13 or ubuntu24.04 for others than Debian 12
-	$(BIN)/python -m tools.deb --arch amd64 --system $(SYSTEM) --out dist
-	$(BIN)/python -m tools.deb --arch arm64 --system $(SYSTEM) --out dist
+	$(BIN)/python -m tools.release.deb --arch amd64 --system $(SYSTEM) --out dist
+	$(BIN)/python -m tools.release.deb --arch arm64 --system $(SYSTEM) --out dist
 
 lock: $(VENV)/release.installed ## write requirements/service.txt again, with the newest versions that pyproject.toml permits
-	$(BIN)/python -m tools.lock
+	$(BIN)/python -m tools.release.lock
 
 sbom: $(VENV)/test.installed ## write the software bill of materials to out/flockd.cdx.json
-	$(BIN)/python -m tools.licences
-	$(BIN)/python -m tools.sbom
+	$(BIN)/python -m tools.release.licences
+	$(BIN)/python -m tools.release.sbom
 
 clean: ## delete the virtual environment and what was built
 	rm -rf $(VENV) build dist *.egg-info

@@ -15,7 +15,7 @@ class PermittedSkip:
     """Tests that may skip for one reason."""
 
     tests: str
-    """Shell pattern of their ids, such as `tests/daemon/*`."""
+    """Shell pattern of their ids, such as `tests/onboard/daemon/*`."""
     reason: str
     """Contained in what the test gives as its reason."""
     to_run: str
@@ -25,29 +25,37 @@ class PermittedSkip:
 PERMITTED = (
     PermittedSkip("tests/sitl/*", "FLOCKD_PX4 names no", "build PX4 SITL and name its build folder in FLOCKD_PX4"),
     PermittedSkip(
-        "tests/datasets/*",
+        "tests/ground/datasets/*",
         "FLOCKD_DATA does not name",
         "name in FLOCKD_DATA a folder that holds hololens/",
     ),
     PermittedSkip(
-        "tests/sources/*", "no virtual camera", "`modprobe vivid`, on a kernel that was built with CONFIG_VIDEO_VIVID"
+        "tests/onboard/sources/*",
+        "no virtual camera",
+        "`modprobe vivid`, on a kernel that was built with CONFIG_VIDEO_VIVID",
     ),
     PermittedSkip(
-        "tests/inference/*", "this computer can compute with CUDA", "install onnxruntime in place of onnxruntime-gpu"
+        "tests/flight/inference/*",
+        "this computer can compute with CUDA",
+        "install onnxruntime in place of onnxruntime-gpu",
     ),
-    PermittedSkip("tests/inference/*", "this computer has TensorRT", "install onnxruntime in place of onnxruntime-gpu"),
     PermittedSkip(
-        "tests/recording/*", "a small file system cannot be mounted", "run as root, where `mount -t tmpfs` is allowed"
+        "tests/flight/inference/*", "this computer has TensorRT", "install onnxruntime in place of onnxruntime-gpu"
     ),
-    PermittedSkip("tests/d*", "systemd-analyze is not here", "install systemd (tests of units in daemon and doctor)"),
-    PermittedSkip("tests/report/*", "chromium is not here", "install chromium"),
-    PermittedSkip("tests/telemetry/*", "openssl is not here", "install the openssl command"),
     PermittedSkip(
-        "tests/training/*",
+        "tests/onboard/recording/*",
+        "a small file system cannot be mounted",
+        "run as root, where `mount -t tmpfs` is allowed",
+    ),
+    PermittedSkip("tests/*/d*", "systemd-analyze is not here", "install systemd (tests of units in daemon and doctor)"),
+    PermittedSkip("tests/review/report/*", "chromium is not here", "install chromium"),
+    PermittedSkip("tests/onboard/telemetry/*", "openssl is not here", "install the openssl command"),
+    PermittedSkip(
+        "tests/tools/training/*",
         "this processor has 16-bit",
         "run on a processor without bfloat16 instructions",
     ),
-    PermittedSkip("tests/training/*", "its instructions are not known", "run on Linux on an x86 processor"),
+    PermittedSkip("tests/tools/training/*", "its instructions are not known", "run on Linux on an x86 processor"),
 )
 
 

@@ -1,4 +1,4 @@
-"""The folders of flockd keep to their places: who may import whom, and what stays pure."""
+"""The nine rooms of flockd, each standing on those below it, and what stays pure."""
 
 from __future__ import annotations
 
@@ -12,112 +12,14 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "flockd"
 
-BASE = {"choices", "messages", "config", "errors", "data", "earth", "printable"}
-"""Under everything: choices, nouns, the typed configuration, error types, the shipped files, how large a degree is,
-texts for a terminal."""
+ROOMS = ("core", "flight", "onboard", "fleet", "ground", "review", "sim", "campaign", "cli")
+"""From the ground up: a room imports itself and rooms below it."""
+FLIGHT = ("geometry", "inference", "tracking", "perception", "flocking", "safety", "obstacles", "mission", "pilot")
+"""The order inside `flight`. Mission and obstacles ask for the fence and the half planes of safety."""
+ONBOARD = ("autopilot", "telemetry", "sources", "recording", "daemon")
+"""The order inside `onboard`: frames may come over zenoh; recording asks telemetry for the table of topics."""
 
-MAY_IMPORT = {
-    "choices": set(),
-    "messages": set(),
-    "errors": set(),
-    "data": {"errors"},
-    "earth": set(),
-    "image_header": set(),
-    "preview": BASE | {"geometry"},
-    "printable": set(),
-    "zenoh_session": {"errors"},
-    "side_process": {"errors"},
-    "config": {"choices", "messages", "errors"},
-    "geometry": BASE,
-    "inference": BASE,
-    "perception": BASE | {"geometry", "inference", "tracking"},
-    "tracking": BASE | {"geometry"},
-    "flocking": BASE,
-    "safety": BASE,
-    "mission": BASE | {"safety"},  # for the fence
-    "obstacles": BASE | {"safety", "flocking"},
-    "worlds": BASE,
-    "control_level": BASE | {"flocking", "mission", "obstacles", "safety", "worlds"},  # neither renderer nor networks
-    "pilot": BASE
-    | {"obstacles"}
-    | {"geometry", "inference", "perception", "tracking", "flocking", "safety", "mission"},
-    "sources": BASE | {"zenoh_session", "image_header"},
-    "cameras": BASE | {"sources"},
-    "autopilot": BASE,
-    "telemetry": BASE | {"zenoh_session"},
-    "recording": BASE
-    | {"geometry", "telemetry", "image_header"},  # telemetry for the table of topics, which says what is recorded
-    "flight_log": BASE | {"geometry", "flocking", "mission", "perception", "pilot", "recording"},
-    "pictures": BASE | {"geometry", "inference", "perception", "datasets", "image_header"},
-    "calibration": BASE | {"geometry", "recording", "datasets", "sources", "perception", "pictures"},
-    "datasets": BASE | {"geometry", "image_header"},
-    "replay": BASE | {"geometry", "inference", "perception", "pilot", "recording", "datasets"},
-    "sim": BASE
-    | {
-        "geometry",
-        "inference",
-        "perception",
-        "tracking",
-        "flocking",
-        "mission",
-        "obstacles",
-        "safety",
-        "pilot",
-        "telemetry",
-        "recording",
-        "flight_log",
-        "side_process",
-        "worlds",
-    }
-    | {"sources", "autopilot"},  # real daemons are fed frames and given autopilots
-    "report": BASE | {"flocking", "flight_log", "side_process"},
-    "campaign": BASE | {"inference", "flocking", "flight_log", "side_process", "sim", "control_level", "report"},
-    "view": BASE | {"geometry", "perception", "pilot", "recording"},
-    "fleet_page": BASE | {"geometry", "preview", "telemetry", "recording"},
-    "foxglove_server": BASE
-    | {"geometry", "preview", "image_header", "telemetry", "recording", "fleet_page"},  # the page has the fleet's rows
-    "daemon": BASE
-    | {"obstacles", "preview"}
-    | {"geometry", "inference", "perception", "pilot", "safety", "sources", "autopilot", "telemetry", "recording"}
-    | {"mission"},
-    "doctor": BASE
-    | {"geometry", "inference", "perception", "pilot", "sources", "cameras", "autopilot", "telemetry", "daemon"},
-    "cli": BASE
-    | {
-        "inference",
-        "perception",
-        "pilot",
-        "telemetry",
-        "recording",
-        "flight_log",
-        "datasets",
-        "replay",
-        "sim",
-        "report",
-        "campaign",
-        "view",
-        "daemon",
-        "doctor",
-        "fleet_page",
-        "foxglove_server",
-    }
-    | {"calibration", "geometry", "sources", "cameras", "pictures"},
-}
-"""What each folder may import of the others."""
-
-PURE = (
-    "choices",
-    "messages",
-    "geometry",
-    "inference",
-    "perception",
-    "tracking",
-    "flocking",
-    "safety",
-    "pilot",
-    "mission",
-    "obstacles",
-)
+PURE_ROOMS = ("flight", "core/messages.py", "core/choices.py")
 """No clock, no socket, no thread, no environment: what is tested is what flies."""
 IMPURE_MODULES = {
     "asyncio",
@@ -154,116 +56,114 @@ def _imports(path: Path) -> frozenset[str]:
     return frozenset(found)
 
 
-def _folder(path: Path) -> str:
-    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+def _place(path: Path) -> tuple[str, ...]:
+    """The room, and what is in it: ("flight", "safety", "gate")."""
+    return path.relative_to(PACKAGE).with_suffix("").parts
 
 
-def _imported_folders(path: Path) -> set[str]:
-    parts = [name.split(".") for name in _imports(path) if name.startswith("flockd.")]
-    return {names[1] for names in parts if names[1] != "__version__"}
+def _room(path: Path) -> str:
+    return _place(path)[0]
+
+
+def _taken(path: Path) -> list[list[str]]:
+    """The modules of flockd that a file imports, without `flockd`: ["flight", "safety", "gate"]."""
+    return [name.split(".")[1:] for name in _imports(path) if name.startswith("flockd.") and "__version__" not in name]
 
 
 def _libraries(path: Path) -> set[str]:
     return {name.partition(".")[0] for name in _imports(path)}
 
 
-MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
+MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.parent != PACKAGE)
 
 
-def test_every_folder_has_its_place_in_the_table() -> None:
-    assert {_folder(path) for path in MODULES} <= MAY_IMPORT.keys()
+def _of(*places: str) -> list[Path]:
+    """The modules of rooms, folders or files; every place has to be there."""
+    found = [path for place in places for path in MODULES if path.is_relative_to(PACKAGE / place)]
+    assert all((PACKAGE / place).exists() for place in places)
+    return found
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_a_module_imports_only_what_its_folder_may(path: Path) -> None:
-    folder = _folder(path)
-    assert _imported_folders(path) <= MAY_IMPORT[folder] | {folder}
+def test_there_are_nine_rooms() -> None:
+    assert {_room(path) for path in MODULES} == set(ROOMS)
 
 
-@pytest.mark.parametrize("folder", PURE)
-def test_the_pure_line_knows_no_clock_no_thread_and_no_network(folder: str) -> None:
-    for path in (path for path in MODULES if _folder(path) == folder):
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_room_imports_only_rooms_below_it(room: str) -> None:
+    below = ROOMS[: ROOMS.index(room) + 1]
+    for path in _of(room):
+        assert {names[0] for names in _taken(path)} <= set(below), path
+
+
+@pytest.mark.parametrize(("room", "order"), [("flight", FLIGHT), ("onboard", ONBOARD)])
+def test_what_flies_stands_in_one_order(room: str, order: tuple[str, ...]) -> None:
+    for path in _of(*(f"{room}/{folder}" for folder in order)):
+        below = set(order[: order.index(_place(path)[1]) + 1])
+        used = {names[1] for names in _taken(path) if names[0] == room and len(names) > 1}
+        assert used & set(order) <= below, path
+
+
+def test_the_pure_line_knows_no_clock_no_thread_and_no_network() -> None:
+    for path in _of(*PURE_ROOMS):
         assert not _libraries(path) & IMPURE_MODULES, path
         assert "environ" not in path.read_text(encoding="utf-8"), path
         assert "getenv" not in path.read_text(encoding="utf-8"), path
 
 
 def test_only_inference_runs_networks() -> None:
-    for path in MODULES:
-        if _folder(path) != "inference":
-            assert not _libraries(path) & NETWORK_LIBRARIES, path
+    for path in set(MODULES) - set(_of("flight/inference")):
+        assert not _libraries(path) & NETWORK_LIBRARIES, path
 
 
 def test_what_flies_needs_none_of_the_simulators_libraries() -> None:
     for path in MODULES:
-        if _folder(path) not in {"sim", "report", "control_level", "campaign"}:
+        if _room(path) not in {"sim", "campaign"} and _place(path)[:2] != ("review", "report"):
             assert not _libraries(path) & SIMULATOR_LIBRARIES, path
         assert not _libraries(path) & TOOL_LIBRARIES, path
 
 
-ZENOH_SESSION = PACKAGE / "zenoh_session.py"
+ZENOH_SESSION = PACKAGE / "onboard" / "telemetry" / "zenoh_session.py"
 """Opens and closes sessions, whatever goes through them."""
-FRAMES_OVER_ZENOH = PACKAGE / "sources" / "shared_memory.py"
+FRAMES_OVER_ZENOH = PACKAGE / "onboard" / "sources" / "shared_memory.py"
 """A drone's own camera frames may come over zenoh, under keys that no telemetry has."""
-WATCHER = PACKAGE / "telemetry" / "watcher.py"
-"""Reads telemetry, for the commands that people run."""
-OPERATOR = PACKAGE / "telemetry" / "operator_client.py"
-"""Sends what operators ask, for the commands that people run."""
-FLEET_STATUS = PACKAGE / "telemetry" / "fleet_status.py"
-"""The table of `flockd status`."""
-REPLIES = PACKAGE / "telemetry" / "publisher.py"
-"""Replies to queries; what it lets an operator ask says nothing of where another drone is."""
+ZENOH_READERS = {
+    "declare_subscriber": {FRAMES_OVER_ZENOH, PACKAGE / "fleet" / "watcher.py"},
+    "declare_queryable": {PACKAGE / "onboard" / "telemetry" / "publisher.py"},
+    "declare_querier": set[Path](),
+}
+"""Replies to queries; what an operator may ask says nothing of where another drone is."""
 
 
 @pytest.mark.parametrize(
     ("library", "adapters"),
     [
-        ("mavsdk", ["autopilot/mavsdk_link.py"]),
-        (
-            "pymavlink",
-            [f"autopilot/fake_{what}.py" for what in ("autopilot", "checks", "telemetry")] + ["sim/ground_station.py"],
-        ),
-        ("pyulog", ["flight_log/ulog.py"]),
-        ("joblib", ["campaign/process_engine.py"]),
-        ("ray", ["campaign/ray_engine.py"]),
-        (
-            "foxglove",
-            [
-                f"foxglove_server/{what}.py"
-                for what in ("camera_messages", "fleet_channels", "fleet_publisher", "map_places", "scene_messages")
-            ]
-            + ["foxglove_server/server.py", "foxglove_server/time_line.py"],
-        ),
-        ("rerun", ["view/flock_file.py", "view/rerun_file.py"]),
+        ("mavsdk", {"onboard/autopilot/mavsdk_link.py"}),
+        ("pymavlink", {"sim/autopilot", "sim/ground_station.py"}),
+        ("pyulog", {"review/flight_log/ulog.py"}),
+        ("joblib", {"campaign/process_engine.py"}),
+        ("ray", {"campaign/ray_engine.py"}),
+        ("foxglove", {"fleet/foxglove"}),
+        ("rerun", {"review/view/flock_file.py", "review/view/rerun_file.py"}),
     ],
 )
-def test_an_outside_library_sits_behind_its_adapters(library: str, adapters: list[str]) -> None:
-    assert [path for path in MODULES if library in _libraries(path)] == [PACKAGE / adapter for adapter in adapters]
+def test_an_outside_library_sits_behind_its_adapters(library: str, adapters: set[str]) -> None:
+    users = {path for path in MODULES if library in _libraries(path)}
+    assert users
+    assert users <= set(_of(*adapters))
 
 
 def test_no_drone_reads_telemetry_to_fly() -> None:
-    """Telemetry can be published; to read it is for the commands of people, and nothing that flies imports that."""
-    from flockd.sources import shared_memory
-    from flockd.telemetry.topics import PREFIX
+    """Telemetry can be published; to read it is for people, in `fleet`, which nothing that flies imports."""
+    from flockd.onboard.sources import shared_memory
+    from flockd.onboard.telemetry.topics import PREFIX
 
     assert not shared_memory.PREFIX.startswith(f"{PREFIX.split('/')[0]}/")
-    readers = {
-        "declare_subscriber": {FRAMES_OVER_ZENOH, WATCHER},
-        "declare_queryable": {REPLIES},
-        "declare_querier": set(),
-    }
     for path in MODULES:
-        if _folder(path) != "telemetry" and path not in {FRAMES_OVER_ZENOH, ZENOH_SESSION}:
+        if path not in {FRAMES_OVER_ZENOH, *_of("onboard/telemetry", "fleet", "sim/repeater.py")}:
             assert "zenoh" not in _libraries(path), path
         text = path.read_text(encoding="utf-8")
-        for word, allowed in readers.items():
+        for word, allowed in ZENOH_READERS.items():
             assert word not in text or path in allowed, path
-        if _folder(path) not in {"cli", "doctor", "fleet_page", "foxglove_server"} and path != FLEET_STATUS:
-            assert "flockd.telemetry.watcher" not in _imports(path), path
-        if _folder(path) != "cli":
-            assert "flockd.telemetry.operator_client" not in _imports(path), path
-        if path not in {WATCHER, OPERATOR} and _folder(path) != "fleet_page":
-            assert "flockd.telemetry.drone_queries" not in _imports(path), path
 
 
 def test_one_file_opens_and_closes_sessions() -> None:
@@ -274,45 +174,22 @@ def test_one_file_opens_and_closes_sessions() -> None:
         assert "session.close" not in text, path
 
 
-def test_reports_and_flight_logs_know_no_simulator() -> None:
-    """A report of a recording needs no simulator: all three meet in the flight log."""
-    assert {"report", "sim"}.isdisjoint(MAY_IMPORT["flight_log"])
-    assert "sim" not in MAY_IMPORT["report"]
-    for path in (path for path in MODULES if _folder(path) in {"report", "flight_log"}):
-        assert "sim" not in _imported_folders(path), path
-        assert _folder(path) == "report" or "report" not in _imported_folders(path), path
-
-
 def test_no_drone_gets_the_truth() -> None:
     """A simulator records where everybody truly is, for those who examine recordings; a pilot gets its own senses."""
-    from flockd.pilot import FlockPilot
+    from flockd.flight.pilot import FlockPilot
 
-    for path in MODULES:
-        if _folder(path) not in {"sim", "recording", "flight_log", "view"}:
-            assert "flockd.recording.truth" not in _imports(path), path
+    for path in set(MODULES) - set(_of("sim", "onboard/recording", "review")):
+        assert "flockd.onboard.recording.truth" not in _imports(path), path
     assert list(inspect.signature(FlockPilot.step).parameters) == ["self", "frames", "vehicle", "trace", "order"]
 
 
 def test_the_doctor_sees_of_the_daemon_what_everybody_sees() -> None:
-    import flockd.daemon
+    import flockd.onboard.daemon
 
-    public = {"flockd.daemon", *(f"flockd.daemon.{name}" for name in flockd.daemon.__all__)}
-    for path in (path for path in MODULES if _folder(path) == "doctor"):
-        assert {name for name in _imports(path) if name.startswith("flockd.daemon")} <= public, path
-
-
-def test_inference_knows_no_drones() -> None:
-    """It runs ONNX files as their manifests say; what a network is for is perception's."""
-    assert {"perception", "geometry", "tracking", "pilot"}.isdisjoint(
-        folder for path in MODULES if _folder(path) == "inference" for folder in _imported_folders(path)
-    )
-
-
-def test_nothing_imports_the_commands() -> None:
-    """Library code does not live in cli; only the entry point of the package may call it."""
-    for path in MODULES:
-        if _folder(path) != "cli" and path != PACKAGE / "__main__.py":
-            assert "cli" not in _imported_folders(path), path
+    name = "flockd.onboard.daemon"
+    public = {name, *(f"{name}.{part}" for part in flockd.onboard.daemon.__all__)}
+    for path in _of("ground/doctor"):
+        assert {taken for taken in _imports(path) if taken.startswith(name)} <= public, path
 
 
 FILES_OF_ONE_NAME = {
@@ -325,5 +202,5 @@ FILES_OF_ONE_NAME = {
 
 
 def test_no_two_files_have_one_name_and_different_meaning() -> None:
-    names = Counter(path.name for path in MODULES if _folder(path) != "cli")
+    names = Counter(path.name for path in MODULES if _room(path) != "cli")
     assert {name for name, count in names.items() if count > 1} <= FILES_OF_ONE_NAME.keys()

@@ -50,11 +50,11 @@ def test_a_permitted_skip_is_counted_with_the_way_to_run_it(options: tuple[str, 
 def test_a_permitted_reason_is_so_for_its_own_tests_only() -> None:
     reason = "Skipped: FLOCKD_PX4 names no SITL build folder of PX4"
     assert permitted("tests/sitl/test_fleet.py::test_px4[1]", reason) is not None
-    assert permitted("tests/safety/test_gate.py::test_px4", reason) is None
+    assert permitted("tests/flight/safety/test_gate.py::test_px4", reason) is None
     assert permitted("tests/sitl/test_fleet.py::test_px4[1]", "Skipped: MAVSDK does not load") is None
 
 
 def test_every_permitted_reason_is_one_that_a_test_gives() -> None:
-    tests = [path.read_text(encoding="utf-8") for path in (ROOT / "tests").glob("*/test_*.py")]
+    tests = [path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py")]
     unused = [entry.reason for entry in PERMITTED if not any(entry.reason in text for text in tests)]
     assert unused == []

@@ -16,8 +16,8 @@ from flockd.campaign.flight_plan import CASE
 from flockd.campaign.intervals import mean_interval
 from flockd.campaign.results import Results
 from flockd.campaign.verdicts import Comparison
-from flockd.config.campaign import Figure as FigureName
-from flockd.report.style import BAND, DRONE_COLOURS, INK, MUTED, STYLE
+from flockd.core.config.campaign import Figure as FigureName
+from flockd.review.report.style import BAND, DRONE_COLOURS, INK, MUTED, STYLE
 
 BINS: Final = 8
 """Of what each flight draws: flights with neighbouring values are taken together."""

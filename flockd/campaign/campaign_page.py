@@ -23,8 +23,8 @@ from flockd.campaign.intervals import Interval
 from flockd.campaign.results import Results, Row
 from flockd.campaign.schedule import is_known
 from flockd.campaign.verdicts import LEVEL, Comparison, Verdict
-from flockd.report.figure_files import inline_svg
-from flockd.report.templates import page_template
+from flockd.review.report.figure_files import inline_svg
+from flockd.review.report.templates import page_template
 
 MOST_ROWS = 200
 """Of a table; the Parquet files have all."""

@@ -9,10 +9,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from flockd.config.campaign import Figure
-from flockd.flight_log.log import FlightLog
-from flockd.messages import FloatArray
-from flockd.report.summary import TAIL_S, estimation_errors, objective_sums, summarise
+from flockd.core.config.campaign import Figure
+from flockd.core.messages import FloatArray
+from flockd.review.flight_log.log import FlightLog
+from flockd.review.report.summary import TAIL_S, estimation_errors, objective_sums, summarise
 
 Figures = dict[Figure, float | None]
 
@@ -59,7 +59,7 @@ def _distance_error(percentile: float) -> Callable[[FlightLog, dict[str, Any]], 
 
 
 def _of_control_level(_: FlightLog, __: dict[str, Any]) -> None:
-    """Nothing: only `flockd.control_level` has this figure."""
+    """Nothing: only `flockd.sim.control_level` has this figure."""
 
 
 MEASURES: dict[Figure, Measure] = {

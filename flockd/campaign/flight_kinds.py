@@ -15,13 +15,13 @@ from functools import lru_cache
 from flockd.campaign.figures import Figures, figures_of
 from flockd.campaign.flight_plan import ControlLevel, Run
 from flockd.campaign.recipe import Recipe
-from flockd.choices import SimulatedPerception
-from flockd.config import ScenarioConfig
-from flockd.config.campaign import Figure, FlightKindName
-from flockd.config.perception import PerceptionConfig
-from flockd.control_level import fly_flocks
-from flockd.errors import FlockdError
-from flockd.inference.hashes import model_hashes
+from flockd.core.choices import SimulatedPerception
+from flockd.core.config import ScenarioConfig
+from flockd.core.config.campaign import Figure, FlightKindName
+from flockd.core.config.perception import PerceptionConfig
+from flockd.core.errors import FlockdError
+from flockd.flight.inference.hashes import model_hashes
+from flockd.sim.control_level import fly_flocks
 from flockd.sim.swarm import fly
 
 Fly = Callable[[Sequence[ScenarioConfig], Sequence[Figure], ControlLevel], Sequence[Figures]]

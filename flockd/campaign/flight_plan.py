@@ -17,16 +17,16 @@ from pydantic import ValidationError
 
 from flockd import __version__
 from flockd.campaign.recipe import Recipe, Values, merged
-from flockd.choices import ROLES
-from flockd.config import CampaignConfig, ScenarioConfig, load_campaign, load_with_places
-from flockd.config.campaign import DRONES, MAX_CONTROL_DRONES, Figure, Variation
-from flockd.config.document import KeyPath, Place
-from flockd.config.loader import PATHS, load_perceived_errors
-from flockd.config.perceived import PerceivedErrors
-from flockd.config.scenario import MAX_DRONES
-from flockd.config.validation_messages import problems_of
-from flockd.errors import ConfigError, ConfigProblem, UsageError
-from flockd.inference.hashes import model_hashes
+from flockd.core.choices import ROLES
+from flockd.core.config import CampaignConfig, ScenarioConfig, load_campaign, load_with_places
+from flockd.core.config.campaign import DRONES, MAX_CONTROL_DRONES, Figure, Variation
+from flockd.core.config.document import KeyPath, Place
+from flockd.core.config.loader import PATHS, load_perceived_errors
+from flockd.core.config.perceived import PerceivedErrors
+from flockd.core.config.scenario import MAX_DRONES
+from flockd.core.config.validation_messages import problems_of
+from flockd.core.errors import ConfigError, ConfigProblem, UsageError
+from flockd.flight.inference.hashes import model_hashes
 
 CASE = "case"
 """The parameter whose values are the names of `cases`."""

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from flockd import __version__
 from flockd.campaign.flight_kinds import FlownRun
 from flockd.campaign.flight_plan import CASE, Plan, values_of
-from flockd.errors import UnavailableError
+from flockd.core.errors import UnavailableError
 
 _TIMINGS: dict[str, Any] = {
     "wall_s": pa.float64(),

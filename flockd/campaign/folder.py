@@ -21,7 +21,7 @@ from flockd.campaign.differences import differences
 from flockd.campaign.flight_kinds import FlownRun
 from flockd.campaign.flight_plan import Plan, Run
 from flockd.campaign.flight_table import FlightTable, read_table, sync_folder, write_table
-from flockd.errors import UsageError
+from flockd.core.errors import UsageError
 
 PLAN_NAME = "campaign.json"
 FLIGHTS_NAME = "flights.parquet"

@@ -16,7 +16,7 @@ from joblib.externals.loky import ProcessPoolExecutor
 from flockd.campaign.engines import MAX_TRIES, ONE_THREAD, Flown, ended
 from flockd.campaign.flight_kinds import Task, fly_task
 from flockd.campaign.flight_plan import Run
-from flockd.side_process import with_package
+from flockd.core.side_process import with_package
 from flockd.sim.bound_to_parent import bind
 
 _QUEUED = 2

@@ -12,8 +12,8 @@ from ray.exceptions import RayError
 
 from flockd.campaign.engines import MAX_TRIES, ONE_THREAD, Flown, ended
 from flockd.campaign.flight_kinds import Task, fly_task
-from flockd.errors import UnavailableError
-from flockd.side_process import with_package
+from flockd.core.errors import UnavailableError
+from flockd.core.side_process import with_package
 
 _QUEUED = 2
 """Tasks for each processor of the cluster: one that it flies, and one that it goes on with."""

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from flockd.config import ScenarioConfig
-from flockd.config.campaign import DRONES
+from flockd.core.config import ScenarioConfig
+from flockd.core.config.campaign import DRONES
 from flockd.sim.start import scattered, with_drones
 
 Values = dict[str, Any]

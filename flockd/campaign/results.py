@@ -17,8 +17,8 @@ from flockd.campaign.flight_plan import Plan
 from flockd.campaign.flight_table import read_table
 from flockd.campaign.folder import FLIGHTS_NAME, TIMINGS_NAME, load_plan
 from flockd.campaign.intervals import Interval, mean_interval
-from flockd.config.campaign import Figure
-from flockd.errors import UsageError
+from flockd.core.config.campaign import Figure
+from flockd.core.errors import UsageError
 
 Row = Mapping[str, Any]
 Seeds = dict[int, float]

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from flockd.campaign.figures import MEASURES
 from flockd.campaign.flight_plan import Plan, Run
 from flockd.campaign.intervals import mean_interval
-from flockd.config.campaign import StopRule
+from flockd.core.config.campaign import StopRule
 
 
 class Schedule:

@@ -15,10 +15,10 @@ from flockd.campaign.figures import MEASURES
 from flockd.campaign.intervals import Interval, mean_interval
 from flockd.campaign.recipe import merged
 from flockd.campaign.results import Results
-from flockd.config import ScenarioConfig
-from flockd.config.campaign import DRONES, Figure
-from flockd.errors import UsageError
-from flockd.messages import BoolArray, FloatArray
+from flockd.core.config import ScenarioConfig
+from flockd.core.config.campaign import DRONES, Figure
+from flockd.core.errors import UsageError
+from flockd.core.messages import BoolArray, FloatArray
 
 LEVEL = 0.05
 """Of all figures together: so often one at most is called different where none is."""

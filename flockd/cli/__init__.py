@@ -28,7 +28,7 @@ from flockd.cli import (
 )  # fmt: skip
 from flockd.cli.output import complain
 from flockd.cli.parser import Parser, add_commands
-from flockd.errors import ExitCode, FlockdError, UnavailableError, shortage_of
+from flockd.core.errors import ExitCode, FlockdError, UnavailableError, shortage_of
 
 # Packages of an extra: without them a command is unavailable, not broken.
 EXTRAS = {

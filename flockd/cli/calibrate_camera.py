@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from flockd.choices import LENS_MODELS, PixelFormat
 from flockd.cli.calibrate_options import (
     add_shared,
     board_of,
@@ -21,13 +20,14 @@ from flockd.cli.config import loaded
 from flockd.cli.output import complain, progress, say, say_json
 from flockd.cli.parser import Commands, positive_count, positive_number
 from flockd.cli.recording_options import opened
-from flockd.errors import ExitCode, UsageError
+from flockd.core.choices import LENS_MODELS, PixelFormat
+from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.calibration.board import BoardSpec
-    from flockd.calibration.image_sources import ImageStream
-    from flockd.calibration.views import Collector
-    from flockd.config import DroneConfig
+    from flockd.core.config import DroneConfig
+    from flockd.ground.calibration.board import BoardSpec
+    from flockd.ground.calibration.image_sources import ImageStream
+    from flockd.ground.calibration.views import Collector
 
 MOST_VIEWS = 60
 NAMED = 6
@@ -71,11 +71,11 @@ def _camera(args: argparse.Namespace) -> int:
     board = board_of(args)
     if args.print_board is not None:
         return _print_board(args, board)
-    from flockd.calibration.board import BoardFinder
-    from flockd.calibration.fragment import measured_today
-    from flockd.calibration.intrinsics import simplest_that_fits
-    from flockd.calibration.lens_session import CalibratedLens, collect_views, fit_lenses, is_enough
-    from flockd.calibration.views import Collector
+    from flockd.ground.calibration.board import BoardFinder
+    from flockd.ground.calibration.fragment import measured_today
+    from flockd.ground.calibration.intrinsics import simplest_that_fits
+    from flockd.ground.calibration.lens_session import CalibratedLens, collect_views, fit_lenses, is_enough
+    from flockd.ground.calibration.views import Collector
 
     collector = Collector(BoardFinder(board), args.views, args.max_blur)
     name, images = _images(args, lambda: is_enough(collector))
@@ -102,9 +102,9 @@ def _camera(args: argparse.Namespace) -> int:
 
 
 def _print_board(args: argparse.Namespace, board: BoardSpec) -> int:
-    from flockd.calibration.errors import CalibrationError
-    from flockd.calibration.paper import board_file, page_of
-    from flockd.recording.editing import written_whole
+    from flockd.ground.calibration.errors import CalibrationError
+    from flockd.ground.calibration.paper import board_file, page_of
+    from flockd.onboard.recording.editing import written_whole
 
     file: Path = args.print_board
     refuse_overwriting(args, file)
@@ -126,8 +126,8 @@ def _print_board(args: argparse.Namespace, board: BoardSpec) -> int:
 
 def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, ImageStream]:
     """Of the one camera that is meant, and its name."""
-    from flockd.calibration import image_sources
-    from flockd.datasets.video import SUFFIXES
+    from flockd.ground.calibration import image_sources
+    from flockd.ground.datasets.video import SUFFIXES
 
     config = loaded(args.config)
     path = None if args.source is None else Path(args.source)

@@ -12,13 +12,13 @@ from flockd.cli.output import progress, say, say_json
 from flockd.cli.parser import Commands, positive_count, positive_number
 from flockd.cli.picture_options import PictureCameras, add_picture_options, detector_of, perception_of
 from flockd.cli.recording_options import opened
-from flockd.errors import ExitCode, UsageError
+from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.calibration.drone_size import DroneSize, Photograph
-    from flockd.config import DroneConfig
-    from flockd.geometry import Camera
-    from flockd.messages import UInt8Array
+    from flockd.core.config import DroneConfig
+    from flockd.core.messages import UInt8Array
+    from flockd.flight.geometry import Camera
+    from flockd.ground.calibration.drone_size import DroneSize, Photograph
 
     Taken = tuple[str, float, UInt8Array, Camera]
     """A picture's name, its distance in metres, the image and its camera."""
@@ -55,8 +55,8 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from flockd.calibration.drone_size import fit_size
-    from flockd.recording.editing import written_whole
+    from flockd.ground.calibration.drone_size import fit_size
+    from flockd.onboard.recording.editing import written_whole
 
     out = args.out or Path("drone_size.yaml")
     refuse_overwriting(args, out)
@@ -72,7 +72,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _distances(args: argparse.Namespace) -> list[tuple[float, Path]]:
-    from flockd.calibration.distances import MAX_DISTANCE_M, read_distances
+    from flockd.ground.calibration.distances import MAX_DISTANCE_M, read_distances
 
     if (args.source is None) == (not args.distance):
         raise UsageError("name the pictures and their distances, either in a YAML file or with --distance M PICTURE...")
@@ -94,7 +94,7 @@ def _distances(args: argparse.Namespace) -> list[tuple[float, Path]]:
 
 def _photographs(args: argparse.Namespace, distances: Sequence[tuple[float, Path]]) -> Iterator[Photograph]:
     """With what is detected in each picture, of unknown size."""
-    from flockd.calibration.drone_size import Photograph, SizeCandidate
+    from flockd.ground.calibration.drone_size import Photograph, SizeCandidate
 
     recordings = [path for _, path in distances if path.suffix == RECORDING]
     cameras = None
@@ -120,7 +120,7 @@ def _photographs(args: argparse.Namespace, distances: Sequence[tuple[float, Path
 def _taken(
     args: argparse.Namespace, distances: Sequence[tuple[float, Path]], cameras: PictureCameras | None
 ) -> Iterator[Taken]:
-    from flockd.pictures import find_pictures
+    from flockd.ground.pictures import find_pictures
 
     for distance_m, path in distances:
         if path.suffix == RECORDING:
@@ -136,7 +136,7 @@ def _of_recording(
     args: argparse.Namespace, distance_m: float, path: Path, config: DroneConfig | None
 ) -> Iterator[Taken]:
     """Frames of every camera, or of --camera."""
-    from flockd.geometry import build_rig
+    from flockd.flight.geometry import build_rig
 
     recording = opened(path)
     rig = build_rig((config or recording.config).rig)

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli.parser import Parser, positive_count, positive_number
-from flockd.errors import UsageError
+from flockd.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from flockd.calibration.board import BoardSpec
+    from flockd.ground.calibration.board import BoardSpec
 
 SECONDS = 120.0
 MARKER_SHARE = 0.75
@@ -44,8 +44,8 @@ def pair(text: str) -> tuple[int, int]:
 
 def board_of(args: argparse.Namespace) -> BoardSpec:
     """The board of the options. Raises UsageError for one that cannot be."""
-    from flockd.calibration.board import BoardSpec
-    from flockd.calibration.errors import CalibrationError
+    from flockd.ground.calibration.board import BoardSpec
+    from flockd.ground.calibration.errors import CalibrationError
 
     square_m = args.square_mm / 1000.0
     marker_m = args.marker_mm / 1000.0 if args.marker_mm else MARKER_SHARE * square_m

@@ -18,12 +18,12 @@ from flockd.cli.config import loaded
 from flockd.cli.output import complain, progress, say, say_json
 from flockd.cli.parser import Commands, positive_number
 from flockd.cli.recording_options import opened
-from flockd.errors import ExitCode, UsageError
+from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.calibration.image_sources import ImageStream
-    from flockd.calibration.rig_session import RigSession
-    from flockd.config import DroneConfig
+    from flockd.core.config import DroneConfig
+    from flockd.ground.calibration.image_sources import ImageStream
+    from flockd.ground.calibration.rig_session import RigSession
 
 MAX_OFFSET_S = 0.3
 
@@ -61,8 +61,8 @@ def _rig(args: argparse.Namespace) -> int:
 
 
 def _by_board(args: argparse.Namespace, out: Path) -> int:
-    from flockd.calibration.board import BoardFinder
-    from flockd.calibration.shared import SharedCollector
+    from flockd.ground.calibration.board import BoardFinder
+    from flockd.ground.calibration.shared import SharedCollector
 
     session = _session(args)
     names = [camera.name for camera in session.config.rig.cameras]
@@ -89,7 +89,7 @@ def _by_motion(args: argparse.Namespace, out: Path) -> int:
 
 
 def _session(args: argparse.Namespace) -> RigSession:
-    from flockd.calibration.rig_session import RigSession
+    from flockd.ground.calibration.rig_session import RigSession
 
     config, images = _images(args)
     return RigSession(config, str(args.config or args.source), source_name(args), images)
@@ -97,7 +97,7 @@ def _session(args: argparse.Namespace) -> RigSession:
 
 def _images(args: argparse.Namespace) -> tuple[DroneConfig, ImageStream]:
     """And the drone they are of: that of --config before that of the recording."""
-    from flockd.calibration import image_sources
+    from flockd.ground.calibration import image_sources
 
     config = loaded(args.config)
     path = None if args.source is None else Path(args.source)

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 from flockd.cli.config_new import image_size
 from flockd.cli.output import cell, complain, say, say_json
 from flockd.cli.parser import Commands, positive_number
-from flockd.errors import ExitCode, UnavailableError, UsageError
+from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
-    from flockd.cameras.found import FoundCamera, Mode
-    from flockd.cameras.listing import Computer
-    from flockd.cameras.measuring import Measured
+    from flockd.ground.cameras.found import FoundCamera, Mode
+    from flockd.ground.cameras.listing import Computer
+    from flockd.ground.cameras.measuring import Measured
 
 SECONDS = 4.0
 NONE_FOUND = (
@@ -50,14 +50,14 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from flockd.cameras.listing import Computer
+    from flockd.ground.cameras.listing import Computer
 
     return run(args, Computer())
 
 
 def run(args: argparse.Namespace, computer: Computer) -> int:
     """The command on a computer."""
-    from flockd.cameras.listing import list_cameras
+    from flockd.ground.cameras.listing import list_cameras
 
     if args.write is not None and args.write.exists() and not args.force:
         raise UsageError(f"{args.write} exists; name another file, or overwrite it with --force")
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace, computer: Computer) -> int:
     usable = [(camera, mode) for camera, mode in zip(found, modes, strict=True) if mode is not None]
     measured: dict[str, Measured] = {}
     if args.measure or args.picture is not None:
-        from flockd.cameras.measuring import measure
+        from flockd.ground.cameras.measuring import measure
 
         complain(f"measuring {len(usable)} cameras for {args.seconds:g} s")
         rows = measure(usable, args.seconds, computer.kernel)
@@ -85,9 +85,9 @@ def run(args: argparse.Namespace, computer: Computer) -> int:
 
 
 def _write(file: Path, usable: Sequence[tuple[FoundCamera, Mode]], names: Sequence[str] | None) -> None:
-    from flockd.cameras.sections import sections_text
     from flockd.cli.config_new import write_checked
-    from flockd.config.new_files import camera_names
+    from flockd.core.config.new_files import camera_names
+    from flockd.ground.cameras.sections import sections_text
 
     if not usable:
         raise UsageError(f"{file} was not written, as no camera can be used; see what is wrong with each above")
@@ -99,7 +99,7 @@ def _write(file: Path, usable: Sequence[tuple[FoundCamera, Mode]], names: Sequen
 
 def _save_pictures(folder: Path, found: Sequence[FoundCamera], measured: Mapping[str, Measured]) -> dict[str, Path]:
     """By the camera's place."""
-    from flockd.cameras.measuring import as_png
+    from flockd.ground.cameras.measuring import as_png
 
     folder.mkdir(parents=True, exist_ok=True)
     saved = {}

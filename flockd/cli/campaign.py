@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.output import Phases, complain, say, say_json
 from flockd.cli.parser import Commands, add_commands, positive_count
-from flockd.errors import ExitCode, UsageError
+from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from flockd.campaign.flight_plan import Plan
@@ -147,8 +147,8 @@ def _rerun(args: argparse.Namespace) -> int:
     from flockd.campaign.flight_plan import Run
     from flockd.campaign.folder import RERUNS, load_plan
     from flockd.cli.flight_summary import report_flight
-    from flockd.config.scenario import MAX_DRONES
-    from flockd.report.flight_folder import prepare_folder
+    from flockd.core.config.scenario import MAX_DRONES
+    from flockd.review.report.flight_folder import prepare_folder
     from flockd.sim.swarm import fly
 
     folder, name = args.flight.parent, args.flight.name

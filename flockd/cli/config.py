@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 from flockd.cli import config_new
 from flockd.cli.output import say, say_json
 from flockd.cli.parser import Commands, add_commands
-from flockd.errors import ConfigError, ConfigProblem, ExitCode, ModelError
+from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, ModelError
 
 if TYPE_CHECKING:
-    from flockd.config import DroneConfig
+    from flockd.core.config import DroneConfig
 
 
 def add(commands: Commands) -> None:
@@ -74,9 +74,9 @@ def _check(args: argparse.Namespace) -> int:
 
 def _check_file(file: Path) -> None:
     """Raises ConfigError for what is wrong with the file, and for models that it names and that are not there."""
-    from flockd.config import ScenarioConfig, load_with_places
-    from flockd.config.document import KeyPath
-    from flockd.inference.manifest_file import find_manifests, manifest_path, models_folder, read_manifest
+    from flockd.core.config import ScenarioConfig, load_with_places
+    from flockd.core.config.document import KeyPath
+    from flockd.flight.inference.manifest_file import find_manifests, manifest_path, models_folder, read_manifest
 
     config, places = load_with_places(file)
     section: KeyPath = ("drone", "perception") if isinstance(config, ScenarioConfig) else ("perception",)
@@ -111,7 +111,7 @@ def _check_file(file: Path) -> None:
 def _show(args: argparse.Namespace) -> int:
     import yaml
 
-    from flockd.config import load
+    from flockd.core.config import load
 
     values = load(args.file).model_dump(mode="json")
     if args.json:
@@ -122,7 +122,7 @@ def _show(args: argparse.Namespace) -> int:
 
 
 def _schema(args: argparse.Namespace) -> int:
-    from flockd.config import schema_of
+    from flockd.core.config import schema_of
 
     say_json(schema_of(args.kind))
     return ExitCode.DONE
@@ -130,7 +130,7 @@ def _schema(args: argparse.Namespace) -> int:
 
 def loaded(file: Path | None) -> DroneConfig | None:
     """The drone of --config, which may also name a scenario. Raises ConfigError."""
-    from flockd.config import ScenarioConfig, load
+    from flockd.core.config import ScenarioConfig, load
 
     if file is None:
         return None

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from flockd.cli.output import say
 from flockd.cli.parser import Commands, Parser, add_commands, positive_count, positive_number
-from flockd.errors import ConfigError, ExitCode, UsageError
+from flockd.core.errors import ConfigError, ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.config.new_files import NewDrone, NewScenario
+    from flockd.core.config.new_files import NewDrone, NewScenario
 
 MISSIONS = ("circle_then_tangent", "hover", "velocity", "waypoints", "follow", "operator")
 OBSTACLES = ("none", "forest", "village")
@@ -84,7 +84,7 @@ def _add_common(parser: Parser) -> None:
 
 
 def _new_drone(args: argparse.Namespace) -> int:
-    from flockd.config.new_files import NewDrone, drone_text
+    from flockd.core.config.new_files import NewDrone, drone_text
 
     _refuse_what_is_there(args)
     default = NewDrone()
@@ -107,8 +107,8 @@ def _new_drone(args: argparse.Namespace) -> int:
 
 
 def _new_scenario(args: argparse.Namespace) -> int:
-    from flockd.config.new_files import NewScenario, scenario_text
-    from flockd.data import data_path
+    from flockd.core.config.new_files import NewScenario, scenario_text
+    from flockd.core.data import data_path
 
     _refuse_what_is_there(args)
     simulated = _path_from(args.file.resolve().parent, data_path("config") / "simulator.yaml")
@@ -165,7 +165,7 @@ def _camera_count(text: str) -> int:
 
 
 def _drone_count(text: str) -> int:
-    from flockd.config.scenario import MAX_DRONES
+    from flockd.core.config.scenario import MAX_DRONES
 
     count = positive_count(text)
     if count > MAX_DRONES:
@@ -212,7 +212,7 @@ def write_checked(file: Path, text: str) -> None:
 
     The draft stands beside it: paths count from there.
     """
-    from flockd.config import load
+    from flockd.core.config import load
 
     draft = file.with_name(f".{file.name}.draft.yaml")
     try:

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 from flockd.cli.output import PIPED_COLUMNS, complain, progress, say, say_json
 from flockd.cli.parser import Commands, positive_count, positive_number
 from flockd.cli.picture_options import PictureCameras, add_picture_options, detector_of, perception_of
-from flockd.errors import ExitCode, UsageError
+from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.pictures import DetectedDrone, PictureDetector, PictureFile, PictureLabels
-    from flockd.pictures.copies import Copies
+    from flockd.ground.pictures import DetectedDrone, PictureDetector, PictureFile, PictureLabels
+    from flockd.ground.pictures.copies import Copies
 
 NOTES = """\
 Larger pictures are resized to 1280 pixels for the networks; boxes are in pixels of the picture.
@@ -77,8 +77,8 @@ class _Detected:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from flockd.pictures import find_pictures, read_labels
-    from flockd.pictures.copies import Copies
+    from flockd.ground.pictures import find_pictures, read_labels
+    from flockd.ground.pictures.copies import Copies
 
     if args.force and args.out is None:
         raise UsageError("--force has no meaning without --out; add it")
@@ -114,8 +114,8 @@ def _detected(
     cameras: PictureCameras,
     copies: Copies | None,
 ) -> Iterator[_Detected]:
-    from flockd.pictures.coco_labels import check_size
-    from flockd.pictures.drawing import annotated
+    from flockd.ground.pictures.coco_labels import check_size
+    from flockd.ground.pictures.drawing import annotated
 
     count = sum(picture.count(args.every) for picture in pictures)
     with progress("detecting", "pictures") as tell:
@@ -138,7 +138,7 @@ def _detected(
 
 
 def _result(detected: Sequence[_Detected], *, measure: bool) -> dict[str, Any]:
-    from flockd.pictures import Labelled, summary
+    from flockd.ground.pictures import Labelled, summary
 
     count = max(len(detected), 1)
     result: dict[str, Any] = {

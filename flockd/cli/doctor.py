@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.output import progress, say, say_json
 from flockd.cli.parser import Commands, positive_number
-from flockd.errors import ExitCode, UsageError
-from flockd.printable import printable
+from flockd.core.errors import ExitCode, UsageError
+from flockd.core.printable import printable
 
 if TYPE_CHECKING:
-    from flockd.doctor import Finding
+    from flockd.ground.doctor import Finding
 
 SECONDS = 4.0
 STYLES = {"FAILURE": "bold red", "WARNING": "yellow", "PASS": "green"}
@@ -24,7 +24,7 @@ STYLES = {"FAILURE": "bold red", "WARNING": "yellow", "PASS": "green"}
 
 def add(commands: Commands) -> None:
     """Adds the command."""
-    from flockd.doctor import CHECKS
+    from flockd.ground.doctor import CHECKS
 
     examples = (
         "flockd doctor --config config/quadrotor.yaml",
@@ -55,8 +55,8 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from flockd.config import load_drone
-    from flockd.doctor import CHECKS, Level, plan, run_checks
+    from flockd.core.config import load_drone
+    from flockd.ground.doctor import CHECKS, Level, plan, run_checks
 
     config = load_drone(args.config)
     if args.unit is not None and not args.unit.is_file():
@@ -69,7 +69,7 @@ def _run(args: argparse.Namespace) -> int:
         environment=os.environ,
         only=args.only or CHECKS,
     )
-    logging.getLogger("flockd.autopilot").setLevel(logging.CRITICAL)  # what MAVSDK has to tell, the findings do
+    logging.getLogger("flockd.onboard.autopilot").setLevel(logging.CRITICAL)  # what MAVSDK has to tell, the findings do
     with progress("examining", "checks") as tell:
         found = run_checks(checks, tell)
     if args.json:

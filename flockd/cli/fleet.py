@@ -14,11 +14,11 @@ from flockd.cli import fleet_page
 from flockd.cli.output import complain, say, say_json
 from flockd.cli.parser import Commands, Parser, add_commands, positive_number
 from flockd.cli.status import ENDPOINT
-from flockd.errors import ExitCode, UnavailableError, UsageError
+from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
-    from flockd.messages import MissionOrder
-    from flockd.telemetry.operator_client import FleetOperator
+    from flockd.core.messages import MissionOrder
+    from flockd.fleet.operator_client import FleetOperator
 
 ALL = "all"
 REPEAT_S = 1.0
@@ -131,7 +131,7 @@ def _number(text: str) -> float:
 def _goto(args: argparse.Namespace) -> int:
     import numpy as np
 
-    from flockd.messages import MissionOrder
+    from flockd.core.messages import MissionOrder
 
     place = np.array([args.north, args.east])
     if args.degrees and not (abs(args.north) <= 90 and abs(args.east) <= 180):
@@ -144,7 +144,7 @@ def _goto(args: argparse.Namespace) -> int:
 def _velocity(args: argparse.Namespace) -> int:
     import numpy as np
 
-    from flockd.messages import MissionOrder
+    from flockd.core.messages import MissionOrder
 
     order = MissionOrder(velocity=np.array([args.north, args.east]), height_m=args.height)
     return _ask(args, "velocity", order, repeat_s=args.seconds or 0.0)
@@ -152,7 +152,7 @@ def _velocity(args: argparse.Namespace) -> int:
 
 def _ask(args: argparse.Namespace, command: str, order: MissionOrder | None, repeat_s: float = 0.0) -> int:
     """Asks all, again and again for ``repeat_s``; says what each answered, later only what has changed."""
-    from flockd.telemetry.operator_client import FleetOperator
+    from flockd.fleet.operator_client import FleetOperator
 
     connect, listen = args.connect or [], args.listen or []
     if not connect and not listen:
@@ -186,7 +186,7 @@ def _drones(operator: FleetOperator, wanted: str, places: str) -> tuple[str, ...
 def _answers(
     operator: FleetOperator, drones: tuple[str, ...], command: str, order: MissionOrder | None
 ) -> dict[str, dict[str, object]]:
-    from flockd.telemetry.order_messages import order_message
+    from flockd.onboard.telemetry.order_messages import order_message
 
     answers: dict[str, dict[str, object]] = {}
     for drone in drones:

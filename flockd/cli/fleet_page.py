@@ -20,12 +20,12 @@ from flockd.cli.fleet_source import (
 )
 from flockd.cli.output import say
 from flockd.cli.parser import Parser
-from flockd.errors import ExitCode, UnavailableError
+from flockd.core.errors import ExitCode, UnavailableError
 
 if TYPE_CHECKING:
     from aiohttp import web
 
-    from flockd.fleet_page.fleet_source import FleetSource
+    from flockd.fleet.page.fleet_source import FleetSource
 
 PORT = 8470
 
@@ -58,8 +58,8 @@ async def _serve(args: argparse.Namespace, source: FleetSource) -> None:
     """Until it is cancelled, as Ctrl-C does."""
     from aiohttp import web
 
-    from flockd.fleet_page.page_access import PageAccess
-    from flockd.fleet_page.page_server import PageServer
+    from flockd.fleet.page.page_access import PageAccess
+    from flockd.fleet.page.page_server import PageServer
 
     access = PageAccess()
     application = PageServer(source, access, may_command=not args.watch_only).application()

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 from flockd.cli.output import complain, progress
 from flockd.cli.parser import Parser
 from flockd.cli.status import ENDPOINT
-from flockd.errors import UsageError
+from flockd.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from flockd.fleet_page.fleet_source import FleetSource
+    from flockd.fleet.page.fleet_source import FleetSource
 
 
 HERE = "127.0.0.1"
@@ -36,9 +36,9 @@ def add_source_options(parser: Parser) -> None:
 
 def open_source(args: argparse.Namespace, stack: ExitStack) -> FleetSource:
     """As the options say; what has to be closed is left to ``stack``."""
-    from flockd.fleet_page.live_fleet import LiveFleet
-    from flockd.fleet_page.recorded_fleet import RecordedFleet
-    from flockd.telemetry.watcher import FleetWatcher
+    from flockd.fleet.page.live_fleet import LiveFleet
+    from flockd.fleet.page.recorded_fleet import RecordedFleet
+    from flockd.fleet.watcher import FleetWatcher
 
     if args.recordings is not None:
         if args.connect or args.drones_at or args.fleet or args.zenoh_config:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flockd.cli.output import Phases, say, say_json
-from flockd.errors import ExitCode
+from flockd.core.errors import ExitCode
 
 if TYPE_CHECKING:
     from flockd.sim.swarm import Flight
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 def report_flight(directory: Path, flight: Flight, args: argparse.Namespace) -> int:
     """Saves a flight, writes its report with progress, and shows its summary as --json and --quiet say."""
-    from flockd.report.flight_folder import REPORT_NAME, save_flight, write_report_files
+    from flockd.review.report.flight_folder import REPORT_NAME, save_flight, write_report_files
 
     with Phases(quiet=args.quiet, verbose=args.verbose) as phases:
         save_flight(directory, flight.log, flight.key_frames)
@@ -29,7 +29,7 @@ def report_flight(directory: Path, flight: Flight, args: argparse.Namespace) -> 
 
 def show_summary(directory: Path, summary: Mapping[str, Any], *, as_json: bool) -> int:
     """Prints the summary as JSON, or its key figures and where the report is."""
-    from flockd.report.flight_folder import REPORT_NAME
+    from flockd.review.report.flight_folder import REPORT_NAME
 
     if as_json:
         say_json(summary)

@@ -18,7 +18,7 @@ from flockd.cli.fleet_source import (
 )
 from flockd.cli.output import say
 from flockd.cli.parser import Commands
-from flockd.errors import ExitCode
+from flockd.core.errors import ExitCode
 
 PORT = 8765
 """Which the app proposes."""
@@ -46,7 +46,7 @@ def add(commands: Commands) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     """Until Ctrl-C."""
-    from flockd.foxglove_server.server import FoxgloveServer
+    from flockd.fleet.foxglove.server import FoxgloveServer
 
     with ExitStack() as stack, suppress(KeyboardInterrupt):
         source = open_source(args, stack)

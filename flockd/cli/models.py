@@ -10,14 +10,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockd.choices import PROVIDERS, Provider
 from flockd.cli.output import progress, say, say_json
 from flockd.cli.parser import Commands, Parser, add_commands, positive_count
-from flockd.errors import ExitCode, ModelError, UnavailableError
+from flockd.core.choices import PROVIDERS, Provider
+from flockd.core.errors import ExitCode, ModelError, UnavailableError
 
 if TYPE_CHECKING:
-    from flockd.config import DroneConfig
-    from flockd.inference import OnnxModel
+    from flockd.core.config import DroneConfig
+    from flockd.flight.inference import OnnxModel
 
 THREADS = 2
 RUNS = 9
@@ -93,8 +93,8 @@ def _list(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.table import Table
 
-    from flockd.inference import load_manifest
-    from flockd.perception.requirements import check_roles
+    from flockd.flight.inference import load_manifest
+    from flockd.flight.perception.requirements import check_roles
 
     models = [load_manifest(path, check_roles) for path in _manifests(args.dir)]
     if args.json:
@@ -109,9 +109,9 @@ def _list(args: argparse.Namespace) -> int:
 
 
 def _verify(args: argparse.Namespace) -> int:
-    from flockd.doctor.deadline import GOLDEN_S, within
-    from flockd.inference import OnnxModel
-    from flockd.perception.requirements import check_roles
+    from flockd.flight.inference import OnnxModel
+    from flockd.flight.perception.requirements import check_roles
+    from flockd.onboard.deadline import GOLDEN_S, within
 
     faults: dict[str, str | None] = {}
     for path in _manifests(args.dir):
@@ -165,8 +165,8 @@ def _bench(args: argparse.Namespace) -> int:
 
 
 def _providers(text: str | None) -> Sequence[Provider]:
-    from flockd.errors import UsageError
-    from flockd.inference.providers import available
+    from flockd.core.errors import UsageError
+    from flockd.flight.inference.providers import available
 
     if text is None:
         return available()
@@ -178,9 +178,9 @@ def _providers(text: str | None) -> Sequence[Provider]:
 
 
 def _timings(manifests: Sequence[Path], providers: Sequence[Provider], args: argparse.Namespace) -> Iterator[_Timing]:
-    from flockd.inference import OnnxModel
-    from flockd.inference.feeds import feeds_for, shapes_of
-    from flockd.perception.requirements import check_roles
+    from flockd.flight.inference import OnnxModel
+    from flockd.flight.inference.feeds import feeds_for, shapes_of
+    from flockd.flight.perception.requirements import check_roles
 
     for path in manifests:
         for provider in providers:
@@ -207,8 +207,8 @@ def _times_ms(model: OnnxModel, feeds: Any, runs: int) -> list[float]:
 
 
 def _prepare(args: argparse.Namespace) -> int:
-    from flockd.config import ScenarioConfig, load
-    from flockd.inference import manifests_of
+    from flockd.core.config import ScenarioConfig, load
+    from flockd.flight.inference import manifests_of
 
     loaded = load(args.config)
     config = loaded.drone if isinstance(loaded, ScenarioConfig) else loaded
@@ -232,11 +232,11 @@ def _prepare(args: argparse.Namespace) -> int:
 
 def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
     """Runs a model on every shape of input that these cameras give it, keeps the engines, and opens it as in flight."""
-    from flockd.inference import OnnxModel
-    from flockd.inference.feeds import feeds_for, golden_feeds, shapes_of
-    from flockd.inference.providers import builds_engines, engines_folder
-    from flockd.perception.networks import CROPS_PER_RUN
-    from flockd.perception.requirements import check_roles
+    from flockd.flight.inference import OnnxModel
+    from flockd.flight.inference.feeds import feeds_for, golden_feeds, shapes_of
+    from flockd.flight.inference.providers import builds_engines, engines_folder
+    from flockd.flight.perception.networks import CROPS_PER_RUN
+    from flockd.flight.perception.requirements import check_roles
 
     wanted = config.perception
     options: Any = {
@@ -269,8 +269,8 @@ def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
 
 
 def _manifests(folder: Path | None) -> tuple[Path, ...]:
-    from flockd.data import data_path
-    from flockd.inference import find_manifests
+    from flockd.core.data import data_path
+    from flockd.flight.inference import find_manifests
 
     folder = folder or data_path("models")
     manifests = find_manifests(folder)

@@ -22,7 +22,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from flockd.printable import printable
+from flockd.core.printable import printable
 
 PLAIN_LINE_EVERY_S = 10.0
 CELL_CHARACTERS = 300

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn, Protocol
 
 from flockd.cli.output import complain
-from flockd.errors import ExitCode
+from flockd.core.errors import ExitCode
 
 
 class Parser(argparse.ArgumentParser):

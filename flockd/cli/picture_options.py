@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 from flockd.cli.config import loaded
 from flockd.cli.parser import Parser, positive_number
-from flockd.errors import UsageError
+from flockd.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from flockd.config import DroneConfig
-    from flockd.config.perception import PerceptionConfig
-    from flockd.geometry import Camera
-    from flockd.pictures import PictureDetector
+    from flockd.core.config import DroneConfig
+    from flockd.core.config.perception import PerceptionConfig
+    from flockd.flight.geometry import Camera
+    from flockd.ground.pictures import PictureDetector
 
 MAX_FOV_DEG = 170.0
 
@@ -78,13 +78,13 @@ class PictureCameras:
                 )
             return self._mine
         if size not in self._cameras:
-            from flockd.pictures import camera_with_fov
+            from flockd.ground.pictures import camera_with_fov
 
             self._cameras[size] = camera_with_fov(size, self._fov)
         return self._cameras[size]
 
     def _of_rig(self, args: argparse.Namespace) -> Camera:
-        from flockd.geometry import build_rig
+        from flockd.flight.geometry import build_rig
 
         assert self.config is not None
         cameras = build_rig(self.config.rig).cameras
@@ -103,7 +103,7 @@ def perception_of(args: argparse.Namespace, drone: DroneConfig | None, **more: A
     """
     from pydantic import ValidationError
 
-    from flockd.config.perception import DIS, PerceptionConfig
+    from flockd.core.config.perception import DIS, PerceptionConfig
 
     values = {} if drone is None else drone.perception.model_dump()
     values |= {"flow": DIS, "scale": "network", **more}
@@ -126,7 +126,7 @@ def perception_of(args: argparse.Namespace, drone: DroneConfig | None, **more: A
 
 def detector_of(config: PerceptionConfig) -> PictureDetector:
     """With the networks loaded. Raises ModelError."""
-    from flockd.perception import load_networks
-    from flockd.pictures import PictureDetector
+    from flockd.flight.perception import load_networks
+    from flockd.ground.pictures import PictureDetector
 
     return PictureDetector(load_networks(config), config)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from flockd.cli.output import cell, say, say_json
 from flockd.cli.parser import Commands, Parser, add_commands
 from flockd.cli.recording_options import add_stretch, opened, refuse_existing, stretch
-from flockd.errors import ExitCode, UsageError
+from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.recording.reader import Recording
+    from flockd.onboard.recording.reader import Recording
 
 
 def add(commands: Commands) -> None:
@@ -65,7 +65,7 @@ def _with_recording(parser: Parser) -> Parser:
 
 
 def _info(args: argparse.Namespace) -> int:
-    from flockd.recording.info import recording_info
+    from flockd.onboard.recording.info import recording_info
 
     recording = opened(args.recording)
     facts = recording_info(recording)
@@ -94,7 +94,7 @@ def _info(args: argparse.Namespace) -> int:
 
 
 def _recover(args: argparse.Namespace) -> int:
-    from flockd.recording.editing import recover
+    from flockd.onboard.recording.editing import recover
 
     out = args.out or args.recording.with_name(f"{args.recording.stem}.recovered.mcap")
     refuse_existing(out)
@@ -103,7 +103,7 @@ def _recover(args: argparse.Namespace) -> int:
 
 
 def _cut(args: argparse.Namespace) -> int:
-    from flockd.recording.editing import cut
+    from flockd.onboard.recording.editing import cut
 
     refuse_existing(args.out)
     recording = opened(args.recording)
@@ -120,7 +120,7 @@ def _report_copy(args: argparse.Namespace, recording: Recording, out: Path, step
 
 
 def _export(args: argparse.Namespace) -> int:
-    from flockd.recording.export import export_images, export_tables
+    from flockd.onboard.recording.export import export_images, export_tables
 
     if args.out.exists() and (not args.out.is_dir() or any(args.out.iterdir())):
         raise UsageError(f"{args.out}: is not an empty folder; name a new one with --out")

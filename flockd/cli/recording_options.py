@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.output import progress
 from flockd.cli.parser import Parser, positive_number
-from flockd.errors import UsageError
+from flockd.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from flockd.recording.reader import Recording
+    from flockd.onboard.recording.reader import Recording
 
 
 def add_stretch(parser: Parser) -> None:
@@ -39,7 +39,7 @@ def stretch(recording: Recording, args: argparse.Namespace) -> tuple[float, floa
 
 def opened(path: Path) -> Recording:
     """The recording, checked as a whole, with a progress bar. Raises RecordingError."""
-    from flockd.recording.reader import Recording
+    from flockd.onboard.recording.reader import Recording
 
     with progress("checking", "bytes") as tell:
         return Recording(path, tell)

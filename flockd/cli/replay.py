@@ -12,12 +12,12 @@ from flockd.cli.output import complain, progress, say, say_json
 from flockd.cli.parser import Commands
 from flockd.cli.recording_options import add_stretch, opened, refuse_existing, stretch
 from flockd.cli.replay_dataset import add_dataset_options, refuse_dataset_options, run_dataset
-from flockd.errors import ExitCode, UsageError
+from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.config import DroneConfig
-    from flockd.recording.difference import Comparison
-    from flockd.recording.reader import Recording
+    from flockd.core.config import DroneConfig
+    from flockd.onboard.recording.difference import Comparison
+    from flockd.onboard.recording.reader import Recording
 
 
 def add(commands: Commands) -> None:
@@ -78,14 +78,14 @@ def _tolerance(text: str) -> tuple[str, float]:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from flockd.datasets import is_dataset
+    from flockd.ground.datasets import is_dataset
 
     if is_dataset(args.recording):
         return run_dataset(args)
     refuse_dataset_options(args)
     _check_options(args)
-    from flockd.replay.fidelity import damage_warnings, replay_warnings
-    from flockd.replay.recorded_flight import compare_replay, replay_flight, replay_result
+    from flockd.review.replay.fidelity import damage_warnings, replay_warnings
+    from flockd.review.replay.recorded_flight import compare_replay, replay_flight, replay_result
 
     recording = opened(args.recording)
     config = _config(args, recording)
@@ -99,7 +99,7 @@ def _run(args: argparse.Namespace) -> int:
             recording, config, start_s, end_s, speed=args.speed, out=args.out, progress=show_progress
         )
     if args.update_reference:
-        from flockd.recording.difference import save_reference
+        from flockd.onboard.recording.difference import save_reference
 
         save_reference(args.reference, recording.drone, replay.outputs)
     comparison = None
@@ -131,7 +131,7 @@ def _config(args: argparse.Namespace, recording: Recording) -> DroneConfig:
     """The settings to fly with: the recorded ones, or those of --config, for the same cameras."""
     if args.config is None:
         return recording.config
-    from flockd.config import ScenarioConfig, load
+    from flockd.core.config import ScenarioConfig, load
 
     loaded = load(args.config)
     config = loaded.drone if isinstance(loaded, ScenarioConfig) else loaded
@@ -152,7 +152,7 @@ def _reference(args: argparse.Namespace) -> Mapping[int, Mapping[str, Any]] | No
         return None
     if not args.reference.is_file():
         raise UsageError(f"{args.reference}: does not exist; write it first with --update-reference")
-    from flockd.recording.difference import load_reference
+    from flockd.onboard.recording.difference import load_reference
 
     return load_reference(args.reference)
 

@@ -11,12 +11,12 @@ from flockd.cli.config import loaded
 from flockd.cli.output import complain, progress, say, say_json
 from flockd.cli.parser import Parser, positive_count
 from flockd.cli.recording_options import refuse_existing
-from flockd.errors import ExitCode, UsageError
+from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.config import DroneConfig
-    from flockd.datasets import Dataset
-    from flockd.replay.dataset_flight import Depth
+    from flockd.core.config import DroneConfig
+    from flockd.ground.datasets import Dataset
+    from flockd.review.replay.dataset_flight import Depth
 
 _OF_RECORDINGS = ("speed", "start", "end", "out", "diff", "reference", "update_reference", "tolerance")
 _OF_DATASETS = ("depth", "stride", "flow", "calibration", "trajectory")
@@ -44,8 +44,8 @@ def run_dataset(args: argparse.Namespace) -> int:
     _refuse(args, _OF_RECORDINGS, "is for recordings of flockd, and this is none; leave it out")
     if args.trajectory is not None:
         refuse_existing(args.trajectory, "--trajectory")
-    from flockd.datasets import open_dataset
-    from flockd.replay.dataset_flight import dataset_config, dataset_result, replay_dataset, write_trajectory
+    from flockd.ground.datasets import open_dataset
+    from flockd.review.replay.dataset_flight import dataset_config, dataset_result, replay_dataset, write_trajectory
 
     stride = args.stride or 1
     depth: Depth = args.depth or "network"

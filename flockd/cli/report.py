@@ -13,13 +13,13 @@ from flockd.cli.flight_summary import show_summary
 from flockd.cli.output import PIPED_COLUMNS, complain, progress, say_json
 from flockd.cli.parser import Commands
 from flockd.cli.recording_options import opened
-from flockd.errors import ExitCode, UsageError
+from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from flockd.flight_log.key_frames import KeyFrame
-    from flockd.flight_log.log import FlightLog
+    from flockd.review.flight_log.key_frames import KeyFrame
+    from flockd.review.flight_log.log import FlightLog
 
 SUFFIX = ".report"
 """Of the folder beside a recording that its report goes to."""
@@ -73,7 +73,7 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from flockd.report.flight_folder import LOG_NAME, check_report_folder, prepare_report_folder, save_flight
+    from flockd.review.report.flight_folder import LOG_NAME, check_report_folder, prepare_report_folder, save_flight
 
     if args.other is not None:
         return _compare(args)
@@ -96,7 +96,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _write(directory: Path, log: FlightLog, args: argparse.Namespace) -> int:
-    from flockd.report.flight_folder import write_report_files
+    from flockd.review.report.flight_folder import write_report_files
 
     with progress("writing the report", "figures") as tell_progress:
         summary = write_report_files(directory, log, tell_progress)
@@ -105,7 +105,7 @@ def _write(directory: Path, log: FlightLog, args: argparse.Namespace) -> int:
 
 def _ulog(path: Path) -> Any:
     """Read first, so that a bad file costs no waiting."""
-    from flockd.flight_log.ulog import read_ulog
+    from flockd.review.flight_log.ulog import read_ulog
 
     with progress("reading the autopilot's log", "files") as tell_progress:
         ulog = read_ulog(path)
@@ -115,9 +115,9 @@ def _ulog(path: Path) -> Any:
 
 def _save_beside(directory: Path, log: FlightLog, recordings: Sequence[Path], ulog: Any, path: Path) -> None:
     """Writes what the autopilot logged, on the flight's time, to where the report finds it."""
-    from flockd.flight_log.from_recordings import autopilot_clock
-    from flockd.flight_log.ulog import autopilot_log, drone_of
-    from flockd.report.flight_folder import AUTOPILOT_LOG_NAME
+    from flockd.review.flight_log.from_recordings import autopilot_clock
+    from flockd.review.flight_log.ulog import autopilot_log, drone_of
+    from flockd.review.report.flight_folder import AUTOPILOT_LOG_NAME
 
     drone, recording = drone_of(ulog, path, log, [opened(one) for one in recordings])
     clock = None if recording is None else autopilot_clock(recording)
@@ -134,8 +134,8 @@ def _again(args: argparse.Namespace, ulog: Any | None) -> int:
             )
     log = _log_in(args.flight)
     if ulog is not None:
-        from flockd.flight_log.from_recordings import recordings_in
-        from flockd.report.flight_folder import RECORDINGS
+        from flockd.review.flight_log.from_recordings import recordings_in
+        from flockd.review.report.flight_folder import RECORDINGS
 
         _save_beside(args.flight, log, recordings_in(args.flight / RECORDINGS), ulog, args.ulog)
     return _write(args.flight, log, args)
@@ -143,8 +143,8 @@ def _again(args: argparse.Namespace, ulog: Any | None) -> int:
 
 def _video(args: argparse.Namespace) -> int:
     from flockd.cli import report_video
-    from flockd.flight_log.from_recordings import recordings_in
-    from flockd.report.flight_folder import LOG_NAME, RECORDINGS
+    from flockd.review.flight_log.from_recordings import recordings_in
+    from flockd.review.report.flight_folder import LOG_NAME, RECORDINGS
 
     _refuse(args, ("out", "without_pictures", "ulog"), "has no meaning with --video")
     of_a_folder = (args.flight / LOG_NAME).is_file()
@@ -161,8 +161,8 @@ def _refuse(args: argparse.Namespace, options: Sequence[str], why: str) -> None:
 def _compare(args: argparse.Namespace) -> int:
     """The key figures of two flights side by side."""
     _refuse(args, ("out", "without_pictures", "force", "ulog", "video", "drone"), "has no meaning with two flights")
-    from flockd.report.comparison import compare
-    from flockd.report.summary import summarise
+    from flockd.review.report.comparison import compare
+    from flockd.review.report.summary import summarise
 
     flights = (args.flight, args.other)
     rows = compare(*(summarise(_log_of(flight)) for flight in flights))
@@ -182,7 +182,7 @@ def _compare(args: argparse.Namespace) -> int:
 
 def _log_of(flight: Path) -> FlightLog:
     """The log in a flight's folder, or the one that recordings make."""
-    from flockd.report.flight_folder import LOG_NAME
+    from flockd.review.report.flight_folder import LOG_NAME
 
     if (flight / LOG_NAME).is_file():
         return _log_in(flight)
@@ -190,8 +190,8 @@ def _log_of(flight: Path) -> FlightLog:
 
 
 def _log_in(folder: Path) -> FlightLog:
-    from flockd.flight_log.log import FlightLog
-    from flockd.report.flight_folder import LOG_NAME
+    from flockd.review.flight_log.log import FlightLog
+    from flockd.review.report.flight_folder import LOG_NAME
 
     path = folder / LOG_NAME
     try:
@@ -202,11 +202,11 @@ def _log_in(folder: Path) -> FlightLog:
 
 def _recordings(path: Path) -> tuple[Path, ...]:
     """The recording that was named, or all in the folder that was."""
-    from flockd.report.flight_folder import LOG_NAME
+    from flockd.review.report.flight_folder import LOG_NAME
 
     if not path.is_dir():
         return (path,)
-    from flockd.flight_log.from_recordings import recordings_in
+    from flockd.review.flight_log.from_recordings import recordings_in
 
     found = recordings_in(path)
     if not found:
@@ -215,8 +215,8 @@ def _recordings(path: Path) -> tuple[Path, ...]:
 
 
 def _flight(paths: Sequence[Path], *, pictured: bool) -> tuple[FlightLog, tuple[KeyFrame, ...]]:
-    from flockd.flight_log.from_recordings import flight_log, key_frames
-    from flockd.replay.fidelity import damage_warnings, replay_warnings
+    from flockd.review.flight_log.from_recordings import flight_log, key_frames
+    from flockd.review.replay.fidelity import damage_warnings, replay_warnings
 
     recordings = [opened(path) for path in paths]
     for recording in recordings:

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.output import progress, say, say_json
 from flockd.cli.recording_options import opened
-from flockd.errors import ExitCode, UsageError
+from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.flight_log.log import FlightLog
-    from flockd.flight_log.moments import Moment
-    from flockd.recording.reader import Recording
+    from flockd.onboard.recording.reader import Recording
+    from flockd.review.flight_log.log import FlightLog
+    from flockd.review.flight_log.moments import Moment
 
 
 def write(args: argparse.Namespace, log: FlightLog, recordings: Sequence[Path]) -> int:
     """Writes the video of ``args.video`` from a flight's log and recordings, or from its folder's key frames."""
-    from flockd.report.flight_video import check_video_path, write_video
+    from flockd.review.report.flight_video import check_video_path, write_video
 
     check_video_path(args.video, force=args.force)
     drone, moments = _of_recordings(args, log, [opened(path) for path in recordings])
@@ -37,7 +37,7 @@ def _of_recordings(
     args: argparse.Namespace, log: FlightLog, recordings: Sequence[Recording]
 ) -> tuple[int, Iterator[Moment]]:
     """Number of the drone, and its moments."""
-    from flockd.flight_log.moments import recorded_moments
+    from flockd.review.flight_log.moments import recorded_moments
 
     if not recordings:
         return _of_key_frames(args, log)
@@ -50,9 +50,9 @@ def _of_recordings(
 
 
 def _of_key_frames(args: argparse.Namespace, log: FlightLog) -> tuple[int, Iterator[Moment]]:
-    from flockd.flight_log.key_frames import load_key_frames
-    from flockd.flight_log.moments import held_moments
-    from flockd.report.flight_folder import KEY_FRAMES_NAME
+    from flockd.review.flight_log.key_frames import load_key_frames
+    from flockd.review.flight_log.moments import held_moments
+    from flockd.review.report.flight_folder import KEY_FRAMES_NAME
 
     if args.drone is not None:
         raise UsageError(f"--drone {args.drone}: {args.flight} has no recordings; drop it, or fly with --record")

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli.parser import Commands
-from flockd.errors import ExitCode, UnavailableError, UsageError
+from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
-    from flockd.config import DroneConfig
-    from flockd.daemon import Daemon, Ending, ServiceManager
+    from flockd.core.config import DroneConfig
+    from flockd.onboard.daemon import Daemon, Ending, ServiceManager
 
 WAITING_EVERY_S = 5.0
 FILES_NEEDED = 128
@@ -45,7 +45,7 @@ def add(commands: Commands) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     _check_limits()
-    from flockd.daemon import StderrLog
+    from flockd.onboard.daemon import StderrLog
 
     log = StderrLog()
     _log_to_stderr(log)
@@ -57,8 +57,8 @@ def _run(args: argparse.Namespace) -> int:
 
 def _run_daemon(args: argparse.Namespace) -> int:
     """Until it is asked to end, with each configuration that it is asked to reload."""
-    from flockd.config import load_drone
-    from flockd.daemon import ServiceManager, event_loop_at, only_instance
+    from flockd.core.config import load_drone
+    from flockd.onboard.daemon import ServiceManager, event_loop_at, only_instance
 
     service = ServiceManager(os.environ)
     config: DroneConfig | None = load_drone(args.config)
@@ -94,11 +94,11 @@ def _check_limits() -> None:
 
 async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceManager) -> Ending:
     """With SIGTERM and Ctrl-C for standstill, Hold and the end, and SIGHUP for the configuration."""
-    from flockd.config import load_drone
-    from flockd.daemon import Daemon, clock_at
-    from flockd.doctor.deadline import GOLDEN_S, within
-    from flockd.inference.hashes import model_hashes
-    from flockd.perception import load_networks
+    from flockd.core.config import load_drone
+    from flockd.flight.inference.hashes import model_hashes
+    from flockd.flight.perception import load_networks
+    from flockd.onboard.daemon import Daemon, clock_at
+    from flockd.onboard.deadline import GOLDEN_S, within
 
     daemon = Daemon(
         config,
@@ -132,4 +132,4 @@ def _log_to_stderr(handler: logging.Handler) -> None:
     dated = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
     handler.setFormatter(logging.Formatter(f"{dated}%(message)s"))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
-    logging.getLogger("flockd.autopilot").setLevel(logging.WARNING)  # MAVSDK tells a lot of itself
+    logging.getLogger("flockd.onboard.autopilot").setLevel(logging.WARNING)  # MAVSDK tells a lot of itself

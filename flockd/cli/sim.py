@@ -10,16 +10,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
-from flockd.choices import TRUTH_ROLES, AutopilotKind, HeightSource, ScaleSource, SimulatedPerception
 from flockd.cli import sim_fleet
 from flockd.cli.flight_summary import report_flight
 from flockd.cli.output import Phases, complain
 from flockd.cli.parser import Commands, positive_count, positive_number, seed
-from flockd.errors import ConfigError, ConfigProblem, ExitCode, UsageError
+from flockd.core.choices import TRUTH_ROLES, AutopilotKind, HeightSource, ScaleSource, SimulatedPerception
+from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.config import Overrides, ScenarioConfig
-    from flockd.recording import Recorder
+    from flockd.core.config import Overrides, ScenarioConfig
+    from flockd.onboard.recording import Recorder
 
 SCENARIO = "paper_flight.yaml"
 COSTS = """\
@@ -127,7 +127,7 @@ def _wind(text: str) -> tuple[float, float]:
 
 
 def _flock_size(text: str) -> int:
-    from flockd.config.scenario import MAX_DRONES
+    from flockd.core.config.scenario import MAX_DRONES
 
     count = positive_count(text)
     if count > MAX_DRONES:
@@ -156,7 +156,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespace) -> int:
-    from flockd.report.flight_folder import RECORDINGS
+    from flockd.review.report.flight_folder import RECORDINGS
 
     if args.verbose:
         for line in _settings(scenario, directory, args):
@@ -168,8 +168,8 @@ def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespac
     with ExitStack() as stack:
         telemetry = None
         if args.telemetry:
-            from flockd.telemetry.publisher import ZenohTelemetry
-            from flockd.telemetry.repeater import Repeater
+            from flockd.onboard.telemetry.publisher import ZenohTelemetry
+            from flockd.sim.repeater import Repeater
 
             zenoh = stack.enter_context(ZenohTelemetry(_plain(scenario.scenario)))
             for number in range(1, len(scenario.vehicles) + 1):
@@ -197,7 +197,7 @@ def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespac
 
 def _settings(scenario: ScenarioConfig, directory: Path, args: argparse.Namespace) -> list[str]:
     """What is flown, for --verbose."""
-    from flockd.config.mission import describe
+    from flockd.core.config.mission import describe
 
     drone, wind = scenario.drone, scenario.vehicle.wind_m_s
     missions = ", ".join(dict.fromkeys(describe(vehicle.mission or drone.mission) for vehicle in scenario.vehicles))
@@ -215,8 +215,8 @@ def _recorders(
     scenario: ScenarioConfig, swap: frozenset[str], directory: Path, stack: ExitStack
 ) -> tuple[Recorder, ...]:
     """A recorder for each drone that flockd flies."""
-    from flockd.inference.hashes import model_hashes
-    from flockd.recording import Recorder
+    from flockd.flight.inference.hashes import model_hashes
+    from flockd.onboard.recording import Recorder
 
     directory.mkdir(exist_ok=True)
     facts = {"scenario": scenario.scenario, "seed": str(scenario.seed), "true_roles": ", ".join(sorted(swap))}
@@ -248,8 +248,8 @@ def _check_options(args: argparse.Namespace) -> None:
 
 def _scenario(args: argparse.Namespace) -> ScenarioConfig:
     """The scenario with the options over it."""
-    from flockd.config import load_scenario
-    from flockd.data import data_path
+    from flockd.core.config import load_scenario
+    from flockd.core.data import data_path
     from flockd.sim.start import with_drones
 
     overrides: Overrides = {
@@ -268,7 +268,7 @@ def _scenario(args: argparse.Namespace) -> ScenarioConfig:
 
 def _of_option(problem: ConfigProblem) -> ConfigProblem:
     """With the option's name where an option gave the value."""
-    from flockd.config.loader import OVERRIDE
+    from flockd.core.config.loader import OVERRIDE
 
     options = {key: option for option, key in OPTIONS.items()}
     if problem.file != OVERRIDE or problem.key not in options:
@@ -278,7 +278,7 @@ def _of_option(problem: ConfigProblem) -> ConfigProblem:
 
 def _folder(scenario: ScenarioConfig, args: argparse.Namespace) -> Path:
     """A folder for this flight alone."""
-    from flockd.report.flight_folder import new_folder, prepare_folder
+    from flockd.review.report.flight_folder import new_folder, prepare_folder
 
     if args.out is None and not args.force:
         return new_folder(Path("out") / _folder_name(scenario, args))

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.flight_summary import report_flight
 from flockd.cli.output import Phases, complain
-from flockd.errors import ExitCode, UsageError
+from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from flockd.config import ScenarioConfig
+    from flockd.core.config import ScenarioConfig
 
 SITL = "px4_sitl.yaml"
 DEFAULT_SPEED_FACTOR = 0.25
@@ -42,9 +42,9 @@ def check_options(args: argparse.Namespace) -> None:
 
 def fly(args: argparse.Namespace, scenario: ScenarioConfig, directory: Path) -> int:
     """Flies, writes the same report as the simulator, and says whether all flew to the end."""
-    from flockd.config import load_drone
-    from flockd.data import data_path
-    from flockd.report.flight_folder import FLEET_LOGS, RECORDINGS
+    from flockd.core.config import load_drone
+    from flockd.core.data import data_path
+    from flockd.review.report.flight_folder import FLEET_LOGS, RECORDINGS
     from flockd.sim.fleet import fly_fleet
 
     with ExitStack() as stack:

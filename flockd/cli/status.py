@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 from flockd.cli.output import PIPED_COLUMNS, cell, say_json
 from flockd.cli.parser import Commands, positive_number
-from flockd.errors import ExitCode, UnavailableError
+from flockd.core.errors import ExitCode, UnavailableError
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from flockd.telemetry.watcher import Watched
+    from flockd.fleet.watcher import Watched
 
 ENDPOINT = "tcp/127.0.0.1:7447"
 LISTEN_S = 3.0
@@ -49,8 +49,8 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from flockd.telemetry.fleet_status import status_rows
-    from flockd.telemetry.watcher import FleetWatcher
+    from flockd.fleet.fleet_status import status_rows
+    from flockd.fleet.watcher import FleetWatcher
 
     connect, listen = args.connect or [], args.listen or []
     if not connect and not listen:
@@ -118,7 +118,7 @@ def _show_live(drones: Callable[[], Iterable[Watched]]) -> int:
     """Until Ctrl-C."""
     from rich.live import Live
 
-    from flockd.telemetry.fleet_status import status_rows
+    from flockd.fleet.fleet_status import status_rows
 
     with suppress(KeyboardInterrupt), Live(console=_console(), auto_refresh=False) as live:
         while True:

@@ -14,7 +14,7 @@ from typing import Any
 from flockd.cli.output import complain, progress, say, say_json
 from flockd.cli.parser import Commands
 from flockd.cli.recording_options import add_stretch, opened, refuse_existing, stretch
-from flockd.errors import ExitCode, UnavailableError, UsageError
+from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 
 def add(commands: Commands) -> None:
@@ -45,7 +45,7 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    import flockd.view.rerun_file  # noqa: F401 - so that nothing is computed when the extra is missing
+    import flockd.review.view.rerun_file  # noqa: F401 - so that nothing is computed when the extra is missing
 
     if args.json and args.save is None:
         raise UsageError("--json has no meaning without --save; add it")
@@ -54,7 +54,7 @@ def _run(args: argparse.Namespace) -> int:
         _tell(args, _write(args, args.save))
         return ExitCode.DONE
     _check_screen()
-    from flockd.view.rerun_file import open_viewer
+    from flockd.review.view.rerun_file import open_viewer
 
     with tempfile.TemporaryDirectory(prefix="flockd-") as folder:
         path = Path(folder) / f"{args.recording.resolve().stem}.rrd"
@@ -73,10 +73,10 @@ def _check_screen() -> None:
 def _write(args: argparse.Namespace, path: Path) -> dict[str, Any]:
     if args.recording.is_dir():
         return _write_flock(args, path)
-    from flockd.recording.editing import written_whole
-    from flockd.replay.fidelity import damage_warnings, replay_warnings
-    from flockd.view.rerun_file import RerunFile
-    from flockd.view.scene import Scenes, texts
+    from flockd.onboard.recording.editing import written_whole
+    from flockd.review.replay.fidelity import damage_warnings, replay_warnings
+    from flockd.review.view.rerun_file import RerunFile
+    from flockd.review.view.scene import Scenes, texts
 
     recording = opened(args.recording)
     start_s, end_s = stretch(recording, args)
@@ -109,11 +109,11 @@ def _write(args: argparse.Namespace, path: Path) -> dict[str, Any]:
 
 def _write_flock(args: argparse.Namespace, path: Path) -> dict[str, Any]:
     """All drones of one flight, as recorded, by the truth in their recordings."""
-    from flockd.flight_log.from_recordings import recordings_in
-    from flockd.recording import RecordingError
-    from flockd.recording.editing import written_whole
-    from flockd.replay.fidelity import damage_warnings
-    from flockd.view.flock_file import FlockFile
+    from flockd.onboard.recording import RecordingError
+    from flockd.onboard.recording.editing import written_whole
+    from flockd.review.flight_log.from_recordings import recordings_in
+    from flockd.review.replay.fidelity import damage_warnings
+    from flockd.review.view.flock_file import FlockFile
 
     folder: Path = args.recording
     if not recordings_in(folder) and (folder / "recordings").is_dir():

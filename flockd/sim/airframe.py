@@ -10,7 +10,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from flockd.messages import Float32Array, FloatArray
+from flockd.core.messages import Float32Array, FloatArray
 from flockd.sim import textures
 from flockd.sim.mesh import Mesh
 from flockd.sim.textures import PackedArray

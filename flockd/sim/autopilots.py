@@ -13,12 +13,12 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from flockd.autopilot.fake_autopilot import FakeAutopilot
-from flockd.autopilot.fake_range_finder import FakeRangeFinder, Ground
-from flockd.autopilot.fake_vehicle import Demand, MotionState
-from flockd.config.scenario import ScenarioConfig, StartConfig, VehicleConfig
-from flockd.errors import UnavailableError, UsageError
-from flockd.messages import FloatArray
+from flockd.core.config.scenario import ScenarioConfig, StartConfig, VehicleConfig
+from flockd.core.errors import UnavailableError, UsageError
+from flockd.core.messages import FloatArray
+from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, Ground
+from flockd.sim.autopilot.fake_vehicle import Demand, MotionState
 from flockd.sim.ground_station import FULL_STICK_M_S, home_deg
 from flockd.sim.leftovers import described, px4_instance, user_of_port
 from flockd.sim.processes import Program, Programs
@@ -87,7 +87,7 @@ class Autopilots(Protocol):
 
 
 class SimulatedAutopilots:
-    """The autopilots that `flockd.autopilot` simulates, on the simulator's own vehicle model."""
+    """The autopilots that `flockd.onboard.autopilot` simulates, on the simulator's own vehicle model."""
 
     name = "fake autopilot"
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flockd.config.scenario import CameraFaultConfig
-from flockd.messages import UInt8Array
+from flockd.core.config.scenario import CameraFaultConfig
+from flockd.core.messages import UInt8Array
 
 _BANDS, _BAND_SHARE = 4, 8
 """Bands of interference in an image, each an eighth of it high; they may overlap."""

@@ -9,19 +9,19 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from flockd.config.mission import MissionParameters
-from flockd.config.scenario import ScenarioConfig
-from flockd.errors import UsageError
-from flockd.geometry import PinholeCamera, build_rig
-from flockd.messages import FloatArray, Frame, FrameSet, UInt8Array
-from flockd.mission import Moment, Navigator
+from flockd.core.config.mission import MissionParameters
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.errors import UsageError
+from flockd.core.messages import FloatArray, Frame, FrameSet, UInt8Array
+from flockd.flight.geometry import PinholeCamera, build_rig
+from flockd.flight.mission import Moment, Navigator
 from flockd.sim.camera_faults import CameraFaults
 from flockd.sim.drone_models import FAMILIES, drone_model
 from flockd.sim.renderer import Renderer, View
 from flockd.sim.truth_perception import RenderTruth
 from flockd.sim.vehicles import REFERENCE_DEG
 from flockd.sim.world import World
-from flockd.worlds.obstacle_worlds import obstacles_of
+from flockd.sim.worlds.obstacle_worlds import obstacles_of
 
 
 class FlockPoses(Protocol):

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from flockd.config.scenario import ScenarioConfig
-from flockd.flight_log.log import FlightLog
-from flockd.messages import FloatArray
-from flockd.worlds.obstacle_worlds import obstacles_of
-from flockd.worlds.obstacles import POINTS_A_STEP, Obstacles
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.messages import FloatArray
+from flockd.review.flight_log.log import FlightLog
+from flockd.sim.worlds.obstacle_worlds import obstacles_of
+from flockd.sim.worlds.obstacles import POINTS_A_STEP, Obstacles
 
 
 def with_obstacles(log: FlightLog, scenario: ScenarioConfig) -> FlightLog:

@@ -12,11 +12,11 @@ from typing import Self
 
 import yaml
 
-from flockd.config import DroneConfig
-from flockd.config.mission import MissionParameters
-from flockd.config.recording import RecordingConfig
-from flockd.config.scenario import ScenarioConfig
-from flockd.errors import ConfigError, ConfigProblem
+from flockd.core.config import DroneConfig
+from flockd.core.config.mission import MissionParameters
+from flockd.core.config.recording import RecordingConfig
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.errors import ConfigError, ConfigProblem
 from flockd.sim.autopilots import Ports
 from flockd.sim.processes import Program, Programs
 

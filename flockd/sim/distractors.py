@@ -11,7 +11,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from flockd.messages import Float32Array, FloatArray
+from flockd.core.messages import Float32Array, FloatArray
 from flockd.sim.mesh import Mesh
 
 _SKIN = 0

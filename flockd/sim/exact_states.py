@@ -7,16 +7,16 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from flockd.config.scenario import ScenarioConfig
-from flockd.flocking import FlockingLaw
-from flockd.messages import BoolArray, FloatArray, MissionStatus, ObstacleRanges
-from flockd.mission import Moment, Navigator
-from flockd.mission.navigator import middle_of
-from flockd.obstacles import Avoidance
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.messages import BoolArray, FloatArray, MissionStatus, ObstacleRanges
+from flockd.flight.flocking import FlockingLaw
+from flockd.flight.mission import Moment, Navigator
+from flockd.flight.mission.navigator import middle_of
+from flockd.flight.obstacles import Avoidance
 from flockd.sim.handover import Handover
 from flockd.sim.vehicles import REFERENCE_DEG, Vehicles
-from flockd.worlds.obstacle_worlds import obstacles_of
-from flockd.worlds.obstacles import true_ranges
+from flockd.sim.worlds.obstacle_worlds import obstacles_of
+from flockd.sim.worlds.obstacles import true_ranges
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,11 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from flockd.choices import AutopilotKind
-from flockd.config import DroneConfig
-from flockd.config.scenario import ScenarioConfig
-from flockd.errors import UnavailableError
-from flockd.flight_log.fleet_log import FleetFrame, FleetRun, fleet_key_frames, fleet_log
+from flockd.core.choices import AutopilotKind
+from flockd.core.config import DroneConfig
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.errors import UnavailableError
+from flockd.onboard.sources import clock_at
+from flockd.review.flight_log.fleet_log import FleetFrame, FleetRun, fleet_key_frames, fleet_log
 from flockd.sim.autopilots import Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.clearances import with_obstacles
@@ -28,7 +29,6 @@ from flockd.sim.frame_server import FrameServer
 from flockd.sim.ground_station import GroundStation, Mode
 from flockd.sim.processes import Program
 from flockd.sim.swarm import Flight
-from flockd.sources import clock_at
 
 Progress = Callable[[int, int], None]
 

@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Self
 
-from flockd.flight_log.fleet_log import FleetFrame
+from flockd.onboard.sources import FramePublisher
+from flockd.review.flight_log.fleet_log import FleetFrame
 from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.ground_station import Poses
-from flockd.sources import FramePublisher
 
 
 class FrameServer:

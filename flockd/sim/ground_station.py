@@ -1,7 +1,7 @@
 """A ground station for a fleet of simulated autopilots, which also receives their true poses.
 
-Poses come over the MAVLink stream on which PX4 SITL sends its true state to a simulator; `flockd.autopilot`'s simulated
-autopilot sends the same.
+Poses come over the MAVLink stream on which PX4 SITL sends its true state to a simulator; `flockd.onboard.autopilot`'s
+simulated autopilot sends the same.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ import numpy as np
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import development as mavlink
 
-from flockd.autopilot.mavlink_messages import StatusText
-from flockd.autopilot.sticks import stick_curve
-from flockd.earth import metres_a_degree
-from flockd.errors import UnavailableError
-from flockd.messages import FloatArray
+from flockd.core.earth import metres_a_degree
+from flockd.core.errors import UnavailableError
+from flockd.core.messages import FloatArray
+from flockd.onboard.autopilot.mavlink_messages import StatusText
+from flockd.sim.autopilot.sticks import stick_curve
 from flockd.sim.leftovers import described, user_of_port
 from flockd.sim.vehicles import REFERENCE_DEG, euler_rotation
 

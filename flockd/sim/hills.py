@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.random import Generator
 
-from flockd.messages import FloatArray
+from flockd.core.messages import FloatArray
 from flockd.sim.terrain import CELL_M
 
 WAVELENGTHS_M = (80.0, 140.0)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from flockd.messages import FloatArray, IntArray
+from flockd.core.messages import FloatArray, IntArray
 
 
 def unit(v: FloatArray) -> FloatArray:

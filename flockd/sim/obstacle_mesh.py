@@ -8,11 +8,11 @@ from typing import NamedTuple, assert_never
 import numpy as np
 from numpy.random import Generator
 
-from flockd.messages import Float32Array, FloatArray
+from flockd.core.messages import Float32Array, FloatArray
 from flockd.sim import textures
 from flockd.sim.scenery import Scenery, leaf_colour, paint_colour, roof_colour
-from flockd.worlds.obstacle_worlds import LOWEST_CROWN_M
-from flockd.worlds.obstacles import Box, Capsule, Frustum, Material, Obstacles
+from flockd.sim.worlds.obstacle_worlds import LOWEST_CROWN_M
+from flockd.sim.worlds.obstacles import Box, Capsule, Frustum, Material, Obstacles
 
 _LOOKS = 3
 """Of each material: the trees of one wood are of a few kinds, the houses of one village too."""

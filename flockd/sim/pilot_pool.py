@@ -10,10 +10,10 @@ from functools import partial
 from types import TracebackType
 from typing import Self
 
-from flockd.config.scenario import ScenarioConfig
-from flockd.geometry import build_rig
-from flockd.messages import FrameSet, VehicleState
-from flockd.side_process import SideProcess
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.messages import FrameSet, VehicleState
+from flockd.core.side_process import SideProcess
+from flockd.flight.geometry import build_rig
 from flockd.sim.pilots import Pilots, Stepped
 from flockd.sim.truth_perception import RenderTruth, TruthPerception
 

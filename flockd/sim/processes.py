@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
 
-from flockd.side_process import with_package
+from flockd.core.side_process import with_package
 from flockd.sim.bound_to_parent import bound
 
 END_S = 30.0

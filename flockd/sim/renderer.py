@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flockd.messages import BoolArray, Float32Array, FloatArray, IntArray, UInt8Array
+from flockd.core.messages import BoolArray, Float32Array, FloatArray, IntArray, UInt8Array
 from flockd.sim import _raster, textures
 from flockd.sim.airframe import DroneModel, machine_texels
 from flockd.sim.distractors import Distractor, Placed

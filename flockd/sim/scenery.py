@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator
 
-from flockd.messages import Float32Array, FloatArray
+from flockd.core.messages import Float32Array, FloatArray
 from flockd.sim import textures
 from flockd.sim.mesh import Mesh
 from flockd.sim.terrain import grid_height

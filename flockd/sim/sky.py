@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.random import Generator
 
-from flockd.messages import FloatArray, UInt8Array
+from flockd.core.messages import FloatArray, UInt8Array
 from flockd.sim import textures
 from flockd.sim.textures import PackedArray
 

@@ -11,18 +11,19 @@ from datetime import UTC, datetime
 import numpy as np
 
 from flockd import __version__
-from flockd.choices import TRUTH_ROLES, SimulatedPerception
-from flockd.config.scenario import ScenarioConfig
-from flockd.errors import UsageError
-from flockd.flight_log.builder import FlightLogBuilder
-from flockd.flight_log.capture import key_frame_steps
-from flockd.flight_log.key_frames import KeyFrame
-from flockd.flight_log.log import FlightLog
-from flockd.flight_log.metadata import FlightMetadata, MissionMetadata
-from flockd.messages import FloatArray, MissionStatus
-from flockd.mission.circle_then_tangent import desired_of
-from flockd.recording import Recorder
-from flockd.recording.truth import TrueDrone, Truth
+from flockd.core.choices import TRUTH_ROLES, SimulatedPerception
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.errors import UsageError
+from flockd.core.messages import FloatArray, MissionStatus
+from flockd.flight.mission.circle_then_tangent import desired_of
+from flockd.onboard.recording import Recorder
+from flockd.onboard.recording.truth import TrueDrone, Truth
+from flockd.onboard.telemetry import TelemetrySink, publish_step
+from flockd.review.flight_log.builder import FlightLogBuilder
+from flockd.review.flight_log.capture import key_frame_steps
+from flockd.review.flight_log.key_frames import KeyFrame
+from flockd.review.flight_log.log import FlightLog
+from flockd.review.flight_log.metadata import FlightMetadata, MissionMetadata
 from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.clearances import with_obstacles
 from flockd.sim.exact_states import Commands, ExactFlock, HandPilot, fly_exact_states, start_yaw, step_times
@@ -30,7 +31,6 @@ from flockd.sim.handover import Handover
 from flockd.sim.pilot_pool import PilotPool
 from flockd.sim.pilots import Stepped
 from flockd.sim.vehicles import SimulatedAutopilot, Vehicles
-from flockd.telemetry import TelemetrySink, publish_step
 
 _KEY_FRAME_DRONES = 8
 """Of more, only the first ones' are kept."""

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.random import Generator
 
-from flockd.messages import FloatArray, IntArray
+from flockd.core.messages import FloatArray, IntArray
 
 CELL_M = 2.0
 HORIZON_M = 1500.0

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from flockd.messages import Float32Array, FloatArray
+from flockd.core.messages import Float32Array, FloatArray
 
 TEXTURE_BITS = 9
 SIZE = 1 << TEXTURE_BITS

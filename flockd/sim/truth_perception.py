@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flockd.geometry import Rig, RigCamera
-from flockd.messages import Float32Array, FloatArray, Frame, UInt8Array
-from flockd.perception import Crop, Instance, Networks, RangeEstimate, SceneMaps
+from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
+from flockd.flight.geometry import Rig, RigCamera
+from flockd.flight.perception import Crop, Instance, Networks, RangeEstimate, SceneMaps
 from flockd.sim.renderer import View, true_flow
 
 _SKY_M = 1000.0

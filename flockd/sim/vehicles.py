@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flockd.autopilot.fake_range_finder import FakeRangeFinder, Ground, level_ground
-from flockd.config.scenario import SensorConfig, StartConfig, VehicleConfig
-from flockd.messages import FloatArray, VehicleState
+from flockd.core.config.scenario import SensorConfig, StartConfig, VehicleConfig
+from flockd.core.messages import FloatArray, VehicleState
+from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, Ground, level_ground
 
 GRAVITY_M_S2 = 9.81
 _MAX_SUBSTEP_S = 0.02

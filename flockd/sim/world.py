@@ -12,13 +12,13 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from flockd.messages import Float32Array, FloatArray, UInt8Array
+from flockd.core.messages import Float32Array, FloatArray, UInt8Array
 from flockd.sim import _raster, obstacle_mesh, sky, terrain, textures
 from flockd.sim.hills import hills
 from flockd.sim.mesh import face_normals, unit
 from flockd.sim.scenery import Scenery, footprint_distance
 from flockd.sim.textures import PackedArray
-from flockd.worlds.obstacles import Obstacles
+from flockd.sim.worlds.obstacles import Obstacles
 
 GROUND_MAP_BITS = 11
 SHADOW_MAP_SIZE = 2048

@@ -12,9 +12,9 @@ from flockd.campaign.figures import Figures
 from flockd.campaign.flight_kinds import Task, fly_task
 from flockd.campaign.flight_plan import Plan
 from flockd.campaign.folder import CampaignFolder
-from flockd.config import ScenarioConfig
-from flockd.config.campaign import Figure
-from flockd.data import data_path
+from flockd.core.config import ScenarioConfig
+from flockd.core.config.campaign import Figure
+from flockd.core.data import data_path
 
 PAPER = data_path("config") / "paper_flight.yaml"
 HEAD = f"""\

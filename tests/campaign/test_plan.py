@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from flockd.campaign.flight_plan import Plan, Run
-from flockd.data import data_path
-from flockd.errors import ConfigError
+from flockd.core.data import data_path
+from flockd.core.errors import ConfigError
 from tests.campaign.flights import HEAD, PAPER, campaign_file
 
 EXAMPLES = sorted((data_path("config") / "campaigns").glob("*.yaml"))

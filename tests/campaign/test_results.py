@@ -17,9 +17,9 @@ from flockd.campaign.flight_table import write_table
 from flockd.campaign.folder import CampaignFolder
 from flockd.campaign.results import Results
 from flockd.campaign.verdicts import compare
-from flockd.errors import UsageError
+from flockd.core.errors import UsageError
 from tests.campaign.flights import HEAD, Shuffled, campaign_file, flown, made_up
-from tools.docs_campaign import table
+from tools.docs.docs_campaign import table
 
 GRID = "vary: {drone.flocking.cohesion: {values: [0.1, 0.2]}}\nmeasure: [min_distance_m, order_tail]\n"
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from flockd.cli import main
-from flockd.errors import ModelError
+from flockd.core.errors import ModelError
 
 ROOT = Path(__file__).parents[2]
 PAPER_FLIGHT = (ROOT / "config" / "paper_flight.yaml").read_text(encoding="utf-8")
@@ -361,7 +361,7 @@ def test_a_flight_leaves_its_log_summary_and_report(
     )
     (folder / "recordings").mkdir()
     (folder / "recordings" / "drone1.mcap").touch()
-    monkeypatch.setattr("flockd.report.flight_folder.write_report", lambda folder, progress, processes: folder)
+    monkeypatch.setattr("flockd.review.report.flight_folder.write_report", lambda folder, progress, processes: folder)
     assert main([*short, "--quiet", "--force"]) == 0
     captured = capsys.readouterr()
     assert (captured.out, captured.err) == (f"{folder / 'report.html'}\n", "")
@@ -372,7 +372,7 @@ def test_each_flight_has_its_own_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("flockd.report.flight_folder.write_report", lambda folder, progress, processes: folder)
+    monkeypatch.setattr("flockd.review.report.flight_folder.write_report", lambda folder, progress, processes: folder)
     for expected in ("", "-2", "-3"):
         assert main(["sim", "--perception", "truth", "--duration", "2", "--quiet"]) == 0
         assert capsys.readouterr().out == f"out/paper_flight-truth-seed0{expected}/report.html\n"
@@ -381,7 +381,7 @@ def test_each_flight_has_its_own_folder(
 def test_an_interrupted_flight_leaves_its_report_and_can_be_flown_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from flockd.flight_log.log import FlightLog
+    from flockd.review.flight_log.log import FlightLog
     from flockd.sim.vehicles import Vehicles
 
     step, steps = Vehicles.step, iter(range(1000))
@@ -392,7 +392,7 @@ def test_an_interrupted_flight_leaves_its_report_and_can_be_flown_again(
         step(vehicles, *arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Vehicles, "step", interrupted)
-    monkeypatch.setattr("flockd.report.flight_folder.write_report", lambda folder, progress, processes: folder)
+    monkeypatch.setattr("flockd.review.report.flight_folder.write_report", lambda folder, progress, processes: folder)
     folder = tmp_path / "flight"
     command = ["sim", "--perception", "truth", "--duration", "20", "--quiet", "--out", str(folder)]
     assert main(command) == 130
@@ -423,7 +423,7 @@ def test_wind_speed_and_radius_are_what_is_flown(capsys: pytest.CaptureFixture[s
 
 
 def test_two_flights_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from flockd.config import load_scenario
+    from flockd.core.config import load_scenario
     from flockd.sim.swarm import fly
 
     for name, seed in (("a", 0), ("b", 1)):

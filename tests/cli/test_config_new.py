@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from flockd.cli import main
-from flockd.config import load_drone, load_scenario
+from flockd.core.config import load_drone, load_scenario
 
 
 def test_a_scenario_of_each_mission_checks_and_keeps_its_drones_apart(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`flockd fleet` without any drone; with drones it is flown in tests/daemon."""
+"""`flockd fleet` without any drone; with drones it is flown in tests/onboard/daemon."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class _Silence:
 def test_a_drone_that_is_not_heard_gets_no_request(
     drones: str, told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("flockd.telemetry.operator_client.FleetOperator", _Silence)
+    monkeypatch.setattr("flockd.fleet.operator_client.FleetOperator", _Silence)
     assert main(["fleet", "hold", drones, "--connect", "tcp/127.0.0.1:1"]) == 69
     sentence = f"{told} found at tcp/127.0.0.1:1; no request was sent; check `flockd status`\n"
     assert capsys.readouterr().err == sentence

@@ -11,7 +11,7 @@ import pytest
 from flockd.cli import main
 from flockd.cli.fleet_page import _told
 
-RECORDING = Path(__file__).parents[1] / "replay" / "crossing.mcap"
+RECORDING = Path(__file__).parents[1] / "review" / "replay" / "crossing.mcap"
 
 
 @pytest.mark.parametrize(

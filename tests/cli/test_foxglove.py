@@ -16,7 +16,7 @@ def test_without_its_extra_it_says_what_to_install(
 ) -> None:
     for name in [name for name in sys.modules if name.partition(".")[0] == "foxglove"]:
         monkeypatch.delitem(sys.modules, name)
-    for name in [name for name in sys.modules if name.startswith("flockd.foxglove_server.")]:
+    for name in [name for name in sys.modules if name.startswith("flockd.fleet.foxglove.")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "foxglove", None)
     assert main(["foxglove", "--recordings", "nowhere"]) == 69
@@ -24,8 +24,8 @@ def test_without_its_extra_it_says_what_to_install(
 
 
 def test_a_taken_port_is_reported_in_one_sentence() -> None:
-    from flockd.errors import UnavailableError
-    from flockd.foxglove_server.server import FoxgloveServer
+    from flockd.core.errors import UnavailableError
+    from flockd.fleet.foxglove.server import FoxgloveServer
 
     class Nothing:
         span_s = None

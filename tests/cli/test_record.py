@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from flockd.cli import main
-from tests.recording.made_up import MODELS, record
+from tests.onboard.recording.made_up import MODELS, record
 
 
 @pytest.fixture

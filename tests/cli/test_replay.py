@@ -14,15 +14,15 @@ import pytest
 import yaml
 
 from flockd.cli import main
-from flockd.config import Overrides, ScenarioConfig, load_scenario
-from flockd.data import data_path
-from flockd.flight_log.from_recordings import flight_log, recordings_in
-from flockd.flight_log.log import FlightLog
-from flockd.messages import FrameSet, MissionOrder, PilotOutput, VehicleState
-from flockd.recording import Recorder
-from flockd.recording.reader import Recording
+from flockd.core.config import Overrides, ScenarioConfig, load_scenario
+from flockd.core.data import data_path
+from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, VehicleState
+from flockd.onboard.recording import Recorder
+from flockd.onboard.recording.reader import Recording
+from flockd.review.flight_log.from_recordings import flight_log, recordings_in
+from flockd.review.flight_log.log import FlightLog
 from flockd.sim.start import with_drones
-from tests.recording.made_up import MODELS, MadeUpPilot, drone_config, record
+from tests.onboard.recording.made_up import MODELS, MadeUpPilot, drone_config, record
 from tests.worlds import worlds_once
 
 __all__ = ["worlds_once"]
@@ -33,9 +33,9 @@ Capture = pytest.CaptureFixture[str]
 @pytest.fixture
 def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A recorded flight of the made-up pilot, which will also be the one to fly it again."""
-    monkeypatch.setattr("flockd.replay.recorded_flight.FlockPilot", MadeUpPilot)
+    monkeypatch.setattr("flockd.review.replay.recorded_flight.FlockPilot", MadeUpPilot)
     for module in ("recorded_flight", "fidelity"):
-        monkeypatch.setattr(f"flockd.replay.{module}.model_hashes", lambda perception: MODELS)
+        monkeypatch.setattr(f"flockd.review.replay.{module}.model_hashes", lambda perception: MODELS)
     path = tmp_path / "drone1.mcap"
     record(path)
     return path
@@ -55,7 +55,7 @@ class Nudged(MadeUpPilot):
 
 @pytest.fixture
 def nudged(path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr("flockd.replay.recorded_flight.FlockPilot", Nudged)
+    monkeypatch.setattr("flockd.review.replay.recorded_flight.FlockPilot", Nudged)
     return path
 
 
@@ -106,7 +106,7 @@ def test_a_reference_is_written_compared_and_updated(
     assert main(update) == 0
     assert main(against) == 0
     assert main([*against, "--start", "0.4"]) == 1, "a pilot that begins in the middle remembers nothing"
-    monkeypatch.setattr("flockd.replay.recorded_flight.FlockPilot", Nudged)
+    monkeypatch.setattr("flockd.review.replay.recorded_flight.FlockPilot", Nudged)
     capsys.readouterr()
     assert main(against) == 1
     last = capsys.readouterr().out.splitlines()[-1]
@@ -138,7 +138,7 @@ def test_a_replay_that_breaks_off_leaves_no_recording(
         def step(self, frames: FrameSet, vehicle: VehicleState, *, order: MissionOrder | None = None) -> PilotOutput:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("flockd.replay.recorded_flight.FlockPilot", Broken)
+    monkeypatch.setattr("flockd.review.replay.recorded_flight.FlockPilot", Broken)
     assert main(["replay", str(path), "--out", str(path.with_name("again.mcap"))]) == 130
     assert [file.name for file in path.parent.iterdir()] == ["drone1.mcap"]
     assert capsys.readouterr().err == "interrupted\n"
@@ -171,7 +171,7 @@ def test_speed_1_takes_as_long_as_the_flight_took(path: Path, capsys: Capture) -
 def test_what_keeps_a_replay_from_being_the_flight_is_told(
     path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
-    monkeypatch.setattr("flockd.replay.fidelity.model_hashes", lambda perception: {"flow": "cd" * 32})
+    monkeypatch.setattr("flockd.review.replay.fidelity.model_hashes", lambda perception: {"flow": "cd" * 32})
     killed = path.with_name("killed.mcap")
     killed.write_bytes(path.read_bytes()[:-200_000])
     assert main(["replay", str(killed), "--diff"]) == 0
@@ -234,7 +234,7 @@ class Flight:
 
 @pytest.fixture(scope="module", params=["dis", "flow"])
 def flight(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Flight:
-    from flockd.inference.hashes import model_hashes
+    from flockd.flight.inference.hashes import model_hashes
     from flockd.sim.swarm import fly
 
     flown = scenario({"drone.perception.flow": request.param})

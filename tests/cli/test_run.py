@@ -17,18 +17,18 @@ from pathlib import Path
 import pytest
 import yaml
 
-from flockd.autopilot.fake_autopilot import FakeAutopilot
 from flockd.cli import main
-from flockd.data import data_path
-from tests.autopilot.conftest import HEARTBEAT_S, free_port
-from tests.daemon.aboard import Cameras, config_for, free_endpoint
-from tests.inference.test_deadline import endless
+from flockd.core.data import data_path
+from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from tests.onboard.autopilot.conftest import HEARTBEAT_S, free_port
+from tests.onboard.daemon.aboard import Cameras, config_for, free_endpoint
+from tests.onboard.test_deadline import endless
 from tests.starvation import tell
 
 RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
 WITHOUT_NETWORKS = (
-    "import flockd.perception; from tests.daemon.aboard import TinyPerceiver; "
-    f"flockd.perception.load_networks = lambda *_: TinyPerceiver(); {RUN}"
+    "import flockd.flight.perception; from tests.onboard.daemon.aboard import TinyPerceiver; "
+    f"flockd.flight.perception.load_networks = lambda *_: TinyPerceiver(); {RUN}"
 )
 ROOT = Path(__file__).parents[2]
 SECONDS_TO_FAIL = 60.0

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from flockd.telemetry.fleet_status import status_rows
-from flockd.telemetry.repeater import Repeater
-from flockd.telemetry.topics import ComputerMessage, FlightMessage
-from flockd.telemetry.watcher import Heard, Watched
+from flockd.fleet.fleet_status import status_rows
+from flockd.fleet.watcher import Heard, Watched
+from flockd.onboard.telemetry.topics import ComputerMessage, FlightMessage
+from flockd.sim.repeater import Repeater
 
 NOW_S = 1000.0
 
@@ -96,7 +96,7 @@ def test_a_simulated_drone_is_there_and_healthy() -> None:
 
 def test_a_drone_whose_time_passes_slowly_is_not_quiet() -> None:
     """At a speed factor of 0.25 two messages a second come every 2 s, above the 1.5 s after which they are stale."""
-    from flockd.telemetry.watcher import _heard
+    from flockd.fleet.watcher import _heard
 
     def row(*heard: tuple[float, float], now_s: float) -> str:
         flight = None

@@ -1,4 +1,5 @@
-"""The catalogue of faults: each has a row, a name, and the stories that inject it. `python -m tools.faults` runs them.
+"""The catalogue of faults: each has a row, a name, and the stories that inject it. `python -m tools.checks.faults`
+runs them.
 
 A story is a test; most start a whole drone (`tests.faults.process`). It notes how long the reaction took with
 `reacted`, and asserts what the row promises beside it: the event that is reported, and how it goes on afterwards.
@@ -57,8 +58,8 @@ CATALOGUE = (
         "hover for a second at most, then Hold; no return by itself",
         (
             f"{_HERE}cameras.py::test_no_camera_delivers_any_more",
-            "tests/sources/test_v4l2.py::test_an_unplugged_camera_is_reported_at_once_and_comes_back_when_plugged_in",
-            "tests/sources/test_gstreamer.py::test_a_crash_is_followed_by_images_when_the_driver_is_back",
+            "tests/onboard/sources/test_v4l2.py::test_an_unplugged_camera_is_reported_at_once_and_comes_back_when_plugged_in",
+            "tests/onboard/sources/test_gstreamer.py::test_a_crash_is_followed_by_images_when_the_driver_is_back",
         ),
         within_s=3.0,
     ),
@@ -66,8 +67,8 @@ CATALOGUE = (
         2, "frozen-frames", "the same image or number again and again", "as for a camera that is unplugged",
         (
             f"{_HERE}cameras.py::test_all_cameras_freeze",
-            "tests/sources/test_v4l2.py::test_a_frozen_camera_counts_as_silent",
-            "tests/sources/test_gstreamer.py::test_a_frozen_pipeline_counts_as_silent",
+            "tests/onboard/sources/test_v4l2.py::test_a_frozen_camera_counts_as_silent",
+            "tests/onboard/sources/test_gstreamer.py::test_a_frozen_pipeline_counts_as_silent",
         ),
         within_s=3.0,
     ),
@@ -75,8 +76,8 @@ CATALOGUE = (
         3, "damaged-images", "corrupt or truncated images", "dropped and counted; degraded above a fifth",
         (
             f"{_HERE}cameras.py::test_images_are_damaged",
-            "tests/sources/test_v4l2.py::test_what_is_worth_nothing_is_dropped_and_counted_and_the_next_is_fine",
-            "tests/sources/test_gstreamer.py::test_what_is_worth_nothing_is_dropped_and_counted_and_the_next_is_fine",
+            "tests/onboard/sources/test_v4l2.py::test_what_is_worth_nothing_is_dropped_and_counted_and_the_next_is_fine",
+            "tests/onboard/sources/test_gstreamer.py::test_what_is_worth_nothing_is_dropped_and_counted_and_the_next_is_fine",
         ),
         within_s=6.0,
     ),
@@ -84,7 +85,7 @@ CATALOGUE = (
         4, "time-stamps-backwards", "time stamps are repeated or run backwards", "dropped and counted; degraded",
         (
             f"{_HERE}cameras.py::test_time_stamps_are_repeated_and_run_backwards",
-            "tests/pilot/test_flock_pilot.py::test_a_repeated_time_stamp_restarts_the_pair_and_says_so",
+            "tests/flight/pilot/test_flock_pilot.py::test_a_repeated_time_stamp_restarts_the_pair_and_says_so",
         ),
         within_s=5.0,
     ),
@@ -98,8 +99,8 @@ CATALOGUE = (
     Fault(
         6, "network-not-finite", "a network's output is not finite", "its step is discarded and counted; degraded",
         (
-            "tests/daemon/test_flight.py::test_networks_not_finite_or_stuck_degrade_and_sigterm_ends_in_hold",
-            "tests/pilot/test_flock_pilot.py::test_an_output_that_is_not_finite_costs_its_frame_only",
+            "tests/onboard/daemon/test_flight.py::test_networks_not_finite_or_stuck_degrade_and_sigterm_ends_in_hold",
+            "tests/flight/pilot/test_flock_pilot.py::test_an_output_that_is_not_finite_costs_its_frame_only",
             f"{_HERE}computer.py::test_a_networks_output_is_not_finite",
         ),
         within_s=2.0,
@@ -108,7 +109,7 @@ CATALOGUE = (
         7, "model-changed", "a model file is missing or changed", "refuse to start with exit code 78",
         (
             f"{_HERE}start.py::test_a_model_was_changed",
-            "tests/inference/test_refusals.py::test_a_start_with_a_damaged_model_ends_with_one_sentence",
+            "tests/flight/inference/test_refusals.py::test_a_start_with_a_damaged_model_ends_with_one_sentence",
         ),
         within_s=15.0,
     ),
@@ -116,7 +117,7 @@ CATALOGUE = (
         8, "network-stuck", "a network does not return", "end the run, then abandon it, then the watchdog acts",
         (
             f"{_HERE}computer.py::test_a_network_never_returns",
-            "tests/daemon/test_parts.py::test_a_stuck_network_is_ended_then_abandoned_then_hopeless",
+            "tests/onboard/daemon/test_parts.py::test_a_stuck_network_is_ended_then_abandoned_then_hopeless",
         ),
         within_s=2.0,
     ),
@@ -132,7 +133,7 @@ CATALOGUE = (
         10, "event-loop-stuck", "the event loop is stuck", "setpoints stop within 0.5 s; the watchdog is not fed",
         (
             f"{_HERE}computer.py::test_the_event_loop_is_stuck",
-            "tests/daemon/test_flight.py::test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe",
+            "tests/onboard/daemon/test_flight.py::test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe",
         ),
         within_s=0.5,
     ),
@@ -140,7 +141,7 @@ CATALOGUE = (
         11, "task-dies", "a task of the daemon dies", "Hold, and an exit code that is not zero",
         (
             f"{_HERE}computer.py::test_a_task_dies",
-            "tests/daemon/test_flight.py::test_a_dead_task_is_held_by_the_last_resort",
+            "tests/onboard/daemon/test_flight.py::test_a_dead_task_is_held_by_the_last_resort",
         ),
         within_s=2.0,
     ),
@@ -184,7 +185,7 @@ CATALOGUE = (
         "separation wins; never faster than can be braked",
         (
             f"{_HERE}flock.py::test_a_neighbour_comes_too_near",
-            "tests/safety/test_gate.py::test_two_that_fly_at_each_other_at_3_m_s_stop_before_the_minimum_distance",
+            "tests/flight/safety/test_gate.py::test_two_that_fly_at_each_other_at_3_m_s_stop_before_the_minimum_distance",
         ),
         within_s=1.5,
     ),
@@ -199,8 +200,8 @@ CATALOGUE = (
         18, "false-neighbour", "a drone is detected where there is none",
         "not confirmed before several hits; bounded influence",
         (
-            "tests/tracking/test_tracker.py::test_false_detections_of_one_frame_are_never_confirmed",
-            "tests/tracking/test_tracker.py::test_one_frame_three_metres_off_moves_a_confirmed_track_little",
+            "tests/flight/tracking/test_tracker.py::test_false_detections_of_one_frame_are_never_confirmed",
+            "tests/flight/tracking/test_tracker.py::test_one_frame_three_metres_off_moves_a_confirmed_track_little",
         ),
     ),
     Fault(
@@ -228,7 +229,7 @@ CATALOGUE = (
         22, "disk-full", "the disk is full", "stop recording, say so, fly on",
         (
             f"{_HERE}recording.py::test_the_disk_is_full",
-            "tests/recording/test_recorder.py::test_a_full_disk_ends_the_recording_and_not_the_flight",
+            "tests/onboard/recording/test_recorder.py::test_a_full_disk_ends_the_recording_and_not_the_flight",
         ),
         within_s=5.0,
     ),
@@ -237,7 +238,7 @@ CATALOGUE = (
         "`record recover` brings back all but the last chunk",
         (
             f"{_HERE}recording.py::test_it_is_killed_while_it_records",
-            "tests/recording/test_reader.py::test_a_kill_at_any_moment_loses_half_a_second_at_most",
+            "tests/onboard/recording/test_reader.py::test_a_kill_at_any_moment_loses_half_a_second_at_most",
         ),
         within_s=2.0,
     ),
@@ -283,7 +284,7 @@ CATALOGUE = (
         "ignored; commands only where configured",
         (
             f"{_HERE}outside.py::test_nonsense_on_the_telemetry_bus",
-            "tests/telemetry/test_access.py::test_what_is_no_message_is_counted_and_not_taken",
+            "tests/onboard/telemetry/test_access.py::test_what_is_no_message_is_counted_and_not_taken",
         ),
     ),
     Fault(
@@ -291,8 +292,8 @@ CATALOGUE = (
         "it counts as lost; no neighbour from it alone; the command stays within 0.1 m/s",
         (
             f"{_HERE}cameras.py::test_a_camera_shows_noise",
-            "tests/daemon/test_flight.py::test_a_noisy_camera_is_lost_and_said_so_until_it_is_good_again",
-            "tests/pilot/test_noisy_camera.py",
+            "tests/onboard/daemon/test_flight.py::test_a_noisy_camera_is_lost_and_said_so_until_it_is_good_again",
+            "tests/flight/pilot/test_noisy_camera.py",
         ),
         within_s=4.0,
     ),
@@ -300,16 +301,16 @@ CATALOGUE = (
         31, "absurd-mavlink", "a MAVLink message with unknown or absurd values", "the field is unknown and counted",
         (
             f"{_HERE}autopilot.py::test_messages_with_absurd_values",
-            "tests/autopilot/test_link.py::test_a_landed_state_that_mavlink_does_not_have_is_unknown_and_counted",
+            "tests/onboard/autopilot/test_link.py::test_a_landed_state_that_mavlink_does_not_have_is_unknown_and_counted",
         ),
     ),
     Fault(
         32, "home-moved", "home or the ground state changes in flight, by a second sender",
         "height band and fence stay until it is disarmed; reported",
         (
-            "tests/daemon/test_flight.py::"
+            "tests/onboard/daemon/test_flight.py::"
             "test_a_second_sender_with_the_autopilots_ids_moves_neither_height_band_nor_fence",
-            "tests/autopilot/test_mavlink_messages.py::"
+            "tests/onboard/autopilot/test_mavlink_messages.py::"
             "test_home_stays_while_armed_whatever_landed_state_and_home_say_and_moves_after",
         ),
     ),
@@ -325,21 +326,21 @@ CATALOGUE = (
         34, "foreign-recordings", "something foreign in the recordings' folder", "skipped with a warning; it records",
         (
             f"{_HERE}recording.py::test_foreign_things_lie_among_the_recordings",
-            "tests/recording/test_recorder.py::test_what_is_no_readable_file_in_the_folder_is_skipped_with_a_warning",
+            "tests/onboard/recording/test_recorder.py::test_what_is_no_readable_file_in_the_folder_is_skipped_with_a_warning",
         ),
     ),
     Fault(
         35, "endless-network", "a network that never ends", "refuse to start with exit code 78 within 10 s",
         (
             "tests/cli/test_run.py::test_a_network_that_never_ends_is_bad_configuration_within_ten_seconds",
-            "tests/inference/test_deadline.py::test_an_endless_network_is_refused_in_one_sentence",
+            "tests/onboard/test_deadline.py::test_an_endless_network_is_refused_in_one_sentence",
         ),
     ),
     Fault(
         36, "hostile-manifest", "a hostile manifest", "exit code 78 within 2 s: line, key, value, what to do",
         (
             f"{_HERE}start.py::test_a_manifest_is_hostile",
-            "tests/inference/test_manifest_file.py",
+            "tests/flight/inference/test_manifest_file.py",
         ),
         within_s=15.0,
     ),
@@ -347,15 +348,15 @@ CATALOGUE = (
         37, "hostile-recording", "a damaged or hostile recording", "one sentence, exit code 1, bounded memory",
         (
             f"{_HERE}files.py::test_a_recording_is_hostile",
-            "tests/recording/test_reader.py::test_a_hostile_chunk_is_damage_and_takes_little_memory",
-            "tests/recording/test_reader.py::test_damage_within_is_reported_and_recovered_from",
+            "tests/onboard/recording/test_reader.py::test_a_hostile_chunk_is_damage_and_takes_little_memory",
+            "tests/onboard/recording/test_reader.py::test_damage_within_is_reported_and_recovered_from",
         ),
     ),
     Fault(
         38, "huge-image", "an image that claims to be 60000 x 60000", "one sentence, before memory is taken",
         (
             f"{_HERE}files.py::test_an_image_claims_to_be_huge",
-            "tests/recording/test_reader.py::test_an_image_that_claims_to_be_huge_is_not_decoded",
+            "tests/onboard/recording/test_reader.py::test_an_image_that_claims_to_be_huge_is_not_decoded",
         ),
     ),
     Fault(
@@ -363,7 +364,7 @@ CATALOGUE = (
         "shown as malformed, escaped; `status` goes on",
         (
             f"{_HERE}outside.py::test_status_shows_a_peer_that_publishes_nonsense",
-            "tests/telemetry/test_malformed.py",
+            "tests/onboard/telemetry/test_malformed.py",
         ),
     ),
     Fault(
@@ -379,7 +380,7 @@ CATALOGUE = (
         41, "text-in-chunks", "the autopilot's text comes in several messages", "joined before anyone sees it",
         (
             f"{_HERE}autopilot.py::test_offboard_is_refused_and_the_whole_reason_reported",
-            "tests/autopilot/test_mavlink_messages.py::test_a_text_in_chunks_is_seen_whole_and_not_before",
+            "tests/onboard/autopilot/test_mavlink_messages.py::test_a_text_in_chunks_is_seen_whole_and_not_before",
         ),
     ),
     Fault(
@@ -393,14 +394,14 @@ CATALOGUE = (
         43, "absurd-limits", "limits in the configuration beyond physics", "refuse to start with exit code 78",
         (
             f"{_HERE}start.py::test_the_configuration_is_wrong",
-            "tests/safety/test_parameters.py::test_limits_beyond_what_any_multirotor_does_are_refused",
+            "tests/flight/safety/test_parameters.py::test_limits_beyond_what_any_multirotor_does_are_refused",
         ),
     ),
     Fault(
         44, "one-spot", "two drones at one horizontal spot", "they part, each to its own right",
         (
             f"{_HERE}flock.py::test_two_drones_at_one_spot_part",
-            "tests/flocking/test_law.py::test_two_drones_at_one_level_spot_part_each_to_its_own_right",
+            "tests/flight/flocking/test_law.py::test_two_drones_at_one_level_spot_part_each_to_its_own_right",
         ),
     ),
     Fault(
@@ -426,7 +427,7 @@ CATALOGUE = (
         (
             f"{_HERE}range_finder.py::test_the_range_finder_lies",
             f"{_HERE}range_finder.py::test_without_the_barometer_a_lie_is_no_scale_and_ends_in_hold",
-            "tests/perception/depth/test_contradiction.py",
+            "tests/flight/perception/depth/test_contradiction.py",
         ),
         within_s=3.0,
     ),

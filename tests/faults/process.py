@@ -14,15 +14,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from flockd.autopilot.fake_autopilot import FakeAutopilot
-from flockd.autopilot.fake_range_finder import FakeRangeFinder
-from flockd.config import DroneConfig
-from flockd.messages import UInt8Array
+from flockd.core.config import DroneConfig
+from flockd.core.messages import UInt8Array
+from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.sim.daemons import Daemons
 from flockd.sim.processes import Program
-from tests.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
-from tests.autopilot.flight import until
-from tests.daemon.aboard import CAMERAS, HEIGHT, WIDTH, Cameras, Watched, config_for, free_endpoint, watched
+from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
+from tests.onboard.autopilot.flight import until
+from tests.onboard.daemon.aboard import CAMERAS, HEIGHT, WIDTH, Cameras, Watched, config_for, free_endpoint, watched
 
 SECONDS_TO_START = 60.0
 """To load three networks on a computer that is busy with other things."""

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockd.autopilot.fake_autopilot import FakeAutopilot
-from flockd.autopilot.fake_telemetry import Mode
-from flockd.autopilot.fake_vehicle import Demand
-from flockd.config import DroneConfig
-from tests.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
-from tests.autopilot.flight import until
-from tests.daemon.aboard import SECONDS_TO_FAIL, aboard
+from flockd.core.config import DroneConfig
+from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from flockd.sim.autopilot.fake_telemetry import Mode
+from flockd.sim.autopilot.fake_vehicle import Demand
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import flying
+from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
+from tests.onboard.autopilot.flight import until
+from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, aboard
 from tests.starvation import tell
 
 pytestmark = pytest.mark.slow

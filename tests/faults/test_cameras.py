@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from flockd.messages import Frame
-from tests.autopilot.flight import until
-from tests.daemon.aboard import CAMERAS, SECONDS_TO_FAIL
+from flockd.core.messages import Frame
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import Process, flying
+from tests.onboard.autopilot.flight import until
+from tests.onboard.daemon.aboard import CAMERAS, SECONDS_TO_FAIL
 from tests.starvation import tell
 
 pytestmark = pytest.mark.slow

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.faults.catalogue import CATALOGUE, REACTION, Fault, fault_named, reacted
-from tools.faults import outcome
+from tools.checks.faults import outcome
 
 ROOT = Path(__file__).parents[2]
 ROWS = 47
@@ -74,7 +74,7 @@ def test_a_fault_passes_only_if_all_its_stories_that_could_run_did(
 
 
 def test_the_command_runs_what_it_is_asked_for() -> None:
-    command = [sys.executable, "-m", "tools.faults"]
+    command = [sys.executable, "-m", "tools.checks.faults"]
     unknown = subprocess.run([*command, "--only", "gremlins"], cwd=ROOT, capture_output=True, text=True, check=False)
     assert unknown.returncode == 2
     assert unknown.stderr == "faults: there is no fault 'gremlins'; --list prints their names\n"

@@ -15,15 +15,15 @@ from pathlib import Path
 import pytest
 import yaml
 
-from flockd.autopilot.fake_autopilot import FakeAutopilot
-from flockd.config import DroneConfig
-from flockd.daemon import DaemonError
-from flockd.daemon.host_monitors import WallClock
-from tests.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
-from tests.autopilot.flight import until
-from tests.daemon.aboard import SECONDS_TO_FAIL, Aboard, TinyPerceiver, aboard, config_for, free_endpoint
+from flockd.core.config import DroneConfig
+from flockd.onboard.daemon import DaemonError
+from flockd.onboard.daemon.host_monitors import WallClock
+from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import flying
+from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
+from tests.onboard.autopilot.flight import until
+from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, Aboard, TinyPerceiver, aboard, config_for, free_endpoint
 from tests.starvation import tell
 
 pytestmark = pytest.mark.slow
@@ -136,7 +136,7 @@ def test_it_gets_too_hot(
 ) -> None:  # fmt: skip
     autopilot, port = in_the_air
     temperature_c = [50.0]
-    monkeypatch.setattr("flockd.daemon.host_monitors.hottest_zone_c", lambda _: temperature_c[0])
+    monkeypatch.setattr("flockd.onboard.daemon.host_monitors.hottest_zone_c", lambda _: temperature_c[0])
 
     async def story() -> None:
         with autopilot:
@@ -191,7 +191,7 @@ def test_a_task_dies(
                 def dies(*_: object) -> None:
                     raise ArithmeticError("for the test")
 
-                monkeypatch.setattr("flockd.daemon.status_messages._computer_message", dies)
+                monkeypatch.setattr("flockd.onboard.daemon.status_messages._computer_message", dies)
                 fault_s = time.monotonic()
                 await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
                 reacted(record_property, "task-dies", time.monotonic() - fault_s)
@@ -209,7 +209,7 @@ def test_the_wall_clock_is_set(
     autopilot, port = in_the_air
     ahead_s = [0.0]
     watch = functools.partial(WallClock, wall=lambda: time.time() + ahead_s[0])
-    monkeypatch.setattr("flockd.daemon.startup.WallClock", watch)
+    monkeypatch.setattr("flockd.onboard.daemon.startup.WallClock", watch)
 
     async def story() -> None:
         with autopilot:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.datasets.test_image_headers import _claiming
-from tests.recording.made_up import record
+from tests.ground.datasets.test_image_headers import _claiming
+from tests.onboard.recording.made_up import record
 
 pytestmark = pytest.mark.slow
 RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"

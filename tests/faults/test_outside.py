@@ -13,13 +13,13 @@ from typing import Any
 import pytest
 import zenoh
 
-from flockd.config import DroneConfig
-from flockd.zenoh_session import close_session, open_session
-from tests.autopilot.flight import until
-from tests.daemon.aboard import SECONDS_TO_FAIL, client, free_endpoint
+from flockd.core.config import DroneConfig
+from flockd.onboard.telemetry.zenoh_session import close_session, open_session
 from tests.faults.process import Process, flying
+from tests.onboard.autopilot.flight import until
+from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, client, free_endpoint
+from tests.onboard.telemetry.test_malformed import FLIGHT
 from tests.starvation import tell
-from tests.telemetry.test_malformed import FLIGHT
 
 pytestmark = pytest.mark.slow
 RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"

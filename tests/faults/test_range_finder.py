@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flockd.autopilot.fake_range_finder import FakeRangeFinder, level_ground
-from flockd.autopilot.fake_vehicle import Demand
-from flockd.choices import HeightSource
-from flockd.config import DroneConfig
-from flockd.config.scenario import RangeFinderConfig
-from flockd.messages import FloatArray, RangeReading
-from tests.autopilot.conftest import HOVER_M
-from tests.autopilot.flight import until
-from tests.daemon.aboard import SECONDS_TO_FAIL
+from flockd.core.choices import HeightSource
+from flockd.core.config import DroneConfig
+from flockd.core.config.scenario import RangeFinderConfig
+from flockd.core.messages import FloatArray, RangeReading
+from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
+from flockd.sim.autopilot.fake_vehicle import Demand
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import Process, drone, started
+from tests.onboard.autopilot.conftest import HOVER_M
+from tests.onboard.autopilot.flight import until
+from tests.onboard.daemon.aboard import SECONDS_TO_FAIL
 from tests.starvation import tell
 
 pytestmark = pytest.mark.slow

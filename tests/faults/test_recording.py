@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 
 from flockd.cli import main
-from flockd.recording.reader import Recording
-from tests.autopilot.flight import until
-from tests.daemon.aboard import SECONDS_TO_FAIL
+from flockd.onboard.recording.reader import Recording
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import Process, flying
+from tests.onboard.autopilot.flight import until
+from tests.onboard.daemon.aboard import SECONDS_TO_FAIL
 from tests.starvation import tell
 
 pytestmark = pytest.mark.slow

@@ -14,12 +14,12 @@ from typing import Any
 import pytest
 import yaml
 
-from flockd.data import data_path
-from tests.autopilot.conftest import free_port
-from tests.autopilot.flight import until
-from tests.daemon.aboard import SECONDS_TO_FAIL, config_for, free_endpoint
+from flockd.core.data import data_path
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import flying
+from tests.onboard.autopilot.conftest import free_port
+from tests.onboard.autopilot.flight import until
+from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, config_for, free_endpoint
 from tests.starvation import tell
 
 pytestmark = pytest.mark.slow

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flockd.config.perception import NoiseParameters
-from flockd.config.scenario import CameraFaultConfig
-from flockd.messages import UInt8Array
-from flockd.perception.image_noise import noise_shares
+from flockd.core.config.perception import NoiseParameters
+from flockd.core.config.scenario import CameraFaultConfig
+from flockd.core.messages import UInt8Array
+from flockd.flight.perception.image_noise import noise_shares
 from flockd.sim.camera_faults import CameraFaults
 
 GREY = np.full((128, 160, 3), 120, np.uint8)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
-from flockd.config import load_scenario
-from flockd.data import data_path
-from flockd.flight_log.fleet_log import FleetRun
+from flockd.core.config import load_scenario
+from flockd.core.data import data_path
+from flockd.review.flight_log.fleet_log import FleetRun
 from flockd.sim import fleet as fleet_module
 from flockd.sim.fleet import _Fleet
 from flockd.sim.ground_station import _update, _Vehicle

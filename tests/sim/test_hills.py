@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from flockd.autopilot.fake_range_finder import FakeRangeFinder, level_ground, range_to_ground
-from flockd.config import load_scenario
-from flockd.config.scenario import RangeFinderConfig, SensorConfig
-from flockd.data import data_path
-from flockd.messages import FloatArray, RangeReading
+from flockd.core.config import load_scenario
+from flockd.core.config.scenario import RangeFinderConfig, SensorConfig
+from flockd.core.data import data_path
+from flockd.core.messages import FloatArray, RangeReading
+from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground, range_to_ground
 from flockd.sim.hills import hills
 from flockd.sim.renderer import Renderer
 from flockd.sim.vehicles import SimulatedAutopilot, euler_rotation

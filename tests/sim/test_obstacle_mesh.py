@@ -9,7 +9,7 @@ import numpy as np
 from flockd.sim.camera_simulator import FIELD_GRID_M, field_grid
 from flockd.sim.renderer import Renderer
 from flockd.sim.world import World
-from flockd.worlds.obstacles import Box, Capsule, Frustum, Obstacles
+from flockd.sim.worlds.obstacles import Box, Capsule, Frustum, Obstacles
 
 SIZE = (320, 240)
 FOCAL_PX = 160.0

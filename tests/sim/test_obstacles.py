@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from flockd.config.obstacle_field import ClearingConfig, ObstaclesConfig
-from flockd.errors import UsageError
-from flockd.messages import SECTORS
+from flockd.core.config.obstacle_field import ClearingConfig, ObstaclesConfig
+from flockd.core.errors import UsageError
+from flockd.core.messages import SECTORS
 from flockd.sim.clearances import clearances
-from flockd.worlds.obstacle_worlds import generate_obstacles
-from flockd.worlds.obstacles import Box, Capsule, Frustum, Obstacles, true_ranges
+from flockd.sim.worlds.obstacle_worlds import generate_obstacles
+from flockd.sim.worlds.obstacles import Box, Capsule, Frustum, Obstacles, true_ranges
 
 HERE = np.array([0.0, 0.0, -4.0])
 NORTH, EAST = 0.0, math.pi / 2

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from flockd.errors import UnavailableError
+from flockd.core.errors import UnavailableError
 from flockd.sim.ground_station import GroundStation
 from flockd.sim.leftovers import described, px4_instance, user_of_port
 

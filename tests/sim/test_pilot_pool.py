@@ -10,18 +10,18 @@ from pathlib import Path
 
 import pytest
 
-from flockd.config import Overrides, ScenarioConfig, load_scenario
-from flockd.data import data_path
-from flockd.errors import ModelError, UnavailableError
-from flockd.side_process import SideProcess
+from flockd.core.config import Overrides, ScenarioConfig, load_scenario
+from flockd.core.data import data_path
+from flockd.core.errors import ModelError, UnavailableError
+from flockd.core.side_process import SideProcess
 from flockd.sim.pilots import Pilots
 from flockd.sim.swarm import fly
 from tests.sim.test_orphans import _until_gone
 
 FLIGHT = """\
 import os, sys
-from flockd.config import load_scenario
-from flockd.side_process import SideProcess
+from flockd.core.config import load_scenario
+from flockd.core.side_process import SideProcess
 from flockd.sim.pilots import Pilots
 process = SideProcess("flew", Pilots, load_scenario(sys.argv[1]), [0], None)
 print(process.pid, flush=True)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from flockd.messages import FloatArray
+from flockd.core.messages import FloatArray
 from flockd.sim.airframe import DroneModel
 from flockd.sim.distractors import Placed, bag, balloon, bird, kite, mast
 from flockd.sim.drone_models import FAMILIES, drone_model

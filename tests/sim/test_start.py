@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from flockd.config import load_scenario
+from flockd.core.config import load_scenario
 from flockd.sim.start import with_drones
 
 PAPER = load_scenario(Path(__file__).parents[2] / "config" / "paper_flight.yaml")

@@ -8,13 +8,13 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from flockd.config import Overrides, ScenarioConfig, load_scenario
-from flockd.data import data_path
-from flockd.flight_log.log import FlightLog
+from flockd.core.config import Overrides, ScenarioConfig, load_scenario
+from flockd.core.data import data_path
+from flockd.onboard.telemetry import TelemetrySink
+from flockd.onboard.telemetry.publisher import ZenohTelemetry
+from flockd.review.flight_log.log import FlightLog
 from flockd.sim.start import with_drones
 from flockd.sim.swarm import Flight, fly
-from flockd.telemetry import TelemetrySink
-from flockd.telemetry.publisher import ZenohTelemetry
 
 STEPS = 3
 
@@ -106,7 +106,7 @@ def test_truth_flight_ends_as_the_pentagon() -> None:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_papers_flight_from_pixels(seed: int) -> None:
     """Nobody closer than 1 m, order 0.98, union 1, recall 0.97, under one false neighbour a drone and minute."""
-    from flockd.report.summary import summarise
+    from flockd.review.report.summary import summarise
 
     paper = load_scenario(data_path("config") / "paper_flight.yaml", {"seed": seed})
     summary = summarise(fly(paper).log)

@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from flockd.config.drone import DroneConfig
-from flockd.config.flocking import FlockingParameters
-from flockd.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
-from flockd.config.scenario import ScenarioConfig, SensorConfig, StartConfig, VehicleConfig
-from flockd.flocking.metrics import min_distance, obj2, pair_distances
+from flockd.core.config.drone import DroneConfig
+from flockd.core.config.flocking import FlockingParameters
+from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.core.config.scenario import ScenarioConfig, SensorConfig, StartConfig, VehicleConfig
+from flockd.flight.flocking.metrics import min_distance, obj2, pair_distances
 from flockd.sim.exact_states import fly_exact_states, step_times
 from flockd.sim.vehicles import SimulatedAutopilot, Vehicles, attitude, euler_rotation
 

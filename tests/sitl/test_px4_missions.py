@@ -11,9 +11,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from flockd.config import load_scenario
-from flockd.data import data_path
-from tools.px4_missions import MISSIONS, Mission, kept, main, rows
+from flockd.core.config import load_scenario
+from flockd.core.data import data_path
+from tools.checks.px4_missions import MISSIONS, Mission, kept, main, rows
 
 PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flockd.config.scenario import ScenarioConfig
+from flockd.core.config.scenario import ScenarioConfig
 from flockd.sim.autopilots import SimulatedAutopilots
-from tools.px4_modes import FAULTS, Fault, Result, _line, main, run
+from tools.checks.px4_modes import FAULTS, Fault, Result, _line, main, run
 
 PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
 
@@ -41,7 +41,7 @@ def test_a_killed_companion_ends_a_fake_autopilots_offboard_flight_in_hold(
     name: str, speed_factor: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The whole of a trial, with a fake autopilot in PX4's place: it goes from offboard to Hold a second later."""
-    monkeypatch.setattr("tools.px4_modes.Px4s", _Fake)
+    monkeypatch.setattr("tools.checks.px4_modes.Px4s", _Fake)
     (killed,) = [fault for fault in FAULTS if fault.name == name]
     (result,) = run([killed], speed_factor, lambda result: None)
     assert result.modes == ("OFFBOARD", "LOITER"), result

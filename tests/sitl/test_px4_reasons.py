@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from flockd.autopilot.refusal_reasons import REASONS
-from tools.px4_reasons import PROVOCATIONS, Provocation, Result, _row, main, run
+from flockd.onboard.autopilot.refusal_reasons import REASONS
+from tools.checks.px4_reasons import PROVOCATIONS, Provocation, Result, _row, main, run
 
 PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
 

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 from pymavlink import mavutil
 
-from flockd.config import DroneConfig, load, load_scenario
-from flockd.data import data_path
-from flockd.doctor.autopilot_checks import check_autopilot
-from flockd.doctor.finding import Level
+from flockd.core.config import DroneConfig, load, load_scenario
+from flockd.core.data import data_path
+from flockd.ground.doctor.autopilot_checks import check_autopilot
+from flockd.ground.doctor.finding import Level
 from flockd.sim.autopilots import Px4s
 from flockd.sim.start import with_drones
 

@@ -45,7 +45,7 @@ class CropFiles:
                     raise ValueError(f"{path}: its crops have no masks; make the folder anew")
         if not self._files:
             raise FileNotFoundError(
-                f"{self._folder}: no crops here; make them with `python -m tools.render_drone_crops`"
+                f"{self._folder}: no crops here; make them with `python -m tools.training.render_drone_crops`"
             )
         self._ends = np.cumsum([len(file["drone"]) for file in self._files.values()])
         family = np.concatenate([np.where(file["drone"] > 0.5, file["family"], -1) for file in self._files.values()])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.lib.format import open_memmap
 from numpy.typing import NDArray
 
-from flockd.geometry import PinholeCamera, RigCamera, RigidTransform
+from flockd.flight.geometry import PinholeCamera, RigCamera, RigidTransform
 
 HEIGHT, WIDTH = 640, 480
 MAX_DRONES = 6
@@ -51,7 +51,9 @@ def open_pairs(folder: Path) -> PairSet:
     """The pairs of every part in ``folder``, opened read-only."""
     parts = sorted(folder.glob("part-*"))
     if not parts:
-        raise FileNotFoundError(f"{folder}: no rendered pairs; make them with `python -m tools.render_training_data`")
+        raise FileNotFoundError(
+            f"{folder}: no rendered pairs; make them with `python -m tools.training.render_training_data`"
+        )
     opened = {name: [np.load(part / f"{name}.npy", mmap_mode="r") for part in parts] for name in ARRAYS}
     big = {"image", "depth", "ids", "flow", "flow_valid"}
     arrays = {n: (_Chained(a) if n in big else np.concatenate([np.asarray(x) for x in a])) for n, a in opened.items()}

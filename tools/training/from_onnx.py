@@ -18,7 +18,7 @@ from tools.training.networks import first_layers_of
 
 
 def begin_with_onnx(net: nn.Module, path: Path, run: Callable[[], object]) -> None:
-    """Give ``net`` the weights of the ONNX file that ``tools.export`` made of one like it.
+    """Give ``net`` the weights of the ONNX file that ``tools.training.export`` made of one like it.
 
     ``run`` calls ``net`` on a batch of training samples: what the normalisations see of it becomes what they know.
     Raises ValueError where the file is of another network.

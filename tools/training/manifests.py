@@ -10,8 +10,8 @@ from typing import Any
 import yaml
 from numpy.typing import NDArray
 
-from flockd.inference import OnnxModel
-from flockd.perception.requirements import check_roles
+from flockd.flight.inference import OnnxModel
+from flockd.flight.perception.requirements import check_roles
 
 
 def write_manifest(document: dict[str, Any], file: Path, golden: Mapping[str, NDArray[Any]]) -> Path:

@@ -51,7 +51,7 @@ def _entry(image: Tensor, *planes: Tensor) -> Tensor:
     """What the first layers of a network that runs look at: the image's 2 x 2 blocks in grey levels less 128, planes.
 
     (n, h, w, 3) uint8 -> (n, 12 + ., h / 2, w / 2). Whole numbers from 0 to 255 less 128 are 8-bit numbers as they are:
-    see ``tools.quantise``.
+    see ``tools.training.quantise``.
     """
     n, h, w, _ = image.shape
     blocks = image.reshape(n, h // 2, 2, w // 2, 2, 3).permute(0, 1, 3, 2, 4, 5)

@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from trimesh.visual.color import uv_to_color
 from trimesh.visual.material import PBRMaterial
 
-from flockd.config.perception import MAX_DRONE_SIZE_M, MIN_DRONE_SIZE_M
+from flockd.core.config.perception import MAX_DRONE_SIZE_M, MIN_DRONE_SIZE_M
 from flockd.sim.airframe import MACHINE_TEXTURES, Airframe, DroneModel
 from flockd.sim.mesh import Mesh, face_normals
 

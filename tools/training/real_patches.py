@@ -1,4 +1,4 @@
-"""Patches of real pictures (tools/mine_pictures.py): what is no drone, backgrounds, and real drones."""
+"""Patches of real pictures (tools/training/mine_pictures.py): what is no drone, backgrounds, and real drones."""
 
 from __future__ import annotations
 
@@ -40,7 +40,9 @@ class RealPatches:
                 self._boxes.append(arrays[f"{kind}_box"])
                 shares.append((weights or {}).get(path.stem, math.sqrt(len(arrays[kind]))))
         if not self._patches:
-            raise FileNotFoundError(f"{folder}: no patches of kind {kind} here; make them with tools/mine_pictures.py")
+            raise FileNotFoundError(
+                f"{folder}: no patches of kind {kind} here; make them with tools/training/mine_pictures.py"
+            )
         self._shares = np.array(shares) / sum(shares)
 
     @property

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flockd.pictures.coco_labels import read_labels
-from flockd.pictures.picture_files import PictureFile, find_pictures
+from flockd.ground.pictures.coco_labels import read_labels
+from flockd.ground.pictures.picture_files import PictureFile, find_pictures
 from tools.training.augment import as_filmed
 from tools.training.dataset import FOCAL_PX, R_BODY_CAMERA, ground_plane, ray_tangents
 from tools.training.samples import Sample

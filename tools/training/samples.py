@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flockd.geometry import Rig, VirtualCrop, virtual_crop
+from flockd.flight.geometry import Rig, VirtualCrop, virtual_crop
 from flockd.sim.airframe import DroneModel
 from tools.training.augment import as_filmed, motion_blur, photometric
 from tools.training.dataset import (

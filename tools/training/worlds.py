@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flockd.config.obstacle_field import ObstaclesConfig
+from flockd.core.config.obstacle_field import ObstaclesConfig
 
 FLIGHTS = range(0, 1_000_000)
 TRAINING = range(1_000_000, 2_000_000)

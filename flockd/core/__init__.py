@@ -1,0 +1,1 @@
+"""The words: messages, choices, errors, configuration and shipped files."""

@@ -1,0 +1,27 @@
+"""The typed configuration and its loader."""
+
+from flockd.core.config.campaign import CampaignConfig
+from flockd.core.config.drone import DroneConfig
+from flockd.core.config.loader import (
+    Overrides,
+    load,
+    load_campaign,
+    load_drone,
+    load_scenario,
+    load_with_places,
+    schema_of,
+)
+from flockd.core.config.scenario import ScenarioConfig
+
+__all__ = [
+    "CampaignConfig",
+    "DroneConfig",
+    "Overrides",
+    "ScenarioConfig",
+    "load",
+    "load_campaign",
+    "load_drone",
+    "load_scenario",
+    "load_with_places",
+    "schema_of",
+]

@@ -1,0 +1,42 @@
+"""The link to the autopilot, and what may be asked of it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from flockd.core.config.base import Distance, Section, Share, Speed
+
+
+class AutopilotParameters(Section):
+    """How flockd reaches this drone's autopilot, and what it may ask of it."""
+
+    address: Annotated[str, Field(pattern=r"^(udpin|udpout|tcpin|tcpout|serial)://.+:\d+$")] = "udpin://127.0.0.1:14540"
+    """`udpin://` waits for an autopilot that sends to this address; `serial:///dev/ttyS1:921600` is a cable."""
+    system_id: Annotated[int, Field(ge=1, le=255)] | None = None
+    """The autopilot's MAV_SYS_ID; other systems are ignored. By default that of the first heartbeat received."""
+    setpoint_rate_hz: Annotated[float, Field(ge=5, le=50)] = 20.0
+    max_setpoint_age_s: Annotated[float, Field(gt=0, le=10)] = 1.0
+    """An older setpoint is not sent."""
+    max_control_age_s: Annotated[float, Field(gt=0, le=0.4)] = 0.3
+    """Nothing is sent when the control loop has not run for this long."""
+    max_gap_s: Annotated[float, Field(gt=0, le=0.9)] = 0.5
+    """A longer gap between setpoints in offboard flight ends the stream until it is begun anew. Keep it below PX4's
+    COM_OF_LOSS_T: PX4 returns to offboard by itself when setpoints come back."""
+    max_heartbeat_age_s: Annotated[float, Field(gt=0, le=10)] = 2.0
+    """The link counts as lost when no heartbeat has arrived for this long."""
+    on_failure: Literal["hold", "land"] = "hold"
+    """The mode that flockd requests from the autopilot when it cannot go on."""
+    arm_and_take_off: bool = False
+    """By default the pilot arms, brings the drone up and switches to offboard."""
+    height_m: Distance | None = None
+    """Height above home to fly at; by default the height at which the flight begins."""
+    max_velocity_trim_m_s: Speed = 0.5
+    """Where the autopilot's velocity and the cameras' differ, setpoints are corrected by up to this: an autopilot flies
+    by its own estimate, which GNSS alone leaves off by 0.1 to 0.3 m/s. 0: not at all. Does nothing with `own_velocity:
+    autopilot`."""
+    velocity_trim_memory: Share = 0.7
+    """Share of the last correction that each step keeps: noise of single steps goes, slow drifts stay."""
+    low_battery_share: Share = 0.2
+    """The battery counts as low when the autopilot says that no more than this is left."""

@@ -1,0 +1,104 @@
+"""The typed configuration of one drone: every parameter, its unit, its default and its limits.
+
+Strict: an unknown key, a wrong type or a number that is not finite is refused. The defaults are the paper's where it
+gives one.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from flockd.core.choices import OwnVelocitySource
+from flockd.core.config.autopilot import AutopilotParameters
+from flockd.core.config.avoidance import ObstacleParameters
+from flockd.core.config.base import Section, refuse
+from flockd.core.config.flocking import FlockingParameters
+from flockd.core.config.geometry import GeometryParameters
+from flockd.core.config.mission import MissionParameters, mission_faults
+from flockd.core.config.perception import PerceptionConfig
+from flockd.core.config.recording import RecordingConfig
+from flockd.core.config.rig import RigConfig
+from flockd.core.config.safety import SafetyParameters
+from flockd.core.config.source import SourceParameters
+from flockd.core.config.telemetry import TelemetryParameters
+from flockd.core.config.tracking import TrackingParameters
+
+
+class DroneConfig(Section):
+    """Everything one drone's pilot needs."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")] = "drone"
+    """By which it is known in telemetry and recordings; different for each drone of a fleet."""
+    step_s: Annotated[float, Field(gt=0, le=60)] = 0.5
+    rig: RigConfig
+    source: SourceParameters | None = None
+    """Where the frames come from; needed to fly, not to simulate."""
+    perception: PerceptionConfig = PerceptionConfig()
+    geometry: GeometryParameters = GeometryParameters()
+    tracking: TrackingParameters = TrackingParameters()
+    flocking: FlockingParameters = FlockingParameters()
+    mission: MissionParameters = MissionParameters()
+    obstacles: ObstacleParameters = ObstacleParameters()
+    safety: SafetyParameters = SafetyParameters()
+    own_velocity: OwnVelocitySource = "vision"
+    yaw: Literal["hold", "course"] = "course"
+    """Heading: kept as it is, or along the desired velocity."""
+
+    @model_validator(mode="after")
+    def _the_mission_can_be_flown(self) -> Self:
+        faults = mission_faults(self.mission, self.safety.gate, self.flocking.max_speed_m_s)
+        refuse(self, {("mission", *key): text for key, text in faults.items()})
+        return self
+
+    @model_validator(mode="after")
+    def _the_gate_lets_the_law_through(self) -> Self:
+        if self.flocking.max_speed_m_s > self.safety.gate.max_speed_m_s:
+            raise ValueError(
+                f"flocking.max_speed_m_s {self.flocking.max_speed_m_s:g} is above safety.gate.max_speed_m_s, which "
+                f"would refuse it; write {self.safety.gate.max_speed_m_s:g} or less"
+            )
+        return self
+
+    recording: RecordingConfig = RecordingConfig()
+    autopilot: AutopilotParameters | None = None
+    """None: this drone's commands go nowhere but to the simulator."""
+    telemetry: TelemetryParameters = TelemetryParameters()
+
+    @property
+    def speed_factor(self) -> float:
+        """How fast this drone's time passes: 1 unless it is simulated."""
+        return 1.0 if self.source is None else self.source.shared_memory.speed_factor
+
+    @model_validator(mode="after")
+    def _the_gate_lets_the_trim_through(self) -> Self:
+        gate_m_s, law_m_s = self.safety.gate.max_speed_m_s, self.flocking.max_speed_m_s
+        trim_m_s = 0.0 if self.autopilot is None else self.autopilot.max_velocity_trim_m_s
+        if law_m_s + trim_m_s > gate_m_s:
+            raise ValueError(
+                f"flocking.max_speed_m_s {law_m_s:g} and autopilot.max_velocity_trim_m_s {trim_m_s:g} are above "
+                f"safety.gate.max_speed_m_s, which would refuse them; write {gate_m_s - law_m_s:g} or less for the trim"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _only_simulated_time_is_slow(self) -> Self:
+        if self.speed_factor != 1.0 and self.autopilot is not None and self.autopilot.address.startswith("serial:"):
+            raise ValueError(
+                "source.shared_memory.speed_factor is for simulations, and an autopilot on a cable is none; delete it"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _every_camera_has_its_device(self) -> Self:
+        if self.source is None or self.source.kind == "shared_memory":
+            return self
+        rig = [camera.name for camera in self.rig.cameras]
+        devices = [camera.name for camera in self.source.cameras]
+        if sorted(rig) != sorted(devices):
+            raise ValueError(
+                f"source.cameras names {', '.join(devices) or 'none'}, but the rig has {', '.join(rig)}; "
+                "give each camera of the rig one entry of the same name"
+            )
+        return self

@@ -1,0 +1,42 @@
+"""The flocking law, Eq. 38-42."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from flockd.core.config.base import Distance, NonNegative, Section
+
+
+class WeightParameters(Section):
+    """The influence weight W of Eq. 39 and 40."""
+
+    kind: Literal["uniform", "nearest"] = "nearest"
+    """`nearest`: 1 on the nearest, 0 on the others; `uniform`: 1 on all, with which more than ten drones crowd."""
+    nearest: Annotated[int, Field(ge=1)] = 6
+    """With kind `nearest`: on how many. Seven drones or fewer fly with 6 as with `uniform`."""
+
+
+class FlockingParameters(Section):
+    """Eq. 38-42, with the paper's values."""
+
+    cohesion: NonNegative = 0.1
+    """C_f"""
+    alignment: NonNegative = 0.1
+    """C_av"""
+    separation: NonNegative = 10.0
+    """C_c"""
+    velocity: NonNegative = 1.0
+    """C_vf"""
+    observation_distance_m: Distance = 20.0
+    """D_c"""
+    desired_distance_m: Distance = 3.5
+    """D_d"""
+    separation_distance_m: Distance = 1.5
+    """D_II"""
+    weight: WeightParameters = WeightParameters()
+    own_weight: NonNegative = 1.0
+    """W_i of Eq. 42"""
+    max_speed_m_s: Annotated[float, Field(gt=0, le=50)] = 3.0
+    max_acceleration_m_s2: Annotated[float, Field(gt=0, le=50)] = 2.0

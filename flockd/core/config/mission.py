@@ -1,0 +1,180 @@
+"""Where a drone wants to go."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from flockd.core.config.base import Distance, NonNegative, Section, Speed, refuse
+from flockd.core.config.safety import GateParameters
+
+MissionKind = Literal["circle_then_tangent", "hover", "velocity", "waypoints", "follow", "operator"]
+AtEnd = Literal["hold", "land", "return"]
+Faults = dict[tuple[str | int, ...], str]
+"""What is wrong, by the keys that lead there."""
+
+_Metres = Annotated[float, Field(ge=-100_000, le=100_000)]
+_ONLY_FOR: Mapping[str, MissionKind] = {
+    "radius_m": "circle_then_tangent",
+    "circle_until_s": "circle_then_tangent",
+    "velocity_m_s": "velocity",
+    "waypoints": "waypoints",
+    "at_end": "waypoints",
+}
+"""Keys that only one kind of mission has."""
+
+
+class WaypointParameters(Section):
+    """A place to fly to: north_m and east_m, or latitude_deg and longitude_deg."""
+
+    north_m: _Metres | None = None
+    """From the mission's origin; so `east_m`."""
+    east_m: _Metres | None = None
+    latitude_deg: Annotated[float, Field(ge=-85, le=85)] | None = None
+    """On the WGS 84 ellipsoid, as maps have it; so `longitude_deg`."""
+    longitude_deg: Annotated[float, Field(ge=-180, le=180)] | None = None
+    height_m: Annotated[float, Field(ge=-1000, le=10_000)] | None = None
+    """Above the ground at home, flown to on the way there. null: as before."""
+    speed_m_s: Speed | None = None
+    """On the way there. null: the mission's."""
+
+    @model_validator(mode="after")
+    def _is_one_place(self) -> Self:
+        missing = [(self.north_m, self.east_m).count(None), (self.latitude_deg, self.longitude_deg).count(None)]
+        if sorted(missing) != [0, 2]:
+            raise ValueError(
+                "a waypoint needs `north_m` and `east_m`, or `latitude_deg` and `longitude_deg`; write two"
+            )
+        return self
+
+
+class MissionParameters(Section):
+    """Where this drone wants to go. Places count from its home, the ground that it takes off from."""
+
+    kind: MissionKind = "circle_then_tangent"
+    """The paper's circle and its tangent (Eq. 43); `hover` at a standstill; a constant `velocity`; `waypoints` one
+    after the other; `follow` the others without a goal of its own (W_i = 0 of Eq. 42); `operator`: what an operator
+    sends over telemetry, as `telemetry.commands` allows."""
+    speed_m_s: Speed = 1.0
+    """Desired speed: V of Eq. 43, and on the way to goals."""
+    radius_m: Distance = 10.0
+    """Of `circle_then_tangent`."""
+    circle_until_s: NonNegative = 66.0
+    """Of `circle_then_tangent`: from then on straight."""
+    velocity_m_s: tuple[float, float] | None = None
+    """Of `velocity`: north and east."""
+    waypoints: Annotated[tuple[WaypointParameters, ...], Field(max_length=1000)] = ()
+    at_end: AtEnd = "hold"
+    """After the last of the `waypoints`: hold the flock there, or have the autopilot land, or return home."""
+    reached_m: Distance = 1.0
+    """A goal is reached when the middle of the flock, of this drone and of the neighbours that it sees, is as near, or
+    has come near and comes no nearer. For flocks of a hundred about the radius of the flock."""
+    timeout_s: Annotated[float, Field(gt=0, le=60)] = 2.0
+    """An operator's velocity holds for this long, and with kind `operator` a goal does too; then the drone hovers."""
+    pull: NonNegative = 1.0
+    """Times `flocking.own_weight`, W_i of Eq. 42. Where k of n drones have a goal, the flock flies there with about
+    k/n of their speed; a larger pull makes up for that."""
+    height_m: Annotated[float, Field(ge=-1000, le=10_000)] | None = None
+    """Above the ground at home, from the beginning on. null: as high as the drone is then."""
+    height_offset_m: Annotated[float, Field(ge=-1000, le=1000)] = 0.0
+    """Added to every height of the mission and of an operator's goals, so that drones that share one fly in layers."""
+    origin_m: tuple[_Metres, _Metres] = (0.0, 0.0)
+    """Where metres of waypoints and of operators' goals count from, north and east of home. Drones that take off from
+    different places and share goals each write their own here."""
+
+    @model_validator(mode="after")
+    def _keys_fit_the_kind(self) -> Self:
+        faults: Faults = {}
+        for key, kind in _ONLY_FOR.items():
+            if self.kind != kind and getattr(self, key) != type(self).model_fields[key].default:
+                faults[key,] = f"has no meaning with kind `{self.kind}`, only with `{kind}`; delete it"
+        if self.kind == "velocity" and self.velocity_m_s is None:
+            faults["kind",] = "`velocity` needs `velocity_m_s`; add it with two numbers, north and east"
+        if self.kind == "waypoints" and not self.waypoints:
+            faults["kind",] = "`waypoints` needs `waypoints`; add a list with at least one"
+        refuse(self, faults)
+        return self
+
+
+def describe(mission: MissionParameters) -> str:
+    """The mission in a few words."""
+    match mission.kind:
+        case "circle_then_tangent":
+            return f"{mission.speed_m_s:g} m/s on a circle of {mission.radius_m:g} m until {mission.circle_until_s:g} s"
+        case "waypoints":
+            count = len(mission.waypoints)
+            return f"{mission.speed_m_s:g} m/s to {count} {'waypoint' if count == 1 else 'waypoints'}"
+        case "velocity":
+            north, east = mission.velocity_m_s or (0.0, 0.0)
+            return f"{north:g} m/s north, {east:g} m/s east"
+        case kind:
+            return kind
+
+
+def mission_faults(mission: MissionParameters, gate: GateParameters, law_speed_m_s: float) -> Faults:
+    """What of a mission the gate and the law, up to `law_speed_m_s`, would not let a drone fly; by key."""
+    limit_m_s = min(law_speed_m_s, gate.max_speed_m_s)
+    faults = _faults_of_speeds(mission, limit_m_s)
+    heights: dict[tuple[str | int, ...], float | None] = {("height_m",): mission.height_m}
+    heights |= {("waypoints", i, "height_m"): waypoint.height_m for i, waypoint in enumerate(mission.waypoints)}
+    for key, height_m in heights.items():
+        if height_m is not None and (fault := fault_of_height(gate, height_m + mission.height_offset_m)):
+            faults[key] = fault
+    for i, waypoint in enumerate(mission.waypoints):
+        if waypoint.north_m is None or waypoint.east_m is None:
+            continue  # in degrees: not before home is known
+        place = waypoint.north_m + mission.origin_m[0], waypoint.east_m + mission.origin_m[1]
+        if outside := fault_of_place(gate, *place):
+            faults["waypoints", i] = outside
+    return faults
+
+
+def _faults_of_speeds(mission: MissionParameters, limit_m_s: float) -> Faults:
+    speeds: dict[tuple[str | int, ...], float | None] = {("speed_m_s",): mission.speed_m_s}
+    speeds |= {("waypoints", i, "speed_m_s"): waypoint.speed_m_s for i, waypoint in enumerate(mission.waypoints)}
+    if mission.velocity_m_s is not None:
+        speeds["velocity_m_s",] = math.hypot(*mission.velocity_m_s)
+    return {
+        key: fault for key, speed in speeds.items() if speed is not None and (fault := fault_of_speed(limit_m_s, speed))
+    }
+
+
+def fault_of_speed(limit_m_s: float, speed_m_s: float) -> str | None:
+    """What is wrong with a mission's speed; None: nothing."""
+    if speed_m_s <= limit_m_s:
+        return None
+    return (
+        f"{speed_m_s:g} m/s is above what flocking.max_speed_m_s and safety.gate.max_speed_m_s let through; "
+        f"write {limit_m_s:g} or less"
+    )
+
+
+def fault_of_height(gate: GateParameters, height_m: float) -> str | None:
+    """What is wrong with a height to fly at; None: nothing."""
+    if gate.min_height_m <= height_m <= gate.max_height_m:
+        return None
+    return (
+        f"leads to a height of {height_m:g} m, and safety.gate allows {gate.min_height_m:g} to "
+        f"{gate.max_height_m:g} m; write another"
+    )
+
+
+def fault_of_place(gate: GateParameters, north_m: float, east_m: float) -> str | None:
+    """What is wrong with a place to fly to, from home; None: it is within the fence."""
+    away_m = math.hypot(north_m, east_m)
+    if gate.fence_radius_m is not None and away_m > gate.fence_radius_m:
+        return f"is {away_m:.1f} m from home, outside the fence of {gate.fence_radius_m:g} m; write a nearer place"
+    if gate.fence_corners_m and not _inside(gate.fence_corners_m, north_m, east_m):
+        return "is outside safety.gate.fence_corners_m; write a place within"
+    return None
+
+
+def _inside(corners: Sequence[tuple[float, float]], north_m: float, east_m: float) -> bool:
+    """Whether a ray to the east crosses a polygon's outline an odd number of times."""
+    crossed = 0
+    for (n1, e1), (n2, e2) in zip(corners, (*corners[1:], corners[0]), strict=True):
+        crossed += (n1 > north_m) != (n2 > north_m) and east_m < e1 + (e2 - e1) * (north_m - n1) / (n2 - n1)
+    return crossed % 2 == 1

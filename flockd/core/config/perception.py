@@ -1,0 +1,173 @@
+"""Which network or method fills which role, and what computes it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from flockd.core.choices import ROLES, FlowRefinement, HeightSource, Provider, Role, ScaleSource
+from flockd.core.config.base import Distance, NonNegative, Positive, Section, Share, refuse
+
+DIS, NO_MODEL = "dis", "none"
+"""What stands where else a model's name does: OpenCV's DIS flow, and no second stage."""
+
+MIN_DRONE_SIZE_M, MAX_DRONE_SIZE_M = 0.05, 5.0
+"""Of a drone from tip to tip: less is a toy's that the networks do not find, more is an aircraft."""
+MAX_SIZE_SIGMA = 0.3
+"""Standard deviation of a known size as a share of it: with more, the networks' own judgement is better."""
+
+
+class DetectionParameters(Section):
+    """How networks' outputs become detections. What belongs to a network's weights stands in its manifest instead."""
+
+    min_range_m: Distance = 0.2
+    """Nearer than this, nothing is a drone: it would touch the own one."""
+    max_range_m: Distance = 60.0
+    """Farther than this, nothing is a drone: it would be smaller than a pixel or two."""
+    crop_shift: Share = 0.03
+    """A further crop is not worth it when it would be moved by less than this share of half its width, ..."""
+    crop_resize: Annotated[float, Field(ge=1)] = 1.05
+    """... and resized by less than this factor."""
+    prediction_gate: Positive = 4.0
+    """What is found where a track was predicted lies within this Mahalanobis distance of it, in standard deviations."""
+    suppression_gate: Positive = 3.4
+    """Two detections are one when their Mahalanobis distance is less: 99 % of pairs of one drone are nearer (chi-square
+    of three degrees of freedom)."""
+    drone_extent: Share = 0.18
+    """Share of its size by which a drone's centre may be misplaced between two of its detections, as a standard
+    deviation: with the gate, two drones are never nearer to each other than 0.6 of their size."""
+    occlusion: Share = 0.25
+    """Nothing is seen of what lies behind a drone within this share of its angular size from its centre."""
+    max_proposals: Annotated[int, Field(ge=1)] = 12
+    """Regions of one image that the first stage segments and the second stage is given, with the residuals: those of
+    the highest score, for a cluttered image not to cost the deadline. More than the drones that one camera sees."""
+    max_residuals: Annotated[int, Field(ge=0)] = 6
+    """Residuals of one image that are proposed, the largest: one full of false ones must not cost the deadline. They
+    count among `max_proposals`."""
+    residual_px: Annotated[int, Field(ge=1)] = 24
+    """Image pixels that a residual has at least."""
+    residual_distance_px: Annotated[int, Field(ge=0)] = 4
+    """How far it is from every drone's mask: nearer, it is the mask's own error."""
+    mask_border_px: Annotated[int, Field(ge=0)] = 5
+    """Background so near to a mask is not used: masks and depth maps are least certain there."""
+    colour_weight: NonNegative = 4.0
+    """Of a pixel's colour against the networks' logits, in a mask. 0: masks are the networks' alone."""
+    depth_map_sigma: Positive = 0.08
+    """Standard deviation of a drone's log range where the depth map alone gives it (`perception.distance: none`)."""
+
+
+class NoiseParameters(Section):
+    """When an image counts as noise, and is not used. Lengths are of the image, and noise of its luminance."""
+
+    level: Positive = 12.0
+    """Standard deviation, in grey levels of 0-255, of white noise that matters; a camera at night has less."""
+    whiteness: Share = 0.8
+    """White noise is at the finest scale at least this strong as a share of the next; photographs have 0.3 to 0.6."""
+    max_white: Share = 0.25
+    """The image is not used where more of it than this is white noise. 1, here and in the next two: all are used."""
+    max_white_rise: Share = 0.08
+    """Nor is it where this much more of it is white noise than of any of the camera's last five images, ..."""
+    rough_level: Positive = 20.0
+    """... or where details at one of the finest scales are stronger than this, in grey levels, ..."""
+    max_rough_rise: Share = 0.4
+    """... in this much more of it than in any of the last five."""
+    max_unexplained: Share = 0.35
+    """Nor is it where this much more of it than of the other cameras' images does not follow from the image before, as
+    when it is damaged in blocks, or covered by soft noise. 1: all are used."""
+    clean_images: Annotated[int, Field(ge=1, le=100)] = 2
+    """So many clean images in a row before a camera that was noisy is used again."""
+
+
+class RangeFinderParameters(Section):
+    """When a range to the ground is used, and how the ground below is followed from ranges."""
+
+    max_age_s: Annotated[float, Field(gt=0, le=5)] = 0.3
+    """An older reading is not used: the sensor has stopped."""
+    min_quality: Share = 0.1
+    """Nor is one whose signal is weaker, where the sensor says how strong it is."""
+    noise: Annotated[float, Field(gt=0, le=0.2)] = 0.02
+    """Standard deviation of a range, as a share of it."""
+    bridge_s: Annotated[float, Field(ge=0, le=10)] = 2.0
+    """So long after the last good reading the ground is expected where it was, with its slope and the own motion."""
+    gate_sigma: Positive = 4.0
+    """A reading farther from the expected ground, in standard deviations, is that of something else: a crate, another
+    drone, a hole. The second in a row is believed, if it does not contradict the height as the next three say."""
+    max_slope: Annotated[float, Field(ge=0, le=2)] = 0.25
+    """Between two places of the last `compare_s`, the ground rises by no more than this for each metre between them,
+    ..."""
+    tolerance_m: Annotated[float, Field(gt=0, le=100)] = 1.0
+    """... this for a step in it and the barometer's drift, and `gate_sigma` of the range. Where ranges and the
+    barometer's height say that it does, the range finder is not believed."""
+    compare_s: Annotated[float, Field(gt=0, le=120)] = 15.0
+
+
+class PerceptionConfig(Section):
+    """Which model fills which role. A name is a manifest in `models_dir`, or a path to one that ends in `.yaml`.
+
+    Relative paths count from the folder of the configuration file.
+    """
+
+    flow: str = "flow_int8"
+    """`dis` is OpenCV's DIS flow instead of a network."""
+    flow_refinement: FlowRefinement = "quick_dis"
+    """A network's flow finds what moved far; DIS then makes it exact. `quick_dis` is for flight: 12 ms an image, where
+    `dis` takes 34, and where the images show nothing, the surroundings determine the flow. With a sensor's depth, on
+    images that are blurred and moved far, `dis` is worth its time, and every pixel keeps its own flow.
+    """
+    flow_refinement_scale: Annotated[int, Field(ge=0, le=5)] = 1
+    """Where DIS after a network stops: at a 2^n-th of the size."""
+    depth: str = "neighbours_int8"
+    segmentation: str = "neighbours_int8"
+    distance: str = "distance_int8"
+    """Second stage: a drone's range from its crop alone. `none`: the depth map decides."""
+    verification: str = "verification_int8"
+    """Whether a crop of the second stage shows a drone at all. `none`: the distance network alone says so."""
+    models_dir: str | None = None
+    """Folder of the manifests; by default the one that comes with flockd."""
+    threads: Annotated[int, Field(ge=1, le=64)] = 2
+    provider: Provider = "cpu"
+    """What ONNX Runtime computes with. Another one than this is never used in its place."""
+    engines_dir: str | None = None
+    """Where `flockd models prepare` keeps what a provider has built; by default `engines` beside the manifests."""
+    deadline_s: Annotated[float, Field(gt=0, le=60)] = 1.0
+    """In flight, a network that has not finished one call by then is stuck, and is ended."""
+    detection: DetectionParameters = DetectionParameters()
+    noise: NoiseParameters = NoiseParameters()
+    drone_size_m: Annotated[float, Field(ge=MIN_DRONE_SIZE_M, le=MAX_DRONE_SIZE_M)] | None = None
+    """Size of every drone of the fleet, from tip to tip with propellers, where it is known: a drone's range is then
+    this over its apparent size. `flockd calibrate drone` measures it. By default the network judges each drone's
+    size."""
+    drone_size_sigma_m: NonNegative = 0.01
+    """Standard deviation of `drone_size_m`: by default of a tape measure. It adds to the deviation of every range."""
+    scale: ScaleSource = "height"
+    """The background's metric scale: `network` (pure RGB, as in the paper), `height` (attitude and height above ground
+    from the autopilot) or `velocity` (attitude and velocity from the autopilot; the drone has to move)."""
+    height: HeightSource = "barometer"
+    """What measures the height for `scale: height`. `barometer`: the autopilot's height above home, so that the ground
+    must be level. `range_finder`: a sensor that faces down; without a good reading there is no scale. `best`: the range
+    finder, and while that gives nothing, the barometer."""
+    range_finder: RangeFinderParameters = RangeFinderParameters()
+
+    @model_validator(mode="after")
+    def _a_known_size_is_of_use(self) -> Self:
+        size = self.drone_size_m
+        if size is None:
+            return self
+        faults: dict[tuple[str | int, ...], str] = {}
+        if self.distance == NO_MODEL:
+            faults["drone_size_m",] = "needs the apparent size, which a second stage gives; name one in `distance`"
+        if self.drone_size_sigma_m > MAX_SIZE_SIGMA * size:
+            faults["drone_size_sigma_m",] = (
+                f"{self.drone_size_sigma_m:g} m is more than {MAX_SIZE_SIGMA:.0%} of drone_size_m, {size:g} m; "
+                "measure it better, or delete both"
+            )
+        refuse(self, faults)
+        return self
+
+    @property
+    def networks(self) -> dict[Role, str]:
+        """The model's name, or its manifest's path, of each role that a network fills."""
+        unused = {"verification"} if self.distance == NO_MODEL else set()
+        names = {role: getattr(self, role) for role in ROLES if role not in unused}
+        return {role: name for role, name in names.items() if name not in {DIS, NO_MODEL}}

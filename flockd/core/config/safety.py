@@ -1,0 +1,127 @@
+"""The supervisor's limits, and those of the last gate before the autopilot."""
+
+from __future__ import annotations
+
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from flockd.core.choices import AutopilotMode
+from flockd.core.config.base import Duration, Positive, Section, Share
+
+_Metres = Annotated[float, Field(ge=-100_000, le=100_000)]
+
+
+class GateParameters(Section):
+    """The last limits on what is sent to the autopilot, whatever asks for it."""
+
+    permission_timeout_s: Annotated[float, Field(gt=0, le=0.4)] = 0.3
+    """The supervisor's permission is good for this long: what has stalled sends nothing half a second later."""
+    command_fresh_s: Annotated[float, Field(gt=0, le=60)] = 0.9
+    """A command older than this is flown ever slower: the pilot has missed a step. Leave it a step and its duration."""
+    command_timeout_s: Annotated[float, Field(gt=0, le=60)] = 1.5
+    """By this age of the command the drone stands still, and one that is older is not flown at all; leave the pilot
+    three of its steps."""
+    max_speed_m_s: Annotated[float, Field(gt=0, le=50)] = 4.0
+    """A command that asks for more is a fault, and refused."""
+    max_acceleration_m_s2: Annotated[float, Field(gt=0, le=50)] = 5.0
+    degraded_speed_m_s: Annotated[float, Field(gt=0, le=50)] = 1.0
+    """Instead, while the drone is degraded: a command that asks for more is flown this fast."""
+    min_separation_m: Annotated[float, Field(ge=0, le=1000)] = 1.0
+    """Nearer than this to a neighbour, no velocity towards it."""
+    degraded_separation_m: Annotated[float, Field(ge=0, le=1000)] = 1.5
+    """Instead, while the drone is degraded."""
+    vertical_separation_m: Annotated[float, Field(ge=0, le=1000)] = 3.0
+    """A neighbour that is above or below by less than this counts as one at the drone's height, and no change of height
+    leads nearer to one whose level distance is within one and a half times `degraded_separation_m`: the lower flies in
+    the other's downwash."""
+    max_climb_m_s: Annotated[float, Field(gt=0, le=20)] = 1.5
+    """The height that is asked for changes no faster, up or down."""
+    braking_m_s2: Annotated[float, Field(gt=0, le=20)] = 1.5
+    """How hard every drone of the flock can brake: none flies faster towards a neighbour or an obstacle than it can
+    stop in time."""
+    obstacle_clearance_m: Annotated[float, Field(ge=0, le=100)] = 0.6
+    """From the drone's middle to an obstacle's surface: nearer than this, no velocity towards it."""
+    reaction_s: Annotated[float, Field(ge=0, le=5)] = 0.5
+    """From a neighbour's change of velocity, or from seeing an obstacle, until the own drone has begun to brake."""
+    fence_radius_m: Annotated[float, Field(gt=0, le=100_000)] | None = 100.0
+    """Around home, level; beyond it only inward velocity. null: no circle."""
+    fence_corners_m: tuple[tuple[_Metres, _Metres], ...] = ()
+    """A fence of any shape: its corners north and east of home, in order. With a radius too, both hold."""
+    min_height_m: Annotated[float, Field(ge=-1000, le=10_000)] = 1.0
+    max_height_m: Annotated[float, Field(ge=-1000, le=10_000)] = 30.0
+
+    @model_validator(mode="after")
+    def _limits_agree(self) -> Self:
+        if self.command_fresh_s >= self.command_timeout_s:
+            raise ValueError(
+                f"command_fresh_s {self.command_fresh_s:g} is not below command_timeout_s; write a smaller one"
+            )
+        if self.min_height_m >= self.max_height_m:
+            raise ValueError(f"min_height_m {self.min_height_m:g} is not below max_height_m; write a smaller one")
+        if self.degraded_speed_m_s > self.max_speed_m_s:
+            raise ValueError("degraded_speed_m_s is above max_speed_m_s; write a smaller one")
+        if self.degraded_separation_m < self.min_separation_m:
+            raise ValueError("degraded_separation_m is below min_separation_m; write a larger one")
+        if 0 < len(self.fence_corners_m) < 3:
+            raise ValueError("fence_corners_m has fewer than 3 corners; add the others, or delete it")
+        if len(set(self.fence_corners_m)) < len(self.fence_corners_m):
+            raise ValueError("fence_corners_m names a corner twice; delete one, the fence closes by itself")
+        return self
+
+
+class SafetyParameters(Section):
+    """When the drone slows down, hovers, hands over to the autopilot and falls silent."""
+
+    gate: GateParameters = GateParameters()
+    camera_timeout_periods: Annotated[float, Field(gt=0, le=100)] = 3.0
+    """A camera without a usable frame for this many of its frame periods is lost."""
+    max_lost_cameras: Annotated[int, Field(ge=0)] = 1
+    """Fly on with the others, degraded, while no more than this many are lost; at least one has to see."""
+    max_dropped_share: Share = 0.2
+    """Of the frames of late; above it, degraded."""
+    estimate_timeout_s: Annotated[float, Field(gt=0, le=60)] = 1.5
+    """Hover when the pilot's newest output is older than this; leave it three of its steps."""
+    degraded_ego_motion_failures: Annotated[int, Field(ge=1)] = 2
+    """Steps in a row without own motion, to be degraded."""
+    max_ego_motion_failures: Annotated[int, Field(ge=1)] = 6
+    """Steps in a row without own motion, to hover."""
+    degraded_load: Positive = 1.0
+    """How long the steps take (95th percentile) over how long they may, to be degraded."""
+    max_load: Positive = 2.0
+    """The same, to hover."""
+    degraded_temperature_c: float = 85.0
+    """Of the hottest thermal zone, to be degraded."""
+    max_temperature_c: float = 95.0
+    """The same, to hover."""
+    max_loop_lag_s: Annotated[float, Field(gt=0, le=10)] = 0.2
+    """Of the event loop; above it, degraded."""
+    heartbeat_timeout_s: Annotated[float, Field(gt=0, le=10)] = 2.0
+    """The link to the autopilot counts as lost, and flockd falls silent for good."""
+    neighbours_timeout_s: Annotated[float, Field(gt=0, le=60)] = 2.0
+    """No confirmed neighbour seen for this long: the drone is alone."""
+    alone_s: Duration | None = 10.0
+    """How long it flies on alone before it asks for Hold. null: for ever."""
+    outside_s: Annotated[float, Field(gt=0, le=60)] = 3.0
+    """How long it may take to come back into the fence and the heights before it asks for Hold."""
+    on_battery_low: AutopilotMode = "hold"
+    """What is asked of the autopilot when it says that its battery is low."""
+    on_position_lost: AutopilotMode = "hold"
+    """What is asked of the autopilot when it has lost its position; it acts by itself too."""
+    hover_s: Annotated[float, Field(gt=0, le=3)] = 1.0
+    """The longest hover, before Hold is asked for."""
+    recovery_s: Annotated[float, Field(ge=0, le=600)] = 2.0
+    """How long all has to be well before a degraded drone flies as usual again."""
+    ask_timeout_s: Annotated[float, Field(gt=0, le=5)] = 2.0
+    """How long the autopilot has to leave offboard when asked, before silence makes it."""
+
+    @model_validator(mode="after")
+    def _worse_comes_later(self) -> Self:
+        for mild, grave in (
+            ("degraded_ego_motion_failures", "max_ego_motion_failures"),
+            ("degraded_load", "max_load"),
+            ("degraded_temperature_c", "max_temperature_c"),
+        ):
+            if getattr(self, mild) > getattr(self, grave):
+                raise ValueError(f"{mild} is above {grave}; write a smaller one")
+        return self

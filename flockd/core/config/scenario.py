@@ -1,0 +1,226 @@
+"""The typed configuration of one simulated flight."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from math import dist
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from flockd.core.config.base import NonNegative, Positive, Section, Share, Vector3, refuse
+from flockd.core.config.drone import DroneConfig
+from flockd.core.config.mission import MissionParameters, mission_faults
+from flockd.core.config.obstacle_field import ObstaclesConfig
+
+MAX_DRONES = 100
+"""More would take days and all memory."""
+MAX_DURATION_S = 86400.0
+DRONE_FAMILIES = 14
+"""Meshes that the simulator can build, counted from 0."""
+_LOWEST_M = 0.5
+"""A drone that begins lower touches the uneven ground."""
+_HIGHEST_M = 1000.0
+MIN_START_DISTANCE_M = 0.7
+"""Of two drones at the start, about the size of one: nearer, they touch."""
+
+
+class StartConfig(Section):
+    """Where one vehicle begins."""
+
+    position_m: Vector3
+    """North, east, down: a height of 4.5 m is -4.5."""
+    velocity_m_s: tuple[float, float] = (0.0, 0.0)
+    """North, east."""
+    mission: MissionParameters | None = None
+    """Its own; null: that of `drone`. Places count from the world's origin."""
+    by_hand: bool = False
+    """A person flies it along its mission, in Position mode and without flockd; the others see it as one of them."""
+
+
+class VehicleConfig(Section):
+    """How a simulated multirotor answers a velocity setpoint."""
+
+    velocity_time_constant_s: Positive = 0.25
+    max_acceleration_m_s2: Positive = 4.0
+    yaw_time_constant_s: Positive = 0.4
+    max_yaw_rate_deg_s: Positive = 60.0
+    tilt_time_constant_s: NonNegative = 0.1
+    wind_m_s: tuple[float, float] = (0.0, 0.0)
+    """Mean wind, north and east."""
+    gust_m_s: NonNegative = 0.0
+    """Standard deviation of the velocity that gusts add, each axis, to that of a drone whose setpoint stays the same.
+    The flocking law begins its setpoint at the own velocity: there drones are carried farther."""
+    radius_m: Annotated[float, Field(gt=0, le=5)] = 0.35
+    """Of the sphere around its centre that holds the whole drone: nearer to an obstacle it collides."""
+
+
+class RangeFinderConfig(Section):
+    """A simulated range finder that faces down, and what separates its readings from the truth."""
+
+    rate_hz: Annotated[float, Field(gt=0, le=200)] = 30.0
+    noise: Share = 0.015
+    """Standard deviation of a reading, as a share of it; 0.01 m at least, as MAVLink sends centimetres."""
+    min_m: NonNegative = 0.15
+    """Nearer ground is not measured: the reading then has no signal."""
+    max_m: Positive = 20.0
+    """Nor is ground that is farther."""
+    tilt_deg: Annotated[float, Field(ge=0, le=10)] = 0.5
+    """Standard deviation of the angle, about each axis, by which it is mounted off the body's down axis."""
+    dropouts_per_min: NonNegative = 2.0
+    """How often it stops giving readings, ..."""
+    dropout_s: Positive = 0.5
+    """... and for how long, mean."""
+
+
+class SensorConfig(Section):
+    """What separates the simulated autopilot's and cameras' readings from the truth."""
+
+    barometer_drift_m: NonNegative = 0.1
+    """Standard deviation of the slow height error."""
+    barometer_drift_time_s: Positive = 100.0
+    barometer_noise_m: NonNegative = 0.02
+    attitude_error_deg: NonNegative = 0.2
+    """Standard deviation of the slow roll and pitch error."""
+    velocity_error_m_s: NonNegative = 0.1
+    """Standard deviation of the slow error of the autopilot's own velocity."""
+    position_error_m: NonNegative = 0.5
+    """Standard deviation of the slow error of the autopilot's own position, each axis."""
+    range_finder: RangeFinderConfig | None = RangeFinderConfig()
+    """null: the drone has none."""
+    image_noise: NonNegative = 2.0
+    """Standard deviation in grey levels of 0-255."""
+
+
+class WorldConfig(Section):
+    """The world."""
+
+    ground_relief_m: NonNegative = 0.15
+    """Standard deviation of the gently uneven ground; 0 is flat."""
+    hills_m: Annotated[float, Field(ge=0, le=20)] = 0.0
+    """From the lowest to the highest point of its hills, where `hills_slope` lets them be so high; level at the
+    origin."""
+    hills_slope: Annotated[float, Field(gt=0, le=0.5)] = 0.15
+    """Rise for each metre where they are steepest."""
+    clearance_m: NonNegative = 9.0
+    """Free of obstacles on both sides of the planned path."""
+    drone_family: Annotated[int, Field(ge=0, le=DRONE_FAMILIES - 1)] | Literal["any"] = "any"
+    """Which mesh the drones wear; `any`: drawn from the seed, the same for the whole flock."""
+    obstacles: ObstaclesConfig | None = None
+    """Trees, or houses, walls, poles and wires, for the flock to fly between, on level ground; null: none within
+    `clearance_m`."""
+
+    @model_validator(mode="after")
+    def _obstacles_stand_on_level_ground(self) -> Self:
+        if self.obstacles is not None and self.hills_m > 0:
+            refuse(self, {("obstacles",): "stand on level ground only; delete them, or write 0 for `hills_m`"})
+        return self
+
+
+class CameraFaultConfig(Section):
+    """What goes wrong with one simulated camera."""
+
+    drone: Annotated[int, Field(ge=1)]
+    """Whose: the number of its entry in `vehicles`, from 1."""
+    camera: str
+    """Its name in the rig."""
+    kind: Literal["uniform", "gaussian", "interference"]
+    """`uniform`: nothing but noise; `gaussian`: noise of `sigma` on the image; `interference`: bands of noise, at other
+    places in each image."""
+    sigma: Annotated[float, Field(gt=0, le=255)] = 50.0
+    """Standard deviation in grey levels of 0-255, for `gaussian`."""
+    begin_s: NonNegative = 0.0
+    """Counted from the first image of the flight; with PX4, that is before the take-off."""
+    end_s: Positive = MAX_DURATION_S
+
+
+class ScenarioConfig(Section):
+    """One simulated flight."""
+
+    scenario: Annotated[str, Field(min_length=1)]
+    duration_s: Annotated[float, Field(gt=0, le=MAX_DURATION_S)] = 110.0
+    """One step of the drone at least, one day at most."""
+    seed: Annotated[int, Field(ge=0)] = 0
+    vehicles: Annotated[tuple[StartConfig, ...], Field(min_length=1, max_length=MAX_DRONES)]
+    vehicle: VehicleConfig = VehicleConfig()
+    sensors: SensorConfig = SensorConfig()
+    world: WorldConfig = WorldConfig()
+    faults: tuple[CameraFaultConfig, ...] = ()
+    """None, unless a flight is to show what flockd does about them."""
+    drone: DroneConfig
+    """In the file: the path of the drone's own configuration, relative to the scenario's; or that configuration. Keys
+    `mission` and `obstacles` beside it are flown instead of its own."""
+
+    def drone_of(self, vehicle: int) -> DroneConfig:
+        """The configuration that one vehicle's pilot flies with."""
+        mission = self.vehicles[vehicle].mission
+        return self.drone if mission is None else self.drone.model_copy(update={"mission": mission})
+
+    @model_validator(mode="after")
+    def _the_missions_can_be_flown(self) -> Self:
+        faults: dict[tuple[str | int, ...], str] = {}
+        for number, vehicle in enumerate(self.vehicles):
+            if vehicle.by_hand and all(other.by_hand for other in self.vehicles):
+                faults["vehicles", number, "by_hand"] = "flies the last drone by hand too; leave one to flockd"
+            if vehicle.mission is not None:
+                limits = self.drone.safety.gate, self.drone.flocking.max_speed_m_s
+                of_mission = mission_faults(vehicle.mission, *limits)
+                faults |= {("vehicles", number, "mission", *key): text for key, text in of_mission.items()}
+        refuse(self, faults)
+        return self
+
+    @model_validator(mode="after")
+    def _lasts_a_step(self) -> Self:
+        step_s = self.drone.step_s
+        if round(self.duration_s / step_s) < 1:
+            text = f"{self.duration_s:g} s is shorter than a step of {step_s:g} s; write {step_s:g} or more"
+            refuse(self, {("duration_s",): text})
+        return self
+
+    @model_validator(mode="after")
+    def _faults_have_their_cameras(self) -> Self:
+        cameras = [camera.name for camera in self.drone.rig.cameras]
+        faults: dict[tuple[str | int, ...], str] = {}
+        for number, fault in enumerate(self.faults):
+            if fault.drone > len(self.vehicles):
+                text = f"is {fault.drone}, but there are {len(self.vehicles)} vehicles; write one of theirs"
+                faults["faults", number, "drone"] = text
+            if fault.camera not in cameras:
+                faults["faults", number, "camera"] = f"is not in the rig; write one of {', '.join(cameras)}"
+            if fault.end_s <= fault.begin_s:
+                faults["faults", number, "end_s"] = f"is not after begin_s {fault.begin_s:g}; write a larger one"
+        refuse(self, faults)
+        return self
+
+    @model_validator(mode="after")
+    def _begins_in_the_air_and_apart(self) -> Self:
+        faults: dict[tuple[str | int, ...], str] = {}
+        for number, vehicle in enumerate(self.vehicles):
+            fault = _fault_of_height(vehicle.position_m[2])
+            if fault is not None:
+                faults["vehicles", number, "position_m"] = fault
+        for one, other in combinations(range(len(self.vehicles)), 2):
+            apart_m = dist(self.vehicles[one].position_m, self.vehicles[other].position_m)
+            if apart_m < MIN_START_DISTANCE_M:
+                faults.setdefault(
+                    ("vehicles", other, "position_m"),
+                    f"is {apart_m:.2g} m from vehicles[{one}], and drones touch below {MIN_START_DISTANCE_M:g} m; "
+                    "move one of them",
+                )
+        refuse(self, faults)
+        return self
+
+
+def _fault_of_height(down_m: float) -> str | None:
+    """What is wrong with the third number of a start position."""
+    if down_m > 0:
+        return (
+            f"the third number points down, so that {down_m:g} is {down_m:g} m below the ground; "
+            f"write {-max(down_m, _LOWEST_M):g}"
+        )
+    if down_m > -_LOWEST_M:
+        height_m = abs(down_m)
+        return f"begins {height_m:g} m above the ground; write -{_LOWEST_M:g} or less as the third number"
+    if down_m < -_HIGHEST_M:
+        return f"begins {-down_m:g} m above the ground; write -{_HIGHEST_M:g} or more as the third number"
+    return None

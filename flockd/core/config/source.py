@@ -1,0 +1,112 @@
+"""Where camera frames come from."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from flockd.core.choices import PixelFormat
+from flockd.core.config.base import Section, refuse
+
+
+class ControlParameters(Section):
+    """One setting of a camera's driver."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
+    """As `v4l2-ctl --list-ctrls` prints it."""
+    value: int
+    """A menu's entry by its number; a switch as 0 or 1."""
+
+
+class CameraDeviceParameters(Section):
+    """Where one camera of the rig is plugged in, and how it is run. Its image has the size the rig says."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z0-9_-]+$")]
+    """The camera's name in the rig."""
+    device: Annotated[str, Field(pattern=r"^/dev/")] = ""
+    """Of kind `v4l2`: its path, best one of /dev/v4l/by-path."""
+    pipeline: Annotated[str, Field(min_length=1)] = ""
+    """Of kind `gstreamer`: elements as `gst-launch-1.0` takes them, without a sink."""
+    pixel_format: PixelFormat = "mjpeg"
+    """Of kind `v4l2`; a pipeline says it itself."""
+    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 30.0
+    controls: tuple[ControlParameters, ...] = ()
+    """Of kind `v4l2`: set in this order whenever the camera is opened; what is not named here stays as it was."""
+
+    @property
+    def place(self) -> str:
+        """Where its images come from: the device or the pipeline."""
+        return self.device or self.pipeline
+
+
+class SharedMemoryParameters(Section):
+    """Where frames come from when another program on this computer takes or draws them."""
+
+    drone: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")] = "drone"
+    """Whose frames: the name under which they are published."""
+    connect: Annotated[tuple[str, ...], Field(min_length=1)] = ("tcp/127.0.0.1:7448",)
+    """zenoh endpoints of the program that publishes them."""
+    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
+    """How often each camera's frames come; `safety.camera_timeout_periods` counts in these."""
+    speed_factor: Annotated[float, Field(ge=0.02, le=10)] = 1.0
+    """How fast a simulator's time passes: at 0.5, half a second of it in each real one, and all of flockd's times and
+    time-outs count in it."""
+
+
+class SourceParameters(Section):
+    """Where camera frames come from, and how those of several cameras become sets."""
+
+    kind: Literal["v4l2", "gstreamer", "shared_memory"]
+    """Cameras of the kernel, those behind a GStreamer pipeline each, or another program's frames."""
+    cameras: tuple[CameraDeviceParameters, ...] = ()
+    """Of kind `v4l2` and `gstreamer`: one for each camera of the rig."""
+    shared_memory: SharedMemoryParameters = SharedMemoryParameters()
+    """Of kind `shared_memory`."""
+    set_tolerance_s: Annotated[float, Field(gt=0, le=60)] = 0.02
+    """How far the time stamp of a frame may be from that of its set; half a frame period or more."""
+    set_wait_s: Annotated[float, Field(gt=0, le=60)] = 0.1
+    """How long a set waits for a camera that is late, or gone."""
+    silence_s: Annotated[float, Field(gt=0, le=60)] = 0.5
+    """A camera without a usable frame for this long is closed and opened again."""
+    frozen_after: Annotated[int, Field(ge=0)] = 5
+    """An image that repeats itself this many times is frozen, and counts as no image; 0: may repeat for ever."""
+
+    @model_validator(mode="after")
+    def _fits_its_kind(self) -> Self:
+        if self.kind == "shared_memory" and self.cameras:
+            raise ValueError("a source of kind `shared_memory` has no devices; delete `cameras`")
+        if self.kind != "shared_memory" and self.shared_memory.speed_factor != 1.0:
+            raise ValueError("real cameras know real time only; delete `shared_memory.speed_factor`")
+        for number, camera in enumerate(self.cameras):
+            refuse(self, {("cameras", number, *key): text for key, text in _misplaced(camera, self.kind).items()})
+            if self.set_tolerance_s * camera.rate_hz < 0.5:
+                raise ValueError(
+                    f"set_tolerance_s {self.set_tolerance_s:g} is less than half a frame period of camera "
+                    f"{camera.name!r}; write {0.5 / camera.rate_hz:.3f} or more"
+                )
+            if self.silence_s * camera.rate_hz < 2.0:
+                raise ValueError(
+                    f"silence_s {self.silence_s:g} is less than two frame periods of camera {camera.name!r}; "
+                    f"write {2.0 / camera.rate_hz:.3f} or more"
+                )
+        devices = [camera.device for camera in self.cameras if camera.device]
+        doubled = {device for device in devices if devices.count(device) > 1}
+        if doubled:
+            raise ValueError(f"two cameras share {sorted(doubled)[0]}; give each its own device")
+        return self
+
+
+def _misplaced(camera: CameraDeviceParameters, kind: str) -> dict[tuple[str, ...], str]:
+    """What a camera of this kind of source must not have, by its key, or what it lacks."""
+    if kind == "v4l2":
+        wrong = {"pipeline": "is of a source of kind `gstreamer`; delete it, or write `kind: gstreamer`"}
+        lacks = "" if camera.device else "has no `device`; write the camera's path, as `flockd cameras` lists it"
+    else:
+        text = "is of a source of kind `v4l2`; let the pipeline say it, and delete this"
+        wrong = dict.fromkeys(("device", "pixel_format", "controls"), text)
+        lacks = "" if camera.pipeline else "has no `pipeline`; write elements such as `v4l2src device=/dev/video0`"
+    faults: dict[tuple[str, ...], str] = {(key,): text for key, text in wrong.items() if key in camera.model_fields_set}
+    if lacks and not faults:
+        faults[()] = lacks
+    return faults

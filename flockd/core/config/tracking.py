@@ -1,0 +1,84 @@
+"""Neighbours over time."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from flockd.core.config.base import Duration, Positive, Section
+
+Probability = Annotated[float, Field(gt=0, lt=1)]
+
+
+class TrackingParameters(Section):
+    """Neighbours over time: motion model, association and existence probability."""
+
+    acceleration_sigma_m_s2: Positive = 0.2
+    """How hard a neighbour may manoeuvre at least, standard deviation an axis."""
+    manoeuvre_time_s: Duration = 0.5
+    """How long an acceleration lasts. The white acceleration noise of the motion model has the spectral density
+    acceleration_sigma_m_s2^2 * manoeuvre_time_s (Bar-Shalom, Li & Kirubarajan 2001, section 6.2)."""
+    own_manoeuvre_memory_s: Duration = 3.0
+    """Neighbours are taken to manoeuvre as hard as this drone did of late, if that is more: gusts and turns move them
+    all. Time constant of that average."""
+    relative_speed_sigma_m_s: Positive = 0.7
+    """Standard deviation an axis of a flock mate's velocity relative to the own drone's, before it is measured."""
+    speed_sigma_m_s: Positive = 1.5
+    """Standard deviation an axis of a neighbour's velocity where the own velocity is not known."""
+    robust_sigma: Positive = 2.5
+    """Innovations beyond this many standard deviations count less and less; of those of the motion and measurement
+    model 82 % are nearer, of measured velocities 90 % (chi-square with 4 and 3 degrees of freedom)."""
+
+    size_correlation: Probability = 0.3
+    """Of the errors of a detection's log range and log size, which are taken to be equally large: a range is the size,
+    which the appearance tells, over the apparent size. Measured as 0.2 with drones of families that the shipped
+    networks know and 0.9 with others; taken low, so that ranges count as uncertain as the networks say they are."""
+    size_drift: Positive = 0.05
+    """How far the log size of one drone drifts, as the network sees it in changing views: standard deviation after one
+    second, growing with the square root of the time."""
+
+    gate_sigma: Positive = 6.0
+    """Association gate: the largest Mahalanobis distance of a detection from a track, in place and size, in standard
+    deviations. Wider than a Gaussian needs, as range errors have heavier tails: a detection left out begins a second
+    track."""
+
+    detection_probability: Probability = 0.7
+    """P_D: of a neighbour that the cameras can show being detected in one frame set. The shipped networks detect 93 %
+    of drones at least 12 px wide and 34 % at 6 to 12 px (docs/networks.md), and misses come in runs. At 0.7 a track
+    stays confirmed through three frame sets in a row without a detection."""
+    clutter_density: Positive = 0.01
+    """False detections in one frame set, per steradian, unit of log range and unit of log size. The shipped networks
+    give 9 in 500 images (docs/networks.md), each of about 1.5 sr, at 0.5 to 20 m and 0.15 to 1.2 m large, thus 0.0016
+    on average; taken larger, as they crowd where trees are."""
+    survival_time_s: Duration = 60.0
+    """Mean time that a neighbour stays within sight: existence probability decays with this time constant."""
+    birth_probability: Probability = 0.5
+    """Existence probability of a new track from a detection that is certainly of a drone."""
+    evidence_interval_s: Duration = 0.5
+    """Frame sets nearer to each other in time are not independent evidence of existence: they count in proportion."""
+    drone_probability_memory_s: Duration = 5.0
+    """Time constant of the average of the network's drone probabilities over a track; its existence probability is
+    multiplied by it."""
+    confirm_hits: Annotated[int, Field(ge=1)] = 3
+    """No track is confirmed with fewer detections that agree with it."""
+    confirm_sigma: Positive = 3.6
+    """A detection farther off than this many standard deviations does not agree: 99 % of those of the motion and
+    measurement model are nearer (chi-square with 4 degrees of freedom)."""
+    confirm_probability: Probability = 0.925
+    """A track is confirmed when its existence probability is above this."""
+    keep_probability: Probability = 0.6
+    """It stays confirmed while its existence probability is above this."""
+    drop_probability: Probability = 0.1
+    """A track is dropped when its existence probability falls below this."""
+    max_unseen_s: Duration = 1.5
+    """A track without a detection for longer is dropped whatever its existence probability."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> TrackingParameters:
+        if not self.drop_probability <= self.keep_probability <= self.confirm_probability:
+            raise ValueError(
+                "drop_probability, keep_probability and confirm_probability must not decrease in this order, "
+                f"as {self.drop_probability:g}, {self.keep_probability:g}, {self.confirm_probability:g} do"
+            )
+        return self

@@ -1,7 +1,0 @@
-"""Examines a drone on the ground: each check says what it measured, whether that is well, and how to fix it."""
-
-from flockd.doctor.finding import Finding, Level, failed, passed, warned
-from flockd.doctor.plan import CHECKS, plan
-from flockd.doctor.runner import Check, run_checks
-
-__all__ = ["CHECKS", "Check", "Finding", "Level", "failed", "passed", "plan", "run_checks", "warned"]

@@ -1,0 +1,1 @@
+"""During a flight, for people: who is there, orders, the page, Foxglove."""

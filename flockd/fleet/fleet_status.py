@@ -1,0 +1,60 @@
+"""The state of each drone of a fleet, from its telemetry."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from flockd.fleet.watcher import Watched
+
+GONE, QUIET = "gone", "quiet"
+"""Instead of a state: its process has ended or cannot be reached; it is there, and publishes nothing."""
+WORST_FIRST = (GONE, QUIET, "asking", "hover", "silent", "degraded", "idle", "ready", "normal")
+
+
+def status_rows(drones: Iterable[Watched], now_s: float) -> list[dict[str, Any]]:
+    """One row for each drone, as JSON, the worst first; ``now_s`` on the watcher's clock."""
+    rows = [_row(drone, now_s) for drone in drones]
+    return sorted(rows, key=lambda row: (WORST_FIRST.index(row["state"]), row["fleet"], row["drone"]))
+
+
+def _row(drone: Watched, now_s: float) -> dict[str, Any]:
+    flight: Mapping[str, Any] = drone.message("flight", now_s) or {}
+    computer: Mapping[str, Any] = drone.message("computer", now_s) or {}
+    clock: Mapping[str, Any] = drone.message("clock", now_s) or {}
+    neighbours = drone.message("neighbours", now_s)
+    pilot: Mapping[str, Any] = drone.message("state", now_s) or {}
+    health: Mapping[str, Any] = drone.message("health", now_s) or {}
+    state = flight.get("state", QUIET) if drone.alive else GONE
+    simulated = drone.alive and "flight" not in drone.topics and bool(health)  # the simulator's own pilot: no daemon
+    if simulated:
+        state = "normal" if health["ok"] else "degraded"
+    starting = drone.alive and not drone.topics and not drone.malformed
+    malformed = [f"its message `{topic}` is malformed: {_told(why)}" for topic, why in sorted(drone.malformed.items())]
+    blind = [camera["fault"] for camera in computer.get("cameras", {}).values() if camera["fault"]]
+    return {
+        "fleet": drone.fleet,
+        "drone": drone.drone,
+        "state": state if state in WORST_FIRST else QUIET,
+        "flight_mode": "simulated" if simulated else flight.get("flight_mode"),
+        "height_m": pilot.get("height_m") if simulated else flight.get("height_m"),
+        "battery_share": flight.get("battery_share"),
+        "neighbours": None
+        if neighbours is None
+        else sum(1 for neighbour in neighbours["neighbours"] if neighbour["confirmed"]),
+        "load": computer.get("load"),
+        "clock_offset_s": clock.get("offset_s"),
+        "clock_error_s": clock.get("error_s"),
+        "clock_jitter_s": clock.get("jitter_s"),
+        "mission": (drone.message("mission", now_s) or {}).get("sentence"),
+        "matters": malformed
+        + (["it has published nothing yet: it starts, or loads its networks"] if starting else [])
+        + [reason["sentence"] for reason in flight.get("reasons", ())]
+        + [str(reason) for reason in (health.get("reasons", ()) if simulated else ())]
+        + blind,
+    }
+
+
+def _told(why: str) -> str:
+    """What is wrong with a message, and what it may come from."""
+    return f"{why}; it may run another version of flockd" if why.endswith("is missing") else why

@@ -1,0 +1,176 @@
+"""What the page shows of each drone: one JSON object, from what a watcher heard of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from flockd.core.earth import metres_a_degree
+from flockd.fleet.fleet_status import GONE, QUIET, status_rows
+from flockd.fleet.watcher import Heard, Watched
+from flockd.onboard.telemetry.topics import AboutMessage
+
+Row = dict[str, Any]
+HISTORY_COLUMNS = (
+    "time", "north", "east", "height", "speed", "battery", "load", "temperature", "rate", "delay", "clock",
+)  # fmt: skip
+"""Of a drone's history: seconds, metres from the map's origin, metres, m/s, shares, degrees Celsius, steps a second,
+milliseconds, seconds."""
+MAX_CORNERS = 200
+"""Of a fence that is drawn."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """What queries found of one drone."""
+
+    about: AboutMessage | None = None
+    delay_s: float | None = None
+    """Of the link, there and back."""
+    clock_s: float | None = None
+    """The drone's wall clock less this computer's."""
+
+
+def drone_rows(drones: Iterable[Watched], known: Mapping[str, Known], now_s: float) -> dict[str, Row]:
+    """A row for each drone by its key `fleet/drone`, the worst first; ``now_s`` on the watcher's clock."""
+    watched = {f"{drone.fleet}/{drone.drone}": drone for drone in drones}
+    rows = {}
+    origin: tuple[float, float] | None = None
+    for status in status_rows(watched.values(), now_s):
+        key = f"{status['fleet']}/{status['drone']}"
+        rows[key] = _row(watched[key], status, known.get(key, Known()), now_s)
+    for key in sorted(rows):  # the map's origin is always the same drone's home
+        origin = origin or rows[key]["home_deg"]
+    for row in rows.values():
+        row["home_ne"] = _offset(origin, row.pop("home_deg"))
+    return rows
+
+
+def history_row(row: Row, time_s: float) -> list[float | None]:
+    """What of a row is kept for trails and curves: `HISTORY_COLUMNS`."""
+    north, east = row["position_ne"] or (None, None)
+    home = row["home_ne"] or (0.0, 0.0)
+    if north is not None and east is not None:
+        north, east = round(north + home[0], 2), round(east + home[1], 2)
+    return [
+        round(time_s, 2), north, east, row["height_m"], row["speed_m_s"], row["battery_share"], row["load"],
+        row["temperature_c"], row["rate_hz"], row["delay_ms"], row["clock_s"],
+    ]  # fmt: skip
+
+
+def _row(drone: Watched, status: Mapping[str, Any], known: Known, now_s: float) -> Row:
+    """With everything that is null where it is not known, or too old to be true now."""
+
+    def of(topic: str) -> Mapping[str, Any]:
+        return drone.message(topic, now_s) or {}
+
+    state, flight, computer = of("state"), of("flight"), of("computer")
+    about = known.about
+    configuration = {} if about is None else about["configuration"]
+    height_m = status["height_m"]
+    return {
+        **status,
+        "height_m": _rounded(state.get("height_m") if height_m is None else height_m, 2),
+        "why": [*_silence(drone, status["state"], now_s), *status["matters"]],
+        "armed": flight.get("armed"),
+        "in_air": flight.get("in_air"),
+        "silence": flight.get("silence"),
+        "yaw_deg": _rounded(state.get("yaw_deg"), 1),
+        "velocity_ne": _vector(state.get("velocity_ned")),
+        "speed_m_s": _speed(state.get("velocity_ned")),
+        "command_ne": _vector(of("command").get("velocity_ne")),
+        "position_ne": _vector(state.get("position_ne")),
+        "home_deg": _vector(state.get("home_deg"), 7),
+        "goal_ne": _vector(of("mission").get("goal_ne")),
+        "sees": [_seen(one) for one in of("neighbours").get("neighbours", ())],
+        "obstacles_m": of("obstacles").get("range_m"),
+        "rate_hz": _rate(drone.topics.get("state"), now_s),
+        "load": _rounded(status["load"], 3),
+        "temperature_c": _rounded(computer.get("temperature_c"), 1),
+        "setpoints_missed": flight.get("setpoints_missed"),
+        "messages_lost": computer.get("messages_lost"),
+        "recording": computer.get("recording"),
+        "delay_ms": None if known.delay_s is None else _rounded(1e3 * known.delay_s, 1),
+        "clock_s": _rounded(known.clock_s, 3),
+        "cameras": {name: camera["fault"] for name, camera in computer.get("cameras", {}).items()},
+        "version": None if about is None else about["version"],
+        "commands": None if about is None else about["commands"],
+        "fence": _fence(configuration),
+    }
+
+
+def _silence(drone: Watched, state: str, now_s: float) -> list[str]:
+    """Why there is nothing of it."""
+    if state not in {GONE, QUIET}:
+        return []
+    last_s = max((heard.time_s for heard in drone.topics.values()), default=None)
+    since = "" if last_s is None else f"; its last message came {_ago(now_s - last_s)} ago"
+    if state == GONE:
+        return [f"its process has ended or cannot be reached{since}"]
+    return [f"it can be reached and publishes nothing new{since}"] if since else []  # its status says that it starts
+
+
+def _ago(seconds: float) -> str:
+    """Coarse, so that a row changes seldom."""
+    if seconds < 10:
+        return "a few seconds"
+    return f"{10 * int(seconds // 10)} s" if seconds < 120 else f"{int(seconds // 60)} min"
+
+
+def _rate(heard: Heard | None, now_s: float) -> float | None:
+    """New messages a second; None where they have ceased."""
+    if heard is None or not heard.period_s or heard.new_s is None:
+        return None
+    return None if now_s - heard.new_s > max(3.0 * heard.period_s, 1.5) else round(1.0 / heard.period_s, 2)
+
+
+def _seen(neighbour: Mapping[str, Any]) -> Row:
+    """A neighbour as its observer has it, metres north and east of that one."""
+    return {
+        "ne": _vector(neighbour["position_ned"]),
+        "sigma_m": _rounded(neighbour["position_sigma_m"], 2),
+        "confirmed": neighbour["confirmed"],
+        "unseen_s": _rounded(neighbour["unseen_s"], 1),
+    }
+
+
+def _vector(values: object, digits: int = 2) -> list[float] | None:
+    """The first two of a list from a peer; None where one of them is missing."""
+    if not isinstance(values, list) or len(values) < 2:
+        return None
+    pair = values[:2]
+    if not all(isinstance(value, int | float) and math.isfinite(value) for value in pair):
+        return None
+    return [round(float(value), digits) for value in pair]
+
+
+def _speed(velocity: object) -> float | None:
+    level = _vector(velocity, 3)
+    return None if level is None else round(math.hypot(*level), 2)
+
+
+def _rounded(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(value, digits)
+
+
+def _offset(origin: list[float] | tuple[float, float] | None, home_deg: list[float] | None) -> list[float] | None:
+    """(2,) metres from the map's origin to a drone's home; None where the home is not known."""
+    if origin is None or home_deg is None:
+        return None
+    return [round((home_deg[i] - origin[i]) * a_degree, 2) for i, a_degree in enumerate(metres_a_degree(origin[0]))]
+
+
+def _fence(configuration: Mapping[str, Any]) -> Row | None:
+    """Around the drone's home, from its configuration, which a peer sent: None for what is no fence."""
+    safety = configuration.get("safety")
+    gate = safety.get("gate") if isinstance(safety, dict) else None
+    if not isinstance(gate, dict):
+        return None
+    radius, corners = gate.get("fence_radius_m"), gate.get("fence_corners_m")
+    known = [_vector(corner) for corner in corners[:MAX_CORNERS]] if isinstance(corners, list) else []
+    return {
+        "radius_m": radius if isinstance(radius, int | float) and 0 < radius < math.inf else None,
+        "corners_m": [corner for corner in known if corner is not None],
+    }

@@ -1,0 +1,260 @@
+"""Serves the fleet page: its files, its live data by WebSocket, pictures, and commands."""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import json
+import secrets
+import time
+from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from aiohttp import WSMsgType, web
+
+from flockd.fleet.page.drone_rows import HISTORY_COLUMNS, Row
+from flockd.fleet.page.fleet_source import Event, FleetSource, events_after
+from flockd.fleet.page.page_access import HEADERS, PageAccess, is_own_host, is_own_origin
+from flockd.onboard.telemetry.order_messages import parse_order
+from flockd.onboard.telemetry.topics import AnswerMessage
+
+PUSH_EVERY_S = 0.25
+MAX_REQUEST_BYTES = 1 << 14
+COMMANDS = ("hold", "land", "resume", "goto")
+"""What the page may ask of drones."""
+_FOLDER = Path(__file__).parent
+_TYPES = {".js": "text/javascript", ".css": "text/css"}
+_THREADS = 16
+_TOKEN = "@TOKEN@"
+"""In the page, for the session's."""
+
+
+class PageServer:
+    """The application of one fleet. `application` gives what aiohttp serves."""
+
+    def __init__(self, source: FleetSource, access: PageAccess, *, may_command: bool) -> None:
+        """``may_command``: whether this page passes commands on at all; each drone decides too."""
+        self._source, self._access, self._may_command = source, access, may_command
+        self._cookie = f"flockd_{secrets.token_hex(4)}"
+        """One a server: browsers do not tell ports apart."""
+        self._threads = ThreadPoolExecutor(_THREADS, "fleet page")
+        self._plotly: bytes | None = None
+
+    def application(self) -> web.Application:
+        """With the access rules around every route."""
+        application = web.Application(middlewares=[self._guarded], client_max_size=MAX_REQUEST_BYTES)
+        application.add_routes(
+            [
+                web.get("/", self._page),
+                web.get("/plotly.js", self._plotting_library),
+                web.get("/history", self._history),
+                web.get("/image/{fleet}/{drone}/{camera}", self._image),
+                web.get("/live", self._live),
+                web.post("/ask", self._ask),
+                web.get("/{file:[a-z_]+\\.(?:js|css)}", self._file),
+            ]
+        )
+        return application
+
+    @web.middleware
+    async def _guarded(
+        self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
+    ) -> web.StreamResponse:
+        """Refuses strangers; the headers of `HEADERS` go with every reply."""
+        try:
+            response = await self._refusal(request) or await handler(request)
+        except web.HTTPException as error:
+            response = web.Response(status=error.status, text=error.reason)
+        if not response.prepared:
+            response.headers.update(HEADERS)
+        return response
+
+    async def _refusal(self, request: web.Request) -> web.Response | None:
+        """None for a request of a session of this server, or one that may open one."""
+        if not is_own_host(request.headers.get("Host", "")):
+            return _text(403, "the page is served under this computer's address or name only")
+        if request.path == "/" and "key" in request.query:
+            return self._entered(request.query["key"])
+        if self._access.token_of(request.cookies.get(self._cookie)) is None:
+            return _text(403, "open the page with the whole address that `flockd fleet` printed, with its key")
+        return None
+
+    def _entered(self, key: str) -> web.Response:
+        """Moves the key out of the address bar, into a cookie that no other site can send."""
+        session = self._access.open_session(key)
+        if session is None:
+            return _text(403, "the key in the address is not this server's; use the address that it printed")
+        response = web.Response(status=303, headers={"Location": "/"})
+        response.set_cookie(self._cookie, session, httponly=True, samesite="Strict")
+        return response
+
+    async def _page(self, request: web.Request) -> web.Response:
+        token = self._access.token_of(request.cookies.get(self._cookie)) or ""
+        page = (_FOLDER / "fleet.html").read_text(encoding="utf-8").replace(_TOKEN, token)
+        return web.Response(text=page, content_type="text/html")
+
+    async def _file(self, request: web.Request) -> web.Response:
+        path = _FOLDER / request.match_info["file"]
+        if not path.is_file():
+            return _text(404, "there is no such file")
+        return web.Response(text=path.read_text(encoding="utf-8"), content_type=_TYPES[path.suffix])
+
+    async def _plotting_library(self, request: web.Request) -> web.Response:
+        """As its Python package has it, packed once."""
+        if self._plotly is None:
+            path = files("plotly") / "package_data" / "plotly.min.js"
+            self._plotly = await asyncio.to_thread(lambda: gzip.compress(path.read_bytes(), 4))
+        headers = {"Content-Encoding": "gzip"}
+        return web.Response(body=self._plotly, content_type="text/javascript", headers=headers)
+
+    async def _history(self, request: web.Request) -> web.Response:
+        return web.json_response({"columns": HISTORY_COLUMNS, "drones": self._source.history()}, dumps=_json)
+
+    async def _image(self, request: web.Request) -> web.Response:
+        drone = f"{request.match_info['fleet']}/{request.match_info['drone']}"
+        time_s = _number(request.query.get("at"))
+        image = await self._on_thread(self._source.image, drone, request.match_info["camera"], time_s)
+        if image is None:
+            return _text(404, "the camera has no picture, or this computer may not see it")
+        return web.Response(body=image, content_type="image/jpeg")
+
+    async def _ask(self, request: web.Request) -> web.Response:
+        """A command to drones, one answer a drone. Only from this server's own page."""
+        session = request.cookies.get(self._cookie)
+        if not is_own_origin(request.headers) or not self._access.is_token(
+            session, request.headers.get("X-Flockd-Token")
+        ):
+            return _text(403, "commands are taken from this server's own page only; load it again")
+        if not self._may_command:
+            return _text(403, "this page shows, and commands nothing: `flockd fleet` was started so")
+        try:
+            drones, command, order = _asked(await request.json())
+        except ValueError as error:
+            return _text(400, str(error))
+        answers = await asyncio.gather(
+            *(self._on_thread(self._source.ask, drone, command, order) for drone in drones)
+        )  # fmt: skip
+        told: dict[str, AnswerMessage] = dict(zip(drones, answers, strict=True))
+        return web.json_response(told, dumps=_json)
+
+    async def _live(self, request: web.Request) -> web.StreamResponse:
+        """Rows as they change. The page's first message has to carry its session's token."""
+        if not is_own_origin(request.headers):
+            return _text(403, "live data goes to this server's own page only")
+        socket = web.WebSocketResponse(heartbeat=10.0, max_msg_size=MAX_REQUEST_BYTES)
+        await socket.prepare(request)
+        first = await socket.receive()
+        hello = _object(first.data if first.type == WSMsgType.TEXT else "")
+        if not self._access.is_token(request.cookies.get(self._cookie), hello.get("token")):
+            await socket.close(code=4403, message=b"load the page again")
+            return socket
+        feed = _Feed(self._source, socket)
+        await feed.greet(may_command=self._may_command)
+        with suppress(ConnectionError):  # the page was closed while something was sent to it
+            await (feed.push() if self._source.span_s is None else feed.follow())
+        return socket
+
+    async def _on_thread(self, job: Callable[..., Any], *arguments: object) -> Any:
+        return await asyncio.get_running_loop().run_in_executor(self._threads, job, *arguments)
+
+
+class _Feed:
+    """What one page is sent: each time only what has changed for it."""
+
+    def __init__(self, source: FleetSource, socket: web.WebSocketResponse) -> None:
+        self._source, self._socket = source, socket
+        self._sent: dict[str, Row] = {}
+        self._event: Event | None = None
+        """The newest that was sent."""
+
+    async def greet(self, *, may_command: bool) -> None:
+        """What the page has to know of the server."""
+        await self._send({"kind": "hello", "span_s": self._source.span_s, "may_command": may_command})
+
+    async def push(self) -> None:
+        """Sends what is new until the page is closed."""
+        reading = asyncio.create_task(self._wait_for_end())
+        try:
+            while not reading.done():
+                began_s = time.monotonic()
+                await self._snapshot(self._source.now_s())
+                rest_s = max(0.05, PUSH_EVERY_S - (time.monotonic() - began_s))
+                await asyncio.wait({reading}, timeout=rest_s)
+        finally:
+            reading.cancel()
+
+    async def follow(self) -> None:
+        """Of recordings: sends what was at each time that the page asks for."""
+        async for message in self._socket:
+            asked = _object(message.data if message.type == WSMsgType.TEXT else "")
+            at = asked.get("at")
+            if isinstance(at, int | float):
+                await self._snapshot(float(at))
+
+    async def _wait_for_end(self) -> None:
+        async for _ in self._socket:
+            pass
+
+    async def _snapshot(self, time_s: float) -> None:
+        rows = self._source.rows(time_s)
+        changed = {key: row for key, row in rows.items() if self._sent.get(key) != row}
+        self._sent = rows
+        events = self._source.events(time_s)
+        replay = self._source.span_s is not None
+        new = events[-100:] if replay else events_after(events, self._event)
+        self._event = events[-1] if events else self._event
+        await self._send(
+            {
+                "kind": "rows",
+                "time_s": time_s,
+                "order": list(rows),
+                "rows": changed,
+                "events": new,
+                "all_events": replay,
+            }
+        )
+
+    async def _send(self, message: dict[str, Any]) -> None:
+        await self._socket.send_str(_json(message))
+
+
+def _asked(body: object) -> tuple[list[str], str, dict[str, object] | None]:
+    """Drones, command and order of a request. Raises ValueError for what is none."""
+    if not isinstance(body, dict):
+        raise ValueError("a command is a JSON object")  # noqa: TRY004 - of the request, not of the caller
+    drones, command, order = body.get("drones"), body.get("command"), body.get("order")
+    if not isinstance(drones, list) or not drones or not all(isinstance(drone, str) for drone in drones):
+        raise ValueError("a command names its drones")
+    if command not in COMMANDS:
+        raise ValueError(f"the page's commands are {', '.join(COMMANDS)}")
+    if command != "goto":
+        return list(dict.fromkeys(drones)), command, None
+    parse_order(command, json.dumps(order).encode())
+    return list(dict.fromkeys(drones)), command, order
+
+
+def _object(text: str) -> dict[str, Any]:
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def _number(text: str | None) -> float:
+    try:
+        return float(text or 0.0)
+    except ValueError:
+        return 0.0
+
+
+def _text(status: int, sentence: str) -> web.Response:
+    return web.Response(status=status, text=sentence)
+
+
+def _json(value: object) -> str:
+    return json.dumps(value, separators=(",", ":"), allow_nan=False)

@@ -1,0 +1,17 @@
+"""The flocking law (Eq. 38-42) and, in `metrics`, figures of a flock.
+
+Everything here is horizontal: north and east.
+"""
+
+from __future__ import annotations
+
+from flockd.core.config.flocking import FlockingParameters, WeightParameters
+from flockd.flight.flocking.law import FlockingLaw, level_offsets, limit_norm
+
+__all__ = [
+    "FlockingLaw",
+    "FlockingParameters",
+    "WeightParameters",
+    "level_offsets",
+    "limit_norm",
+]

@@ -1,0 +1,116 @@
+"""The flocking law of the paper: from what a drone sees of its neighbours to an acceleration (Eq. 38-42)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from flockd.core.config.flocking import FlockingParameters, WeightParameters
+from flockd.core.messages import BoolArray, FloatArray
+
+_MIN_DISTANCE_M = 1e-3
+"""Nearer than this counts as this far: Eq. 39 and 41 have a pole at zero distance."""
+
+SAME_SPOT_M = 0.1
+"""Neighbours at a smaller level range are above or below: their direction is not measured that well."""
+
+
+class FlockingLaw:
+    """Eq. 38-42 for one drone. Holds no state: the same input gives the same output."""
+
+    def __init__(self, parameters: FlockingParameters | None = None) -> None:
+        self.parameters = parameters or FlockingParameters()
+
+    def acceleration(
+        self, velocity: ArrayLike, positions: ArrayLike, velocities: ArrayLike, desired_velocity: ArrayLike
+    ) -> FloatArray:
+        """U of Eq. 38: (2,) m/s^2, not limited.
+
+        All arguments are level, north and east. `velocity` (2,) is the own one over ground; `positions` (n, 2) metres
+        are the neighbours' relative to the own drone (Q_j - Q_i); `velocities` (n, 2) theirs over ground;
+        `desired_velocity` (2,) is efv of Eq. 42. n may be 0. A neighbour at no distance pushes to the south, as one
+        that sits 1 mm to the north; `level_offsets` keeps two drones from that. Raises ValueError for other shapes
+        and for numbers that are not finite.
+        """
+        p = self.parameters
+        own = _finite(velocity, (2,), "the own velocity")
+        desired = _finite(desired_velocity, (2,), "the desired velocity")
+        offsets = _finite(positions, (-1, 2), "the neighbours' positions")
+        theirs = _finite(velocities, (len(offsets), 2), "the neighbours' velocities")
+        offsets = np.where(np.any(offsets != 0, axis=1, keepdims=True), offsets, [_MIN_DISTANCE_M, 0.0])
+        distances = np.hypot(offsets[:, 0], offsets[:, 1])
+        near = distances <= max(p.observation_distance_m, p.separation_distance_m)
+        offsets, theirs, distances = offsets[near], theirs[near], distances[near]
+        directions = offsets / distances[:, None]
+        distances = np.maximum(distances, _MIN_DISTANCE_M)
+
+        weights = influence_weights(p.weight, distances, distances <= p.observation_distance_m)
+        cohesion = p.cohesion * (weights * distances * np.log(distances / p.desired_distance_m)) @ directions  # Eq. 39
+        alignment = p.alignment * weights @ (theirs - own)  # Eq. 40
+        crowding = np.maximum(1 / distances - 1 / p.separation_distance_m, 0.0)  # 0 beyond D_II
+        separation = -p.separation * crowding**2 @ directions  # Eq. 41
+        following = p.velocity * p.own_weight * desired  # Eq. 42
+        u: FloatArray = cohesion + alignment + separation + following - own  # Eq. 38
+        return u
+
+    def command(
+        self, velocity: ArrayLike, positions: ArrayLike, velocities: ArrayLike, desired: ArrayLike, step_s: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """The velocity to ask for, (2,) m/s, and the acceleration that leads there, (2,) m/s^2, both within limits.
+
+        The acceleration's norm is limited first, then that of V + u * st. Arguments and errors as of `acceleration`;
+        `step_s` is the sampling time st.
+        """
+        return self.limited(velocity, self.acceleration(velocity, positions, velocities, desired), step_s)
+
+    def limited(self, velocity: ArrayLike, acceleration: FloatArray, step_s: float) -> tuple[FloatArray, FloatArray]:
+        """As `command`, for an acceleration (2,) m/s^2 without limits."""
+        if not (math.isfinite(step_s) and step_s > 0):
+            raise ValueError(f"the step must be finite and positive, not {step_s} s")
+        u = limit_norm(acceleration, self.parameters.max_acceleration_m_s2)
+        return limit_norm(np.asarray(velocity, dtype=float) + u * step_s, self.parameters.max_speed_m_s), u
+
+
+def level_offsets(offsets: FloatArray) -> FloatArray:
+    """(n, 2) metres north and east of neighbours at (n, 3) metres NED, such that drones at one level spot part.
+
+    Directions within `SAME_SPOT_M` are noise, and two drones with the same noise would fly off the same way. Such a
+    neighbour counts as that far to the west where it is below and to the east where it is not: of two drones that face
+    each other, both with north overhead, each then flies to its own right.
+    """
+    same_spot = np.hypot(offsets[:, 0], offsets[:, 1]) < SAME_SPOT_M
+    sides = np.where(offsets[:, 2] > 0, -SAME_SPOT_M, SAME_SPOT_M)
+    aside = np.column_stack([np.zeros(len(offsets)), sides])
+    level: FloatArray = np.where(same_spot[:, None], aside, offsets[:, :2])
+    return level
+
+
+def influence_weights(parameters: WeightParameters, distances: FloatArray, observed: BoolArray) -> FloatArray:
+    """W of Eq. 39 and 40, which the paper leaves open: (n,) of 0 and 1, 0 for who is not `observed` (n,).
+
+    `uniform` gives all 1, as in the paper's flight of five. `nearest` gives 1 to the k nearest, which is the same to
+    k + 1 drones or fewer and keeps larger flocks from collapsing; of two equally far the first counts as nearer.
+    """
+    weights = observed.astype(float)
+    if parameters.kind == "nearest":
+        weights[np.argsort(distances, kind="stable")[parameters.nearest :]] = 0.0
+    return weights
+
+
+def limit_norm(vector: FloatArray, maximum: float) -> FloatArray:
+    """The vector itself if it is no longer than `maximum`, else the one of that length in its direction."""
+    norm = float(np.linalg.norm(vector))
+    return vector if norm <= maximum else vector * (maximum / norm)
+
+
+def _finite(values: ArrayLike, shape: tuple[int, int] | tuple[int], name: str) -> FloatArray:
+    """`values` as an array of `shape` (-1: any length), or ValueError."""
+    array = np.asarray(values, dtype=float)
+    if array.ndim != len(shape) or any(want not in (-1, have) for want, have in zip(shape, array.shape, strict=True)):
+        wanted = tuple("n" if want == -1 else want for want in shape)
+        raise ValueError(f"{name} must have the shape {wanted}, not {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite")
+    return array

@@ -1,0 +1,53 @@
+"""Camera models, rigid fits, Algorithm 1, ego- and neighbour motion. Pure: no clock, no files, the same every time."""
+
+from flockd.flight.geometry.cameras import Camera, PinholeCamera, WideAngleCamera
+from flockd.flight.geometry.ego_motion import estimate_ego_motion
+from flockd.flight.geometry.ego_motion_refinement import refine_ego_motion
+from flockd.flight.geometry.ground import ground_inverse_depth
+from flockd.flight.geometry.ground_fit import FittedGround, GroundSamples, fit_ground
+from flockd.flight.geometry.ground_track import scale_on_track
+from flockd.flight.geometry.neighbour_motion import estimate_neighbour_motion
+from flockd.flight.geometry.pairs import BACKGROUND_LABEL, PointPairs, grid_pixels, label_pixels, lift_matches
+from flockd.flight.geometry.polar import log_polar, log_polar_covariance, log_polar_residual
+from flockd.flight.geometry.rig import Rig, RigCamera, build_rig
+from flockd.flight.geometry.rigid_fit import fit_rigid
+from flockd.flight.geometry.robust.ransac import RansacResult, ransac_rigid
+from flockd.flight.geometry.rotations import euler_from_rotation, rotation_angle_deg, rotation_from_euler
+from flockd.flight.geometry.transform import RigidTransform
+from flockd.flight.geometry.triangulation import inverse_depths
+from flockd.flight.geometry.virtual_camera import VirtualCrop, virtual_crop
+
+__all__ = [
+    "BACKGROUND_LABEL",
+    "Camera",
+    "FittedGround",
+    "GroundSamples",
+    "PinholeCamera",
+    "PointPairs",
+    "RansacResult",
+    "Rig",
+    "RigCamera",
+    "RigidTransform",
+    "VirtualCrop",
+    "WideAngleCamera",
+    "build_rig",
+    "estimate_ego_motion",
+    "estimate_neighbour_motion",
+    "euler_from_rotation",
+    "fit_ground",
+    "fit_rigid",
+    "grid_pixels",
+    "ground_inverse_depth",
+    "inverse_depths",
+    "label_pixels",
+    "lift_matches",
+    "log_polar",
+    "log_polar_covariance",
+    "log_polar_residual",
+    "ransac_rigid",
+    "refine_ego_motion",
+    "rotation_angle_deg",
+    "rotation_from_euler",
+    "scale_on_track",
+    "virtual_crop",
+]

@@ -1,0 +1,291 @@
+"""Cameras: from points in the optical frame (RDF) to pixels and back (Eq. 1-6), with lens distortion."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from flockd.core.messages import BoolArray, FloatArray
+
+_NEWTON_STEPS = 20
+_NEWTON_TOLERANCE = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Camera(ABC):
+    """A projection with intrinsics ``matrix`` (3, 3) in pixels and ``size`` (width, height).
+
+    Pixels are (u, v) with pixel centres at +0.5. Two cameras are the same only if they are one object. Raises
+    ValueError for a matrix with skew or without focal length, for an empty image and for a wrong number of
+    distortion coefficients.
+    """
+
+    matrix: FloatArray
+    size: tuple[int, int]
+    distortion: tuple[float, ...] = ()
+
+    depth_kind: ClassVar[Literal["z", "range"]]
+    """What `unproject` takes: metres along the optical axis, or metres along the ray."""
+    _coefficient_counts: ClassVar[tuple[int, ...]]
+
+    def __post_init__(self) -> None:
+        matrix = np.asarray(self.matrix, dtype=np.float64)
+        if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+            raise ValueError("a camera matrix is (3, 3) and finite")
+        fx, fy = matrix[0, 0], matrix[1, 1]
+        if fx <= 0.0 or fy <= 0.0 or np.any(matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] != (0, 0, 0, 0, 1)):
+            raise ValueError("a camera matrix is [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy")
+        if min(self.size) < 1:
+            raise ValueError(f"a camera's size is a positive width and height, not {self.size}")
+        if len(self.distortion) not in self._coefficient_counts:
+            raise ValueError(
+                f"{type(self).__name__} takes {self._coefficient_counts} distortion coefficients, "
+                f"not {len(self.distortion)}"
+            )
+        object.__setattr__(self, "matrix", matrix)
+
+    @abstractmethod
+    def project(self, points: FloatArray) -> FloatArray:
+        """Pixels (n, 2) of points (n, 3); NaN rows for what the lens cannot see. The image's border does not cut."""
+
+    @abstractmethod
+    def jacobian(self, points: FloatArray) -> FloatArray:
+        """(n, 2, 3) derivative of `project`, pixels per metre; NaN where `project` is."""
+
+    @abstractmethod
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        """Unit vectors (n, 3) towards what pixels (n, 2) show; NaN rows where no direction is imaged there."""
+
+    @abstractmethod
+    def unproject(self, pixels: FloatArray, depth: FloatArray) -> FloatArray:
+        """Points (n, 3) at ``depth`` (n,) metres, of this camera's `depth_kind`, behind pixels (n, 2)."""
+
+    def in_image(self, pixels: FloatArray) -> BoolArray:
+        """Mask (n,): which pixels (n, 2) lie inside the image; NaN does not."""
+        u, v = pixels[:, 0], pixels[:, 1]
+        inside: BoolArray = (u >= 0.0) & (u < self.size[0]) & (v >= 0.0) & (v < self.size[1])
+        return inside
+
+    @property
+    def focal_px(self) -> float:
+        """Pixels per radian at the principal point, the geometric mean of both axes."""
+        return math.sqrt(float(self.matrix[0, 0] * self.matrix[1, 1]))
+
+    def _to_pixels(self, normalised: FloatArray) -> FloatArray:
+        # Column by column: numpy broadcasts a row of two several times slower, and a crop has thousands of pixels.
+        pixels = np.empty_like(normalised)
+        for axis in range(2):
+            pixels[:, axis] = normalised[:, axis] * self.matrix[axis, axis] + self.matrix[axis, 2]
+        return pixels
+
+    def _from_pixels(self, pixels: FloatArray) -> FloatArray:
+        normalised = np.empty((len(pixels), 2))
+        for axis in range(2):
+            normalised[:, axis] = (pixels[:, axis] - self.matrix[axis, 2]) / self.matrix[axis, axis]
+        return normalised
+
+
+@dataclass(frozen=True, eq=False)
+class PinholeCamera(Camera):
+    """The pinhole (Eq. 1-6), distorted by OpenCV's k1 k2 p1 p2 [k3]. Depth is z, along the optical axis.
+
+    A point behind the camera, or so far out that the distortion polynomial folds back into the image, has NaN pixels.
+    """
+
+    depth_kind = "z"
+    _coefficient_counts = (0, 4, 5)
+
+    def project(self, points: FloatArray) -> FloatArray:
+        """Pixels (n, 2) of points (n, 3); NaN rows behind the camera."""
+        points = np.asarray(points, dtype=np.float64)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse_z = np.where(points[:, 2] > 0.0, 1.0 / points[:, 2], np.nan)
+            normalised = np.empty((len(points), 2))
+            np.multiply(points[:, 0], inverse_z, out=normalised[:, 0])
+            np.multiply(points[:, 1], inverse_z, out=normalised[:, 1])
+            if self.distortion:
+                normalised = self._distort(normalised)
+        return self._to_pixels(normalised)
+
+    def jacobian(self, points: FloatArray) -> FloatArray:
+        """(n, 2, 3) derivative of `project`."""
+        points = np.asarray(points, dtype=np.float64)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse_z = np.where(points[:, 2] > 0.0, 1.0 / points[:, 2], np.nan)
+        normalised = points[:, :2] * inverse_z[:, None]
+        derivative = np.zeros((len(points), 2, 3))
+        derivative[:, 0, 0] = inverse_z
+        derivative[:, 1, 1] = inverse_z
+        derivative[:, :, 2] = -normalised * inverse_z[:, None]
+        if self.distortion:
+            derivative = self._distortion_jacobian(normalised) @ derivative
+        scaled: FloatArray = derivative * self.matrix[[0, 1], [0, 1]][:, None]
+        return scaled
+
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        """Unit vectors (n, 3)."""
+        points = self.unproject(pixels, np.ones(len(pixels)))
+        unit: FloatArray = points / np.linalg.norm(points, axis=1, keepdims=True)
+        return unit
+
+    def unproject(self, pixels: FloatArray, depth: FloatArray) -> FloatArray:
+        """Points (n, 3) at ``depth`` (n,) metres along the optical axis (Eq. 6)."""
+        normalised = self._from_pixels(pixels)
+        if self.distortion:
+            normalised = self._undistort(normalised)
+        depth = np.asarray(depth, dtype=np.float64)
+        points = np.empty((len(normalised), 3))
+        points[:, 0], points[:, 1], points[:, 2] = normalised[:, 0] * depth, normalised[:, 1] * depth, depth
+        return points
+
+    def _coefficients(self) -> tuple[float, float, float, float, float]:
+        k1, k2, p1, p2 = self.distortion[:4]
+        return k1, k2, p1, p2, self.distortion[4] if len(self.distortion) == 5 else 0.0
+
+    def _radius_limit(self) -> float:
+        k1, k2, _, _, k3 = self._coefficients()
+        return _first_turning_point((k1, k2, k3))
+
+    def _distort(self, normalised: FloatArray) -> FloatArray:
+        k1, k2, p1, p2, k3 = self._coefficients()
+        x, y = normalised.T
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        radial = np.where(r2 < self._radius_limit() ** 2, radial, np.nan)
+        return np.stack(
+            [
+                x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+                y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+            ],
+            axis=1,
+        )
+
+    def _distortion_jacobian(self, normalised: FloatArray) -> FloatArray:
+        k1, k2, p1, p2, k3 = self._coefficients()
+        x, y = normalised.T
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))  # d radial / d(r^2), times 2
+        derivative = np.empty((len(x), 2, 2))
+        derivative[:, 0, 0] = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+        derivative[:, 0, 1] = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
+        derivative[:, 1, 0] = derivative[:, 0, 1]
+        derivative[:, 1, 1] = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+        return derivative
+
+    def _undistort(self, distorted: FloatArray) -> FloatArray:
+        """Newton's method; NaN where no undistorted point leads to the distorted one."""
+        estimate = distorted.copy()
+        with np.errstate(all="ignore"):
+            for _ in range(_NEWTON_STEPS):
+                error = self._distort(estimate) - distorted
+                if not np.nanmax(np.abs(error), initial=0.0) > _NEWTON_TOLERANCE:
+                    break
+                a, b = self._distortion_jacobian(estimate)[:, 0].T
+                c, d = self._distortion_jacobian(estimate)[:, 1].T
+                step = np.stack([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - c * error[:, 0]], axis=1)
+                estimate = estimate - step / (a * d - b * c)[:, None]
+            error = self._distort(estimate) - distorted
+            converged = np.abs(error).max(axis=1) < 1e-9
+        return np.where(converged[:, None], estimate, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class WideAngleCamera(Camera):
+    """The equidistant fisheye (Kannala-Brandt k1..k4), also beyond 180 degrees.
+
+    The image radius is ``f theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)`` at ``theta`` off the
+    optical axis. Depth is the range along the ray, because z vanishes at 90 degrees.
+    """
+
+    depth_kind = "range"
+    _coefficient_counts = (0, 4)
+
+    def project(self, points: FloatArray) -> FloatArray:
+        """Pixels (n, 2) of points (n, 3), of whichever side; NaN rows where theta is beyond what the lens images."""
+        points = np.asarray(points, dtype=np.float64)
+        off_axis = np.hypot(points[:, 0], points[:, 1])
+        theta = np.arctan2(off_axis, points[:, 2])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = np.where(off_axis > 0.0, self._radius(theta) / off_axis, 1.0 / points[:, 2])
+        visible = (theta <= self._theta_limit()) & ((off_axis > 0.0) | (points[:, 2] > 0.0))
+        return self._to_pixels(points[:, :2] * np.where(visible, scale, np.nan)[:, None])
+
+    def jacobian(self, points: FloatArray) -> FloatArray:
+        """(n, 2, 3) derivative of `project`."""
+        points = np.asarray(points, dtype=np.float64)
+        x, y, z = points.T
+        # On the axis the derivative has a limit; a hair off it the formula below reaches it.
+        off_axis = np.maximum(np.hypot(x, y), 1e-9 * np.abs(z))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ex = np.where(np.hypot(x, y) >= off_axis, x / off_axis, 1.0)
+            ey = np.where(np.hypot(x, y) >= off_axis, y / off_axis, 0.0)
+            theta = np.arctan2(off_axis, z)
+            range2 = off_axis**2 + z**2
+            radial = np.stack([z * ex, z * ey, -off_axis], axis=1) * (self._slope(theta) / range2)[:, None]
+            across = np.stack([-ey, ex, np.zeros_like(x)], axis=1) * (self._radius(theta) / off_axis)[:, None]
+        radial[theta > self._theta_limit()] = np.nan
+        derivative = np.stack(
+            [ex[:, None] * radial - ey[:, None] * across, ey[:, None] * radial + ex[:, None] * across], axis=1
+        )
+        scaled: FloatArray = derivative * self.matrix[[0, 1], [0, 1]][:, None]
+        return scaled
+
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        """Unit vectors (n, 3)."""
+        normalised = self._from_pixels(pixels)
+        radius = np.hypot(normalised[:, 0], normalised[:, 1])
+        theta = self._theta(radius)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sideways = np.where(radius > 0.0, np.sin(theta) / radius, 1.0)
+        return np.concatenate([normalised * sideways[:, None], np.cos(theta)[:, None]], axis=1)
+
+    def unproject(self, pixels: FloatArray, depth: FloatArray) -> FloatArray:
+        """Points (n, 3) at ``depth`` (n,) metres along the ray."""
+        points: FloatArray = self.rays(pixels) * np.asarray(depth, dtype=np.float64)[:, None]
+        return points
+
+    def _theta_limit(self) -> float:
+        return min(math.pi, _first_turning_point(self.distortion)) if self.distortion else math.pi
+
+    def _radius(self, theta: FloatArray) -> FloatArray:
+        polynomial = np.ones_like(theta)
+        for power, k in enumerate(self.distortion, start=1):
+            polynomial += k * theta ** (2 * power)
+        radius: FloatArray = theta * polynomial
+        return radius
+
+    def _slope(self, theta: FloatArray) -> FloatArray:
+        slope = np.ones_like(theta)
+        for power, k in enumerate(self.distortion, start=1):
+            slope += (2 * power + 1) * k * theta ** (2 * power)
+        return slope
+
+    def _theta(self, radius: FloatArray) -> FloatArray:
+        """Newton's method; NaN beyond the largest imaged angle."""
+        limit = self._theta_limit()
+        theta = np.minimum(radius, limit)
+        if self.distortion:
+            with np.errstate(all="ignore"):
+                for _ in range(_NEWTON_STEPS):
+                    error = self._radius(theta) - radius
+                    if not np.nanmax(np.abs(error), initial=0.0) > _NEWTON_TOLERANCE:
+                        break
+                    theta = np.clip(theta - error / self._slope(theta), 0.0, limit)
+        imaged = np.abs(self._radius(theta) - radius) < 1e-9
+        return np.where(imaged, theta, np.nan)
+
+
+def _first_turning_point(coefficients: tuple[float, ...]) -> float:
+    """The smallest positive x at which ``x (1 + c1 x^2 + c2 x^4 + ...)`` stops growing; infinity if it never does.
+
+    Beyond it the polynomial no longer describes a lens: far directions would fold back into the image.
+    """
+    derivative = [1.0, *((2 * power + 1) * c for power, c in enumerate(coefficients, start=1))]
+    roots = np.roots(derivative[::-1])
+    turning = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0.0)]
+    return math.sqrt(float(turning.min())) if len(turning) else math.inf

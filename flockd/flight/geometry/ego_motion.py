@@ -1,0 +1,86 @@
+"""The drone's own motion from the background that all its cameras see (Eq. 7-21, Algorithm 1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockd.core.config.geometry import GeometryParameters
+from flockd.core.messages import EgoMotion
+from flockd.flight.geometry.ego_motion_refinement import refine_ego_motion
+from flockd.flight.geometry.pairs import BACKGROUND_LABEL, PointPairs
+from flockd.flight.geometry.rig import Rig
+from flockd.flight.geometry.robust.ransac import ransac_rigid
+from flockd.flight.geometry.transform import RigidTransform
+
+
+@dataclass(frozen=True)
+class EgoMotionAcceptance:
+    """Which motions are believed, by the matches that they explain."""
+
+    explained_px: float = 3.0
+    """A match is explained that is so near to where the motion moves it."""
+    min_explained: float = 0.08
+    """Of all matches. On real images true motions explain 15 % and more; those that Algorithm 1 finds in nothing but
+    false matches, because within metres there are always some that agree, under 6 %."""
+    min_kept: float = 0.9
+    """Of the explained matches: a refinement that loses more has followed the false ones."""
+
+
+ACCEPTANCE = EgoMotionAcceptance()
+
+
+def estimate_ego_motion(
+    pairs: PointPairs, rig: Rig, interval_s: float, parameters: GeometryParameters, *, seed: int = 0
+) -> EgoMotion:
+    """``P_C = R_FC P_F + T_FC`` (Eq. 7) from the pairs labelled background, of all cameras together.
+
+    Algorithm 1 finds it; with ``parameters.refine`` its reprojection error is then made small, and the result of
+    Algorithm 1 stays where that fails or leaves its matches behind. ``inliers`` and ``threshold_m`` are Algorithm 1's.
+    Raises ValueError with the reason where there is no estimate, or one that explains hardly any of the matches that
+    it was made from.
+    """
+    background = pairs.select(pairs.labels == BACKGROUND_LABEL)
+    found = ransac_rigid(
+        background.current,
+        background.previous,
+        threshold=parameters.initial_threshold_m,
+        min_inlier_ratio=parameters.min_inlier_ratio,
+        hypotheses=parameters.hypotheses,
+        max_threshold=parameters.max_threshold_m,
+        seed=seed,
+    )
+    motion = found.transform
+    explained = _explained(background, rig, motion)
+    if parameters.refine:
+        refined = refine_ego_motion(background, rig, motion, agreeing=found.inliers, seed=seed)
+        still = _explained(background, rig, refined) if refined else 0.0
+        if refined and still >= ACCEPTANCE.min_kept * explained:
+            motion, explained = refined, still
+    if explained < ACCEPTANCE.min_explained:
+        raise ValueError(
+            f"the best motion explains only {explained:.1%} of {len(background)} matches within "
+            f"{ACCEPTANCE.explained_px:g} px"
+        )
+    return EgoMotion(
+        rotation=motion.rotation,
+        translation=motion.translation,
+        interval_s=interval_s,
+        pairs=len(background),
+        inliers=int(found.inliers.sum()),
+        threshold_m=found.threshold,
+    )
+
+
+def _explained(pairs: PointPairs, rig: Rig, motion: RigidTransform) -> float:
+    """The share of matches whose point, seen first and moved, falls on its second pixel."""
+    moved = motion.inverse().apply(pairs.previous)
+    near = 0
+    for name, camera in rig.cameras.items():
+        mine = pairs.camera_names == name
+        mount = camera.T_body_camera
+        pixels = camera.camera.project((moved[mine] - mount.translation) @ mount.rotation)
+        distances = np.linalg.norm(pixels - pairs.pixels_current[mine], axis=1)
+        near += int(np.count_nonzero(distances < ACCEPTANCE.explained_px))  # behind a camera it is NaN, and not near
+    return near / len(pairs)

@@ -1,0 +1,108 @@
+"""The ground as a plane, fitted to the depth of what is seen of it around the drone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockd.core.messages import BoolArray, FloatArray
+from flockd.flight.geometry.robust.kernels import Kernel, Tukey
+from flockd.flight.geometry.robust.reweighting import reweighted
+
+RELIEF = 0.03
+"""Standard deviation of what the ground departs from its plane, as a share of the depth, straight below; it grows with
+the distance from there."""
+NEAR_EXPECTED = 0.35
+"""What is seen counts as ground when its inverse depth is within this share of the expected plane's."""
+REACH = 3.0
+"""How far from the point below the drone the ground is used, in heights."""
+MIN_POINTS = 60
+MIN_AGREEING = 0.4
+"""Of the points: with fewer, what is there is no plane."""
+ROUNDS = 8
+MEDIAN_DEVIATIONS = 6.0
+"""Beyond so many of the residuals' median size a point counts nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class GroundSamples:
+    """Points seen, by their direction and inverse depth, with level axes at the drone's place."""
+
+    rays: FloatArray
+    """(n, 3) NED, to a point at depth 1."""
+    inverse: FloatArray
+    """(n,) one over the depth."""
+    offsets: FloatArray
+    """(n, 3) NED, of the camera from the body's origin, in the same unit as the depth."""
+    sigma: FloatArray
+    """(n,) standard deviation of `inverse`."""
+
+    def select(self, chosen: BoolArray) -> GroundSamples:
+        """Those of a mask (n,)."""
+        return GroundSamples(self.rays[chosen], self.inverse[chosen], self.offsets[chosen], self.sigma[chosen])
+
+    @staticmethod
+    def concatenate(parts: list[GroundSamples]) -> GroundSamples:
+        """All together."""
+        return GroundSamples(
+            np.concatenate([part.rays for part in parts]), np.concatenate([part.inverse for part in parts]),
+            np.concatenate([part.offsets for part in parts]), np.concatenate([part.sigma for part in parts]),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class FittedGround:
+    """A plane under the drone."""
+
+    height: float
+    """Of the body's origin above it, straight down, in the samples' unit."""
+    slope: FloatArray
+    """(2,) rise for each metre to the north and to the east."""
+
+
+def fit_ground(samples: GroundSamples, height: float, slope: FloatArray) -> FittedGround:
+    """The plane that most of the samples near an expected one lie on.
+
+    What stands on the ground is nearer than it and does not count. Raises ValueError where too little ground is seen.
+    """
+    normal = np.array([*slope, 1.0])
+    expected = samples.rays @ normal / (height - samples.offsets @ normal)
+    level = np.hypot(samples.rays[:, 0], samples.rays[:, 1])
+    near = (samples.rays[:, 2] > 0.0) & (level < REACH * samples.rays[:, 2])
+    near &= np.abs(samples.inverse - expected) < NEAR_EXPECTED * expected
+    if near.sum() < MIN_POINTS:
+        raise ValueError("too little ground is seen to fit a plane")
+    ground = samples.select(near)
+    away = level[near] / ground.rays[:, 2]
+    spread = np.hypot(ground.sigma, RELIEF * (1.0 + away) * expected[near])
+    plane, weights = reweighted(
+        lambda weights, _: _fitted(ground, weights, spread),
+        lambda plane: _residuals(ground, plane) / spread,
+        _tukey,
+        np.ones(len(spread)),
+        rounds=ROUNDS,
+    )
+    if (weights > 0.5).mean() < MIN_AGREEING:
+        raise ValueError("the ground that is seen is no plane")
+    return FittedGround(float(plane[0]), plane[1:].copy())
+
+
+def _fitted(ground: GroundSamples, weights: FloatArray, spread: FloatArray) -> FloatArray:
+    """(3,) height and slope. A point at inverse depth w is on the plane where ``n . (ray + w offset) = w height``."""
+    at = ground.rays + ground.inverse[:, None] * ground.offsets
+    rows = np.column_stack([ground.inverse, -at[:, :2]])
+    root: FloatArray = np.sqrt(weights) / spread
+    found, *_ = np.linalg.lstsq(rows * root[:, None], at[:, 2] * root, rcond=None)
+    return np.asarray(found, np.float64)
+
+
+def _residuals(ground: GroundSamples, plane: FloatArray) -> FloatArray:
+    """(n,) of the inverse depth."""
+    normal = np.array([plane[1], plane[2], 1.0])
+    left: FloatArray = ground.inverse - ground.rays @ normal / (plane[0] - ground.offsets @ normal)
+    return left
+
+
+def _tukey(left: FloatArray) -> Kernel:
+    return Tukey(max(MEDIAN_DEVIATIONS * float(np.median(np.abs(left))), 1e-6))

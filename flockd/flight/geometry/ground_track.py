@@ -1,0 +1,55 @@
+"""The scale of what is seen of the ground, from places where its height was measured."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flockd.core.messages import FloatArray
+from flockd.flight.geometry.ground_fit import GroundSamples
+
+WIDTH = 0.2
+"""Standard deviation, in heights, of the distance at which a measured place still says what is seen beside it."""
+BESIDE = 2.0
+"""In that unit: what is seen farther from every measured place does not count."""
+MIN_POINTS = 40
+MIN_SPAN = 0.5
+"""In heights: of the measured places in view; over less, a single bump decides."""
+ROUNDS = 3
+
+
+def scale_on_track(samples: GroundSamples, track: FloatArray, slope: FloatArray, factor: float) -> float:
+    """By what the samples' unit has to be multiplied for them to lie on the measured ground.
+
+    Between the places the ground goes on with its slope. What stands on it is an outlier: the median counts.
+
+    Args:
+        samples: in any unit.
+        track: (k, 3) metres NED from the drone, places on the ground.
+        slope: (2,) of the ground, to the north and to the east.
+        factor: about what is looked for.
+
+    Raises ValueError where too little is seen of the places.
+    """
+    down_m = float(np.median(track[:, 2])) if len(track) else 0.0
+    reach_m = WIDTH * down_m
+    if not reach_m > 0.0:
+        raise ValueError("no place on the ground was measured")
+    seen = (samples.rays / samples.inverse[:, None] + samples.offsets)[samples.rays[:, 2] > 0.0]
+    margin_m = 2.0 * BESIDE * reach_m  # more than the factor's change below can move a point
+    around = (factor * seen[:, :2] > track[:, :2].min(axis=0) - margin_m).all(axis=1)
+    around &= (factor * seen[:, :2] < track[:, :2].max(axis=0) + margin_m).all(axis=1)
+    seen = seen[around]
+    for _ in range(ROUNDS):
+        away = (factor * seen[:, None, :2] - track[None, :, :2]) / reach_m
+        weights = np.exp(-0.5 * (away**2).sum(axis=2)) * ((away**2).sum(axis=2) < BESIDE**2)
+        total = weights.sum(axis=1)
+        beside = total > 0.0
+        if beside.sum() < MIN_POINTS:
+            raise ValueError("too little is seen of the ground that was measured")
+        expected = weights @ track[:, 2] - (weights * (away @ slope) * reach_m).sum(axis=1)
+        factors = expected[beside] / total[beside] / seen[beside, 2]
+        factor = float(np.median(factors))
+    used = track[(weights > 0.0).any(axis=0), :2]
+    if float(np.linalg.norm(np.ptp(used, axis=0))) < MIN_SPAN * down_m:
+        raise ValueError("too little is seen of the ground that was measured")
+    return factor

@@ -1,0 +1,44 @@
+"""Log-polar coordinates of a place: a bearing (unit vector) and the natural logarithm of the range.
+
+Their covariance is a (3, 3) matrix in the axes of the bearing: along it the variance of the log range, across it that
+of the angle in rad^2. To first order it is the covariance of the position over the range squared.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flockd.core.messages import FloatArray
+
+
+def log_polar(position: FloatArray) -> tuple[FloatArray, float]:
+    """Bearing (3,) and log range of a position (3,) in metres. Raises ValueError for the origin, NaN and infinity."""
+    range_m = float(np.linalg.norm(position))
+    if not (math.isfinite(range_m) and range_m > 0.0):
+        raise ValueError(f"a place at {np.asarray(position).tolist()} m has no bearing")
+    return np.asarray(position, np.float64) / range_m, math.log(range_m)
+
+
+def log_polar_covariance(bearing: FloatArray, log_range_sigma: float, bearing_sigma_rad: float) -> FloatArray:
+    """(3, 3) where range and bearing err independently, the bearing alike in all directions."""
+    along = np.outer(bearing, bearing)
+    covariance: FloatArray = bearing_sigma_rad**2 * (np.eye(3) - along) + log_range_sigma**2 * along
+    return covariance
+
+
+def log_polar_residual(
+    bearing: FloatArray, log_range: float, from_bearing: FloatArray, from_log_range: float
+) -> FloatArray:
+    """(3,) from one place to another: across ``from_bearing`` the angle in rad, along it the change of log range.
+
+    Its derivative with respect to the position is the identity over the range at the place it starts from.
+    """
+    cosine = float(np.clip(bearing @ from_bearing, -1.0, 1.0))
+    across = bearing - cosine * from_bearing
+    sine = float(np.linalg.norm(across))
+    angle = math.atan2(sine, cosine)
+    turned = across * (angle / sine) if sine > 1e-12 else across
+    residual: FloatArray = turned + (log_range - from_log_range) * from_bearing
+    return residual

@@ -1,0 +1,84 @@
+"""The rig: every camera of the drone and where it sits in the body (FRD)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockd.core.config.rig import CameraConfig, RigConfig
+from flockd.core.messages import BoolArray, FloatArray
+from flockd.flight.geometry.cameras import Camera, PinholeCamera, WideAngleCamera
+from flockd.flight.geometry.rotations import rotation_from_euler
+from flockd.flight.geometry.transform import RigidTransform
+
+# A camera that faces forward: its right is the body's right, its down the body's down, its optical axis forward.
+_R_FRD_RDF = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class RigCamera:
+    """A camera and its mounting: ``T_body_camera`` takes optical RDF to body FRD."""
+
+    name: str
+    camera: Camera
+    T_body_camera: RigidTransform
+
+    def pixels_of_points(self, points_body: FloatArray) -> FloatArray:
+        """(n, 2) pixels of body points (n, 3); NaN rows where the point is not in this camera's image."""
+        return self._seen((np.asarray(points_body) - self.T_body_camera.translation) @ self.T_body_camera.rotation)
+
+    def pixels_of_directions(self, directions_body: FloatArray) -> FloatArray:
+        """(n, 2) pixels of body directions (n, 3), as of points at infinity; NaN rows where not in the image."""
+        return self._seen(np.asarray(directions_body) @ self.T_body_camera.rotation)
+
+    def _seen(self, points_camera: FloatArray) -> FloatArray:
+        pixels = self.camera.project(points_camera)
+        pixels[~self.camera.in_image(pixels)] = np.nan
+        return pixels
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """All cameras, by name. Raises ValueError if there is none or a name does not fit its camera."""
+
+    cameras: Mapping[str, RigCamera]
+
+    def __post_init__(self) -> None:
+        if not self.cameras:
+            raise ValueError("a rig has at least one camera")
+        for name, camera in self.cameras.items():
+            if camera.name != name:
+                raise ValueError(f"camera {camera.name!r} is filed under the name {name!r}")
+
+    def covers(self, directions: FloatArray) -> BoolArray:
+        """Mask (n,): which body directions (n, 3) are in view of any camera."""
+        seen = np.zeros(len(directions), dtype=np.bool_)
+        for camera in self.cameras.values():
+            seen |= np.isfinite(camera.pixels_of_directions(directions)[:, 0])
+        return seen
+
+    def pixels_of(self, points_body: FloatArray) -> dict[str, FloatArray]:
+        """For each camera the (n, 2) pixels of body points (n, 3); NaN rows where the point is not in its image."""
+        return {name: camera.pixels_of_points(points_body) for name, camera in self.cameras.items()}
+
+
+def build_rig(config: RigConfig) -> Rig:
+    """The rig of a configuration. Raises ValueError where a camera's intrinsics make no camera."""
+    return Rig({camera.name: _build_camera(camera) for camera in config.cameras})
+
+
+def _build_camera(config: CameraConfig) -> RigCamera:
+    intrinsics, extrinsics = config.intrinsics, config.extrinsics
+    matrix = np.array([[intrinsics.fx, 0.0, intrinsics.cx], [0.0, intrinsics.fy, intrinsics.cy], [0.0, 0.0, 1.0]])
+    model = PinholeCamera if intrinsics.model == "pinhole" else WideAngleCamera
+    turn = rotation_from_euler(
+        math.radians(extrinsics.roll_deg), math.radians(extrinsics.pitch_deg), math.radians(extrinsics.yaw_deg)
+    )
+    return RigCamera(
+        name=config.name,
+        camera=model(matrix, config.size_px, intrinsics.distortion),
+        T_body_camera=RigidTransform(turn @ _R_FRD_RDF, np.array(extrinsics.position_m)),
+    )

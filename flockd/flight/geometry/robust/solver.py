@@ -1,0 +1,182 @@
+"""Nonlinear least squares on normal equations: Gauss-Newton, and its damped form by Levenberg and Marquardt.
+
+A `Problem` has the residuals, their derivatives and the robust kernel; an optimiser, `GaussNewton` or
+`LevenbergMarquardt`, has the damping and when to stop. Any of one goes with any of the other.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from flockd.core.messages import FloatArray
+
+State = TypeVar("State")
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """A problem near one state: ``hessian @ step = -gradient`` is its best step."""
+
+    cost: float
+    """Weighted sum of squares; infinite where the state is no solution at all."""
+    gradient: FloatArray
+    """(n,) J^T W r"""
+    hessian: FloatArray
+    """(n, n) J^T W J"""
+
+    @classmethod
+    def of(cls, residuals: FloatArray, jacobian: FloatArray, weights: FloatArray | None = None) -> NormalEquations:
+        """From residuals (m,), their derivatives (m, n) and weights (m,); unsolvable where a number is not finite."""
+        weighted = jacobian if weights is None else jacobian * weights[:, None]
+        cost = float(residuals @ (residuals if weights is None else weights * residuals))
+        if not (math.isfinite(cost) and np.isfinite(weighted).all()):
+            return cls.unsolvable(jacobian.shape[1])
+        return cls(cost, weighted.T @ residuals, weighted.T @ jacobian)
+
+    @classmethod
+    def unsolvable(cls, parameters: int) -> NormalEquations:
+        """Of a state that is no solution."""
+        return cls(math.inf, np.zeros(parameters), np.eye(parameters))
+
+    @property
+    def solvable(self) -> bool:
+        """Whether the state is a solution, if not the best."""
+        return math.isfinite(self.cost)
+
+    def damped(self, diagonal: FloatArray) -> NormalEquations:
+        """With ``diagonal`` (n,) added to the hessian's: the larger, the shorter that parameter's step."""
+        return replace(self, hessian=self.hessian + np.diag(diagonal))
+
+    def step(self) -> FloatArray:
+        """(n,)"""
+        return np.asarray(np.linalg.solve(self.hessian, -self.gradient), np.float64)
+
+
+class Problem(ABC, Generic[State]):
+    """What is minimised, over states that a step of n numbers moves."""
+
+    @abstractmethod
+    def linearise(self, state: State) -> NormalEquations:
+        """The normal equations at a state."""
+
+    @abstractmethod
+    def move(self, state: State, step: FloatArray) -> State:
+        """A state moved by a step (n,)."""
+
+    def limited(self, step: FloatArray) -> FloatArray:
+        """The step (n,), or the part of it within which the linearisation holds."""
+        return step
+
+    def step_size(self, step: FloatArray) -> float:
+        """What an optimiser's ``tolerance`` is compared with; by default the largest number of the step (n,)."""
+        return float(np.abs(step).max())
+
+
+@dataclass(frozen=True, eq=False)
+class Solution(Generic[State]):
+    """Where an optimiser stopped."""
+
+    state: State
+    equations: NormalEquations
+    """The last that were made: at ``state`` (Levenberg-Marquardt), or one step before it (Gauss-Newton)."""
+    converged: bool
+    """Whether the last step was too small to matter; else the steps were used up or led to no solution."""
+
+    def sigma(self, residuals: int, parameters: int) -> FloatArray:
+        """(n,) standard deviations of the state's ``parameters``, from ``residuals`` numbers that the fit left over.
+
+        Infinite where the residuals say nothing of a parameter.
+        """
+        variance = self.equations.cost / max(residuals - parameters, 1)
+        scale = np.sqrt(np.diag(self.equations.hessian))
+        if not (scale > 0.0).all():
+            return np.where(scale > 0.0, 0.0, math.inf)
+        values, vectors = np.linalg.eigh(self.equations.hessian / np.outer(scale, scale))
+        with np.errstate(divide="ignore"):
+            # Relative to the largest, which is at most n for a scaled hessian: less than this is rounding.
+            inverse = np.where(values > 1e-13, 1.0 / values, math.inf)
+            spread: FloatArray = np.sqrt(variance * np.minimum((vectors**2) @ inverse, 1e300)) / scale
+        return spread
+
+
+@dataclass(frozen=True)
+class GaussNewton:
+    """Takes every step, whatever it does to the cost: for starts that are near, and weights that change on the way."""
+
+    max_steps: int
+    tolerance: float
+    """A step smaller than this has converged."""
+    min_steps: int = 1
+    """Before this many it has not."""
+    max_condition: float = math.inf
+    """Of a hessian: beyond, some parameter is not known at all."""
+
+    def minimise(self, problem: Problem[State], state: State) -> Solution[State]:
+        """Goes downhill from ``state``."""
+        equations = problem.linearise(state)
+        for number in range(1, self.max_steps + 1):
+            if number > 1:
+                equations = problem.linearise(state)
+            if not equations.solvable:
+                break
+            step = self._step(equations)
+            if step is None:
+                return Solution(state, NormalEquations.unsolvable(len(equations.gradient)), converged=False)
+            step = problem.limited(step)
+            state = problem.move(state, step)
+            if number >= self.min_steps and problem.step_size(step) < self.tolerance:
+                return Solution(state, equations, converged=True)
+        return Solution(state, equations, converged=False)
+
+    def _step(self, equations: NormalEquations) -> FloatArray | None:
+        """(n,) or None where the hessian is singular."""
+        if math.isfinite(self.max_condition) and not np.linalg.cond(equations.hessian) < self.max_condition:
+            return None
+        try:
+            return equations.step()
+        except np.linalg.LinAlgError:
+            return None
+
+
+@dataclass(frozen=True)
+class LevenbergMarquardt:
+    """Takes only steps that lower the cost, and damps them until they do; each parameter in its own scale.
+
+    Marquardt, An algorithm for least-squares estimation of nonlinear parameters, 1963: the damping falls and rises by
+    factors of ten.
+    """
+
+    max_steps: int = 60
+    first_damping: float = 1e-4
+    min_damping: float = 1e-12
+    max_damping: float = 1e9
+    relative_gain: float = 1e-10
+    """Of the cost: a step that gains less has converged."""
+
+    def minimise(self, problem: Problem[State], state: State) -> Solution[State]:
+        """Goes downhill from ``state``."""
+        equations, damping = problem.linearise(state), self.first_damping
+        for _ in range(self.max_steps):
+            scale = np.sqrt(np.maximum(np.diag(equations.hessian), 1e-30))
+            scaled = replace(
+                equations, gradient=equations.gradient / scale, hessian=equations.hessian / np.outer(scale, scale)
+            )
+            while damping < self.max_damping:
+                step = problem.limited(scaled.damped(np.full(len(scale), damping)).step() / scale)
+                candidate = problem.move(state, step)
+                there = problem.linearise(candidate)
+                if there.cost < equations.cost:
+                    break
+                damping *= 10.0
+            else:
+                return Solution(state, equations, converged=equations.solvable)
+            gain = (equations.cost - there.cost) / equations.cost
+            state, equations, damping = candidate, there, max(damping / 10.0, self.min_damping)
+            if gain < self.relative_gain:
+                return Solution(state, equations, converged=True)
+        return Solution(state, equations, converged=False)

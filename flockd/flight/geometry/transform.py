@@ -1,0 +1,60 @@
+"""A rigid motion, as a value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockd.core.messages import FloatArray
+
+_EYE = np.eye(3)
+_TOLERANCE = 1e-6 + 1e-5 * _EYE
+"""Of a rotation times its transpose."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigidTransform:
+    """``p_a = rotation @ p_b + translation``: named ``T_a_b``, it takes coordinates from frame b to frame a.
+
+    Raises ValueError where ``rotation`` (3, 3) is not a rotation or ``translation`` (3,) is not finite.
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+
+    def __post_init__(self) -> None:
+        rotation = np.asarray(self.rotation, dtype=np.float64)
+        translation = np.asarray(self.translation, dtype=np.float64)
+        if rotation.shape != (3, 3) or translation.shape != (3,):
+            raise ValueError(f"a rigid transform is (3, 3) and (3,), not {rotation.shape} and {translation.shape}")
+        if not np.isfinite(translation).all():
+            raise ValueError("a rigid transform's translation must be finite")
+        if not (np.abs(rotation @ rotation.T - _EYE) <= _TOLERANCE).all() or _is_mirrored(rotation):  # NaN neither
+            raise ValueError("the matrix is not a rotation: its columns must be orthonormal and right-handed")
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "translation", translation)
+
+    @classmethod
+    def identity(cls) -> RigidTransform:
+        """No motion."""
+        return cls(np.eye(3), np.zeros(3))
+
+    def apply(self, points: FloatArray) -> FloatArray:
+        """Points (..., 3) of frame b in frame a."""
+        moved: FloatArray = np.asarray(points) @ self.rotation.T + self.translation
+        return moved
+
+    def inverse(self) -> RigidTransform:
+        """``T_b_a``."""
+        return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation)
+
+    def __matmul__(self, other: RigidTransform) -> RigidTransform:
+        """``T_a_b @ T_b_c`` is ``T_a_c``."""
+        return RigidTransform(self.rotation @ other.rotation, self.apply(other.translation))
+
+
+def _is_mirrored(matrix: FloatArray) -> bool:
+    """Whether the determinant of a (3, 3) matrix is negative: a pilot's step asks that a hundred times."""
+    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
+    return bool(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0.0)

@@ -1,0 +1,183 @@
+"""A small camera that faces one direction, its image drawn from whichever real cameras see there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from flockd.core.messages import BoolArray, Float32Array, FloatArray, UInt8Array
+from flockd.flight.geometry.cameras import PinholeCamera
+from flockd.flight.geometry.pairs import grid_pixels
+from flockd.flight.geometry.rig import Rig, RigCamera
+from flockd.flight.geometry.transform import RigidTransform
+
+_GREY = 128
+_AT_A_TIME = 30_000
+"""OpenCV samples no more places in a row."""
+_MINIFICATION = 1.5
+"""Image pixels per crop pixel from which on single samples would alias."""
+
+
+@dataclass(frozen=True, eq=False)
+class VirtualCrop:
+    """A square pinhole camera in the body, at the optical centre of its main camera, and the way to its image."""
+
+    camera: PinholeCamera
+    T_body_virtual: RigidTransform
+    main: str
+    """The real camera at whose optical centre it sits: from there its image is exact at every range."""
+    rig: Rig
+
+    def sample(self, images: Mapping[str, UInt8Array], *, range_m: float | None = None) -> tuple[UInt8Array, BoolArray]:
+        """The image (size, size, 3) and the mask (size, size) of its pixels that some camera sees; grey elsewhere.
+
+        Each pixel comes from the main camera wherever that sees it, else from the camera in whose image it lies
+        deepest. ``images`` are (h, w, 3) by camera name; a camera without an image sees nothing. With ``range_m``,
+        the distance of the target, other cameras are sampled where they see that distance, which corrects
+        their parallax; without it, where they see infinity.
+        """
+        size = self.camera.size
+        crop = np.full((size[1], size[0], 3), _GREY, dtype=np.uint8)
+        valid = np.zeros((size[1], size[0]), dtype=np.bool_)
+        for name, where in self._maps(images, range_m).items():
+            seen = np.isfinite(where[0])
+            if not seen.any():
+                continue
+            drawn = _draw(images[name], where, self._minification(self.rig.cameras[name]))
+            if seen.all():
+                return drawn, seen
+            cv2.copyTo(drawn, seen.view(np.uint8), crop)
+            valid |= seen
+        return crop, valid
+
+    def look_up(self, values: Float32Array, points_body: FloatArray) -> Float32Array:
+        """(n,) what a map (size, size) over the image says at points (n, 3) of the body; NaN where not in it."""
+        pixels = self.camera.project(self.T_body_virtual.inverse().apply(points_body))
+        inside = self.camera.in_image(pixels)
+        found = np.full(len(points_body), np.nan, np.float32)
+        places = (pixels[inside] - 0.5).astype(np.float32)
+        for start in range(0, len(places), _AT_A_TIME):
+            u, v = places[start : start + _AT_A_TIME].T[:, :, None]
+            part = cv2.remap(values, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            found[np.flatnonzero(inside)[start : start + _AT_A_TIME]] = part[:, 0]
+        return found
+
+    def _maps(self, images: Mapping[str, UInt8Array], range_m: float | None) -> dict[str, Float32Array]:
+        """For each camera that is needed, u and v (2, size, size) of what it fills the crop with; NaN elsewhere."""
+        pixel_centres = _pixel_centres(self.camera.size)
+        directions = self.camera.unproject(pixel_centres, np.ones(len(pixel_centres))) @ self.T_body_virtual.rotation.T
+        maps: dict[str, FloatArray] = {}
+        missing = np.ones(len(directions), dtype=np.bool_)
+        if self.main in images:
+            maps[self.main] = self.rig.cameras[self.main].pixels_of_directions(directions)
+            missing = np.isnan(maps[self.main][:, 0])
+        others = [camera for name, camera in self.rig.cameras.items() if name != self.main and name in images]
+        if missing.any() and others:
+            if range_m is None:
+                pixels = [camera.pixels_of_directions(directions[missing]) for camera in others]
+            else:
+                towards = directions[missing]
+                lengths = np.sqrt(np.einsum("ij,ij->i", towards, towards))
+                points = self.T_body_virtual.translation + towards * (range_m / lengths)[:, None]
+                pixels = [camera.pixels_of_points(points) for camera in others]
+            margins = np.stack([_margin(camera, seen) for camera, seen in zip(others, pixels, strict=True)])
+            best = margins.argmax(axis=0)
+            for index, camera in enumerate(others):
+                chosen = (best == index) & (margins[index] >= 0.0)
+                if chosen.any():
+                    full = np.full((len(directions), 2), np.nan)
+                    full[np.flatnonzero(missing)[chosen]] = pixels[index][chosen]
+                    maps[camera.name] = full
+        shape = (2, self.camera.size[1], self.camera.size[0])
+        return {name: where.T.astype(np.float32, order="C").reshape(shape) for name, where in maps.items()}
+
+    def _minification(self, camera: RigCamera) -> int:
+        """How many pixels of a camera's image, each way, fall into one of the crop's at its middle."""
+        R_camera_virtual = camera.T_body_camera.rotation.T @ self.T_body_virtual.rotation
+        # Pixels of the image per radian both ways across the line of sight: their product is an area.
+        per_radian = camera.camera.jacobian(R_camera_virtual[:, 2][None])[0] @ R_camera_virtual[:, :2]
+        # A camera that only sees the crop's rim may not see its middle; its pixels are then taken one by one.
+        if not np.isfinite(per_radian).all():
+            return 1
+        minification = math.sqrt(abs(float(np.linalg.det(per_radian)))) / self.camera.focal_px
+        return min(round(minification), *camera.camera.size) if minification > _MINIFICATION else 1
+
+
+def virtual_crop(rig: Rig, direction_body: FloatArray, half_angle_rad: float, size_px: int) -> VirtualCrop:
+    """The virtual camera along ``direction_body`` (3,), ``half_angle_rad`` to its borders, ``size_px`` square.
+
+    It sits at the optical centre of the camera in whose image the direction lies deepest, and is level: its x axis is
+    horizontal in the body. A rig of the cameras that work makes it choose among those. Raises ValueError where no
+    camera sees the direction, and for an angle outside (0, pi/2).
+    """
+    if not 0.0 < half_angle_rad < math.pi / 2.0:
+        raise ValueError(
+            f"a pinhole's half angle lies between 0 and 90 degrees, not {math.degrees(half_angle_rad):.1f}"
+        )
+    forward = np.asarray(direction_body, dtype=np.float64)
+    forward = forward / np.linalg.norm(forward)
+    margins = {
+        name: float(_margin(camera, camera.pixels_of_directions(forward[None]))[0])
+        for name, camera in rig.cameras.items()
+    }
+    main = max(margins, key=lambda name: margins[name])
+    if margins[main] < 0.0:
+        raise ValueError(f"no camera sees the body direction {np.round(forward, 3).tolist()}")
+    focal = size_px / 2.0 / math.tan(half_angle_rad)
+    centre = size_px / 2.0
+    return VirtualCrop(
+        camera=PinholeCamera(
+            np.array([[focal, 0.0, centre], [0.0, focal, centre], [0.0, 0.0, 1.0]]), (size_px, size_px)
+        ),
+        T_body_virtual=RigidTransform(_level_towards(forward), rig.cameras[main].T_body_camera.translation),
+        main=main,
+        rig=rig,
+    )
+
+
+def _level_towards(forward: FloatArray) -> FloatArray:
+    """``R_body_virtual``: z along ``forward``, x horizontal."""
+    right = np.array([-forward[1], forward[0], 0.0])  # down x forward
+    length = float(np.linalg.norm(right))
+    # Straight up or down every x is horizontal: the body's right then.
+    right = right / length if length > 1e-6 else np.array([0.0, 1.0, 0.0])
+    return np.stack([right, np.cross(forward, right), forward], axis=1)
+
+
+@lru_cache(maxsize=8)
+def _pixel_centres(size: tuple[int, int]) -> FloatArray:
+    return grid_pixels(size, 1)
+
+
+def _draw(image: UInt8Array, where: Float32Array, minification: int) -> UInt8Array:
+    """The image's colours at u and v (2, h, w), averaged over ``minification`` pixels both ways; any at NaN."""
+    origin = np.zeros(2, dtype=np.float32)
+    if minification > 1:
+        # Only the part that the crop covers, a block wider, cut along whole blocks.
+        low = np.maximum(np.nanmin(where, axis=(1, 2)) // minification - 1, 0).astype(np.int64) * minification
+        blocks = np.nanmax(where, axis=(1, 2)).astype(np.int64) // minification + 2 - low // minification
+        blocks = np.minimum(blocks, (np.array(image.shape[1::-1]) - low) // minification)
+        high = low + blocks * minification
+        part = cv2.resize(
+            image[low[1] : high[1], low[0] : high[0]],
+            (int(blocks[0]), int(blocks[1])),
+            interpolation=cv2.INTER_AREA,
+        )
+        image, origin = part.astype(np.uint8, copy=False), low.astype(np.float32)
+    # Centres are at integers here, and beyond the outermost ones the border repeats.
+    x, y = (where - origin[:, None, None]) / np.float32(minification) - np.float32(0.5)
+    drawn = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return drawn.astype(np.uint8, copy=False)
+
+
+def _margin(camera: RigCamera, pixels: FloatArray) -> FloatArray:
+    """(n,) distance from the image's border, in focal lengths so that cameras compare; -1 for what is not in it."""
+    width, height = camera.camera.size
+    u, v = pixels.T
+    margin = np.minimum(np.minimum(u, width - u), np.minimum(v, height - v)) / camera.camera.focal_px
+    return np.where(np.isfinite(margin), margin, -1.0)

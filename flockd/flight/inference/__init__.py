@@ -1,0 +1,24 @@
+"""ONNX networks behind manifests: what enters, what comes out, what runs them. Knows nothing of their use."""
+
+from flockd.flight.inference.manifest import Fault, Manifest
+from flockd.flight.inference.manifest_file import (
+    find_manifests,
+    load_manifest,
+    manifest_path,
+    manifests_of,
+    models_folder,
+    read_manifest,
+)
+from flockd.flight.inference.session import OnnxModel
+
+__all__ = [
+    "Fault",
+    "Manifest",
+    "OnnxModel",
+    "find_manifests",
+    "load_manifest",
+    "manifest_path",
+    "manifests_of",
+    "models_folder",
+    "read_manifest",
+]

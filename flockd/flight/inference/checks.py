@@ -1,0 +1,110 @@
+"""Whether a model file is what its manifest says: its weights, its tensors, and its outputs for the golden input."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Protocol
+
+from numpy.typing import NDArray
+
+from flockd.core.errors import FlockdError, UnavailableError, shortage_of
+from flockd.flight.inference.manifest import Fault, InputSpec, Manifest, OutputSpec, golden_deviates, listed
+from flockd.flight.inference.manifest_file import ManifestFile
+from flockd.flight.inference.weights import fault_of_weights
+
+_GOLDEN_TOLERANCE = 0.02
+"""Of mean and deviation: providers round differently."""
+
+Deadline = Callable[[Callable[[], None], Callable[[], None]], None]
+"""Runs the first; where that takes too long, calls the second, which ends it, and raises TimeoutError.
+
+This folder knows no clock: whoever opens a model and wants a deadline brings it along.
+"""
+
+
+def no_deadline(work: Callable[[], None], stop: Callable[[], None]) -> None:
+    """Runs ``work``, however long it takes."""
+    work()
+
+
+class Tensor(Protocol):
+    """What ONNX Runtime says of an input or an output."""
+
+    name: str
+    type: str
+    shape: Sequence[int | str | None]
+
+
+def check_weights(file: ManifestFile, content: bytes) -> None:
+    """Raises ModelError when the bytes of the ONNX file hold a weight that is no number."""
+    try:
+        fault = fault_of_weights(content)
+    except ValueError as error:
+        raise file.error(("file",), f"{file.model} cannot be loaded ({error}); restore it") from None
+    if fault:
+        raise file.error(("file",), f"{file.model}: {fault}")
+
+
+def check_tensors(file: ManifestFile, inputs: Sequence[Tensor], outputs: Sequence[Tensor]) -> None:
+    """Raises ModelError when the ONNX file's inputs and outputs are not those of the manifest."""
+    for fault in _misfits(file.manifest, {t.name: t for t in inputs}, {t.name: t for t in outputs}):
+        raise file.error(fault.key, f"{fault.message}; make them agree")
+
+
+def _misfits(manifest: Manifest, inputs: Mapping[str, Tensor], outputs: Mapping[str, Tensor]) -> Iterator[Fault]:
+    # Every input has to be fed; of the outputs, some may be of no use.
+    for key, wanted, found, fits in (
+        ("inputs", manifest.inputs, inputs, set(manifest.inputs) == set(inputs)),
+        ("outputs", manifest.outputs, outputs, set(manifest.outputs) <= set(outputs)),
+    ):
+        if not fits:
+            yield Fault((key,), f"the manifest names {sorted(wanted)} but the model file has {sorted(found)}")
+    for key, specs, tensors in (("inputs", manifest.inputs, inputs), ("outputs", manifest.outputs, outputs)):
+        for name, spec in specs.items():
+            fault = _misfit(spec, tensors[name].type, tensors[name].shape)
+            if fault:
+                yield Fault((key, name, *fault.key), fault.message)
+
+
+def _misfit(spec: InputSpec | OutputSpec, type_: str, shape: Sequence[int | str | None]) -> Fault | None:
+    """Where a manifest's and a model file's tensor differ. What is free in the file, the manifest may fix."""
+    of_file = {"tensor(float)": "float32"}.get(type_, type_.removeprefix("tensor(").removesuffix(")"))
+    if of_file != spec.dtype:
+        return Fault(("dtype",), f"the manifest says {spec.dtype} but the model file {of_file}")
+    if isinstance(spec, OutputSpec) and not shape:
+        return None  # exporters may leave out the shape of what comes out
+    may_be_free = isinstance(spec, OutputSpec)
+    if len(shape) == len(spec.shape) and all(
+        not isinstance(there, int) or here == there or (may_be_free and isinstance(here, str))
+        for here, there in zip(spec.shape, shape, strict=True)
+    ):
+        return None
+    return Fault(("shape",), f"the manifest says {listed(spec.shape)} but the model file {listed(list(shape))}")
+
+
+def check_golden(file: ManifestFile, outputs: Mapping[str, NDArray[Any]]) -> None:
+    """Raises ModelError when the outputs for the golden input are not the manifest's."""
+    for name, spec in file.manifest.outputs.items():
+        difference = golden_deviates(spec, outputs[name], _GOLDEN_TOLERANCE)
+        if difference:
+            raise file.error(("outputs", name), f"{difference}; export the model and its manifest together")
+
+
+def cannot_run(file: ManifestFile, provider: str, error: Exception) -> FlockdError:
+    """The error that a model does not run on the golden input."""
+    if (lacking := shortage_of(error)) is not None:
+        return UnavailableError(f"{file.model} cannot be run: out of {lacking}; raise the limits")
+    if isinstance(error, TimeoutError):
+        return file.error(
+            ("file",),
+            f"{file.manifest.file} did not finish the golden input in time ({error}); restore the model file or "
+            "choose another perception.provider",
+        )
+    if isinstance(error, FloatingPointError):
+        return file.error(("file",), f"{error} on the golden input; restore the model file")
+    reason = str(error).splitlines()[0].rpartition("Status Message: ")[2].rpartition("] ")[2]
+    return file.error(
+        ("file",),
+        f"{provider} cannot run {file.manifest.file} ({reason}); choose another perception.provider or restore the "
+        "model file",
+    )

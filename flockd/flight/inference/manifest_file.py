@@ -1,0 +1,129 @@
+"""A manifest's YAML file, read as strictly as a configuration, and the model file that it names."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from flockd.core.config.document import Place, key_text, read_document
+from flockd.core.config.perception import PerceptionConfig
+from flockd.core.config.validation_messages import problems_of
+from flockd.core.data import data_path
+from flockd.core.errors import ConfigError, ConfigProblem, ModelError, shortage_of
+from flockd.flight.inference.manifest import Fault, Key, Manifest
+
+Check = Callable[[Manifest], Iterable[Fault]]
+"""What is wrong with a manifest, for a caller that uses the model."""
+MAX_MODEL_BYTES = 2 << 30
+"""A protobuf, and so an ONNX file without weights outside it, cannot be larger."""
+
+
+@dataclass(frozen=True)
+class ManifestFile:
+    """A manifest that has been read, with the place of each of its keys, for errors found later."""
+
+    path: Path
+    manifest: Manifest
+    places: Mapping[Key, Place]
+
+    @property
+    def model(self) -> Path:
+        """The ONNX file."""
+        return self.path.parent / self.manifest.file
+
+    def error(self, key: Key, message: str) -> ModelError:
+        """The error that something is wrong at a key, or at the section that lacks it: file, line, key, and what."""
+        section = key
+        while section not in self.places:
+            section = section[:-1]
+        return ModelError(str(ConfigProblem(str(self.path), self.places[section].line, key_text(key), message)))
+
+    def read_model(self) -> bytes:
+        """The ONNX file's bytes. Raises ModelError where it is missing or differs from the manifest's SHA-256."""
+        model, wanted = self.model, self.manifest.sha256
+        try:
+            if model.exists() and not model.is_file():
+                raise self.error(("file",), f"{model} is not an ordinary file; name the ONNX file")
+            if model.stat().st_size > MAX_MODEL_BYTES:
+                raise self.error(("file",), f"{model} is larger than 2 GiB, which no ONNX file is; name the right one")
+            content = model.read_bytes()
+        except OSError as error:
+            if shortage_of(error):
+                raise
+            reason = f"cannot read {model} ({error.strerror})"
+            raise self.error(("file",), f"{reason}; put the model file back or name the right one") from None
+        digest = hashlib.sha256(content).hexdigest()
+        if digest != wanted:
+            raise self.error(
+                ("sha256",),
+                f"{model} has {digest[:12]}... and not {wanted[:12]}..., so the model file was changed or damaged; "
+                "restore it, or export it again with its manifest",
+            )
+        return content
+
+
+def nothing_more(manifest: Manifest) -> Iterable[Fault]:
+    """The check for a caller that only describes a model."""
+    return ()
+
+
+def read_manifest(path: Path, check: Check = nothing_more) -> ManifestFile:
+    """The manifest at ``path``; its model file is not opened.
+
+    Raises ModelError with the first thing wrong: one sentence with file, line, key, value and what to do.
+    """
+    try:
+        document = read_document(path, "manifest")
+        manifest = Manifest.model_validate(document.values)
+    except ConfigError as error:
+        raise ModelError(str(error.problems[0])) from None
+    except ValidationError as error:
+        problems = document.problems or problems_of(error.errors(), Manifest, document.places)
+        raise ModelError(str(min(problems))) from None
+    if document.problems:
+        raise ModelError(str(min(document.problems)))
+    file = ManifestFile(path, manifest, document.places)
+    for fault in chain(manifest.faults(), check(manifest)):
+        raise file.error(fault.key, fault.message)
+    return file
+
+
+def load_manifest(path: Path, check: Check = nothing_more) -> tuple[Manifest, Path]:
+    """The manifest at ``path`` and its model file's path, hash checked. Raises ModelError; see `read_manifest`."""
+    file = read_manifest(path, check)
+    file.read_model()
+    return file.manifest, file.model
+
+
+def models_folder(config: PerceptionConfig) -> Path:
+    """Where a configuration's models are known by their names: its own folder, else the one that comes with flockd.
+
+    Raises ModelError when its own is not there.
+    """
+    if config.models_dir is None:
+        return data_path("models")
+    folder = Path(config.models_dir)
+    if not folder.is_dir():
+        raise ModelError(f"perception.models_dir: {folder} is no folder; name the one that holds the models' manifests")
+    return folder
+
+
+def manifest_path(folder: Path, name: str) -> Path:
+    """Of a model by its name in a folder, or of one that is named by its manifest's path."""
+    return Path(name) if name.endswith(".yaml") else folder / f"{name}.yaml"
+
+
+def manifests_of(config: PerceptionConfig) -> tuple[Path, ...]:
+    """The manifests of all models that a configuration names, each once. Raises ModelError for a missing folder."""
+    folder = models_folder(config)
+    return tuple(dict.fromkeys(manifest_path(folder, name) for name in config.networks.values()))
+
+
+def find_manifests(folder: Path) -> tuple[Path, ...]:
+    """All manifests in a folder, by name."""
+    return tuple(sorted(folder.glob("*.yaml")))

@@ -1,0 +1,143 @@
+"""One ONNX model in memory: opened with a checked file, the wanted provider and its golden output."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import NDArray
+
+from flockd.core.choices import Provider
+from flockd.core.messages import Float32Array, UInt8Array
+from flockd.flight.inference.checks import (
+    Deadline,
+    cannot_run,
+    check_golden,
+    check_tensors,
+    check_weights,
+    no_deadline,
+)
+from flockd.flight.inference.feeds import golden_feeds, shapes_of
+from flockd.flight.inference.fitting import entering, leaving
+from flockd.flight.inference.manifest_file import Check, ManifestFile, nothing_more, read_manifest
+from flockd.flight.inference.providers import Prepared, Shapes, engine_folder, is_slow_to_build, open_session
+
+
+class OnnxModel:
+    """A model behind its manifest. ``run`` may be called from any thread."""
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        threads: int,
+        provider: Provider = "cpu",
+        engines: Path | None = None,
+        preparing: bool = False,
+        check: Check = nothing_more,
+        deadline: Deadline = no_deadline,
+    ) -> None:
+        """Open and check it; ``ModelError`` says what is wrong, and where.
+
+        Args:
+            path: the manifest.
+            threads: on the CPU.
+            provider: what computes it; never another in its place.
+            engines: where providers keep what they build.
+            preparing: whether a provider that is slow to build may do so now.
+            check: what else has to be true of the manifest.
+            deadline: for the run on the golden input.
+        """
+        file = read_manifest(path, check)
+        content = file.read_model()
+        self.manifest = file.manifest
+        self._refuse_provider(file, provider)
+        check_weights(file, content)
+        del content
+        self._engines = engine_folder(engines, provider, self.manifest.name, self.manifest.sha256)
+        self._prepared = Prepared.load(self._engines)
+        self._may_build = preparing or not is_slow_to_build(provider)
+        if not self._may_build and self._prepared is None:
+            message = f"is not prepared for {provider}, which would build its engine for minutes"
+            raise file.error(("file",), f"{self.manifest.file} {message}; run `flockd models prepare` first")
+        if self._engines is not None:
+            self._engines.mkdir(parents=True, exist_ok=True)
+        self._session = open_session(file, threads=threads, provider=provider, folder=self._engines)
+        self._running: set[ort.RunOptions] = set()
+        check_tensors(file, self._session.get_inputs(), self._session.get_outputs())
+        self._check_golden(file, deadline)
+
+    @property
+    def provider(self) -> str:
+        """What really runs it, by ONNX Runtime's own account, which may not be what was asked for."""
+        return str(self._session.get_providers()[0])
+
+    @property
+    def engines(self) -> Path | None:
+        """The folder of what its provider builds; None where it builds nothing."""
+        return self._engines
+
+    def run(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """The outputs by name. ``FloatingPointError`` when one is not finite.
+
+        ``ValueError`` for inputs of a shape that an engine would first have to be built for, and ought not to now.
+        """
+        if not self._may_build and not (self._prepared and self._prepared.covers(shapes_of(feeds))):
+            raise ValueError(f"model {self.manifest.name} is not prepared for inputs of {shapes_of(feeds)}")
+        names = list(self.manifest.outputs)
+        outputs = dict(zip(names, self._run(names, feeds), strict=True))
+        for name, value in outputs.items():
+            if not np.isfinite(value).all():
+                raise FloatingPointError(f"model {self.manifest.name}: output {name} is not finite")
+        return outputs
+
+    def infer(self, contents: Mapping[str, Sequence[UInt8Array] | Float32Array]) -> dict[str, Float32Array]:
+        """The outputs by what they give, in their units, for inputs by what they carry.
+
+        Images are (h, w, 3) RGB of the input's size, planes (n, c, h, w). Raises as ``run`` does.
+        """
+        feeds = {}
+        for name, spec in self.manifest.inputs.items():
+            content = contents[spec.carries or name]
+            feeds[name] = content if isinstance(content, np.ndarray) else entering(spec, content)
+        specs = self.manifest.outputs
+        return {specs[name].gives or name: leaving(specs[name], value) for name, value in self.run(feeds).items()}
+
+    def keep_engines(self, shapes: Sequence[Shapes]) -> None:
+        """Note that the engines in the folder cover these shapes and all between them."""
+        if self._engines is not None:
+            Prepared.over(shapes).save(self._engines)
+
+    def terminate(self) -> None:
+        """Ends the runs that are under way, from any thread; ONNX Runtime then raises an error of its own in them."""
+        for options in tuple(self._running):
+            options.terminate = True
+
+    def _run(self, names: list[str], feeds: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
+        options = ort.RunOptions()
+        self._running.add(options)
+        try:
+            outputs: list[NDArray[Any]] = self._session.run(names, dict(feeds), options)
+        finally:
+            self._running.discard(options)
+        return outputs
+
+    def _refuse_provider(self, file: ManifestFile, provider: Provider) -> None:
+        made_for = self.manifest.providers
+        if made_for and provider not in made_for:
+            raise file.error(
+                ("providers",),
+                f"{self.manifest.name} is made for {' and '.join(made_for)}, not for {provider}; name another model "
+                "(flockd's own without _int8 are made for any), or another perception.provider",
+            )
+
+    def _check_golden(self, file: ManifestFile, deadline: Deadline) -> None:
+        outputs: dict[str, NDArray[Any]] = {}
+        try:
+            deadline(lambda: outputs.update(self.run(golden_feeds(self.manifest))), self.terminate)
+        except Exception as error:  # noqa: BLE001 - ONNX Runtime's own exception types are private
+            raise cannot_run(file, self.provider, error) from None
+        check_golden(file, outputs)

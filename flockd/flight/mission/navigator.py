@@ -1,0 +1,125 @@
+"""Flies a drone's mission: the configured one, or the one that an operator's order has put in its place."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from flockd.core.config.mission import MissionParameters, WaypointParameters
+from flockd.core.config.safety import GateParameters
+from flockd.core.messages import FloatArray, MissionOrder, MissionStatus
+from flockd.flight.mission.circle_then_tangent import CircleThenTangent
+from flockd.flight.mission.follow import Follow
+from flockd.flight.mission.guidance import Guidance, Mission, Moment
+from flockd.flight.mission.hover import Hover
+from flockd.flight.mission.operator import Operator
+from flockd.flight.mission.velocity import Velocity
+from flockd.flight.mission.waypoints import Waypoints
+
+MAX_TURN_RAD_S = 0.2
+"""How fast the heading follows the course, but on the paper's circle: cameras that turn faster see less."""
+
+
+class Navigator:
+    """The mission of one flight; remembers how far it is."""
+
+    def __init__(self, parameters: MissionParameters, gate: GateParameters) -> None:
+        self._configured, self._gate = parameters, gate
+        self._parameters = parameters
+        self._mission = _mission(parameters, gate)
+        self._began_s = 0.0
+        self._course_rad: float | None = None
+        self._turned_s = 0.0
+
+    @property
+    def is_paper(self) -> bool:
+        """Whether it flies the paper's circle, which has no goal and no end."""
+        return self._parameters.kind == "circle_then_tangent"
+
+    def step(self, moment: Moment) -> Guidance:
+        """What the mission wants, `moment.time_s` after the flight began; an order may put another in its place.
+
+        Its height has the offset of the configuration, its course turns no faster than `MAX_TURN_RAD_S`.
+        """
+        if moment.order is not None and self._parameters.kind != "operator":
+            self._replace(moment.order, moment.time_s)
+        guidance = self._mission.step(replace(moment, time_s=moment.time_s - self._began_s))
+        height_m = self._parameters.height_m if guidance.height_m is None else guidance.height_m
+        if height_m is not None:
+            height_m += self._parameters.height_offset_m
+        course_rad = guidance.course_rad if self.is_paper else self._turned(guidance.course_rad, moment.time_s)
+        self._course_rad, self._turned_s = course_rad, moment.time_s
+        return replace(guidance, height_m=height_m, course_rad=course_rad)
+
+    def pull(self, guidance: Guidance) -> FloatArray:
+        """(2,) m/s: efv of Eq. 42 with the mission's own part of W_i, which is 0 for `follow`."""
+        return guidance.velocity * self._parameters.pull
+
+    def status(self, guidance: Guidance) -> MissionStatus | None:
+        """For telemetry and recordings; see `PilotOutput.mission`."""
+        if self.is_paper:
+            return None
+        return MissionStatus(
+            kind=self._parameters.kind,
+            desired=self.pull(guidance),
+            sentence=guidance.sentence,
+            goal=guidance.goal,
+            goal_height_m=guidance.height_m,
+            arrived=guidance.arrived,
+            takeover=guidance.takeover,
+        )
+
+    def _replace(self, order: MissionOrder, time_s: float) -> None:
+        """Begins the mission that an order asks for: a goal for good, or an operator's velocity for some seconds."""
+        self._parameters = ordered_mission(self._configured, order)
+        self._mission = _mission(self._parameters, self._gate)
+        self._began_s = time_s
+
+    def _turned(self, wanted_rad: float | None, time_s: float) -> float | None:
+        """The course after turning from the last one, as far as there was time for."""
+        before_rad = self._course_rad
+        if wanted_rad is None or before_rad is None:
+            return before_rad if wanted_rad is None else wanted_rad
+        most_rad = MAX_TURN_RAD_S * max(time_s - self._turned_s, 0.0)
+        turn_rad = (wanted_rad - before_rad + math.pi) % (2 * math.pi) - math.pi
+        return before_rad + min(max(turn_rad, -most_rad), most_rad)
+
+
+def ordered_mission(configured: MissionParameters, order: MissionOrder) -> MissionParameters:
+    """The mission that an order puts in place of the configured one; see `Navigator`."""
+    kept = configured.model_dump(
+        include={"speed_m_s", "reached_m", "timeout_s", "height_offset_m", "height_m", "origin_m"}
+    )
+    if order.velocity is not None:
+        return MissionParameters(kind="operator", **kept)
+    place = {}
+    if order.place is not None:
+        place = {"north_m": float(order.place[0]), "east_m": float(order.place[1])}
+    elif order.place_deg is not None:
+        place = {"latitude_deg": float(order.place_deg[0]), "longitude_deg": float(order.place_deg[1])}
+    waypoint = WaypointParameters(height_m=order.height_m, speed_m_s=order.speed_m_s, **place)
+    return MissionParameters(kind="waypoints", waypoints=(waypoint,), **kept)
+
+
+def middle_of(neighbours: FloatArray) -> FloatArray:
+    """(2,) metres: the middle of a drone, which is the origin, and of its neighbours at (n, 2) metres."""
+    middle: FloatArray = neighbours.sum(axis=0) / (len(neighbours) + 1)
+    return middle if len(neighbours) else np.zeros(2)
+
+
+def _mission(parameters: MissionParameters, gate: GateParameters) -> Mission:
+    match parameters.kind:
+        case "circle_then_tangent":
+            return CircleThenTangent(parameters)
+        case "hover":
+            return Hover()
+        case "velocity":
+            return Velocity(parameters)
+        case "waypoints":
+            return Waypoints(parameters, gate)
+        case "follow":
+            return Follow()
+        case "operator":
+            return Operator(parameters)

@@ -1,0 +1,9 @@
+"""Obstacles: ranged in the images, kept in a local map for a few seconds, and flown around."""
+
+from __future__ import annotations
+
+from flockd.flight.obstacles.avoidance import Avoidance
+from flockd.flight.obstacles.local_map import LocalMap, nearest_points
+from flockd.flight.obstacles.ranging import ObstacleRanging
+
+__all__ = ["Avoidance", "LocalMap", "ObstacleRanging", "nearest_points"]

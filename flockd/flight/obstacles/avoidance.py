@@ -1,0 +1,89 @@
+"""Obstacle avoidance: what the flocking law wants, steered around obstacles and slowed before them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flockd.core.config.avoidance import ObstacleParameters
+from flockd.core.config.safety import GateParameters
+from flockd.core.messages import FloatArray, ObstacleRanges
+from flockd.flight.flocking import FlockingLaw, level_offsets, limit_norm
+from flockd.flight.obstacles.local_map import nearest_points
+from flockd.flight.obstacles.steering import Steering
+from flockd.flight.safety.approach import stopping_speed, towards_neighbours, towards_obstacles
+from flockd.flight.safety.half_planes import nearest_within
+
+AWAY_PER_S = 1.0
+"""Nearer than the clearance, away from an obstacle at this much of what is missing each second."""
+
+
+class Avoidance:
+    """One drone's. Remembers which way around it goes."""
+
+    def __init__(self, parameters: ObstacleParameters, gate: GateParameters, step_s: float) -> None:
+        self._parameters, self._gate = parameters, gate
+        self._step_s = step_s
+        self._reaction_s = gate.reaction_s + step_s
+        self._steering = Steering(parameters)
+
+    def command(
+        self,
+        law: FlockingLaw,
+        velocity: FloatArray,
+        neighbours: FloatArray,
+        velocities: FloatArray,
+        desired: FloatArray,
+        ranges: ObstacleRanges,
+    ) -> tuple[FloatArray, FloatArray]:
+        """The velocity to ask for, (2,) m/s, and the acceleration that leads there, (2,) m/s^2.
+
+        As of `FlockingLaw.command`, but `neighbours` are (n, 3) metres NED from the drone. Under the law the velocity
+        tends to V + u: that one is steered around obstacles, and the one that the step leads to has to be safe.
+        """
+        u = law.acceleration(velocity, level_offsets(neighbours), velocities, desired)
+        wanted = limit_norm(velocity + u, law.parameters.max_speed_m_s)
+        flock = velocities.mean(axis=0) if len(velocities) else np.zeros(2)
+        asked, _ = law.limited(velocity, self.steered(wanted, ranges, flock) - velocity, self._step_s)
+        safe = self.within(asked, ranges, neighbours, velocities)
+        return safe, (safe - velocity) / self._step_s
+
+    def steered(self, wanted: FloatArray, ranges: ObstacleRanges, flock: FloatArray) -> FloatArray:
+        """The velocity (2,) m/s to fly with instead of the `wanted` one, which the flocking law tends to.
+
+        No faster than the drone can stop within what is known to be free. `flock` (2,) m/s is the neighbours' mean
+        velocity, zero without any.
+        """
+        velocity, free_m = self._steering.around(wanted, ranges, flock)
+        most_m_s = float(stopping_speed(np.array(free_m), self._gate.braking_m_s2, self._reaction_s))
+        speed = math.hypot(*velocity)
+        slowed = velocity if speed <= most_m_s else velocity * (most_m_s / speed)
+        return slowed + self._away(ranges)
+
+    def within(
+        self, velocity: FloatArray, ranges: ObstacleRanges, neighbours: FloatArray, velocities: FloatArray
+    ) -> FloatArray:
+        """The velocity (2,) m/s nearest to the given one from which the drone can stop before what is near.
+
+        `neighbours` (n, 3) metres NED from the drone, with their `velocities` (n, 2) m/s. A step passes before the
+        next velocity, which counts as reaction. Neighbours turn aside here without notice: they are kept as far off as
+        by a degraded drone.
+        """
+        p, gate = self._parameters, self._gate
+        points = nearest_points(ranges, p.sigmas)
+        to_obstacles = towards_obstacles(points, p.clearance_m, gate.braking_m_s2, self._reaction_s)
+        to_neighbours = towards_neighbours(gate, neighbours, velocities, gate.degraded_separation_m)
+        directions, most_m_s = zip(to_obstacles, to_neighbours, strict=True)
+        return nearest_within(velocity, np.concatenate(directions), np.concatenate(most_m_s))
+
+    def _away(self, ranges: ObstacleRanges) -> FloatArray:
+        """(2,) m/s from the nearest obstacle, where that is nearer than the clearance."""
+        points = nearest_points(ranges, self._parameters.sigmas)
+        away_m = np.hypot(*points.T)
+        if not (away_m < self._parameters.clearance_m).any():
+            return np.zeros(2)
+        nearest = int(np.argmin(away_m))
+        missing_m = self._parameters.clearance_m - away_m[nearest]
+        away: FloatArray = -AWAY_PER_S * missing_m * points[nearest] / away_m[nearest]
+        return away

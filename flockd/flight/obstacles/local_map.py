@@ -1,0 +1,148 @@
+"""The local map: where obstacles are around the drone, from the ranges of the last few seconds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockd.core.config.avoidance import ObstacleParameters
+from flockd.core.messages import SECTORS, BoolArray, FloatArray, IntArray, ObstacleRanges
+
+_CONSISTENT_SIGMAS = 3.0
+"""Two ranges that differ by no more may be of one obstacle."""
+_CONTRADICTIONS = 2
+"""An obstacle that so many steps have looked past is none."""
+_WHILE_UNKNOWN_M = 0.5
+"""Standard deviation, each axis, of where the drone went in a step in which it does not know its own motion."""
+
+AZIMUTHS = 2 * math.pi / SECTORS * np.arange(SECTORS)
+"""(n,) radians, clockwise from north: the sectors' middles."""
+DIRECTIONS = np.column_stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)])
+"""(n, 2) north and east, of length 1: the sectors' middles."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """Obstacles seen, one a row: places (m, 2) metres north and east from the drone, and the others (m,)."""
+
+    places: FloatArray
+    sigma_m: FloatArray
+    seen_s: FloatArray
+    contradictions: FloatArray
+
+    def where(self, chosen: BoolArray) -> _Points:
+        return _Points(self.places[chosen], self.sigma_m[chosen], self.seen_s[chosen], self.contradictions[chosen])
+
+    def __add__(self, other: _Points) -> _Points:
+        return _Points(
+            np.concatenate([self.places, other.places]),
+            np.concatenate([self.sigma_m, other.sigma_m]),
+            np.concatenate([self.seen_s, other.seen_s]),
+            np.concatenate([self.contradictions, other.contradictions]),
+        )
+
+
+_NOTHING = _Points(np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0))
+
+
+class LocalMap:
+    """Obstacles as points in level axes that point north and east, with the drone at the origin.
+
+    A point moves as the drone does not, and grows uncertain by the drone's own motion. It is replaced by a newer one
+    of the same obstacle, and forgotten after `memory_s`, or when newer ranges look past it.
+    """
+
+    def __init__(self, parameters: ObstacleParameters) -> None:
+        self._parameters = parameters
+        self._points = _NOTHING
+        self._seen_m = np.zeros(SECTORS)
+        self._time_s: float | None = None
+
+    def step(
+        self, time_s: float, ranges: ObstacleRanges | None, displacement: FloatArray | None, sigma_m: float
+    ) -> ObstacleRanges:
+        """What the map says at `time_s`.
+
+        Args:
+            time_s: not before the last step's; if it is, the map begins anew.
+            ranges: of this time; None: nothing was looked at.
+            displacement: (2,) metres north and east that the drone went since the last step; None: not known.
+            sigma_m: its standard deviation, each axis.
+        """
+        self._move(time_s, displacement, sigma_m)
+        if ranges is not None:
+            self._take(ranges)
+        return self._now(time_s)
+
+    def _move(self, time_s: float, displacement: FloatArray | None, sigma_m: float) -> None:
+        if self._time_s is None or time_s < self._time_s:
+            self._points, self._seen_m = _NOTHING, np.zeros(SECTORS)
+            self._time_s = time_s
+            return
+        elapsed_s, self._time_s = time_s - self._time_s, time_s
+        way = np.zeros(2) if displacement is None else displacement
+        sigma_m = _WHILE_UNKNOWN_M if displacement is None else sigma_m
+        points = self._points
+        moved = _Points(points.places - way, np.hypot(points.sigma_m, sigma_m), points.seen_s, points.contradictions)
+        p = self._parameters
+        kept = (time_s - points.seen_s <= p.memory_s) & (np.hypot(*moved.places.T) <= p.range_m)
+        self._points = moved.where(kept)
+        faded_m = p.range_m * elapsed_s / p.memory_s + math.hypot(*way)
+        self._seen_m = np.maximum(self._seen_m - faded_m, 0.0)
+
+    def _take(self, ranges: ObstacleRanges) -> None:
+        p = self._parameters
+        found = ranges.range_m <= p.range_m
+        self._points = self._without_what_is_seen_anew(ranges) + _Points(
+            ranges.range_m[found, None] * DIRECTIONS[found],
+            ranges.sigma_m[found],
+            np.full(found.sum(), ranges.time_s),
+            np.zeros(found.sum()),
+        )
+        self._seen_m = np.maximum(self._seen_m, np.minimum(ranges.seen_m, p.range_m))
+
+    def _without_what_is_seen_anew(self, ranges: ObstacleRanges) -> _Points:
+        """The points that newer ranges neither show again nor have looked past often enough."""
+        points = self._points
+        away_m = np.hypot(*points.places.T)
+        around = (_sector_of(points.places)[:, None] + [-1, 0, 1]) % SECTORS
+        own = around[:, 1]
+        allowed_m = _CONSISTENT_SIGMAS * np.hypot(points.sigma_m[:, None], ranges.sigma_m[around])
+        beyond = np.minimum(ranges.range_m, ranges.seen_m)[around] > away_m[:, None] + allowed_m
+        width_m = away_m * (2 * math.pi / SECTORS)
+        again = np.abs(ranges.range_m[own] - away_m) <= np.maximum(allowed_m[:, 1], width_m)
+        contradictions = points.contradictions + beyond.all(axis=1)
+        counted = _Points(points.places, points.sigma_m, points.seen_s, contradictions)
+        return counted.where(~again & (contradictions < _CONTRADICTIONS))
+
+    def _now(self, time_s: float) -> ObstacleRanges:
+        """In each sector the point that may be nearest."""
+        points = self._points
+        away_m = np.hypot(*points.places.T)
+        sectors = _sector_of(points.places)
+        farthest_first = np.argsort(-(away_m - self._parameters.sigmas * points.sigma_m), kind="stable")
+        range_m, sigma_m = np.full(SECTORS, np.inf), np.zeros(SECTORS)
+        range_m[sectors[farthest_first]] = away_m[farthest_first]  # the last one written stays
+        sigma_m[sectors[farthest_first]] = points.sigma_m[farthest_first]
+        return ObstacleRanges(time_s, range_m, sigma_m, self._seen_m)
+
+
+def nearest_points(ranges: ObstacleRanges, sigmas: float) -> FloatArray:
+    """(m, 2) metres north and east: the obstacles, each nearer by so many standard deviations than it was measured."""
+    known = np.isfinite(ranges.range_m)
+    away_m = np.maximum(ranges.range_m[known] - sigmas * ranges.sigma_m[known], NEAREST_M)
+    points: FloatArray = away_m[:, None] * DIRECTIONS[known]
+    return points
+
+
+NEAREST_M = 0.01
+"""No obstacle counts as nearer: it needs a direction."""
+
+
+def _sector_of(places: FloatArray) -> IntArray:
+    """(m,) of places (m, 2)."""
+    azimuths = np.arctan2(places[:, 1], places[:, 0])
+    sectors: IntArray = np.round(azimuths * SECTORS / (2 * math.pi)).astype(np.int64) % SECTORS
+    return sectors

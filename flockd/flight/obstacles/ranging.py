@@ -1,0 +1,226 @@
+"""From the depth maps of all cameras to the nearest obstacle in each direction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockd.core.config.avoidance import ObstacleParameters
+from flockd.core.messages import (
+    SECTORS,
+    UNCLASSED,
+    BoolArray,
+    EgoMotion,
+    Float32Array,
+    FloatArray,
+    IntArray,
+    ObstacleRanges,
+    UInt8Array,
+)
+from flockd.flight.geometry import Rig, RigCamera, grid_pixels
+from flockd.flight.perception.observation import CameraObservation, Observation
+
+_STRIDE_PX = 4
+"""Between pixels that are taken: a trunk of 0.2 m at 10 m is 4 px wide at 222 px a radian."""
+_NEAREST_M = 0.3
+_RATIO = 1.1
+"""Of a range to that of the bin before it."""
+_GROUND_MARGIN_M = 0.7
+"""What is no higher than this above the ground counts as ground."""
+_HORIZON = 0.1
+"""Tangent of the elevation up to which a ray shows how far the drone sees at its own height."""
+
+
+_GRID = slice(_STRIDE_PX // 2, None, _STRIDE_PX)
+"""Of `grid_pixels`."""
+_STEEPEST = 0.25
+"""Sine of the elevation up to which pixels are triangulated: the band of heights from 3 m on, and its middle nearer."""
+_MIN_BASELINE_M = 0.05
+"""Across the line of sight: with less between two images, their flow shows no depth."""
+_FLOW_SIGMA_PX = 1.0
+_CERTAIN_SIGMAS = 5.0
+"""A point by flow counts where its inverse depth is so many standard deviations from that of the sky."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """Places (3, n) metres, with relative standard deviations of their ranges (n,) and labels (n,)."""
+
+    places: Float32Array
+    relative_sigma: Float32Array
+    labels: UInt8Array
+
+    def where(self, chosen: BoolArray) -> _Points:
+        return _Points(self.places[:, chosen], self.relative_sigma[chosen], self.labels[chosen])
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[_Points]) -> _Points:
+        return cls(
+            np.concatenate([part.places for part in parts], axis=1),
+            np.concatenate([part.relative_sigma for part in parts]),
+            np.concatenate([part.labels for part in parts]),
+        )
+
+
+_NOTHING = _Points(np.empty((3, 0), np.float32), np.empty(0, np.float32), np.empty(0, np.uint8))
+
+
+class ObstacleRanging:
+    """Takes pixels of the depth maps for points, and of each sector the nearest distance that enough of them agree on.
+
+    Points count in the band of heights that the drone needs, where they are no ground and on no drone. The sky is far.
+    Glass, wires thinner than a pixel, and what is in the dark have no depth, or a wrong one: they are not seen.
+    """
+
+    def __init__(self, rig: Rig, parameters: ObstacleParameters) -> None:
+        self._rig, self._parameters = rig, parameters
+        self._rays = {name: _body_rays(camera) for name, camera in rig.cameras.items()}
+        self._triangulations = {name: _Triangulation(camera) for name, camera in rig.cameras.items()}
+        self._bins = 1 + math.ceil(_bin(parameters.range_m))
+
+    def ranges(self, observation: Observation, ego: EgoMotion | None = None) -> ObstacleRanges:
+        """Of one observation, whose depth has its scale, and of the flow since the one before where `ego` is known."""
+        R_ned_body = observation.vehicle.R_ned_body.astype(np.float32)
+        parts = [_NOTHING]
+        for name, camera in observation.cameras.items():
+            origin = R_ned_body @ self._rig.cameras[name].T_body_camera.translation.astype(np.float32)
+            places = (R_ned_body @ self._rays[name]) * camera.depth[_GRID, _GRID].ravel() + origin[:, None]
+            relative = np.full(places.shape[1], self._parameters.range_sigma, np.float32)
+            parts.append(self._about_level(_Points(places, relative, camera.labels[_GRID, _GRID].ravel())))
+            if ego is not None and observation.previous is not None and camera.flow is not None:
+                moved = self._triangulations[name].points(ego, observation.previous, camera)
+                ahead = R_ned_body @ moved.places + origin[:, None]
+                parts.append(self._about_level(_Points(ahead, moved.relative_sigma, moved.labels)))
+        return self._nearest(observation, _Points.concatenate(parts))
+
+    def _about_level(self, points: _Points) -> _Points:
+        """Those that are in the drone's band of heights, or show how far it sees."""
+        return points.where((np.abs(points.places[2]) <= self._parameters.height_band_m) | _is_level(*points.places))
+
+    def _nearest(self, observation: Observation, points: _Points) -> ObstacleRanges:
+        """Of places (3, n) metres NED from the drone."""
+        p, labels = self._parameters, points.labels
+        north, east, down = points.places
+        away_m = np.hypot(north, east)
+        sectors = np.round(np.arctan2(east, north) * (SECTORS / (2 * math.pi))).astype(np.int64) % SECTORS
+        in_band = np.abs(down) <= p.height_band_m
+        above_ground = down <= _ground_down_m(observation, north, east) - _GROUND_MARGIN_M
+        counts = in_band & above_ground & (labels == 0) & (away_m <= p.range_m)
+        range_m, relative = self._agreed(
+            sectors[counts], away_m[counts].astype(float), points.relative_sigma[counts].astype(float)
+        )
+        level = _is_level(north, east, down) & (labels != UNCLASSED)
+        seen_m = _medians(sectors[level], np.minimum(away_m[level], p.range_m))
+        found = np.isfinite(range_m)
+        sigma_m = np.where(found, relative * np.where(found, range_m, 0.0), 0.0)
+        return ObstacleRanges(
+            observation.time_s, range_m, sigma_m, np.where(found, np.minimum(range_m, p.range_m), seen_m)
+        )
+
+    def _agreed(self, sectors: IntArray, away_m: FloatArray, relative: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(SECTORS,) metres: the mean of the nearest points of each sector that are enough; inf where none are.
+
+        And the mean of their relative standard deviations.
+        """
+        bins = np.minimum(np.floor(_bin(away_m)), self._bins - 1).astype(np.int64)
+        shape = (SECTORS, self._bins)
+        cells = sectors * shape[1] + bins
+
+        def summed(values: FloatArray | None) -> FloatArray:
+            totals = np.bincount(cells, values, minlength=math.prod(shape)).reshape(shape)
+            return totals.astype(float)
+
+        count = summed(None)
+        enough = np.cumsum(count, axis=1) >= self._parameters.min_pixels
+        first = (np.arange(SECTORS), np.argmax(enough, axis=1))
+        in_first = np.maximum(count[first], 1)
+        mean_m = np.where(enough.any(axis=1), summed(away_m)[first] / in_first, np.inf)
+        return mean_m, summed(relative)[first] / in_first
+
+
+def _ground_down_m(observation: Observation, north: Float32Array, east: Float32Array) -> float | Float32Array:
+    """How far below the drone the ground is under points (n,): level, or the plane that ranges to it tell."""
+    ground = observation.ground
+    if ground is None:
+        return observation.vehicle.height_m
+    return np.asarray(ground.height_m - north * ground.slope[0] - east * ground.slope[1], np.float32)
+
+
+def _bin(range_m: FloatArray | float) -> FloatArray:
+    """On the logarithmic scale of ranges."""
+    bins: FloatArray = np.log(np.maximum(range_m, _NEAREST_M) / _NEAREST_M) / math.log(_RATIO)
+    return bins
+
+
+def _is_level(north: Float32Array, east: Float32Array, down: Float32Array) -> BoolArray:
+    """(n,) of points: whether they are about as high as the drone, seen from it; NaN is not."""
+    level: BoolArray = down**2 <= _HORIZON**2 * (north**2 + east**2)
+    return level
+
+
+def _body_rays(camera: RigCamera) -> Float32Array:
+    """(3, n): what has to be multiplied by the depth of each pixel that is taken, in body axes."""
+    pixels = grid_pixels(camera.camera.size, _STRIDE_PX)
+    rays: FloatArray = camera.T_body_camera.rotation @ camera.camera.unproject(pixels, np.ones(len(pixels))).T
+    return rays.astype(np.float32)
+
+
+def _medians(sectors: IntArray, values: Float32Array) -> FloatArray:
+    """(SECTORS,) of each sector's values; 0 where there are none."""
+    order = np.lexsort((values, sectors))
+    count = np.bincount(sectors, minlength=SECTORS)
+    first = np.cumsum(count) - count
+    middle = np.minimum(first + count // 2, max(len(values) - 1, 0))
+    if not len(values):
+        return np.zeros(SECTORS)
+    return np.where(count > 0, values[order][middle], 0.0).astype(float)
+
+
+class _Triangulation:
+    """Of one camera: places of what stood still between two of its images."""
+
+    def __init__(self, camera: RigCamera) -> None:
+        self._camera = camera
+        width, height = camera.camera.size
+        rows = slice(_STRIDE_PX // 2, height, 2 * _STRIDE_PX)  # every second one of those of `grid_pixels`
+        self._grid = rows, slice(_STRIDE_PX // 2, width, _STRIDE_PX)
+        row, column = np.mgrid[self._grid].reshape(2, -1)
+        self._pixels = np.stack([column, row], axis=1) + 0.5
+        self._rays = camera.camera.rays(self._pixels)
+        self._down_body = camera.T_body_camera.rotation @ self._rays.T
+
+    def points(self, ego: EgoMotion, before: Observation, now: CameraObservation) -> _Points:
+        """From the flow and the drone's own motion, in body axes, without the camera's own place.
+
+        Where a pixel's inverse depth is not well above that of the sky, it is left out.
+        """
+        assert now.flow is not None
+        mounted, lens = self._camera.T_body_camera, self._camera.camera
+        to_camera, offset = mounted.rotation.T, mounted.translation
+        rotation = to_camera @ ego.rotation @ mounted.rotation  # from the camera now to the camera before
+        translation = to_camera @ (ego.rotation @ offset + ego.translation - offset)
+        near_level = np.abs(before.vehicle.R_ned_body[2] @ self._down_body) <= _STEEPEST
+        start, p = self._pixels[near_level], self._rays[near_level]
+        end = start + now.flow[self._grid].reshape(-1, 2)[near_level]
+        labels_before = before.cameras[self._camera.name].labels[self._grid].ravel()
+        still = lens.in_image(end) & (labels_before[near_level] == 0)
+        end, p = end[still], p[still]
+        column, row = end.astype(np.int64).T
+        background = now.labels[row, column] == 0
+        end, p = end[background], p[background]
+        ray = lens.unproject(end, np.ones(len(end)))
+        # p is parallel to R q / w + t, so that p x R q + w (p x t) = 0: linear in the inverse depth w. With unit p,
+        # by Lagrange, (p x a) . (p x b) = a . b - (p . a) (p . b).
+        turned, along = ray @ rotation.T, p @ translation
+        parallax = turned @ translation - along * np.einsum("ij,ij->i", p, turned)
+        baseline = np.sqrt(np.maximum(translation @ translation - along**2, 0.0))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = -parallax / baseline**2
+            sigma = _FLOW_SIGMA_PX / lens.focal_px / baseline
+            certain = (baseline > _MIN_BASELINE_M) & (inverse > _CERTAIN_SIGMAS * sigma)
+        places = mounted.rotation @ (ray[certain] / inverse[certain, None]).T
+        relative = (sigma / inverse)[certain].astype(np.float32)
+        return _Points(places.astype(np.float32), relative, np.zeros(len(relative), np.uint8))

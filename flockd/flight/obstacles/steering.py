@@ -1,0 +1,102 @@
+"""Which way around obstacles: the direction nearest to the wanted one that is free for some seconds.
+
+After Ulrich and Borenstein 1998, "VFH+: reliable obstacle avoidance for fast mobile robots": directions in which
+an obstacle, enlarged by the clearance, is met too soon are closed; of the others the cheapest is taken, and the one
+taken last is cheaper than it would be otherwise.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flockd.core.config.avoidance import ObstacleParameters
+from flockd.core.messages import FloatArray, ObstacleRanges
+from flockd.flight.obstacles.local_map import AZIMUTHS, nearest_points
+
+TURNS = np.linspace(-math.pi, math.pi, 144, endpoint=False)
+"""(n,) radians, clockwise from the wanted direction; 0 is one of them."""
+LAST = 0.5
+"""How much a turn away from the last direction counts, relative to one away from the wanted direction."""
+FLOCK = 0.15
+"""The same, away from where the neighbours fly."""
+RIGHT_RAD = 0.02
+"""To the left costs this much more: of two ways alike all drones take the same."""
+SHORTER = (1.0, 0.6, 0.3)
+"""Where no direction is free as far as it should be: shares of that way that do too."""
+BESIDE_M = 0.02
+"""Beside an obstacle that is nearer than the margin, the margin is smaller by this than what there is."""
+TURNED_RAD = 0.1
+"""A turn smaller than this is not worth remembering."""
+
+
+class Steering:
+    """Remembers the last way around, so that the next step takes the same side."""
+
+    def __init__(self, parameters: ObstacleParameters) -> None:
+        self._parameters = parameters
+        self._last_rad: float | None = None
+
+    def around(self, wanted: FloatArray, ranges: ObstacleRanges, flock: FloatArray) -> tuple[FloatArray, float]:
+        """The velocity (2,) m/s of the same speed in a free direction, and how far that direction is free, metres.
+
+        `wanted` (2,) m/s; `flock` (2,) m/s is the neighbours' mean velocity, zero without any.
+        """
+        p = self._parameters
+        speed = math.hypot(*wanted)
+        if speed == 0.0:
+            return wanted, 0.0
+        wanted_rad = math.atan2(wanted[1], wanted[0])
+        points = nearest_points(ranges, p.sigmas)
+        azimuths = wanted_rad + TURNS
+        cost = self._cost(azimuths, flock)
+        nearest_m = float(np.hypot(*points.T).min(initial=np.inf))
+        with_margin_m = min(max(nearest_m - BESIDE_M, p.clearance_m), p.clearance_m + p.margin_m)
+        for radius_m in (with_margin_m, p.clearance_m):
+            free_m = free_way(points, radius_m, azimuths)
+            free_m = np.minimum(free_m, seen_way(ranges, azimuths) - radius_m)
+            for share in SHORTER:
+                is_free = free_m >= min(share * speed * p.horizon_s, p.range_m - radius_m)
+                if is_free.any():
+                    return self._taken(int(np.argmin(np.where(is_free, cost, np.inf))), wanted, free_m)
+        return self._taken(int(np.argmax(free_m - cost)), wanted, free_m)
+
+    def _cost(self, azimuths: FloatArray, flock: FloatArray) -> FloatArray:
+        cost = np.abs(TURNS) + np.where(TURNS < 0, RIGHT_RAD, 0.0)
+        if self._last_rad is not None:
+            cost = cost + LAST * np.abs(_wrapped(azimuths - self._last_rad))
+        if flock.any():
+            cost = cost + FLOCK * np.abs(_wrapped(azimuths - math.atan2(flock[1], flock[0])))
+        return cost
+
+    def _taken(self, index: int, wanted: FloatArray, free_m: FloatArray) -> tuple[FloatArray, float]:
+        turn = float(TURNS[index])
+        velocity: FloatArray = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ wanted
+        self._last_rad = math.atan2(velocity[1], velocity[0]) if abs(turn) > TURNED_RAD else None
+        return velocity, max(float(free_m[index]), 0.0)
+
+
+def free_way(points: FloatArray, radius_m: float, azimuths: FloatArray) -> FloatArray:
+    """How far, (k,) m, a disc flies straight in each direction, (k,) rad, before it touches one of the points (m, 2).
+
+    inf where it touches none. Of a point within the disc it flies no way nearer, and any way off.
+    """
+    ahead_m = points @ np.array([np.cos(azimuths), np.sin(azimuths)])
+    square = radius_m**2 - (np.sum(points**2, axis=1)[:, None] - ahead_m**2)
+    meets = (square > 0) & (ahead_m > 0)
+    way_m = np.where(meets, np.maximum(ahead_m - np.sqrt(np.maximum(square, 0.0)), 0.0), np.inf)
+    free: FloatArray = way_m.min(axis=0, initial=np.inf)
+    return free
+
+
+def seen_way(ranges: ObstacleRanges, azimuths: FloatArray) -> FloatArray:
+    """How far, (k,) m, the sector of each direction, (k,) rad, is known."""
+    seen: FloatArray = ranges.seen_m[np.round(azimuths / AZIMUTHS[1]).astype(np.int64) % len(AZIMUTHS)]
+    return seen
+
+
+def _wrapped(angles: FloatArray) -> FloatArray:
+    """(k,) radians from -pi to pi."""
+    wrapped: FloatArray = (angles + math.pi) % (2 * math.pi) - math.pi
+    return wrapped

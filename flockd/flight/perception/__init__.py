@@ -1,0 +1,26 @@
+"""Perception: frames in, an observation out; each role of it an ONNX model behind a manifest."""
+
+from flockd.flight.perception.detection.instances import Instance, group_instances
+from flockd.flight.perception.flow import DisFlow, Flow, OnnxFlow
+from flockd.flight.perception.maps import Crop, OpenDepth, RangeEstimate, SceneMaps
+from flockd.flight.perception.networks import Networks, OnnxNetworks
+from flockd.flight.perception.observation import CameraObservation, Observation
+from flockd.flight.perception.pipeline import Perception, load_networks
+
+__all__ = [
+    "CameraObservation",
+    "Crop",
+    "DisFlow",
+    "Flow",
+    "Instance",
+    "Networks",
+    "Observation",
+    "OnnxFlow",
+    "OnnxNetworks",
+    "OpenDepth",
+    "Perception",
+    "RangeEstimate",
+    "SceneMaps",
+    "group_instances",
+    "load_networks",
+]

@@ -1,0 +1,190 @@
+"""The ground below the drone as a plane, from ranges to it, the own motion and the slope that images show.
+
+A Kalman filter of three numbers: the ground's height below the drone, in the frame of the autopilot's height, and its
+slope to the north and to the east. Flying on, the ground rises by the slope; a range says where the ground is at one
+point; points one after the other tell the slope along the path, and images that across it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockd.core.choices import HeightSource
+from flockd.core.config.perception import RangeFinderParameters
+from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, VehicleState
+from flockd.flight.perception.depth.contradiction import ContradictionMonitor, GroundPoint
+
+OF_HEIGHT = "height: "
+"""How reasons begin that tell of the height's source."""
+HEIGHT_NOISE_M = 0.03
+"""Standard deviation of the autopilot's height from one reading to the next; what changes slowly does not matter."""
+FIRST_SLOPE = 0.1
+"""Standard deviation of the ground's slope where nothing is known of it."""
+SLOPE_CHANGE = 0.02
+"""Standard deviation of what the slope changes over a metre: a hill of 5 m turns from 15 % up to 15 % down in 100 m."""
+SEEN_SLOPE = 0.04
+"""Standard deviation, each axis, of a slope from images of rough ground, which has bumps around the drone, too."""
+ROUGHNESS_M = 0.03
+"""Standard deviation of what the ground departs from its slope over a metre."""
+TRACK_POINTS = 40
+"""Ranges remembered: 20 s of steps of the paper's length."""
+LONGEST_GAP_S = 5.0
+"""After a longer one between two steps nothing is known of the ground any more."""
+BELIEVED_AFTER = 2
+"""Readings in a row that the expected ground does not explain: then the ground is as they say."""
+
+
+@dataclass(frozen=True)
+class NoGround:
+    """Why there is no ground to fix the scale by: one short sentence, the same for each occurrence."""
+
+    reason: str
+
+
+class GroundBelow:
+    """Follows the ground below one drone. Call `update` once for each step."""
+
+    def __init__(self, source: HeightSource, parameters: RangeFinderParameters) -> None:
+        self._source, self._parameters = source, parameters
+        self._state: FloatArray | None = None
+        """(3,): metres above the zero of the autopilot's height, then the slope to the north and to the east."""
+        self._covariance = np.zeros((3, 3))
+        self._last: VehicleState | None = None
+        self._measured_s = -math.inf
+        self._unexplained = 0
+        self._flown = np.zeros(2)
+        """North and east since the beginning, as the autopilot says."""
+        self._contradictions = ContradictionMonitor(parameters)
+        self._track: deque[FloatArray] = deque(maxlen=TRACK_POINTS)
+        """(3,) each: where a range hit the ground, north and east in that frame, and the ground's height there."""
+
+    def track(self, vehicle: VehicleState) -> FloatArray:
+        """(k, 3) metres NED from the drone: where the last ranges hit the ground; of the step of the last `update`."""
+        places = np.array(self._track).reshape(-1, 3)
+        return np.column_stack([places[:, :2] - self._flown, vehicle.height_m - places[:, 2]])
+
+    def update(self, vehicle: VehicleState) -> tuple[GroundEstimate | NoGround, str | None]:
+        """The ground at a step, and why its source is not the one that was wanted; None: it is."""
+        if self._source == "barometer":
+            return _level(vehicle), None
+        fault = self._follow(vehicle)
+        age_s = vehicle.time_s - self._measured_s
+        if self._state is not None and (fault is None or age_s <= self._parameters.bridge_s):
+            height_m = vehicle.height_m - float(self._state[0])
+            return GroundEstimate(height_m, self._state[1:].copy(), "range_finder"), None
+        if self._source == "best":
+            return _level(vehicle), f"{OF_HEIGHT}{fault}; the barometer's is used"
+        return NoGround(f"{OF_HEIGHT}{fault}; there is no scale"), None
+
+    def see_slope(self, slope: FloatArray) -> None:
+        """Takes the slope (2,) that the images of the newest step show."""
+        if self._state is not None:
+            self._correct(np.eye(3)[1:], slope, np.eye(2) * SEEN_SLOPE**2)
+
+    def _follow(self, vehicle: VehicleState) -> str | None:
+        """Takes a step and its range; why that one is not used, None: it is."""
+        self._predict(vehicle)
+        reading = vehicle.ground_range
+        fault = reading_fault(reading, vehicle.time_s, self._parameters)
+        if reading is None or fault is not None:
+            return fault
+        along = np.array([0.0, 0.0, 1.0]) if reading.vertical else vehicle.R_ned_body[:, 2]
+        point = reading.range_m * along
+        ground_m = _height_at(reading.time_s, vehicle) - float(point[2])
+        place = GroundPoint(vehicle.time_s, self._flown + point[:2], ground_m, reading.range_m)
+        home = None if vehicle.position is None else self._flown - vehicle.position
+        if self._contradictions.update(place, home):
+            if self._contradictions.doubted:  # the readings before made the state false, too
+                self._forget()
+            return "the range contradicts the barometer"
+        variance = (self._parameters.noise * reading.range_m) ** 2 + HEIGHT_NOISE_M**2
+        row = np.array([1.0, point[0], point[1]])
+        if self._state is not None and self._is_unexplained(row, ground_m, variance):
+            self._unexplained += 1
+            if self._unexplained < BELIEVED_AFTER:
+                return "the range is not that of the ground expected"
+            self._forget()
+        if self._state is None:
+            self._state = np.array([ground_m, 0.0, 0.0])
+            self._covariance = np.diag([variance, FIRST_SLOPE**2, FIRST_SLOPE**2])
+        else:
+            self._correct(row[None], np.array([ground_m]), np.array([[variance]]))
+        self._unexplained, self._measured_s = 0, vehicle.time_s
+        self._track.append(np.array([*(self._flown + point[:2]), ground_m]))
+        return None
+
+    def _is_unexplained(self, row: FloatArray, ground_m: float, variance: float) -> bool:
+        assert self._state is not None
+        sigma_m = math.sqrt(float(row @ self._covariance @ row) + variance)
+        return abs(ground_m - float(row @ self._state)) > self._parameters.gate_sigma * sigma_m
+
+    def _predict(self, vehicle: VehicleState) -> None:
+        last, self._last = self._last, vehicle
+        if last is None:
+            return
+        way = _way(last, vehicle)
+        if way is None or not 0.0 < vehicle.time_s - last.time_s <= LONGEST_GAP_S:
+            self._forget()
+            self._contradictions.forget()
+            return
+        self._flown = self._flown + way
+        if self._state is None:
+            return
+        onward = np.eye(3)
+        onward[0, 1:] = way
+        length_m = float(np.hypot(*way))
+        change = np.array([ROUGHNESS_M**2, SLOPE_CHANGE**2, SLOPE_CHANGE**2]) * length_m
+        self._state = onward @ self._state
+        self._covariance = onward @ self._covariance @ onward.T + np.diag(change)
+
+    def _forget(self) -> None:
+        self._state, self._unexplained = None, 0
+        self._track.clear()
+
+    def _correct(self, rows: FloatArray, measured: FloatArray, noise: FloatArray) -> None:
+        assert self._state is not None
+        gain = self._covariance @ rows.T @ np.linalg.inv(rows @ self._covariance @ rows.T + noise)
+        self._state = self._state + gain @ (measured - rows @ self._state)
+        kept = np.eye(3) - gain @ rows
+        self._covariance = kept @ self._covariance @ kept.T + gain @ noise @ gain.T  # Joseph's form stays symmetric
+
+
+def reading_fault(reading: RangeReading | None, now_s: float, parameters: RangeFinderParameters) -> str | None:
+    """Why a range says nothing of the ground; None: it does."""
+    if reading is None:
+        return "no range finder is heard"
+    if not math.isfinite(reading.range_m):
+        return "the range is not a number"
+    if not abs(now_s - reading.time_s) <= parameters.max_age_s:
+        return "the range is too old"
+    if reading.quality is not None and reading.quality < parameters.min_quality:
+        return "the range finder's signal is too weak"
+    if reading.range_m <= (reading.min_m or 0.0):
+        return "the ground is nearer than the range finder measures"
+    if reading.max_m is not None and reading.range_m >= reading.max_m:
+        return "the ground is farther than the range finder measures"
+    return None
+
+
+def _level(vehicle: VehicleState) -> GroundEstimate:
+    return GroundEstimate(vehicle.height_m, np.zeros(2), "barometer")
+
+
+def _height_at(time_s: float, vehicle: VehicleState) -> float:
+    """The autopilot's height shortly before or after a state."""
+    sink_m_s = 0.0 if vehicle.velocity_ned is None else float(vehicle.velocity_ned[2])
+    return vehicle.height_m + sink_m_s * (vehicle.time_s - time_s)
+
+
+def _way(before: VehicleState, now: VehicleState) -> FloatArray | None:
+    """(2,) metres north and east that the autopilot says it flew; None: it does not say."""
+    if before.position is not None and now.position is not None:
+        return now.position - before.position
+    if before.velocity_ned is None or now.velocity_ned is None:
+        return None
+    way: FloatArray = 0.5 * (before.velocity_ned + now.velocity_ned)[:2] * (now.time_s - before.time_s)
+    return way

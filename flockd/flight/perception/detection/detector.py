@@ -1,0 +1,102 @@
+"""The detection pipeline of a frame set: propose, crop, refine, suppress, mask."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from flockd.core.config.perception import DetectionParameters
+from flockd.core.messages import Detection, UInt8Array, VehicleState
+from flockd.flight.geometry import Rig
+from flockd.flight.perception.detection.from_depth import candidates_from_depth
+from flockd.flight.perception.detection.instances import Instance
+from flockd.flight.perception.detection.masks import DroneMasks, MaskRenderer, first_stage_labels
+from flockd.flight.perception.detection.nms import Suppressed, separate, suppress
+from flockd.flight.perception.detection.proposals import (
+    Proposal,
+    propose_instances,
+    propose_predictions,
+    propose_residuals,
+)
+from flockd.flight.perception.detection.refinement import Candidate, Cascade
+from flockd.flight.perception.maps import KnownSize, SceneMaps
+from flockd.flight.perception.networks import Networks
+from flockd.flight.tracking import Prediction
+
+
+@dataclass
+class DetectionTrace:
+    """What the detector went through, for reports and measurements: filled where a caller passes one in."""
+
+    proposals: list[Proposal] = field(default_factory=list)
+    candidates: list[Candidate] = field(default_factory=list)
+
+
+class Detector:
+    """Finds drones in the images of a rig."""
+
+    def __init__(
+        self, rig: Rig, networks: Networks, parameters: DetectionParameters, known_size: KnownSize | None = None
+    ) -> None:
+        self._rig, self._networks, self._parameters = rig, networks, parameters
+        stage = networks.second_stage
+        self._refining = None if stage is None else (stage.rules, Cascade(networks, stage, parameters, known_size))
+        self._renderers = {name: MaskRenderer(c, networks.map_stride) for name, c in rig.cameras.items()}
+
+    def detect(
+        self,
+        images: Mapping[str, UInt8Array],
+        scenes: Mapping[str, SceneMaps],
+        vehicle: VehicleState,
+        predictions: Sequence[Prediction],
+        trace: DetectionTrace,
+    ) -> tuple[tuple[Detection, ...], dict[str, UInt8Array]]:
+        """The drones in view, and each camera's mask (h, w) of their labels.
+
+        Args:
+            images: (h, w, 3) by camera.
+            scenes: what the first stage says of each, with depth in metres.
+            vehicle: for the attitude.
+            predictions: of tracks, where the second stage searches too.
+            trace: filled.
+        """
+        if not images:
+            return (), {}
+        rig = Rig({name: self._rig.cameras[name] for name in images})
+        if self._refining is None:
+            trace.candidates += candidates_from_depth(rig, scenes, self._parameters)
+            return self._masked(suppress(trace.candidates, self._parameters), images, scenes, ())
+        rules, cascade = self._refining
+        proposals = propose_instances(rig, scenes, rules, self._parameters)
+        candidates, rejected = cascade.refine(rig, images, proposals)
+        predicted = propose_predictions(rig, vehicle, predictions, [c.bearing for c in candidates], rules)
+        candidates += cascade.refine(rig, images, predicted)[0]
+        none = {proposal.instance for proposal in rejected if proposal.instance}
+        masks = {n: m.by_networks() for n, m in self._masks(separate(candidates), scenes, none).items()}
+        residuals = propose_residuals(rig, scenes, masks, rules, self._parameters)
+        candidates += cascade.refine(rig, images, residuals)[0]
+        trace.proposals += [*proposals, *predicted, *residuals]
+        trace.candidates += candidates
+        return self._masked(suppress(candidates, self._parameters), images, scenes, none)
+
+    def _masked(
+        self,
+        found: Suppressed,
+        images: Mapping[str, UInt8Array],
+        scenes: Mapping[str, SceneMaps],
+        rejected: Container[Instance],
+    ) -> tuple[tuple[Detection, ...], dict[str, UInt8Array]]:
+        masks = self._masks(found, scenes, rejected)
+        weight = self._parameters.colour_weight
+        return found.detections, {name: mask.by_colours(images[name], weight) for name, mask in masks.items()}
+
+    def _masks(
+        self, found: Suppressed, scenes: Mapping[str, SceneMaps], rejected: Container[Instance]
+    ) -> dict[str, DroneMasks]:
+        masks = {}
+        for name, scene in scenes.items():
+            labels = first_stage_labels(scene, found.labels_of(name), rejected)
+            masks[name] = DroneMasks(labels)
+            if scene.logit is not None:
+                masks[name] = self._renderers[name].render(labels, scene.logit, found.detections, found.masks_of)
+        return masks

@@ -1,0 +1,144 @@
+"""Where a drone may be: what the first stage segments, where tracks are predicted, and residuals that no mask explains.
+
+A proposal costs a few crops of the second stage, which decides.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from flockd.core.config.perception import DetectionParameters
+from flockd.core.messages import UNCLASSED, BoolArray, FloatArray, UInt8Array, VehicleState
+from flockd.flight.geometry import Rig, log_polar
+from flockd.flight.perception.detection.instances import Instance
+from flockd.flight.perception.detection.roi import CropRules, Roi, angle_between, roi_of_instance
+from flockd.flight.perception.maps import SceneMaps
+from flockd.flight.tracking import Prediction
+
+
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """Where a track should be, in log-polar coordinates of the body."""
+
+    bearing: FloatArray
+    """(3,) unit vector."""
+    log_range: float
+    covariance: FloatArray
+    """(3, 3) as of `Detection.covariance`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A region of interest, and where it comes from."""
+
+    cameras: tuple[str, ...]
+    """Those that show it."""
+    roi: Roi
+    instance: Instance | None = None
+    """Of the first stage; None where it comes from a prediction."""
+    predicted: Predicted | None = None
+    """Where it comes from a track; None elsewhere."""
+
+    @property
+    def area_px(self) -> float:
+        """Of its pixels in the first stage."""
+        return self.instance.area_px if self.instance else 0.0
+
+
+def propose_instances(
+    rig: Rig, scenes: Mapping[str, SceneMaps], rules: CropRules, parameters: DetectionParameters
+) -> list[Proposal]:
+    """What the first stage segments, of each image those of the highest score, in the order of the instances."""
+    return [
+        Proposal((name,), roi_of_instance(rig.cameras[name], instance, rules), instance)
+        for name, scene in scenes.items()
+        for instance in best_instances(scene, parameters.max_proposals)
+    ]
+
+
+def best_instances(scene: SceneMaps, most: int) -> list[Instance]:
+    """At most so many, and none below the score that the first stage asks for; of equal scores the larger."""
+    good = [one for one in scene.instances if one.score >= scene.min_score]
+    kept = {one.label for one in sorted(good, key=lambda one: (-one.score, -one.area_px))[:most]}
+    return [one for one in good if one.label in kept]
+
+
+def propose_predictions(
+    rig: Rig,
+    vehicle: VehicleState,
+    predictions: Iterable[Prediction],
+    detected: Sequence[FloatArray],
+    rules: CropRules,
+) -> list[Proposal]:
+    """Where a track is predicted and nothing was found.
+
+    Args:
+        rig: the cameras that have an image.
+        vehicle: for the attitude.
+        predictions: of the confirmed tracks.
+        detected: bearings (3,), in the body, of what was found already.
+        rules: for the crops.
+    """
+    proposals = []
+    for prediction in predictions:
+        R_body_ned = vehicle.R_ned_body.T
+        place = R_body_ned @ prediction.position
+        bearing, log_range = log_polar(place)
+        range_m = math.exp(log_range)
+        covariance = R_body_ned @ prediction.covariance @ R_body_ned.T / range_m**2
+        roi = Roi(bearing, rules.half_angle(prediction.size_m, range_m))
+        cameras = tuple(name for name, pixel in rig.pixels_of(place[None]).items() if np.isfinite(pixel).all())
+        found = any(angle_between(roi.direction, bearing) < roi.half_angle for bearing in detected)
+        if cameras and not found:
+            proposals.append(Proposal(cameras, roi, predicted=Predicted(bearing, log_range, covariance)))
+    return proposals
+
+
+def propose_residuals(
+    rig: Rig,
+    scenes: Mapping[str, SceneMaps],
+    masks: Mapping[str, UInt8Array],
+    rules: CropRules,
+    parameters: DetectionParameters,
+) -> list[Proposal]:
+    """Where the first stage is certain of a drone and no mask of the second explains it.
+
+    A drone that another hides in part, or passes close by, is often segmented as a part of it. Instances of too low a
+    score to be proposed are no residuals. ``masks`` are the networks' alone: by colours, one drone's would take more of
+    another that is painted alike.
+    """
+    proposals = []
+    for name, scene in scenes.items():
+        if scene.uncertain is None:
+            continue
+        mask = masks[name]
+        residual = (mask == UNCLASSED) & (scene.labels > 0) & ~scene.uncertain
+        proposed = best_instances(scene, parameters.max_proposals)
+        if len(proposed) < len(scene.instances):
+            residual &= np.isin(scene.labels, [one.label for one in proposed])
+        if residual.any():
+            masked = ((mask > 0) & (mask != UNCLASSED)).astype(np.uint8)
+            width = 2 * parameters.residual_distance_px + 1
+            residual &= cv2.dilate(masked, np.ones((width, width), np.uint8)) == 0
+            camera = rig.cameras[name]
+            most = min(parameters.max_residuals, parameters.max_proposals - len(proposed))
+            blobs = largest_blobs(residual, most, parameters.residual_px)
+            proposals += [Proposal((name,), roi_of_instance(camera, blob, rules), blob) for blob in blobs]
+    return proposals
+
+
+def largest_blobs(pixels: BoolArray, max_blobs: int, min_px: int) -> list[Instance]:
+    """The largest groups (at most ``max_blobs``) of at least ``min_px`` pixels (h, w) that touch each other."""
+    count, _, stats, centres = cv2.connectedComponentsWithStats(pixels.astype(np.uint8))
+    largest = sorted(range(1, count), key=lambda k: -stats[k, cv2.CC_STAT_AREA])[:max_blobs]
+    found = []
+    for k in largest:
+        left, top, width, height, area = (float(value) for value in stats[k])
+        if area >= min_px:
+            found.append(Instance(0, centres[k] + 0.5, np.array([left, top, left + width, top + height]), area))
+    return found

@@ -1,0 +1,219 @@
+"""The second stage as a cascade: each crop's estimate aims the next one, until the next would show the same again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from flockd.core.config.perception import DetectionParameters
+from flockd.core.messages import FloatArray, UInt8Array
+from flockd.flight.geometry import Rig, VirtualCrop, log_polar, log_polar_covariance, log_polar_residual
+from flockd.flight.perception.detection.masks import CropMask
+from flockd.flight.perception.detection.proposals import Proposal
+from flockd.flight.perception.detection.roi import Roi, take_crops
+from flockd.flight.perception.detection.second_stage import SecondStage
+from flockd.flight.perception.maps import Crop, KnownSize, RangeEstimate
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A drone as one proposal's crops show it, in log-polar coordinates of the body."""
+
+    proposal: Proposal
+    bearing: FloatArray
+    """(3,) unit vector."""
+    log_range: float
+    """Of metres."""
+    log_range_sigma: float
+    bearing_sigma_rad: float
+    size_m: float
+    drone_probability: float = 1.0
+    masks: tuple[CropMask, ...] = ()
+
+    @property
+    def range_m(self) -> float:
+        """From the body's origin."""
+        return math.exp(self.log_range)
+
+    @property
+    def position(self) -> FloatArray:
+        """(3,) metres in the body."""
+        return self.range_m * self.bearing
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(3, 3) as of `Detection.covariance`."""
+        return log_polar_covariance(self.bearing, self.log_range_sigma, self.bearing_sigma_rad)
+
+
+class RangeNetwork(Protocol):
+    """Of `flockd.flight.perception.networks.Networks`, what refinement needs."""
+
+    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+        """Range and centre of the drone in the middle of each crop."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class _Stage:
+    """The next crop of a proposal."""
+
+    proposal: Proposal
+    roi: Roi
+    drone_probability: float = 1.0
+    """The least that an earlier crop gave, but for the first, which may be far from what suits the drone."""
+
+
+class Cascade:
+    """Refines proposals with the network of the second stage."""
+
+    def __init__(
+        self,
+        network: RangeNetwork,
+        second_stage: SecondStage,
+        parameters: DetectionParameters,
+        known_size: KnownSize | None = None,
+    ) -> None:
+        """``known_size``: of every drone; None: the network judges each one's."""
+        self._network, self._crop_size, self._known_size = network, second_stage.crop_size, known_size
+        self._rules, self._thresholds, self._parameters = second_stage.rules, second_stage.thresholds, parameters
+
+    def refine(
+        self, rig: Rig, images: Mapping[str, UInt8Array], proposals: Sequence[Proposal]
+    ) -> tuple[list[Candidate], list[Proposal]]:
+        """The drones among the proposals, and the proposals that surely are none.
+
+        At least two crops each, the further ones cut to the drone's size with it in the middle, then one of its mirror
+        image. Where two cameras share the drone, the crops show it whole.
+
+        Args:
+            rig: the cameras that have an image.
+            images: (h, w, 3) by camera.
+            proposals: of all cameras.
+        """
+        settled: list[tuple[_Stage, Candidate]] = []
+        rejected: list[Proposal] = []
+        stages = [_Stage(proposal, proposal.roi) for proposal in proposals]
+        for number in range(1, self._rules.max_crops + 1):
+            if not stages:
+                break
+            further = []
+            for stage, candidate in zip(stages, self._candidates(rig, images, stages), strict=True):
+                probability = min(stage.drone_probability, candidate.drone_probability)
+                if probability <= self._thresholds.another_crop:
+                    rejected.append(stage.proposal)
+                    continue
+                if not self._is_in_range(candidate):
+                    continue
+                roi = self._next_roi(rig, stage, candidate)
+                following = _Stage(stage.proposal, roi, probability if number > 1 else 1.0)
+                if number == 1 or (number < self._rules.max_crops and not self._would_repeat(stage.roi, roi)):
+                    further.append(following)
+                elif probability > self._thresholds.drone:  # a mirror image would not raise it
+                    settled.append((following, candidate))
+            stages = further
+        candidates = []
+        for candidate in self._with_mirrored(rig, images, settled):
+            if candidate.drone_probability <= self._thresholds.another_crop:
+                rejected.append(candidate.proposal)
+            elif candidate.drone_probability > self._needed(candidate.proposal) and self._is_as_predicted(candidate):
+                candidates.append(candidate)
+        return candidates, rejected
+
+    def _candidates(self, rig: Rig, images: Mapping[str, UInt8Array], stages: Sequence[_Stage]) -> list[Candidate]:
+        """What the network says of each crop, in the body."""
+        if not stages:
+            return []
+        crops, views = take_crops(rig, images, [stage.roi for stage in stages], self._crop_size)
+        return [
+            self._candidate(stage, view, estimate)
+            for stage, view, estimate in zip(stages, views, self._network.ranges(crops), strict=True)
+        ]
+
+    def _candidate(self, stage: _Stage, view: VirtualCrop, estimate: RangeEstimate) -> Candidate:
+        """The camera sits beside the body's origin, so that bearing and range change a little."""
+        if self._known_size is not None:
+            estimate = estimate.of_size(self._known_size)
+        ray = view.camera.rays(estimate.centre[None])[0]
+        bearing, log_range = ray, estimate.log_range
+        if math.isfinite(log_range) and log_range < math.log(2 * self._parameters.max_range_m):
+            place = view.T_body_virtual.apply(math.exp(log_range) * ray[None])[0]
+            bearing, log_range = log_polar(place)
+        masks = () if estimate.mask is None else (CropMask(view, estimate.mask, stage.roi.half_angle),)
+        return Candidate(
+            stage.proposal, bearing, log_range, estimate.log_range_sigma, self._thresholds.bearing_sigma_rad,
+            estimate.size_m, estimate.drone_probability, masks,
+        )  # fmt: skip
+
+    def _with_mirrored(
+        self, rig: Rig, images: Mapping[str, UInt8Array], settled: Sequence[tuple[_Stage, Candidate]]
+    ) -> list[Candidate]:
+        """Each candidate together with what the mirror image of its crop says; without those that it contradicts."""
+        stages = []
+        for stage, _ in settled:
+            half_angle = self._rules.mirror_scale * stage.roi.half_angle
+            stages.append(replace(stage, roi=replace(stage.roi, half_angle=half_angle, mirrored=True)))
+        together = []
+        for (stage, candidate), other in zip(settled, self._candidates(rig, images, stages), strict=True):
+            if self._is_in_range(other) and min(candidate.log_range_sigma, other.log_range_sigma) > 0:
+                both = mean_candidate(candidate, other)
+                sigma = self._thresholds.mean_sigma * both.log_range_sigma
+                together.append(
+                    replace(
+                        both,
+                        log_range_sigma=max(sigma, self._thresholds.min_log_range_sigma),
+                        drone_probability=min(stage.drone_probability, both.drone_probability),
+                    )
+                )
+        return together
+
+    def _next_roi(self, rig: Rig, stage: _Stage, candidate: Candidate) -> Roi:
+        """With the drone in its middle, or where the proposal was if no camera sees that direction."""
+        seen = bool(rig.covers(candidate.bearing[None])[0])
+        direction = candidate.bearing if seen else stage.proposal.roi.direction
+        half_angle = self._rules.half_angle(candidate.size_m, candidate.range_m, stage.roi.half_angle)
+        return Roi(direction, half_angle, candidate.range_m)
+
+    def _would_repeat(self, roi: Roi, further: Roi) -> bool:
+        return roi.resembles(further, self._parameters.crop_shift, self._parameters.crop_resize)
+
+    def _is_in_range(self, candidate: Candidate) -> bool:
+        """False for NaN too."""
+        low, high = math.log(self._parameters.min_range_m), math.log(self._parameters.max_range_m)
+        return low < candidate.log_range < high
+
+    def _needed(self, proposal: Proposal) -> float:
+        return self._thresholds.drone if proposal.predicted is None else self._thresholds.predicted_drone
+
+    def _is_as_predicted(self, candidate: Candidate) -> bool:
+        """Within a Mahalanobis distance of the track that it was proposed for."""
+        track = candidate.proposal.predicted
+        if track is None:
+            return True
+        residual = log_polar_residual(candidate.bearing, candidate.log_range, track.bearing, track.log_range)
+        extent = self._parameters.drone_extent * candidate.size_m / candidate.range_m
+        spread = track.covariance + candidate.covariance + extent**2 * np.eye(3)
+        return float(residual @ np.linalg.solve(spread, residual)) < self._parameters.prediction_gate**2
+
+
+def mean_candidate(one: Candidate, other: Candidate) -> Candidate:
+    """The mean of log range, bearing, log size and log sigma, weighted by the variances; the lesser probability."""
+    weight = one.log_range_sigma**-2 / (one.log_range_sigma**-2 + other.log_range_sigma**-2)
+
+    def mean(a: float, b: float) -> float:
+        return weight * a + (1.0 - weight) * b
+
+    bearing = weight * one.bearing + (1.0 - weight) * other.bearing
+    return replace(
+        one,
+        bearing=bearing / np.linalg.norm(bearing),
+        log_range=mean(one.log_range, other.log_range),
+        log_range_sigma=math.exp(mean(math.log(one.log_range_sigma), math.log(other.log_range_sigma))),
+        size_m=math.exp(mean(math.log(one.size_m), math.log(other.size_m))),
+        drone_probability=min(one.drone_probability, other.drone_probability),
+        masks=one.masks + other.masks,
+    )

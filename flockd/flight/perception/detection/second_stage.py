@@ -1,0 +1,74 @@
+"""What a network of the second stage asks for: how its crops are cut, and how its outputs are judged."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from flockd.core.errors import ModelError
+from flockd.flight.inference import Manifest
+from flockd.flight.perception.detection.roi import CropRules
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Decision thresholds on the network's outputs. They belong to its weights, and are in its manifest."""
+
+    drone: float
+    """Least drone probability of a detection."""
+    predicted_drone: float
+    """The same where a track was predicted."""
+    another_crop: float
+    """With no more than this, a proposal is rejected without another crop."""
+    mean_sigma: float
+    """Error of the mean of a crop and its mirrored one, as a share of what a single crop's would be."""
+    min_log_range_sigma: float
+    bearing_sigma_rad: float
+
+
+@dataclass(frozen=True)
+class SecondStage:
+    """A network's interface."""
+
+    crop_size: int
+    """Width and height of its crops, pixels."""
+    rules: CropRules
+    thresholds: Thresholds
+
+    @classmethod
+    def of(cls, manifest: Manifest, verification: Manifest | None = None) -> SecondStage:
+        """Of a distance network, and of the verification network whose probability counts instead of its own.
+
+        Raises ModelError where a manifest does not say how crops are cut or outputs are judged, or where the two take
+        crops of different sizes.
+        """
+        judge = verification or manifest
+        if judge.fixed_size != manifest.fixed_size:
+            raise ModelError(
+                f"perception.verification: model {judge.name} takes crops of another size than {manifest.name}; "
+                "choose one that takes the same"
+            )
+        crop = manifest.crop
+        if crop is None:
+            raise ModelError(f"model {manifest.name} takes no crops; choose one whose manifest has a section `crop`")
+        return cls(
+            crop_size=manifest.crop_size_px,
+            rules=CropRules(
+                fill=crop.fill,
+                first_margin=crop.first_margin,
+                cut_margin=crop.cut_margin,
+                mirror_scale=crop.mirror_scale,
+                min_half_angle=math.radians(crop.min_half_angle_deg),
+                max_half_angle=math.radians(crop.max_half_angle_deg),
+                max_resize=crop.max_resize,
+                max_crops=crop.max_crops,
+            ),
+            thresholds=Thresholds(
+                drone=judge.threshold("drone_probability"),
+                predicted_drone=judge.threshold("expected_drone_probability"),
+                another_crop=judge.threshold("another_crop_probability"),
+                mean_sigma=manifest.threshold("mean_sigma_factor"),
+                min_log_range_sigma=manifest.threshold("min_relative_sigma"),
+                bearing_sigma_rad=manifest.threshold("bearing_sigma_rad"),
+            ),
+        )

@@ -1,0 +1,30 @@
+"""Grey levels, smoothing and gradients of images, as several methods of flow need them."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from flockd.core.messages import Float32Array, UInt8Array
+
+
+def grey(image: UInt8Array) -> UInt8Array:
+    """(h, w) grey levels of (h, w, 3) RGB."""
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def smoothed(image: UInt8Array | Float32Array, sigma_px: float) -> Float32Array:
+    """The image after a Gaussian filter."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), dtype=np.float32)
+
+
+def gradients(image: Float32Array, kernel: Literal["central", "sobel"]) -> tuple[Float32Array, Float32Array]:
+    """How the grey levels of (h, w) change per pixel to the right and down.
+
+    ``central``: differences of both neighbours; ``sobel``: of three rows or columns of them, which has less noise.
+    """
+    size, scale = (1, 1 / 2) if kernel == "central" else (3, 1 / 8)
+    right, down = (cv2.Sobel(image, cv2.CV_32F, *way, ksize=size, scale=scale) for way in ((1, 0), (0, 1)))
+    return np.asarray(right, np.float32), np.asarray(down, np.float32)

@@ -1,0 +1,93 @@
+"""What networks say, in units: the maps of one image, and the range of the drone in one crop."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from flockd.core.messages import BoolArray, Float32Array, FloatArray, UInt8Array
+from flockd.flight.geometry import PinholeCamera, RigidTransform
+from flockd.flight.perception.detection.instances import Instance
+
+
+@dataclass(frozen=True, eq=False)
+class OpenDepth:
+    """What a network says of depth while its scale is open."""
+
+    inverse: Float32Array
+    """(h, w): a factor makes 1/m of it."""
+    shift: bool
+    """Whether something has to be added as well: the inverse depth is known up to scale and shift."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneMaps:
+    """What the networks say of one image."""
+
+    depth: Float32Array
+    """(h, w) metres along the optical axis; the sky is very far. All NaN while the scale is open."""
+    labels: UInt8Array
+    """(h, w) 0 for background, then one value a drone."""
+    instances: tuple[Instance, ...]
+    open: OpenDepth | None = None
+    """What is there instead of metres, for `flockd.flight.perception.depth` to fix."""
+    uncertain: BoolArray | None = None
+    """(h, w) pixels of the drones that may just as well be background; None: no such."""
+    logit: Float32Array | None = None
+    """(h, w) / `Networks.map_stride`, of each pixel being any drone's; None: the labels are all that is known."""
+    min_score: float = 0.0
+    """Instances of a lower score are not proposed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Crop:
+    """A small image of one region of interest, as a virtual camera that faces it sees it."""
+
+    image: UInt8Array
+    """(size, size, 3) RGB"""
+    camera: PinholeCamera
+    T_body_camera: RigidTransform
+    mirrored: bool = False
+    """Whether the network is to be given the mirror image, on which it errs differently. The estimate is as if not."""
+
+
+@dataclass(frozen=True)
+class KnownSize:
+    """Of every drone of the fleet, from tip to tip, and its standard deviation."""
+
+    size_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class RangeEstimate:
+    """What the second stage says of one crop."""
+
+    log_range: float
+    """Natural logarithm of the range in metres, from the virtual camera's optical centre."""
+    log_range_sigma: float
+    """Standard deviation of `log_range`."""
+    centre: FloatArray
+    """(2,) u, v of the drone's centre in the crop."""
+    size_m: float
+    """The drone's size from tip to tip; errs like the range does, but is the same in every crop of one drone."""
+    drone_probability: float = 1.0
+    """Of there being a drone at all."""
+    mask: Float32Array | None = None
+    """(size, size) logit of each pixel of the crop being that drone's; None: the model does not say."""
+
+    def of_size(self, known: KnownSize) -> RangeEstimate:
+        """With the range at which a drone of a known size has this apparent size.
+
+        The network says one deviation, that of its range; as it judges most drones' size well, that is what its
+        apparent size errs by. The known size's own deviation adds to it, as the two are independent.
+        """
+        if not (self.size_m > 0 and math.isfinite(self.size_m)):
+            return replace(self, log_range=math.nan)
+        log_apparent_size = math.log(self.size_m) - self.log_range
+        return replace(
+            self,
+            log_range=math.log(known.size_m) - log_apparent_size,
+            log_range_sigma=math.hypot(self.log_range_sigma, known.sigma_m / known.size_m),
+            size_m=known.size_m,
+        )

@@ -1,0 +1,322 @@
+"""The networks' side of perception: flow of a pair of images, depth and drones of one, range of the drone in a crop."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from flockd.core.choices import Role
+from flockd.core.config.perception import NO_MODEL, PerceptionConfig
+from flockd.core.errors import ModelError
+from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
+from flockd.flight.geometry import RigCamera
+from flockd.flight.inference.checks import Deadline, no_deadline
+from flockd.flight.inference.fitting import fit
+from flockd.flight.inference.manifest import Unknown
+from flockd.flight.inference.manifest_file import manifest_path
+from flockd.flight.inference.providers import engines_folder
+from flockd.flight.inference.session import OnnxModel
+from flockd.flight.perception.detection.instances import group_instances
+from flockd.flight.perception.detection.second_stage import SecondStage
+from flockd.flight.perception.flow import DisFlow, Flow, OnnxFlow, background_flow, object_flow
+from flockd.flight.perception.maps import Crop, OpenDepth, RangeEstimate, SceneMaps
+from flockd.flight.perception.requirements import check_roles
+
+CROPS_PER_RUN = 24
+"""Crops in one run of a network, so that an image full of false proposals does not take more memory."""
+_MIN_DEPTH_M, _MAX_DEPTH_M = 1e-3, 1e3
+"""Where a reciprocal of depth is taken: nearer than the lens, and where flow and height measure nothing any more."""
+_MIN_RAY_Z = 0.1
+"""Of a unit ray, for its tangents to stay finite: 84 degrees off the optical axis."""
+
+
+class Networks(Protocol):
+    """What perception asks of networks: `OnnxNetworks`, or exact ones that a simulator puts in their place."""
+
+    @property
+    def map_stride(self) -> int:
+        """Image pixels per pixel of the first stage's maps."""
+        ...
+
+    @property
+    def second_stage(self) -> SecondStage | None:
+        """How the crops are cut that `ranges` takes; None: there is no second stage."""
+        ...
+
+    def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
+        """(h, w, 2) pixels from the first image to the second.
+
+        ``labels`` (h, w) of the first image: one value a drone, 0 and 255 none.
+        """
+        ...
+
+    def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
+        """Depth and drones of one image.
+
+        ``ground`` (h / map_stride, w / map_stride) is the inverse depth (1/m) of flat ground, where attitude and height
+        are to fix the scale.
+        """
+        ...
+
+    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+        """Range and centre of the drone in the middle of each crop.
+
+        The range may be NaN where the probability is no more than `second_stage` asks for another crop.
+        """
+        ...
+
+
+class OnnxNetworks:
+    """The networks that a configuration names. Stateless: may serve several pilots."""
+
+    def __init__(self, config: PerceptionConfig, models_dir: Path, deadline: Deadline = no_deadline) -> None:
+        """``deadline`` is for each network's run on its golden input. Raises ModelError."""
+        self._models: dict[str, OnnxModel] = {}
+        self._dir = models_dir
+        self._config = config
+        self._deadline = deadline
+        cv2.setNumThreads(config.threads)
+        self._flow = self._build_flow(config)
+        self._depth = self._model(config.depth, "depth")
+        self._segmentation = self._model(config.segmentation, "segmentation")
+        self._unknown = self._what_is_unknown(config)
+        self._distance = None if config.distance == NO_MODEL else self._model(config.distance, "distance")
+        has_verification = self._distance is not None and config.verification != NO_MODEL
+        self._verification = self._model(config.verification, "verification") if has_verification else None
+        self.map_stride = self._segmentation.manifest.map_stride or 1
+        self.second_stage = None
+        if self._distance is not None:
+            verification = None if self._verification is None else self._verification.manifest
+            self.second_stage = SecondStage.of(self._distance.manifest, verification)
+
+    def terminate(self) -> None:
+        """Ends every run of a network that is under way; its caller gets an error."""
+        for model in self._models.values():
+            model.terminate()
+
+    def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
+        """See `Networks`. The flow of each drone is found by itself."""
+        before, after = first.image, second.image
+        flow = self._flow.flow(before, after)
+        if self._config.flow_refinement == "quick_dis":
+            flow = background_flow(flow, before, after, labels)
+        return object_flow(flow, before, after, labels)
+
+    def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
+        """See `Networks`."""
+        height, width = frame.image.shape[:2]
+        planes = geometry_planes(camera, ground, self.map_stride)
+        maps = self._run(self._depth, frame.image, planes)
+        depth = np.asarray(
+            cv2.resize(maps["depth"][0], (width, height), interpolation=cv2.INTER_NEAREST), dtype=np.float32
+        )
+        if self._segmentation is not self._depth:
+            maps = self._run(self._segmentation, frame.image, planes)
+        logit = self._at_map_stride(maps["drone"], (width, height))[0]
+        offset = self._at_map_stride(maps["offset"], (width, height))
+        # A second stage weeds out false proposals, so that the first may propose more.
+        threshold = self._segmentation.manifest.threshold
+        alone = threshold("proposal_logit_alone")
+        proposal, certain = alone, alone
+        if self._distance is not None:
+            proposal, certain = threshold("proposal_logit"), threshold("mask_logit")
+        labels, instances = group_instances(logit - np.float32(proposal), offset, scale=self.map_stride)
+        labels = np.asarray(cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
+        low = cv2.resize((logit < certain).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+        peak = self._segmentation.manifest.thresholds.get("proposal_peak_logit", proposal) - proposal
+        scene = SceneMaps(
+            np.full_like(depth, np.nan), labels, instances, uncertain=low & (labels > 0), logit=logit, min_score=peak
+        )
+        return self._with_depth(scene, depth, camera)
+
+    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+        """See `Networks`."""
+        if self._distance is None or self.second_stage is None:
+            raise ValueError("this configuration has no distance model")
+        if not crops:
+            return ()
+        images = [np.ascontiguousarray(c.image[:, ::-1]) if c.mirrored else c.image for c in crops]
+        size = self.second_stage.crop_size
+        if self._verification is None:
+            return self._ranges(self._distance, crops, images, np.zeros(len(crops)), limit=math.inf)
+        outputs = _in_batches(self._verification, images)
+        logits = self._verification.manifest.results["drone"].by_column(outputs["drone"])["drone_logit"].astype(float)
+        limit = self._verification.manifest.threshold("distance_logit_limit")
+        # Where there is no drone, there is no range to ask for: most crops of a cluttered image end here.
+        most = _probability(logits + limit)
+        rest = [k for k, p in enumerate(most) if p > self.second_stage.thresholds.another_crop]
+        ranged = self._ranges(
+            self._distance, [crops[k] for k in rest], [images[k] for k in rest], logits[rest], limit=limit
+        )
+        estimates = [_no_range(float(p), size) for p in most]
+        for k, estimate in zip(rest, ranged, strict=True):
+            estimates[k] = estimate
+        return tuple(estimates)
+
+    @staticmethod
+    def _ranges(
+        distance: OnnxModel,
+        crops: Sequence[Crop],
+        images: Sequence[UInt8Array],
+        logits: FloatArray,
+        *,
+        limit: float,
+    ) -> tuple[RangeEstimate, ...]:
+        """What the distance network says of crops, given their images as they enter.
+
+        Of there being a drone, what it says is added to ``logits`` (n,), up to ``limit``: log odds of independent
+        evidence add.
+        """
+        if not crops:
+            return ()
+        outputs = _in_batches(distance, images)
+        columns = distance.manifest.results["range"].by_column(outputs["range"])
+        evidence = logits + np.clip(columns["drone_logit"], -limit, limit)
+        masks = list(outputs["mask"][:, 0]) if "mask" in outputs else [None] * len(crops)
+        return tuple(
+            _estimate({name: float(column[k]) for name, column in columns.items()}, float(evidence[k]), crop, masks[k])
+            for k, crop in enumerate(crops)
+        )
+
+    def _run(self, model: OnnxModel, image: UInt8Array, planes: Float32Array) -> dict[str, Float32Array]:
+        """One model's maps (c, h, w) that show all of an image, at the model's resolution."""
+        fitting = fit(model.manifest, (image.shape[1], image.shape[0]))
+        contents: dict[str, Sequence[UInt8Array] | Float32Array] = {"image": [fitting.enter(image)]}
+        if "geometry" in model.manifest.contents:
+            contents["geometry"] = fitting.enter_planes(planes, self.map_stride)[None]
+        return {name: fitting.inside(map_)[0] for name, map_ in model.infer(contents).items()}
+
+    def _at_map_stride(self, maps: Float32Array, image: tuple[int, int]) -> Float32Array:
+        """(c, h, w) at the resolution that drones are segmented at; two channels are pixels of the map."""
+        width, height = image[0] // self.map_stride, image[1] // self.map_stride
+        if maps.shape[1:] == (height, width):
+            return maps
+        resized = np.stack([cv2.resize(plane, (width, height), interpolation=cv2.INTER_LINEAR) for plane in maps])
+        if len(maps) == 2:
+            resized *= np.array([width / maps.shape[2], height / maps.shape[1]], np.float32)[:, None, None]
+        return np.asarray(resized, dtype=np.float32)
+
+    def _with_depth(self, scene: SceneMaps, depth: Float32Array, camera: RigCamera) -> SceneMaps:
+        """With metres where the depth network knows them, else with what it leaves open."""
+        meaning = self._depth.manifest.results["depth"].depth
+        is_inverse = meaning.quantity == "inverse_depth"
+        if meaning.focal_px:
+            size = (depth.shape[1], depth.shape[0])
+            longer = fit(self._depth.manifest, size).scale[0] * camera.camera.focal_px / meaning.focal_px
+            depth = depth / longer if is_inverse else depth * longer
+        if self._unknown == "nothing":
+            metres = 1.0 / np.maximum(depth, 1.0 / _MAX_DEPTH_M) if is_inverse else depth
+            return replace(scene, depth=np.asarray(metres, np.float32))
+        inverse = depth if is_inverse else 1.0 / np.maximum(depth, _MIN_DEPTH_M)
+        return replace(scene, open=OpenDepth(np.asarray(inverse, np.float32), shift=self._unknown == "scale_and_shift"))
+
+    def _what_is_unknown(self, config: PerceptionConfig) -> Unknown:
+        """What of the depth is left for the autopilot's height or velocity to fix. Raises ModelError."""
+        manifest = self._depth.manifest
+        unknown = manifest.results["depth"].depth.unknown
+        if config.scale == "network" and unknown != "nothing":
+            raise ModelError(
+                f"perception.scale: depth model {config.depth!r} has no metric scale for `network` to take; "
+                "write height or velocity, or choose a metric model"
+            )
+        takes_ground = "geometry" in manifest.contents
+        if unknown == "nothing" and (config.scale == "velocity" or (config.scale == "height" and not takes_ground)):
+            return "scale"
+        return unknown
+
+    def _build_flow(self, config: PerceptionConfig) -> Flow:
+        if config.flow == "dis":
+            return DisFlow()
+        network = OnnxFlow(self._model(config.flow, "flow"))
+        if config.flow_refinement == "none":
+            return network
+        return DisFlow(network, config.flow_refinement_scale, quick=config.flow_refinement == "quick_dis")
+
+    def _model(self, name: str, role: Role) -> OnnxModel:
+        path = manifest_path(self._dir, name)
+        key = str(path)
+        if key not in self._models:
+            if not path.is_file():
+                raise ModelError(f"perception.{role}: {_what_to_name_instead(name, role, path, self._dir)}")
+            self._models[key] = OnnxModel(
+                path,
+                threads=self._config.threads,
+                provider=self._config.provider,
+                engines=engines_folder(self._config),
+                check=check_roles,
+                deadline=self._deadline,
+            )
+        model = self._models[key]
+        if role not in model.manifest.roles:
+            raise ModelError(
+                f"perception.{role}: model {name!r} fills {', '.join(model.manifest.roles)} and not {role}; "
+                "choose another"
+            )
+        return model
+
+
+def _what_to_name_instead(name: str, role: Role, path: Path, folder: Path) -> str:
+    if name.endswith(".onnx"):
+        return f"{name} is a model's ONNX file; name the manifest beside it, {Path(name).with_suffix('.yaml')}"
+    if "/" in name and not name.endswith(".yaml"):
+        return f"{name!r} is no model's name, and no manifest; name the manifest, as in {Path(name) / role}.yaml"
+    at_hand = ", ".join(sorted(p.stem for p in folder.glob("*.yaml"))) or "none at hand"
+    return f"there is no model {name!r} ({path} is missing); choose one of {at_hand}"
+
+
+def _in_batches(model: OnnxModel, images: Sequence[UInt8Array]) -> dict[str, Float32Array]:
+    """A model's outputs for all crops, (n, ...) each."""
+    batches = [images[i : i + CROPS_PER_RUN] for i in range(0, len(images), CROPS_PER_RUN)]
+    outputs = [model.infer({"crop": batch}) for batch in batches]
+    return {name: np.concatenate([output[name] for output in outputs]) for name in outputs[0]}
+
+
+def _no_range(drone_probability: float, size: int) -> RangeEstimate:
+    """Of a crop that shows no drone."""
+    middle = np.full(2, size / 2)
+    return RangeEstimate(math.nan, math.nan, middle, math.nan, drone_probability=drone_probability)
+
+
+def _probability(logit: FloatArray) -> FloatArray:
+    return np.asarray(1.0 / (1.0 + np.exp(-logit)))
+
+
+def _estimate(columns: Mapping[str, float], drone_logit: float, crop: Crop, mask: Float32Array | None) -> RangeEstimate:
+    """Of one crop's output, with a mirror image's turned back."""
+    size = crop.camera.size[0]
+    right = columns["right_px"]
+    if crop.mirrored:
+        right = -right
+        mask = None if mask is None else np.ascontiguousarray(mask[:, ::-1])
+    return RangeEstimate(
+        log_range=columns["log_range_per_focal"] + float(np.log(crop.camera.focal_px)),
+        log_range_sigma=float(np.exp(columns["log_relative_sigma"])),
+        centre=np.array([size / 2 + right, size / 2 + columns["down_px"]]),
+        size_m=float(np.exp(columns["log_range_per_focal"] + columns["log_apparent_size"])),
+        drone_probability=float(_probability(np.array(drone_logit))),
+        mask=mask,
+    )
+
+
+def geometry_planes(camera: RigCamera, ground: Float32Array | None, stride: int) -> Float32Array:
+    """(3, h / stride, w / stride): tangents of the rays right and down, inverse depth of flat ground (0: none)."""
+    tangents = _ray_tangents(camera, stride)
+    flat = np.zeros(tangents.shape[1:], np.float32) if ground is None else ground
+    return np.concatenate([tangents, flat[None]])
+
+
+@lru_cache(maxsize=32)
+def _ray_tangents(camera: RigCamera, stride: int) -> Float32Array:
+    """(2, h / stride, w / stride) of the block centres' rays, right and down of the optical axis."""
+    width, height = camera.camera.size
+    u, v = np.meshgrid(np.arange(stride / 2, width, stride), np.arange(stride / 2, height, stride))
+    rays = camera.camera.rays(np.stack([u.ravel(), v.ravel()], 1))
+    tangents = rays[:, :2] / np.maximum(rays[:, 2:], _MIN_RAY_Z)
+    return np.ascontiguousarray(tangents.T.reshape(2, *u.shape), dtype=np.float32)

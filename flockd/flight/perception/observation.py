@@ -1,0 +1,64 @@
+"""What all cameras saw in one frame set, with one label a drone across the whole rig."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from flockd.core.messages import (
+    Detection,
+    Float32Array,
+    FloatArray,
+    GroundEstimate,
+    ObstacleRanges,
+    UInt8Array,
+    VehicleState,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class CameraObservation:
+    """One camera's image and maps, all of the camera's size."""
+
+    image: UInt8Array
+    """(h, w, 3) RGB."""
+    depth: Float32Array
+    """(h, w) metres, as `Camera.unproject` takes it; drones at their detections' ranges."""
+    labels: UInt8Array
+    """(h, w) 0 background, k the detection with label k, 255 not to be used."""
+    flow: Float32Array | None
+    """(h, w, 2) pixels from the image before to this one; None where there is none before."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """All cameras at one time."""
+
+    time_s: float
+    vehicle: VehicleState
+    cameras: Mapping[str, CameraObservation]
+    detections: tuple[Detection, ...]
+    previous: Observation | None
+    """What the flow comes from; its own previous one is None. None where the pair starts anew."""
+    reasons: tuple[str, ...] = ()
+    """Why something is missing: each is one short sentence."""
+    noisy_cameras: tuple[str, ...] = ()
+    """Whose images were noise, and were not used."""
+    ground: GroundEstimate | None = None
+    """See `PilotOutput.ground`."""
+    ground_track: FloatArray | None = None
+    """(k, 3) metres NED from the drone: where the last ranges hit the ground; None: no range finder is used."""
+    obstacles: ObstacleRanges | None = None
+    """Exact ones, of a simulation; None: they are in the cameras' depth."""
+
+    @property
+    def flows(self) -> dict[str, Float32Array]:
+        """By camera, where both observations have an image."""
+        return {name: camera.flow for name, camera in self.cameras.items() if camera.flow is not None}
+
+    @property
+    def interval_s(self) -> float:
+        """Since the previous observation. Raises ValueError where there is none."""
+        if self.previous is None:
+            raise ValueError("a single observation has no interval")
+        return self.time_s - self.previous.time_s

@@ -1,0 +1,195 @@
+"""What each role of perception needs of a model's manifest: inputs, outputs, columns, thresholds, crop."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+from flockd.core.choices import ROLES, Role
+from flockd.flight.inference.manifest import Fault, Manifest
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """A number by which a model's outputs are judged."""
+
+    meaning: str
+    low: float
+    high: float
+    """It lies between these, both included."""
+    optional: bool = False
+    """Whether a manifest may leave it out."""
+
+
+@dataclass(frozen=True)
+class Requirements:
+    """Of one role."""
+
+    inputs: tuple[str, ...]
+    """What its inputs carry."""
+    outputs: tuple[str, ...]
+    """What its outputs give."""
+    optional_inputs: tuple[str, ...] = ()
+    columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Of an output (n, k): the columns it has to have, in any order."""
+    thresholds: Mapping[str, Threshold] = field(default_factory=dict)
+    crop: bool = False
+    """Whether the manifest has to say how crops are cut."""
+    map_stride: bool = False
+
+
+_PROBABILITIES = {
+    "drone_probability": Threshold("A refined proposal below this probability is no drone.", 0.0, 1.0),
+    "expected_drone_probability": Threshold("The same where a track predicts a drone.", 0.0, 1.0),
+    "another_crop_probability": Threshold(
+        "A proposal up to this probability is refused without another crop.", 0.0, 1.0
+    ),
+}
+_LOGIT = (-50.0, 50.0)
+"""The bounds of a threshold that is a logit: beyond, a float32 probability is 0 or 1."""
+_GEOMETRY = ("geometry",)
+"""Planes of the rays' tangents right and down, and of the inverse depth (1/m) of flat ground, 0 where unknown."""
+
+REQUIREMENTS: Mapping[Role, Requirements] = {
+    "flow": Requirements(inputs=("first", "second"), outputs=("flow",)),
+    "depth": Requirements(inputs=("image",), outputs=("depth",), optional_inputs=_GEOMETRY),
+    "segmentation": Requirements(
+        inputs=("image",),
+        outputs=("drone", "offset"),
+        optional_inputs=_GEOMETRY,
+        thresholds={
+            "proposal_logit": Threshold(
+                "Logit from which pixels make proposals where a second stage refuses those that are no drones.", *_LOGIT
+            ),
+            "mask_logit": Threshold(
+                "Logit from which pixels of a proposal count as the drone's; above the proposals', whose masks are a "
+                "little too wide.",
+                *_LOGIT,
+            ),
+            "proposal_peak_logit": Threshold(
+                "Highest logit of its pixels from which a proposal goes to the second stage; by default any does.",
+                *_LOGIT,
+                optional=True,
+            ),
+            "proposal_logit_alone": Threshold(
+                "Logit from which pixels are a drone's where there is no second stage.", *_LOGIT
+            ),
+        },
+        map_stride=True,
+    ),
+    "distance": Requirements(
+        inputs=("crop",),
+        outputs=("range",),
+        columns={
+            "range": (
+                "log_range_per_focal",
+                "right_px",
+                "down_px",
+                "log_relative_sigma",
+                "drone_logit",
+                "log_apparent_size",
+            )
+        },
+        thresholds={
+            **_PROBABILITIES,
+            "bearing_sigma_rad": Threshold("Standard deviation of a refined bearing, each way.", 1e-6, 1.0),
+            "min_relative_sigma": Threshold("Least standard deviation of a range, as a share of it.", 0.0, 1.0),
+            "mean_sigma_factor": Threshold(
+                "Standard deviation of the mean of the last crop and the mirrored one, as a share of what each says "
+                "of its own.",
+                1e-3,
+                1.0,
+            ),
+        },
+        crop=True,
+    ),
+    "verification": Requirements(
+        inputs=("crop",),
+        outputs=("drone",),
+        columns={"drone": ("drone_logit",)},
+        thresholds={
+            **_PROBABILITIES,
+            "distance_logit_limit": Threshold(
+                "The distance network's logit counts as well, up to this much for or against a drone.", 0.0, 50.0
+            ),
+        },
+    ),
+}
+"""The table that a manifest is checked against. A distance model may give a `mask` (n, h, w) of logits as well."""
+
+
+def check_roles(manifest: Manifest) -> Iterator[Fault]:
+    """What a manifest lacks for its roles, and what none of them knows: the check to open perception's models with."""
+    known: list[Requirements] = []
+    for index, name in enumerate(manifest.roles):
+        role = next((role for role in ROLES if role == name), None)
+        if role is None:
+            yield Fault(("roles", index), f"{name} is not a role; the roles are {', '.join(ROLES)}")
+            return
+        known.append(REQUIREMENTS[role])
+        yield from _faults_of_tensors(manifest, role, REQUIREMENTS[role])
+        yield from _faults_of_numbers(manifest, role, REQUIREMENTS[role])
+    yield from _unknown_to_all(manifest, known)
+
+
+def _faults_of_tensors(manifest: Manifest, role: Role, needed: Requirements) -> Iterator[Fault]:
+    for content in needed.inputs:
+        if content not in manifest.contents:
+            message = f"the role {role} needs one that carries {content!r}; name it so, or set its `carries`"
+            yield Fault(("inputs",), message)
+    for result in needed.outputs:
+        if result not in manifest.results:
+            message = f"the role {role} needs one that gives {result!r}; name it so, or set its `gives`"
+            yield Fault(("outputs",), message)
+    for result, columns in needed.columns.items():
+        spec = manifest.results.get(result)
+        for column in columns:
+            if spec is not None and column not in spec.columns:
+                message = f"has no {column!r}; name the model's columns in their order, of which {role} needs "
+                yield Fault(("outputs", _key(manifest, result), "columns"), message + ", ".join(columns))
+    if needed.crop:
+        yield from _faults_of_mask(manifest)
+
+
+def _faults_of_numbers(manifest: Manifest, role: Role, needed: Requirements) -> Iterator[Fault]:
+    for name, threshold in needed.thresholds.items():
+        value = manifest.thresholds.get(name)
+        limits = f"a number from {threshold.low:g} to {threshold.high:g}"
+        if value is None:
+            if not threshold.optional:
+                yield Fault(("thresholds", name), f"is missing for the role {role}; add it with {limits}")
+        elif not threshold.low <= value <= threshold.high:
+            yield Fault(("thresholds", name), f"{value:g} is out of range; write {limits}")
+    if needed.crop and manifest.crop is None:
+        yield Fault(("crop",), f"is missing for the role {role}; add a section that says how crops are cut out")
+    if needed.map_stride and manifest.map_stride is None:
+        yield Fault(("map_stride",), f"is missing for the role {role}; write how many image pixels a map pixel spans")
+
+
+def _faults_of_mask(manifest: Manifest) -> Iterator[Fault]:
+    mask, crop = manifest.results.get("mask"), manifest.contents.get("crop")
+    if mask is not None and crop is not None and mask.map_size != crop.image_size:
+        message = "has to be as high and wide as the crop that enters; correct it, or leave the mask out"
+        yield Fault(("outputs", _key(manifest, "mask"), "shape"), message)
+
+
+def _unknown_to_all(manifest: Manifest, known: list[Requirements]) -> Iterator[Fault]:
+    """What stands in the manifest and would not be used, which is a slip more often than not."""
+    inputs = {content for one in known for content in (*one.inputs, *one.optional_inputs)}
+    for name, spec in manifest.inputs.items():
+        content = spec.carries or name
+        if content not in inputs:
+            message = f"nothing is known to feed {content!r} with; set `carries` to one of {', '.join(sorted(inputs))}"
+            yield Fault(("inputs", name), message)
+        elif (spec.kind == "planes") != (content in _GEOMETRY):
+            yield Fault(("inputs", name, "kind"), f"has to be `{'planes' if content in _GEOMETRY else 'image'}` here")
+    names = [name for one in known for name in one.thresholds]
+    for name in manifest.thresholds:
+        if name not in names:
+            message = f"is not a threshold of its roles; delete it, or write one of {', '.join(names)}"
+            yield Fault(("thresholds", name), message if names else "is not a threshold of its roles; delete it")
+
+
+def _key(manifest: Manifest, result: str) -> str:
+    """The name of the output that gives a result."""
+    return next(name for name, spec in manifest.outputs.items() if (spec.gives or name) == result)

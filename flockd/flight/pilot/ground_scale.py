@@ -1,0 +1,85 @@
+"""The own motion's metric scale from the height above the ground that the motion itself shows.
+
+Two images and the motion between them give the depth of matched points in units of that motion, and so the ground's
+plane: its slope, and the drone's height above it. Where a range finder says how high that is, the unit is known.
+Ground is not plane, and a bump of 0.2 m straight below would be 4 % at 5 m: so, once the drone has flown far enough,
+the places that the last ranges hit are compared with the same places in the images.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from flockd.core.messages import EgoMotion, Float32Array, FloatArray
+from flockd.flight.geometry import (
+    GroundSamples,
+    Rig,
+    RigCamera,
+    RigidTransform,
+    fit_ground,
+    grid_pixels,
+    inverse_depths,
+    scale_on_track,
+)
+from flockd.flight.perception import CameraObservation, Observation
+
+STRIDE_PX = 4
+FLOW_SIGMA_PX = 0.3
+MIN_BASELINE_M = 0.08
+"""Across the line of sight; with less, the ground's depth is noise."""
+MAX_CORRECTION = 1.4
+"""Factor, or one over it: what would be more is a false plane."""
+
+
+def scaled_by_ground(rig: Rig, observation: Observation, ego: EgoMotion) -> tuple[EgoMotion, FloatArray]:
+    """The motion with the scale of the range finder's height, and the ground's slope (2,), north and east.
+
+    Raises ValueError with the reason where the ground does not tell.
+    """
+    ground = observation.ground
+    if ground is None or ground.source != "range_finder":
+        raise ValueError("no range to the ground")
+    samples = [
+        _samples(rig.cameras[name], observation, camera, flow, ego)
+        for name, camera in observation.cameras.items()
+        if (flow := camera.flow) is not None
+    ]
+    if not samples:
+        raise ValueError("no camera has both frames")
+    seen = GroundSamples.concatenate(samples)
+    plane = fit_ground(seen, ground.height_m, ground.slope)
+    factor = ground.height_m / plane.height
+    track = observation.ground_track
+    if track is not None:
+        with suppress(ValueError):  # before it has flown far enough, the plane alone tells
+            factor = scale_on_track(seen, track, plane.slope, factor)
+    if not abs(math.log(factor)) < math.log(MAX_CORRECTION):
+        raise ValueError("the ground that is seen does not fit the range")
+    return replace(ego, translation=ego.translation * factor), plane.slope
+
+
+def _samples(
+    camera: RigCamera, observation: Observation, now: CameraObservation, flow: Float32Array, ego: EgoMotion
+) -> GroundSamples:
+    """Matched background of one camera, at its place in the newest image."""
+    assert observation.previous is not None
+    labels_before = observation.previous.cameras[camera.name].labels
+    start = grid_pixels(camera.camera.size, STRIDE_PX)
+    column, row = start.astype(np.int64).T
+    end = start + flow[row, column]
+    used = camera.camera.in_image(end) & (labels_before[row, column] == 0)
+    start, end = start[used], end[used]
+    column, row = end.astype(np.int64).T
+    background = now.labels[row, column] == 0
+    start, end = start[background], end[background]
+    inverse, baseline = inverse_depths(camera, RigidTransform(ego.rotation, ego.translation), start, end)
+    R_ned_body, mount = observation.vehicle.R_ned_body, camera.T_body_camera
+    rays = camera.camera.unproject(end, np.ones(len(end))) @ (R_ned_body @ mount.rotation).T
+    clear = (baseline > MIN_BASELINE_M) & (inverse > 0.0) & np.isfinite(rays).all(axis=1)  # false for NaN
+    offsets = np.broadcast_to(R_ned_body @ mount.translation, rays.shape)
+    sigma = FLOW_SIGMA_PX / camera.camera.focal_px / np.maximum(baseline, MIN_BASELINE_M)
+    return GroundSamples(rays, inverse, offsets, sigma).select(clear)

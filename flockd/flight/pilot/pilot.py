@@ -1,0 +1,388 @@
+"""``FlockPilot.step``: camera frames and the own autopilot's state in, velocity command out. No clock, no I/O."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from flockd.core.config.drone import DroneConfig
+from flockd.core.messages import (
+    BoolArray,
+    Detection,
+    EgoMotion,
+    FloatArray,
+    FrameSet,
+    MissionOrder,
+    MissionStatus,
+    Neighbour,
+    NeighbourMotion,
+    ObstacleRanges,
+    PilotOutput,
+    VehicleState,
+    VelocityCommand,
+)
+from flockd.flight.flocking import FlockingLaw, level_offsets
+from flockd.flight.geometry import build_rig
+from flockd.flight.mission import Moment, Navigator
+from flockd.flight.mission.navigator import middle_of
+from flockd.flight.obstacles import Avoidance, LocalMap, ObstacleRanging
+from flockd.flight.perception import Networks, Observation, Perception, load_networks
+from flockd.flight.perception.detection.detector import DetectionTrace
+from flockd.flight.pilot.ground_scale import scaled_by_ground
+from flockd.flight.pilot.motions import ego_motion, neighbour_motions
+from flockd.flight.pilot.trim import VelocityTrim
+from flockd.flight.tracking import Blind, Measurement, Prediction, Tracker
+
+_ROTATION_TOLERANCE = 1e-3
+"""Of an attitude's R R^T from the identity: MAVLink sends quaternions in single precision, which are 1e-6 off."""
+_BY_VELOCITY_SIGMA_M = 0.1
+"""Of where the drone went in a step, each axis, by its velocity alone."""
+
+
+@dataclass
+class StepTrace:
+    """What a step saw on its way, for reports and viewers: filled where a caller passes one in."""
+
+    observation: Observation | None = None
+    detection: DetectionTrace = field(default_factory=DetectionTrace)
+
+
+class Observer(Protocol):
+    """What sees for the pilot: see `Perception.observe`."""
+
+    def observe(
+        self,
+        frames: FrameSet,
+        vehicle: VehicleState,
+        predictions: Sequence[Prediction],
+        trace: DetectionTrace | None,
+        lap: Callable[[str], None],
+    ) -> Observation:
+        """What the newest frame set shows."""
+
+    def see_slope(self, slope: FloatArray) -> None:
+        """See `Perception.see_slope`."""
+
+
+class FlockPilot:
+    """One drone's pilot. Remembers the last frame set and its tracks; everything else comes in with each step."""
+
+    def __init__(
+        self,
+        config: DroneConfig,
+        networks: Networks | None = None,
+        stopwatch: Callable[[], float] | None = None,
+        observer: Observer | None = None,
+    ) -> None:
+        """``networks`` may be shared by several pilots; None: those that the configuration names.
+
+        ``stopwatch`` (seconds) only fills ``stages_ms``. ``observer`` takes perception's place: simulations have exact
+        ones. Raises ModelError.
+        """
+        self._config = config
+        self._rig = build_rig(config.rig)
+        self._perception = observer or Perception(
+            self._rig, networks or load_networks(config.perception), config.perception
+        )
+        self._tracker = Tracker(config.tracking)
+        self._law = FlockingLaw(config.flocking)
+        self._map = LocalMap(config.obstacles) if config.obstacles.enabled else None
+        self._ranging = ObstacleRanging(self._rig, config.obstacles) if config.obstacles.enabled else None
+        self._avoidance = Avoidance(config.obstacles, config.safety.gate, config.step_s)
+        self._navigator = Navigator(config.mission, config.safety.gate)
+        limit_m_s, memory = 0.0, 0.0
+        if config.autopilot is not None and config.own_velocity == "vision":
+            limit_m_s, memory = config.autopilot.max_velocity_trim_m_s, config.autopilot.velocity_trim_memory
+        self._trim = VelocityTrim(limit_m_s, memory)
+        self._stopwatch = stopwatch
+        self._first_time_s: float | None = None
+        self._last_time_s: float | None = None
+        self._velocity: FloatArray | None = None
+        self._yaw_rad = 0.0
+        self._refused_in_a_row = 0
+        self._order: MissionOrder | None = None
+
+    def step(
+        self,
+        frames: FrameSet,
+        vehicle: VehicleState,
+        trace: StepTrace | None = None,
+        order: MissionOrder | None = None,
+    ) -> PilotOutput:
+        """One step of the pure line.
+
+        Args:
+            frames: the newest image of every camera that has one.
+            vehicle: what the own autopilot says, at the frames' time.
+            trace: filled with what was seen; changes nothing.
+            order: an operator's to the mission, in the first step after it came.
+
+        Input that cannot be is refused with a reason: the command is standstill, and nothing of it is remembered but
+        the order.
+        """
+        self._order = self._order if order is None else order
+        refusal = _why_refused(frames, vehicle)
+        if refusal is not None:
+            return self._refused(frames, refusal)
+        laps = _Laps(self._stopwatch)
+        trace = trace or StepTrace()
+        predictions = self._predictions(frames.time_s)
+        observation = self._perception.observe(frames, vehicle, predictions, trace.detection, laps.end)
+        trace.observation = observation
+        ego, why_no_ego = self._ego_motion(observation)
+        ego = self._scaled(observation, ego)
+        laps.end("ego_motion")
+        motions, why_no_motion = self._neighbour_motions(observation, ego)
+        laps.end("neighbour_motion")
+        self._trim.update(vehicle, ego)
+        velocity = self._own_velocity(observation, ego)
+        tracks = self._track(observation, ego, motions, velocity)
+        neighbours = self._tracker.neighbours()
+        laps.end("tracking")
+        obstacles = self._local_map(observation, ego, velocity)
+        laps.end("obstacles")
+        command, mission = self._command(observation, neighbours, velocity, obstacles)
+        laps.end("flocking")
+        self._last_time_s = observation.time_s
+        reasons = (*observation.reasons, *why_no_ego, *why_no_motion)
+        return PilotOutput(
+            time_s=observation.time_s,
+            ego_motion=ego,
+            velocity=velocity,
+            detections=observation.detections,
+            detection_tracks=tracks,
+            neighbour_motions=motions,
+            neighbours=neighbours,
+            command=command,
+            reasons=reasons,
+            counts=Counter(reasons),
+            stages_ms=laps.stages_ms,
+            mission=mission,
+            noisy_cameras=observation.noisy_cameras or None,
+            ground=observation.ground,
+            obstacles=obstacles,
+        )
+
+    def _refused(self, frames: FrameSet, reason: str) -> PilotOutput:
+        """The output of a step that was not done."""
+        last_s = 0.0 if self._last_time_s is None else self._last_time_s
+        return PilotOutput(
+            time_s=frames.time_s if math.isfinite(frames.time_s) else last_s,
+            ego_motion=None,
+            velocity=self._velocity,
+            detections=(),
+            detection_tracks=(),
+            neighbour_motions={},
+            neighbours=self._tracker.neighbours(),
+            command=VelocityCommand(np.zeros(2), np.zeros(2), self._yaw_rad),
+            reasons=(reason,),
+            counts={reason: 1},
+        )
+
+    def _predictions(self, time_s: float) -> tuple[Prediction, ...]:
+        """Of the tracks, at the frames' time; none where time does not go on."""
+        if self._last_time_s is None or time_s <= self._last_time_s:
+            return ()
+        return self._tracker.predictions(time_s - self._last_time_s, self._velocity)
+
+    def _ego_motion(self, observation: Observation) -> tuple[EgoMotion | None, Sequence[str]]:
+        """The own motion in C (the body frame at the previous observation), or why there is none."""
+        if observation.previous is None:
+            return None, ()
+        try:
+            ego = ego_motion(self._rig, observation, self._config.geometry)
+        except ValueError as error:
+            return None, (f"ego-motion: {error}",)
+        if not self._is_plausible(_displacement(observation, ego), ego.interval_s):
+            return None, ("ego-motion: no vehicle changes its velocity that fast",)
+        return ego, ()
+
+    def _scaled(self, observation: Observation, ego: EgoMotion | None) -> EgoMotion | None:
+        """The own motion with the range finder's scale where the ground shows it, and as it is otherwise."""
+        if ego is None or observation.ground is None:
+            return ego
+        try:
+            scaled, slope = scaled_by_ground(self._rig, observation, ego)
+        except ValueError:  # at a standstill, or over water and walls: the depth maps' scale stays
+            return ego
+        self._perception.see_slope(slope)
+        return scaled
+
+    def _is_plausible(self, displacement: FloatArray, interval_s: float) -> bool:
+        """Whether the last velocity can have become this one; after some refusals the last one is doubted instead."""
+        if self._velocity is None:
+            return True
+        parameters = self._config.geometry
+        change = float(np.linalg.norm(displacement / interval_s - self._velocity))
+        allowed = parameters.max_acceleration_m_s2 * interval_s * (1 + self._refused_in_a_row)
+        if change <= allowed or self._refused_in_a_row == parameters.max_refused_ego_motions:
+            self._refused_in_a_row = 0
+            return True
+        self._refused_in_a_row += 1
+        return False
+
+    def _neighbour_motions(
+        self, observation: Observation, ego: EgoMotion | None
+    ) -> tuple[Mapping[int, NeighbourMotion], Sequence[str]]:
+        if ego is None:
+            return {}, ()
+        return neighbour_motions(self._rig, observation, ego, self._config.geometry)
+
+    def _own_velocity(self, observation: Observation, ego: EgoMotion | None) -> FloatArray | None:
+        """(3,) NED m/s. Where vision fails, the last one that it gave."""
+        if ego is not None:
+            self._velocity = _displacement(observation, ego) / ego.interval_s  # Eq. 21
+        return observation.vehicle.velocity_ned if self._config.own_velocity == "autopilot" else self._velocity
+
+    def _track(
+        self,
+        observation: Observation,
+        ego: EgoMotion | None,
+        motions: Mapping[int, NeighbourMotion],
+        velocity: FloatArray | None,
+    ) -> tuple[int, ...]:
+        """The track of each detection."""
+        if observation.previous is not None:
+            displacement = None if ego is None else _displacement(observation, ego)
+            sigma_m = self._config.geometry.own_displacement_sigma_m
+            self._tracker.predict(observation.interval_s, displacement, sigma_m)
+        caution = self._config.geometry.neighbour_velocity_caution
+        measurements = [_measurement(observation, d, motions.get(d.label), caution) for d in observation.detections]
+        return self._tracker.update(observation.time_s, measurements, velocity, self._blind(observation))
+
+    def _local_map(
+        self, observation: Observation, ego: EgoMotion | None, velocity: FloatArray | None
+    ) -> ObstacleRanges | None:
+        """The local map at this time; None where obstacles are not looked for."""
+        if self._map is None or self._ranging is None:
+            return None
+        displacement, sigma_m = None, 0.0
+        if ego is not None:
+            displacement, sigma_m = _displacement(observation, ego)[:2], self._config.geometry.own_displacement_sigma_m
+        elif velocity is not None and self._last_time_s is not None:
+            displacement, sigma_m = velocity[:2] * (observation.time_s - self._last_time_s), _BY_VELOCITY_SIGMA_M
+        ranges = observation.obstacles or self._ranging.ranges(observation, ego)
+        return self._map.step(observation.time_s, ranges, displacement, sigma_m)
+
+    def _blind(self, observation: Observation) -> Blind | None:
+        """Where only cameras point that gave nothing in this step; None: they all did."""
+        gone = self._rig.cameras.keys() - observation.cameras.keys()
+        if not gone:
+            return None
+
+        def blind(places: FloatArray) -> BoolArray:
+            pixels = self._rig.pixels_of(places @ observation.vehicle.R_ned_body)  # row by row R^T p: into the body
+            shown = {name: np.isfinite(uv).all(axis=1) for name, uv in pixels.items()}
+            of_gone = np.any([shown[name] for name in gone], axis=0)
+            of_others = np.any([shown[name] for name in observation.cameras], axis=0)
+            hidden: BoolArray = of_gone & ~of_others
+            return hidden
+
+        return blind
+
+    def _command(
+        self,
+        observation: Observation,
+        neighbours: Sequence[Neighbour],
+        velocity: FloatArray | None,
+        obstacles: ObstacleRanges | None,
+    ) -> tuple[VelocityCommand, MissionStatus | None]:
+        if self._first_time_s is None:
+            self._first_time_s = observation.time_s
+        seen = [n for n in neighbours if n.confirmed]
+        places = np.array([n.position for n in seen]).reshape(-1, 3)
+        velocities = np.array([n.velocity[:2] for n in seen]).reshape(-1, 2)
+        vehicle = observation.vehicle
+        guidance = self._navigator.step(
+            Moment(
+                time_s=max(observation.time_s - self._first_time_s, 0.0),
+                position=vehicle.position,
+                middle=middle_of(places[:, :2]),
+                home_deg=vehicle.home_deg,
+                order=self._order,
+            )
+        )
+        self._order = None
+        desired = self._navigator.pull(guidance)
+        own = guidance.velocity if velocity is None else velocity[:2]  # before the first pair: as desired
+        if obstacles is None:
+            command, acceleration = self._law.command(
+                own, level_offsets(places), velocities, desired, self._config.step_s
+            )
+        else:
+            command, acceleration = self._avoidance.command(self._law, own, places, velocities, desired, obstacles)
+        self._yaw_rad = self._heading(vehicle, guidance.course_rad)
+        trim = self._trim.velocity
+        return VelocityCommand(
+            command + trim, acceleration, self._yaw_rad, trim if trim.any() else None, guidance.height_m
+        ), self._navigator.status(guidance)
+
+    def _heading(self, vehicle: VehicleState, course_rad: float | None) -> float:
+        """The mission's course; without one the heading that the drone was asked for last, or has."""
+        R = vehicle.R_ned_body
+        heading_rad = math.atan2(R[1, 0], R[0, 0])
+        if self._config.yaw == "hold":
+            return heading_rad
+        if course_rad is not None:
+            return course_rad
+        return heading_rad if self._last_time_s is None else self._yaw_rad
+
+
+def _why_refused(frames: FrameSet, vehicle: VehicleState) -> str | None:
+    """What of a step's input cannot be; None: nothing."""
+    R, velocity = vehicle.R_ned_body, vehicle.velocity_ned
+    if not (math.isfinite(frames.time_s) and math.isfinite(vehicle.time_s)):
+        return "input refused: a time is not finite"
+    if not np.allclose(R @ R.T, np.eye(3), atol=_ROTATION_TOLERANCE):  # false for NaN too
+        return "input refused: the attitude is not a rotation"
+    if not math.isfinite(vehicle.height_m):
+        return "input refused: the height is not finite"
+    if velocity is not None and not np.isfinite(velocity).all():
+        return "input refused: the autopilot's velocity is not finite"
+    reading = vehicle.ground_range
+    if reading is not None and not math.isfinite(reading.time_s):
+        return "input refused: the range finder's time is not finite"
+    for place in (vehicle.position, vehicle.home_deg):
+        if place is not None and not np.isfinite(place).all():
+            return "input refused: the autopilot's position is not finite"
+    return None
+
+
+def _displacement(observation: Observation, ego: EgoMotion) -> FloatArray:
+    """(3,) metres NED that the drone went since the previous observation."""
+    before = observation.vehicle if observation.previous is None else observation.previous.vehicle
+    displacement: FloatArray = before.R_ned_body @ ego.translation
+    return displacement
+
+
+def _measurement(
+    observation: Observation, detection: Detection, motion: NeighbourMotion | None, caution: float
+) -> Measurement:
+    """A detection in NED axes, with the velocity of Eq. 36 where there is one."""
+    R_ned_body = observation.vehicle.R_ned_body
+    velocity, sigma_m_s = None, 1.0
+    if motion is not None and observation.previous is not None:
+        velocity = observation.previous.vehicle.R_ned_body @ motion.velocity
+        sigma_m_s = caution * math.sqrt(2) * detection.range_sigma_m / motion.interval_s
+    return Measurement.of(detection, R_ned_body, velocity, sigma_m_s)
+
+
+class _Laps:
+    """Milliseconds between calls, if there is a watch."""
+
+    def __init__(self, stopwatch: Callable[[], float] | None) -> None:
+        self._watch = stopwatch
+        self._last = stopwatch() if stopwatch else 0.0
+        self.stages_ms: dict[str, float] = {}
+
+    def end(self, stage: str) -> None:
+        """Of a stage."""
+        if self._watch:
+            now = self._watch()
+            self.stages_ms[stage] = 1e3 * (now - self._last)
+            self._last = now

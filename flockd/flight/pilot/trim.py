@@ -1,0 +1,45 @@
+"""By how much the setpoints are corrected for what the autopilot believes wrongly of its own velocity."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flockd.core.messages import EgoMotion, FloatArray, VehicleState
+from flockd.flight.flocking import limit_norm
+
+
+class VelocityTrim:
+    """The autopilot's velocity less the one that the cameras measured, averaged over some steps and limited.
+
+    An autopilot flies a setpoint v so that its own estimate becomes v. Where that estimate is off by b, the drone moves
+    with v - b, and so do neighbours with other b: a flock with equal commands drifts together. So b is added.
+    """
+
+    def __init__(self, limit_m_s: float, memory: float) -> None:
+        """``limit_m_s``: its largest norm; 0: no trim. ``memory``: share of the last trim that each step keeps."""
+        self._limit_m_s, self._memory = limit_m_s, memory
+        self._before: VehicleState | None = None
+        self._mean = np.zeros(2)
+
+    @property
+    def velocity(self) -> FloatArray:
+        """(2,) m/s, north and east, to be added to the pilot's command."""
+        return limit_norm(self._mean, self._limit_m_s)
+
+    def update(self, vehicle: VehicleState, ego: EgoMotion | None) -> None:
+        """With the vehicle's state and the ego-motion of each step.
+
+        Without ego-motion, or without a finite velocity of the autopilot at both of its ends, the trim stays as it was.
+        """
+        before, self._before = self._before, vehicle
+        if before is None or ego is None or before.velocity_ned is None or vehicle.velocity_ned is None:
+            return
+        if not math.isclose(vehicle.time_s - before.time_s, ego.interval_s, rel_tol=0.2):
+            return  # a state from another time than the frames
+        believed = (before.velocity_ned + vehicle.velocity_ned) / 2  # the mean over the interval, as the measured one
+        wrong = (believed - before.R_ned_body @ ego.velocity)[:2]
+        if not np.isfinite(wrong).all():
+            return  # it would never leave the mean again
+        self._mean = self._memory * self._mean + (1 - self._memory) * limit_norm(wrong, 2 * self._limit_m_s)

@@ -1,0 +1,41 @@
+"""Whether the drone may be flown, and what may be sent: a supervisor and a last gate, without clock or I/O."""
+
+from __future__ import annotations
+
+from flockd.core.config.safety import GateParameters, SafetyParameters
+from flockd.flight.safety.events import OFFBOARD, CameraHealth, Event, Inputs, MissionEnd
+from flockd.flight.safety.fence import outside_fence, outside_heights
+from flockd.flight.safety.gate import (
+    Gate,
+    Objection,
+    Permission,
+    Surroundings,
+    Verdict,
+    Wanted,
+)
+from flockd.flight.safety.policy import Action, Reaction
+from flockd.flight.safety.supervisor import Decision, Reason, State, Supervisor
+
+__all__ = [
+    "OFFBOARD",
+    "Action",
+    "CameraHealth",
+    "Decision",
+    "Event",
+    "Gate",
+    "GateParameters",
+    "Inputs",
+    "MissionEnd",
+    "Objection",
+    "Permission",
+    "Reaction",
+    "Reason",
+    "SafetyParameters",
+    "State",
+    "Supervisor",
+    "Surroundings",
+    "Verdict",
+    "Wanted",
+    "outside_fence",
+    "outside_heights",
+]

@@ -1,0 +1,62 @@
+"""How fast a drone may fly towards what is near: so that it can stop in time."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flockd.core.config.safety import GateParameters
+from flockd.core.messages import FloatArray
+
+SAME_SPOT_M = 0.1
+"""A neighbour whose level range is smaller is above or below, in no direction: cameras do not measure one that well."""
+
+
+def towards_neighbours(
+    p: GateParameters, offsets: FloatArray, velocities: FloatArray, separation_m: float
+) -> tuple[FloatArray, FloatArray]:
+    """For each neighbour about at the drone's height its direction, (n, 2), and how fast to fly there, (n,) m/s.
+
+    `offsets` (k, 3) metres NED from the drone, `velocities` (k, 2) m/s over ground.
+
+    Nearer than the separation: not at all. Farther, so fast that the distance left suffices if both brake, as in
+    Shalev-Shwartz et al. 2017, "On a formal model of safe and scalable self-driving cars": with v towards a
+    neighbour that comes at w (negative: goes), the drone's reaction time r and its braking b,
+    (v + w) r + v^2 / 2b + w |w| / 2b <= distance left. The neighbour's gate may let it begin to come just now; so,
+    but for following one that goes, this has to hold for w = v too.
+    """
+    ranges = np.hypot(offsets[:, 0], offsets[:, 1])
+    about_m = max(separation_m, p.vertical_separation_m)
+    meets = (ranges >= SAME_SPOT_M) & (ranges < math.inf) & (np.abs(offsets[:, 2]) < about_m)
+    offsets, ranges = offsets[meets], ranges[meets]
+    towards = offsets[:, :2] / ranges[:, None]
+    velocities = np.nan_to_num(velocities[meets], posinf=0.0, neginf=0.0)
+    comes = -np.clip(np.sum(velocities * towards, axis=1), -p.max_speed_m_s, p.max_speed_m_s)
+    left_m = ranges - separation_m
+    lag = p.braking_m_s2 * p.reaction_s
+    square = lag**2 + 2 * p.braking_m_s2 * (left_m - comes * p.reaction_s) - comes * np.abs(comes)
+    most_m_s = np.sqrt(np.maximum(square, lag**2)) - lag
+    if_both_come = np.sqrt(lag**2 + p.braking_m_s2 * np.maximum(left_m, 0.0)) - lag
+    most_m_s = np.minimum(most_m_s, np.maximum(if_both_come, -comes))
+    return towards, np.where(left_m > 0, most_m_s, 0.0)
+
+
+def towards_obstacles(
+    points: FloatArray, clearance_m: float, braking_m_s2: float, reaction_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """For each obstacle's point its direction, (n, 2), and how fast to fly there, (n,) m/s: see `stopping_speed`.
+
+    `points` (m, 2) metres north and east from the drone; those that are not finite, or at no distance, are left out.
+    """
+    ranges = np.hypot(points[:, 0], points[:, 1])
+    somewhere = (ranges > 0) & (ranges < math.inf)
+    points, ranges = points[somewhere], ranges[somewhere]
+    return points / ranges[:, None], stopping_speed(ranges - clearance_m, braking_m_s2, reaction_s)
+
+
+def stopping_speed(left_m: FloatArray, braking_m_s2: float, reaction_s: float) -> FloatArray:
+    """The fastest speed, m/s, from which a drone stops within `left_m`: v r + v^2 / 2b = left; 0 where none is left."""
+    lag = braking_m_s2 * reaction_s
+    speed: FloatArray = np.sqrt(lag**2 + 2 * braking_m_s2 * np.maximum(left_m, 0.0)) - lag
+    return speed

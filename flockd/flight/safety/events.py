@@ -1,0 +1,233 @@
+"""The supervisor's inputs, and the events in them: faults, and other reasons to end a flight."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+from flockd.core.config.safety import SafetyParameters
+
+OFFBOARD = "offboard"
+"""The flight mode in which the autopilot follows setpoints; all others are the pilot's or the autopilot's own."""
+
+
+@dataclass(frozen=True)
+class CameraHealth:
+    """How one camera is doing."""
+
+    age_s: float
+    """Of its newest usable frame; infinite before the first."""
+    period_s: float
+    """How far apart its frames should be."""
+    unplugged: bool
+    """Its device reported an error or is gone, and is not open again yet."""
+    frozen: bool
+    """It keeps sending the same image or the same sequence number."""
+    noisy: bool
+    """Its images have been noise for too long."""
+
+
+class MissionEnd(StrEnum):
+    """What a mission that is over wants of the autopilot."""
+
+    LAND = "land"
+    RETURN = "return"
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """All that the supervisor goes by, as of one instant. A number that is NaN counts as bad."""
+
+    cameras: Mapping[str, CameraHealth]
+    """Every camera of the rig, by name."""
+    dropped_share: float
+    """Of the frames of the last seconds: corrupt, truncated, stamped out of order, or noise."""
+    estimate_age_s: float
+    """Of the pilot's newest output; infinite before the first."""
+    ego_motion_failures: int
+    """Steps in a row in which the pilot found no motion of its own."""
+    network_faults: int
+    """Outputs of a network that are NaN, infinite or out of range, since the last call."""
+    inference_stuck: bool
+    """A network has passed its deadline and not returned yet."""
+    load: float
+    """How long the steps take (95th percentile, slowest stage) over how long they may."""
+    temperature_c: float | None
+    """Of the hottest thermal zone; None on a computer that has none."""
+    loop_lag_s: float
+    """How late the event loop runs."""
+    dead_tasks: tuple[str, ...]
+    """Names of tasks that have ended and should not have."""
+    neighbours_age_s: float
+    """Since a confirmed neighbour was last seen; infinite before the first."""
+    nearest_neighbour_m: float
+    """Range of the nearest confirmed neighbour; infinite without one."""
+    refused_commands: int
+    """Commands since the last call that the gate found not finite or too large."""
+    outside_fence: bool
+    """As of `outside_fence`."""
+    outside_heights: bool
+    """As of `outside_heights`."""
+    heartbeat_age_s: float
+    """Of the autopilot's newest heartbeat; infinite before the first."""
+    flight_mode: str | None
+    """The autopilot's; `OFFBOARD` or any other word. None: not known yet, as for the next two."""
+    armed: bool | None
+    in_air: bool | None
+    offboard_refused: bool
+    """Since the last call the autopilot has refused offboard mode when flockd asked for it, or not replied."""
+    battery_low: bool
+    """So says the autopilot."""
+    position_lost: bool
+    """The autopilot has lost its estimate, or the satellites that it needs for it."""
+    shutdown_asked: bool
+    """The process was asked to end."""
+    hold_asked: bool
+    """By an operator; so `land_asked`."""
+    land_asked: bool
+    resume_asked: bool
+    """By an operator, since the last call: may be ready again, after a flight that was ended in the air."""
+    mission_over: MissionEnd | None = None
+    """The mission of this flight has come to its end, and how it ends; None: it has not, or ends in the air."""
+
+
+class Event(StrEnum):
+    """Something that is not as it is in a quiet flight. The value is its name in telemetry."""
+
+    SIGHT_LOST = "sight_lost"
+    CAMERA_LOST = "camera_lost"
+    FRAMES_DROPPED = "frames_dropped"
+    ESTIMATE_STALE = "estimate_stale"
+    EGO_MOTION_POOR = "ego_motion_poor"
+    EGO_MOTION_LOST = "ego_motion_lost"
+    NETWORK_FAULT = "network_fault"
+    INFERENCE_STUCK = "inference_stuck"
+    OVERLOADED = "overloaded"
+    FAR_OVERLOADED = "far_overloaded"
+    HOT = "hot"
+    TOO_HOT = "too_hot"
+    LOOP_LATE = "loop_late"
+    TASK_DIED = "task_died"
+    NEIGHBOURS_LOST = "neighbours_lost"
+    NEIGHBOUR_CLOSE = "neighbour_close"
+    COMMAND_REFUSED = "command_refused"
+    FENCE_LEFT = "fence_left"
+    HEIGHTS_LEFT = "heights_left"
+    LINK_LOST = "link_lost"
+    NOT_OFFBOARD = "not_offboard"
+    NOT_ARMED = "not_armed"
+    NOT_IN_AIR = "not_in_air"
+    OFFBOARD_REFUSED = "offboard_refused"
+    BATTERY_LOW = "battery_low"
+    POSITION_LOST = "position_lost"
+    SHUTDOWN_ASKED = "shutdown_asked"
+    HOLD_ASKED = "hold_asked"
+    LAND_ASKED = "land_asked"
+    MISSION_LANDS = "mission_lands"
+    MISSION_RETURNS = "mission_returns"
+    # The supervisor's own, not noticed in the inputs:
+    STARTED = "started"
+    NO_ANSWER = "no_answer"
+
+
+def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
+    """What is the matter, each with one short sentence for people; empty in a quiet flight."""
+    lost = [f"{name} {fault}" for name, camera in inputs.cameras.items() if (fault := _fault(camera, p))]
+    sightless = len(lost) == len(inputs.cameras) or len(lost) > p.max_lost_cameras
+    failures = inputs.ego_motion_failures
+    temperature = inputs.temperature_c
+    table = (
+        (Event.SIGHT_LOST, sightless, f"too few cameras deliver images: {', '.join(lost) or 'there are none'}"),
+        (Event.CAMERA_LOST, len(lost) > 0 and not sightless, f"a camera is lost: {', '.join(lost)}"),
+        (
+            Event.FRAMES_DROPPED,
+            not inputs.dropped_share <= p.max_dropped_share,
+            f"{inputs.dropped_share:.0%} of the frames were dropped",
+        ),
+        (
+            Event.ESTIMATE_STALE,
+            not inputs.estimate_age_s <= p.estimate_timeout_s,
+            f"no estimate {_since(inputs.estimate_age_s)}",
+        ),
+        (
+            Event.EGO_MOTION_POOR,
+            p.degraded_ego_motion_failures <= failures < p.max_ego_motion_failures,
+            f"ego-motion not estimated in {failures} steps in a row",
+        ),
+        (
+            Event.EGO_MOTION_LOST,
+            failures >= p.max_ego_motion_failures,
+            f"ego-motion not estimated in {failures} steps in a row",
+        ),
+        (Event.NETWORK_FAULT, inputs.network_faults > 0, "a network's output is not finite or not plausible"),
+        (Event.INFERENCE_STUCK, inputs.inference_stuck, "a network does not respond"),
+        (
+            Event.OVERLOADED,
+            p.degraded_load < inputs.load <= p.max_load,
+            f"a step takes {inputs.load:.0%} of the step time",
+        ),
+        (Event.FAR_OVERLOADED, not inputs.load <= p.max_load, f"a step takes {inputs.load:.0%} of the step time"),
+        (
+            Event.HOT,
+            temperature is not None and p.degraded_temperature_c < temperature <= p.max_temperature_c,
+            f"the computer is at {temperature} °C",
+        ),
+        (
+            Event.TOO_HOT,
+            temperature is not None and not temperature <= p.max_temperature_c,
+            f"the computer is at {temperature} °C",
+        ),
+        (
+            Event.LOOP_LATE,
+            not inputs.loop_lag_s <= p.max_loop_lag_s,
+            f"the event loop is {inputs.loop_lag_s:.2f} s late",
+        ),
+        (Event.TASK_DIED, len(inputs.dead_tasks) > 0, f"ended and should not have: {', '.join(inputs.dead_tasks)}"),
+        (
+            Event.NEIGHBOURS_LOST,
+            not inputs.neighbours_age_s <= p.neighbours_timeout_s,
+            f"no neighbour seen {_since(inputs.neighbours_age_s)}",
+        ),
+        (
+            Event.NEIGHBOUR_CLOSE,
+            not inputs.nearest_neighbour_m >= p.gate.min_separation_m,
+            f"a neighbour is {inputs.nearest_neighbour_m:.1f} m away",
+        ),
+        (Event.COMMAND_REFUSED, inputs.refused_commands > 0, "a command was not finite or far too large"),
+        (Event.FENCE_LEFT, inputs.outside_fence, "outside the fence"),
+        (Event.HEIGHTS_LEFT, inputs.outside_heights, "above or below the heights allowed"),
+        (
+            Event.LINK_LOST,
+            not inputs.heartbeat_age_s <= p.heartbeat_timeout_s,
+            f"no heartbeat from the autopilot {_since(inputs.heartbeat_age_s)}",
+        ),
+        (Event.NOT_OFFBOARD, inputs.flight_mode != OFFBOARD, f"the flight mode is {inputs.flight_mode or 'not known'}"),
+        (Event.NOT_ARMED, not inputs.armed, "not armed"),
+        (Event.NOT_IN_AIR, not inputs.in_air, "not in the air"),
+        (Event.OFFBOARD_REFUSED, inputs.offboard_refused, "the autopilot refused offboard mode"),
+        (Event.BATTERY_LOW, inputs.battery_low, "the autopilot says that the battery is low"),
+        (Event.POSITION_LOST, inputs.position_lost, "the autopilot has lost its position"),
+        (Event.SHUTDOWN_ASKED, inputs.shutdown_asked, "asked to end"),
+        (Event.HOLD_ASKED, inputs.hold_asked, "an operator asked for Hold"),
+        (Event.LAND_ASKED, inputs.land_asked, "an operator asked for Land"),
+        (Event.MISSION_LANDS, inputs.mission_over is MissionEnd.LAND, "the mission is over and ends with Land"),
+        (Event.MISSION_RETURNS, inputs.mission_over is MissionEnd.RETURN, "the mission is over and ends with Return"),
+    )
+    return {event: sentence for event, holds, sentence in table if holds}
+
+
+def _since(age_s: float) -> str:
+    return "yet" if age_s == math.inf else f"for {age_s:.1f} s"
+
+
+def _fault(camera: CameraHealth, p: SafetyParameters) -> str:
+    """What is wrong with a camera, in a word; empty if it is fine."""
+    if camera.unplugged:
+        return "unplugged"
+    if camera.frozen:
+        return "frozen"
+    if camera.noisy:
+        return "noisy"
+    return "" if camera.age_s <= p.camera_timeout_periods * camera.period_s else "silent"

@@ -1,0 +1,274 @@
+"""The last gate: of what is asked for, what may be sent to the autopilot. Silent until allowed.
+
+It is independent of pilot and networks: it checks every command, whatever produced it, and limits what it can do.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from flockd.core.config.safety import GateParameters
+from flockd.core.messages import FloatArray, Setpoint, VelocityCommand
+from flockd.flight.safety.approach import towards_neighbours, towards_obstacles
+from flockd.flight.safety.fence import is_fenced, offsets_outside
+from flockd.flight.safety.half_planes import nearest_within
+from flockd.flight.safety.policy import Action
+
+
+@dataclass(frozen=True)
+class Permission:
+    """What the supervisor said, and when."""
+
+    action: Action
+    time_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Wanted:
+    """What the pilot's code asks for."""
+
+    command: VelocityCommand | None
+    """None before the first."""
+    time_s: float
+    """When the command was made."""
+    height_m: float
+    """To hold."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """Where the drone is, and who is near."""
+
+    position: FloatArray
+    """(2,) metres north and east of home."""
+    velocity: FloatArray
+    """(2,) m/s, north and east."""
+    yaw_rad: float
+    neighbours: FloatArray
+    """(n, 3) metres, NED, relative to the drone."""
+    neighbour_velocities: FloatArray
+    """(n, 2) m/s over ground, north and east."""
+    height_m: float
+    """Of the drone, as in `VehicleState`; NaN: not known."""
+    obstacles: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    """(m, 2) metres, north and east, relative to the drone: points of obstacles, each the nearest that it may be."""
+
+
+class Objection(StrEnum):
+    """Why something was not sent as it was asked for. The value is its name in counts."""
+
+    NOT_ALLOWED = "not_allowed"
+    PERMISSION_STALE = "permission_stale"
+    COMMAND_STALE = "command_stale"
+    SETPOINT_NOT_FINITE = "setpoint_not_finite"
+    COMMAND_NOT_FINITE = "command_not_finite"
+    COMMAND_TOO_LARGE = "command_too_large"
+    POSITION_UNKNOWN = "position_unknown"
+    NEIGHBOUR_UNKNOWN = "neighbour_unknown"
+    OBSTACLE_UNKNOWN = "obstacle_unknown"
+    SLOWED = "slowed"
+    FENCE = "fence"
+    HEIGHT = "height"
+    SEPARATION = "separation"
+    OBSTACLE = "obstacle"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What may be sent; None: nothing. And why it is not what was asked for."""
+
+    setpoint: Setpoint | None
+    objections: tuple[Objection, ...]
+
+
+_COLUMN = 1.5
+"""A neighbour is above or below where its level range is less than this many times the degraded separation: downwash
+widens on its way down, and neither drone stays exactly where it is."""
+_HEIGHT_NOISE_M = 0.3
+"""Of a height over a few seconds: a difference this small between asked and own height is no climb."""
+
+_MOVES = frozenset({Action.FLY, Action.FLY_DEGRADED})
+_STANDS_STILL = frozenset({Action.OFFER, Action.HOVER, Action.ASK_HOLD, Action.ASK_RETURN, Action.ASK_LAND})
+
+
+class Gate:
+    """Passes each setpoint, makes it smaller, or sends nothing.
+
+    A speed above the limit or a number that is not finite is refused: the drone is brought to a standstill instead.
+    Towards a neighbour or an obstacle the drone flies no faster than it can brake before the minimum distance. Every
+    change of velocity stays within the acceleration limit, except that this one, and no velocity outward beyond the
+    fence, win.
+    """
+
+    def __init__(self, parameters: GateParameters) -> None:
+        self._parameters = parameters
+        self._last: Setpoint | None = None
+        self.counts: Counter[Objection] = Counter()
+        """Objections since the start."""
+
+    def step(self, now_s: float, permission: Permission, wanted: Wanted, around: Surroundings) -> Verdict:
+        """What may be sent at `now_s`, on the clock of the other times; never raises, whatever the numbers are."""
+        objections: list[Objection] = []
+        self._last = self._setpoint(now_s, permission, wanted, around, objections)
+        self.counts.update(objections)
+        return Verdict(self._last, tuple(objections))
+
+    def _setpoint(
+        self, now_s: float, permission: Permission, wanted: Wanted, around: Surroundings, objections: list[Objection]
+    ) -> Setpoint | None:
+        if permission.action not in _MOVES | _STANDS_STILL:
+            objections.append(Objection.NOT_ALLOWED)
+            return None
+        if not abs(now_s - permission.time_s) <= self._parameters.permission_timeout_s:
+            objections.append(Objection.PERMISSION_STALE)
+            return None
+        yaw_rad = self._last.yaw_rad if self._last is not None else around.yaw_rad
+        target = np.zeros(2)
+        if permission.action in _MOVES:
+            if wanted.command is None or not abs(now_s - wanted.time_s) <= self._parameters.command_timeout_s:
+                objections.append(Objection.COMMAND_STALE)
+                return None
+            if math.isfinite(wanted.command.yaw_rad):
+                yaw_rad = wanted.command.yaw_rad
+            if self._accepts(wanted.command, around, objections):
+                target = self._slowed(wanted.command.velocity, now_s - wanted.time_s, permission.action)
+                if (target != wanted.command.velocity).any():
+                    objections.append(Objection.SLOWED)
+        velocity = self._within_acceleration(target, now_s, around)
+        velocity = self._within_space(velocity, permission.action, around, objections)
+        if not np.isfinite([*velocity, wanted.height_m, yaw_rad]).all():
+            objections.append(Objection.SETPOINT_NOT_FINITE)
+            return None
+        height_m = self._within_climb(now_s, permission.action, wanted, around, objections)
+        return Setpoint(now_s, velocity, self._within_heights(height_m, objections), yaw_rad)
+
+    def _slowed(self, velocity: FloatArray, age_s: float, action: Action) -> FloatArray:
+        """A command's velocity: slower once a newer command is missed, nothing when it is too old, slow if degraded."""
+        p = self._parameters
+        limit_m_s = p.degraded_speed_m_s if action is Action.FLY_DEGRADED else p.max_speed_m_s
+        return _limited(self._share(age_s) * velocity, limit_m_s)
+
+    def _share(self, age_s: float) -> float:
+        """How much of a command is flown at its age: all while it is fresh, nothing at the time-out."""
+        p = self._parameters
+        return min((p.command_timeout_s - age_s) / (p.command_timeout_s - p.command_fresh_s), 1.0)
+
+    def _accepts(self, command: VelocityCommand, around: Surroundings, objections: list[Objection]) -> bool:
+        """Whether the command may move the drone at all."""
+        refusals = (
+            (
+                Objection.COMMAND_NOT_FINITE,
+                not (np.isfinite(command.velocity).all() and math.isfinite(command.yaw_rad)),
+            ),
+            (Objection.COMMAND_TOO_LARGE, math.hypot(*command.velocity) > self._parameters.max_speed_m_s),
+            (Objection.POSITION_UNKNOWN, is_fenced(self._parameters) and not np.isfinite(around.position).all()),
+            (
+                Objection.NEIGHBOUR_UNKNOWN,
+                not (np.isfinite(around.neighbours).all() and np.isfinite(around.neighbour_velocities).all()),
+            ),
+            (Objection.OBSTACLE_UNKNOWN, not np.isfinite(around.obstacles).all()),
+        )
+        found = [objection for objection, holds in refusals if holds]
+        objections.extend(found)
+        return not found
+
+    def _within_acceleration(self, target: FloatArray, now_s: float, around: Surroundings) -> FloatArray:
+        """The velocity nearest to the target that can be reached from the last one sent, or else from the true one."""
+        p, last = self._parameters, self._recent(now_s)
+        if last is not None:
+            start, elapsed_s = last.velocity, max(now_s - last.time_s, 0.0)
+        elif np.isfinite(around.velocity).all():
+            start, elapsed_s = _limited(around.velocity, p.max_speed_m_s), 0.0
+        else:
+            start, elapsed_s = np.zeros(2), 0.0
+        return start + _limited(target - start, p.max_acceleration_m_s2 * elapsed_s)
+
+    def _recent(self, now_s: float) -> Setpoint | None:
+        """The last setpoint; None where that is too long ago to go on from it."""
+        last = self._last
+        return None if last is None or now_s - last.time_s > self._parameters.permission_timeout_s else last
+
+    def _within_space(
+        self, velocity: FloatArray, action: Action, around: Surroundings, objections: list[Objection]
+    ) -> FloatArray:
+        """The velocity without what leads out of the fence, too fast towards a neighbour, or too near an obstacle."""
+        p = self._parameters
+        separation_m = p.min_separation_m if action is Action.FLY else p.degraded_separation_m
+        outward = _units(offsets_outside(p, around.position))
+        to_neighbours = towards_neighbours(p, around.neighbours, around.neighbour_velocities, separation_m)
+        to_obstacles = towards_obstacles(around.obstacles, p.obstacle_clearance_m, p.braking_m_s2, p.reaction_s)
+        limits = {
+            Objection.FENCE: (outward, np.zeros(len(outward))),
+            Objection.SEPARATION: to_neighbours,
+            Objection.OBSTACLE: to_obstacles,
+        }
+        for objection, (directions, most_m_s) in limits.items():
+            if (directions @ velocity > most_m_s).any():
+                objections.append(objection)
+        every_direction, every_limit = zip(*limits.values(), strict=True)
+        return nearest_within(velocity, np.concatenate(every_direction), np.concatenate(every_limit))
+
+    def _within_climb(
+        self, now_s: float, action: Action, wanted: Wanted, around: Surroundings, objections: list[Objection]
+    ) -> float:
+        """The height nearest to the one to hold that may be asked for now.
+
+        It changes no faster than the limit, as much slower as the velocity of an old command, and not at all where the
+        drone is to stand still in flight. It leads no nearer to a neighbour that is near above or below.
+        """
+        if action is Action.OFFER:  # on the ground, or flown by the pilot: as high as the control loop says
+            return wanted.height_m
+        last = self._recent(now_s)
+        if last is not None:
+            start_m, elapsed_s = last.height_m, max(now_s - last.time_s, 0.0)
+        else:
+            start_m, elapsed_s = (around.height_m if math.isfinite(around.height_m) else wanted.height_m), 0.0
+        most_m = 0.0
+        if action in _MOVES:
+            most_m = self._parameters.max_climb_m_s * elapsed_s * self._share(now_s - wanted.time_s)
+        height_m = start_m + min(max(wanted.height_m - start_m, -most_m), most_m)
+        lowest_m, highest_m = self._between_neighbours(start_m, around)
+        between_m = min(max(height_m, lowest_m), highest_m)
+        if between_m != height_m:
+            objections.append(Objection.SEPARATION)
+        return between_m
+
+    def _between_neighbours(self, start_m: float, around: Surroundings) -> tuple[float, float]:
+        """From which height to which one may be asked for, from `start_m` on, where neighbours are above or below.
+
+        A height that was asked for already, and from which the drone's own differs by noise only, stays. A drone that
+        does not know its height counts as where it was asked to be.
+        """
+        p, offsets = self._parameters, around.neighbours
+        own_m = around.height_m if math.isfinite(around.height_m) else start_m
+        near = np.hypot(offsets[:, 0], offsets[:, 1]) < _COLUMN * p.degraded_separation_m
+        up = -offsets[near, 2]
+        room_up = np.maximum(up[up > 0] - p.vertical_separation_m, 0.0).min(initial=math.inf)
+        room_down = np.maximum(-up[up < 0] - p.vertical_separation_m, 0.0).min(initial=math.inf)
+        highest_m = max(own_m + float(room_up), min(start_m, own_m + _HEIGHT_NOISE_M))
+        lowest_m = min(own_m - float(room_down), max(start_m, own_m - _HEIGHT_NOISE_M))
+        return lowest_m, highest_m
+
+    def _within_heights(self, height_m: float, objections: list[Objection]) -> float:
+        within = min(max(height_m, self._parameters.min_height_m), self._parameters.max_height_m)
+        if within != height_m:
+            objections.append(Objection.HEIGHT)
+        return within
+
+
+def _units(vectors: FloatArray) -> FloatArray:
+    """The vectors (n, 2) at length 1, without those of no length."""
+    lengths = np.hypot(vectors[:, 0], vectors[:, 1])
+    units: FloatArray = vectors[lengths > 0] / lengths[lengths > 0, None]
+    return units
+
+
+def _limited(vector: FloatArray, limit: float) -> FloatArray:
+    """The vector itself if it is no longer than `limit`, else the one of that length in its direction."""
+    length = math.hypot(*vector)
+    return vector if length <= limit else vector * (limit / length)

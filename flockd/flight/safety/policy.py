@@ -1,0 +1,118 @@
+"""What is done about each event: the one table, from faults to reactions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum, StrEnum
+
+from flockd.core.config.safety import SafetyParameters
+from flockd.flight.safety.events import Event
+
+
+class Reaction(IntEnum):
+    """What is done in flight; of several the worst wins."""
+
+    NOTE = 0
+    """Fly on, and say so."""
+    DEGRADE = 1
+    """Fly on, slower and farther from neighbours."""
+    HOVER = 2
+    """Stand still, if it passes soon; then hold."""
+    HOLD = 3
+    """Stand still and ask the autopilot to take over: in Hold, to return home, or to land."""
+    RETURN = 4
+    LAND = 5
+    SILENCE = 6
+    """Send nothing more: the pilot has taken over, or the autopilot's failsafe is to act."""
+
+
+class Barrier(IntEnum):
+    """What an event means for a drone that flockd does not fly."""
+
+    NONE = 0
+    WAIT = 1
+    """Not ready while it lasts."""
+    LATCH = 2
+    """Not ready any more, before the vehicle was seen disarmed on the ground or an operator asked to resume."""
+
+
+class Action(StrEnum):
+    """What the daemon does now."""
+
+    SILENCE = "silence"
+    """Send nothing and ask for nothing."""
+    OFFER = "offer"
+    """Send standstill, so that the autopilot lets the pilot switch to offboard; it does not follow it before."""
+    FLY = "fly"
+    FLY_DEGRADED = "fly_degraded"
+    HOVER = "hover"
+    """Send standstill. So do the three that ask the autopilot for a mode, until it has changed."""
+    ASK_HOLD = "ask_hold"
+    ASK_RETURN = "ask_return"
+    ASK_LAND = "ask_land"
+
+
+ASKS: Mapping[Reaction, Action] = {
+    Reaction.HOLD: Action.ASK_HOLD,
+    Reaction.RETURN: Action.ASK_RETURN,
+    Reaction.LAND: Action.ASK_LAND,
+}
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What is done about one event."""
+
+    barrier: Barrier
+    """Before the flight and after it."""
+    reaction: Reaction
+    """In flight."""
+    after_s: float = math.inf
+    later: Reaction = Reaction.HOLD
+    """In flight, instead, once it has lasted `after_s`."""
+
+    def reaction_at(self, lasted_s: float) -> Reaction:
+        """What is done in flight about the event when it has lasted this long."""
+        return self.later if lasted_s >= self.after_s else self.reaction
+
+
+def rules(p: SafetyParameters) -> dict[Event, Rule]:
+    """The rule of every event that can be noticed."""
+    on_battery_low = Reaction[p.on_battery_low.upper()]
+    on_position_lost = Reaction[p.on_position_lost.upper()]
+    alone_s = math.inf if p.alone_s is None else p.alone_s
+    return {
+        Event.SIGHT_LOST: Rule(Barrier.WAIT, Reaction.HOVER),
+        Event.CAMERA_LOST: Rule(Barrier.NONE, Reaction.DEGRADE),
+        Event.FRAMES_DROPPED: Rule(Barrier.NONE, Reaction.DEGRADE),
+        Event.ESTIMATE_STALE: Rule(Barrier.WAIT, Reaction.HOVER),
+        Event.EGO_MOTION_POOR: Rule(Barrier.NONE, Reaction.DEGRADE),
+        Event.EGO_MOTION_LOST: Rule(Barrier.WAIT, Reaction.HOVER),
+        Event.NETWORK_FAULT: Rule(Barrier.NONE, Reaction.DEGRADE),
+        Event.INFERENCE_STUCK: Rule(Barrier.NONE, Reaction.DEGRADE),
+        Event.OVERLOADED: Rule(Barrier.NONE, Reaction.DEGRADE),
+        Event.FAR_OVERLOADED: Rule(Barrier.WAIT, Reaction.HOVER),
+        Event.HOT: Rule(Barrier.NONE, Reaction.DEGRADE),
+        Event.TOO_HOT: Rule(Barrier.WAIT, Reaction.HOVER),
+        Event.LOOP_LATE: Rule(Barrier.NONE, Reaction.DEGRADE),
+        Event.TASK_DIED: Rule(Barrier.WAIT, Reaction.HOLD),
+        Event.NEIGHBOURS_LOST: Rule(Barrier.NONE, Reaction.NOTE, alone_s, Reaction.HOLD),
+        Event.NEIGHBOUR_CLOSE: Rule(Barrier.NONE, Reaction.NOTE),
+        Event.COMMAND_REFUSED: Rule(Barrier.NONE, Reaction.DEGRADE),
+        Event.FENCE_LEFT: Rule(Barrier.WAIT, Reaction.DEGRADE, p.outside_s, Reaction.HOLD),
+        Event.HEIGHTS_LEFT: Rule(Barrier.WAIT, Reaction.DEGRADE, p.outside_s, Reaction.HOLD),
+        Event.LINK_LOST: Rule(Barrier.LATCH, Reaction.SILENCE),
+        Event.NOT_OFFBOARD: Rule(Barrier.NONE, Reaction.SILENCE),
+        Event.NOT_ARMED: Rule(Barrier.WAIT, Reaction.SILENCE),
+        Event.NOT_IN_AIR: Rule(Barrier.WAIT, Reaction.NOTE),
+        Event.OFFBOARD_REFUSED: Rule(Barrier.LATCH, Reaction.SILENCE),
+        Event.BATTERY_LOW: Rule(Barrier.WAIT, on_battery_low),
+        Event.POSITION_LOST: Rule(Barrier.WAIT, on_position_lost),
+        Event.SHUTDOWN_ASKED: Rule(Barrier.LATCH, Reaction.HOLD),
+        Event.HOLD_ASKED: Rule(Barrier.LATCH, Reaction.HOLD),
+        Event.LAND_ASKED: Rule(Barrier.LATCH, Reaction.LAND),
+        Event.MISSION_LANDS: Rule(Barrier.NONE, Reaction.LAND),
+        Event.MISSION_RETURNS: Rule(Barrier.NONE, Reaction.RETURN),
+    }

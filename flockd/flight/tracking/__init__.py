@@ -1,0 +1,9 @@
+"""Neighbours over time: which detection is of which drone, where it is now, how it moves and whether it exists."""
+
+from __future__ import annotations
+
+from flockd.core.config.tracking import TrackingParameters
+from flockd.flight.tracking.measurement import Measurement
+from flockd.flight.tracking.tracker import Blind, Prediction, Tracker
+
+__all__ = ["Blind", "Measurement", "Prediction", "Tracker", "TrackingParameters"]

@@ -1,0 +1,52 @@
+"""Integrated probabilistic data association (IPDA): the probability that a track is of a drone at all.
+
+D. Musicki, R. Evans, S. Stankovic, "Integrated probabilistic data association", IEEE Transactions on Automatic Control
+39(6), 1994, with one measurement a track, as the assignment is hard. `weight` (0 to 1) is how much of an independent
+frame set this one is: log likelihood ratios count by it.
+"""
+
+from __future__ import annotations
+
+import math
+
+from flockd.core.config.tracking import TrackingParameters
+from flockd.flight.tracking.filter import Innovation
+
+
+def predicted(probability: float, interval_s: float, parameters: TrackingParameters) -> float:
+    """`interval_s` later: neighbours leave."""
+    return probability * math.exp(-interval_s / parameters.survival_time_s)
+
+
+def missed(probability: float, weight: float, parameters: TrackingParameters) -> float:
+    """After a frame set without a detection of the track, where the cameras could have shown it."""
+    return _bayes(probability, weight * math.log(1.0 - parameters.detection_probability))
+
+
+def detected(probability: float, innovation: Innovation, weight: float, parameters: TrackingParameters) -> float:
+    """After a detection that was assigned to the track: its density as a track's against that of clutter."""
+    miss = 1.0 - parameters.detection_probability
+    density_ratio = math.exp(min(innovation.log_likelihood - math.log(parameters.clutter_density), _MAX_LOG_RATIO))
+    return _bayes(probability, weight * math.log(miss + parameters.detection_probability * density_ratio))
+
+
+def averaged(
+    drone_probability: float, measured: float, hits: int, interval_s: float, parameters: TrackingParameters
+) -> float:
+    """The network's probability of a drone, averaged over a track's `hits` detections up to `measured`.
+
+    Where the network is mistaken, it is so from frame to frame: its probabilities are no independent evidence, which
+    Bayes' rule would take for certainty in the end. The memory is exponential in time.
+    """
+    share = max(1.0 / hits, 1.0 - math.exp(-interval_s / parameters.drone_probability_memory_s))
+    return drone_probability + share * (measured - drone_probability)
+
+
+def _bayes(probability: float, log_likelihood_ratio: float) -> float:
+    """The probability after evidence with this ratio of likelihoods, existence over absence."""
+    ratio = math.exp(log_likelihood_ratio)
+    return probability * ratio / (1.0 - probability + probability * ratio)
+
+
+_MAX_LOG_RATIO = 100.0
+"""Beyond it an exponential comes near the largest number there is; a probability is 1 long before."""

@@ -1,0 +1,198 @@
+"""The Kalman filter of one track: motion model, update in log-polar coordinates and size, update of the velocity."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockd.core.config.tracking import TrackingParameters
+from flockd.core.messages import FloatArray
+from flockd.flight.geometry import log_polar_residual
+from flockd.flight.tracking.measurement import Measurement
+
+_LINEARISATIONS = 3
+"""Of the iterated update (B. Bell, F. Cathey, IEEE Transactions on Automatic Control 38(2), 1993)."""
+MIN_RANGE_M = 0.01
+"""A predicted position nearer than this, inside the drone itself, has no bearing."""
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """A neighbour's position relative to the own drone and its velocity over ground, NED, and its size."""
+
+    mean: FloatArray
+    """(7,) three in metres, three in m/s, and the natural logarithm of the size in metres."""
+    covariance: FloatArray
+    """(7, 7)"""
+
+    @property
+    def position(self) -> FloatArray:
+        """(3,) metres."""
+        return self.mean[:3].copy()
+
+    @property
+    def velocity(self) -> FloatArray:
+        """(3,) m/s."""
+        return self.mean[3:6].copy()
+
+    @property
+    def size_m(self) -> float:
+        """As of `Detection.size_m`."""
+        return math.exp(self.mean[6])
+
+    @property
+    def position_covariance(self) -> FloatArray:
+        """(3, 3) m^2."""
+        return self.covariance[:3, :3].copy()
+
+    @property
+    def velocity_covariance(self) -> FloatArray:
+        """(3, 3) m^2/s^2."""
+        return self.covariance[3:6, 3:6].copy()
+
+
+@dataclass(frozen=True, eq=False)
+class Innovation:
+    """How far a measurement is from where a track predicts it, in log-polar coordinates and log size."""
+
+    residual: FloatArray
+    """(4,) as of `flockd.flight.geometry.log_polar_residual`, from the prediction to the measurement, and of the log
+    size."""
+    covariance: FloatArray
+    """(4, 4) of the residual, the prediction's and the measurement's together."""
+
+    @property
+    def squared_distance(self) -> float:
+        """The squared Mahalanobis distance."""
+        return float(self.residual @ np.linalg.solve(self.covariance, self.residual))
+
+    @property
+    def log_determinant(self) -> float:
+        """Of the covariance."""
+        return float(np.linalg.slogdet(self.covariance).logabsdet)
+
+    @property
+    def log_likelihood(self) -> float:
+        """Logarithm of the Gaussian density, per steradian, unit of log range and unit of log size."""
+        return -0.5 * (self.squared_distance + self.log_determinant + 4 * math.log(2 * math.pi))
+
+
+def initial(measurement: Measurement, own_velocity: FloatArray | None, parameters: TrackingParameters) -> State:
+    """The state after a first detection; flock mates move alike, so that it starts with the own velocity (3,)."""
+    velocity, sigma_m_s = np.zeros(3), parameters.speed_sigma_m_s
+    if own_velocity is not None:
+        velocity, sigma_m_s = own_velocity, parameters.relative_speed_sigma_m_s
+    of_place = np.vstack([measurement.range_m * np.eye(3, 4), np.zeros((3, 4)), [0.0, 0.0, 0.0, 1.0]])
+    covariance = of_place @ _noise(measurement, parameters) @ of_place.T
+    covariance[3:6, 3:6] = sigma_m_s**2 * np.eye(3)
+    return _with_velocity(State(_at(measurement, velocity), covariance), measurement, parameters)
+
+
+def predict(
+    state: State,
+    interval_s: float,
+    own_displacement: FloatArray | None,
+    own_displacement_sigma_m: float,
+    density: FloatArray,
+    parameters: TrackingParameters,
+) -> State:
+    """The state `interval_s` later, at constant velocity with white acceleration noise of `density` (3,) m^2/s^3.
+
+    `own_displacement` (3,) NED metres is the way the own drone went meanwhile, with its standard deviation an axis.
+    None: not known; the neighbour then stays where it is relative to the own drone, as flock mates move alike. Its log
+    size drifts by `size_drift`.
+    """
+    dt = interval_s
+    transition, displacement, sigma_m = np.eye(7), np.zeros(3), parameters.relative_speed_sigma_m_s * dt
+    if own_displacement is not None:
+        transition[:3, 3:6] = dt * np.eye(3)
+        displacement, sigma_m = own_displacement, own_displacement_sigma_m
+    noise = np.zeros((7, 7))
+    noise[:6, :6] = np.kron(np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), np.diag(density))
+    noise[:3, :3] += sigma_m**2 * np.eye(3)
+    noise[6, 6] = parameters.size_drift**2 * dt
+    return State(
+        mean=transition @ state.mean - np.concatenate([displacement, np.zeros(4)]),
+        covariance=transition @ state.covariance @ transition.T + noise,
+    )
+
+
+def innovation(state: State, measurement: Measurement, parameters: TrackingParameters) -> Innovation:
+    """Of a measurement against the predicted state."""
+    residual, derivative = _linearised(state.mean, measurement)
+    return Innovation(residual, derivative @ state.covariance @ derivative.T + _noise(measurement, parameters))
+
+
+def update(state: State, measurement: Measurement, parameters: TrackingParameters) -> State:
+    """The state after a measurement: an iterated extended Kalman update in log-polar coordinates, then the velocity.
+
+    The first linearisation is at the measurement and not at the prediction: where the prediction is vague, e.g. of a
+    new track, one at the prediction would overshoot.
+    """
+    predicted = innovation(state, measurement, parameters)
+    excess = _excess(predicted.squared_distance, parameters)
+    covariance = _noise(measurement, parameters) + (excess - 1.0) * predicted.covariance
+    mean = _at(measurement, state.velocity)
+    for _ in range(_LINEARISATIONS):
+        residual, derivative = _linearised(mean, measurement)
+        mean, posterior = _kalman(state, derivative, residual - derivative @ (state.mean - mean), covariance)
+    return _with_velocity(State(mean, posterior), measurement, parameters)
+
+
+def _noise(measurement: Measurement, parameters: TrackingParameters) -> FloatArray:
+    """(4, 4) covariance of a measurement's log-polar coordinates and log size.
+
+    A range is a size over an apparent size, so that the two err together: by as much, with `size_correlation`.
+    """
+    variance = measurement.log_range_variance
+    across = parameters.size_correlation * variance * measurement.bearing[:, None]
+    return np.block([[measurement.covariance, across], [across.T, np.array([[variance]])]])
+
+
+def _at(measurement: Measurement, velocity: FloatArray) -> FloatArray:
+    """The mean (7,) of a state where the measurement is, with this velocity (3,)."""
+    return np.concatenate([measurement.position, velocity, [math.log(measurement.size_m)]])
+
+
+def _with_velocity(state: State, measurement: Measurement, parameters: TrackingParameters) -> State:
+    if measurement.velocity is None:
+        return state
+    observation = np.eye(7)[3:6]
+    residual = measurement.velocity - state.velocity
+    covariance = measurement.velocity_sigma_m_s**2 * np.eye(3)
+    spread = state.velocity_covariance + covariance
+    excess = _excess(float(residual @ np.linalg.solve(spread, residual)), parameters)
+    return State(*_kalman(state, observation, residual, covariance + (excess - 1.0) * spread))
+
+
+def _excess(squared_distance: float, parameters: TrackingParameters) -> float:
+    """By how much an innovation's covariance is enlarged, at least 1.
+
+    An innovation of d > `robust_sigma` standard deviations has its covariance enlarged by (d / robust_sigma)^2: the
+    farther off, the less it moves the state.
+    """
+    return max(1.0, squared_distance / parameters.robust_sigma**2)
+
+
+def _linearised(mean: FloatArray, measurement: Measurement) -> tuple[FloatArray, FloatArray]:
+    """The residual (4,) of a measurement from a state (7,), and the derivative (4, 7) of the predicted measurement."""
+    distance_m = float(np.linalg.norm(mean[:3]))
+    range_m = max(distance_m, MIN_RANGE_M)
+    bearing = mean[:3] / range_m if distance_m >= MIN_RANGE_M else measurement.bearing
+    place = log_polar_residual(measurement.bearing, measurement.log_range, bearing, float(np.log(range_m)))
+    derivative = np.zeros((4, 7))
+    derivative[:3, :3] = np.eye(3) / range_m
+    derivative[3, 6] = 1.0
+    return np.append(place, math.log(measurement.size_m) - mean[6]), derivative
+
+
+def _kalman(
+    state: State, derivative: FloatArray, residual: FloatArray, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (7,) and covariance (7, 7), in Joseph's form, after `residual` with noise of `covariance`."""
+    spread = derivative @ state.covariance @ derivative.T + covariance
+    gain = np.linalg.solve(spread, derivative @ state.covariance).T
+    left = np.eye(7) - gain @ derivative
+    return state.mean + gain @ residual, left @ state.covariance @ left.T + gain @ covariance @ gain.T

@@ -1,0 +1,85 @@
+"""One detection in the axes the tracker works in."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from flockd.core.messages import Detection, FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A neighbour measured in log-polar coordinates, in level axes that point north, east and down (NED).
+
+    Raises ValueError for numbers that are not finite or out of range.
+    """
+
+    bearing: FloatArray
+    """(3,) unit vector from the own drone to the neighbour."""
+    log_range: float
+    """Natural logarithm of the range in metres."""
+    covariance: FloatArray
+    """(3, 3) of what `flockd.flight.geometry.log_polar_residual` measures, in NED axes: along the bearing the variance
+    of the log range, across it that of the angle, rad^2."""
+    size_m: float
+    """As of `Detection.size_m`."""
+    drone_probability: float = 1.0
+    """Of being a drone at all, 0 to 1."""
+    velocity: FloatArray | None = None
+    """(3,) m/s over ground, where one was estimated (Eq. 36)."""
+    velocity_sigma_m_s: float = 1.0
+    """Standard deviation of `velocity`, each axis."""
+
+    def __post_init__(self) -> None:
+        if not abs(float(np.linalg.norm(self.bearing)) - 1.0) < 1e-6:  # a NaN fails too
+            raise ValueError("a measured bearing must be a unit vector")
+        if not math.isfinite(self.log_range):
+            raise ValueError("a measured log range must be finite")
+        if not np.isfinite(self.covariance).all():
+            raise ValueError("a measurement's covariance must be finite")
+        if not (math.isfinite(self.size_m) and self.size_m > 0):
+            raise ValueError(f"a measured size must be finite and positive, not {self.size_m} m")
+        if not 0 <= self.drone_probability <= 1:
+            raise ValueError(f"a probability lies between 0 and 1, not at {self.drone_probability}")
+        if self.velocity is not None and not np.isfinite(self.velocity).all():
+            raise ValueError("a measured velocity must be finite")
+        if not (math.isfinite(self.velocity_sigma_m_s) and self.velocity_sigma_m_s > 0):
+            raise ValueError(f"a velocity's sigma must be finite and positive, not {self.velocity_sigma_m_s} m/s")
+
+    @classmethod
+    def of(
+        cls,
+        detection: Detection,
+        R_ned_body: FloatArray,
+        velocity: FloatArray | None = None,
+        velocity_sigma_m_s: float = 1.0,
+    ) -> Self:
+        """A detection, turned by the attitude (3, 3) from body into NED axes; `velocity` (3,) is NED already."""
+        return cls(
+            bearing=R_ned_body @ detection.bearing,
+            log_range=detection.log_range,
+            covariance=R_ned_body @ detection.covariance @ R_ned_body.T,
+            size_m=detection.size_m,
+            drone_probability=detection.drone_probability,
+            velocity=velocity,
+            velocity_sigma_m_s=velocity_sigma_m_s,
+        )
+
+    @property
+    def range_m(self) -> float:
+        """From the own drone."""
+        return math.exp(self.log_range)
+
+    @property
+    def log_range_variance(self) -> float:
+        """The part of `covariance` along the bearing."""
+        return float(self.bearing @ self.covariance @ self.bearing)
+
+    @property
+    def position(self) -> FloatArray:
+        """(3,) metres, NED, own drone at the origin."""
+        return self.range_m * self.bearing

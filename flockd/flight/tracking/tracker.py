@@ -1,0 +1,199 @@
+"""The tracker: neighbours followed from frame set to frame set, each with a probability of existing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockd.core.config.tracking import TrackingParameters
+from flockd.core.messages import BoolArray, FloatArray, Neighbour
+from flockd.flight.tracking import existence, filter  # noqa: A004 - the field's word
+from flockd.flight.tracking.association import assign
+from flockd.flight.tracking.filter import Innovation, State
+from flockd.flight.tracking.manoeuvres import Manoeuvres
+from flockd.flight.tracking.measurement import Measurement
+
+Blind = Callable[[FloatArray], BoolArray]
+"""Of positions (n, 3), metres NED from the own drone: which (n,) no camera could show at this time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Where a confirmed neighbour should be detected next."""
+
+    position: FloatArray
+    """(3,) metres, NED, own drone at the origin."""
+    covariance: FloatArray
+    """(3, 3) m^2 of `position`."""
+    size_m: float
+    """As of `Detection.size_m`."""
+    existence_probability: float
+
+
+class Tracker:
+    """Follows neighbours in level axes that point north, east and down, with the own drone at the origin.
+
+    Every step: `predict`, then `update`, with no measurements too; then `neighbours`. Deterministic.
+    """
+
+    def __init__(self, parameters: TrackingParameters) -> None:
+        self.parameters = parameters
+        self._tracks: list[_Track] = []
+        self._manoeuvres = Manoeuvres(parameters)
+        self._time_s = 0.0
+        self._created = 0
+
+    def predict(
+        self, interval_s: float, own_displacement: FloatArray | None, own_displacement_sigma_m: float = 0.0
+    ) -> None:
+        """Move all tracks on by `interval_s`.
+
+        `own_displacement` (3,) NED metres is the way the own drone went meanwhile, with its standard deviation an axis.
+        None: not known; the tracks then stay where they are relative to the own drone, as flock mates move alike, and
+        grow uncertain by `relative_speed_sigma_m_s`. The own drone's changes of velocity say how hard its neighbours
+        manoeuvre (`Manoeuvres`).
+        """
+        self._manoeuvres.see(own_displacement, own_displacement_sigma_m, interval_s)
+        density = self._manoeuvres.density
+        for track in self._tracks:
+            track.state = filter.predict(
+                track.state, interval_s, own_displacement, own_displacement_sigma_m, density, self.parameters
+            )
+            track.existence = existence.predicted(track.existence, interval_s, self.parameters)
+
+    def update(
+        self,
+        time_s: float,
+        measurements: Sequence[Measurement],
+        own_velocity: FloatArray | None = None,
+        blind: Blind | None = None,
+    ) -> tuple[int, ...]:
+        """Take in one frame set's measurements at `time_s`; the track number of each, new where it fits no track.
+
+        `own_velocity` (3,) NED m/s is what a new track starts with: flock mates move alike. A track that is missed
+        where the rig is `blind` (None: nowhere) is as probable as before, but ages as any other.
+        """
+        interval_s = max(0.0, time_s - self._time_s)
+        weight = min(1.0, interval_s / self.parameters.evidence_interval_s)
+        self._time_s = time_s
+        pairs = assign(measurements, [track.state for track in self._tracks], self.parameters)
+        missed = self._without({column for column, _ in pairs.values()})
+        self._miss(missed, weight, blind)
+        numbers = []
+        for index, measurement in enumerate(measurements):
+            if index in pairs:
+                column, innovation = pairs[index]
+                track = self._tracks[column]
+                self._detect(track, measurement, innovation, weight)
+            else:
+                track = self._begin(measurement, own_velocity)
+                self._tracks.append(track)
+            numbers.append(track.number)
+        for track in self._tracks:
+            self._confirm(track)
+        self._tracks = [track for track in self._tracks if self._is_kept(track)]
+        return tuple(numbers)
+
+    def predictions(self, interval_s: float, own_velocity: FloatArray | None) -> tuple[Prediction, ...]:
+        """Where the tracks that were ever confirmed should be after `interval_s`, at constant velocities.
+
+        `own_velocity` (3,) NED m/s; None: all stay where they are relative to the own drone. Changes nothing.
+        """
+        displacement = None if own_velocity is None else interval_s * own_velocity
+        known = [track for track in self._tracks if track.was_confirmed]
+        density = self._manoeuvres.density
+        states = [
+            filter.predict(track.state, interval_s, displacement, 0.0, density, self.parameters) for track in known
+        ]
+        return tuple(
+            Prediction(
+                position=state.position,
+                covariance=state.position_covariance,
+                size_m=state.size_m,
+                existence_probability=track.drone_probability
+                * existence.predicted(track.existence, interval_s, self.parameters),
+            )
+            for track, state in zip(known, states, strict=True)
+        )
+
+    def neighbours(self) -> tuple[Neighbour, ...]:
+        """All tracks as of the last `predict` and `update`, confirmed or not, by track number."""
+        return tuple(
+            Neighbour(
+                track=track.number,
+                position=track.state.position,
+                velocity=track.state.velocity,
+                position_sigma_m=float(np.sqrt(np.trace(track.state.position_covariance) / 3)),
+                velocity_sigma_m_s=float(np.sqrt(np.trace(track.state.velocity_covariance) / 3)),
+                age_s=self._time_s - track.first_seen_s,
+                unseen_s=self._time_s - track.last_seen_s,
+                hits=track.hits,
+                confirmed=track.confirmed,
+                existence_probability=track.existence * track.drone_probability,
+            )
+            for track in self._tracks
+        )
+
+    def _without(self, assigned: set[int]) -> list[_Track]:
+        return [track for index, track in enumerate(self._tracks) if index not in assigned]
+
+    def _miss(self, tracks: Sequence[_Track], weight: float, blind: Blind | None) -> None:
+        if blind is not None and tracks:
+            hidden = blind(np.array([track.state.position for track in tracks]))
+            tracks = [track for track, one in zip(tracks, hidden, strict=True) if not one]
+        for track in tracks:
+            track.existence = existence.missed(track.existence, weight, self.parameters)
+
+    def _detect(self, track: _Track, measurement: Measurement, innovation: Innovation, weight: float) -> None:
+        interval_s = max(0.0, self._time_s - track.last_seen_s)
+        track.hits += 1
+        track.agreed += innovation.squared_distance <= self.parameters.confirm_sigma**2
+        track.existence = existence.detected(track.existence, innovation, weight, self.parameters)
+        track.drone_probability = existence.averaged(
+            track.drone_probability, measurement.drone_probability, track.hits, interval_s, self.parameters
+        )
+        track.state = filter.update(track.state, measurement, self.parameters)
+        track.last_seen_s = self._time_s
+
+    def _begin(self, measurement: Measurement, own_velocity: FloatArray | None) -> _Track:
+        self._created += 1
+        return _Track(
+            number=self._created,
+            state=filter.initial(measurement, own_velocity, self.parameters),
+            existence=self.parameters.birth_probability,
+            drone_probability=measurement.drone_probability,
+            first_seen_s=self._time_s,
+            last_seen_s=self._time_s,
+        )
+
+    def _confirm(self, track: _Track) -> None:
+        needed = self.parameters.keep_probability if track.confirmed else self.parameters.confirm_probability
+        track.confirmed = (
+            track.agreed >= self.parameters.confirm_hits and track.existence * track.drone_probability > needed
+        )
+        track.was_confirmed |= track.confirmed
+
+    def _is_kept(self, track: _Track) -> bool:
+        unseen_s = self._time_s - track.last_seen_s
+        return unseen_s <= self.parameters.max_unseen_s and track.existence >= self.parameters.drop_probability
+
+
+@dataclass
+class _Track:
+    """One neighbour."""
+
+    number: int
+    state: State
+    existence: float
+    """Probability of being anything that persists."""
+    drone_probability: float
+    """Of being a drone if it exists."""
+    first_seen_s: float
+    last_seen_s: float
+    hits: int = 1
+    agreed: int = 1
+    """Of the hits, those within `confirm_sigma`."""
+    confirmed: bool = False
+    was_confirmed: bool = False

@@ -1,0 +1,1 @@
+"""Before a flight: cameras, calibration, doctor, datasets, pictures."""

@@ -1,0 +1,279 @@
+"""From views of a board to a camera: the lens that puts every corner where it was seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import compress
+
+import numpy as np
+
+from flockd.core.choices import LensModel
+from flockd.core.messages import FloatArray
+from flockd.flight.geometry import Camera, PinholeCamera, RigidTransform, WideAngleCamera
+from flockd.flight.geometry.robust.solver import LevenbergMarquardt, NormalEquations, Problem
+from flockd.ground.calibration.errors import CalibrationError
+from flockd.ground.calibration.poses import first_poses, jacobian_of_move, moved
+from flockd.ground.calibration.rejection import OutlierRejection, root_mean_square
+from flockd.ground.calibration.views import View
+
+MIN_VIEWS = 6
+_COEFFICIENTS = {"pinhole": 5, "wide_angle": 4}
+_FIRST_FOCALS = {
+    "pinhole": np.geomspace(0.3, 4.0, 9),
+    "wide_angle": 1.0 / np.radians(np.linspace(60.0, 240.0, 9)),
+}
+"""Focal lengths to begin with, in widths of the image."""
+_REJECTION = OutlierRejection(margin_px=0.1)
+_COEFFICIENT_STEP = 1e-6
+_FOCAL_SIGMA = 0.01
+"""A focal length that the views leave more uncertain than this is not known."""
+_CENTRE_SIGMA = 0.01
+"""The same for the principal point, in widths of the image."""
+_LEAST_TILT_DEG = 10.0
+CLEARLY_BETTER = 0.8
+"""A more complicated model has to leave less than this share of a simpler one's residual."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """A calibrated camera, and how well the views agree on it."""
+
+    model: LensModel
+    camera: Camera
+    sigma: FloatArray
+    """Standard deviations of fx, fy, cx, cy and the distortion, from the residuals: what noise alone leaves open."""
+    views: tuple[View, ...]
+    """Those it was fitted to."""
+    poses: tuple[RigidTransform, ...]
+    """``T_camera_board`` of each."""
+    dropped: tuple[tuple[View, float], ...]
+    """Views that did not fit the others, each with its residual in pixels."""
+
+    def residuals(self) -> list[FloatArray]:
+        """For each view (n, 2) pixels, seen less predicted."""
+        return [_residuals(self.camera, view, pose) for view, pose in zip(self.views, self.poses, strict=True)]
+
+    @property
+    def rms_px(self) -> float:
+        """Root of the mean squared distance of all corners."""
+        return root_mean_square(np.concatenate(self.residuals()))
+
+    @property
+    def rms_of_views_px(self) -> tuple[float, ...]:
+        """The same for each view."""
+        return tuple(root_mean_square(residuals) for residuals in self.residuals())
+
+    @property
+    def max_px(self) -> float:
+        """The largest distance of any corner."""
+        return float(np.linalg.norm(np.concatenate(self.residuals()), axis=1).max())
+
+    @property
+    def tilts_deg(self) -> tuple[float, ...]:
+        """How far the board's plane was turned away from the image's, in each view."""
+        return tuple(tilt_deg(pose) for pose in self.poses)
+
+    @property
+    def reaches_corners(self) -> bool:
+        """Whether the fitted lens gives a ray for every pixel of the image."""
+        width, height = self.camera.size
+        edges = np.array([(u, v) for u in (0.0, width / 2, width) for v in (0.0, height / 2, height)])
+        return bool(np.isfinite(self.camera.rays(edges)).all())
+
+    @property
+    def field_of_view_deg(self) -> tuple[float, float]:
+        """From left to right and from top to bottom through the principal point; NaN where it does not reach."""
+        (width, height), cx, cy = self.camera.size, self.camera.matrix[0, 2], self.camera.matrix[1, 2]
+        rays = self.camera.rays(np.array([(0.0, cy), (width, cy), (cx, 0.0), (cx, height)]))
+        angles = np.degrees(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]))
+        return float(angles[0] + angles[1]), float(angles[2] + angles[3])
+
+
+def calibrate(views: Sequence[View], size: tuple[int, int], model: LensModel) -> Lens:
+    """The camera of this model with the least squared residual.
+
+    Raises CalibrationError for too few views, and for views from which the camera cannot be known: all square to it,
+    or not of one flat board.
+    """
+    if len(views) < MIN_VIEWS:
+        raise CalibrationError(
+            f"{len(views)} usable views of the board are too few; show it at least {MIN_VIEWS} times"
+        )
+    state = _begin(views, size, model)
+    dropped: list[tuple[View, float]] = []
+    kept = list(views)
+    for _ in range(_REJECTION.max_rounds):
+        solution = LevenbergMarquardt().minimise(_LensProblem(kept), state)
+        state = solution.state
+        rms = np.array(
+            [root_mean_square(_residuals(state.camera, *one)) for one in zip(kept, state.poses, strict=True)]
+        )
+        fits = _REJECTION.inliers(rms)
+        if fits.all():
+            break
+        dropped += [(kept[index], float(rms[index])) for index in np.flatnonzero(~fits)]
+        state = _State(state.camera, tuple(compress(state.poses, fits)))
+        kept = list(compress(kept, fits))
+        if len(dropped) > _REJECTION.max_dropped * len(views) or len(kept) < MIN_VIEWS:
+            raise CalibrationError(
+                f"{len(dropped)} of {len(views)} views contradict the others; use a flat, rigid board, focus that "
+                "stays as it is, and the board's own numbers of squares"
+            )
+    corners = sum(len(view.seen.ids) for view in kept)
+    sigma = solution.sigma(2 * corners, len(solution.equations.gradient))[: 4 + _COEFFICIENTS[model]]
+    lens = Lens(model, state.camera, sigma, tuple(kept), state.poses, tuple(dropped))
+    _check_known(lens)
+    return lens
+
+
+def simplest_that_fits(lenses: Sequence[Lens]) -> Lens:
+    """Of lenses fitted to the same views, simplest first: the first that none fits clearly better than.
+
+    Noise alone leaves one model a little less residual than another, and an absurd distortion can imitate a plain lens.
+    """
+    best_px = min(lens.rms_px for lens in lenses)
+    return next(lens for lens in lenses if lens.rms_px * CLEARLY_BETTER <= best_px)
+
+
+def tilt_deg(pose: RigidTransform) -> float:
+    """How far the board's plane is turned away from the image's, 0 to 90."""
+    return math.degrees(math.acos(min(abs(float(pose.rotation[2, 2])), 1.0)))
+
+
+def rough_tilts_deg(views: Sequence[View], size: tuple[int, int], model: LensModel) -> list[float]:
+    """Tilts of the board before its camera is calibrated: good enough for advice."""
+    if len(views) < 2:
+        return [0.0] * len(views)
+    return [tilt_deg(pose) for pose in _begin(views, size, model).poses]
+
+
+def _check_known(lens: Lens) -> None:
+    fx, fy = lens.camera.matrix[0, 0], lens.camera.matrix[1, 1]
+    focal = float(max(lens.sigma[0] / fx, lens.sigma[1] / fy))
+    centre = float(max(lens.sigma[2:4])) / lens.camera.size[0]
+    tilted = max(lens.tilts_deg)
+    known = focal < _FOCAL_SIGMA and centre < _CENTRE_SIGMA
+    if tilted < _LEAST_TILT_DEG:
+        raise CalibrationError(
+            f"the board was tilted by {tilted:.0f} degrees at most, so that the focal length cannot be separated from "
+            "the distance; show it tilted by 30 to 45 degrees to each side, up and down, and all over the image"
+        )
+    if not known:
+        raise CalibrationError(
+            f"the views leave the focal length uncertain by {100 * focal:.2g} % and the principal point by "
+            f"{100 * centre:.2g} % of the width, with a residual of {lens.rms_px:.2f} px; show the board tilted, and "
+            "all over the image, or choose another model"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    camera: Camera
+    poses: tuple[RigidTransform, ...]
+
+
+def _begin(views: Sequence[View], size: tuple[int, int], model: LensModel) -> _State:
+    """The best of a few plain lenses, with the board's pose in each view."""
+    best: tuple[float, Camera, list[tuple[float, RigidTransform | None]]] | None = None
+    for focal in _FIRST_FOCALS[model]:
+        camera = _camera(model, size, np.array([focal * size[0], focal * size[0], size[0] / 2, size[1] / 2]))
+        poses = [_first_pose(camera, view) for view in views]
+        error = float(np.median([error for error, _ in poses]))
+        if best is None or error < best[0]:
+            best = error, camera, poses
+    assert best is not None
+    lost = [view.name for view, (_, pose) in zip(views, best[2], strict=True) if pose is None]
+    if lost:
+        raise CalibrationError(f"{lost[0]}: what is seen is no flat board; remove it, or check the board's squares")
+    return _State(_with_zero_distortion(best[1]), tuple(pose for _, pose in best[2] if pose is not None))
+
+
+def _first_pose(camera: Camera, view: View) -> tuple[float, RigidTransform | None]:
+    """The board's likelier pose, after its residual; none, after infinity, where it fits none."""
+    found = [(root_mean_square(_residuals(camera, view, pose)), pose) for pose in first_poses(camera, view.seen)]
+    finite = [one for one in found if math.isfinite(one[0])]
+    return min(finite, key=lambda one: one[0]) if finite else (math.inf, None)
+
+
+@dataclass(frozen=True, eq=False)
+class _LensProblem(Problem[_State]):
+    """Blocks: the lens, then six for each view."""
+
+    views: Sequence[View]
+
+    def linearise(self, state: _State) -> NormalEquations:
+        lens = len(_numbers(state.camera))
+        size = lens + 6 * len(self.views)
+        gradient, hessian, cost = np.zeros(size), np.zeros((size, size)), 0.0
+        pairs = list(zip(self.views, state.poses, strict=True))
+        points = np.concatenate([pose.apply(view.seen.points) for view, pose in pairs])
+        residuals = state.camera.project(points) - np.concatenate([view.seen.pixels for view in self.views])
+        by_point, by_lens = state.camera.jacobian(points), _jacobian_of_lens(state.camera, points)
+        if not (np.isfinite(residuals).all() and np.isfinite(by_point).all() and np.isfinite(by_lens).all()):
+            return NormalEquations.unsolvable(size)
+        start = 0
+        for index, (view, pose) in enumerate(pairs):
+            part = slice(start, start + len(view.seen.ids))
+            start = part.stop
+            by_pose = by_point[part] @ jacobian_of_move(pose, view.seen.points)
+            block = NormalEquations.of(
+                residuals[part].ravel(), np.concatenate([by_lens[part], by_pose], axis=2).reshape(-1, lens + 6)
+            )
+            own = np.r_[:lens, lens + 6 * index : lens + 6 * index + 6]
+            cost += block.cost
+            gradient[own] += block.gradient
+            hessian[np.ix_(own, own)] += block.hessian
+        return NormalEquations(cost, gradient, hessian)
+
+    def move(self, state: _State, step: FloatArray) -> _State:
+        numbers = _numbers(state.camera)
+        changed = numbers + step[: len(numbers)]
+        # A focal length that shrinks to nothing or turns its sign is no camera; the step is refused by its cost.
+        changed[:2] = np.maximum(changed[:2], 0.2 * numbers[:2])
+        steps = step[len(numbers) :].reshape(-1, 6)
+        poses = tuple(moved(pose, own) for pose, own in zip(state.poses, steps, strict=True))
+        return _State(_camera_like(state.camera, changed), poses)
+
+
+def _jacobian_of_lens(camera: Camera, points: FloatArray) -> FloatArray:
+    """(n, 2, 4 + coefficients) derivative of the pixels by fx, fy, cx, cy and the distortion."""
+    numbers = _numbers(camera)
+    derivative = np.zeros((len(points), 2, len(numbers)))
+    pixels = camera.project(points)
+    derivative[:, [0, 1], [0, 1]] = (pixels - numbers[2:4]) / numbers[:2]
+    derivative[:, [0, 1], [2, 3]] = 1.0
+    for index in range(4, len(numbers)):
+        step = np.zeros(len(numbers))
+        step[index] = _COEFFICIENT_STEP
+        more, less = _camera_like(camera, numbers + step), _camera_like(camera, numbers - step)
+        derivative[:, :, index] = (more.project(points) - less.project(points)) / (2 * _COEFFICIENT_STEP)
+    return derivative
+
+
+def _numbers(camera: Camera) -> FloatArray:
+    m = camera.matrix
+    return np.array([m[0, 0], m[1, 1], m[0, 2], m[1, 2], *camera.distortion])
+
+
+def _camera_like(camera: Camera, numbers: FloatArray) -> Camera:
+    return _camera("pinhole" if isinstance(camera, PinholeCamera) else "wide_angle", camera.size, numbers)
+
+
+def _camera(model: LensModel, size: tuple[int, int], numbers: FloatArray) -> Camera:
+    fx, fy, cx, cy, *distortion = (float(number) for number in numbers)
+    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    kind = PinholeCamera if model == "pinhole" else WideAngleCamera
+    return kind(matrix, size, tuple(distortion))
+
+
+def _with_zero_distortion(camera: Camera) -> Camera:
+    """The same lens, with coefficients to be fitted."""
+    numbers = _numbers(camera)
+    model: LensModel = "pinhole" if isinstance(camera, PinholeCamera) else "wide_angle"
+    return _camera(model, camera.size, np.concatenate([numbers, np.zeros(_COEFFICIENTS[model])]))
+
+
+def _residuals(camera: Camera, view: View, pose: RigidTransform) -> FloatArray:
+    return view.seen.pixels - camera.project(pose.apply(view.seen.points))

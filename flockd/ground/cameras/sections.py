@@ -1,0 +1,62 @@
+"""The sections `rig` and `source` of a drone's configuration for the cameras that are plugged in."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+
+from flockd.core.config.new_files import rig_lines
+from flockd.ground.cameras.found import FoundCamera, Mode
+
+FIELD_OF_VIEW_DEG = 120.0
+"""Written down until the lenses are calibrated."""
+_BY_HAND = {"auto_exposure": 1, "exposure_auto": 1, "exposure_time_absolute": 50, "exposure_absolute": 50}
+"""What cameras of the USB video class take for an exposure of 5 ms that is set by hand."""
+
+
+def sections_text(cameras: Mapping[str, tuple[FoundCamera, Mode]]) -> str:
+    """A commented file that `flockd config check` passes; cameras by their names in the rig."""
+    as_pipelines = any(camera.element for camera, _ in cameras.values())
+    lines = [
+        "# Written by `flockd cameras`: the cameras of this computer, as sections of a drone's configuration.",
+        "# Fill in which camera looks where: exchange the names. `flockd cameras --picture FOLDER` shows what each",
+        "# sees.",
+        *rig_lines({name: mode.size for name, (_, mode) in cameras.items()}, FIELD_OF_VIEW_DEG),
+        "",
+        "source:",
+        f"  kind: {'gstreamer' if as_pipelines else 'v4l2'}",
+        "  cameras:",
+    ]
+    slowest_hz = min(mode.rates_hz[0] for _, mode in cameras.values())
+    for name, (camera, mode) in cameras.items():
+        parameters = camera.parameters(name, mode, as_pipeline=as_pipelines)
+        where = f", {camera.node} now" if camera.node else ""
+        lines.append(f"    - name: {name}    # {' '.join(camera.name.split())}{where}")
+        if parameters.pipeline:
+            lines.append(f"      pipeline: {json.dumps(parameters.pipeline, ensure_ascii=False)}")
+        else:
+            lines.append(f"      device: {json.dumps(parameters.device)}")
+            lines.append(f"      pixel_format: {parameters.pixel_format}")
+        lines.append(f"      rate_hz: {parameters.rate_hz:g}")
+        if not as_pipelines:
+            lines += _controls(camera)
+    tolerance_s = max(0.02, 0.6 / slowest_hz)
+    silence_s = max(0.5, 3.0 / slowest_hz)
+    lines += [
+        f"  set_tolerance_s: {tolerance_s:.3g}    # half a frame period or more",
+        f"  silence_s: {silence_s:.3g}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _controls(camera: FoundCamera) -> list[str]:
+    """A fixed, short exposure where the camera has the usual controls; the others as comments."""
+    offered = {control.name: control for control in camera.controls}
+    set_by_hand = [name for name in _BY_HAND if name in offered]
+    lines = ["      controls:"] if set_by_hand else []
+    for name in set_by_hand:
+        low, high = offered[name].low, offered[name].high
+        value = min(max(_BY_HAND[name], low), high)
+        lines.append(f"        - {{name: {name}, value: {value}}}    # {low} to {high}")
+    others = [f"{one.name} {one.low} to {one.high}" for one in camera.controls if one.name not in set_by_hand]
+    return [*lines, *(f"      # also: {other}" for other in others)]

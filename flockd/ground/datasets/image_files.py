@@ -1,0 +1,109 @@
+"""Image and depth files, whole or not at all: a decoder would fill in what is missing."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from flockd.core.image_header import MAX_IMAGE_PIXELS, image_size
+from flockd.core.messages import Float32Array, UInt8Array
+from flockd.ground.datasets.errors import DatasetError
+
+SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff"})
+_PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
+_JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+MAX_FILE_BYTES = 1 << 29
+"""Of an image with the most pixels that are read, and a depth of 16 bits, uncompressed, and some."""
+_CHUNK_FRAME = 12
+"""Bytes of a PNG chunk beside its data: length, name and checksum."""
+
+
+def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool = False) -> UInt8Array:
+    """(h, w, 3) RGB; grey images have three equal channels. Raises DatasetError, also for another ``size``.
+
+    ``upright``: turned as the file's orientation says, as a phone writes it; else as the sensor gave it.
+    """
+    image = _decoded(path, cv2.IMREAD_COLOR_RGB | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION))
+    if size is not None:
+        _check_size(path, image.shape[1::-1], size)
+    return np.asarray(image, np.uint8)
+
+
+def read_depth(path: Path, size: tuple[int, int], units_per_m: float) -> Float32Array:
+    """(h, w) metres, NaN where the file has 0. Raises DatasetError, also for a file that has 0 everywhere."""
+    raw = _decoded(path, cv2.IMREAD_UNCHANGED)
+    if raw.dtype != np.uint16 or raw.ndim != 2:
+        raise DatasetError(f"{path}: is no depth map; it needs one channel of 16 bits")
+    _check_size(path, raw.shape[1::-1], size)
+    if not raw.any():
+        raise DatasetError(f"{path}: its depth is 0 everywhere; restore it, or replay with --depth network")
+    return np.where(raw > 0, raw.astype(np.float32) / np.float32(units_per_m), np.float32(np.nan))
+
+
+def _decoded(path: Path, flags: int) -> cv2.typing.MatLike:
+    logging = cv2.utils.logging
+    before = logging.setLogLevel(logging.LOG_LEVEL_SILENT)  # the sentence below says it
+    try:
+        data = _read(path)
+        fault = _fault(data)
+        image = None if fault else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except (OSError, ValueError) as error:  # ValueError: what a list names cannot be a path
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise DatasetError(f"{path}: cannot be read ({reason}); restore it, or leave its frame out") from None
+    except cv2.error:  # of a header that claims more pixels than OpenCV takes
+        image, fault = None, "cannot be decoded"
+    finally:
+        logging.setLogLevel(before)
+    if image is None:
+        raise DatasetError(f"{path}: {fault or 'is no image'}; restore it, or leave its frame out")
+    return image
+
+
+def _read(path: Path) -> bytes:
+    """Of an ordinary file: a pipe or a device may never end."""
+    if path.exists() and not path.is_file():
+        raise DatasetError(f"{path}: is not an ordinary file; restore it, or leave its frame out")
+    if path.exists() and path.stat().st_size > MAX_FILE_BYTES:
+        raise DatasetError(f"{path}: is larger than {MAX_FILE_BYTES >> 20} MiB; give it the dataset's size")
+    return path.read_bytes()
+
+
+def _fault(data: bytes) -> str | None:
+    """What is wrong with a file before it is decoded, and memory taken for what it claims to hold."""
+    if not data:
+        return "is empty"
+    size = image_size(data)
+    if size is None:
+        return "is no image"
+    if size[0] * size[1] > MAX_IMAGE_PIXELS:
+        return f"claims to be {size[0]} x {size[1]} pixels, more than any camera has"
+    if data.startswith(_PNG):
+        return _png_fault(data)
+    if data.startswith(_JPEG) and _JPEG_END not in data[-64:]:
+        return "the JPEG ends too early"
+    return None
+
+
+def _png_fault(data: bytes) -> str | None:
+    at = len(_PNG)
+    while at + _CHUNK_FRAME <= len(data):
+        end = at + _CHUNK_FRAME + int.from_bytes(data[at : at + 4])
+        if end > len(data):
+            break
+        if zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end]):
+            return f"the PNG is damaged at byte {at}"
+        if data[at + 4 : at + 8] == _PNG_END:
+            return None
+        at = end
+    return "the PNG ends too early"
+
+
+def _check_size(path: Path, found: tuple[int, ...], size: tuple[int, int]) -> None:
+    if found != size:
+        raise DatasetError(
+            f"{path}: is {found[0]} x {found[1]} pixels, and the camera {size[0]} x {size[1]}; "
+            "give it the dataset's size"
+        )

@@ -1,0 +1,284 @@
+"""The autopilot: connected, of a known version, and set up to act when setpoints stop. Nothing here changes it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+
+from flockd.core.config import DroneConfig
+from flockd.core.config.autopilot import AutopilotParameters
+from flockd.core.config.safety import GateParameters
+from flockd.ground.doctor.finding import Finding, Level, failed, failed_from_error, passed, warned
+from flockd.ground.doctor.range_checks import WATCHED_S, judge_range_finder
+from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware
+from flockd.onboard.autopilot.clock_sync import ClockEstimate
+from flockd.onboard.autopilot.mavlink_messages import MOST_ERROR_S
+from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
+from flockd.onboard.autopilot.refusals import Refusal
+
+HEARD_S = 10.0
+CLOCK_S = 1.0
+"""For exchanges of times with it."""
+CHECKS_S = 2.0
+"""For the autopilot to run its checks and to tell them."""
+OLDEST_TRIED = (1, 14)
+"""Before PX4 1.14, COM_OBL_RC_ACT held only with a remote control, and COM_OBL_ACT without."""
+LONGEST_LOSS_S = 1.0
+
+
+def check_autopilot(config: DroneConfig) -> Iterator[Finding]:
+    """All of it, over a link of its own."""
+    if config.autopilot is None:
+        measured = "the configuration has no `autopilot`: this drone can be simulated but not flown"
+        yield warned("autopilot", measured, "add `autopilot` with the `address` of the autopilot")
+        return
+    yield from asyncio.run(_ask(config, config.autopilot))
+
+
+async def _ask(config: DroneConfig, parameters: AutopilotParameters) -> list[Finding]:
+    link = await AutopilotLink.connect(parameters, timeout_s=HEARD_S)
+    try:
+        heard = link.status()
+        firmware = await _firmware(link)
+        found = [judge_heartbeat(link.system_id, heard, parameters)]
+        signing = judge_signing(isinstance(firmware, Firmware), link.status().heartbeat_age_s, parameters)
+        if isinstance(firmware, Firmware):
+            found += [judge_firmware(firmware), signing, *await _parameters(link, config, parameters)]
+        elif signing.level is Level.FAILURE:
+            found += [failed_from_error("firmware", str(firmware)), signing]
+        else:
+            found += [failed_from_error("firmware", str(firmware)), *await _parameters(link, config, parameters)]
+        if link.status().heartbeat_age_s <= parameters.max_heartbeat_age_s:
+            found += judge_refusals(await _refusals(link))
+            found.append(judge_clock(await _clock(link)))
+            found += await _range_finder(link, config)
+        found += judge_messages(link.unknown_values())
+    finally:
+        await link.close()
+    return found
+
+
+async def _refusals(link: AutopilotLink) -> tuple[Refusal, ...]:
+    """What the autopilot's checks say when they are run now; without such a list, what its messages say."""
+    try:
+        async with asyncio.timeout(CHECKS_S):
+            await link.ask_for_checks()
+            while not link.knows_checks():
+                await asyncio.sleep(0.02)
+    except (AutopilotError, TimeoutError):
+        pass
+    return link.refusals()
+
+
+async def _clock(link: AutopilotLink) -> ClockEstimate | None:
+    """The autopilot's clock after some exchanges; None where it does not answer them."""
+    with suppress(TimeoutError):
+        async with asyncio.timeout(CLOCK_S):
+            await link.synchronise()
+    return link.clock()
+
+
+async def _range_finder(link: AutopilotLink, config: DroneConfig) -> list[Finding]:
+    await asyncio.sleep(WATCHED_S if config.perception.height != "barometer" else 0.0)
+    return judge_range_finder(link.ground_range(), link.range_finders(), config)
+
+
+async def _firmware(link: AutopilotLink) -> Firmware | AutopilotError:
+    try:
+        return await link.firmware()
+    except AutopilotError as error:
+        return error
+
+
+async def _parameters(link: AutopilotLink, config: DroneConfig, parameters: AutopilotParameters) -> list[Finding]:
+    found = []
+    for name, kind in KINDS.items():
+        try:
+            value = await link.parameter(name, kind)
+        except AutopilotError as error:
+            fix = f"check whether this firmware has {name}, and whether the link loses messages"
+            found.append(failed(name, str(error), fix))
+            if link.status().heartbeat_age_s > parameters.max_heartbeat_age_s:
+                found.append(judge_heartbeat(link.system_id, link.status(), parameters))
+                break
+        else:
+            found.append(JUDGES[name](value, config))
+    return found
+
+
+def judge_heartbeat(system_id: int, status: AutopilotStatus, parameters: AutopilotParameters) -> Finding:
+    """Heard, and at rest."""
+    measured = f"system {system_id} at {parameters.address}, heard {status.heartbeat_age_s:.1f} s ago"
+    if status.heartbeat_age_s > parameters.max_heartbeat_age_s:
+        return failed("heartbeat", f"{measured} and not since", "check the cable, its baud rate, and what else uses it")
+    if status.armed:
+        return warned("heartbeat", f"{measured}, and armed", "disarm it on the ground before you examine it")
+    return passed("heartbeat", f"{measured}, disarmed, in flight mode {status.flight_mode}")
+
+
+def judge_signing(responds: bool, heartbeat_age_s: float, parameters: AutopilotParameters) -> Finding:
+    """Whether it accepts messages that are not signed (MAVLink 2): flockd's are not, and others' need not be either."""
+    if responds:
+        return passed("signing", "it accepts unsigned messages of any sender: keep all others off its link")
+    if heartbeat_age_s > parameters.max_heartbeat_age_s:
+        return warned("signing", "not known: it is not heard any more", "repair the link first")
+    measured = "it is heard and does not respond: nothing reaches it, or it accepts signed messages only"
+    return failed("signing", measured, "check the cable's other direction; remove the signing key from its SD card")
+
+
+def judge_refusals(refusals: Sequence[Refusal]) -> list[Finding]:
+    """Why it could not be armed or fly offboard now."""
+    if not refusals:
+        return [passed("arming", "its checks let it be armed and fly offboard")]
+    refused = [(f"refuses {refusal.refused}: " if refusal.refused else "", refusal) for refusal in refusals]
+    return [failed("arming", f"{start}{refusal.what}", refusal.remedy) for start, refusal in refused]
+
+
+def judge_clock(clock: ClockEstimate | None) -> Finding:
+    """Whether its stamps can be placed on this computer's clock."""
+    if clock is None:
+        measured = "it does not answer TIMESYNC: attitudes count from when they arrive"
+        return warned("clock", measured, "update the firmware, and check whether the link loses messages")
+    measured = (
+        f"{clock.offset_s:+.4f} s against this computer's, known to {1e3 * clock.error_s:.2f} ms; "
+        f"single measurements {1e3 * clock.jitter_s:.2f} ms apart, "
+        f"shortest round trip {1e3 * clock.round_trip_s:.1f} ms"
+    )
+    fix = "raise the link's baud rate, send fewer streams over it, and take load off this computer"
+    if clock.error_s > MOST_ERROR_S:
+        return warned("clock", f"{measured}: so uncertain that attitudes count from when they arrive", fix)
+    return passed("clock", measured)
+
+
+def judge_messages(unknown_values: Mapping[str, int]) -> list[Finding]:
+    """A warning where messages had values that flockd does not know."""
+    if not unknown_values:
+        return []
+    values = ", ".join(f"{value} ({count} times)" for value, count in sorted(unknown_values.items()))
+    return [warned("messages", f"values that flockd does not know: {values}", "update flockd, or the firmware")]
+
+
+def judge_firmware(firmware: Firmware) -> Finding:
+    """Whether it is one whose modes and failsafes flockd knows."""
+    measured = f"{firmware.autopilot} {firmware.version}"
+    if firmware.autopilot != "PX4":
+        return failed("firmware", f"{measured} has other flight modes and failsafes", "flash PX4")
+    if tuple(int(part) for part in firmware.version.split(".")[:2]) < OLDEST_TRIED:
+        oldest = ".".join(map(str, OLDEST_TRIED))
+        return warned("firmware", f"{measured} is older than {oldest}, whose parameters are known here", "update PX4")
+    return passed("firmware", measured)
+
+
+def judge_loss_time(value: float, config: DroneConfig) -> Finding:
+    """COM_OF_LOSS_T, in seconds."""
+    name, measured = "COM_OF_LOSS_T", f"{value:g} s"
+    gap_s = AutopilotParameters().max_gap_s if config.autopilot is None else config.autopilot.max_gap_s
+    fix = f"set {name} to {LONGEST_LOSS_S:g} s"
+    if value <= gap_s:
+        measured = (
+            f"{measured}, not above autopilot.max_gap_s {gap_s:g}: PX4 would leave offboard in gaps flockd bridges"
+        )
+        return failed(name, measured, fix)
+    if value > LONGEST_LOSS_S:
+        return warned(name, f"{measured}: so long it flies on with the last velocity when setpoints stop", fix)
+    return passed(name, f"{measured} without setpoints, then its failsafe")
+
+
+_ON_LOSS = {3: "Return", 4: "Land", 5: "Hold"}
+_FATAL_ON_LOSS = {
+    -1: "disabled: it flies on with the last velocity",
+    1: "Altitude: it keeps its height, and drifts on",
+    2: "Stabilized: it keeps level, and drifts on and down",
+    6: "Terminate: the motors stop in the air",
+    7: "Disarm: the motors stop in the air",
+}
+
+
+def judge_loss_action(value: int, config: DroneConfig) -> Finding:
+    """COM_OBL_RC_ACT: what it does when setpoints stop."""
+    name, fix = "COM_OBL_RC_ACT", "set COM_OBL_RC_ACT to 5 (Hold), 4 (Land) or 3 (Return)"
+    if value in _ON_LOSS:
+        return passed(name, f"{value} ({_ON_LOSS[value]}) when setpoints stop")
+    if value == 0:
+        measured = "0 (Position) when setpoints stop: the sticks then fly it; with no remote control it returns home"
+        return warned(name, measured, fix)
+    return failed(name, f"{value} ({_FATAL_ON_LOSS.get(value, 'not known')}) when setpoints stop", fix)
+
+
+_ON_LOW_BATTERY = {1: "Return", 2: "Land", 3: "Return, and Land when nearly empty"}
+
+
+def judge_low_battery(value: int, config: DroneConfig) -> Finding:
+    """COM_LOW_BAT_ACT."""
+    name = "COM_LOW_BAT_ACT"
+    if value in _ON_LOW_BATTERY:
+        return passed(name, f"{value} ({_ON_LOW_BATTERY[value]}) when the battery is low")
+    what = "only warns" if value == 0 else "not known"
+    own = f"flockd asks for {config.safety.on_battery_low} (safety.on_battery_low), and nothing does while it is down"
+    return warned(name, f"{value} ({what}) when the battery is low: {own}", f"set {name} to 3 or 2 (Land)")
+
+
+_AT_FENCE = {2: "Hold", 3: "Return", 5: "Land"}
+
+
+def judge_fence_action(value: int, config: DroneConfig) -> Finding:
+    """GF_ACTION."""
+    name, fix = "GF_ACTION", "set GF_ACTION to 2 (Hold), 3 (Return) or 5 (Land)"
+    if value in _AT_FENCE:
+        return passed(name, f"{value} ({_AT_FENCE[value]}) at PX4's fence")
+    off = {
+        0: "None: PX4 has no fence",
+        1: "Warning: PX4's fence stops nothing",
+        4: "Terminate: motors stop at the fence",
+    }
+    return warned(name, f"{value} ({off.get(value, 'not known')})", fix)
+
+
+def judge_fence_radius(value: float, config: DroneConfig) -> Finding:
+    """GF_MAX_HOR_DIST, in metres."""
+    return _judge_limit("GF_MAX_HOR_DIST", value, _reach_m(config.safety.gate), "fence")
+
+
+def judge_fence_height(value: float, config: DroneConfig) -> Finding:
+    """GF_MAX_VER_DIST, in metres."""
+    return _judge_limit("GF_MAX_VER_DIST", value, config.safety.gate.max_height_m, "max_height_m")
+
+
+def _judge_limit(name: str, value: float, own_m: float | None, what: str) -> Finding:
+    """PX4's limit should lie a little outside flockd's own, as a second line."""
+    outside = "where it must never fly" if own_m is None else f"{1.2 * own_m:.0f} m, a little outside flockd's own"
+    if value <= 0:
+        return warned(name, f"{value:g}: PX4's fence has no such limit", f"set {name} to {outside}")
+    if own_m is not None and value <= own_m:
+        measured = f"{value:g} m is not outside flockd's own {what} of {own_m:g} m: PX4 ends the flight first"
+        return warned(name, measured, f"set {name} to {outside}, or make safety.gate.{what} smaller")
+    own = "flockd has none itself" if own_m is None else f"outside flockd's own {own_m:g} m"
+    return passed(name, f"{value:g} m, {own}")
+
+
+def _reach_m(gate: GateParameters) -> float | None:
+    """How far from home flockd's own fence lets it fly; None: for ever."""
+    corners = [(north**2 + east**2) ** 0.5 for north, east in gate.fence_corners_m]
+    limits = [max(corners)] if corners else []
+    return min([*limits, *([] if gate.fence_radius_m is None else [gate.fence_radius_m])], default=None)
+
+
+KINDS: dict[str, type[int] | type[float]] = {
+    "COM_OF_LOSS_T": float,
+    "COM_OBL_RC_ACT": int,
+    "COM_LOW_BAT_ACT": int,
+    "GF_ACTION": int,
+    "GF_MAX_HOR_DIST": float,
+    "GF_MAX_VER_DIST": float,
+}
+"""As PX4 declares them."""
+JUDGES: dict[str, Callable[..., Finding]] = {
+    "COM_OF_LOSS_T": judge_loss_time,
+    "COM_OBL_RC_ACT": judge_loss_action,
+    "COM_LOW_BAT_ACT": judge_low_battery,
+    "GF_ACTION": judge_fence_action,
+    "GF_MAX_HOR_DIST": judge_fence_radius,
+    "GF_MAX_VER_DIST": judge_fence_height,
+}
+"""Each takes the value and the drone's configuration."""

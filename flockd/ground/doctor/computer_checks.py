@@ -1,0 +1,187 @@
+"""The computer: room for recordings, memory, temperature, clocks."""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+from flockd.core.config import DroneConfig
+from flockd.ground.doctor.finding import Finding, failed, passed, warned
+
+STATE_FOLDER = Path("/var/lib/flockd")
+"""Where the systemd unit lets flockd record."""
+MB = 1e6
+NEEDS_MB = 350.0
+"""Resident, with the shipped networks and four cameras, beside what waits for the disk."""
+SPARE_MB = 200.0
+SPARE_K = 10.0
+THERMAL = Path("/sys/class/thermal")
+MEMORY = Path("/proc/meminfo")
+YEARS = (2026, 2100)
+"""A clock that says another year was never set."""
+SYNCHRONISED_BELOW_US = 16_000_000
+"""The kernel's largest error estimate; it stands there until a time service sets it."""
+SAMPLES = 20
+SAMPLE_S = 0.02
+DRIFT = 0.05
+
+
+def check_disk(config: DroneConfig, folder: Path | None) -> Iterator[Finding]:
+    """Whether recordings fit; ``folder`` as for `flockd run --record`, None for the service's where there is one."""
+    folder = folder or (STATE_FOLDER if STATE_FOLDER.is_dir() else None)
+    if folder is None:
+        measured = "no folder for recordings was named, so none was checked"
+        yield warned(
+            "disk", measured, "name it with --record DIR, as for `flockd run`; without one nothing is recorded"
+        )
+        return
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(b"flockd")
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        fix = "make the folder and give it to the user that flies, as with `chown flockd`, or name another"
+        yield failed("disk", f"{folder} cannot be written ({error.strerror})", fix)
+        return
+    own_mb = sum(path.stat().st_size for path in folder.glob(f"{config.name}-*.mcap")) / MB
+    yield judge_room(config, folder, shutil.disk_usage(folder).free / MB, own_mb)
+
+
+def judge_room(config: DroneConfig, folder: Path, free_mb: float, own_mb: float) -> Finding:
+    """The quota counts what this drone has recorded there before, and deletes the oldest of it."""
+    wanted = config.recording
+    room_mb = free_mb + own_mb
+    measured = f"{free_mb / 1e3:.1f} GB free in {folder}, {own_mb / 1e3:.1f} GB are this drone's recordings"
+    if room_mb < wanted.file_mb:
+        fix = f"make room, or write recording.file_mb and quota_mb: {0.8 * room_mb:.0f}"
+        return failed("disk", f"{measured}: not enough for a file of {wanted.file_mb / 1e3:g} GB (file_mb)", fix)
+    if room_mb < wanted.quota_mb:
+        fix = f"make room, or write recording.quota_mb: {0.9 * room_mb:.0f}"
+        return warned("disk", f"{measured}: not enough for the quota of {wanted.quota_mb / 1e3:g} GB", fix)
+    return passed("disk", f"{measured}; the quota of {wanted.quota_mb / 1e3:g} GB fits")
+
+
+def check_memory(config: DroneConfig, meminfo: Path = MEMORY) -> Iterator[Finding]:
+    """Whether flockd fits beside what runs now."""
+    values = dict(line.split(":", 1) for line in meminfo.read_text(encoding="ascii").splitlines())
+    free_mb, total_mb = (int(values[key].split()[0]) * 1024 / MB for key in ("MemAvailable", "MemTotal"))
+    needs_mb = NEEDS_MB + config.recording.queue_mb
+    measured = f"{free_mb:.0f} of {total_mb:.0f} MB are available, flockd needs about {needs_mb:.0f}"
+    fix = "stop other programs, or make recording.queue_mb smaller"
+    if free_mb < needs_mb:
+        yield failed("memory", measured, fix)
+    elif free_mb < needs_mb + SPARE_MB:
+        yield warned("memory", f"{measured}: little is left", fix)
+    else:
+        yield passed("memory", measured)
+
+
+def check_temperature(config: DroneConfig, folder: Path = THERMAL) -> Iterator[Finding]:
+    """How hot it is now, at rest, and whether the processor is being slowed down for it."""
+    zones = dict(_zones(folder))
+    slowed = sorted(_slowed(folder))
+    if slowed:
+        measured = f"the processor is being slowed down ({', '.join(slowed)})"
+        yield warned("temperature", measured, "cool it, and check its power supply; then measure the step again")
+    if not zones:
+        measured = "this computer reports no temperature, so flockd will not notice when it gets too hot"
+        yield warned("temperature", measured, "load the driver of its thermal sensor, if it has one")
+        return
+    hottest = max(zones, key=zones.__getitem__)
+    limit_c = config.safety.degraded_temperature_c
+    measured = f"{zones[hottest]:.0f} °C ({hottest}); from {limit_c:g} on it flies slowly"
+    if zones[hottest] >= limit_c:
+        yield failed("temperature", measured, "let it cool down, and improve its airflow, or add a heat sink")
+    elif zones[hottest] > limit_c - SPARE_K:
+        yield warned("temperature", f"{measured}: little is left", "improve its airflow, or add a heat sink")
+    else:
+        yield passed("temperature", measured)
+
+
+def _zones(folder: Path) -> Iterator[tuple[str, float]]:
+    """Those that can be read; a zone that is switched off cannot."""
+    for zone in sorted(folder.glob("thermal_zone*")):
+        try:
+            yield (zone / "type").read_text("ascii").strip(), int((zone / "temp").read_text("ascii")) / 1000
+        except (OSError, ValueError):
+            continue
+
+
+def _slowed(folder: Path) -> Iterator[str]:
+    """Cooling devices that are the processor itself, and at work."""
+    for device in folder.glob("cooling_device*"):
+        try:
+            kind, state = (device / "type").read_text("ascii").strip(), int((device / "cur_state").read_text("ascii"))
+        except (OSError, ValueError):
+            continue
+        if state > 0 and ("cpu" in kind.lower() or "processor" in kind.lower()):
+            yield kind
+
+
+class _Timex(ctypes.Structure):
+    """The beginning of struct timex of 64-bit Linux (adjtimex(2)), and room for what follows."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint),
+        ("offset", ctypes.c_long),
+        ("freq", ctypes.c_long),
+        ("maxerror", ctypes.c_long),
+        ("rest", ctypes.c_char * 256),
+    )
+
+
+def wall_clock_error_us() -> int:
+    """The kernel's largest error estimate of the wall clock. Raises OSError."""
+    state = _Timex(modes=0)  # 0: only reads
+    library = ctypes.CDLL(None, use_errno=True)
+    if library.adjtimex(ctypes.byref(state)) < 0:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), "adjtimex")
+    return int(state.maxerror)
+
+
+def check_clock(
+    error_us: Callable[[], int] = wall_clock_error_us,
+    today: Callable[[], datetime] = lambda: datetime.now(UTC),
+    monotonic: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> Iterator[Finding]:
+    """The wall clock, by which recordings and logs are dated, and the monotonic one, by which it flies."""
+    date = today()
+    if not YEARS[0] <= date.year <= YEARS[1]:
+        measured = f"the wall clock shows {date:%Y-%m-%d}: recordings get wrong dates, and TLS no valid certificate"
+        yield failed("wall clock", measured, "set it (`timedatectl set-time`), or fit a battery for the clock")
+    elif error_us() >= SYNCHRONISED_BELOW_US:
+        measured = f"{date:%Y-%m-%d %H:%M} UTC, not synchronised: recordings of several drones will not fit together"
+        yield warned("wall clock", measured, "start a time service, as with `timedatectl set-ntp true`")
+    else:
+        yield passed("wall clock", f"{date:%Y-%m-%d %H:%M} UTC, synchronised to {1e-3 * error_us():.0f} ms")
+    yield judge_monotonic(_ticks(monotonic, sleep))
+
+
+def _ticks(monotonic: Callable[[], float], sleep: Callable[[float], None]) -> list[float]:
+    ticks = [monotonic()]
+    for _ in range(SAMPLES):
+        sleep(SAMPLE_S)
+        ticks.append(monotonic())
+    return ticks
+
+
+def judge_monotonic(ticks: list[float]) -> Finding:
+    """Readings with pauses of `SAMPLE_S` between them; a pause takes as long or longer."""
+    fix = "check /sys/devices/system/clocksource/clocksource0/current_clocksource, and boot with another"
+    steps = [after - before for before, after in itertools.pairwise(ticks)]
+    if min(steps) <= 0.0:
+        return failed("monotonic clock", f"it stood or went back by {-1e3 * min(steps):.1f} ms", fix)
+    shortest = min(steps)
+    if shortest < (1.0 - DRIFT) * SAMPLE_S:
+        measured = f"{1e3 * shortest:.1f} ms went by in a pause of {1e3 * SAMPLE_S:.0f} ms: it is slow or coarse"
+        return failed("monotonic clock", measured, fix)
+    return passed("monotonic clock", f"runs on; {1e3 * SAMPLE_S:.0f} ms pauses took {1e3 * shortest:.1f} ms and more")

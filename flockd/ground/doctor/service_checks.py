@@ -1,0 +1,77 @@
+"""flockd as a service: whether one runs already, and how much of the system its unit leaves open."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from flockd.core.data import data_path
+from flockd.core.errors import UnavailableError
+from flockd.ground.doctor.finding import Finding, failed, passed, warned
+from flockd.onboard.daemon import only_instance, service_lock
+
+UNIT_FOLDERS = (Path("/etc/systemd/system"), Path("/usr/lib/systemd/system"), Path("/lib/systemd/system"))
+UNIT = "flockd.service"
+BAR, MUCH = 1.5, 5.0
+"""Of 10. systemd itself calls 5 and more at best medium."""
+
+
+def check_instance(drone: str, environment: Mapping[str, str]) -> Iterator[Finding]:
+    """Whether the drone's lock is free. ``environment`` is the process's own."""
+    lock = service_lock(drone)
+    if lock.exists() and not os.access(lock, os.R_OK | os.W_OK):
+        yield _unseen(str(lock))
+        return
+    try:
+        with only_instance(drone, environment):
+            pass
+    except UnavailableError as error:
+        measured = str(error).rpartition("; ")[0]
+        fix = "stop it while you examine (`systemctl stop flockd`): it holds the cameras and the autopilot's link"
+        yield failed("instance", measured, fix)
+    except PermissionError as error:
+        yield _unseen(str(error.filename))
+    else:
+        yield passed("instance", f"no other flockd flies {drone} on this computer")
+
+
+def _unseen(lock: str) -> Finding:
+    fix = "examine as the user that flies: `sudo -u flockd flockd doctor ...`"
+    return warned("instance", f"{lock} belongs to another user, so who holds it cannot be seen", fix)
+
+
+def check_unit(unit: Path | None) -> Iterator[Finding]:
+    """The security score of ``unit``; None: of the installed one, else of the one that comes with flockd."""
+    chosen, whose = (unit, "") if unit is not None else _find_unit()
+    if shutil.which("systemd-analyze") is None:
+        measured = f"{chosen} was not checked, as systemd-analyze is not installed"
+        yield warned("unit", measured, "examine where flockd is to run as a service")
+        return
+    command = ["systemd-analyze", "security", "--offline=true", "--no-pager", str(chosen)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    score = re.search(r"Overall exposure level for [^:]*: ([0-9.]+)", result.stdout)
+    if score is None:
+        reason = (result.stderr.strip().splitlines() or ["it said nothing"])[-1]
+        yield failed("unit", f"{chosen} cannot be judged ({reason})", "install systemd/flockd.service anew")
+        return
+    yield judge_exposure(float(score[1]), chosen, whose)
+
+
+def judge_exposure(score: float, unit: Path, whose: str) -> Finding:
+    """0 is closed, 10 is open."""
+    measured = f"{unit}{whose} exposes {score:.1f} of 10"
+    fix = f"compare it and its drop-ins with systemd/{UNIT}; `systemd-analyze security` lists what is open"
+    if score >= MUCH:
+        return failed("unit", measured, fix)
+    return warned("unit", f"{measured}, more than {BAR:g}", fix) if score > BAR else passed("unit", measured)
+
+
+def _find_unit() -> tuple[Path, str]:
+    for folder in UNIT_FOLDERS:
+        if (folder / UNIT).is_file():
+            return folder / UNIT, ""
+    return data_path("systemd") / UNIT, " (not installed)"

@@ -1,0 +1,104 @@
+"""Pictures on disk: images, folders of them, and the frames of videos."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from flockd.core.errors import UsageError
+from flockd.core.image_header import MAX_IMAGE_PIXELS
+from flockd.core.messages import UInt8Array
+from flockd.ground.datasets import image_files, video
+from flockd.ground.datasets.errors import DatasetError
+
+
+@dataclass(frozen=True)
+class PictureFile:
+    """An image or a video."""
+
+    path: Path
+    root: Path
+    """The folder that was named, or the one that the file is in."""
+
+    @property
+    def is_video(self) -> bool:
+        """By the end of its name."""
+        return self.path.suffix.lower() in video.SUFFIXES
+
+    @property
+    def relative(self) -> Path:
+        """To the folder that was named."""
+        return self.path.relative_to(self.root)
+
+    def count(self, every: int) -> int:
+        """How many pictures it is about, for a progress bar."""
+        if not self.is_video:
+            return 1
+        with video.opened_video(self.path) as opened:
+            return max(-(-int(opened.get(cv2.CAP_PROP_FRAME_COUNT)) // every), 1)
+
+    def images(self, every: int) -> Iterator[tuple[str, UInt8Array]]:
+        """Names and images (h, w, 3), RGB, as the camera was held; ``every``-th frames of a video.
+
+        Raises DatasetError where it cannot be read.
+        """
+        if not self.is_video:
+            yield str(self.path), image_files.read_image(self.path, upright=True)
+            return
+        with video.opened_video(self.path) as opened:
+            opened.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+            width, height = (int(opened.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+            if width * height > MAX_IMAGE_PIXELS:
+                raise DatasetError(
+                    f"{self.path}: says that it has {width} x {height} pixels; convert it to a smaller one"
+                )
+            index = 0
+            while opened.grab():
+                if index % every == 0:
+                    is_there, image = opened.retrieve()
+                    if not is_there:
+                        break
+                    yield f"{self.path}#{index}", np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+                index += 1
+        if index == 0:
+            raise DatasetError(f"{self.path}: is no video that can be decoded; restore it, or convert it to MP4")
+
+    def rate_hz(self) -> float:
+        """Frames a second of a video; 30 where it does not say."""
+        with video.opened_video(self.path) as opened:
+            rate = float(opened.get(cv2.CAP_PROP_FPS))
+        return rate if np.isfinite(rate) and rate > 0 else 30.0
+
+
+def find_pictures(paths: Sequence[Path], but_not: Path | None = None) -> list[PictureFile]:
+    """The images and videos that are named, and those in the folders that are named and below; each once.
+
+    Files whose name begins with a dot are other programs' notes, and count only where they are named. Nor
+    does what lies in ``but_not``, a folder of copies inside one that is named.
+    Raises UsageError for what is not there, is neither, or is a folder without any.
+    """
+    endings = image_files.SUFFIXES | video.SUFFIXES
+    copies = None if but_not is None else but_not.resolve()
+    found: dict[Path, PictureFile] = {}
+    for path in paths:
+        if path.is_dir():
+            inside = sorted(one for one in path.rglob("[!.]*") if one.suffix.lower() in endings and one.is_file())
+            if copies is not None and path.resolve() in copies.parents:
+                inside = [one for one in inside if copies not in one.resolve().parents]
+            if not inside:
+                raise UsageError(f"{path}: has no images or videos; name the folder that they are in")
+            for one in inside:
+                found.setdefault(one.resolve(), PictureFile(one, path))
+        elif not path.exists():
+            raise UsageError(f"{path}: does not exist; name an image, a video or a folder")
+        elif path.suffix.lower() not in endings:
+            raise UsageError(
+                f"{path}: is no image or video by its name; its name ends in one of {', '.join(sorted(endings))}"
+            )
+        else:
+            found.setdefault(path.resolve(), PictureFile(path, path.parent))
+    return list(found.values())

@@ -1,0 +1,151 @@
+"""Detection in one picture by the pipeline that flies; nothing is known of attitude, height or tracks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from flockd.core.config.perception import PerceptionConfig
+from flockd.core.messages import Detection, FloatArray, Frame, FrameSet, UInt8Array, VehicleState
+from flockd.flight.geometry import Camera, PinholeCamera, Rig, RigCamera, RigidTransform
+from flockd.flight.perception import Networks, Perception
+from flockd.flight.perception.detection.detector import DetectionTrace
+from flockd.flight.perception.detection.refinement import Candidate
+from flockd.flight.perception.detection.roi import angle_between
+
+MAX_SIDE_PX = 1280
+"""Larger pictures are resized to this before the networks: they were trained on cameras of 640 pixels."""
+_R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""Of a camera that faces forward: optical right-down-forward axes to the body's forward-right-down."""
+_MAX_INSTANCE = 2.0
+"""An instance's longer side over the drone's apparent size, for it to be of this drone alone: masks of soft pictures
+lack thin arms and propellers, which the first stage has, but it may take several drones for one."""
+_UNKNOWN_HEIGHT_M = 5.0
+"""Not used: the networks give the scale. A vehicle state has to hold some height."""
+
+Box = tuple[float, float, float, float]
+"""Left, top, right, bottom in pixels of the picture."""
+
+
+@dataclass(frozen=True)
+class DetectedDrone:
+    """One detection in one picture."""
+
+    box: Box
+    """Around its mask and the first stage's instances of it."""
+    centre_px: tuple[float, float]
+    """Right and down, of the detection's bearing."""
+    probability: float
+    range_m: float
+    range_sigma_m: float
+    size_m: float
+    size_sigma_m: float
+    """Standard deviation: of the known size, else the range's share."""
+    label: int
+    """Its value in the mask."""
+
+
+@dataclass(frozen=True, eq=False)
+class PictureResult:
+    """What the pipeline found in one picture."""
+
+    detections: tuple[DetectedDrone, ...]
+    proposals: int
+    """Regions that went to the second stage."""
+    mask: UInt8Array
+    """(h, w) labels of the detections' pixels, at the size that the networks saw; 0 is background."""
+
+    def at_least(self, probability: float) -> PictureResult:
+        """With the detections that are at least so probable."""
+        return replace(self, detections=tuple(one for one in self.detections if one.probability >= probability))
+
+
+class PictureDetector:
+    """Single-frame detection. May be used for pictures of several sizes."""
+
+    def __init__(self, networks: Networks, config: PerceptionConfig) -> None:
+        """``config``: its models are not loaded again; the scale is the networks'."""
+        self._networks, self._config = networks, config.model_copy(update={"scale": "network"})
+        self._mounted: RigCamera | None = None
+
+    def detect(self, image: UInt8Array, camera: Camera) -> PictureResult:
+        """Drones in an image (h, w, 3), RGB.
+
+        Args:
+            image: RGB.
+            camera: of the picture, of the picture's size or of the size that it is to be resized to.
+        """
+        height, width = image.shape[:2]
+        scale = np.array(camera.size) / (width, height)
+        if camera.size != (width, height):
+            image = np.asarray(cv2.resize(image, camera.size, interpolation=cv2.INTER_AREA), np.uint8)
+        if self._mounted is None or self._mounted.camera is not camera:  # one object, as rays are cached by it
+            self._mounted = RigCamera("camera", camera, RigidTransform(_R_BODY_CAMERA, np.zeros(3)))
+        perception = Perception(Rig({"camera": self._mounted}), self._networks, self._config)
+        frames = FrameSet(0.0, {"camera": Frame("camera", np.ascontiguousarray(image), 0.0, 0)})
+        trace = DetectionTrace()
+        observation = perception.observe(frames, VehicleState(0.0, np.eye(3), _UNKNOWN_HEIGHT_M), trace=trace)
+        if "camera" not in observation.cameras:  # the networks' output was not finite
+            return PictureResult((), 0, np.zeros(image.shape[:2], np.uint8))
+        seen = observation.cameras["camera"].labels
+        mask = np.where(np.isin(seen, [one.label for one in observation.detections]), seen, np.uint8(0))
+        found = tuple(self._drone(one, camera, mask, trace.candidates, scale) for one in observation.detections)
+        return PictureResult(found, sum(proposal.instance is not None for proposal in trace.proposals), mask)
+
+    def _drone(
+        self, one: Detection, camera: Camera, mask: UInt8Array, candidates: Sequence[Candidate], scale: FloatArray
+    ) -> DetectedDrone:
+        """With pixels of the picture before it was resized by ``scale`` (2,)."""
+        centre = camera.project(one.position[None] @ _R_BODY_CAMERA)[0]
+        size_px = one.size_m / one.range_m * camera.focal_px
+        mine = [c for c in candidates if angle_between(c.bearing, one.bearing) < one.size_m / one.range_m / 2]
+        boxes = [c.proposal.instance.box for c in mine if c.proposal.instance is not None]
+        boxes = [box for box in boxes if (box[2:] - box[:2]).max() <= _MAX_INSTANCE * size_px]
+        masked = _box_of(mask == one.label)
+        if masked is not None:
+            boxes.append(masked)
+        if not boxes:  # no mask, or a nearer drone's covers it
+            boxes.append(np.clip([*(centre - size_px / 2), *(centre + size_px / 2)], 0, np.tile(camera.size, 2)))
+        box = np.concatenate([np.min(boxes, axis=0)[:2], np.max(boxes, axis=0)[2:]])
+        left, top, right, bottom = (float(value) for value in box / np.tile(scale, 2))
+        u, v = (float(value) for value in centre / scale)
+        sigma = one.range_sigma_m
+        known = self._config.drone_size_m is not None
+        return DetectedDrone(
+            box=(left, top, right, bottom),
+            centre_px=(u, v),
+            probability=one.drone_probability,
+            range_m=one.range_m,
+            range_sigma_m=sigma,
+            size_m=one.size_m,
+            size_sigma_m=self._config.drone_size_sigma_m if known else one.size_m * sigma / one.range_m,
+            label=one.label,
+        )
+
+
+def camera_with_fov(size: tuple[int, int], fov_deg: float, max_side_px: int = MAX_SIDE_PX) -> PinholeCamera:
+    """A camera without distortion, of a picture's size or, for a larger one, of the size to resize it to.
+
+    Args:
+        size: width and height of the picture.
+        fov_deg: field of view across the longer side, as of a phone that is held either way.
+        max_side_px: what a longer side is resized to.
+    """
+    longer = max(size)
+    if longer > max_side_px:
+        size = (max(round(size[0] * max_side_px / longer), 1), max(round(size[1] * max_side_px / longer), 1))
+    focal = max(size) / 2 / math.tan(math.radians(fov_deg) / 2)
+    matrix = np.array([[focal, 0.0, size[0] / 2], [0.0, focal, size[1] / 2], [0.0, 0.0, 1.0]])
+    return PinholeCamera(matrix, size)
+
+
+def _box_of(mask: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> FloatArray | None:
+    """(4,) left, top, right, bottom of the pixels of a mask (h, w); None for an empty one."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not rows.size:
+        return None
+    return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], np.float64)

@@ -1,0 +1,59 @@
+"""The autopilot's status, and its errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from flockd.core.errors import UnavailableError
+from flockd.core.messages import FloatArray
+
+FlightMode = Literal[
+    "manual", "altitude", "position", "hold", "mission", "return", "land", "take-off", "offboard", "other", "unknown"
+]
+"""PX4's flight modes as flockd tells them apart; unknown: not heard yet."""
+LandedState = Literal["unknown", "ground", "air", "taking off", "landing"]
+
+
+class AutopilotError(UnavailableError):
+    """The autopilot is not there, did not answer, or refused; the text says which, and what to do."""
+
+
+@dataclass(frozen=True, eq=False)
+class AutopilotStatus:
+    """The newest of everything, at `time_s` on the link's clock. None: not heard yet, or not known there."""
+
+    time_s: float
+    heartbeat_age_s: float
+    """Since the last heartbeat; infinite before the first."""
+    flight_mode: FlightMode
+    armed: bool
+    failsafe: bool
+    """It flies by its own failsafe and no longer as it was asked."""
+    landed_state: LandedState
+    battery_share: float | None
+    """0 to 1."""
+    battery_v: float | None
+    estimate_ok: bool | None
+    """Attitude, height and horizontal velocity and position are estimated."""
+    gps_ok: bool | None
+    """A three-dimensional fix."""
+    position_ned: FloatArray | None
+    """(3,) metres from the estimator's origin, which is not home."""
+    home_ned: FloatArray | None
+    """(3,) metres, likewise."""
+
+    @property
+    def in_air(self) -> bool:
+        """Off the ground; not so while it is unknown."""
+        return self.landed_state in {"air", "taking off", "landing"}
+
+
+@dataclass(frozen=True)
+class Firmware:
+    """What runs on the autopilot."""
+
+    autopilot: str
+    """`PX4`, or `autopilot N` by its MAV_AUTOPILOT."""
+    version: str
+    """As in `1.16.0`."""

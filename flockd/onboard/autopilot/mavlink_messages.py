@@ -1,0 +1,394 @@
+"""What the autopilot's MAVLink messages say: decoding, without MAVSDK and without I/O.
+
+Messages are kept as they come, the newest of each kind, so that no queue grows and the state is known at any time.
+Values of enumerations are checked where they enter: one that is not known here counts as unknown, and is counted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flockd.core.messages import FloatArray, RangeReading, VehicleState
+from flockd.onboard.autopilot.autopilot_status import AutopilotStatus, FlightMode, LandedState
+from flockd.onboard.autopilot.clock_sync import ClockSync
+from flockd.onboard.autopilot.refusals import CheckEvents, Refusal, refusals
+
+Fields = Mapping[str, Any]
+
+MAV_MODE_FLAG_SAFETY_ARMED = 128
+MAV_STATE_CRITICAL = 5
+GPS_FIX_3D = 3
+ESTIMATOR_ATTITUDE, ESTIMATOR_VELOCITY_HORIZONTAL = 1, 2
+ESTIMATOR_POSITION_RELATIVE, ESTIMATOR_POSITION_ABSOLUTE, ESTIMATOR_HEIGHT = 8, 16, 32
+
+MODES: Mapping[tuple[int, int], FlightMode] = {
+    (1, 0): "manual",
+    (2, 0): "altitude",
+    (3, 0): "position",
+    (4, 2): "take-off",
+    (4, 3): "hold",
+    (4, 4): "mission",
+    (4, 5): "return",
+    (4, 6): "land",
+    (6, 0): "offboard",
+    (7, 0): "manual",
+}
+"""PX4's main and sub mode."""
+LANDED_STATES: tuple[LandedState, ...] = ("unknown", "ground", "air", "taking off", "landing")
+"""By MAV_LANDED_STATE."""
+RESULTS = (
+    "accepted",
+    "refused for now",
+    "denied",
+    "not supported",
+    "failed",
+    "still in progress",
+    "cancelled",
+    "refused as COMMAND_LONG",
+    "refused as COMMAND_INT",
+    "refused for its frame",
+    "refused because another station has control",
+)
+"""By MAV_RESULT."""
+ENUMERATIONS: Mapping[tuple[str, str], int] = {
+    ("EXTENDED_SYS_STATE", "landed_state"): len(LANDED_STATES),
+    ("GPS_RAW_INT", "fix_type"): 9,  # GPS_FIX_TYPE
+    ("HEARTBEAT", "system_status"): 9,  # MAV_STATE
+}
+"""How many values each field's enumeration has, from 0, by message and field: of the MAVLink dialect `common`."""
+RANGES: Mapping[tuple[str, str], range] = {("SYS_STATUS", "battery_remaining"): range(-1, 101)}
+"""What other fields may be, likewise; -1 is MAVLink's own word for unknown."""
+FACES_DOWN = 25
+"""Of MAV_SENSOR_ORIENTATION: MAV_SENSOR_ROTATION_PITCH_270."""
+FULL_SIGNAL, NO_SIGNAL = 100, 1
+"""Of DISTANCE_SENSOR's `signal_quality`, in percent; 0 is for sensors that do not say."""
+RANGE_LOST_S = 0.5
+"""A range finder that is silent for so long gives way to the autopilot's own distance to bottom."""
+QUATERNION_TOLERANCE = 0.1
+"""Of its norm from 1; one that is farther off is no attitude."""
+HOME_TOLERANCE_M = 0.5
+"""A home that moves less in flight is not reported: estimators drift."""
+STAMPED = frozenset({"ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "DISTANCE_SENSOR"})
+"""Messages whose `time_boot_ms` says when they were true."""
+MOST_ERROR_S = 0.005
+"""Of a clock whose stamps are better than times of arrival."""
+LONGEST_DELAY_S = 1.0
+"""A stamp that is older at its arrival is not believed."""
+MAV_SEVERITY_WARNING = 4
+TEXTS_KEPT = 20
+TEXT_MEMORY_S = 10.0
+"""For how long a text counts as a reason for a refusal; nor is it reported again meanwhile."""
+MAV_TYPE_ONBOARD_CONTROLLER = 18
+OTHER_COMPUTER_S = 5.0
+"""For how long another onboard computer counts as there after its last heartbeat."""
+TEXT_CHUNK = 50
+"""Characters of a STATUSTEXT; one with fewer is the last of its text."""
+
+
+@dataclass(frozen=True)
+class ReceivedMessage:
+    """A message, and when it arrived on the link's clock."""
+
+    time_s: float
+    fields: Fields
+
+
+class ReceivedMessages:
+    """The newest message of each kind. `add` is for one thread, everything else for any."""
+
+    def __init__(self, report: Callable[[str], None]) -> None:
+        """``report`` is called by `add` with one sentence on the first of each unknown value, of a home that moves in
+        flight, of a landing, and of what the autopilot says as a warning or worse."""
+        self._report = report
+        self._newest: dict[str, ReceivedMessage] = {}
+        self._unknown_values: Counter[str] = Counter()
+        self._home: FloatArray | None = None
+        self._home_deg: FloatArray | None = None
+        self._flies = False
+        """In the air, or seen there and not disarmed since: a landed state alone does not end a flight."""
+        self._home_moved = False
+        self._landed = False
+        self._text = StatusText()
+        self._texts: deque[tuple[float, str]] = deque(maxlen=TEXTS_KEPT)
+        """Warnings and worse, with their times."""
+        self._ranges = RangeMessages()
+        self._other_computer_s = -math.inf
+        self.check_events = CheckEvents()
+        self.clock = ClockSync()
+
+    def add(self, name: str, fields: Fields, time_s: float) -> None:
+        """Takes a message by its name and fields, NaN as null, as MAVSDK decodes them to JSON, and when it came."""
+        if name == "STATUSTEXT":
+            whole = self._text.joined(fields)
+            if whole is None:
+                return
+            fields = {**fields, "text": whole}
+            self._take_text(whole.strip(), int(fields.get("severity") or 0), time_s)
+        if name == "EVENT":
+            self.check_events.add(fields, time_s)
+        if name in STAMPED:
+            arrived_s, time_s = time_s, self._stamped_s(fields, time_s)
+            if name == "DISTANCE_SENSOR":
+                self._ranges.add(fields, time_s, arrived_s)
+        self._newest[name] = ReceivedMessage(time_s, self._checked(name, fields))
+        if name in ("HEARTBEAT", "EXTENDED_SYS_STATE"):
+            status = self.status(time_s)
+            self._flies = status.in_air or (self._flies and status.armed)
+            self._home_moved = self._home_moved and self._flies
+            self._take_landing(status.landed_state)
+        elif name == "HOME_POSITION":
+            self._take_home(_vector(fields, "x", "y", "z"), _vector(fields, "latitude", "longitude"))
+
+    def add_other_heartbeat(self, fields: Fields, time_s: float) -> None:
+        """Takes a HEARTBEAT of another component on the link."""
+        if fields.get("type") == MAV_TYPE_ONBOARD_CONTROLLER:
+            self._other_computer_s = time_s
+
+    def recent_texts(self, now_s: float, memory_s: float) -> list[str]:
+        """What the autopilot has said in the last seconds as a warning or worse, each once."""
+        return list(dict.fromkeys(text for time_s, text in list(self._texts) if now_s - time_s < memory_s))
+
+    def refusals(self, now_s: float, *, streams: bool) -> tuple[Refusal, ...]:
+        """Why the autopilot would refuse to arm or to fly offboard; ``streams``: flockd sends setpoints."""
+        return refusals(
+            self.status(now_s),
+            self.check_events,
+            {name: self._fields(name) for name in ("HEARTBEAT", "SYS_STATUS")},
+            self.recent_texts(now_s, TEXT_MEMORY_S),
+            now_s - self._other_computer_s < OTHER_COMPUTER_S,
+            streams=streams,
+        )
+
+    def _take_text(self, text: str, severity: int, time_s: float) -> None:
+        if severity > MAV_SEVERITY_WARNING:
+            return
+        if text not in self.recent_texts(time_s, TEXT_MEMORY_S):
+            self._report(f"the autopilot says: {text}")
+        self._texts.append((time_s, text))
+
+    def _stamped_s(self, fields: Fields, arrived_s: float) -> float:
+        """When it was true on this computer's clock: by the autopilot's stamp, else when it came."""
+        clock, boot_ms = self.clock.estimate, fields.get("time_boot_ms")
+        if clock is None or boot_ms is None or clock.error_s > MOST_ERROR_S:
+            return arrived_s
+        time_s = min(clock.local_s(1e-3 * (boot_ms + 0.5)), arrived_s)  # the stamp is cut to a millisecond
+        return time_s if arrived_s - time_s <= LONGEST_DELAY_S else arrived_s
+
+    @property
+    def home_down_m(self) -> float | None:
+        """Down from the estimator's origin; None: not known yet."""
+        return None if self._home is None else float(self._home[2])
+
+    def _take_home(self, home: FloatArray | None, home_e7: FloatArray | None) -> None:
+        """Home as it is until the next flight: one that moves in flight would move the height band and the fence."""
+        if home is None:
+            return
+        if self._home is None or not self._flies:
+            self._home = home
+            self._home_deg = None if home_e7 is None else home_e7 * 1e-7
+        elif not self._home_moved and np.linalg.norm(home - self._home) > HOME_TOLERANCE_M:
+            self._home_moved = True
+            self._report(
+                f"the autopilot's home moved by {np.linalg.norm(home - self._home):.1f} m in flight; "
+                "height band and fence stay where they were until it is disarmed"
+            )
+
+    def _take_landing(self, landed_state: LandedState) -> None:
+        landed = self._flies and (self._landed or landed_state == "ground")
+        if landed and not self._landed:
+            self._report("the autopilot reports that the drone is on the ground, still armed")
+        self._landed = landed
+
+    def newest(self, name: str) -> ReceivedMessage | None:
+        """The newest of a kind; None before the first."""
+        return self._newest.get(name)
+
+    def unknown_values(self) -> Mapping[str, int]:
+        """How often each unknown value has arrived, as in `EXTENDED_SYS_STATE.landed_state = 5`."""
+        return dict(self._unknown_values)
+
+    def status(self, now_s: float) -> AutopilotStatus:
+        """What they say of the autopilot."""
+        heartbeat = self._newest.get("HEARTBEAT", ReceivedMessage(-math.inf, {}))
+        system = self._fields("SYS_STATUS")
+        landed_state = self._fields("EXTENDED_SYS_STATE").get("landed_state")
+        fix_type = self._fields("GPS_RAW_INT").get("fix_type")
+        return AutopilotStatus(
+            time_s=now_s,
+            heartbeat_age_s=now_s - heartbeat.time_s,
+            flight_mode=self.flight_mode(),
+            armed=bool(heartbeat.fields.get("base_mode", 0) & MAV_MODE_FLAG_SAFETY_ARMED),
+            failsafe=heartbeat.fields.get("system_status") == MAV_STATE_CRITICAL,
+            landed_state="unknown" if landed_state is None else LANDED_STATES[landed_state],
+            battery_share=_known(system.get("battery_remaining", -1), scale=0.01),
+            battery_v=_known(system.get("voltage_battery", 0), scale=0.001, unknown=(0, 65535)),
+            estimate_ok=_estimate_ok(self._newest.get("ESTIMATOR_STATUS")),
+            gps_ok=None if fix_type is None else fix_type >= GPS_FIX_3D,
+            position_ned=_vector(self._fields("LOCAL_POSITION_NED"), "x", "y", "z"),
+            home_ned=self._home,
+        )
+
+    def vehicle_state(self) -> VehicleState | None:
+        """Attitude, height above home and velocity, as old as the older of them; None before they are known.
+
+        Before home is known the height is above the place where the estimator began.
+        """
+        attitude, position = self._newest.get("ATTITUDE_QUATERNION"), self._newest.get("LOCAL_POSITION_NED")
+        if attitude is None or position is None:
+            return None
+        place = _vector(position.fields, "x", "y", "z")
+        velocity = _vector(position.fields, "vx", "vy", "vz")
+        quaternion = _vector(attitude.fields, "q1", "q2", "q3", "q4")
+        if place is None or velocity is None or quaternion is None:
+            return None
+        if abs(float(np.linalg.norm(quaternion)) - 1.0) > QUATERNION_TOLERANCE:
+            return None
+        return VehicleState(
+            time_s=min(attitude.time_s, position.time_s),
+            R_ned_body=rotation_from_quaternion(quaternion),
+            height_m=float((self.home_down_m or 0.0) - place[2]),
+            velocity_ned=velocity,
+            position=None if self._home is None else (place - self._home)[:2],
+            home_deg=self._home_deg,
+            ground_range=self.ground_range(),
+        )
+
+    def ground_range(self) -> RangeReading | None:
+        """The newest of the range finder that faces down, or PX4's distance to bottom where that is silent."""
+        sensor, altitude = self._ranges.newest, self._newest.get("ALTITUDE")
+        bottom = None if altitude is None else _vector(altitude.fields, "bottom_clearance")
+        if altitude is None or bottom is None or bottom[0] <= 0.0:
+            return sensor
+        if sensor is not None and altitude.time_s - sensor.time_s <= RANGE_LOST_S:
+            return sensor
+        return RangeReading(altitude.time_s, float(bottom[0]), vertical=True)
+
+    def range_finders(self) -> Mapping[int, tuple[float, ...]]:
+        """When the last readings came, by the MAV_SENSOR_ORIENTATION of the sensor."""
+        return self._ranges.arrivals_s()
+
+    def flight_mode(self) -> FlightMode:
+        """By the newer of heartbeat and CURRENT_MODE; a mode that is not in `MODES` is `other`."""
+        reports = [self._newest[name] for name in ("HEARTBEAT", "CURRENT_MODE") if name in self._newest]
+        if not reports:
+            return "unknown"
+        mode = int(max(reports, key=lambda message: message.time_s).fields["custom_mode"])
+        return MODES.get((mode >> 16 & 0xFF, mode >> 24 & 0xFF), "other")
+
+    def _fields(self, name: str) -> Fields:
+        message = self._newest.get(name)
+        return {} if message is None else message.fields
+
+    def _checked(self, name: str, fields: Fields) -> Fields:
+        """The same fields with None for values that their enumeration or range does not have."""
+        allowed = {**{field: range(count) for field, count in ENUMERATIONS.items()}, **RANGES}
+        unknown = [
+            field
+            for (message, field), values in allowed.items()
+            if message == name and fields.get(field) is not None and fields[field] not in values
+        ]
+        for field in unknown:
+            value = f"{name}.{field} = {fields[field]}"
+            if value not in self._unknown_values:
+                self._report(f"the autopilot sends {value}, which flockd does not know; it counts as unknown")
+            self._unknown_values[value] += 1
+        return {**fields, **dict.fromkeys(unknown)} if unknown else fields
+
+
+class RangeMessages:
+    """DISTANCE_SENSOR messages: of several sensors, with the newest reading of the one that faces down."""
+
+    KEPT = 200
+    """Arrivals of each orientation, to tell its rate."""
+
+    def __init__(self) -> None:
+        self.newest: RangeReading | None = None
+        self._arrivals_s: dict[int, deque[float]] = {}
+
+    def add(self, fields: Fields, time_s: float, arrived_s: float) -> None:
+        """Takes a message by its fields."""
+        orientation = int(fields.get("orientation") or 0)
+        self._arrivals_s.setdefault(orientation, deque(maxlen=self.KEPT)).append(arrived_s)
+        if orientation == FACES_DOWN:
+            self.newest = _range_reading(fields, time_s)
+
+    def arrivals_s(self) -> Mapping[int, tuple[float, ...]]:
+        """By orientation."""
+        return {orientation: tuple(times) for orientation, times in list(self._arrivals_s.items())}
+
+
+class StatusText:
+    """Joins the chunks of a STATUSTEXT, which carry an id and number themselves from 0."""
+
+    def __init__(self) -> None:
+        self._id, self._chunks = 0, [""]
+
+    def joined(self, fields: Fields) -> str | None:
+        """The whole text with its last chunk, None before; where a chunk was lost, dots stand for it."""
+        text = str(fields.get("text") or "").partition("\0")[0]
+        number, chunk = fields.get("id") or 0, fields.get("chunk_seq") or 0
+        if number == 0:
+            return text
+        if number != self._id or chunk == 0:
+            self._id, self._chunks = number, []
+        if chunk > len(self._chunks):
+            self._chunks += ["..."] * (chunk - len(self._chunks))
+        self._chunks.append(text)
+        return "".join(self._chunks) if len(text) < TEXT_CHUNK else None
+
+
+def result_text(result: int) -> str:
+    """What a MAV_RESULT means, for people."""
+    return RESULTS[result] if 0 <= result < len(RESULTS) else f"answered with the unknown result {result}"
+
+
+def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
+    """(3, 3) from (4,) w x y z; turns body into NED coordinates as MAVLink's attitude does."""
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _range_reading(fields: Fields, time_s: float) -> RangeReading:
+    """In metres; a field that is missing is not known."""
+    centimetres = [fields.get(f"{name}_distance") for name in ("current", "min", "max")]
+    current, least, most = (None if value is None else 0.01 * float(value) for value in centimetres)
+    signal = int(fields.get("signal_quality") or 0)
+    return RangeReading(
+        time_s,
+        math.nan if current is None else current,
+        min_m=least,
+        max_m=most or None,
+        quality=None if signal == 0 else min((signal - NO_SIGNAL) / (FULL_SIGNAL - NO_SIGNAL), 1.0),
+    )
+
+
+def _vector(fields: Fields, *names: str) -> FloatArray | None:
+    """The named numbers, or None where one is missing, null, which is how NaN comes, or infinite."""
+    numbers = [fields.get(name) for name in names]
+    vector = np.array([math.nan if number is None else number for number in numbers], dtype=float)
+    return vector if np.isfinite(vector).all() else None
+
+
+def _known(value: float | None, *, scale: float, unknown: tuple[float, ...] = (-1,)) -> float | None:
+    return None if value is None or value in unknown else value * scale
+
+
+def _estimate_ok(message: ReceivedMessage | None) -> bool | None:
+    if message is None:
+        return None
+    flags = int(message.fields["flags"])
+    needed = ESTIMATOR_ATTITUDE | ESTIMATOR_VELOCITY_HORIZONTAL | ESTIMATOR_HEIGHT
+    position = ESTIMATOR_POSITION_RELATIVE | ESTIMATOR_POSITION_ABSOLUTE
+    return flags & needed == needed and bool(flags & position)

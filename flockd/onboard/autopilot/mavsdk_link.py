@@ -1,0 +1,400 @@
+"""The link to the autopilot: the one file that knows MAVSDK.
+
+Everything goes through MAVSDK's raw MAVLink path. Its offboard plugin repeats the last setpoint for ever, also when
+the program that gave it has ended; here a setpoint is sent once. What received messages mean is in `mavlink_messages`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import math
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from typing import Any, Self, TypeVar
+
+from mavsdk.component_type import ComponentType
+from mavsdk.connection_result import ConnectionResult
+from mavsdk.logging import LogLevel, log_subscribe
+from mavsdk.mavsdk import Configuration, Mavsdk
+from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkDirectError, MavlinkDirectResult, MavlinkMessage
+from mavsdk.plugins.param import Param, ParamError
+from mavsdk.system import System
+
+from flockd.core.config.autopilot import AutopilotParameters
+from flockd.core.messages import RangeReading, Setpoint, VehicleState
+from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware, FlightMode
+from flockd.onboard.autopilot.clock_sync import ClockEstimate
+from flockd.onboard.autopilot.mavlink_messages import MODES, Fields, ReceivedMessages, result_text
+from flockd.onboard.autopilot.refusal_reasons import REMEDIES_OF_RESULTS
+from flockd.onboard.autopilot.refusals import Refusal
+from flockd.onboard.autopilot.throttled_log import ThrottledLog
+
+T = TypeVar("T")
+Clock = Callable[[], float]
+
+AUTOPILOT_COMPONENT = 1
+SETPOINT_TYPE_MASK = 2531
+"""SET_POSITION_TARGET_LOCAL_NED: velocity in x and y, position in z, and yaw; the rest is ignored."""
+MAV_FRAME_LOCAL_NED = 1
+MAV_AUTOPILOT_PX4 = 12
+COMMAND_ARM_DISARM = 400
+COMMAND_SET_MODE = 176
+COMMAND_SET_MESSAGE_INTERVAL = 511
+COMMAND_REQUEST_MESSAGE = 512
+COMMAND_RUN_CHECKS = 401
+STARTS = frozenset({COMMAND_ARM_DISARM, COMMAND_SET_MODE})
+"""Commands that the autopilot's checks may refuse."""
+STREAMS_HZ = {
+    "ATTITUDE_QUATERNION": (31, 50.0),
+    "LOCAL_POSITION_NED": (32, 30.0),
+    "EXTENDED_SYS_STATE": (245, 2.0),
+    "SYS_STATUS": (1, 1.0),
+    "GPS_RAW_INT": (24, 1.0),
+    "ESTIMATOR_STATUS": (230, 2.0),
+    "HOME_POSITION": (242, 1.0),
+    "CURRENT_MODE": (436, 20.0),
+    "DISTANCE_SENSOR": (132, 30.0),
+    "ALTITUDE": (141, 10.0),
+}
+"""What is asked for, by message number and rate. PX4 sends CURRENT_MODE at once when the mode changes, at this rate at
+most; its heartbeat comes once a second whatever one asks."""
+RECEIVED = (*STREAMS_HZ, "HEARTBEAT", "AUTOPILOT_VERSION", "STATUSTEXT", "EVENT")
+TIME_SYNC = "TIMESYNC"
+TIME_SYNC_S = 0.1
+"""Between two exchanges."""
+MOST_OPEN = 20
+"""Exchanges whose reply is waited for; older ones are lost."""
+TEXT_MEMORY_S = 2.0
+STREAMS_S = 0.5
+"""Setpoints that are not farther apart are a stream."""
+MOST_REPORTS = 100
+
+_log = logging.getLogger(__name__)
+_throttled = ThrottledLog(_log)
+"""MAVSDK sends a heartbeat a second, and complains of each that an autopilot which is gone does not take."""
+_LOG_LEVELS = {
+    LogLevel.DEBUG: logging.DEBUG,
+    LogLevel.INFO: logging.INFO,
+    LogLevel.WARN: logging.WARNING,
+    LogLevel.ERROR: logging.ERROR,
+}
+
+
+class AutopilotLink:
+    """One autopilot. Everything that is not a coroutine may be called from any thread and returns at once."""
+
+    def __init__(self, mavsdk: Mavsdk, system: System, executor: ThreadPoolExecutor, clock: Clock) -> None:
+        """Use `connect`."""
+        self._mavsdk = mavsdk
+        self._executor = executor
+        self._clock = clock
+        self._system_id = int(system.get_system_id())
+        self._reports: deque[str] = deque(maxlen=MOST_REPORTS)
+        self._received = ReceivedMessages(self._reports.append)
+        self._sent_s = -math.inf
+        """When the last setpoint was sent."""
+        self._param = Param(system)
+        self._direct = MavlinkDirect(system)
+        self._time_syncs: deque[int] = deque(maxlen=MOST_OPEN)
+        """This computer's times in nanoseconds of exchanges that were not answered yet."""
+        for name in (*RECEIVED, TIME_SYNC):
+            self._direct.subscribe_message(name, self._receive)
+
+    @classmethod
+    async def connect(
+        cls, parameters: AutopilotParameters, *, timeout_s: float = 10.0, clock: Clock = time.monotonic
+    ) -> Self:
+        """The link, once an autopilot has been heard and told what to send.
+
+        Raises AutopilotError when the address cannot be used or nobody answers within `timeout_s`.
+        """
+        _refuse_a_taken_port(parameters.address)
+        log_subscribe(_to_logging)
+        executor = ThreadPoolExecutor(1, thread_name_prefix="mavsdk")  # never asyncio's own: it may be saturated
+        mavsdk = Mavsdk(_configuration(parameters.system_id))
+        try:
+            deadline = clock() + timeout_s
+            await _open(mavsdk, parameters.address, executor)
+            system = await _find_system(mavsdk, parameters, deadline, timeout_s, clock)
+            link = cls(mavsdk, system, executor, clock)
+            await link._wait_for("HEARTBEAT", deadline)
+            for name, (number, rate_hz) in STREAMS_HZ.items():
+                await link._request_stream(name, number, rate_hz)
+        except BaseException:
+            mavsdk.destroy()
+            executor.shutdown(wait=False)
+            raise
+        return link
+
+    async def close(self) -> None:
+        """Ends the link; nothing of it may be used afterwards."""
+        await self._call(self._mavsdk.destroy)
+        self._executor.shutdown(wait=False)
+
+    @property
+    def system_id(self) -> int:
+        """The autopilot's MAV_SYS_ID."""
+        return self._system_id
+
+    def status(self) -> AutopilotStatus:
+        """The newest of everything that the autopilot has sent."""
+        return self._received.status(self._clock())
+
+    def vehicle_state(self) -> VehicleState | None:
+        """See `ReceivedMessages.vehicle_state`."""
+        return self._received.vehicle_state()
+
+    def ground_range(self) -> RangeReading | None:
+        """See `ReceivedMessages.ground_range`."""
+        return self._received.ground_range()
+
+    def range_finders(self) -> Mapping[int, tuple[float, ...]]:
+        """See `ReceivedMessages.range_finders`."""
+        return self._received.range_finders()
+
+    def unknown_values(self) -> Mapping[str, int]:
+        """See `ReceivedMessages.unknown_values`."""
+        return self._received.unknown_values()
+
+    def refusals(self) -> tuple[Refusal, ...]:
+        """Why it would refuse to arm or to fly offboard now, the cause first."""
+        now = self._clock()
+        return self._received.refusals(now, streams=now - self._sent_s < STREAMS_S)
+
+    def knows_checks(self) -> bool:
+        """Whether the autopilot's list of failed checks is here, and whole."""
+        return not self._received.check_events.incomplete
+
+    async def ask_for_checks(self) -> None:
+        """Asks it to send its list of failed checks. Raises AutopilotError where it cannot."""
+        await self._command("for its checks", COMMAND_RUN_CHECKS)
+
+    def clock(self) -> ClockEstimate | None:
+        """The autopilot's clock; None while it is not known. It is measured by `synchronise`."""
+        return self._received.clock.estimate
+
+    async def synchronise(self) -> None:
+        """Exchanges times with the autopilot until cancelled."""
+        while True:
+            sent_ns = int(1e9 * self._clock())
+            self._time_syncs.append(sent_ns)
+            with suppress(MavlinkDirectError):  # a link that cannot send says so where setpoints are sent
+                self._direct.send_message(self._message(TIME_SYNC, {"tc1": 0, "ts1": sent_ns}))
+            await asyncio.sleep(TIME_SYNC_S)
+
+    def take_reports(self) -> list[str]:
+        """What happened to the messages since the last call that people should know, each in one sentence."""
+        return [self._reports.popleft() for _ in range(len(self._reports))]
+
+    def send_setpoint(self, setpoint: Setpoint) -> None:
+        """Sends it, once. Raises AutopilotError when it is not finite or MAVSDK cannot send it."""
+        north, east = (float(v) for v in setpoint.velocity)
+        down = (self._received.home_down_m or 0.0) - setpoint.height_m
+        if not all(math.isfinite(number) for number in (north, east, down, setpoint.yaw_rad)):
+            raise AutopilotError("a setpoint that is not finite was not sent")
+        fields = {
+            "time_boot_ms": int(self._clock() * 1000) & 0xFFFFFFFF,
+            "coordinate_frame": MAV_FRAME_LOCAL_NED,
+            "type_mask": SETPOINT_TYPE_MASK,
+            "vx": north,
+            "vy": east,
+            "z": down,
+            "yaw": setpoint.yaw_rad,
+        }
+        unused = dict.fromkeys(("x", "y", "vz", "afx", "afy", "afz", "yaw_rate"), 0.0)
+        try:
+            self._direct.send_message(self._message("SET_POSITION_TARGET_LOCAL_NED", {**unused, **fields}))
+        except MavlinkDirectError as error:
+            raise AutopilotError(f"MAVSDK could not send a setpoint ({error.result.name.lower()})") from error
+        self._sent_s = self._clock()
+
+    async def request_offboard(self) -> None:
+        """Asks for offboard flight; setpoints must be streaming by then. Raises AutopilotError when refused."""
+        await self._set_mode("offboard")
+
+    async def hold(self) -> None:
+        """Asks it to stop and stay. Raises AutopilotError when refused."""
+        await self._set_mode("hold")
+
+    async def land(self) -> None:
+        """Asks it to land here. Raises AutopilotError when refused."""
+        await self._leave_offboard()
+        await self._set_mode("land")
+
+    async def return_home(self) -> None:
+        """Asks it to fly home and land. Raises AutopilotError when refused."""
+        await self._leave_offboard()
+        await self._set_mode("return")
+
+    async def arm(self) -> None:
+        """Starts the motors. Raises AutopilotError when refused."""
+        await self._command("to arm", COMMAND_ARM_DISARM, 1)
+
+    async def take_off(self) -> None:
+        """Climbs to its own take-off height (MIS_TAKEOFF_ALT), once armed. Raises AutopilotError when refused."""
+        await self._set_mode("take-off")
+
+    async def parameter(self, name: str, kind: type[T]) -> T:
+        """One of its parameters, of `kind` int or float as the firmware has it. Raises AutopilotError."""
+        read = self._param.get_param_int if kind is int else self._param.get_param_float
+        try:
+            return kind(await self._call(read, name))  # type: ignore[call-arg]
+        except ParamError as error:
+            reason = error.result.name.lower().replace("_", " ")
+            raise AutopilotError(f"the autopilot's parameter {name} could not be read ({reason})") from error
+
+    async def firmware(self, timeout_s: float = 3.0) -> Firmware:
+        """What runs on it. Raises AutopilotError when it does not say within `timeout_s`."""
+        await self._command("for its version", COMMAND_REQUEST_MESSAGE, 148)
+        number = int((await self._wait_for("AUTOPILOT_VERSION", self._clock() + timeout_s))["flight_sw_version"])
+        kind = (await self._wait_for("HEARTBEAT", math.inf))["autopilot"]
+        return Firmware(
+            autopilot="PX4" if kind == MAV_AUTOPILOT_PX4 else f"autopilot {kind}",
+            version=".".join(str(number >> shift & 0xFF) for shift in (24, 16, 8)),
+        )
+
+    def _receive(self, message: MavlinkMessage, _: object) -> None:
+        """Called on MAVSDK's thread, one message after the other."""
+        now = self._clock()
+        if message.system_id != self._system_id or message.component_id != AUTOPILOT_COMPONENT:
+            if message.message_name == "HEARTBEAT":
+                self._received.add_other_heartbeat(json.loads(message.fields_json), now)
+        elif message.message_name == TIME_SYNC:
+            self._take_time(json.loads(message.fields_json), now)
+        else:
+            self._received.add(message.message_name, json.loads(message.fields_json), now)
+
+    def _take_time(self, fields: Fields, now: float) -> None:
+        """Takes the reply to an exchange of ours; the autopilot asks in the same message, which is left to others."""
+        sent_ns = int(fields["ts1"])
+        if fields["tc1"] and sent_ns in self._time_syncs:
+            self._time_syncs.remove(sent_ns)
+            self._received.clock.add(1e-9 * sent_ns, 1e-9 * int(fields["tc1"]), now)
+
+    async def _set_mode(self, mode: FlightMode) -> None:
+        main, sub = next(numbers for numbers, name in MODES.items() if name == mode)
+        await self._command(f"for {mode}", COMMAND_SET_MODE, 1, main, sub)
+
+    async def _leave_offboard(self) -> None:
+        """PX4 goes back to the last mode it was asked for after landing, and cannot be armed if that was offboard."""
+        if self._received.flight_mode() == "offboard":
+            await self.hold()
+
+    async def _request_stream(self, name: str, number: int, rate_hz: float) -> None:
+        try:
+            await self._command(f"for {name}", COMMAND_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz)
+        except AutopilotError as error:  # an older firmware may lack one; whatever needs it then says so
+            _log.warning("%s", error)
+
+    async def _command(self, what: str, command: int, *values: float) -> None:
+        """Sends a command until it is acknowledged. Raises AutopilotError when refused or never answered."""
+        loop = asyncio.get_running_loop()
+        answer: asyncio.Future[tuple[MavlinkDirectResult, str]] = loop.create_future()
+
+        def on_answer(result: MavlinkDirectResult, ack: MavlinkMessage, _: object) -> None:
+            loop.call_soon_threadsafe(_settle, answer, (result, ack.fields_json))
+
+        numbers = {f"param{i}": float(value) for i, value in enumerate((*values, *[0.0] * (7 - len(values))), start=1)}
+        fields = {"command": command, "confirmation": 0, **numbers}
+        self._direct.send_command_async(self._message("COMMAND_LONG", fields), on_answer)
+        result, ack = await answer
+        if result != MavlinkDirectResult.SUCCESS:
+            raise AutopilotError(f"the autopilot was asked {what} and did not respond ({result.name.lower()})")
+        verdict = int(json.loads(ack)["result"])
+        if verdict != 0:
+            raise AutopilotError(
+                f"the autopilot was asked {what}, which was {result_text(verdict)}{self._why(command, verdict)}"
+            )
+
+    def _why(self, command: int, verdict: int) -> str:
+        """What is known of a refusal, with what to do."""
+        said = self._received.recent_texts(self._clock(), TEXT_MEMORY_S)
+        checks = self.refusals() if command in STARTS else ()
+        known = [*said, *(f"{refusal.what}; {refusal.remedy}" for refusal in checks)]
+        if known:
+            return f": {'; '.join(known)}"
+        return f"; {REMEDIES_OF_RESULTS[verdict]}" if verdict in REMEDIES_OF_RESULTS else ""
+
+    def _message(self, name: str, fields: Fields) -> MavlinkMessage:
+        target = {"target_system": self._system_id, "target_component": AUTOPILOT_COMPONENT}
+        text = json.dumps({**target, **fields}, allow_nan=False)
+        return MavlinkMessage(name, 0, 0, self._system_id, AUTOPILOT_COMPONENT, text)
+
+    async def _wait_for(self, name: str, deadline: float) -> Fields:
+        while (message := self._received.newest(name)) is None:
+            if self._clock() > deadline:
+                raise AutopilotError(f"the autopilot sends no {name}; check the link")
+            await asyncio.sleep(0.02)
+        return message.fields
+
+    async def _call(self, function: Callable[..., Any], *arguments: object) -> Any:
+        return await asyncio.get_running_loop().run_in_executor(self._executor, function, *arguments)
+
+
+def _configuration(system_id: int | None) -> Configuration:
+    """An onboard computer of the same system: PX4 then knows it is no ground station."""
+    configuration = Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)
+    if system_id is not None:
+        configuration.system_id = system_id
+    return configuration
+
+
+def _refuse_a_taken_port(address: str) -> None:
+    """Two programs can share a UDP port without an error, and then both command the drone."""
+    kind, _, rest = address.partition("://")
+    if kind != "udpin":
+        return
+    host, _, port = rest.rpartition(":")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((host, int(port)))
+        except OSError as error:
+            raise AutopilotError(
+                f"autopilot.address: {address} cannot be used ({error.strerror}); is another program on it?"
+            ) from error
+
+
+async def _open(mavsdk: Mavsdk, address: str, executor: ThreadPoolExecutor) -> None:
+    result = await asyncio.get_running_loop().run_in_executor(executor, mavsdk.add_any_connection, address)
+    if result != ConnectionResult.SUCCESS:
+        reason = ConnectionResult(result).name.lower().replace("_", " ")
+        raise AutopilotError(
+            f"autopilot.address: {address} cannot be opened ({reason}); check the address and the cable"
+        )
+
+
+async def _find_system(
+    mavsdk: Mavsdk, parameters: AutopilotParameters, deadline: float, timeout_s: float, clock: Clock
+) -> System:
+    wanted = parameters.system_id
+    while True:
+        systems = {int(system.get_system_id()): system for system in mavsdk.get_systems() if system.has_autopilot()}
+        if wanted is None and systems:
+            return next(iter(systems.values()))
+        if wanted in systems:
+            return systems[wanted]
+        if clock() > deadline:
+            others = f"; heard instead: {', '.join(map(str, sorted(systems)))}" if systems else ""
+            who = "no autopilot" if wanted is None else f"no autopilot with system id {wanted}"
+            raise AutopilotError(
+                f"{who} was heard at {parameters.address} within {timeout_s:g} s{others}; "
+                "check autopilot.address, autopilot.system_id and that the autopilot is on"
+            )
+        await asyncio.sleep(0.05)
+
+
+def _settle(answer: asyncio.Future[T], value: T) -> None:
+    if not answer.done():
+        answer.set_result(value)
+
+
+def _to_logging(level: LogLevel, message: str, *_: object) -> bool:
+    """MAVSDK would print; this says that it is taken care of."""
+    _throttled(_LOG_LEVELS[level], message)
+    return True

@@ -1,0 +1,272 @@
+"""Why the autopilot would refuse to arm or to fly offboard now, from its messages; without I/O.
+
+PX4 sends the checks that fail as MAVLink events: a summary with the modes that can be armed and flown, one event for
+each check, and a second summary at the end. A firmware without events tells less, by texts and by single flags.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
+from flockd.onboard.autopilot.refusal_reasons import (
+    CHECKS_FAIL,
+    NAMES,
+    NAVIGATION_STATES,
+    NO_SETPOINTS,
+    NOT_STREAMING,
+    OF_STATE,
+    RANK,
+    REASONS,
+    SAID,
+    SEVERAL_SENDERS,
+    SYSTEMS,
+    TEXTS,
+    UNHEALTHY,
+    UNKNOWN_CHECK,
+    event_number,
+)
+
+BEGINS, ENDS = event_number("commander_arming_check_summary"), event_number("commander_health_summary")
+DENIALS = frozenset(
+    event_number(name)
+    for name in (
+        "commander_arm_denied_throttle_unsafe",
+        "commander_arm_denied_calibrating",
+        "commander_kill_sw_engaged",
+        CHECKS_FAIL,
+    )
+)
+MODE_DENIED = event_number("commander_modeswitch_not_avail")
+OFFBOARD_MAIN_MODE = 6
+"""Of PX4's custom mode."""
+ALL_MODES = 0xFFFFFFFF
+ERROR, WARNING = 3, 4
+"""Of PX4's log levels, which are worse the smaller."""
+MOST_CHECKS = 300
+"""That a report may name as failed: PX4 has fewer."""
+PREARM_CHECK = 1 << 28
+"""Of MAV_SYS_STATUS_SENSOR."""
+QUIET_ERRORS = frozenset({"check_system_safety_button", "check_modes_mission"})
+"""PX4 sends them as information, and refuses to arm all the same."""
+REMEMBERED_S = 15.0
+"""For how long a request that was refused is told."""
+MOST_TOLD = 5
+"""Reasons at once; further ones are counted."""
+HIGHEST_TOLD_SEVERITY = 4
+"""A STATUSTEXT up to this MAV_SEVERITY, a warning, may be a reason."""
+STICKS = "check_modes_manual_control"
+MANUAL_MODES = frozenset({"manual", "altitude", "position"})
+
+
+class Refusal(NamedTuple):
+    """One reason, in the words of `REASONS`."""
+
+    reason: str
+    """Its name in the table."""
+    refused: str
+    """`to arm` or `offboard`; empty for what is the matter with both."""
+    what: str
+    remedy: str
+
+    @property
+    def sentence(self) -> str:
+        """For people."""
+        if not self.refused:
+            return f"the autopilot: {self.what}; {self.remedy}"
+        return f"the autopilot refuses {self.refused}: {self.what}; {self.remedy}"
+
+
+class FailedCheck(NamedTuple):
+    """A check of PX4 that fails."""
+
+    number: int
+    """Of the event."""
+    modes: int
+    """Bits of the modes that it concerns."""
+    level: int
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """All checks of PX4 as of one time."""
+
+    can_arm: int
+    """Bits of the modes; so `can_run`."""
+    can_run: int
+    failed: tuple[FailedCheck, ...]
+
+
+class CheckEvents:
+    """Puts reports together from EVENT messages."""
+
+    def __init__(self) -> None:
+        self.report: CheckReport | None = None
+        """The newest whole one."""
+        self.incomplete = True
+        """There is none yet, or events were lost since."""
+        self.denied: tuple[float, str] | None = None
+        """When a request was last refused, and why: a switch to offboard, for want of setpoints."""
+        self._sequence: int | None = None
+        self._begun: tuple[int, int] | None = None
+        self._failed: list[FailedCheck] = []
+
+    def add(self, fields: Mapping[str, Any], time_s: float) -> None:
+        """Takes an EVENT; one that is none is ignored."""
+        try:
+            number, sequence = int(fields["id"]), int(fields["sequence"])
+            arguments, level = bytes(fields["arguments"]), int(fields["log_levels"]) & 0xF
+        except (KeyError, TypeError, ValueError, OverflowError):
+            return
+        if self._sequence is not None and sequence == self._sequence:
+            return
+        if self._sequence is not None and sequence != (self._sequence + 1) & 0xFFFF:
+            self._begun, self.incomplete = None, True
+        self._sequence = sequence
+        if number == BEGINS:
+            self._begun, self._failed = (_word(arguments, 9), _word(arguments, 13)), []
+        elif number == ENDS:
+            if self._begun is not None:
+                self.report = CheckReport(*self._begun, tuple(self._failed))
+                self.incomplete = False
+            self._begun = None
+        elif number in DENIALS:
+            self.denied = time_s, NAMES[number]
+        elif number == MODE_DENIED:
+            if _word(arguments, 0) >> 16 & 0xFF == OFFBOARD_MAIN_MODE:
+                self.denied = time_s, NO_SETPOINTS
+        elif self._begun is not None and len(self._failed) < MOST_CHECKS:
+            self._failed.append(FailedCheck(number, _word(arguments, 0), level))
+
+
+def refusals(
+    status: AutopilotStatus,
+    events: CheckEvents,
+    messages: Mapping[str, Mapping[str, Any]],
+    texts: Sequence[str],
+    other_computers: bool,
+    *,
+    streams: bool,
+) -> tuple[Refusal, ...]:
+    """Why it would refuse now, the cause first; empty in offboard flight and where nothing is known against it.
+
+    Args:
+        status: the newest.
+        events: what the events say.
+        messages: the newest fields of SYS_STATUS and HEARTBEAT, by name.
+        texts: STATUSTEXT of warning or worse of the last seconds.
+        other_computers: one more onboard computer is heard.
+        streams: flockd sends setpoints.
+    """
+    found = [_refusal(SEVERAL_SENDERS, "")] if other_computers else []
+    if not (status.armed and status.flight_mode == "offboard"):
+        found += _of_state(messages)
+        report = events.report
+        if report is not None:
+            found += _of_report(report, status, streams=streams, asked=_asked(events, status.time_s))
+        elif not status.armed:
+            found += _of_flags(status, messages, texts)
+        found += _of_denial(events, status, found)
+    return _few({refusal.reason: refusal for refusal in reversed(found)})
+
+
+def _few(found: Mapping[str, Refusal]) -> tuple[Refusal, ...]:
+    """Each reason once, the cause first; the last that is told says how many are not."""
+    ordered = sorted(found.values(), key=lambda refusal: RANK[refusal.reason])
+    rest = len(ordered) - MOST_TOLD
+    if rest <= 0:
+        return tuple(ordered)
+    last = ordered[MOST_TOLD - 1]
+    more = f"{rest} further reason" + ("s" if rest > 1 else "")
+    return (*ordered[: MOST_TOLD - 1], last._replace(remedy=f"{last.remedy} ({more})"))
+
+
+def _asked(events: CheckEvents, now_s: float) -> bool:
+    """Somebody has just tried to switch to offboard."""
+    return events.denied is not None and events.denied[1] == NO_SETPOINTS and now_s - events.denied[0] < REMEMBERED_S
+
+
+def _of_state(messages: Mapping[str, Mapping[str, Any]]) -> list[Refusal]:
+    state = OF_STATE.get(int(messages["HEARTBEAT"].get("system_status") or 0))
+    return [] if state is None else [_refusal(state, "to arm")]
+
+
+def _of_report(report: CheckReport, status: AutopilotStatus, *, streams: bool, asked: bool) -> Iterator[Refusal]:
+    """What PX4's checks say: of arming while it is disarmed, and of offboard."""
+    state = NAVIGATION_STATES.get(status.flight_mode)
+    if not status.armed and state is not None and not report.can_arm >> state & 1:
+        for check in _blocking(report, state, status):
+            yield _named(check, "to arm", streams=streams)
+    state = NAVIGATION_STATES["offboard"]
+    if not report.can_run >> state & 1:
+        for check in report.failed:
+            silent = NAMES.get(check.number) == NO_SETPOINTS and not streams
+            if check.modes >> state & 1 and check.modes != ALL_MODES and (status.armed or asked or not silent):
+                yield _named(check, "offboard", streams=streams)
+
+
+def _blocking(report: CheckReport, state: int, status: AutopilotStatus) -> list[FailedCheck]:
+    """Of the checks that fail in a mode those that keep it from being armed; PX4 does not say which do."""
+    failed = [check for check in report.failed if check.modes >> state & 1]
+    certain = [
+        check
+        for check in failed
+        if check.level <= ERROR or check.modes != ALL_MODES or NAMES.get(check.number) in QUIET_ERRORS
+    ]
+    manual = status.flight_mode in MANUAL_MODES
+    warned = [check for check in failed if check.level == WARNING and (manual or NAMES.get(check.number) != STICKS)]
+    return certain or warned or [FailedCheck(event_number(CHECKS_FAIL), ALL_MODES, ERROR)]
+
+
+def _of_flags(
+    status: AutopilotStatus, messages: Mapping[str, Mapping[str, Any]], texts: Sequence[str]
+) -> Iterator[Refusal]:
+    """For a firmware without events: what its texts, its health bits and single messages say."""
+    system = messages["SYS_STATUS"]
+    enabled, healthy = (int(system.get(f"onboard_control_sensors_{what}") or 0) for what in ("enabled", "health"))
+    if healthy & PREARM_CHECK:
+        return
+    for text in texts:
+        words = text.lower()
+        name = next((name for parts, name in TEXTS if all(part in words for part in parts)), SAID)
+        if name != SAID or "fail" in words or "denied" in words:
+            refusal = _refusal(name, "to arm")
+            yield refusal._replace(what=f'{refusal.what} ("{text}")')
+    unhealthy = [name for bit, name in SYSTEMS.items() if enabled & bit and not healthy & bit]
+    if unhealthy:
+        yield _refusal(UNHEALTHY, "to arm")._replace(what=f"not healthy: {', '.join(unhealthy)}")
+    if status.estimate_ok is False:
+        yield _refusal("estimate_missing", "to arm")
+    if status.gps_ok is False:
+        yield _refusal("fix_missing", "to arm")
+    if status.home_ned is None:
+        yield _refusal("home_missing", "to arm")
+    if not (unhealthy or texts) and enabled & PREARM_CHECK and not healthy & PREARM_CHECK:
+        yield _refusal(CHECKS_FAIL, "to arm")
+
+
+def _of_denial(events: CheckEvents, status: AutopilotStatus, found: Sequence[Refusal]) -> Iterator[Refusal]:
+    """Arming that was refused a moment ago, unless the reasons are told already."""
+    if status.armed or events.denied is None or status.time_s - events.denied[0] >= REMEMBERED_S:
+        return
+    name = events.denied[1]
+    if name != NO_SETPOINTS and not (name == CHECKS_FAIL and (found or events.report is not None)):
+        yield _refusal(name, "to arm")
+
+
+def _named(check: FailedCheck, refused: str, *, streams: bool) -> Refusal:
+    name = NAMES.get(check.number)
+    if name is None:
+        refusal = _refusal(UNKNOWN_CHECK, refused)
+        return refusal._replace(what=f"{refusal.what} (event {check.number})")
+    return _refusal(NOT_STREAMING if name == NO_SETPOINTS and not streams else name, refused)
+
+
+def _refusal(name: str, refused: str) -> Refusal:
+    return Refusal(name, refused, *REASONS[name])
+
+
+def _word(data: bytes, offset: int) -> int:
+    return int.from_bytes(data[offset : offset + 4], "little")

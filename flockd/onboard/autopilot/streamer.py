@@ -1,0 +1,201 @@
+"""Streams setpoints to the autopilot, and falls silent when anything is wrong: silence is what stops a drone.
+
+It runs on its own thread with its own deadlines, so that neither busy cores nor a stuck event loop make it stutter, and
+sends only while the control loop runs. PX4 goes back to offboard by itself when setpoints return after
+its failsafe; so a stream that was interrupted in flight never resumes unless it is begun anew.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from flockd.core.config.autopilot import AutopilotParameters
+from flockd.core.messages import Setpoint
+from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus
+
+Send = Callable[[Setpoint], None]
+Gate = Callable[[Setpoint], Setpoint | None]
+"""What may be sent in a setpoint's place; None: nothing."""
+
+CLOSE_TIMEOUT_S = 1.0
+"""A cable that takes no more bytes may hold the thread for ever; it ends with the process."""
+
+
+@dataclass(frozen=True)
+class StreamReport:
+    """What the streamer has done since it was made."""
+
+    streaming: bool
+    """Begun and not ended; it may be silent all the same."""
+    offboard: bool
+    """This stream has seen the autopilot in offboard."""
+    silence: str | None
+    """Why nothing was sent at the last deadline; None: a setpoint was."""
+    sent: int
+    refused: Mapping[str, int]
+    """Deadlines at which nothing was sent, by reason."""
+    missed: int
+    """Deadlines that passed unused because the thread did not get to run."""
+
+
+class SetpointStreamer:
+    """Sends the newest setpoint at a fixed rate for as long as all of this holds.
+
+    It was begun; the control loop beats; the setpoint is fresh and the gate lets it pass; the autopilot is heard, not
+    in its failsafe, and has not left offboard. What ends a stream for good (the pilot's mode change, a lost link, a gap
+    in offboard flight, a fault of the gate) is final until `begin`. Every method may be called from any thread and
+    returns at once.
+    """
+
+    def __init__(
+        self,
+        send: Send,
+        status: Callable[[], AutopilotStatus],
+        gate: Gate,
+        parameters: AutopilotParameters,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """`status` is asked before each setpoint; `clock` is the one that setpoints are dated by."""
+        self._send = send
+        self._status = status
+        self._gate = gate
+        self._parameters = parameters
+        self._clock = clock
+        self._setpoint: Setpoint | None = None
+        self._beat_s = float("-inf")
+        self._stream = _Stream(begun_s=clock(), ended="not begun")
+        self._silence: str | None = "not begun"
+        self._sent = 0
+        self._missed = 0
+        self._refused: Counter[str] = Counter()
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Starts the thread; nothing is sent before `begin`."""
+        self._thread = threading.Thread(target=self._run, name="setpoints", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Ends the stream and the thread."""
+        self.end("closed")
+        self._closing.set()
+        if self._thread is not None:
+            self._thread.join(CLOSE_TIMEOUT_S)
+
+    def begin(self) -> None:
+        """Streams from now on, with setpoints given from now on."""
+        self._setpoint = None
+        self._stream = _Stream(begun_s=self._clock())
+
+    def end(self, reason: str) -> None:
+        """Silence until `begin`; `reason` is reported unless the stream had ended before."""
+        self._stream.end(reason)
+
+    def offer(self, setpoint: Setpoint) -> None:
+        """The setpoint to send from now on, until a newer one is offered or it is too old."""
+        self._setpoint = setpoint
+
+    def beat(self) -> None:
+        """The control loop runs. To be called by the control loop itself, several times in `max_control_age_s`."""
+        self._beat_s = self._clock()
+
+    def report(self) -> StreamReport:
+        """What has been done so far."""
+        stream = self._stream
+        return StreamReport(
+            streaming=stream.ended is None,
+            offboard=stream.offboard,
+            silence=stream.ended or self._silence,
+            sent=self._sent,
+            refused=dict(self._refused),
+            missed=self._missed,
+        )
+
+    def step(self) -> None:
+        """One deadline: sends a setpoint, or counts why not. The thread calls this."""
+        stream = self._stream
+        if stream.ended is not None:
+            return
+        silence = self._watch(stream) or self._send_one(stream)
+        self._silence = silence
+        if silence is not None:
+            self._refused[silence] += 1
+            gap_s = self._clock() - stream.last_sent_s
+            if stream.offboard and gap_s > self._parameters.max_gap_s:
+                stream.end(f"{silence}, for more than {self._parameters.max_gap_s:g} s in offboard flight")
+
+    def _watch(self, stream: _Stream) -> str | None:
+        """Why the autopilot's state forbids sending; ends the stream where that is final."""
+        status = self._status()
+        if status.heartbeat_age_s > self._parameters.max_heartbeat_age_s:
+            stream.end("the autopilot's heartbeat is lost")
+        elif status.flight_mode == "offboard":
+            stream.offboard = True
+        elif stream.offboard:
+            stream.end(f"the autopilot left offboard for {status.flight_mode}")
+        elif status.failsafe:
+            return "the autopilot is in its failsafe"
+        return stream.ended
+
+    def _send_one(self, stream: _Stream) -> str | None:
+        """Sends the newest setpoint; why not, where it cannot be sent."""
+        setpoint = self._setpoint
+        now = self._clock()
+        if now - self._beat_s > self._parameters.max_control_age_s:
+            return "the control loop is late"
+        if setpoint is None:
+            return "no setpoint yet"
+        if not 0.0 <= now - setpoint.time_s <= self._parameters.max_setpoint_age_s:
+            return "the setpoint is not fresh"
+        if now - stream.last_sent_s > self._parameters.max_gap_s and stream.offboard:
+            return "the thread was stopped"  # between two deadlines: SIGSTOP, or a machine that slept
+        allowed = self._gate(setpoint)
+        if allowed is None:
+            return "the gate refused"
+        if stream.ended is not None:
+            return stream.ended
+        try:
+            self._send(allowed)
+        except AutopilotError as error:
+            return str(error)
+        stream.last_sent_s = now
+        self._sent += 1
+        return None
+
+    def _run(self) -> None:
+        """Deadlines on the wall of the real clock; one that has passed is counted and not made up for."""
+        period_s = 1.0 / self._parameters.setpoint_rate_hz
+        deadline = time.monotonic()
+        while not self._closing.wait(max(0.0, deadline - time.monotonic())):
+            try:
+                self.step()
+            except Exception as error:  # noqa: BLE001 - the thread's last line: silence, and the reason is reported
+                self._stream.end(f"the streamer failed: {error!r}")
+            deadline += period_s
+            late = int((time.monotonic() - deadline) / period_s)
+            if late > 0:
+                self._missed += late
+                deadline += late * period_s
+
+
+@dataclass
+class _Stream:
+    """One stream, from `begin` to its end."""
+
+    begun_s: float
+    ended: str | None = None
+    offboard: bool = False
+    last_sent_s: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.last_sent_s = self.begun_s
+
+    def end(self, reason: str) -> None:
+        if self.ended is None:
+            self.ended = reason

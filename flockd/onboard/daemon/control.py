@@ -1,0 +1,163 @@
+"""The control loop, every 50 ms: supervisor step, setpoint, and requests to the autopilot. It feeds the watchdog."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from flockd.core.config import DroneConfig
+from flockd.core.messages import FloatArray, Setpoint, VehicleState
+from flockd.flight.obstacles import nearest_points
+from flockd.flight.safety import Action, Decision, Event, MissionEnd, Permission, State, Supervisor, Surroundings
+from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
+from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
+from flockd.onboard.autopilot.streamer import SetpointStreamer
+from flockd.onboard.daemon.autopilot_requests import AutopilotRequests, Takeover
+from flockd.onboard.daemon.operator_commands import OperatorRequests
+from flockd.onboard.daemon.pilot_loop import PilotLoop
+from flockd.onboard.daemon.stream_gate import Clearance, StreamGate
+from flockd.onboard.daemon.supervisor_inputs import InputCollector, position_from_home
+from flockd.onboard.daemon.vehicle_history import VehicleHistory
+
+PERIOD_S = 0.05
+FLYING = frozenset({State.NORMAL, State.DEGRADED, State.HOVER, State.ASKING})
+_TAKEOVERS: dict[Action, Takeover] = {Action.ASK_HOLD: "hold", Action.ASK_RETURN: "return", Action.ASK_LAND: "land"}
+
+
+class Control:
+    """Ticks every `PERIOD_S`, independent of the pilot's steps."""
+
+    def __init__(
+        self,
+        config: DroneConfig,
+        link: AutopilotLink,
+        streamer: SetpointStreamer,
+        stream_gate: StreamGate,
+        pilot_loop: PilotLoop,
+        input_collector: InputCollector,
+        requests: AutopilotRequests,
+        history: VehicleHistory,
+        operator: OperatorRequests,
+        on_tick: Callable[[Decision, Decision], None],
+        clock: Callable[[], float],
+    ) -> None:
+        """``on_tick`` is called at the end of each tick with the decision before and the one now."""
+        assert config.autopilot is not None
+        self._autopilot = config.autopilot
+        self._sigmas = config.obstacles.sigmas
+        self._link, self._streamer, self._stream_gate, self._pilot_loop = link, streamer, stream_gate, pilot_loop
+        self._input_collector, self._requests, self._history = input_collector, requests, history
+        self._operator, self._on_tick, self._clock = operator, on_tick, clock
+        self._supervisor = Supervisor(config.safety)
+        self._first_steps = max(2, config.tracking.confirm_hits)
+        self._height_m = math.nan
+        self._yaw_rad = math.nan
+        self._flight = 0
+        self.decision = Decision(State.IDLE, Action.SILENCE, ())
+
+    async def run(self) -> None:
+        """Ticks until cancelled."""
+        due_s = self._clock()
+        while True:
+            self.tick()
+            now = self._clock()
+            due_s = max(due_s + PERIOD_S, now)
+            await asyncio.sleep(due_s - now)
+
+    def tick(self) -> None:
+        """One tick."""
+        status, vehicle = self._link.status(), self._link.vehicle_state()
+        if vehicle is not None:
+            self._history.add(vehicle)
+        inputs = self._input_collector.collect(status, vehicle, self._operator, self._mission_over())
+        before, now = self.decision, self._clock()
+        self.decision = self._supervisor.step(now, inputs)
+        self._begin_or_end_flight(before, vehicle)
+        self._stream(now, status, vehicle, before)
+        self._requests.takeover = self._takeover()
+        self._on_tick(before, self.decision)
+
+    def stand_still(self) -> None:
+        """For when no tick follows: the streamer sends standstill until it notices that the control loop is late."""
+        if self._stream_gate.clearance is not None:
+            permission = Permission(Action.ASK_HOLD, self._clock())
+            self._stream_gate.clearance = replace(self._stream_gate.clearance, permission=permission)
+
+    def _mission_over(self) -> MissionEnd | None:
+        """What the mission of this flight asks of the autopilot; None while nothing flies, as its mission is past."""
+        result = self._pilot_loop.newest
+        if self.decision.state not in FLYING or result is None or result.flight != self._flight:
+            return None
+        mission = result.output.mission
+        return None if mission is None or mission.takeover is None else MissionEnd(mission.takeover)
+
+    def _begin_or_end_flight(self, before: Decision, vehicle: VehicleState | None) -> None:
+        """A flight begins with a new pilot, and holds the height and the heading that the drone has then."""
+        flies = self.decision.state in FLYING
+        if flies and before.state not in FLYING:
+            self._flight += 1
+            self._pilot_loop.begin_flight(self._flight)
+        elif not flies and vehicle is not None:
+            self._height_m = self._autopilot.height_m or vehicle.height_m
+            self._yaw_rad = _yaw(vehicle)
+
+    def _stream(self, now: float, status: AutopilotStatus, vehicle: VehicleState | None, before: Decision) -> None:
+        """Offers a setpoint, with the clearance for the gate, or ends the stream."""
+        action = self.decision.action
+        if action is Action.SILENCE:
+            self._stream_gate.clearance = None
+            self._streamer.end(self.decision.reasons[0].sentence if self.decision.reasons else action)
+            return
+        if before.action is Action.SILENCE:
+            self._streamer.begin()
+        velocity, height_m, yaw_rad, made_s = self._command(now)
+        around = self._around(now, status, vehicle)
+        self._stream_gate.clearance = Clearance(Permission(action, now), around, made_s)
+        self._streamer.offer(Setpoint(now, velocity, height_m, yaw_rad))
+        self._streamer.beat()
+
+    def _command(self, now: float) -> tuple[FloatArray, float, float, float]:
+        """Velocity, height, heading, and when they were computed; standstill during a flight's first steps.
+
+        Before those it knows neither its ego-motion nor its neighbours.
+        """
+        result = self._pilot_loop.newest
+        if result is None or result.flight != self._flight or result.number < self._first_steps:
+            return np.zeros(2), self._height_m, self._yaw_rad, now
+        command = result.output.command
+        height_m = self._height_m if command.height_m is None else command.height_m
+        return command.velocity, height_m, command.yaw_rad, result.time_s
+
+    def _around(self, now: float, status: AutopilotStatus, vehicle: VehicleState | None) -> Surroundings:
+        known = vehicle is not None and vehicle.velocity_ned is not None
+        velocity = vehicle.velocity_ned if vehicle is not None and known else np.full(3, np.nan)
+        assert velocity is not None
+        result = self._pilot_loop.newest
+        confirmed = [] if result is None else [n for n in result.output.neighbours if n.confirmed]
+        age_s = 0.0 if result is None else now - result.time_s
+        own = np.nan_to_num(velocity)
+        ranges = None if result is None else result.output.obstacles
+        places = [n.position + age_s * (n.velocity - own) for n in confirmed]  # at constant velocity since the step
+        return Surroundings(
+            position=position_from_home(status),
+            velocity=velocity[:2],
+            yaw_rad=math.nan if vehicle is None else _yaw(vehicle),
+            height_m=math.nan if vehicle is None else vehicle.height_m,
+            neighbours=np.reshape(places, (len(places), 3)),
+            neighbour_velocities=np.reshape([n.velocity[:2] for n in confirmed], (len(confirmed), 2)),
+            obstacles=np.empty((0, 2)) if ranges is None else nearest_points(ranges, self._sigmas) - age_s * own[:2],
+        )
+
+    def _takeover(self) -> Takeover | None:
+        takeover = _TAKEOVERS.get(self.decision.action)
+        by_people = {Event.SHUTDOWN_ASKED, Event.HOLD_ASKED} & {reason.event for reason in self.decision.reasons}
+        return self._autopilot.on_failure if takeover == "hold" and not by_people else takeover
+
+
+def _yaw(vehicle: VehicleState) -> float:
+    R = vehicle.R_ned_body
+    return math.atan2(R[1, 0], R[0, 0])

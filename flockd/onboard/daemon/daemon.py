@@ -1,0 +1,240 @@
+"""The daemon's life cycle: start, one task for each concern, hand-over to the autopilot, end."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from flockd.core.config import DroneConfig
+from flockd.core.errors import ConfigError, ConfigProblem, FlockdError
+from flockd.flight.safety import Decision, Event, State
+from flockd.onboard.autopilot.autopilot_status import AutopilotError
+from flockd.onboard.daemon.components import Components
+from flockd.onboard.daemon.control import FLYING
+from flockd.onboard.daemon.operator_commands import OperatorRequests
+from flockd.onboard.daemon.service_manager import ServiceManager
+from flockd.onboard.daemon.startup import open_components
+from flockd.onboard.daemon.status_messages import notify_service_manager, publish_status
+from flockd.onboard.daemon.watched_networks import InterruptibleNetworks
+from flockd.onboard.sources import open_source
+
+HOLD_S = 2.0
+"""For the autopilot to confirm Hold after the control loop has failed."""
+
+
+class DaemonError(FlockdError):
+    """The flight ended because something in flockd did; the text says what."""
+
+
+class Ending(NamedTuple):
+    """How a daemon ended that ended without an error."""
+
+    reload: DroneConfig | None
+    """The configuration to start again with; None: done."""
+
+
+class Daemon:
+    """One drone's flight program, from its start to its end. `run` once."""
+
+    def __init__(
+        self,
+        config: DroneConfig,
+        file: str,
+        *,
+        load_networks: Callable[[], InterruptibleNetworks],
+        models: Mapping[str, str],
+        recordings: Path | None,
+        service: ServiceManager,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Checks the configuration; nothing is opened before `run`.
+
+        Args:
+            config: the drone's.
+            file: its path, named in errors.
+            load_networks: runs on a thread of its own.
+            models: SHA-256 of each model, by name, for the recordings.
+            recordings: the folder for recordings of flights; None: nothing is recorded.
+            service: the service manager, if any.
+            clock: monotonic seconds.
+
+        Raises ConfigError for a configuration that cannot be flown.
+        """
+        _check_flyable(config, file)
+        self._source = open_source(config, file, clock=clock)
+        self._config, self._file = config, file
+        self._load_networks, self._models, self._recordings = load_networks, models, recordings
+        self._service, self._clock = service, clock
+        self._operator = OperatorRequests()
+        self._stopping = asyncio.Event()
+        self._reload: DroneConfig | None = None
+        self._components: Components | None = None
+
+    def waits_for(self) -> str | None:
+        """What has to come before it can fly, for people; None once it has all."""
+        assert self._config.autopilot is not None
+        if self._components is None:
+            return f"the autopilot at {self._config.autopilot.address}, and for the networks to load"
+        if self._components.pilot_loop.frames is None:
+            faults = [status.fault for status in self._components.source.status().values() if status.fault]
+            return f"camera frames: {'; '.join(faults) or 'none came yet'}"
+        return None
+
+    def ask_to_stop(self) -> None:
+        """As SIGTERM does: standstill, Hold, and the end."""
+        self._operator.shutdown = True
+        self._stopping.set()
+
+    def ask_to_reload(self, read: Callable[[], DroneConfig]) -> None:
+        """As SIGHUP does: ends, to start again with what ``read`` returns.
+
+        Refused, with an event, while the drone is armed or in the air, or when the file is wrong.
+        """
+        refusal = self._why_not_reload()
+        if refusal is None:
+            try:
+                config = read()
+                _check_flyable(config, self._file)
+                open_source(config, self._file)
+            except FlockdError as error:
+                refusal = f"the new configuration was refused, and the old one stays in use: {error}"
+            else:
+                self._reload = config
+                self._service.reloading()
+                self.ask_to_stop()
+                return
+        if self._components is not None:
+            self._components.sinks.event(refusal)
+
+    async def run(self) -> Ending:
+        """Flies until it is asked to stop.
+
+        Raises FlockdError when it cannot start, DaemonError when a task died or Hold was not confirmed.
+        """
+        async with AsyncExitStack() as stack:
+            start = open_components(
+                stack,
+                self._config,
+                source=self._source,
+                load_networks=self._load_networks,
+                models=self._models,
+                recordings=self._recordings,
+                operator=self._operator,
+                on_tick=self._on_tick,
+                clock=self._clock,
+            )
+            components = await self._unless_stopped(start)
+            if components is not None:
+                self._components = components
+                await self._fly(components)
+        return Ending(self._reload)
+
+    def _why_not_reload(self) -> str | None:
+        if self._components is None:
+            return None
+        state, status = self._components.control.decision.state, self._components.link.status()
+        if state in FLYING or status.in_air or status.armed:
+            return "the configuration was not read again, because the drone is armed or in the air; land and disarm it"
+        return None
+
+    async def _unless_stopped(self, start: Coroutine[Any, Any, Components]) -> Components | None:
+        """Starts; None when asked to stop before that is done."""
+        starting = asyncio.create_task(start)
+        stopping = asyncio.create_task(self._stopping.wait())
+        try:
+            await asyncio.wait({starting, stopping}, return_when=asyncio.FIRST_COMPLETED)
+            return starting.result() if starting.done() else None
+        finally:
+            stopping.cancel()
+            starting.cancel()
+            await asyncio.wait({starting})
+
+    async def _fly(self, components: Components) -> None:
+        """Runs one task for each concern until the flight is over."""
+        assert self._config.autopilot is not None
+        concerns = {
+            "control": components.control.run,
+            "requests": components.requests.run,
+            "refusals": components.refusals.run,
+            "autopilot clock": components.link.synchronise,
+            "pilot": components.pilot_loop.run,
+            "loop lag": components.lag.run,
+            "thermometer": components.thermometer.run,
+            "wall clock": components.wall_clock.run,
+            "telemetry": lambda: publish_status(components, self._clock),
+            "service": lambda: notify_service_manager(components, self._service),
+        }
+        if self._config.autopilot.arm_and_take_off:
+            concerns["take-off"] = components.take_off.run
+        async with asyncio.TaskGroup() as group:
+            tasks = [
+                group.create_task(self._supervised(name, run, components), name=name) for name, run in concerns.items()
+            ]
+            await components.over.wait()
+            self._service.stopping()
+            for task in tasks:
+                task.cancel()
+        _raise_failure(components)
+
+    async def _supervised(self, name: str, run: Callable[[], Awaitable[None]], components: Components) -> None:
+        """A task that ends is an event for the supervisor, which ends the flight; it does not end the other tasks."""
+        try:
+            await run()
+            components.dead_tasks[name] = "it returned"
+        except Exception as error:  # noqa: BLE001 - whatever it is, the drone has to be handed over
+            components.dead_tasks[name] = repr(error)
+        components.sinks.event(f"the task {name} died: {components.dead_tasks[name]}")
+        if name in {"control", "requests"}:
+            await self._hold_without_control(components)
+
+    async def _hold_without_control(self, components: Components) -> None:
+        """The tasks that request Hold are dead: requests it here, while the streamer sends standstill."""
+        components.control.stand_still()
+        if components.link.status().flight_mode == "offboard":
+            try:
+                async with asyncio.timeout(HOLD_S):
+                    await components.link.hold()
+            except (AutopilotError, TimeoutError) as error:
+                components.sinks.event(f"the autopilot did not confirm Hold ({error}); setpoints end, so it fails safe")
+        components.streamer.end("a task died")
+        components.over.set()
+
+    def _on_tick(self, before: Decision, now: Decision) -> None:
+        """Called by the control loop: feeds the watchdog, reports changes of state, begins and ends recordings."""
+        components = self._components
+        assert components is not None
+        if not components.networks.hopeless:
+            self._service.alive()
+        for report in components.link.take_reports():
+            components.sinks.event(report)
+        if now.state is not before.state:
+            why = "; ".join(reason.sentence for reason in now.reasons)
+            components.sinks.event(f"{now.state}: {why}" if why else str(now.state))
+        if now.state in FLYING and before.state not in FLYING:
+            components.sinks.begin_recording()
+        elif components.sinks.recording is not None and not components.link.status().armed:
+            components.sinks.end_recording()
+        handed_over = now.state in {State.IDLE, State.SILENT} and not components.requests.asking
+        if (self._operator.shutdown or components.dead_tasks) and handed_over:
+            components.over.set()
+
+
+def _raise_failure(components: Components) -> None:
+    """Raises DaemonError unless all ended as it should."""
+    if components.dead_tasks:
+        deaths = "; ".join(f"{name}: {why}" for name, why in components.dead_tasks.items())
+        raise DaemonError(f"flockd ended because a task died ({deaths}); read its log")
+    if Event.NO_ANSWER in {reason.event for reason in components.control.decision.reasons}:
+        raise DaemonError(
+            "the autopilot did not confirm Hold; flockd stopped sending setpoints, so that its failsafe acts; check it"
+        )
+
+
+def _check_flyable(config: DroneConfig, file: str) -> None:
+    if config.autopilot is None:
+        problem = ConfigProblem(file, 0, "autopilot", "is missing; add it with the `address` of the autopilot")
+        raise ConfigError([problem])

@@ -1,0 +1,105 @@
+"""Sends every message of the daemon to its sinks: telemetry, the recording of the flight, and the log."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+
+from flockd.core.config import DroneConfig
+from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, VehicleState
+from flockd.onboard.daemon.worker import BusyError, Worker
+from flockd.onboard.recording import Recorder
+from flockd.onboard.telemetry import TelemetrySink, publish_step
+from flockd.onboard.telemetry.topics import EventMessage
+
+BACKLOG = 100
+CLOSE_S = 5.0
+
+_log = logging.getLogger(__name__)
+
+
+class MessageSinks:
+    """Only `close` waits, and no error here ends a flight. `event` and `publish` may be called on any thread."""
+
+    def __init__(
+        self,
+        config: DroneConfig,
+        telemetry: TelemetrySink,
+        models: Mapping[str, str],
+        folder: Path | None,
+        clock: Callable[[], float],
+    ) -> None:
+        """``folder``: where flights are recorded; None: nowhere. ``models``: SHA-256 of each, by name."""
+        self._config, self._telemetry, self._models = config, telemetry, models
+        self._folder, self._clock = folder, clock
+        self._worker = Worker("telemetry", BACKLOG)
+        self._recorder: Recorder | None = None
+        self._path: Path | None = None
+        self.lost = 0
+        """Messages dropped because the worker was busy."""
+
+    def event(self, sentence: str) -> None:
+        """Logs and publishes one event."""
+        _log.info("%s", sentence)
+        self.publish("events", EventMessage(time_s=self._clock(), event=sentence))
+
+    def publish(self, topic: str, message: Mapping[str, object]) -> None:
+        """One message; see `flockd.onboard.telemetry.TOPICS`."""
+        self._submit(self._telemetry.publish, self._config.name, topic, message)
+        if self._recorder is not None:
+            self._recorder.publish(self._config.name, topic, message)
+
+    def step(self, frames: FrameSet, vehicle: VehicleState, output: PilotOutput, order: MissionOrder | None) -> None:
+        """Publishes and records one step of the pilot."""
+        self._submit(publish_step, self._telemetry, self._config.name, vehicle, output)
+        if self._recorder is not None:
+            self._recorder.step(frames, vehicle, output, order=order)
+
+    @property
+    def recording(self) -> str | None:
+        """The file, or why its recording ended; None where nothing is being recorded."""
+        if self._recorder is None:
+            return None
+        return self._recorder.failure or str(self._path)
+
+    def begin_recording(self) -> None:
+        """Begins a new file for a flight, where flights are recorded."""
+        if self._folder is None:
+            return
+        self.end_recording()
+        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S%fZ")
+        self._path = self._folder / f"{self._config.name}-{stamp}.mcap"
+        self._recorder = Recorder(
+            self._path,
+            drone=self._config.name,
+            config=self._config,
+            models=self._models,
+            on_event=self._on_event,
+        )
+        self.event(f"recording to {self._path}")
+
+    def end_recording(self) -> None:
+        """Ends the file in the background."""
+        recorder, self._recorder = self._recorder, None
+        if recorder is not None:
+            self._submit(recorder.close, CLOSE_S)
+
+    async def close(self) -> None:
+        """Ends the recording, and waits until all is written or it takes too long. Raises LateError."""
+        self.end_recording()
+        await self._worker.do(CLOSE_S + 1.0, lambda: None)
+        self._worker.leave()
+
+    def _on_event(self, sentence: str) -> None:
+        """The recorder has recorded it already, if it still can."""
+        _log.warning("%s", sentence)
+        message = EventMessage(time_s=self._clock(), event=sentence)
+        self._submit(self._telemetry.publish, self._config.name, "events", message)
+
+    def _submit(self, job: Callable[..., None], *arguments: object) -> None:
+        try:
+            self._worker.submit(job, *arguments)
+        except BusyError:
+            self.lost += 1

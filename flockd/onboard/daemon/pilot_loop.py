@@ -1,0 +1,180 @@
+"""The pilot's loop: takes the newest frames, runs a step of the pilot, and keeps the result."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flockd.core.config import DroneConfig
+from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, VehicleState
+from flockd.flight.perception.depth import OF_HEIGHT
+from flockd.flight.pilot import FlockPilot
+from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
+from flockd.onboard.daemon.worker import Worker
+from flockd.onboard.sources import FrameSource
+
+FRAME_WAIT_S = 0.1
+FRAME_DEADLINE_S = 5.0
+"""To decode one set."""
+STEP_DEADLINE_S = 30.0
+"""Of a whole step, whose networks have deadlines of their own; the drone has been handed over long before."""
+LEAVE_S = 0.7
+STEPS_REMEMBERED = 20
+
+
+@dataclass(frozen=True, eq=False)
+class StepResult:
+    """The output of one step, and when its frames were fetched, on the daemon's clock."""
+
+    time_s: float
+    output: PilotOutput
+    flight: int
+    """The number of the flight whose pilot computed it."""
+    number: int
+    """Of the step, from 1 for the first of its pilot."""
+
+
+OnStep = Callable[[FrameSet, VehicleState, PilotOutput, MissionOrder | None], None]
+
+
+class PilotLoop:
+    """Steps the pilot at its own rate; the source drops frames that come meanwhile."""
+
+    def __init__(
+        self,
+        config: DroneConfig,
+        source: FrameSource,
+        networks: WatchedNetworks,
+        vehicle_at: Callable[[float], VehicleState | None],
+        on_step: OnStep,
+        log_event: Callable[[str], None],
+        clock: Callable[[], float],
+    ) -> None:
+        """``vehicle_at`` gives the vehicle's state at a frame's time; None before any is known."""
+        self._config, self._source, self._networks = config, source, networks
+        self._vehicle_at, self._on_step, self._log_event, self._clock = vehicle_at, on_step, log_event, clock
+        self._decoding = Worker("decoding")
+        self._geometry = Worker("geometry")
+        self._pilot: FlockPilot | None = None
+        self._flight = 0
+        self._failure: str | None = None
+        self._height_reports = HeightReports()
+        self._took_s: deque[float] = deque(maxlen=STEPS_REMEMBERED)
+        self.frames: FrameSet | None = None
+        """The newest; None before the first."""
+        self.newest: StepResult | None = None
+        self.stepped: tuple[FrameSet, PilotOutput] | None = None
+        """The frames of the newest result, and its output."""
+        self.steps = 0
+        self.failed = 0
+        """Steps without a result, because a network failed or was late."""
+        self.ego_motion_failures = 0
+        """In a row."""
+        self.noisy_images: Counter[str] = Counter()
+        """That were not used, by camera."""
+        self.neighbour_seen_s = -math.inf
+        """When a confirmed neighbour was last seen."""
+        self.order: MissionOrder | None = None
+        """An operator's that no finished step has taken yet."""
+
+    def begin_flight(self, number: int) -> None:
+        """Uses a new pilot from the next step on: its time begins there, so that a recording can be replayed."""
+        self._flight, self._pilot, self.order = number, None, None
+
+    def load(self) -> float:
+        """How long the steps take, 95th percentile of the last ones, over how long they may."""
+        return float(np.percentile(self._took_s, 95)) / self._config.step_s if self._took_s else 0.0
+
+    async def run(self) -> None:
+        """Steps until cancelled. Raises LateError when decoding or a step hangs."""
+        due_s, frame_period_s = self._clock(), _frame_period_s(self._config)
+        while True:
+            frames = await self._decoding.do(FRAME_DEADLINE_S, self._source.newest, FRAME_WAIT_S)
+            if frames is None:
+                continue
+            self.frames = frames
+            taken_s = self._clock()
+            vehicle = self._vehicle_at(frames.time_s + self._config.rig.time_offset_s)
+            if vehicle is not None:
+                await self._step(taken_s, frames, vehicle)
+            now = self._clock()
+            due_s = max(due_s + self._config.step_s, now)
+            await asyncio.sleep(due_s - frame_period_s - now)  # the next frame is the one that comes when a step is due
+
+    def leave(self) -> None:
+        """Ends what runs; takes up to two seconds, from any thread."""
+        self._networks.leave()
+        self._geometry.leave(LEAVE_S)
+        self._decoding.leave(LEAVE_S)
+
+    async def _step(self, taken_s: float, frames: FrameSet, vehicle: VehicleState) -> None:
+        flight, order = self._flight, self.order
+        self.steps += 1
+        try:
+            pilot = self._pilot
+            if pilot is None:
+                pilot = await self._geometry.do(STEP_DEADLINE_S, self._new_pilot)
+            output = await self._geometry.do(STEP_DEADLINE_S, pilot.step, frames, vehicle, None, order)
+        except (FloatingPointError, NetworkStuckError) as error:
+            self._note_failure(str(error))
+            return
+        finally:
+            self._took_s.append(self._clock() - taken_s)
+        if flight != self._flight:
+            return  # a flight began meanwhile; this result is the old pilot's
+        if self.order is order:
+            self.order = None  # a step that fails is not recorded, so that the next takes the order again
+        self._failure = None
+        number = 1 if self._pilot is None or self.newest is None else self.newest.number + 1
+        self._pilot = pilot
+        self.newest = StepResult(taken_s, output, flight, number)
+        self.stepped = frames, output
+        self._count(self.newest)
+        report = self._height_reports.update(output.reasons)
+        if report is not None:
+            self._log_event(report)
+        self._on_step(frames, vehicle, output, order)
+
+    def _new_pilot(self) -> FlockPilot:
+        return FlockPilot(self._config, self._networks, stopwatch=time.perf_counter)
+
+    def _note_failure(self, why: str) -> None:
+        """Counts a failed step; an event for a new reason."""
+        self.failed += 1
+        if why != self._failure:
+            self._log_event(f"a step failed: {why}")
+        self._failure = why
+
+    def _count(self, result: StepResult) -> None:
+        if result.number > 1:  # the first has nothing to compare with
+            self.ego_motion_failures = 0 if result.output.ego_motion is not None else self.ego_motion_failures + 1
+        self.noisy_images.update(result.output.noisy_cameras or ())
+        seen = [result.time_s - neighbour.unseen_s for neighbour in result.output.neighbours if neighbour.confirmed]
+        self.neighbour_seen_s = max([self.neighbour_seen_s, *seen])
+
+
+class HeightReports:
+    """Reports when the range finder begins to fail, fails for another reason, or works again."""
+
+    def __init__(self) -> None:
+        self._fault: str | None = None
+
+    def update(self, reasons: Sequence[str]) -> str | None:
+        """The sentence that a step's reasons are worth; None: nothing new."""
+        before, self._fault = self._fault, next((one for one in reasons if one.startswith(OF_HEIGHT)), None)
+        if self._fault == before:
+            return None
+        return self._fault or f"{OF_HEIGHT}the range finder works again"
+
+
+def _frame_period_s(config: DroneConfig) -> float:
+    """Of the slowest camera."""
+    assert config.source is not None
+    rates_hz = [camera.rate_hz for camera in config.source.cameras] or [config.source.shared_memory.rate_hz]
+    return 1.0 / min(rates_hz)

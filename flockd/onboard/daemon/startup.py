@@ -1,0 +1,151 @@
+"""Opens everything a flight needs, in order, and registers how each part is closed."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Any
+
+from flockd import __version__
+from flockd.core.config import DroneConfig
+from flockd.flight.geometry import build_rig
+from flockd.flight.safety import Decision, Gate
+from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
+from flockd.onboard.autopilot.streamer import SetpointStreamer
+from flockd.onboard.daemon.autopilot_requests import AutopilotRequests
+from flockd.onboard.daemon.components import Components
+from flockd.onboard.daemon.control import Control
+from flockd.onboard.daemon.host_monitors import LoopLag, Thermometer, WallClock
+from flockd.onboard.daemon.message_sinks import MessageSinks
+from flockd.onboard.daemon.mission_orders import MissionOrders
+from flockd.onboard.daemon.operator_commands import OperatorRequests, command_handler
+from flockd.onboard.daemon.pilot_loop import PilotLoop
+from flockd.onboard.daemon.refusal_watch import RefusalWatch
+from flockd.onboard.daemon.stream_gate import StreamGate
+from flockd.onboard.daemon.supervisor_inputs import InputCollector
+from flockd.onboard.daemon.take_off import TakeOff
+from flockd.onboard.daemon.vehicle_history import VehicleHistory
+from flockd.onboard.daemon.watched_networks import InterruptibleNetworks, WatchedNetworks
+from flockd.onboard.daemon.worker import BusyError, LateError, Worker
+from flockd.onboard.sources import FrameSource
+from flockd.onboard.telemetry.preview import Previews
+from flockd.onboard.telemetry.publisher import ZenohTelemetry
+from flockd.onboard.telemetry.topics import AboutMessage
+
+LOAD_S = 60.0
+"""To load the networks from a slow card."""
+OPEN_S = 10.0
+CLOSE_S = 3.0
+
+
+async def open_components(
+    stack: AsyncExitStack,
+    config: DroneConfig,
+    *,
+    source: FrameSource,
+    load_networks: Callable[[], InterruptibleNetworks],
+    models: Mapping[str, str],
+    recordings: Path | None,
+    operator: OperatorRequests,
+    on_tick: Callable[[Decision, Decision], None],
+    clock: Callable[[], float],
+) -> Components:
+    """Opens and connects all components; ``stack`` closes what was opened, in reverse order.
+
+    See `Daemon` for the arguments. Raises FlockdError for what cannot be opened.
+    """
+    assert config.autopilot is not None
+    loading = Worker("loading")
+    # A process that ends while a thread is inside ONNX Runtime is aborted; nothing else runs by then.
+    stack.callback(loading.leave, LOAD_S)
+    closing = Worker("closing", backlog=8)
+    stack.callback(closing.leave)
+    telemetry = await closing.do(OPEN_S, _open_telemetry, config)
+    stack.push_async_callback(_close, closing, telemetry.close)
+    sinks = MessageSinks(config, telemetry, models, recordings, clock)
+    stack.push_async_callback(_close_async, sinks.close)
+    await closing.do(OPEN_S, source.start)
+    stack.push_async_callback(_close, closing, source.stop)
+    networks, link = await _both(
+        _networks(config, loading, load_networks), AutopilotLink.connect(config.autopilot, clock=clock)
+    )
+    stack.push_async_callback(_close_async, link.close)
+    gate = Gate(config.safety.gate)
+    stream_gate = StreamGate(gate, clock)
+    streamer = SetpointStreamer(link.send_setpoint, link.status, stream_gate, config.autopilot, clock=clock)
+    streamer.start()
+    stack.callback(streamer.close)
+    history, lag, thermometer = VehicleHistory(), LoopLag(clock), Thermometer()
+    pilot_loop = PilotLoop(config, source, networks, history.at, sinks.step, sinks.event, clock)
+    stack.push_async_callback(_close, closing, pilot_loop.leave)
+    dead_tasks: dict[str, str] = {}
+    collector = InputCollector(config, source, pilot_loop, networks, gate, lag, thermometer, dead_tasks, clock)
+    requests = AutopilotRequests(link, sinks.event)
+    control = Control(
+        config, link, streamer, stream_gate, pilot_loop, collector, requests, history, operator, on_tick, clock
+    )  # fmt: skip
+    take_off = TakeOff(link, streamer, operator, lambda: control.decision, sinks.event)
+    missions = MissionOrders(config, pilot_loop, link.vehicle_state, lambda: control.decision.state)
+    loop = asyncio.get_running_loop()
+    handle = command_handler(config.telemetry.commands, operator, missions, loop, sinks.event)
+    previews = Previews(build_rig(config.rig), lambda: (pilot_loop.frames, pilot_loop.stepped))
+    telemetry.announce(config.name, _about(config), handle, previews.picture)
+    return Components(
+        link=link, streamer=streamer, source=source, pilot_loop=pilot_loop, networks=networks, control=control,
+        requests=requests, refusals=RefusalWatch(link, sinks.event, clock), take_off=take_off, sinks=sinks,
+        telemetry=telemetry, lag=lag, thermometer=thermometer,
+        wall_clock=WallClock(sinks.event, time.monotonic), dead_tasks=dead_tasks,
+    )  # fmt: skip
+
+
+async def _networks(config: DroneConfig, loading: Worker, load: Callable[[], InterruptibleNetworks]) -> WatchedNetworks:
+    networks = await loading.do(LOAD_S, load)
+    loading.leave()
+    return WatchedNetworks(networks, config.perception.deadline_s / config.speed_factor)
+
+
+def _open_telemetry(config: DroneConfig) -> ZenohTelemetry:
+    parameters = config.telemetry
+    settings = None if parameters.zenoh_config is None else Path(parameters.zenoh_config)
+    return ZenohTelemetry(parameters.fleet, listen=parameters.listen, connect=parameters.connect, settings=settings)
+
+
+def _about(config: DroneConfig) -> AboutMessage:
+    return AboutMessage(
+        version=__version__,
+        configuration=config.model_dump(mode="json"),
+        commands=list(config.telemetry.commands),
+    )
+
+
+async def _both(
+    networks: Coroutine[Any, Any, WatchedNetworks], link: Coroutine[Any, Any, AutopilotLink]
+) -> tuple[WatchedNetworks, AutopilotLink]:
+    """Runs both concurrently; when one fails the other is cancelled."""
+    tasks = asyncio.create_task(networks), asyncio.create_task(link)
+    try:
+        return await asyncio.gather(*tasks)
+    except BaseException:
+        for task in tasks:
+            task.cancel()
+        raise
+
+
+async def _close(worker: Worker, close: Callable[[], None]) -> None:
+    """Closes on a worker, within a deadline: what hangs ends with the process."""
+    try:
+        await worker.do(CLOSE_S, close)
+    except (LateError, BusyError):
+        return
+
+
+async def _close_async(close: Callable[[], Awaitable[None]]) -> None:
+    """The same for a coroutine."""
+    try:
+        async with asyncio.timeout(2 * CLOSE_S):
+            await close()
+    except (TimeoutError, LateError, BusyError):
+        return

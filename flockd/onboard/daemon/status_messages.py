@@ -1,0 +1,144 @@
+"""Periodic status of the daemon, for telemetry and for the service manager."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable, Mapping
+
+from flockd.flight.safety import Decision, Event, State
+from flockd.onboard.daemon.components import Components
+from flockd.onboard.daemon.service_manager import ServiceManager
+from flockd.onboard.telemetry import TOPICS
+from flockd.onboard.telemetry.topics import CameraMessage, ClockMessage, ComputerMessage, FlightMessage, ReasonMessage
+
+START_POLL_S = 0.1
+START_MORE_S = 10.0
+STATUS_EVERY_S = 2.0
+STATUS_POLL_S = 0.05
+"""A new status is sent after this long at most, so that whoever reads the lines has them in the order of events."""
+
+
+async def notify_service_manager(components: Components, service: ServiceManager) -> None:
+    """Reports ready with the first frame, and a status line before and after it, until cancelled."""
+    while components.pilot_loop.frames is None:
+        faults = [status.fault for status in components.source.status().values() if status.fault]
+        service.starting(f"waits for frames: {'; '.join(faults) or 'none came yet'}", START_MORE_S)
+        await asyncio.sleep(START_POLL_S)
+    sent = components.control.decision
+    service.ready(_status_line(sent))
+    components.sinks.event("ready: models loaded, autopilot heard, first frames seen")
+    reported: set[str] = set()
+    loop = asyncio.get_running_loop()
+    while True:
+        for note in set(components.source.notes()) - reported:
+            components.sinks.event(note)
+            reported.add(note)
+        until = loop.time() + STATUS_EVERY_S
+        while _matters(components.control.decision) == _matters(sent) and loop.time() < until:
+            await asyncio.sleep(STATUS_POLL_S)
+        sent = components.control.decision
+        service.status(_status_line(sent))
+
+
+async def publish_status(components: Components, clock: Callable[[], float]) -> None:
+    """Publishes `flight`, `computer` and `clock` at the rates of the table of topics, until cancelled."""
+    messages: dict[str, Callable[[float], Mapping[str, object]]] = {
+        "flight": lambda now: _flight_message(components, now),
+        "computer": lambda now: _computer_message(components, now),
+        "clock": lambda now: _clock_message(components, now),
+    }
+    due_s = dict.fromkeys(messages, clock())
+    while True:
+        for topic, message in messages.items():
+            rate_hz = TOPICS[topic].rate_hz
+            assert rate_hz is not None
+            now = clock()
+            if now >= due_s[topic]:
+                due_s[topic] = now + 1.0 / rate_hz
+                components.sinks.publish(topic, message(now))
+        await asyncio.sleep(max(0.0, min(due_s.values()) - clock()))
+
+
+def _matters(decision: Decision) -> tuple[State, tuple[Event, ...]]:
+    """What changes a status line, but for the numbers in it."""
+    return decision.state, tuple(reason.event for reason in decision.reasons)
+
+
+def _noisy(images: int) -> dict[str, int]:
+    """Their count, absent where there are none, as all counts."""
+    return {"noisy": images} if images else {}
+
+
+def _status_line(decision: Decision) -> str:
+    reasons = "; ".join(reason.sentence for reason in decision.reasons)
+    return f"{decision.state}: {reasons}" if reasons else str(decision.state)
+
+
+def _flight_message(components: Components, now: float) -> FlightMessage:
+    decision, status, stream = components.control.decision, components.link.status(), components.streamer.report()
+    vehicle, refusals = components.link.vehicle_state(), components.refusals.current
+    return FlightMessage(
+        time_s=now,
+        state=decision.state.value,
+        reasons=[
+            *(ReasonMessage(event=reason.event.value, sentence=reason.sentence) for reason in decision.reasons),
+            *(ReasonMessage(event=refusal.reason, sentence=refusal.sentence) for refusal in refusals),
+        ],
+        flight_mode=status.flight_mode,
+        armed=None if math.isinf(status.heartbeat_age_s) else status.armed,
+        in_air=None if status.landed_state == "unknown" else status.in_air,
+        heartbeat_age_s=status.heartbeat_age_s,
+        battery_share=status.battery_share,
+        height_m=None if vehicle is None else vehicle.height_m,
+        velocity_trim=_velocity_trim(components),
+        silence=stream.silence,
+        setpoints_sent=stream.sent,
+        setpoints_missed=stream.missed,
+    )
+
+
+def _clock_message(components: Components, now: float) -> ClockMessage:
+    clock = components.link.clock()
+    if clock is None:
+        return ClockMessage(time_s=now, offset_s=None, error_s=None, jitter_s=None, round_trip_s=None, age_s=None)
+    return ClockMessage(
+        time_s=now,
+        offset_s=clock.offset_s,
+        error_s=clock.error_s,
+        jitter_s=clock.jitter_s,
+        round_trip_s=clock.round_trip_s,
+        age_s=now - clock.time_s,
+    )
+
+
+def _velocity_trim(components: Components) -> list[float]:
+    """(2,) m/s, north and east, of the newest command."""
+    newest = components.pilot_loop.newest
+    trim = None if newest is None else newest.output.command.trim
+    return [0.0, 0.0] if trim is None else [float(v) for v in trim]
+
+
+def _computer_message(components: Components, now: float) -> ComputerMessage:
+    noisy_images = components.pilot_loop.noisy_images
+    cameras = {
+        name: CameraMessage(
+            age_s=camera.age_s,
+            fault=camera.fault,
+            counts={str(what): n for what, n in camera.counts.items()} | _noisy(noisy_images[name]),
+        )
+        for name, camera in components.source.status().items()
+    }
+    return ComputerMessage(
+        time_s=now,
+        cameras=cameras,
+        load=components.pilot_loop.load(),
+        steps=components.pilot_loop.steps,
+        steps_failed=components.pilot_loop.failed,
+        network_faults=components.networks.faults,
+        networks_stuck=components.networks.ended,
+        loop_lag_s=components.lag.worst_s(),
+        temperature_c=components.thermometer.hottest_c,
+        messages_lost=components.sinks.lost + components.telemetry.lost,
+        recording=components.sinks.recording,
+    )

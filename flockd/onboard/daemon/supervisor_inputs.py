@@ -1,0 +1,198 @@
+"""Collects the supervisor's inputs from all components."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from flockd.core.config import DroneConfig
+from flockd.core.messages import FloatArray, VehicleState
+from flockd.flight.safety import CameraHealth, Gate, Inputs, MissionEnd, Objection, outside_fence, outside_heights
+from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
+from flockd.onboard.daemon.host_monitors import LoopLag, Thermometer
+from flockd.onboard.daemon.operator_commands import OperatorRequests
+from flockd.onboard.daemon.pilot_loop import PilotLoop
+from flockd.onboard.daemon.watched_networks import WatchedNetworks
+from flockd.onboard.sources import CameraStatus, Count, FrameSource
+
+DROPS_WINDOW_S = 5.0
+_BAD: tuple[Count, ...] = ("time_stamp", "flagged", "corrupt", "malformed")
+_REFUSED = (Objection.COMMAND_NOT_FINITE, Objection.COMMAND_TOO_LARGE)
+
+
+class InputCollector:
+    """Collects the inputs at each tick of the control loop."""
+
+    def __init__(
+        self,
+        config: DroneConfig,
+        source: FrameSource,
+        pilot_loop: PilotLoop,
+        networks: WatchedNetworks,
+        gate: Gate,
+        lag: LoopLag,
+        thermometer: Thermometer,
+        dead_tasks: Mapping[str, str],
+        clock: Callable[[], float],
+    ) -> None:
+        """``dead_tasks``: why each task that has ended did, by name; grows elsewhere."""
+        self._config, self._source, self._pilot_loop, self._networks = config, source, pilot_loop, networks
+        self._gate, self._lag, self._thermometer, self._dead_tasks = gate, lag, thermometer, dead_tasks
+        self._clock = clock
+        self._camera_monitor = CameraMonitor(config)
+        self._faults_before = 0
+        self._refused_before = 0
+        self._had_satellites = False
+
+    def collect(
+        self,
+        status: AutopilotStatus,
+        vehicle: VehicleState | None,
+        operator: OperatorRequests,
+        mission_over: MissionEnd | None,
+    ) -> Inputs:
+        """All inputs as of now; requests that count once are reset in ``operator``."""
+        now = self._clock()
+        pilot_loop, result = self._pilot_loop, self._pilot_loop.newest
+        neighbours = result.output.neighbours if result else ()
+        ranges = [float(np.linalg.norm(n.position)) for n in neighbours if n.confirmed]
+        noisy = (result.output.noisy_cameras or ()) if result else ()
+        summary = self._camera_monitor.update(now, self._source.status(), noisy, pilot_loop.noisy_images.total())
+        position = position_from_home(status)
+        self._had_satellites = self._had_satellites or status.gps_ok is True
+        inputs = Inputs(
+            cameras=summary.cameras,
+            dropped_share=summary.dropped_share,
+            estimate_age_s=math.inf if result is None else now - result.time_s,
+            ego_motion_failures=pilot_loop.ego_motion_failures,
+            network_faults=self._networks.faults - self._faults_before,
+            inference_stuck=self._networks.stuck,
+            load=pilot_loop.load(),
+            temperature_c=self._thermometer.hottest_c,
+            loop_lag_s=self._lag.worst_s(),
+            dead_tasks=tuple(self._dead_tasks),
+            neighbours_age_s=now - pilot_loop.neighbour_seen_s,
+            nearest_neighbour_m=min(ranges, default=math.inf),
+            refused_commands=self._refused() - self._refused_before,
+            outside_fence=outside_fence(self._config.safety.gate, position),
+            outside_heights=vehicle is None or outside_heights(self._config.safety.gate, vehicle.height_m),
+            heartbeat_age_s=status.heartbeat_age_s,
+            flight_mode=None if status.flight_mode == "unknown" else status.flight_mode,
+            armed=None if math.isinf(status.heartbeat_age_s) else status.armed,
+            in_air=None if status.landed_state == "unknown" else status.in_air,
+            offboard_refused=operator.offboard_refused,
+            battery_low=self._battery_low(status),
+            position_lost=status.estimate_ok is False or (self._had_satellites and status.gps_ok is False),
+            shutdown_asked=operator.shutdown,
+            hold_asked=operator.hold,
+            land_asked=operator.land,
+            resume_asked=operator.resume,
+            mission_over=mission_over,
+        )
+        self._faults_before += inputs.network_faults
+        self._refused_before += inputs.refused_commands
+        operator.resume = operator.offboard_refused = False
+        return inputs
+
+    def _refused(self) -> int:
+        return sum(self._gate.counts[objection] for objection in _REFUSED)
+
+    def _battery_low(self, status: AutopilotStatus) -> bool:
+        assert self._config.autopilot is not None
+        return status.battery_share is not None and status.battery_share <= self._config.autopilot.low_battery_share
+
+
+def position_from_home(status: AutopilotStatus) -> FloatArray:
+    """(2,) metres north and east; NaN while the autopilot has not sent its position or home."""
+    if status.position_ned is None or status.home_ned is None:
+        return np.full(2, np.nan)
+    from_home: FloatArray = (status.position_ned - status.home_ned)[:2]
+    return from_home
+
+
+@dataclass(frozen=True)
+class CameraSummary:
+    """The supervisor's inputs from the cameras."""
+
+    cameras: Mapping[str, CameraHealth]
+    dropped_share: float
+
+
+class CameraMonitor:
+    """The health of each camera, and the share of frames dropped in the last seconds."""
+
+    def __init__(self, config: DroneConfig) -> None:
+        source = config.source
+        assert source is not None
+        common_hz = source.shared_memory.rate_hz
+        rates = {camera.name: camera.rate_hz for camera in source.cameras}
+        self._periods_s = {camera.name: 1.0 / rates.get(camera.name, common_hz) for camera in config.rig.cameras}
+        self._timeout_periods = config.safety.camera_timeout_periods
+        self._frozen_before = dict.fromkeys(self._periods_s, 0)
+        self._clean_s: dict[str, float] = {}
+        """When each camera's images were last not noise."""
+        self._window: deque[tuple[float, _Tally]] = deque()
+
+    def update(
+        self, now: float, status: Mapping[str, CameraStatus], noisy: Collection[str] = (), noisy_images: int = 0
+    ) -> CameraSummary:
+        """As of now; to be called at each tick.
+
+        ``noisy``: the cameras whose newest images the pilot found to be noise; ``noisy_images``: how many since the
+        start, of all cameras.
+        """
+        for name in status.keys() - set(noisy):
+            self._clean_s[name] = now
+        cameras = {name: self._health(name, camera, now) for name, camera in status.items()}
+        while self._window and now - self._window[0][0] > DROPS_WINDOW_S:
+            self._window.popleft()
+        tally = _Tally.of(status, noisy_images)
+        self._window.append((now, tally))
+        return CameraSummary(cameras, tally.dropped_share(since=self._window[0][1]))
+
+    def _health(self, name: str, camera: CameraStatus, now: float) -> CameraHealth:
+        """A fault with frozen images counted since the last good state means that the camera is frozen."""
+        frozen = camera.counts.get("frozen", 0)
+        if camera.fault is None:
+            self._frozen_before[name] = frozen
+        is_frozen = camera.fault is not None and frozen > self._frozen_before[name]
+        unplugged = camera.fault is not None and not is_frozen
+        period_s = self._periods_s[name]
+        noisy = now - self._clean_s.setdefault(name, now) > self._timeout_periods * period_s
+        return CameraHealth(camera.age_s, period_s, unplugged=unplugged, frozen=is_frozen, noisy=noisy)
+
+
+class _Tally(NamedTuple):
+    """Frames of all cameras since the start. Few are decoded, so that these are a tally of their own."""
+
+    received: int
+    refused: int
+    """When they came."""
+    decoded: int
+    useless: int
+    """Of the decoded: they show nothing, or noise."""
+
+    @classmethod
+    def of(cls, status: Mapping[str, CameraStatus], noisy_images: int) -> Self:
+        """As of now."""
+
+        def count(*what: Count) -> int:
+            return sum(camera.counts.get(one, 0) for camera in status.values() for one in what)
+
+        undecodable = count("undecodable")
+        return cls(
+            received=count("received"),
+            refused=count(*_BAD) - undecodable,
+            decoded=count("used") + undecodable,
+            useless=undecodable + noisy_images,
+        )
+
+    def dropped_share(self, since: Self) -> float:
+        """The larger of the shares of those refused and of those useless, since another time."""
+        refused = (self.refused - since.refused) / max(self.received - since.received, 1)
+        return max(refused, (self.useless - since.useless) / max(self.decoded - since.decoded, 1))

@@ -1,0 +1,309 @@
+"""The one adapter to the MCAP format: writes it in small chunks, and reads whatever of a file is whole."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import os
+import struct
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO, Literal, Self
+
+import lz4.frame
+import zstandard
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Message, Metadata, Schema
+from mcap.stream_reader import breakup_chunk
+from mcap.writer import CompressionType, Writer
+
+from flockd.core.errors import FlockdError
+
+CHUNK_BYTES = 100_000
+"""What a killed writer loses at most, besides what it has not yet been given time to flush."""
+SYNC_EVERY_S = 1.0
+"""How much a loss of power takes, where the disk keeps its word."""
+_MAGIC = b"\x89MCAP0\r\n"
+_HEAD = struct.Struct("<BQ")
+MAX_RECORD_BYTES = 256 << 20
+"""Of a record in the file, and of a chunk uncompressed: what takes more is damaged. The largest holds one image."""
+# RuntimeError and EOFError: lz4; ValueError: a wrong checksum, text that is not UTF-8; OverflowError: sizes over 2^63
+_BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError, RuntimeError, EOFError, MemoryError)
+
+
+class RecordingError(FlockdError):
+    """A file is no recording, or not one that can do what was asked of it."""
+
+
+Encoding = Literal["json", "protobuf"]
+
+
+@dataclass(frozen=True)
+class Stream:
+    """One topic of a file and what its messages are."""
+
+    topic: str
+    encoding: Encoding
+    schema_name: str
+    schema: bytes
+    """A JSON schema, or a serialised protobuf FileDescriptorSet."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One message of a file."""
+
+    stream: Stream
+    time_ns: int
+    sequence: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Note:
+    """Named facts about the whole file."""
+
+    name: str
+    facts: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Inclosure:
+    """A whole file within the file."""
+
+    name: str
+    media_type: str
+    data: bytes
+
+
+Record = Entry | Note | Inclosure
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Where and why a file cannot be read any further, or one chunk of it not at all."""
+
+    offset: int
+    reason: str
+    at_end: bool
+    """The file just stops: its writer was killed. Otherwise something within it is damaged."""
+
+
+class _ChunkIndices:
+    """Where each chunk of a file is, as bytes of the index at its end.
+
+    The writer of MCAP keeps an object for each, 1.3 kB with a dozen topics: with five chunks a second, 24 MB an hour.
+    """
+
+    def __init__(self) -> None:
+        self._packed = bytearray()
+
+    def append(self, index: ChunkIndex) -> None:
+        """What the writer calls when a chunk has ended."""
+        builder = RecordBuilder()
+        index.write(builder)
+        self._packed += builder.end()  # type: ignore[no-untyped-call]
+
+    def __iter__(self) -> Iterator[ChunkIndex]:
+        """When the file is finished."""
+        stream = ReadDataStream(io.BytesIO(self._packed))
+        while stream.count < len(self._packed):
+            stream.read1()  # the opcode
+            stream.read8()  # the record's length
+            yield ChunkIndex.read(stream)
+
+
+class McapFile:
+    """Writes one file. Every method may raise OSError; then only `abandon` is left to call."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = path.open("wb")
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer._Writer__chunk_indices = _ChunkIndices()  # type: ignore[attr-defined]
+        self._channels: dict[str, int] = {}
+        self._synced_s = time.monotonic()
+        self._syncing: threading.Thread | None = None
+        self._sync_error: OSError | None = None
+        try:
+            self._writer.start(library="flockd")
+        except OSError:
+            self.abandon()
+            raise
+
+    @property
+    def size(self) -> int:
+        """Bytes so far, without the chunk in progress."""
+        return self._file.tell()
+
+    def write(self, record: Record) -> None:
+        """Adds a record; notes and inclosures go straight to the file, entries into a chunk."""
+        match record:
+            case Entry(stream, time_ns, sequence, data):
+                self._writer.add_message(self._channel(stream), time_ns, data, time_ns, sequence)
+            case Note(name, facts):
+                self._writer.add_metadata(name, dict(facts))
+            case Inclosure(name, media_type, data):
+                self._writer.add_attachment(0, 0, name, media_type, data)
+
+    def flush(self) -> None:
+        """Ends the chunk and hands it to the system; about once a second also to the disk."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        if self._sync_error is not None:
+            raise self._sync_error
+        now_s = time.monotonic()
+        if now_s - self._synced_s >= SYNC_EVERY_S and not (self._syncing and self._syncing.is_alive()):
+            self._synced_s = now_s
+            self._syncing = threading.Thread(target=self._sync, args=(os.dup(self._file.fileno()),), daemon=True)
+            self._syncing.start()
+
+    def finish(self) -> None:
+        """Writes the index and closes the file."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._file.close()
+
+    def abandon(self) -> None:
+        """Closes the file as it stands, without another byte: what is in it can be recovered."""
+        self._file.raw.close()  # closing the buffered file would try to write once more
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.finish()
+        else:
+            self.abandon()
+
+    def _sync(self, descriptor: int) -> None:
+        """In a thread of its own: a slow disk takes long for this, and the next messages must not wait for it."""
+        try:
+            os.fsync(descriptor)
+        except OSError as error:
+            self._sync_error = error
+        finally:
+            os.close(descriptor)
+
+    def _channel(self, stream: Stream) -> int:
+        if stream.topic not in self._channels:
+            encoding = "jsonschema" if stream.encoding == "json" else stream.encoding
+            schema = self._writer.register_schema(stream.schema_name, encoding, stream.schema)
+            self._channels[stream.topic] = self._writer.register_channel(stream.topic, stream.encoding, schema)
+        return self._channels[stream.topic]
+
+
+def read_records(path: Path) -> Iterator[Record | Damage]:
+    """All records in the order in which they were written, and what could not be read.
+
+    A damaged chunk is yielded as `Damage`; where the file stops before its end, that comes last. Raises RecordingError
+    for what is not an MCAP file, and OSError.
+    """
+    with path.open("rb") as file:
+        if file.read(len(_MAGIC)) != _MAGIC:
+            raise RecordingError(f"{path}: is not a recording (it does not begin as MCAP files do); name another file")
+        yield from _Reader(file).records()
+
+
+class _Reader:
+    """Walks from record to record by their lengths, so that one broken record does not hide the next."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._size = os.fstat(file.fileno()).st_size
+        self._schemas: dict[int, Schema] = {}
+        self._streams: dict[int, Stream] = {}
+
+    def records(self) -> Iterator[Record | Damage]:
+        while True:
+            offset = self._file.tell()
+            head = self._file.read(_HEAD.size)
+            if len(head) < _HEAD.size:
+                yield Damage(offset, "it stops without an end", at_end=True)
+                return
+            opcode, length = _HEAD.unpack(head)
+            if offset + _HEAD.size + length > self._size:
+                yield Damage(offset, "it stops within a record", at_end=True)
+                return
+            if opcode == Opcode.DATA_END:
+                if self._file.seek(-len(_MAGIC), io.SEEK_END) and self._file.read() != _MAGIC:
+                    yield Damage(offset, "it stops within its index", at_end=True)
+                return
+            if opcode == 0:
+                yield Damage(offset, "zeros stand where a record should begin", at_end=True)
+                return
+            if length > MAX_RECORD_BYTES:
+                yield Damage(offset, f"a {_name(opcode)} is {length:,} bytes long", at_end=False)
+                self._file.seek(length, io.SEEK_CUR)
+                continue
+            content = self._file.read(length)
+            try:
+                found = list(self._parsed(opcode, content))
+            except _BROKEN as error:
+                yield Damage(offset, f"a {_name(opcode)} cannot be read ({error})", at_end=False)
+            else:
+                yield from found
+
+    def _parsed(self, opcode: int, content: bytes) -> Iterator[Record]:
+        stream = ReadDataStream(io.BytesIO(content))
+        match opcode:
+            case Opcode.CHUNK:
+                for record in breakup_chunk(_uncompressed(Chunk.read(stream)), validate_crc=True):
+                    yield from self._unpacked(record)
+            case Opcode.SCHEMA:
+                yield from self._unpacked(Schema.read(stream))
+            case Opcode.CHANNEL:
+                yield from self._unpacked(Channel.read(stream))
+            case Opcode.MESSAGE:
+                yield from self._unpacked(Message.read(stream, len(content)))
+            case Opcode.METADATA:
+                metadata = Metadata.read(stream)
+                yield Note(metadata.name, metadata.metadata)
+            case Opcode.ATTACHMENT:
+                attachment = Attachment.read(stream)
+                yield Inclosure(attachment.name, attachment.media_type, attachment.data)
+
+    def _unpacked(self, record: object) -> Iterator[Entry]:
+        match record:
+            case Schema():
+                self._schemas[record.id] = record
+            case Channel():
+                schema = self._schemas.get(record.schema_id)
+                name, data = (schema.name, schema.data) if schema else ("", b"")
+                encoding: Encoding = "protobuf" if record.message_encoding == "protobuf" else "json"
+                self._streams[record.id] = Stream(record.topic, encoding, name, data)
+            case Message() if record.channel_id in self._streams:  # its channel was in a damaged chunk
+                yield Entry(self._streams[record.channel_id], record.log_time, record.sequence, record.data)
+
+
+def _uncompressed(chunk: Chunk) -> Chunk:
+    """The chunk without its compression, in no more memory than it says. Raises ValueError and those of `_BROKEN`."""
+    size = chunk.uncompressed_size
+    if size > MAX_RECORD_BYTES:
+        raise ValueError(f"{size:,} bytes uncompressed")
+    match chunk.compression:
+        case "zstd":
+            data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
+        case "lz4":
+            data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+        case _:
+            return chunk
+    if len(data) != size:
+        raise ValueError("its uncompressed size is not what it says")
+    return dataclasses.replace(chunk, compression="", data=data)
+
+
+def _name(opcode: int) -> str:
+    try:
+        return Opcode(opcode).name.lower()
+    except ValueError:
+        return f"record of the unknown kind {opcode}"

@@ -1,0 +1,339 @@
+"""Reads a recording: finished, or cut off by a kill. Refuses other MCAP files and what is too damaged to replay."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from pydantic import ValidationError
+
+from flockd.core.config import DroneConfig
+from flockd.core.image_header import MAX_IMAGE_PIXELS, image_size
+from flockd.core.messages import Frame, FrameSet, MissionOrder, UInt8Array, VehicleState
+from flockd.onboard.recording import foxglove
+from flockd.onboard.recording.codec import from_json, parsed
+from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, Note, Record, RecordingError, read_records
+from flockd.onboard.recording.migration import Migrated, migrate_configuration, migrate_output
+from flockd.onboard.recording.streams import (
+    CONFIGURATION,
+    END_NOTE,
+    FLIGHT_NOTE,
+    FORMAT,
+    FRAMES,
+    MODELS_NOTE,
+    ORDER,
+    OUTPUT,
+    PILOT_BEGAN,
+    TRUTH,
+    VEHICLE,
+    StepFrames,
+    part_path,
+)
+from flockd.onboard.recording.truth import Truth
+
+_WHAT_TO_DO = "`flockd record recover` makes a recording without it"
+_IMAGE_SUFFIX, _CALIBRATION_SUFFIX = "/image", "/calibration"
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedStep:
+    """Inputs and output of one step of the pilot."""
+
+    number: int
+    """Counted from 0 at the flight's first step."""
+    frames: FrameSet
+    vehicle: VehicleState
+    output: Mapping[str, Any] | None
+    """A `PilotOutput` as JSON, every number exact; None where the recording ends before it. Of an earlier version: as
+    `migrate_output` converts it."""
+    truth: Truth | None
+    """Of a simulated flight."""
+    order: MissionOrder | None = None
+    """An operator's that the step took."""
+
+
+@dataclass
+class StreamFacts:
+    """One topic of a recording."""
+
+    topic: str
+    schema: str
+    messages: int = 0
+    bytes: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Messages a second from the first to the last."""
+        span_s = (self.last_ns - self.first_ns) * 1e-9
+        return (self.messages - 1) / span_s if span_s > 0 else None
+
+
+@dataclass
+class Contents:
+    """What one pass over all of a recording's files found."""
+
+    flight: Mapping[str, str]
+    models: Mapping[str, str]
+    configuration: bytes
+    paths: tuple[Path, ...] = ()
+    streams: dict[str, StreamFacts] = field(default_factory=dict)
+    steps: list[tuple[int, float]] = field(default_factory=list)
+    """Number and time of each step."""
+    lost: int = 0
+    """Steps and messages that the recorder dropped, by its own count."""
+    damages: list[tuple[Path, Damage]] = field(default_factory=list)
+
+    @property
+    def finished(self) -> bool:
+        """Whether its writer came to the end of it."""
+        return not any(damage.at_end for _, damage in self.damages)
+
+    @property
+    def gaps(self) -> tuple[tuple[int, int], ...]:
+        """Each run of steps that is missing, as its first and last number."""
+        numbers = [number for number, _ in self.steps]
+        return tuple((a + 1, b - 1) for a, b in pairwise(numbers) if b > a + 1)
+
+
+class Recording:
+    """One drone's recording with all its files, checked as a whole when it is opened."""
+
+    def __init__(self, path: Path, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
+        """Opens the file and those that go on where it ends.
+
+        Raises RecordingError for what is not a recording of flockd, or too damaged to replay, and OSError.
+        `progress` is called with (bytes checked, bytes in all).
+        """
+        self.path = path
+        self.contents = _survey(path, progress)
+        migrated = _migrated(path, self.contents.configuration)
+        self.config = _config(path, migrated)
+        self.migrations: tuple[str, ...] = migrated.notes
+        """What was changed in a configuration of an earlier version, each in one sentence."""
+
+    @property
+    def drone(self) -> str:
+        """Whose flight it is."""
+        return self.contents.flight["drone"]
+
+    @property
+    def start_s(self) -> float:
+        """The first step's time."""
+        return self.contents.steps[0][1]
+
+    @property
+    def duration_s(self) -> float:
+        """From the first step to the last."""
+        return self.contents.steps[-1][1] - self.start_s
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether a simulator recorded the true states of all drones."""
+        return TRUTH.topic in self.contents.streams
+
+    @property
+    def pilot_began_s(self) -> float | None:
+        """When the pilot took its first step, from which it counts its time; None where that is not known."""
+        number, time_s = self.contents.steps[0]
+        known = self.contents.flight.get(PILOT_BEGAN)
+        return time_s if number == 0 else None if known is None else float(known)
+
+    def steps(self, start_s: float = -np.inf, end_s: float = np.inf) -> Iterator[RecordedStep]:
+        """The steps at these times (of the recording's clock) in the order in which they were flown.
+
+        Raises RecordingError where an image or a message is damaged.
+        """
+        number, messages = -1, dict[str, bytes]()
+        for path in self.contents.paths:
+            for record in read_records(path):
+                if isinstance(record, Entry) and makes_steps(record.stream.topic):
+                    if record.sequence != number:
+                        yield from self._built(number, messages, start_s, end_s)
+                        number, messages = record.sequence, {}
+                    messages[record.stream.topic] = record.data
+        yield from self._built(number, messages, start_s, end_s)
+
+    def _built(
+        self, number: int, messages: Mapping[str, bytes], start_s: float, end_s: float
+    ) -> Iterator[RecordedStep]:
+        if FRAMES.topic not in messages:
+            return
+        if VEHICLE.topic not in messages and not self.contents.finished and number == self.contents.steps[-1][0]:
+            return  # killed within this step
+        try:
+            listed: StepFrames = from_json(StepFrames, parsed(messages[FRAMES.topic]))
+            if not start_s <= listed.time_s <= end_s:
+                return
+            vehicle: VehicleState = from_json(VehicleState, parsed(messages[VEHICLE.topic]))
+            output = migrate_output(parsed(messages[OUTPUT.topic])) if OUTPUT.topic in messages else None
+            truth = from_json(Truth, parsed(messages[TRUTH.topic])) if TRUTH.topic in messages else None
+            order = from_json(MissionOrder, parsed(messages[ORDER.topic])) if ORDER.topic in messages else None
+            frames = {}
+            for entry in listed.frames:
+                image = decoded_image(messages[foxglove.image_stream(entry.camera).topic])
+                frames[entry.camera] = Frame(entry.camera, image, entry.time_s, entry.sequence)
+        except KeyError as error:
+            raise RecordingError(f"{self.path}: step {number} lost its message {error}; {_WHAT_TO_DO}") from error
+        except (ValueError, RecordingError) as error:
+            raise RecordingError(f"{self.path}: step {number} cannot be read ({error}); {_WHAT_TO_DO}") from error
+        yield RecordedStep(number, FrameSet(listed.time_s, frames), vehicle, output, truth, order)
+
+
+def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
+    """What every file begins with: the flight, its models and its configuration.
+
+    Raises RecordingError where the file is not a recording of flockd or ends before all three, and OSError.
+    """
+    flight, models, configuration = None, None, None
+    for record in read_records(path):
+        match record:
+            case Note(name) if name == FLIGHT_NOTE:
+                flight = record
+            case Note(name) if name == MODELS_NOTE:
+                models = record
+            case Inclosure(name) if name == CONFIGURATION:
+                configuration = record
+            case Damage():
+                if flight is None:
+                    raise RecordingError(f"{path}: nothing in it can be read ({record.reason}); use another copy")
+                raise RecordingError(f"{path}: is cut off before the configuration of the flight; use another copy")
+            case Entry() if flight is None:
+                break
+        if flight and models and configuration:
+            if flight.facts.get("format") != FORMAT:
+                known = f"format {flight.facts.get('format')!r}, and this flockd reads {FORMAT!r}"
+                raise RecordingError(f"{path}: is of {known}; use the flockd that wrote it")
+            return flight, models, configuration
+    raise RecordingError(f"{path}: is an MCAP file, but not a recording of flockd; name one that flockd wrote")
+
+
+def check(path: Path) -> None:
+    """Raises RecordingError when there is no file to read at all."""
+    if not path.is_file():
+        fault = "is a folder; name a recording in it" if path.is_dir() else "does not exist; check the path"
+        raise RecordingError(f"{path}: {fault}")
+
+
+def _survey(first: Path, progress: Callable[[int, int], None]) -> Contents:
+    check(first)
+    flight, models, configuration = head_of(first)
+    found = Contents(flight.facts, models.facts, configuration.data)
+    found.paths = tuple(_all_parts(first, flight))
+    total, done = sum(path.stat().st_size for path in found.paths), 0
+    for path in found.paths:
+        for record in read_records(path):
+            if isinstance(record, Entry):
+                done += len(record.data)
+                progress(done, total)
+            _note(found, path, record)
+    if not found.steps:
+        raise RecordingError(f"{first}: holds no step of a flight; record one that flies")
+    return found
+
+
+def _all_parts(first: Path, flight: Note) -> Iterator[Path]:
+    """The file, and those after it that say they are of the same recording."""
+    yield first
+    number = _count(first, flight.facts, "part")
+    start = first if number == 0 else first.with_name(first.name.replace(f".{number}.mcap", ".mcap"))
+    while (path := part_path(start, number + 1)).is_file() and path != first:
+        number += 1
+        try:
+            head = head_of(path)[0]
+        except RecordingError:  # killed in the moment in which it was begun, or left over from another flight
+            return
+        if head.facts.get("recording") != flight.facts.get("recording"):
+            return
+        yield path
+
+
+def _note(found: Contents, path: Path, record: Record | Damage) -> None:
+    match record:
+        case Entry(stream, time_ns, sequence, data):
+            facts = found.streams.setdefault(stream.topic, StreamFacts(stream.topic, stream.schema_name))
+            facts.first_ns = time_ns if facts.messages == 0 else min(facts.first_ns, time_ns)
+            facts.last_ns = max(facts.last_ns, time_ns)
+            facts.messages += 1
+            facts.bytes += len(data)
+            if stream.topic == FRAMES.topic:
+                found.steps.append((sequence, _time_of(path, data)))
+        case Note(name, facts_of_end) if name == END_NOTE:
+            found.lost = _count(path, facts_of_end, "lost")
+        case Damage():
+            found.damages.append((path, record))
+
+
+def _count(path: Path, facts: Mapping[str, str], name: str) -> int:
+    text = facts.get(name, "0")
+    if not (text.isascii() and text.isdecimal() and len(text) < 10):
+        raise RecordingError(f"{path}: says {name} {text[:20]!r}, which is no number; use another copy")
+    return int(text)
+
+
+def _time_of(path: Path, data: bytes) -> float:
+    try:
+        time_s = float(parsed(data)["time_s"])
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        raise RecordingError(f"{path}: holds a frame set without a time; use another copy") from error
+    if not math.isfinite(time_s):
+        raise RecordingError(f"{path}: holds a frame set without a time; use another copy")
+    return time_s
+
+
+def _migrated(path: Path, text: bytes) -> Migrated:
+    try:
+        return migrate_configuration(parsed(text))
+    except ValueError as error:
+        raise RecordingError(f"{path}: the configuration in it is not JSON ({error}); use another copy") from error
+
+
+def _config(path: Path, migrated: Migrated) -> DroneConfig:
+    try:
+        # Strict checks allow in JSON what they refuse in Python values, such as a list for a tuple.
+        return DroneConfig.model_validate_json(json.dumps(migrated.document))
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"]) or "the whole"
+        raise RecordingError(
+            f"{path}: the configuration in it is not one of this flockd ({key}: {first['msg']}); "
+            "use the flockd that wrote it"
+        ) from error
+
+
+def is_image(topic: str) -> bool:
+    """Whether this stream holds a camera's images."""
+    return topic.endswith(_IMAGE_SUFFIX)
+
+
+def is_calibration(topic: str) -> bool:
+    """Whether this stream says once what a camera is."""
+    return topic.endswith(_CALIBRATION_SUFFIX)
+
+
+def makes_steps(topic: str) -> bool:
+    """Whether this stream's messages are parts of steps, numbered by their sequence."""
+    return topic in {FRAMES.topic, VEHICLE.topic, ORDER.topic, OUTPUT.topic, TRUTH.topic} or is_image(topic)
+
+
+def decoded_image(message: bytes) -> UInt8Array:
+    """(h, w, 3) RGB of an image's message. Raises ValueError and RecordingError."""
+    data, kind = foxglove.image_data(message)
+    width, height = image_size(data) or (0, 0)
+    if width * height > MAX_IMAGE_PIXELS:
+        raise ValueError(f"a {kind} image claims {width}x{height} pixels")
+    try:
+        bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    except cv2.error:
+        bgr = None
+    if bgr is None:
+        raise ValueError(f"a {kind} image does not decode")
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)

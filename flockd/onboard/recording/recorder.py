@@ -1,0 +1,466 @@
+"""Records one drone's flight in a thread of its own. The flight never waits for it, and never ends because of it."""
+
+from __future__ import annotations
+
+import json
+import platform
+import queue
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import cv2
+import numpy as np
+
+from flockd import __version__
+from flockd.core.config import DroneConfig
+from flockd.core.config.recording import RecordingConfig
+from flockd.core.config.rig import RigConfig
+from flockd.core.messages import Frame, FrameSet, MissionOrder, PilotOutput, VehicleState
+from flockd.onboard.recording import foxglove
+from flockd.onboard.recording.codec import to_json
+from flockd.onboard.recording.mcap_file import Entry, Inclosure, McapFile, Note, RecordingError
+from flockd.onboard.recording.own_path import OwnPath
+from flockd.onboard.recording.reader import head_of
+from flockd.onboard.recording.streams import (
+    CONFIGURATION,
+    EDITED,
+    END_NOTE,
+    FLIGHT_NOTE,
+    FORMAT,
+    FRAMES,
+    MODELS_NOTE,
+    ORDER,
+    OUTPUT,
+    TABLE,
+    TRUTH,
+    VEHICLE,
+    FrameEntry,
+    StepFrames,
+    nanoseconds,
+    part_path,
+)
+from flockd.onboard.recording.truth import Truth
+from flockd.onboard.telemetry import publish_step
+
+FLUSH_EVERY_S = 0.2
+_VERSIONS = {
+    "version": __version__,
+    "python": platform.python_version(),
+    "numpy": np.__version__,
+    "opencv": cv2.__version__,
+    "machine": f"{platform.system()} {platform.machine()}",
+}
+_MB = 1e6
+_SMALL_BYTES = 4096
+"""What anything but an image counts for in the queue."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    number: int
+    frames: FrameSet
+    vehicle: VehicleState
+    output: PilotOutput
+    truth: Truth | None
+    order: MissionOrder | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Message:
+    topic: str
+    message: Mapping[str, object]
+
+
+@dataclass(frozen=True, eq=False)
+class _Close:
+    pass
+
+
+class Recorder:
+    """Writes `PATH`, and when that is full `PATH` with a number before its suffix, each file complete in itself.
+
+    `step` and `publish` return at once, whatever the disk does. What does not fit into the queue is dropped, counted
+    and reported once; a disk that fails or is full ends the recording alone. Times are those of the messages.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        drone: str,
+        config: DroneConfig,
+        settings: RecordingConfig | None = None,
+        models: Mapping[str, str] | None = None,
+        facts: Mapping[str, str] | None = None,
+        on_event: Callable[[str], None] = lambda event: None,
+    ) -> None:
+        """Begins a new recording over whatever `path` held.
+
+        Args:
+            path: of the first file; its folder must exist.
+            drone: whose flight.
+            config: what its pilot flies with; goes into each file.
+            settings: how to record; by default the configuration's own.
+            models: SHA-256 of each model in use, by name.
+            facts: more to be known of the flight, such as what of it was not learned.
+            on_event: called, from the recorder's thread or the caller's, with what went wrong, in one sentence.
+        """
+        self._settings = settings or config.recording
+        self._drone = drone
+        self._on_event = on_event
+        began = datetime.now(UTC).isoformat(timespec="seconds")
+        flight = {"drone": drone, "began": began, "images": self._settings.images, **_VERSIONS, **(facts or {})}
+        head = (
+            Note(MODELS_NOTE, models or {}),
+            Inclosure(CONFIGURATION, "application/json", config.model_dump_json(indent=1).encode()),
+        )
+        self._parts = _Parts(path, flight, head, config.rig, self._settings, self._tell)
+        self._track = _Track(config.rig)
+        self._queue: queue.SimpleQueue[_Step | _Message | _Close] = queue.SimpleQueue()
+        self._lock = threading.Condition()
+        self._held_bytes = 0
+        self._steps = 0
+        self._lost = 0
+        self._told_full = False
+        self._closed = False
+        self._failure: str | None = None
+        self._time_s: float | None = None
+        self._early: list[_Message] = []
+        self._thread = threading.Thread(target=self._write_all, name=f"recorder {drone}", daemon=True)
+        self._thread.start()
+
+    @property
+    def lost(self) -> int:
+        """Steps and messages that were dropped."""
+        return self._lost
+
+    @property
+    def failure(self) -> str | None:
+        """Why the recording ended before the flight; None while all is well."""
+        return self._failure
+
+    def step(
+        self,
+        frames: FrameSet,
+        vehicle: VehicleState,
+        output: PilotOutput,
+        truth: Truth | None = None,
+        order: MissionOrder | None = None,
+    ) -> None:
+        """Takes one step of the pilot: what went in and what came out, and all telemetry that follows from it.
+
+        A simulator adds the ``truth``, which no pilot knows. ``order`` is the operator's that the step took.
+        """
+        number, self._steps = self._steps, self._steps + 1
+        size = sum(frame.image.nbytes for frame in frames.frames.values())
+        self._put(_Step(number, frames, vehicle, output, truth, order), size + _SMALL_BYTES)
+
+    def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
+        """Takes one telemetry message, if the table of topics marks it as recorded; a `TelemetrySink`.
+
+        For what does not follow from a step, such as events: all that does is written with the step.
+        """
+        if drone == self._drone and topic in TABLE:
+            self._put(_Message(topic, message), _SMALL_BYTES)
+
+    def drain(self) -> None:
+        """Waits until all is written: only for those whose time stands still meanwhile, such as a simulator."""
+        with self._lock:
+            self._lock.wait_for(lambda: self._held_bytes == 0 or self._failure is not None)
+
+    def close(self, timeout_s: float = 30.0) -> None:
+        """Writes what is left and ends the file. What is not written by then is lost, and reported."""
+        if self._closed:
+            return
+        self._closed = True
+        self._queue.put(_Close())
+        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            self._on_event(
+                f"recording {self._parts.path}: the disk was too slow to end it; `flockd record recover` repairs it"
+            )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _put(self, item: _Step | _Message, size: int) -> None:
+        with self._lock:
+            fits = self._held_bytes == 0 or self._held_bytes + size <= self._settings.queue_mb * _MB
+            if self._closed or self._failure is not None or not fits:
+                self._lost += 1
+                news = not fits and not self._told_full
+                self._told_full = self._told_full or not fits
+            else:
+                self._held_bytes += size
+                self._queue.put(item)
+                news = False
+        if news:
+            self._tell("recording: the disk is too slow, so that steps are dropped; record smaller or fewer images")
+
+    def _tell(self, event: str) -> None:
+        """Into the file and to the subscribers."""
+        with self._lock:
+            self._held_bytes += _SMALL_BYTES
+            self._queue.put(_Message("events", {"event": event}))
+        self._on_event(event)
+
+    def _write_all(self) -> None:
+        """The thread."""
+        try:
+            self._write_queue()
+            self._parts.finish({"steps": str(self._steps), "lost": str(self._lost)})
+        except OSError as error:
+            self._fail((error.strerror or str(error)).lower())
+        except Exception as error:  # noqa: BLE001 - no fault of the recorder may end a flight, or hide
+            self._fail(repr(error))
+
+    def _fail(self, reason: str) -> None:
+        sentence = f"recording {self._parts.path}: {reason}; the recording ends here and the flight goes on"
+        with self._lock:
+            self._failure = sentence
+            self._held_bytes = 0
+            while not self._queue.empty():  # the thread that takes these has failed
+                self._lost += isinstance(self._queue.get(), _Step | _Message)
+            self._lock.notify_all()
+        self._parts.abandon()
+        self._on_event(sentence)
+
+    def _write_queue(self) -> None:
+        self._parts.begin()
+        flushed_s = time.monotonic()
+        closing = unflushed = False
+        while not (closing and self._queue.empty()):  # events of closing belong into the file too
+            try:
+                item = self._queue.get(timeout=FLUSH_EVERY_S)
+            except queue.Empty:
+                item = None
+            match item:
+                case _Step():
+                    self._write_step(item)
+                case _Message():
+                    self._write_message(item)
+                case _Close():
+                    closing = True
+            unflushed = unflushed or item is not None
+            if unflushed and (item is None or time.monotonic() - flushed_s >= FLUSH_EVERY_S):
+                self._parts.flush()
+                flushed_s, unflushed = time.monotonic(), False
+            if isinstance(item, _Step | _Message):
+                self._parts.turn_page()
+                self._release(item)
+
+    def _release(self, item: _Step | _Message) -> None:
+        size = _SMALL_BYTES
+        if isinstance(item, _Step):
+            size += sum(frame.image.nbytes for frame in item.frames.frames.values())
+        with self._lock:
+            self._held_bytes -= size
+            if self._held_bytes == 0:
+                self._lock.notify_all()
+
+    def _write_step(self, step: _Step) -> None:
+        self._time_s = step.frames.time_s
+        for entry in _step_entries(step, self._settings, self._track, self._tell):
+            self._parts.write(entry)
+        publish_step(_Direct(self._write_message), self._drone, step.vehicle, step.output)
+        for reason in step.output.reasons:
+            self._parts.write(_log_entry(step.frames.time_s, "WARNING", reason))
+        early, self._early = self._early, []
+        for item in early:  # from before there was a time
+            self._write_message(item)
+
+    def _write_message(self, item: _Message) -> None:
+        if item.topic not in TABLE:
+            return
+        stamp = item.message.get("time_s", self._time_s)  # without one: the recorder's own events
+        if not isinstance(stamp, int | float):
+            self._early.append(item)
+            return
+        time_s = float(stamp)
+        self._parts.write(_json_entry(TABLE[item.topic], time_s, 0, {"time_s": time_s, **item.message}))
+        if item.topic == "events":
+            self._parts.write(_log_entry(time_s, "INFO", str(item.message.get("event", ""))))
+
+
+@dataclass(frozen=True)
+class _Direct:
+    """A telemetry sink within the recorder's own thread."""
+
+    take: Callable[[_Message], None]
+
+    def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
+        self.take(_Message(topic, message))
+
+
+class _Track:
+    """The frames' places and the own path, for viewers."""
+
+    def __init__(self, rig: RigConfig) -> None:
+        self._rig = rig
+        self._path = OwnPath()
+
+    def entries(self, step: _Step) -> Iterator[Entry]:
+        """Where everything is at this step."""
+        time_s, velocity = step.frames.time_s, step.output.velocity
+        position, R_ned_body = self._path.go_on(time_s, velocity, step.vehicle.height_m), step.vehicle.R_ned_body
+        stamp = nanoseconds(time_s)
+        places = foxglove.transforms(stamp, position, R_ned_body, self._rig)
+        yield Entry(foxglove.TRANSFORMS, stamp, step.number, places)
+        if velocity is not None:
+            path = foxglove.odometry(stamp, position, R_ned_body, velocity)
+            yield Entry(foxglove.ODOMETRY, stamp, step.number, path)
+
+
+class _Parts:
+    """The files of one recording: each begins with all that is needed to understand it alone."""
+
+    def __init__(
+        self,
+        path: Path,
+        flight: Mapping[str, str],
+        head: Sequence[Note | Inclosure],
+        rig: RigConfig,
+        settings: RecordingConfig,
+        tell: Callable[[str], None],
+    ) -> None:
+        self._first = path
+        self._flight = {"format": FORMAT, "recording": uuid.uuid4().hex, **flight}
+        self._head, self._rig, self._settings, self._tell = head, rig, settings, tell
+        self._number = 0
+        self._skipped: set[Path] = set()
+        self._file: McapFile | None = None
+        self._calibrated = False
+
+    @property
+    def path(self) -> Path:
+        """Of the file that is being written."""
+        return part_path(self._first, self._number)
+
+    def begin(self) -> None:
+        """Starts the next file."""
+        self._make_room()
+        self._file = McapFile(self.path)
+        self._calibrated = False
+        self._file.write(Note(FLIGHT_NOTE, {**self._flight, "part": str(self._number)}))
+        for record in self._head:
+            self._file.write(record)
+        self._file.flush()
+
+    def write(self, entry: Entry) -> None:
+        """Adds a message, before the first one what is known of the cameras."""
+        assert self._file is not None
+        if not self._calibrated:
+            self._calibrated = True
+            for camera in self._rig.cameras:
+                message = foxglove.calibration(entry.time_ns, camera)
+                self._file.write(Entry(foxglove.calibration_stream(camera.name), entry.time_ns, 0, message))
+        self._file.write(entry)
+
+    def flush(self) -> None:
+        """Makes safe what was written."""
+        assert self._file is not None
+        self._file.flush()
+
+    def turn_page(self) -> None:
+        """Goes on in the next file where this one is full."""
+        assert self._file is not None
+        if self._file.size >= self._settings.file_mb * _MB:
+            self._file.finish()
+            self._number += 1
+            self.begin()
+
+    def finish(self, end: Mapping[str, str]) -> None:
+        """Ends the last file."""
+        assert self._file is not None
+        self._file.write(Note(END_NOTE, end))
+        self._file.finish()
+
+    def abandon(self) -> None:
+        """Leaves the last file as it is."""
+        if self._file is not None:
+            self._file.abandon()
+
+    def _make_room(self) -> None:
+        """Deletes this drone's oldest recordings in the folder until a whole file more stays within the quota.
+
+        Only what a recorder wrote: what someone cut or recovered from it stays and does not count.
+        """
+        others = [path for path in self._first.parent.glob("*.mcap") if path != self.path and self._may_delete(path)]
+        others.sort(key=lambda path: path.stat().st_mtime)
+        room = (self._settings.quota_mb - self._settings.file_mb) * _MB - sum(path.stat().st_size for path in others)
+        for path in others:
+            if room >= 0:
+                return
+            room += path.stat().st_size
+            path.unlink()
+            self._tell(f"recording: {path} was deleted, as all recordings may take {self._settings.quota_mb:g} MB")
+
+    def _may_delete(self, path: Path) -> bool:
+        """Whether a recorder of this drone wrote the file; what is no readable file is reported once and left alone."""
+        try:
+            facts = head_of(path)[0].facts if path.is_file() else None  # a pipe would wait for ever to be opened
+            why = "is not a file"
+        except (RecordingError, OSError) as error:
+            facts, why = None, str(error).removeprefix(f"{path}: ")
+        if facts is None:
+            if path not in self._skipped:
+                self._skipped.add(path)
+                self._tell(f"recording: {path} was skipped and does not count for the quota: it {why}")
+            return False
+        return facts.get("drone") == self._flight["drone"] and not facts.keys() & EDITED
+
+
+def _step_entries(
+    step: _Step, settings: RecordingConfig, track: _Track, tell: Callable[[str], None]
+) -> Iterator[Entry]:
+    """All messages that a step becomes; its output comes last, so that a step with an output is whole."""
+    time_s = step.frames.time_s
+    kept = []
+    for camera, frame in step.frames.frames.items():
+        data = _compressed(frame, settings)
+        if data is None:
+            tell(f"recording: an image of camera {camera} has no pixels or not three channels and is left out")
+            continue
+        kept.append(FrameEntry(camera, frame.time_s, frame.sequence))
+        stamp = nanoseconds(frame.time_s)
+        message = foxglove.image(stamp, camera, data, settings.images)
+        yield Entry(foxglove.image_stream(camera), stamp, step.number, message)
+    yield _json_entry(FRAMES, time_s, step.number, StepFrames(step.number, time_s, tuple(kept)))
+    yield _json_entry(VEHICLE, time_s, step.number, step.vehicle)
+    if step.order is not None:
+        yield _json_entry(ORDER, time_s, step.number, step.order)
+    yield from track.entries(step)
+    if step.truth is not None:
+        yield _json_entry(TRUTH, time_s, step.number, step.truth)
+    yield _json_entry(OUTPUT, time_s, step.number, step.output)
+
+
+def _compressed(frame: Frame, settings: RecordingConfig) -> bytes | None:
+    if frame.image.ndim != 3 or frame.image.shape[2] != 3 or frame.image.size == 0:
+        return None
+    bgr = cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR)
+    options = [cv2.IMWRITE_PNG_COMPRESSION, 1]  # higher takes several times longer for a few per cent
+    if settings.images == "jpeg":
+        options = [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality]
+    return bytes(cv2.imencode(f".{settings.images}", bgr, options)[1])
+
+
+def _json_entry(stream: Any, time_s: float, sequence: int, message: object) -> Entry:
+    return Entry(stream, nanoseconds(time_s), sequence, json.dumps(to_json(message), allow_nan=False).encode())
+
+
+def _log_entry(time_s: float, level: Literal["INFO", "WARNING"], text: str) -> Entry:
+    stamp = nanoseconds(time_s)
+    return Entry(foxglove.LOG, stamp, 0, foxglove.log(stamp, level, text))

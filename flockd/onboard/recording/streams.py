@@ -1,0 +1,70 @@
+"""What a recording consists of: the streams that replay needs, those of the table of topics, and those for viewers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flockd.core.messages import MissionOrder, PilotOutput, VehicleState
+from flockd.onboard.recording.codec import json_schema
+from flockd.onboard.recording.mcap_file import Stream
+from flockd.onboard.recording.truth import Truth
+from flockd.onboard.telemetry import TOPICS
+
+FORMAT = "1"
+"""Of this layout; a reader refuses others."""
+FLIGHT_NOTE = "flockd"
+MODELS_NOTE = "models"
+END_NOTE = "end"
+RECOVERED, CUT, REPLAYED = EDITED = ("recovered_from", "cut_from", "replayed_from")
+"""Facts of a recording that was made of another."""
+PILOT_BEGAN = "pilot_began_s"
+"""A fact of what was cut or recovered: when the pilot took its first step, from which it counts its time."""
+CONFIGURATION = "configuration.json"
+
+
+@dataclass(frozen=True)
+class FrameEntry:
+    """One image of a frame set; the image itself is the camera's message with the step's number."""
+
+    camera: str
+    time_s: float
+    sequence: int
+
+
+@dataclass(frozen=True)
+class StepFrames:
+    """Which images went into a step."""
+
+    step: int
+    """Counted from 0 over the whole recording; a missing number is a step that was dropped."""
+    time_s: float
+    frames: tuple[FrameEntry, ...]
+
+
+def _json_stream(topic: str, kind: Any) -> Stream:
+    name = f"flockd.{kind.__name__.removesuffix('Message')}"
+    return Stream(topic, "json", name, json.dumps(json_schema(kind)).encode())
+
+
+FRAMES = _json_stream("/frames", StepFrames)
+VEHICLE = _json_stream("/vehicle", VehicleState)
+ORDER = _json_stream("/order", MissionOrder)
+"""Of steps in which the pilot took an operator's order."""
+OUTPUT = _json_stream("/output", PilotOutput)
+TRUTH = _json_stream("/truth", Truth)
+"""Of simulated flights."""
+TABLE = {key: _json_stream(f"/{key}", topic.type) for key, topic in TOPICS.items() if topic.recorded}
+"""The telemetry that the table of topics marks as recorded."""
+
+
+def part_path(first: Path, number: int) -> Path:
+    """Of a recording's files, the one with this number; the first is number 0."""
+    return first.with_name(f"{first.stem}.{number}{first.suffix}") if number else first
+
+
+def nanoseconds(time_s: float) -> int:
+    """A time as MCAP has it; the exact one stands in the messages themselves."""
+    return max(0, round(time_s * 1e9))

@@ -1,0 +1,157 @@
+"""Puts the frames of several cameras together into sets by time stamp. Pure: the caller gives the time."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from flockd.core.config.source import SourceParameters
+from flockd.onboard.sources.frames import Count, RawFrame
+
+_MOST_HELD = 16
+"""Frames kept of one camera, however fast it is."""
+
+
+@dataclass(frozen=True, eq=False)
+class RawFrameSet:
+    """Frames of one time; a camera that has none near it is absent."""
+
+    time_s: float
+    frames: Mapping[str, RawFrame]
+
+
+@dataclass(frozen=True, eq=False)
+class _Held:
+    frame: RawFrame
+    arrival_s: float
+
+
+@dataclass
+class _Line:
+    """What is known of one camera."""
+
+    held: deque[_Held] = field(default_factory=deque)
+    last: RawFrame | None = None
+    repeats: int = 0
+    usable_s: float = -math.inf
+    """When its last usable frame arrived."""
+    awaited: bool = True
+    counts: Counter[Count] = field(default_factory=Counter)
+
+
+class Assembler:
+    """Frames go in one by one, sets come out; the newest wins.
+
+    A set is complete when every camera that is awaited has a frame within ``set_tolerance_s`` of the set's time, which
+    is the stamp of one of its frames. What is not complete ``set_wait_s`` after a frame came goes on as it is, and who
+    is absent from it is not awaited again before its next usable frame. Set times increase, and no frame is in two
+    sets.
+
+    ``now_s`` is the caller's clock; it is only compared with itself, never with time stamps.
+    """
+
+    def __init__(self, cameras: Sequence[str], parameters: SourceParameters) -> None:
+        self._lines = {camera: _Line() for camera in cameras}
+        self._tolerance_s = parameters.set_tolerance_s
+        self._wait_s = parameters.set_wait_s
+        self._frozen_after = parameters.frozen_after or math.inf
+        self._last_set_s = -math.inf
+
+    def offer(self, frame: RawFrame, now_s: float) -> Count | None:
+        """Takes a frame of a known camera; gives what it is refused for, None for a usable one."""
+        line = self._lines[frame.camera]
+        line.counts["received"] += 1
+        refused = self._judge(line, frame)
+        if refused is not None:
+            line.counts[refused] += 1
+            return refused
+        line.usable_s = now_s
+        line.awaited = True
+        line.held.append(_Held(frame, now_s))
+        while self._is_useless(line):
+            line.held.popleft()
+            line.counts["superseded"] += 1
+        return None
+
+    def take(self, now_s: float) -> RawFrameSet | None:
+        """The newest set that is ready; None if there is none newer than the last."""
+        awaited = {name for name, line in self._lines.items() if line.awaited}
+        best: RawFrameSet | None = None
+        for time_s in self._times():
+            candidate = RawFrameSet(time_s, self._near(time_s))
+            if awaited <= candidate.frames.keys():
+                return self._handed_out(candidate)
+            if best is None or len(candidate.frames) > len(best.frames):
+                best = candidate
+        if best is not None and now_s - self._oldest_arrival_s() > self._wait_s:
+            return self._handed_out(best)
+        return None
+
+    def count(self, camera: str, what: Count) -> None:
+        """Adds something that happened outside to a camera's counts."""
+        self._lines[camera].counts[what] += 1
+
+    def spoil(self, camera: str) -> None:
+        """A frame of the last set turned out to be no image: the set is without this camera."""
+        self._lines[camera].counts.update({"corrupt": 1, "undecodable": 1, "missing": 1, "used": -1})
+
+    def counts(self, camera: str) -> dict[Count, int]:
+        """What happened to a camera's frames so far; what never happened is absent."""
+        return {what: count for what, count in self._lines[camera].counts.items() if count}
+
+    def age_s(self, camera: str, now_s: float) -> float:
+        """Since the camera's last usable frame arrived; infinite before the first."""
+        return now_s - self._lines[camera].usable_s
+
+    def _judge(self, line: _Line, frame: RawFrame) -> Count | None:
+        last = line.last
+        if not math.isfinite(frame.time_s) or (last is not None and frame.time_s <= last.time_s):
+            return "time_stamp"
+        line.last = frame
+        if last is not None:
+            same = frame.sequence == last.sequence or frame.data == last.data
+            line.repeats = line.repeats + 1 if same else 0
+            line.counts["lost"] += max(frame.sequence - last.sequence - 1, 0)  # a reopened camera begins at zero
+        if line.repeats >= self._frozen_after:
+            return "frozen"
+        return "late" if frame.time_s + self._tolerance_s <= self._last_set_s else None
+
+    def _is_useless(self, line: _Line) -> bool:
+        """Whether a camera's oldest frame is older than any set can wait for."""
+        span_s = line.held[-1].frame.time_s - line.held[0].frame.time_s
+        return span_s > self._wait_s + self._tolerance_s or len(line.held) > _MOST_HELD
+
+    def _times(self) -> list[float]:
+        """Where a set could be, newest first."""
+        stamps = {held.frame.time_s for line in self._lines.values() for held in line.held}
+        return sorted((stamp for stamp in stamps if stamp > self._last_set_s), reverse=True)
+
+    def _near(self, time_s: float) -> dict[str, RawFrame]:
+        nearest = {}
+        for name, line in self._lines.items():
+            frames = [held.frame for held in line.held if abs(held.frame.time_s - time_s) <= self._tolerance_s]
+            if frames:
+                nearest[name] = min(frames, key=lambda frame: abs(frame.time_s - time_s))
+        return nearest
+
+    def _oldest_arrival_s(self) -> float:
+        return min(
+            held.arrival_s
+            for line in self._lines.values()
+            for held in line.held
+            if held.frame.time_s > self._last_set_s
+        )
+
+    def _handed_out(self, chosen: RawFrameSet) -> RawFrameSet:
+        self._last_set_s = chosen.time_s
+        for name, line in self._lines.items():
+            used = chosen.frames.get(name)
+            line.counts["used" if used else "missing"] += 1
+            line.awaited = used is not None
+            until_s = used.time_s if used else chosen.time_s - self._tolerance_s
+            while line.held and line.held[0].frame.time_s <= until_s:
+                if line.held.popleft().frame is not used:
+                    line.counts["superseded"] += 1
+        return chosen

@@ -1,0 +1,162 @@
+"""Cameras of this computer: one thread each fetches its frames, notices silence, and opens it again."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+
+from flockd.core.config.drone import DroneConfig
+from flockd.core.config.source import CameraDeviceParameters, SourceParameters
+from flockd.core.messages import FrameSet
+from flockd.onboard.sources.devices import CameraDevice, CameraError, CapturedBuffer
+from flockd.onboard.sources.frame_receiver import FrameReceiver
+from flockd.onboard.sources.frames import CameraStatus, Count, RawFrame
+from flockd.onboard.sources.image_formats import CorruptImageError, ImageFormat
+
+_LOOK_S = 0.05
+"""How long a thread waits for a frame before it checks whether it should stop."""
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
+_STOP_S = 1.0
+"""A thread that hangs in a driver for longer is left to end with the process."""
+
+
+OpenDevice = Callable[[CameraDeviceParameters, tuple[int, int]], CameraDevice]
+"""Opens a camera, for images of a width and height; raises CameraError."""
+
+
+class DeviceSource:
+    """A ``FrameSource`` of cameras that are opened by ``open_device``, with their own time stamps and numbers."""
+
+    def __init__(
+        self,
+        config: DroneConfig,
+        parameters: SourceParameters,
+        open_device: OpenDevice,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``parameters`` have one entry for each camera of the rig; ``clock`` is that of the time stamps."""
+        sizes = {camera.name: camera.size_px for camera in config.rig.cameras}
+        self._receiver = FrameReceiver(tuple(sizes), parameters, clock)
+        self._cameras = [
+            _Camera(camera, sizes[camera.name], parameters.silence_s, self._receiver, open_device, clock)
+            for camera in parameters.cameras
+        ]
+
+    def start(self) -> None:
+        """See ``FrameSource``."""
+        for camera in self._cameras:
+            camera.start()
+
+    def newest(self, timeout_s: float = 0.0) -> FrameSet | None:
+        """See ``FrameSource``."""
+        return self._receiver.newest(timeout_s)
+
+    def status(self) -> Mapping[str, CameraStatus]:
+        """See ``FrameSource``."""
+        return self._receiver.status()
+
+    def notes(self) -> tuple[str, ...]:
+        """See ``FrameSource``."""
+        return ()
+
+    def stop(self) -> None:
+        """See ``FrameSource``."""
+        self._receiver.stop()
+        for camera in self._cameras:
+            camera.ask_to_stop()
+        until_s = time.monotonic() + _STOP_S
+        for camera in self._cameras:
+            camera.join(max(until_s - time.monotonic(), 0.0))
+
+
+class _Camera:
+    """One camera and the thread that keeps it running."""
+
+    def __init__(
+        self,
+        parameters: CameraDeviceParameters,
+        size: tuple[int, int],
+        silence_s: float,
+        receiver: FrameReceiver,
+        open_device: OpenDevice,
+        clock: Callable[[], float],
+    ) -> None:
+        self._name = parameters.name
+        self._parameters = parameters
+        self._size = size
+        self._silence_s = silence_s
+        self._receiver = receiver
+        self._open_device = open_device
+        self._clock = clock
+        self._delivered = False
+        """Whether this opening of the device has brought a usable frame."""
+        self._has_delivered = False
+        """Whether any has."""
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"camera-{self._name}", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def ask_to_stop(self) -> None:
+        self._stopping.set()
+
+    def join(self, timeout_s: float) -> None:
+        if self._thread.is_alive():
+            self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        pause_s = _FIRST_PAUSE_S
+        while not self._stopping.is_set():
+            self._delivered = False
+            try:
+                with self._open_device(self._parameters, self._size) as device:
+                    self._receiver.count(self._name, "opened")
+                    self._capture(device)
+            except CameraError as error:
+                self._receiver.fault(self._name, str(error))
+            pause_s = _FIRST_PAUSE_S if self._delivered else pause_s
+            self._stopping.wait(pause_s)
+            pause_s = min(2.0 * pause_s, _LONGEST_PAUSE_S)
+
+    def _capture(self, device: CameraDevice) -> None:
+        """Until it is asked to stop; raises CameraError when the camera fails or falls silent."""
+        usable_s, refused = self._clock(), None
+        left_over = self._has_delivered  # drivers may begin again with the last image of before, stamped as of now
+        while not self._stopping.is_set():
+            captured = device.read(_LOOK_S)
+            if captured is not None and left_over:
+                self._receiver.count(self._name, "received", "late")
+                left_over = False
+            elif captured is not None:
+                refused = self._take(captured, device.image_format())
+                if refused is None:
+                    usable_s, self._delivered, self._has_delivered = self._clock(), True, True
+            limit_s = self._silence_s if self._delivered else max(device.start_s, self._silence_s)
+            if self._clock() - usable_s > limit_s:
+                last = f"; the last was refused ({refused.replace('_', ' ')})" if refused else ""
+                raise CameraError(
+                    f"{self._name}: {self._parameters.place} gave no usable image for {limit_s:g} s{last}"
+                )
+
+    def _take(self, captured: CapturedBuffer, image_format: ImageFormat) -> Count | None:
+        refused = self._refusal(captured, image_format)
+        if refused is not None:
+            self._receiver.count(self._name, "received", refused)
+            return refused
+        frame = RawFrame(self._name, captured.data, image_format.decode, captured.time_s, captured.sequence)
+        return self._receiver.offer(frame)
+
+    def _refusal(self, captured: CapturedBuffer, image_format: ImageFormat) -> Count | None:
+        if captured.flagged:
+            return "flagged"
+        # Some drivers do not say which clock is in their stamps: what is of now is of ours.
+        if not self._receiver.is_of_now(captured.time_s, self._silence_s):
+            return "time_stamp"
+        try:
+            image_format.check(captured.data)
+        except CorruptImageError:
+            return "corrupt"
+        return None

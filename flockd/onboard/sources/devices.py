@@ -1,0 +1,47 @@
+"""What every kind of camera device has in common for the code that runs it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Literal, Protocol, Self
+
+from flockd.core.errors import UnavailableError
+from flockd.onboard.sources.image_formats import ImageFormat
+
+Clock = Literal["monotonic", "copied", "unknown"]
+
+
+class CameraError(UnavailableError):
+    """Why a camera gives no frames, in one sentence."""
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedBuffer:
+    """What the driver handed over: one image, its time and its number."""
+
+    data: bytes
+    time_s: float
+    clock: Clock
+    sequence: int
+    flagged: bool
+    """The driver says that the data may be damaged."""
+
+
+class CameraDevice(Protocol):
+    """An open camera that streams; a context manager that closes it. Every method raises CameraError when it fails."""
+
+    start_s: float
+    """How long it may take to its first frame."""
+
+    def read(self, timeout_s: float) -> CapturedBuffer | None:
+        """The next image; None if there is none within the time."""
+
+    def image_format(self) -> ImageFormat:
+        """Of the image that `read` gave last."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...

@@ -1,0 +1,126 @@
+"""From the bytes a camera sent to an RGB image, or the reason why not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from flockd.core.image_header import jpeg_size
+from flockd.core.messages import UInt8Array
+
+Decoder = Callable[[bytes], UInt8Array]
+"""Bytes to (height, width, 3) RGB; raises CorruptImageError."""
+
+_START, _END = b"\xff\xd8", b"\xff\xd9"
+_SAMPLE_STRIDE = 8
+_FLAT_DEVIATION = 1.0
+"""Standard deviation in grey levels below which a whole image shows nothing: the noise of a sensor alone is more."""
+_LOST_SHARE = 16
+"""An image is cut off where its last 1/16 of rows is one value: what decoders fill in for data that never came."""
+_SATURATED = (8, 247)
+"""Between these a strip of one value is not just too dark or too bright."""
+
+
+class CorruptImageError(ValueError):
+    """The bytes are no whole image of the right size; the text says why."""
+
+
+class ImageFormat(Protocol):
+    """How a camera sends its images."""
+
+    def check(self, data: bytes) -> None:
+        """Raises CorruptImageError for what can be seen to be wrong without decoding: takes microseconds."""
+
+    def decode(self, data: bytes) -> UInt8Array:
+        """(height, width, 3) RGB; raises CorruptImageError."""
+
+
+@dataclass(frozen=True)
+class MjpegFormat:
+    """A JPEG each; with or without its Huffman tables, which many cameras leave out."""
+
+    size: tuple[int, int]
+    """Width, height."""
+
+    def check(self, data: bytes) -> None:
+        """See ``ImageFormat``: begin, end and size."""
+        if not data.startswith(_START):
+            raise CorruptImageError("no JPEG begins here")
+        if not data.rstrip(b"\0").endswith(_END):  # some cameras pad with zeros
+            raise CorruptImageError("JPEG ends too early")
+        found = jpeg_size(data)
+        if found != self.size:
+            shown = "no size" if found is None else f"{found[0]}x{found[1]}"
+            raise CorruptImageError(f"JPEG has {shown} instead of {self.size[0]}x{self.size[1]}")
+
+    def decode(self, data: bytes) -> UInt8Array:
+        """See ``ImageFormat``."""
+        self.check(data)
+        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+        try:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        except cv2.error as error:
+            raise CorruptImageError(f"JPEG cannot be decoded ({error})") from error
+        if image is None:
+            raise CorruptImageError("JPEG cannot be decoded")
+        return plausible(np.asarray(image, np.uint8))
+
+
+@dataclass(frozen=True)
+class YuyvFormat:
+    """YUYV 4:2:2 by BT.601, luma from 16 to 235."""
+
+    size: tuple[int, int]
+    """Width, height."""
+    bytes_per_line: int
+
+    def check(self, data: bytes) -> None:
+        """See ``ImageFormat``: size."""
+        check_length(data, self.bytes_per_line * self.size[1])
+
+    def decode(self, data: bytes) -> UInt8Array:
+        """See ``ImageFormat``."""
+        self.check(data)
+        width, height = self.size
+        rows = np.frombuffer(data, np.uint8).reshape(height, self.bytes_per_line)
+        pixels = np.ascontiguousarray(rows[:, : 2 * width]).reshape(height, width, 2)
+        return plausible(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_YUV2RGB_YUY2), np.uint8))
+
+
+@dataclass(frozen=True)
+class RgbFormat:
+    """Plain RGB, as a simulator draws it: whatever it shows is right."""
+
+    size: tuple[int, int]
+    """Width, height."""
+
+    def check(self, data: bytes) -> None:
+        """See ``ImageFormat``: size."""
+        check_length(data, self.size[0] * self.size[1] * 3)
+
+    def decode(self, data: bytes) -> UInt8Array:
+        """See ``ImageFormat``; nothing is copied."""
+        self.check(data)
+        return np.frombuffer(data, np.uint8).reshape(self.size[1], self.size[0], 3)
+
+
+def check_length(data: bytes, length: int) -> None:
+    """Raises CorruptImageError for another length."""
+    if len(data) != length:
+        raise CorruptImageError(f"{len(data)} bytes instead of {length}")
+
+
+def plausible(image: UInt8Array) -> UInt8Array:
+    """The same image; raises CorruptImageError for what decodes without complaint and yet shows too little."""
+    sample = image[::_SAMPLE_STRIDE, ::_SAMPLE_STRIDE]
+    if float(sample.std(axis=(0, 1)).max()) < _FLAT_DEVIATION:
+        raise CorruptImageError("image is all of one colour")
+    strip = image[-max(image.shape[0] // _LOST_SHARE, 1) :, ::_SAMPLE_STRIDE]
+    low, high = _SATURATED
+    if np.all(strip == strip[0, 0]) and np.any((strip[0, 0] > low) & (strip[0, 0] < high)):
+        raise CorruptImageError("image stops short of its last rows")
+    return image

@@ -1,0 +1,82 @@
+"""Orders to a drone's mission, as they travel in queries."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+
+from flockd.core.messages import FloatArray, MissionOrder
+from flockd.onboard.telemetry.topics import OrderMessage
+
+_OF_GOTO = frozenset({"north_m", "east_m", "latitude_deg", "longitude_deg", "height_m", "speed_m_s"})
+_OF_VELOCITY = frozenset({"velocity_ne", "height_m"})
+_LONGEST = 4096
+
+
+def parse_order(command: str, payload: bytes) -> MissionOrder:
+    """The order in a query for `goto` or `velocity`.
+
+    Raises ValueError, with a sentence for its sender, for what is none; whether it may be flown is not checked here.
+    """
+    message = _object(payload)
+    allowed = _OF_GOTO if command == "goto" else _OF_VELOCITY
+    unknown = sorted(message.keys() - allowed)
+    if unknown:
+        raise ValueError(f"{command} has no key {unknown[0]!r}; its keys are {', '.join(sorted(allowed))}")
+    height_m, speed_m_s = (None if key not in message else _number(message, key) for key in ("height_m", "speed_m_s"))
+    if command == "velocity":
+        velocity = message.get("velocity_ne")
+        if not isinstance(velocity, list) or len(velocity) != 2:
+            raise ValueError("velocity needs `velocity_ne`, a list of two numbers in m/s")
+        parts = {"north": velocity[0], "east": velocity[1]}
+        return MissionOrder(velocity=_pair(parts, "north", "east"), height_m=height_m)
+    metres, degrees = {"north_m", "east_m"} & message.keys(), {"latitude_deg", "longitude_deg"} & message.keys()
+    if sorted((len(metres), len(degrees))) != [0, 2]:
+        raise ValueError("goto needs `north_m` and `east_m`, or `latitude_deg` and `longitude_deg`")
+    return MissionOrder(
+        place=_pair(message, "north_m", "east_m") if metres else None,
+        place_deg=_pair(message, "latitude_deg", "longitude_deg") if degrees else None,
+        height_m=height_m,
+        speed_m_s=speed_m_s,
+    )
+
+
+def order_message(order: MissionOrder) -> OrderMessage:
+    """What `parse_order` reads."""
+    message = OrderMessage()
+    if order.place is not None:
+        message["north_m"], message["east_m"] = order.place.tolist()
+    if order.place_deg is not None:
+        message["latitude_deg"], message["longitude_deg"] = order.place_deg.tolist()
+    if order.velocity is not None:
+        message["velocity_ne"] = order.velocity.tolist()
+    if order.height_m is not None:
+        message["height_m"] = order.height_m
+    if order.speed_m_s is not None:
+        message["speed_m_s"] = order.speed_m_s
+    return message
+
+
+def _object(payload: bytes) -> dict[str, Any]:
+    if len(payload) > _LONGEST:
+        raise ValueError(f"an order has {_LONGEST} bytes at most")
+    try:
+        message = json.loads(payload)
+    except (ValueError, RecursionError) as error:
+        raise ValueError("an order has to be a JSON object") from error
+    if not isinstance(message, dict):
+        raise ValueError("an order has to be a JSON object")  # noqa: TRY004 - of the message, not of the caller
+    return message
+
+
+def _pair(message: dict[str, Any], one: str, other: str) -> FloatArray:
+    return np.array([_number(message, one), _number(message, other)])
+
+
+def _number(message: dict[str, Any], key: str) -> float:
+    value = message[key]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:  # false for NaN too
+        raise ValueError(f"{key} has to be a number, and is {str(value)[:40]!r}")
+    return float(value)

@@ -1,0 +1,141 @@
+"""Publishes telemetry over zenoh, as one peer for all drones of a process, and replies to queries."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import zenoh
+
+from flockd.onboard.telemetry.topics import PREFIX, TOPICS, AboutMessage, AnswerMessage, TimeMessage, checked_name
+from flockd.onboard.telemetry.zenoh_session import SessionOwner, open_session
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+
+Ask = Callable[[str, bytes], AnswerMessage]
+"""Takes an operator's command by name, with what its query carries, on a thread of zenoh's; returns at once."""
+NewestImage = Callable[[str], bytes | None]
+"""Gives a camera's newest image as JPEG, on a thread of zenoh's; None where there is none."""
+
+
+class ZenohTelemetry(SessionOwner):
+    """A telemetry sink that puts each message under `flockd/v1/<fleet>/<drone>/<topic>`.
+
+    It listens on and connects to the given endpoints only: discovery by multicast and gossip is off. A put never
+    waits: without a subscriber it goes nowhere, and a congested link drops it. Raises UnavailableError when an endpoint
+    or the file of settings cannot be used, and ValueError for a fleet's name that does not fit into a key.
+    """
+
+    def __init__(
+        self,
+        fleet: str,
+        *,
+        listen: Sequence[str] = (DEFAULT_ENDPOINT,),
+        connect: Sequence[str] = (),
+        settings: Path | None = None,
+    ) -> None:
+        self._prefix = f"{PREFIX}/{checked_name(fleet)}"
+        self._publishers: dict[tuple[str, str], zenoh.Publisher] = {}
+        self._kept: list[object] = []
+        self._lost = 0
+        self._session = open_session("telemetry", listen, connect, settings=settings)
+
+    @property
+    def lost(self) -> int:
+        """Messages that zenoh refused to take; congestion on the way is not known here."""
+        return self._lost
+
+    def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
+        """Publishes one message; a number that is not finite becomes null.
+
+        Raises ValueError for a topic that is not in `TOPICS` or a drone's name that does not fit into a key.
+        """
+        payload = json.dumps(_finite(message), allow_nan=False).encode()
+        try:
+            self._publisher(drone, topic).put(payload)
+        except zenoh.ZError:  # telemetry never ends a flight
+            self._lost += 1
+
+    def show_alive(self, drone: str) -> None:
+        """Publishes that a drone is alive for as long as this session is, and tells its clocks; no daemon to ask."""
+        key = f"{self._prefix}/{checked_name(drone)}"
+        self._kept += [
+            self._session.liveliness().declare_token(f"{key}/alive"),
+            self._session.declare_queryable(f"{key}/time", _tell_time),
+        ]
+
+    def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
+        """Publishes that a drone is alive for as long as this session is, and replies to queries.
+
+        Queries are for what it flies with, its clocks, operators' commands, and a camera's newest image.
+        """
+        self.show_alive(drone)
+        key = f"{self._prefix}/{drone}"
+        self._kept += [
+            self._session.declare_queryable(f"{key}/about", lambda query: _reply(query, about)),
+            self._session.declare_queryable(
+                f"{key}/ask/*",
+                lambda query: _reply(query, ask(str(query.key_expr).rpartition("/")[2], _payload(query))),
+            ),
+            self._session.declare_queryable(f"{key}/image/*", lambda query: _send_image(query, newest_image)),
+        ]
+
+    def _publisher(self, drone: str, topic: str) -> zenoh.Publisher:
+        publisher = self._publishers.get((drone, topic))
+        if publisher is None:
+            if topic not in TOPICS:
+                raise ValueError(f"{topic!r} is not a topic; the topics are {', '.join(TOPICS)}")
+            publisher = self._session.declare_publisher(
+                f"{self._prefix}/{checked_name(drone)}/{topic}",
+                encoding=zenoh.Encoding.APPLICATION_JSON,
+                congestion_control=zenoh.CongestionControl.DROP,
+            )
+            self._publishers[drone, topic] = publisher
+        return publisher
+
+
+def _payload(query: zenoh.Query) -> bytes:
+    """What the query carries; empty where it is nothing."""
+    return b"" if query.payload is None else query.payload.to_bytes()
+
+
+def _reply(query: zenoh.Query, message: Mapping[str, object]) -> None:
+    """Replies under the key of the query; a query for several at once, as with `*`, gets one reply."""
+    query.reply(query.key_expr, json.dumps(_finite(message), allow_nan=False), encoding=zenoh.Encoding.APPLICATION_JSON)
+
+
+def _tell_time(query: zenoh.Query) -> None:
+    _reply(query, TimeMessage(time_s=time.monotonic(), wall_s=time.time()))
+
+
+def _send_image(query: zenoh.Query, newest_image: NewestImage) -> None:
+    camera = str(query.key_expr).rpartition("/")[2]
+    image = newest_image(camera)
+    if image is None:
+        query.reply_err(f"camera {camera!r} has no image", encoding=zenoh.Encoding.TEXT_PLAIN)
+    else:
+        query.reply(query.key_expr, image, encoding=zenoh.Encoding.IMAGE_JPEG)
+
+
+_PLAIN = frozenset({str, int, bool, type(None)})
+
+
+def _finite(value: object) -> object:
+    """The same value in plain types, with null for every number that JSON cannot say."""
+    if type(value) is float:  # most are: this runs for every number of every message
+        return value if math.isfinite(value) else None
+    if type(value) in _PLAIN:
+        return value
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(inner) for inner in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,88 @@
+"""Opens and closes zenoh sessions, as peers without discovery. No other file does."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import zenoh
+
+from flockd.core.errors import UnavailableError
+
+
+class SessionError(UnavailableError):
+    """Endpoints, or a file of settings, that cannot be used."""
+
+    def __init__(self, purpose: str, endpoints: str, reason: str) -> None:
+        super().__init__(f"{purpose} cannot use {endpoints} ({reason}); name another endpoint")
+        self.reason = reason
+
+
+def open_session(
+    purpose: str,
+    listen: Sequence[str],
+    connect: Sequence[str],
+    *,
+    settings: Path | None = None,
+    shared_memory: bool | None = None,
+) -> zenoh.Session:
+    """A session that listens on and connects to these endpoints only, for ever where nobody is there yet.
+
+    Args:
+        purpose: what it is for, as errors say it.
+        listen: zenoh endpoints.
+        connect: zenoh endpoints.
+        settings: a file of zenoh's own to begin with: for TLS and access control.
+        shared_memory: whether large messages go through it; None: as zenoh or the settings have it.
+
+    Raises SessionError.
+    """
+    try:
+        return zenoh.open(_config(listen, connect, settings, shared_memory))
+    except zenoh.ZError as error:
+        endpoints = ", ".join([*listen, *connect]) or "no endpoint"
+        with_settings = f" with the settings of {settings}" if settings else ""
+        reason = str(error).split(" at ")[0].split(": [")[0]
+        raise SessionError(purpose, f"{endpoints}{with_settings}", reason) from error
+
+
+def close_session(session: zenoh.Session) -> None:
+    """Ends a session and all that was declared in it."""
+    session.close()  # type: ignore[no-untyped-call]
+
+
+class SessionOwner:
+    """A context manager that ends its session."""
+
+    _session: zenoh.Session
+
+    def close(self) -> None:
+        """Ends the session; what is sent later is lost."""
+        close_session(self._session)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _config(
+    listen: Sequence[str], connect: Sequence[str], settings: Path | None, shared_memory: bool | None
+) -> zenoh.Config:
+    """A peer opens without a router, unlike a client; discovery by multicast and gossip is off."""
+    config = zenoh.Config() if settings is None else zenoh.Config.from_file(str(settings))
+    config.insert_json5("mode", '"peer"')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("scouting/gossip/enabled", "false")
+    config.insert_json5("listen/endpoints", json.dumps(list(listen)))
+    config.insert_json5("connect/endpoints", json.dumps(list(connect)))
+    config.insert_json5("connect/retry", json.dumps({"period_init_ms": 100, "period_max_ms": 1000}))
+    if shared_memory is not None:
+        config.insert_json5("transport/shared_memory/enabled", json.dumps(shared_memory))
+    return config

@@ -1,0 +1,1 @@
+"""After a flight: its log, replay, report and view."""

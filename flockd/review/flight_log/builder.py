@@ -1,0 +1,157 @@
+"""Builds a flight log step by step, in the simulator or from recordings, and matches estimates to the truth."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from flockd.core.messages import SECTORS, BoolArray, FloatArray, MissionStatus, ObstacleRanges, PilotOutput
+from flockd.review.flight_log.log import FlightLog
+from flockd.review.flight_log.metadata import FlightMetadata
+from flockd.review.flight_log.truth_matching import match_neighbours
+
+_BY_STEP = (
+    "_times", "_position", "_velocity", "_attitude", "_desired", "_command_velocity", "_command_acceleration",
+    "_ego_rotation", "_ego_translation", "_ego_inlier_ratio", "_own_velocity", "_neighbour_position",
+    "_neighbour_velocity", "_detection_position", "_false_tracks", "_goal", "_obstacle_range",
+)  # fmt: skip
+"""Arrays with a row for each step."""
+
+
+class FlightLogBuilder:
+    """Of a flight of ``drones`` drones whose steps begin at ``times`` (S,) s; NaN where nothing is added."""
+
+    def __init__(self, times: FloatArray, drones: int) -> None:
+        steps, n, nan = len(times), drones, np.nan
+        self._times = times
+        self._position, self._velocity = np.full((steps, n, 3), nan), np.full((steps, n, 3), nan)
+        self._attitude = np.full((steps, n, 3, 3), nan)
+        self._desired = np.full((steps, 2), nan)
+        self._goal = np.full((steps, 2), nan)
+        self._command_velocity, self._command_acceleration = np.full((steps, n, 2), nan), np.full((steps, n, 2), nan)
+        self._ego_rotation, self._ego_translation = np.full((steps, n, 3, 3), nan), np.full((steps, n, 3), nan)
+        self._ego_inlier_ratio = np.full((steps, n), nan)
+        self._own_velocity = np.full((steps, n, 3), nan)
+        self._neighbour_position, self._neighbour_velocity = (np.full((steps, n, n, 3), nan) for _ in range(2))
+        self._detection_position = np.full((steps, n, n, 3), nan)
+        self._obstacle_range = np.full((steps, n, SECTORS), nan)
+        self._false_tracks = np.zeros((steps, n), np.int64)
+        self._false_so_far: list[set[int]] = [set() for _ in range(n)]
+        self._tracked: list[tuple[float, ...]] = []
+        self._stages: dict[str, list[float]] = {}
+        self._mission_over = [False] * n
+
+    def add_truth(self, step: int, position: FloatArray, velocity: FloatArray, R_ned_body: FloatArray) -> None:
+        """True states of all drones as a step begins: (N, 3) m and (N, 3) m/s NED, (N, 3, 3).
+
+        Call it before `add_output` of the same step, which matches estimates to it.
+        """
+        self._position[step], self._velocity[step], self._attitude[step] = position, velocity, R_ned_body
+
+    @property
+    def true_path(self) -> tuple[FloatArray, FloatArray]:
+        """Positions (S, N, 3) m and velocities (S, N, 3) m/s NED: of a flight on exact states its own companion."""
+        return self._position, self._velocity
+
+    def add_missions(
+        self, step: int, desired: FloatArray, missions: Sequence[MissionStatus | None], homes: FloatArray | None = None
+    ) -> None:
+        """What each drone's mission wants, (n, 2) m/s, and how far it is.
+
+        `homes` (n, 2) are metres north and east from which the drones' goals count; None: all from the origin. A drone
+        whose mission was over in an earlier step has no goal any more. Call it in order of the steps.
+        """
+        same = (desired == desired[0]).all()
+        self._desired[step] = desired[0] if same else desired.mean(axis=0)
+        goals = [
+            tuple(np.round(mission.goal + (0.0 if homes is None else homes[i]), 3).tolist())
+            for i, mission in enumerate(missions)
+            if mission is not None and mission.goal is not None and not self._mission_over[i]
+        ]
+        for i, mission in enumerate(missions):
+            self._mission_over[i] |= mission is not None and mission.takeover is not None
+        if goals:
+            self._goal[step] = Counter(goals).most_common(1)[0][0]
+
+    def add_obstacles(self, step: int, i: int, seen: ObstacleRanges) -> None:
+        """What drone ``i`` knew of them."""
+        self._obstacle_range[step, i] = np.where(seen.seen_m > 0, seen.range_m, np.nan)
+
+    def add_exact_states(
+        self, step: int, i: int, others: BoolArray, relative: FloatArray, velocities: FloatArray,
+        command: FloatArray, acceleration: FloatArray,
+    ) -> None:  # fmt: skip
+        """What drone ``i`` was given of the others in a flight with exact states, and its command.
+
+        ``others`` (N,) is true for those that ``relative`` (N - 1, 3) m NED are of; ``velocities`` (N, 3) m/s NED.
+        """
+        self._neighbour_position[step, i, others] = relative
+        self._neighbour_velocity[step, i, others] = velocities[others]
+        self._own_velocity[step, i] = velocities[i]
+        self._command_velocity[step, i], self._command_acceleration[step, i] = command, acceleration
+
+    def add_output(
+        self, step: int, i: int, output: PilotOutput, R_ned_body: FloatArray, stages_ms: Mapping[str, float]
+    ) -> None:
+        """What the pilot of drone ``i`` estimated and commanded, with the attitude (3, 3) from its autopilot."""
+        if np.isfinite(self._position[step]).all():
+            self._match(step, i, output, R_ned_body)
+        for neighbour in output.neighbours:
+            if neighbour.confirmed:
+                self._tracked.append((float(step), float(i), float(neighbour.track), *neighbour.position.tolist()))
+        if output.obstacles is not None:
+            self.add_obstacles(step, i, output.obstacles)
+        ego = output.ego_motion
+        if ego is not None:
+            self._ego_rotation[step, i], self._ego_translation[step, i] = ego.rotation, ego.translation
+            self._ego_inlier_ratio[step, i] = ego.inliers / ego.pairs
+        if output.velocity is not None:
+            self._own_velocity[step, i] = output.velocity
+        self._command_velocity[step, i] = output.command.velocity
+        self._command_acceleration[step, i] = output.command.acceleration
+        for stage, ms in stages_ms.items():
+            self._stages.setdefault(stage, []).append(ms)
+
+    def _match(self, step: int, i: int, output: PilotOutput, R_ned_body: FloatArray) -> None:
+        """Match confirmed tracks and detections to true drones; confirmed tracks without a match are false."""
+        others = [j for j in range(self._position.shape[1]) if j != i]
+        true = self._position[step, others] - self._position[step, i]
+        confirmed = [n for n in output.neighbours if n.confirmed]
+        tracked = np.array([n.position for n in confirmed]).reshape(-1, 3)
+        matches = match_neighbours(tracked, true)
+        for estimate, truth in matches:
+            self._neighbour_position[step, i, others[truth]] = confirmed[estimate].position
+            self._neighbour_velocity[step, i, others[truth]] = confirmed[estimate].velocity
+        matched = {estimate for estimate, _ in matches}
+        false = {n.track for k, n in enumerate(confirmed) if k not in matched} - self._false_so_far[i]
+        self._false_so_far[i] |= false
+        self._false_tracks[step, i] = len(false)
+        detected = np.array([R_ned_body @ s.position for s in output.detections]).reshape(-1, 3)
+        for estimate, truth in match_neighbours(detected, true):
+            self._detection_position[step, i, others[truth]] = detected[estimate]
+
+    def cut(self, steps: int) -> None:
+        """Leaves only the first ``steps`` steps: the flight ended there."""
+        for name in _BY_STEP:
+            setattr(self, name, getattr(self, name)[:steps])
+        self._tracked = [row for row in self._tracked if row[0] < steps]
+
+    def build(self, metadata: FlightMetadata, companion: tuple[FloatArray, FloatArray] | None) -> FlightLog:
+        """The log, with positions and velocities (S, N, 3) of the companion with exact states, if there is one."""
+        drones = self._position.shape[1]
+        truth_position, truth_velocity = companion or (np.zeros((0, drones, 3)), np.zeros((0, drones, 3)))
+        looked = not np.isnan(self._obstacle_range).all()
+        return FlightLog(
+            time_s=self._times, position=self._position, velocity=self._velocity, attitude=self._attitude,
+            desired=self._desired, command_velocity=self._command_velocity,
+            command_acceleration=self._command_acceleration, ego_rotation=self._ego_rotation,
+            ego_translation=self._ego_translation, ego_inlier_ratio=self._ego_inlier_ratio,
+            own_velocity_estimate=self._own_velocity, neighbour_position=self._neighbour_position,
+            neighbour_velocity=self._neighbour_velocity, detection_position=self._detection_position,
+            false_tracks=self._false_tracks, truth_position=truth_position, truth_velocity=truth_velocity,
+            stages_ms={stage: np.array(ms) for stage, ms in self._stages.items()}, metadata=metadata,
+            tracked=np.array(self._tracked).reshape(-1, 6), goal=self._goal,
+            obstacle_range=self._obstacle_range if looked else np.zeros((0, 0, 0)),
+        )  # fmt: skip

@@ -1,0 +1,216 @@
+"""The log and the key frames of a fleet's flight, from the simulator's truth and the daemons' recordings."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from flockd import __version__
+from flockd.core.config import DroneConfig
+from flockd.core.config.flocking import FlockingParameters
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.messages import FloatArray, MissionStatus, PilotOutput
+from flockd.flight.flocking.metrics import order, union
+from flockd.flight.mission.circle_then_tangent import desired_of
+from flockd.flight.perception import load_networks
+from flockd.flight.pilot import FlockPilot, StepTrace
+from flockd.onboard.recording.codec import from_json
+from flockd.onboard.recording.mcap_file import Entry, read_records
+from flockd.onboard.recording.reader import Recording
+from flockd.onboard.recording.streams import OUTPUT, VEHICLE
+from flockd.review.flight_log.builder import FlightLogBuilder
+from flockd.review.flight_log.capture import capture, key_frame_steps
+from flockd.review.flight_log.key_frames import KeyFrame
+from flockd.review.flight_log.log import FlightLog
+from flockd.review.flight_log.metadata import FleetMetadata, FlightMetadata, MissionMetadata, Percentiles
+
+END_OF_FLIGHT_S = 20.0
+"""Over which order and union at the end are averaged."""
+KEY_FRAME_DRONE = 0
+
+
+@dataclass(frozen=True, eq=False)
+class FleetFrame:
+    """One frame set of every drone, rendered at one time, and the true state of the flock of n drones then."""
+
+    time_s: float
+    """On the simulated clock: the time stamp of all its frames."""
+    position: FloatArray
+    """(n, 3) m NED."""
+    velocity: FloatArray
+    """(n, 3) m/s NED."""
+    R_ned_body: FloatArray
+    """(n, 3, 3)"""
+    delay_s: float
+    """Simulated seconds until the last drone had its frames."""
+
+
+@dataclass
+class FleetRun:
+    """What the simulator measures while a fleet flies."""
+
+    began_s: float
+    began: str = ""
+    """Wall time, ISO 8601."""
+    interrupted: bool = False
+    ended_s: float = 0.0
+    wall_s: float = 0.0
+    frames: tuple[FleetFrame, ...] = ()
+    cores: dict[str, float] = field(default_factory=dict)
+    """How many processor cores each kind of program kept busy."""
+    handed_over: dict[str, str] = field(default_factory=dict)
+    """Why a drone did not fly to the end, by its name; also where its mission ends so."""
+    modes: dict[str, list[str]] = field(default_factory=dict)
+    """The flight modes of each autopilot, in order, by its drone's name."""
+    autopilot: str = ""
+    clock_rates: list[float] = field(default_factory=list)
+    """Seconds of each autopilot's clock in one of the simulation's."""
+    exit_codes: dict[str, int] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+def fleet_log(
+    scenario: ScenarioConfig,
+    configs: Sequence[DroneConfig],
+    run: FleetRun,
+    recordings: Path,
+    speed_factor: float,
+    companion: tuple[FloatArray, FloatArray],
+) -> FlightLog:
+    """The flight's log: the simulator's truth, and what the daemons recorded of their pilots.
+
+    ``companion`` holds positions and velocities (S, N, 3) of the same flight on exact states, at the S frames' times.
+    """
+    frames, drone = run.frames, configs[0]
+    begin_s = frames[0].time_s
+    times = np.array([frame.time_s - begin_s for frame in frames])
+    builder = FlightLogBuilder(times, len(scenario.vehicles))
+    for row, frame in enumerate(frames):
+        builder.add_truth(row, frame.position, frame.velocity, frame.R_ned_body)
+    rows = {frame.time_s: row for row, frame in enumerate(frames)}
+    flown = [i for i, vehicle in enumerate(scenario.vehicles) if not vehicle.by_hand]
+    statuses: list[dict[int, MissionStatus | None]] = [{} for _ in frames]
+    processed: dict[str, int] = {}
+    over: set[str] = set()
+    longest_s, spanning = 0.0, 0
+    for i, config in zip(flown, configs, strict=True):
+        steps = [(rows[o.time_s], o, R) for o, R in _outputs(recordings, config.name) if o.time_s in rows]
+        for before, (row, output, R_ned_body) in zip([None, *steps], steps, strict=False):
+            spans_more = False
+            if before is not None:
+                longest_s = max(longest_s, float(times[row] - times[before[0]]))
+                spans_more = row - before[0] != 1 and output.ego_motion is not None
+                spanning += spans_more
+            # The log compares a motion with the truth of one frame set before: it cannot take one that spans more.
+            kept = replace(output, ego_motion=None) if spans_more else output
+            builder.add_output(row, i, kept, R_ned_body, output.stages_ms)
+            statuses[row][i] = output.mission
+            if output.mission is not None and output.mission.takeover is not None:
+                over.add(config.name)
+        processed[config.name] = len(steps)
+    _add_missions(builder, scenario, frames, times, statuses)
+    metadata = FlightMetadata.of_configuration(
+        drone,
+        scenario=scenario.scenario,
+        drones=len(scenario.vehicles),
+        mission=MissionMetadata.of(scenario),
+        duration_s=float(times[-1]) + drone.step_s if run.interrupted else scenario.duration_s,
+        interrupted=run.interrupted,
+        began=run.began or None,
+        version=__version__,
+        seed=scenario.seed,
+        perception="learned",
+        wall_s=run.wall_s,
+        autopilot=run.autopilot,
+        fleet=_metadata(run, times, drone.flocking, speed_factor, processed, longest_s, spanning, over),
+    )
+    return builder.build(metadata, companion)
+
+
+def _add_missions(
+    builder: FlightLogBuilder, scenario: ScenarioConfig, frames: Sequence[FleetFrame], times: FloatArray,
+    statuses: Sequence[Mapping[int, MissionStatus | None]],
+) -> None:  # fmt: skip
+    """What each drone wanted at each frame; where its pilot left one out, what it wanted before.
+
+    Of one that is flown by hand nobody knows more than how it flew.
+    """
+    vehicles = range(len(scenario.vehicles))
+    homes = np.array([vehicle.position_m[:2] for vehicle in scenario.vehicles])
+    missions = [scenario.drone_of(i).mission for i in vehicles]
+    newest: dict[int, MissionStatus | None] = {}
+    for row, (frame, found) in enumerate(zip(frames, statuses, strict=True)):
+        newest |= found
+        desired = [
+            frame.velocity[i, :2]
+            if scenario.vehicles[i].by_hand
+            else desired_of(missions[i], float(times[row]), newest[i])
+            if i in newest
+            else np.zeros(2)
+            for i in vehicles
+        ]
+        builder.add_missions(row, np.array(desired), [newest.get(i) for i in vehicles], homes)
+
+
+def _metadata(
+    run: FleetRun, times: FloatArray, flocking: FlockingParameters, speed_factor: float,
+    processed: dict[str, int], longest_step_s: float, spanning: int, over: Set[str],
+) -> FleetMetadata:  # fmt: skip
+    delays_s = [frame.delay_s for frame in run.frames]
+    position = np.array([frame.position[:, :2] for frame in run.frames])
+    velocity = np.array([frame.velocity[:, :2] for frame in run.frames])
+    end = np.flatnonzero(times >= times[-1] - END_OF_FLIGHT_S)
+    return FleetMetadata(
+        speed_factor=speed_factor,
+        cores={name: round(cores, 3) for name, cores in run.cores.items()},
+        frame_sets=len(run.frames),
+        frame_sets_looked_at=processed,
+        longest_step_s=longest_step_s,
+        motions_over_more_than_one_frame_set=spanning,
+        frames_late_s=Percentiles(p50=float(np.percentile(delays_s, 50)), p95=float(np.percentile(delays_s, 95))),
+        autopilot_clock_rates=[round(rate, 4) for rate in run.clock_rates],
+        order_last_20s=float(np.mean([order(velocity[s]) for s in end])),
+        union_last_20s=float(np.mean([union(position[s], flocking.observation_distance_m) for s in end])),
+        handed_over={name: why for name, why in run.handed_over.items() if name not in over},
+        mission_over={name: why for name, why in run.handed_over.items() if name in over},
+        modes=run.modes,
+        exit_codes=run.exit_codes,
+        notes=run.notes,
+    )
+
+
+def _outputs(recordings: Path, drone: str) -> Iterator[tuple[PilotOutput, FloatArray]]:
+    """The output of one drone's pilot in each step of its flight, and the attitude (3, 3) from its autopilot."""
+    for path in sorted(recordings.glob(f"{drone}-*.mcap")):
+        outputs: dict[int, PilotOutput] = {}
+        attitudes: dict[int, FloatArray] = {}
+        for record in read_records(path):
+            if isinstance(record, Entry) and record.stream.topic == OUTPUT.topic:
+                outputs[record.sequence] = from_json(PilotOutput, json.loads(record.data))
+            elif isinstance(record, Entry) and record.stream.topic == VEHICLE.topic:
+                attitudes[record.sequence] = np.reshape(json.loads(record.data)["R_ned_body"], (3, 3))
+        yield from ((outputs[step], attitudes[step]) for step in sorted(outputs.keys() & attitudes.keys()))
+
+
+def fleet_key_frames(recordings: Path, run: FleetRun) -> tuple[KeyFrame, ...]:
+    """Key frames of one drone, computed again: a fresh pilot for each, with two frame sets of the recording."""
+    drone = f"drone{KEY_FRAME_DRONE + 1}"
+    path = min(recordings.glob(f"{drone}-*.mcap"), default=None)
+    if path is None:
+        return ()
+    recording = Recording(path)
+    networks = load_networks(recording.config.perception)
+    times = [time_s for _, time_s in recording.contents.steps]
+    key_frames: list[KeyFrame] = []
+    for index in sorted(key_frame_steps(len(times))):
+        pilot = FlockPilot(recording.config, networks)
+        for step in recording.steps(times[max(index - 1, 0)], times[index]):
+            trace = StepTrace()
+            output = pilot.step(step.frames, step.vehicle, trace, step.order)
+        begin_s = run.frames[0].time_s
+        key_frames += (replace(one, time_s=one.time_s - begin_s) for one in capture(trace, output, KEY_FRAME_DRONE))
+    return tuple(key_frames)

@@ -1,0 +1,162 @@
+"""The log of a flight: what was true, what was estimated and what was commanded, step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flockd.core.messages import BoolArray, FloatArray, IntArray
+from flockd.review.flight_log.metadata import FlightMetadata
+
+_STAGE_PREFIX = "stage "
+_LEFT_AWAY = ("goal", "obstacles", "clearance", "obstacle_range")
+"""From the file, where they are empty."""
+
+
+@dataclass(frozen=True, eq=False)
+class FlightLog:
+    """S steps of N drones; NaN where there was no estimate, and where the truth is not known.
+
+    A drone that was not recorded in a step has no command in it. Raises ValueError for shapes that do not fit together.
+    """
+
+    time_s: FloatArray
+    """(S,) since the flight's start, when each step began."""
+    position: FloatArray
+    """(S, N, 3) m NED, true."""
+    velocity: FloatArray
+    """(S, N, 3) m/s NED, true."""
+    attitude: FloatArray
+    """(S, N, 3, 3) R_ned_body, true."""
+    desired: FloatArray
+    """(S, 2) m/s, the flock's desired velocity: the mean of its drones', each times its pull."""
+    command_velocity: FloatArray
+    """(S, N, 2) m/s, the setpoint of each step."""
+    command_acceleration: FloatArray
+    """(S, N, 2) m/s^2, u of Eq. 38 after its limit."""
+    ego_rotation: FloatArray
+    """(S, N, 3, 3) R_FC as estimated over the interval that ended with the step (Eq. 7)."""
+    ego_translation: FloatArray
+    """(S, N, 3) m, T_FC likewise, in body axes of the interval's start."""
+    ego_inlier_ratio: FloatArray
+    """(S, N) share of the background pairs that Algorithm 1 kept."""
+    own_velocity_estimate: FloatArray
+    """(S, N, 3) m/s NED, what the flocking law took for the own velocity."""
+    neighbour_position: FloatArray
+    """(S, N, N, 3) m NED: [s, i, j] is drone j relative to drone i by i's confirmed track of it."""
+    neighbour_velocity: FloatArray
+    """(S, N, N, 3) m/s NED over ground, likewise."""
+    detection_position: FloatArray
+    """(S, N, N, 3) m NED: as `neighbour_position`, of the single frame set before tracking."""
+    false_tracks: IntArray
+    """(S, N) confirmed tracks that match no true drone and did not count before."""
+    truth_position: FloatArray
+    """(S2, N, 3) m NED of the same scenario flown with exact states, same time base; S2 is S, or 0
+    without one."""
+    truth_velocity: FloatArray
+    """(S2, N, 3) m/s NED, likewise."""
+    stages_ms: Mapping[str, FloatArray]
+    """(K,) duration of each run of each stage."""
+    metadata: FlightMetadata
+    tracked: FloatArray = field(default_factory=lambda: np.zeros((0, 6)))
+    """(K, 6) each confirmed track at each step: step, observer, track, and metres north, east and down of it."""
+
+    goal: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    """(S, 2) m north and east: where most drones that have a goal want to go, to the millimetre; NaN without
+    one; (0, 2) in logs from before there were goals."""
+    obstacles: FloatArray = field(default_factory=lambda: np.zeros((0, 7)))
+    """(K, 7) each solid from above: metres north and east of its middle, half its length and width, the heading of its
+    length (rad), and its lowest and highest height above z = 0. A round one has its radius as half length, and half
+    width 0."""
+    clearance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    """(S, N) m, the smallest distance of a drone's centre from an obstacle's surface from the step to the next, inside
+    negative; (0, 0) without obstacles."""
+    obstacle_range: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    """(S, N, n) m, `ObstacleRanges.range_m` as each drone knew them; NaN where it did not look; (0, 0, 0) if none
+    did."""
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether it is known where the drones truly were."""
+        return bool(np.isfinite(self.position).all())
+
+    @property
+    def recorded(self) -> BoolArray:
+        """(S, N): which drones' steps are in it."""
+        return np.asarray(np.isfinite(self.command_velocity).all(axis=2))
+
+    @property
+    def companion(self) -> tuple[FloatArray, FloatArray] | None:
+        """Positions and velocities (S, N, 3) of the companion with exact states.
+
+        None without one, and of a flight that flew on exact states itself.
+        """
+        if not len(self.truth_position) or not self.metadata.by_sight:
+            return None
+        return self.truth_position, self.truth_velocity
+
+    def __post_init__(self) -> None:
+        steps, drones = self.position.shape[:2]
+        sectors = self.obstacle_range.shape[-1]
+        companion = steps if len(self.truth_position) else 0
+        state, seen = (steps, drones, 3), (steps, drones, drones, 3)
+        expected: dict[str, tuple[int, ...]] = {
+            "time_s": (steps,),
+            "position": state,
+            "velocity": state,
+            "attitude": (*state, 3),
+            "desired": (steps, 2),
+            "command_velocity": (steps, drones, 2),
+            "command_acceleration": (steps, drones, 2),
+            "ego_rotation": (*state, 3),
+            "ego_translation": state,
+            "ego_inlier_ratio": (steps, drones),
+            "own_velocity_estimate": state,
+            "neighbour_position": seen,
+            "neighbour_velocity": seen,
+            "detection_position": seen,
+            "false_tracks": (steps, drones),
+            "goal": (steps if len(self.goal) else 0, 2),
+            "obstacles": (len(self.obstacles), 7),
+            "clearance": (steps, drones) if len(self.clearance) else (0, 0),
+            "obstacle_range": (steps, drones, sectors) if len(self.obstacle_range) else (0, 0, 0),
+            "truth_position": (companion, drones, 3),
+            "truth_velocity": (companion, drones, 3),
+        }
+        for name, shape in expected.items():
+            have = getattr(self, name).shape
+            if have != shape:
+                raise ValueError(f"{name} of a flight of {steps} steps and {drones} drones is {have}, not {shape}")
+
+    def save(self, path: Path) -> None:
+        """Write one compressed `.npz`."""
+        arrays: dict[str, Any] = {
+            part.name: getattr(self, part.name) for part in fields(self) if part.name not in ("stages_ms", "metadata")
+        }
+        for name in _LEFT_AWAY:
+            if not len(arrays[name]):
+                del arrays[name]
+        arrays |= {_STAGE_PREFIX + stage: samples for stage, samples in self.stages_ms.items()}
+        with path.open("wb") as file:
+            np.savez_compressed(file, **arrays, meta=self.metadata.model_dump_json(exclude_unset=True))
+
+    @classmethod
+    def load(cls, path: Path) -> FlightLog:
+        """Read what `save` wrote. Raises OSError, or ValueError where the file is not a flight log."""
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        stages = {
+            name.removeprefix(_STAGE_PREFIX): arrays.pop(name)
+            for name in list(arrays)
+            if name.startswith(_STAGE_PREFIX)
+        }
+        needed = {part.name for part in fields(cls) if part.default_factory is MISSING}
+        missing = needed - {"stages_ms", "metadata"} - arrays.keys() | ({"meta"} - arrays.keys())
+        if missing:
+            raise ValueError(f"{path} is not a flight log: it has no {', '.join(sorted(missing))}")
+        metadata = FlightMetadata.model_validate_json(str(arrays.pop("meta")))
+        return cls(**arrays, stages_ms=stages, metadata=metadata)

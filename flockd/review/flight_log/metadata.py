@@ -1,0 +1,147 @@
+"""Metadata of a flight: what was flown, with what, for how long."""
+
+from __future__ import annotations
+
+from typing import Any, Final, Self
+
+from pydantic import BaseModel, ConfigDict
+
+from flockd.core.config import DroneConfig
+from flockd.core.config.scenario import ScenarioConfig
+
+EXACT_STATES: Final = "truth"
+"""`FlightMetadata.perception` of a flight whose drones were given the others' true states."""
+
+
+_FROZEN = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="constants")
+
+
+class Percentiles(BaseModel):
+    """Of a set of durations."""
+
+    model_config = _FROZEN
+
+    p50: float
+    p95: float
+
+
+class FleetMetadata(BaseModel):
+    """How a fleet of real daemons flew with the simulator."""
+
+    model_config = _FROZEN
+
+    speed_factor: float
+    """How fast simulated time passed."""
+    cores: dict[str, float]
+    """How many processor cores each kind of program kept busy."""
+    frame_sets: int
+    """Rendered for each drone."""
+    frame_sets_looked_at: dict[str, int]
+    """Processed by each drone's pilot, by its name."""
+    longest_step_s: float
+    motions_over_more_than_one_frame_set: int
+    """Ego-motions that are not in the log, as the pilot had skipped a frame set."""
+    frames_late_s: Percentiles
+    """Simulated seconds until the last drone had its frames."""
+    autopilot_clock_rates: list[float]
+    """Seconds of each autopilot's clock in one of the simulation's."""
+    order_last_20s: float
+    union_last_20s: float
+    handed_over: dict[str, str]
+    """Why a drone did not fly to the end, by its name."""
+    mission_over: dict[str, str] = {}
+    """When a drone's autopilot took over as its mission was over, by the drone's name."""
+    modes: dict[str, list[str]] = {}
+    """The flight modes of each autopilot, in order, by the drone's name."""
+    exit_codes: dict[str, int]
+    """Of the daemons, by the drone's name."""
+    notes: list[str]
+
+
+class MissionMetadata(BaseModel):
+    """Where the drones of a flight wanted to go."""
+
+    model_config = _FROZEN
+
+    kind: str
+    """Of the missions, by name, each once."""
+    reached_m: float
+    """How near to a goal the flock's middle has to come."""
+
+    @classmethod
+    def of(cls, scenario: ScenarioConfig) -> Self:
+        """Of all vehicles of a scenario."""
+        vehicles = range(len(scenario.vehicles))
+        kinds = [
+            f"{scenario.drone_of(i).mission.kind}{' by hand' if scenario.vehicles[i].by_hand else ''}" for i in vehicles
+        ]
+        reached_m = max(scenario.drone_of(i).mission.reached_m for i in vehicles)
+        return cls(kind=", ".join(dict.fromkeys(kinds)), reached_m=reached_m)
+
+
+class FlightMetadata(BaseModel):
+    """What was flown. A key that a flight log has no value for is left out of its file."""
+
+    model_config = _FROZEN
+
+    scenario: str
+    """Its name; of a recording that names none, the drone's."""
+    perception: str
+    """`learned`, `learned, true flow` with roles replaced by the truth, or `EXACT_STATES`."""
+    flow: str
+    """Which network or method; `truth` or `none` where there was none."""
+    scale: str
+    """Where metric scale came from."""
+    drones: int
+    duration_s: float
+    step_s: float
+    circle_until_s: float
+    desired_distance_m: float
+    observation_distance_m: float
+    separation_distance_m: float
+    seed: int | None = None
+    """Of the scenario; None where a recording does not hold it."""
+    wall_s: float | None = None
+    """How long the simulation took; None of a recording."""
+    autopilot: str | None = None
+    """What real daemons flew; None where there were no daemons."""
+    fleet: FleetMetadata | None = None
+    names: list[str] | None = None
+    """Of all drones, in the log's order; None where they are drone1, drone2, ..."""
+    recorded: list[str] | None = None
+    """Drones whose recordings the log was made of; None of a log that a simulator wrote."""
+    began: str | None = None
+    """Wall time, ISO 8601, at which the flight, or its first recording, was begun."""
+    version: str | None = None
+    """Of flockd."""
+    interrupted: bool = False
+    """It was ended before its time; `duration_s` is what was flown."""
+    mission: MissionMetadata | None = None
+    """None in logs from before there were missions."""
+    drone_radius_m: float | None = None
+    """Of the sphere that holds a drone; None where there is nothing to collide with."""
+    clock_at_start_s: float | None = None
+    """Time of the recordings' clock at the log's 0 s."""
+
+    @classmethod
+    def of_configuration(cls, config: DroneConfig, **facts: Any) -> Self:
+        """Of a flight with this configuration of its drones. ``facts`` are all other fields, and override its own.
+
+        Raises ValueError (pydantic's ValidationError) for facts that are missing, unknown or of another type.
+        """
+        configured = {
+            "flow": config.perception.flow,
+            "scale": config.perception.scale,
+            "step_s": config.step_s,
+            "circle_until_s": config.mission.circle_until_s if config.mission.kind == "circle_then_tangent" else 0.0,
+            "mission": MissionMetadata(kind=config.mission.kind, reached_m=config.mission.reached_m),
+            "desired_distance_m": config.flocking.desired_distance_m,
+            "observation_distance_m": config.flocking.observation_distance_m,
+            "separation_distance_m": config.flocking.separation_distance_m,
+        }
+        return cls.model_validate({**configured, **facts})
+
+    @property
+    def by_sight(self) -> bool:
+        """Whether the drones found each other with their cameras."""
+        return self.perception != EXACT_STATES

@@ -1,0 +1,166 @@
+"""Replays a recorded flight: the same frames and vehicle states, through the same pilot."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from flockd.core.config import DroneConfig
+from flockd.core.config.recording import RecordingConfig
+from flockd.flight.inference.hashes import model_hashes
+from flockd.flight.pilot import FlockPilot
+from flockd.onboard.recording import Recorder, RecordingError
+from flockd.onboard.recording.codec import to_json
+from flockd.onboard.recording.difference import Comparison, compare
+from flockd.onboard.recording.editing import written_whole
+from flockd.onboard.recording.reader import RecordedStep, Recording
+from flockd.onboard.recording.streams import REPLAYED
+
+Outputs = Mapping[int, Mapping[str, Any]]
+"""The pilot's outputs as JSON, by step number."""
+
+
+@dataclass
+class Replay:
+    """The outputs of a replay beside the recorded ones, and how long it took."""
+
+    outputs: dict[int, Mapping[str, Any]] = field(default_factory=dict)
+    recorded: dict[int, Mapping[str, Any]] = field(default_factory=dict)
+    times_s: list[float] = field(default_factory=list)
+    """Of each step's frames."""
+    reading_s: float = 0.0
+    computing_s: float = 0.0
+    stages_ms: dict[str, list[float]] = field(default_factory=dict)
+
+
+def replay_flight(
+    recording: Recording,
+    config: DroneConfig,
+    start_s: float,
+    end_s: float,
+    *,
+    speed: float = 0.0,
+    out: Path | None = None,
+    progress: Callable[[int, int], None],
+) -> Replay:
+    """Runs a new pilot over the recorded steps.
+
+    Args:
+        recording: of any drone.
+        config: the settings to fly with, for the recording's cameras.
+        start_s: first time, on the recording's clock.
+        end_s: last time.
+        speed: times real time; 0: as fast as possible.
+        out: a new recording of the replay; None: none.
+        progress: called with the steps done and their total.
+
+    Raises RecordingError when ``out`` cannot be written, ModelError.
+    """
+    pilot = FlockPilot(config, stopwatch=time.perf_counter)
+    total = sum(start_s <= step_s <= end_s for _, step_s in recording.contents.steps)
+    replay = Replay()
+    with ExitStack() as stack:
+        recorder = None if out is None else stack.enter_context(_recording_to(out, recording, config))
+        for step, read_s in _paced(recording.steps(start_s, end_s), speed):
+            begin_s = time.perf_counter()
+            output = pilot.step(step.frames, step.vehicle, order=step.order)
+            replay.computing_s += time.perf_counter() - begin_s
+            replay.reading_s += read_s
+            replay.times_s.append(step.frames.time_s)
+            replay.outputs[step.number] = to_json(output)
+            if step.output is not None:
+                replay.recorded[step.number] = step.output
+            for stage, ms in output.stages_ms.items():
+                replay.stages_ms.setdefault(stage, []).append(ms)
+            if recorder is not None:
+                recorder.drain()  # nothing waits for a replay, so nothing need be dropped
+                recorder.step(step.frames, step.vehicle, output, step.truth, step.order)
+            progress(len(replay.outputs), total)
+    return replay
+
+
+def compare_replay(
+    drone: str, replay: Replay, reference: Outputs | None, tolerances: Mapping[str, float], *, part_only: bool
+) -> Comparison:
+    """Compares with the reference, or, without one, with the recorded outputs of the replayed steps.
+
+    ``part_only``: only a part of the flight was replayed, so that further steps of the reference are not missing.
+    """
+    if reference is None:
+        found = {step: replay.outputs[step] for step in replay.recorded}
+        return compare(drone, replay.recorded, found, tolerances)
+    expected = {step: output for step, output in reference.items() if step in replay.outputs or not part_only}
+    return compare(drone, expected, replay.outputs, tolerances)
+
+
+def replay_result(
+    recording: Recording, replay: Replay, warnings: Sequence[str], comparison: Comparison | None
+) -> dict[str, Any]:
+    """The result of a replay as JSON, for `flockd replay --json`."""
+    duration_s = replay.times_s[-1] - replay.times_s[0]
+    spent_s = replay.reading_s + replay.computing_s
+    return {
+        "recording": str(recording.path),
+        "drone": recording.drone,
+        "steps": len(replay.outputs),
+        "duration_s": duration_s,
+        "realtime_factor": duration_s / spent_s,
+        "reading_share": replay.reading_s / spent_s,
+        "stages_ms": {stage: _spread(samples) for stage, samples in replay.stages_ms.items()},
+        "warnings": list(warnings),
+        "diff": None if comparison is None else _diff(comparison),
+    }
+
+
+def _spread(samples: Sequence[float]) -> dict[str, float]:
+    ordered = sorted(samples)
+    return {"median": ordered[len(ordered) // 2], "p95": ordered[int(0.95 * (len(ordered) - 1))]}
+
+
+def _diff(comparison: Comparison) -> dict[str, Any]:
+    return {
+        "equal": comparison.first is None,
+        "steps": comparison.steps,
+        "values": comparison.values,
+        "first": None if comparison.first is None else asdict(comparison.first),
+        "fields": {
+            name: {"steps": len(difference.steps), "largest": difference.largest}
+            for name, difference in comparison.fields.items()
+        },
+    }
+
+
+@contextmanager
+def _recording_to(out: Path, recording: Recording, config: DroneConfig) -> Iterator[Recorder]:
+    """A recorder whose file exists once all is written, and not otherwise: one file, without loss or quota."""
+    settings = RecordingConfig(images="png", file_mb=1e9, quota_mb=1e12)
+    flown = recording.contents.flight
+    facts = {**{name: flown[name] for name in ("scenario", "seed") if name in flown}, REPLAYED: recording.path.name}
+    models = model_hashes(config.perception)
+    with written_whole(out) as draft:
+        with Recorder(
+            draft, drone=recording.drone, config=config, settings=settings, models=models, facts=facts
+        ) as recorder:
+            yield recorder
+        if recorder.failure is not None:
+            raise RecordingError(f"{out}: could not be written ({recorder.failure}); choose another place with --out")
+
+
+def _paced(steps: Iterator[RecordedStep], speed: float) -> Iterator[tuple[RecordedStep, float]]:
+    """Each step not before its time, with how long it took to read."""
+    began_s, first_s = time.monotonic(), None
+    while True:
+        begin_s = time.perf_counter()
+        step = next(steps, None)
+        read_s = time.perf_counter() - begin_s
+        if step is None:
+            return
+        first_s = step.frames.time_s if first_s is None else first_s
+        if speed > 0:
+            due_s = began_s + (step.frames.time_s - first_s) / speed
+            time.sleep(max(0.0, due_s - time.monotonic()))
+        yield step, read_s

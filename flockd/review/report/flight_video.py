@@ -1,0 +1,255 @@
+"""A video of a flight: what one drone's cameras saw with what it detected, beside the flock from above."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from flockd.core.errors import UnavailableError, UsageError
+from flockd.core.messages import FloatArray, UInt8Array
+from flockd.review.flight_log.log import FlightLog
+from flockd.review.flight_log.moments import Moment, Outline
+from flockd.review.report.filmstrip import RIG_ORDER
+from flockd.review.report.style import FEW, colour_of
+
+CODECS = {".webm": "VP90", ".mp4": "vp09"}
+"""VP9 in both: free of royalties, in OpenCV's own build, and shown by every browser."""
+_PLATE, _PANEL, _INK, _MUTED = "#14181f", "#1c222b", "#e8ecf1", "#98a3b0"
+_HEAD_PX, _GAP_PX, _MAP_PX = 36, 6, 640
+"""Of the line above, between the parts, and each side of the map."""
+_TRAIL_S = 20.0
+_LEAST_REACH_M = 6.0
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+_SHIFT = 4
+"""Fractional bits of the pixels that OpenCV draws at."""
+Colour = tuple[int, int, int]
+"""RGB."""
+Progress = Callable[[int, int], None]
+
+
+def check_video_path(path: Path, *, force: bool) -> None:
+    """Raises UsageError for what cannot be written, or must not be."""
+    if path.suffix.lower() not in CODECS:
+        raise UsageError(f"{path}: a video's name ends in {' or '.join(CODECS)}; give it another")
+    if path.exists() and not force:
+        raise UsageError(f"{path} exists; name another file, or overwrite it with --force")
+    if not path.parent.is_dir():
+        raise UsageError(f"{path.parent} is not a folder; make it first")
+
+
+def write_video(
+    path: Path,
+    log: FlightLog,
+    drone: int,
+    moments: Iterable[Moment],
+    progress: Progress = lambda done, total: None,
+    *,
+    scale: float = 1.0,
+) -> int:
+    """Writes the video, a frame a step in real time, and gives the number of frames.
+
+    ``drone`` (from 0) is whose ``moments`` these are; ``scale`` makes the frames smaller. The file appears when it is
+    whole. Raises UnavailableError where OpenCV has no encoder.
+    """
+    draft = path.with_name(f".{path.stem}.part{path.suffix}")
+    plate, count, video = _Plate(log, drone), 0, None
+    try:
+        for moment in moments:
+            frame = _scaled(plate.draw(moment), scale)
+            video = video or _opened(draft, 1.0 / log.metadata.step_s, (frame.shape[1], frame.shape[0]))
+            video.write(np.ascontiguousarray(frame[..., ::-1]))
+            count += 1
+            progress(min(count, len(log.time_s)), len(log.time_s))
+        if video is None:
+            raise UsageError(f"{path} was not written, as the flight has no step; name another flight")
+        video.release()
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
+    return count
+
+
+def _scaled(image: UInt8Array, scale: float) -> UInt8Array:
+    """Both sides stay even, as encoders want them."""
+    if scale == 1.0:
+        return image
+    height, width = (2 * round(side * scale / 2) for side in image.shape[:2])
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _opened(path: Path, rate_hz: float, size: tuple[int, int]) -> cv2.VideoWriter:
+    code = cv2.VideoWriter_fourcc(*CODECS[path.suffix.lower()])  # type: ignore[attr-defined]
+    with _silent_stderr():
+        video = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, rate_hz, size)
+    if not video.isOpened():
+        raise UnavailableError(
+            f"{path.suffix}: this build of OpenCV cannot write VP9; install opencv-python-headless with pip"
+        )
+    return video
+
+
+@contextmanager
+def _silent_stderr() -> Iterator[None]:
+    """OpenCV complains there, past its own log level, that WebM has no tag for the codec, which it does not need."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+class _Plate:
+    """Everything that is the same in all frames."""
+
+    def __init__(self, log: FlightLog, drone: int) -> None:
+        self._log, self._drone = log, drone
+        self._known = bool(np.isfinite(log.position[:, drone]).any())
+        self._colours = [_rgb(colour_of(number, log.position.shape[1])) for number in range(log.position.shape[1])]
+        self._middle, self._reach_m = self._extent()
+
+    def draw(self, moment: Moment) -> UInt8Array:
+        """(h, w, 3) RGB; both sides are even."""
+        row = int(np.clip(np.searchsorted(self._log.time_s, moment.time_s - 1e-6), 0, len(self._log.time_s) - 1))
+        seen = _tiles(moment)
+        height = _HEAD_PX + _MAP_PX + _GAP_PX
+        width = seen.shape[1] + _MAP_PX + 3 * _GAP_PX
+        image = np.full((height + height % 2, width + width % 2, 3), _rgb(_PLATE), np.uint8)
+        image[_HEAD_PX : _HEAD_PX + _MAP_PX, _GAP_PX : _GAP_PX + seen.shape[1]] = seen
+        left = seen.shape[1] + 2 * _GAP_PX
+        image[_HEAD_PX : _HEAD_PX + _MAP_PX, left : left + _MAP_PX] = self._map(row)
+        names = self._log.metadata.names
+        name = names[self._drone] if names else f"drone {self._drone + 1}"
+        held = f"   images of {moment.taken_s:.1f} s" if moment.taken_s < moment.time_s - 1e-6 else ""
+        _write(image, (_GAP_PX + 2, 24), f"{_ascii(name)}   t = {moment.time_s:.1f} s{held}", _rgb(_INK), 0.6)
+        return image
+
+    def _extent(self) -> tuple[FloatArray, float]:
+        """Middle (2,) and half width in metres of what the map shows."""
+        plan = self._log.position[..., :2].reshape(-1, 2)
+        plan = plan[np.isfinite(plan).all(axis=1)]
+        if not len(plan):
+            tracked = self._log.tracked[self._log.tracked[:, 1] == self._drone, 3:5]
+            far_m = float(np.abs(tracked).max()) if len(tracked) else 0.0
+            return np.zeros(2), max(1.15 * far_m, _LEAST_REACH_M)
+        low, high = plan.min(axis=0), plan.max(axis=0)
+        return (low + high) / 2, max(0.56 * float((high - low).max()), _LEAST_REACH_M)
+
+    def _map(self, row: int) -> UInt8Array:
+        """The flock from above, north up, with the drone's tracks as rings."""
+        log, own = self._log, self._drone
+        image = np.full((_MAP_PX, _MAP_PX, 3), _rgb(_PANEL), np.uint8)
+        self._grid(image)
+        since = int(np.searchsorted(log.time_s, log.time_s[row] - _TRAIL_S))
+        for number, colour in enumerate(self._colours):
+            trail = log.position[since : row + 1, number, :2]
+            trail = trail[np.isfinite(trail).all(axis=1)]
+            if len(trail):
+                _line(image, self._pixels(trail), colour, 1)
+                _disc(image, self._pixels(trail[-1:])[0], colour)
+        origin = log.position[row, own, :2] if np.isfinite(log.position[row, own, :2]).all() else np.zeros(2)
+        here = self._pixels(origin[None])[0]
+        cv2.circle(image, *_at(here, 10), _rgb(_INK), 1, cv2.LINE_AA, _SHIFT)
+        if not self._known:
+            _disc(image, here, self._colours[own])
+        for track in log.tracked[(log.tracked[:, 0] == row) & (log.tracked[:, 1] == own)]:
+            place = self._pixels((origin + track[3:5])[None])[0]
+            cv2.circle(image, *_at(place, 7), _rgb(colour_of(int(track[2]), FEW)), 2, cv2.LINE_AA, _SHIFT)
+        command = log.command_velocity[row, own]
+        if np.isfinite(command).all():
+            _line(image, self._pixels(np.stack([origin, origin + 2.0 * command])), _rgb(_INK), 1)
+        told = "paths, tracks (rings), command (line, 2 s)" if self._known else "tracks around the drone, command"
+        _write(image, (8, _MAP_PX - 10), told, _rgb(_MUTED), 0.42)
+        return image
+
+    def _grid(self, image: UInt8Array) -> None:
+        step_m = next(step for step in (1, 2, 5, 10, 20, 50, 100, 200, 500, 10_000) if 2 * self._reach_m / step < 9)
+        for axis in (0, 1):
+            first = math.ceil((self._middle[axis] - self._reach_m) / step_m) * step_m
+            for at_m in np.arange(first, self._middle[axis] + self._reach_m, step_m):
+                ends = np.stack([self._middle - self._reach_m, self._middle + self._reach_m])
+                ends[:, axis] = at_m
+                _line(image, self._pixels(ends), (44, 52, 64), 1)
+        _write(image, (8, 20), f"north up, grid {step_m} m", _rgb(_MUTED), 0.42)
+
+    def _pixels(self, plan: FloatArray) -> FloatArray:
+        """(n, 2) across and down of (n, 2) metres north and east."""
+        scale = _MAP_PX / (2 * self._reach_m)
+        off = (plan - self._middle) * scale
+        return np.stack([_MAP_PX / 2 + off[:, 1], _MAP_PX / 2 - off[:, 0]], axis=1)
+
+
+def _tiles(moment: Moment) -> UInt8Array:
+    """All images, in reading order of a turn to the right; as high together as the map."""
+    cameras = sorted(moment.images, key=lambda name: RIG_ORDER.index(name) if name in RIG_ORDER else len(RIG_ORDER))
+    if not cameras:
+        return np.full((_MAP_PX, _MAP_PX, 3), _rgb(_PANEL), np.uint8)
+    across = math.ceil(math.sqrt(len(cameras)))
+    down = math.ceil(len(cameras) / across)
+    height = _MAP_PX // down
+    tiles = [_tile(moment.images[name], name, moment.outlines, height) for name in cameras]
+    width = max(tile.shape[1] for tile in tiles)
+    image = np.full((_MAP_PX, across * width, 3), _rgb(_PANEL), np.uint8)
+    for number, tile in enumerate(tiles):
+        top, left = number // across * height, number % across * width
+        image[top : top + height, left : left + tile.shape[1]] = tile
+    return image
+
+
+def _tile(image: UInt8Array, camera: str, outlines: Mapping[str, Iterable[Outline]], height: int) -> UInt8Array:
+    scale = height / image.shape[0]
+    size = (round(scale * image.shape[1]), height)
+    tile = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    for outline in outlines.get(camera, ()):
+        colour = _rgb(colour_of(outline.track, FEW)) if outline.track is not None else (255, 255, 255)
+        pixels = scale * outline.pixels
+        _line(tile, pixels, colour, 2)
+        name = "new" if outline.track is None else f"#{outline.track}"
+        caption = name if outline.range_m is None else f"{name} {outline.range_m:.1f} m"
+        wide = 8 * len(caption)
+        left = float(np.clip(pixels[:, 0].mean() - wide / 2, 2, max(size[0] - wide, 2)))
+        top = float(pixels[:, 1].min()) - 6
+        _write(tile, (round(left), round(top if top > 14 else pixels[:, 1].max() + 16)), caption, (255, 255, 255), 0.42)
+    _write(tile, (6, size[1] - 8), _ascii(camera), (255, 255, 255), 0.42)
+    return tile
+
+
+def _rgb(colour: str) -> Colour:
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+def _at(pixel: FloatArray, radius_px: float) -> tuple[tuple[int, int], int]:
+    """Centre and radius as OpenCV wants them, in parts of pixels."""
+    scale = 1 << _SHIFT
+    return (round(float(pixel[0] - 0.5) * scale), round(float(pixel[1] - 0.5) * scale)), round(radius_px * scale)
+
+
+def _disc(image: UInt8Array, pixel: FloatArray, colour: Colour) -> None:
+    cv2.circle(image, *_at(pixel, 5), colour, -1, cv2.LINE_AA, _SHIFT)
+
+
+def _line(image: UInt8Array, pixels: FloatArray, colour: Colour, thick: int) -> None:
+    points = np.round((pixels - 0.5) * (1 << _SHIFT)).astype(np.int32)
+    cv2.polylines(image, [points], isClosed=False, color=colour, thickness=thick, lineType=cv2.LINE_AA, shift=_SHIFT)
+
+
+def _write(image: UInt8Array, place: tuple[int, int], text: str, colour: Colour, size: float) -> None:
+    """With a dark rim, to be read on anything; ``place`` is the lower left corner."""
+    for across, down in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        cv2.putText(image, text, (place[0] + across, place[1] + down), _FONT, size, (0, 0, 0), 1, cv2.LINE_AA)
+    cv2.putText(image, text, place, _FONT, size, colour, 1, cv2.LINE_AA)
+
+
+def _ascii(text: str) -> str:
+    """The font has no other letters."""
+    return text.encode("ascii", "replace").decode()

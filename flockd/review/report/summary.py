@@ -1,0 +1,280 @@
+"""The figures of one flight: the paper's Tables 2 and 3, the flock, the tracked neighbours and the timings."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flockd.core.config.flocking import FlockingParameters
+from flockd.core.messages import BoolArray, FloatArray
+from flockd.flight.flocking.metrics import connectivity, min_distance, obj1, obj2, order, safety, union
+from flockd.review.flight_log.log import FlightLog
+
+TAIL_S = 10.0
+"""The end of a flight, over which the flock counts as converged."""
+CONVERGENCE_BAND = {"obj1": 0.05, "obj2": 0.2}
+"""How near to its tail mean a sum must stay to have converged."""
+RECALL_RANGE_M = 10.0
+SAME_GOAL_M = 1e-6
+NEAR_M = 1.0
+"""To an obstacle."""
+
+Json = dict[str, Any]
+
+
+def summarise(log: FlightLog) -> Json:
+    """All figures as plain JSON values; null where there is nothing to say.
+
+    `table2`: absolute errors over all drones, steps and seen neighbours, before and from `circle_until_s`. `table3`:
+    convergence of the companion with exact states ("truth") and of this flight ("vision"), null unless the flight goes
+    on for 10 s after the circle. `flock`: distances and `safety` between drone centres in three dimensions over all
+    steps; order, union and connectivity are horizontal means over the last 10 s, with the law's observation distance as
+    interaction distance. `neighbours`: the share of all drones within 10 m, at all steps, of which there was a
+    confirmed track, and new false tracks; of drones and steps that were recorded. A flight whose perception is "truth"
+    has no perception: its `neighbours` are null and it is itself Table 3's "truth". Of a recording without truth
+    (`has_truth`) all of these are null. `mission` is `mission_figures`, `obstacles` is `obstacle_figures`.
+    `own_account` needs no truth: the recorded drones' own estimates. `autopilot` names what real daemons flew, and
+    `fleet` holds their figures; null where the simulator ran the pilots.
+    """
+    metadata, value = log.metadata, log.metadata.model_dump()
+    return {
+        **{key: value[key] for key in _FROM_METADATA},
+        "has_truth": log.has_truth,
+        "realtime_factor": metadata.duration_s / metadata.wall_s if metadata.wall_s else None,
+        "table2": _table_2(log),
+        "table3": _table_3(log),
+        "flock": _flock(log),
+        "mission": mission_figures(log),
+        "obstacles": obstacle_figures(log),
+        "neighbours": _neighbours(log),
+        "own_account": _own_account(log),
+        "stages_ms": {
+            stage: {"p50": _finite(np.percentile(samples, 50)), "p95": _finite(np.percentile(samples, 95))}
+            for stage, samples in log.stages_ms.items()
+            if len(samples)
+        },
+    }
+
+
+_FROM_METADATA = (
+    "scenario", "perception", "flow", "scale", "drones", "duration_s", "step_s", "seed", "wall_s", "circle_until_s",
+    "desired_distance_m",
+    "recorded", "began", "version", "interrupted", "autopilot", "fleet",
+)  # fmt: skip
+
+
+def write_summary(summary: Json, path: Path) -> None:
+    """Write strict JSON; a NaN in it raises ValueError."""
+    path.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def estimation_errors(log: FlightLog) -> dict[str, FloatArray]:
+    """Signed errors by Table 2's columns: (S, N) of the ego-motion, (S, N, N) of the distance; NaN without estimate.
+
+    Translation in body axes C of the interval's start; the angles are the aerospace angles of R_est R_true^T; distance
+    is horizontal (d^ij of Eq. 39).
+    """
+    into_C = np.swapaxes(log.attitude[:-1], -1, -2)
+    true_rotation = into_C @ log.attitude[1:]
+    true_translation = (into_C @ np.diff(log.position, axis=0)[..., None])[..., 0]
+    rotation, translation = np.full_like(log.attitude, np.nan), np.full_like(log.position, np.nan)
+    rotation[1:] = log.ego_rotation[1:] @ np.swapaxes(true_rotation, -1, -2)
+    translation[1:] = log.ego_translation[1:] - true_translation
+    true_distance = np.linalg.norm(_relative_positions(log)[..., :2], axis=-1)
+    return {
+        "translation_x_m": translation[..., 0],
+        "translation_y_m": translation[..., 1],
+        "yaw_deg": np.degrees(np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0])),
+        "pitch_deg": -np.degrees(np.arcsin(np.clip(rotation[..., 2, 0], -1, 1))),
+        "roll_deg": np.degrees(np.arctan2(rotation[..., 2, 1], rotation[..., 2, 2])),
+        "distance_m": np.linalg.norm(log.neighbour_position[..., :2], axis=-1) - true_distance,
+    }
+
+
+def objective_sums(log: FlightLog, position: FloatArray, velocity: FloatArray) -> dict[str, FloatArray]:
+    """The sums of obj1 and obj2 over the flock at each step, (S,), of true states (S, N, 3) on the log's time base."""
+    parameters = _flocking(log)
+    circling = log.time_s < log.metadata.circle_until_s
+    plan, speed = position[..., :2], velocity[..., :2]
+    steps = range(len(plan))
+    return {
+        "obj1": np.array([obj1(speed[s], log.desired[s], circling=bool(circling[s])).sum() for s in steps]),
+        "obj2": np.array([obj2(plan[s], speed[s], parameters).sum() for s in steps]),
+    }
+
+
+def mission_figures(log: FlightLog) -> Json:
+    """Whether the flock's true middle is at its last goal at the end, since when, and how far away; null without one.
+
+    The end is that of the mission, where the autopilots land or return then, else that of the flight. `time_s`: the
+    first time that it was there, once that goal was the one to fly to.
+    """
+    mission = log.metadata.mission
+    figures: Json = {"kind": None if mission is None else mission.kind, "arrived": None, "time_s": None}
+    goals = np.flatnonzero(np.isfinite(log.goal).all(axis=1))
+    if mission is None or not len(goals) or not log.has_truth:
+        return {**figures, "final_error_m": None}
+    last = log.goal[goals[-1]]
+    away_m = np.linalg.norm(log.position[..., :2].mean(axis=1) - last, axis=1)
+    same = np.linalg.norm(log.goal - last, axis=1) <= SAME_GOAL_M
+    others = goals[~same[goals]]
+    since = others[-1] + 1 if len(others) else 0
+    there = np.flatnonzero((away_m <= mission.reached_m) & (np.arange(len(away_m)) >= since))
+    return {
+        **figures,
+        "arrived": bool(away_m[goals[-1]] <= mission.reached_m),
+        "time_s": float(log.time_s[there[0]]) if len(there) else None,
+        "final_error_m": float(away_m[goals[-1]]),
+    }
+
+
+def obstacle_figures(log: FlightLog) -> Json:
+    """How near the drones came to the obstacles; all null without any.
+
+    `collisions` counts each drone's contacts: from when the sphere around it touches an obstacle until it is free
+    again. `min_clearance_m` is the smallest distance from that sphere to an obstacle, inside negative, and
+    `time_within_1m_s` how long it was below 1 m, summed over the drones.
+    """
+    if not len(log.clearance) or log.metadata.drone_radius_m is None:
+        return dict.fromkeys(("collisions", "min_clearance_m", "time_within_1m_s"))
+    free_m = log.clearance - log.metadata.drone_radius_m
+    touching = np.vstack([np.zeros((1, free_m.shape[1]), dtype=bool), free_m < 0])
+    return {
+        "collisions": int((touching[1:] & ~touching[:-1]).sum()),
+        "min_clearance_m": float(free_m.min()),
+        "time_within_1m_s": float((free_m < NEAR_M).sum() * log.metadata.step_s),
+    }
+
+
+def _table_2(log: FlightLog) -> Json:
+    by_sight = np.full(len(log.time_s), log.metadata.by_sight)
+    circling = np.asarray(log.time_s < log.metadata.circle_until_s)
+    errors = estimation_errors(log)
+    return {
+        window: {column: _spread(np.abs(values[steps & by_sight])) for column, values in errors.items()}
+        for window, steps in (("before", circling), ("after", ~circling))
+    }
+
+
+def _spread(values: FloatArray) -> Json:
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return dict.fromkeys(("mean", "median", "p95", "max"))
+    return {
+        "mean": float(known.mean()),
+        "median": float(np.median(known)),
+        "p95": float(np.percentile(known, 95)),
+        "max": float(known.max()),
+    }
+
+
+def _table_3(log: FlightLog) -> Json:
+    totals: dict[str, dict[str, FloatArray]] = {}
+    if _is_settled(log):
+        totals["vision" if log.metadata.by_sight else "truth"] = objective_sums(log, log.position, log.velocity)
+        if log.metadata.by_sight and len(log.truth_position):
+            totals["truth"] = objective_sums(log, log.truth_position, log.truth_velocity)
+    return {
+        row: {name: _convergence(log, name, totals.get(row), totals.get("truth")) for name in CONVERGENCE_BAND}
+        for row in ("truth", "vision")
+    }
+
+
+def _convergence(
+    log: FlightLog, name: str, totals: dict[str, FloatArray] | None, truth: dict[str, FloatArray] | None
+) -> Json:
+    """From when on a sum stays near its tail mean (null: never), how much it still moves there, and how far from truth.
+
+    All null without `totals`.
+    """
+    if totals is None:
+        return {"time_s": None, "error": None, "shape_bias": None}
+    tail = _tail(log)
+    mean = totals[name][tail].mean()
+    off = np.abs(totals[name] - mean)
+    outside = np.flatnonzero(off > CONVERGENCE_BAND[name])
+    begin = outside[-1] + 1 if len(outside) else 0
+    return {
+        "time_s": float(log.time_s[begin]) if begin < len(log.time_s) else None,
+        "error": float(off[tail].mean()),
+        "shape_bias": None if truth is None else float(mean - truth[name][tail].mean()),
+    }
+
+
+_FLOCK = ("min_distance_m", "min_distance_after_10s_m", "order_tail", "union_tail", "connectivity_tail", "safety")
+
+
+def _flock(log: FlightLog) -> Json:
+    if not log.has_truth:
+        return dict.fromkeys(_FLOCK)
+    steps = range(len(log.time_s))
+    nearest = np.array([min_distance(log.position[s]) for s in steps])
+    tail = np.flatnonzero(_tail(log))
+    reach_m = log.metadata.observation_distance_m
+    return {
+        "min_distance_m": _finite(nearest.min(initial=np.inf)),
+        "min_distance_after_10s_m": _finite(nearest[log.time_s >= 10.0].min(initial=np.inf)),
+        "order_tail": _mean([order(log.velocity[s, :, :2]) for s in tail]),
+        "union_tail": _mean([union(log.position[s, :, :2], reach_m) for s in tail]),
+        "connectivity_tail": _mean([connectivity(log.position[s, :, :2], reach_m) for s in tail]),
+        "safety": _mean([safety(log.position[s]) for s in steps]),
+    }
+
+
+def _neighbours(log: FlightLog) -> Json:
+    if not (log.metadata.by_sight and log.has_truth):
+        return {"recall_within_10m": None, "false_per_drone_minute": None}
+    drones = log.position.shape[1]
+    distances = np.linalg.norm(_relative_positions(log), axis=-1)
+    near = (distances <= RECALL_RANGE_M) & ~np.eye(drones, dtype=bool) & log.recorded[..., None]
+    seen = np.asarray(np.isfinite(log.neighbour_position).all(axis=-1))
+    drone_minutes = log.recorded.sum() * log.metadata.step_s / 60
+    return {
+        "recall_within_10m": _mean(seen[near]),
+        "false_per_drone_minute": float(log.false_tracks.sum() / drone_minutes),
+    }
+
+
+def _own_account(log: FlightLog) -> Json:
+    """How often the own motion was estimated, from the second step on, and how many neighbours were tracked at once."""
+    estimating = log.recorded & log.metadata.by_sight
+    _, counts = np.unique(log.tracked[:, :2], axis=0, return_counts=True)
+    return {
+        "own_motion_ratio": _mean(np.isfinite(log.ego_inlier_ratio)[1:][estimating[1:]]),
+        "most_neighbours_tracked": int(counts.max(initial=0)) if estimating.any() and len(log.tracked) else None,
+    }
+
+
+def _relative_positions(log: FlightLog) -> FloatArray:
+    """(S, N, N, 3) m NED: [s, i, j] is drone j relative to drone i."""
+    return np.asarray(log.position[:, None] - log.position[:, :, None], dtype=float)
+
+
+def _is_settled(log: FlightLog) -> bool:
+    """Whether the whole tail follows the circle's end, where Eq. 44 changes its branch."""
+    tail = _tail(log)
+    return log.has_truth and not tail.all() and bool(np.all(log.time_s[tail] >= log.metadata.circle_until_s))
+
+
+def _tail(log: FlightLog) -> BoolArray:
+    """The steps of the last 10 s; all of a shorter flight."""
+    begin_s = log.time_s[-1] + log.metadata.step_s - TAIL_S
+    return np.asarray(log.time_s > begin_s - 1e-6, dtype=bool)  # the step that begins just then belongs to it
+
+
+def _flocking(log: FlightLog) -> FlockingParameters:
+    """With the distances that Eq. 45 takes."""
+    return FlockingParameters(
+        observation_distance_m=log.metadata.observation_distance_m, desired_distance_m=log.metadata.desired_distance_m
+    )
+
+
+def _mean(values: FloatArray | BoolArray | list[float]) -> float | None:
+    return float(np.mean(values)) if len(values) else None
+
+
+def _finite(value: np.floating[Any]) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,1 @@
+"""Fake autopilots, for simulation and tests."""

@@ -1,0 +1,418 @@
+"""A fake autopilot for tests, and for the simulator where there is no PX4. It is not PX4 and flies nothing real.
+
+It speaks real MAVLink over UDP and keeps PX4's rules where flockd depends on them: who may enter offboard, when it is
+lost and what follows, that PX4 returns to offboard by itself when setpoints come back, that the heartbeat comes once a
+second only. Where PX4 does more (climbing before a return, position control in Hold, estimators) it does not try.
+
+    python -m flockd.sim.autopilot.fake_autopilot --port 14540 --height 2.5
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import socket
+import struct
+import threading
+import time
+from collections import deque
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from pymavlink.dialects.v20 import development as mavlink
+
+from flockd.core.messages import FloatArray, Setpoint
+from flockd.onboard.autopilot.refusal_reasons import CHECKS_FAIL, NO_SETPOINTS
+from flockd.sim.autopilot.fake_checks import FakeChecks
+from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
+from flockd.sim.autopilot.fake_telemetry import (
+    ON_GROUND_M,
+    Mode,
+    Outlet,
+    TelemetryStreams,
+    VehicleSnapshot,
+    custom_mode,
+    mode_by_number,
+)
+from flockd.sim.autopilot.fake_vehicle import Demand, Motion, MotionState, PointMass
+from flockd.sim.autopilot.sticks import stick_curve
+
+TICK_S = 0.02
+MAX_STEP_S = 0.2
+"""After a longer pause of this computer the vehicle has stood still."""
+TYPE_MASK = 2531
+"""The one kind of setpoint it takes: horizontal velocity, height and yaw."""
+DISARM_AFTER_LANDING_S = 2.0
+ARRIVED_M = 0.3
+STICKS_FRESH_S = 0.5
+OFFBOARD_LOSS_MODES: dict[int, Mode] = {0: "RTL", 3: "RTL", 4: "LAND", 5: "LOITER"}
+"""By COM_OBL_RC_ACT, no others; 0 would be position mode, which needs a remote control, which there is none of."""
+HOME_DEG = (47.3977, 8.5456)
+MAX_SETPOINTS_KEPT = 100_000
+SO_TIMESTAMPNS = 35
+"""Of Linux: the kernel says when each packet came, however long this thread waited for a turn."""
+
+
+class FakeAutopilot:
+    """One vehicle that sends to `udpin://127.0.0.1:<port>`, on its own thread between `start` and `close`.
+
+    It begins on the ground, or armed and in Hold at `height_m`. With a `motion` of the caller's, that decides where it
+    begins. What a test or a pilot does to it (`pilot_selects`, the attributes) takes effect within a tick.
+    """
+
+    def __init__(
+        self,
+        port: int,
+        *,
+        system_id: int = 1,
+        height_m: float = 0.0,
+        yaw_rad: float = 0.0,
+        motion: Motion | None = None,
+        heartbeat_s: float = 1.0,
+        home_deg: tuple[float, float] = HOME_DEG,
+        truth_port: int | None = None,
+        speed_factor: float = 1.0,
+        range_finder: FakeRangeFinder | None = None,
+        clock_ahead_s: float = 0.0,
+    ) -> None:
+        """Bind a socket; nothing is sent before `start`.
+
+        Args:
+            port: of this computer, where a companion computer listens.
+            system_id: its MAV_SYS_ID.
+            height_m: in Hold at this height; 0: on the ground.
+            yaw_rad: heading, radians clockwise from north.
+            motion: flies it instead of a `PointMass`, in metres from its home.
+            heartbeat_s: between two; a second is PX4's.
+            home_deg: latitude and longitude of where it begins.
+            truth_port: where a simulator listens: it gets the true pose, as PX4 in software
+                sends it, and may send commands, as a ground station may.
+            speed_factor: how fast its time passes.
+            range_finder: its own, which faces down; None: it has none.
+            clock_ahead_s: what its clock shows when it is made.
+        """
+        self._speed_factor = speed_factor
+        self.battery_share = 1.0
+        self.estimate_ok = True
+        self.failing: set[str] = set()
+        """PX4's names of further checks that fail; each refuses to arm."""
+        self.silent = False
+        """True: as if the cable were cut, in both directions."""
+        self.parameters: dict[str, float | int] = {
+            "COM_OF_LOSS_T": 1.0,
+            "COM_OBL_RC_ACT": 5,
+            "COM_LOW_BAT_ACT": 0,
+            "GF_ACTION": 2,
+            "GF_MAX_HOR_DIST": 0.0,
+            "GF_MAX_VER_DIST": 0.0,
+            "MIS_TAKEOFF_ALT": 2.5,
+            "MPC_VEL_MANUAL": 10.0,
+            "MAN_DEADZONE": 0.1,
+        }
+        """An int is an INT32 parameter, a float a REAL32 one."""
+        self.setpoints: deque[tuple[float, Setpoint]] = deque(maxlen=MAX_SETPOINTS_KEPT)
+        """When each came by the kernel's stamp, on the monotonic clock times the speed factor, and what it said."""
+        self.refused_setpoints = 0
+
+        self._link = ("127.0.0.1", port)
+        self._ground = None if truth_port is None else ("127.0.0.1", truth_port)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        self._mav = mavlink.MAVLink(self, srcSystem=system_id, srcComponent=1)
+        self._mav.robust_parsing = True
+        self.checks = FakeChecks(self._mav)
+        truth = mavlink.MAVLink(Outlet(self._socket, self._ground), srcSystem=system_id, srcComponent=1)
+        self._motion = motion or PointMass(np.array([0.0, 0.0, -height_m]), yaw_rad)
+        self._state = self._motion(Demand(np.zeros(2), -height_m, yaw_rad), 0.0)
+        self._armed = height_m > 0.0
+        self._intended: Mode = "LOITER"
+        self._mode: Mode = "LOITER"
+        self._hold_down_m = -height_m
+        self._hold_yaw_rad = yaw_rad
+        self._landed_s: float | None = None
+        self._sticks = -math.inf, np.zeros(2)
+        """When a person last moved them, and forward and right from -1 to 1."""
+        self.clock_offset_s = clock_ahead_s - self._clock()
+        """Its own clock, of its stamps and of TIMESYNC, less the monotonic clock times the speed factor."""
+        self._streams = TelemetryStreams(self._mav, truth, heartbeat_s, home_deg, -self.clock_offset_s, range_finder)
+        self._lock = threading.RLock()
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="fake autopilot", daemon=True)
+
+    def start(self) -> Self:
+        """Starts the thread."""
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Ends the thread and closes the socket."""
+        self._closing.set()
+        self._thread.join()
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def mode(self) -> Mode:
+        """The mode it really flies, which is not the one it was asked for while its failsafe is active."""
+        return self._mode
+
+    @property
+    def armed(self) -> bool:
+        """Motors on."""
+        return self._armed
+
+    @property
+    def failsafe(self) -> bool:
+        """It is in another mode than it was asked for."""
+        return self._mode != self._intended
+
+    @property
+    def state(self) -> MotionState:
+        """The truth."""
+        return self._state
+
+    def pilot_arms(self) -> None:
+        """The pilot starts the motors."""
+        with self._lock:
+            self._arm()
+
+    def pilot_selects(self, mode: Mode) -> None:
+        """The pilot turns the switch."""
+        with self._lock:
+            self._intended = mode
+            self._update_mode()
+
+    def write(self, data: bytes) -> None:
+        """Takes what pymavlink has packed."""
+        if self.silent:
+            return
+        self._socket.sendto(data, self._link)
+        if self._ground is not None:
+            self._socket.sendto(data, self._ground)
+
+    def _snapshot(self) -> VehicleSnapshot:
+        return VehicleSnapshot(
+            self._state, self._mode, self._intended, self._armed, self.estimate_ok, self.battery_share
+        )
+
+    def _clock(self) -> float:
+        return self._speed_factor * time.monotonic()
+
+    def _run(self) -> None:
+        flown_s = self._clock()
+        while not self._closing.is_set():
+            self._receive_until(flown_s + TICK_S)
+            with self._lock:
+                now = self._clock()
+                self._fly(min(now - flown_s, MAX_STEP_S))
+                self._streams.send_due(now, self._snapshot())
+                self.checks.tell_changes(self._failing())
+            flown_s = now
+
+    def _receive_until(self, deadline: float) -> None:
+        """All that comes by then; when it is late already, all that waits."""
+        while True:
+            left_s = max(deadline - self._clock(), 0.0)
+            self._socket.settimeout(left_s / self._speed_factor)
+            try:
+                data, ancillary, _, _ = self._socket.recvmsg(4096, 64)
+            except (TimeoutError, BlockingIOError):
+                return
+            if self.silent:
+                continue
+            arrived_s = self._clock() - self._speed_factor * _age(ancillary)
+            with self._lock:
+                for message in self._mav.parse_buffer(data) or ():
+                    self._handle(message, arrived_s)
+
+    # Rules
+
+    def _signal(self) -> bool:
+        """Whether setpoints are coming, by PX4's measure."""
+        if not self.setpoints or not self.estimate_ok:
+            return False
+        return self._clock() - self.setpoints[-1][0] < self.parameters["COM_OF_LOSS_T"]
+
+    def _update_mode(self) -> None:
+        """The intended mode, or what PX4's failsafe puts in its place while offboard cannot run."""
+        lost = self._armed and self._intended == "OFFBOARD" and not self._signal()
+        mode = OFFBOARD_LOSS_MODES[int(self.parameters["COM_OBL_RC_ACT"])] if lost else self._intended
+        if mode == self._mode:
+            return
+        self._mode = mode
+        self._hold_down_m = float(self._state.position[2])
+        R = self._state.R_ned_body
+        self._hold_yaw_rad = math.atan2(R[1, 0], R[0, 0])
+
+    def _select(self, mode: Mode) -> bool:
+        """A mode requested over MAVLink: while armed, only one that can run."""
+        if mode == "OFFBOARD" and self._armed and not self._signal():
+            self.checks.say("Offboard not possible: no offboard signal")
+            self.checks.deny("commander_modeswitch_not_avail", custom_mode(mode))
+            return False
+        self.pilot_selects(mode)
+        return True
+
+    def _arm(self) -> bool:
+        if self._intended == "OFFBOARD" and not self._signal():
+            self.checks.say("Arming denied: no offboard signal")
+            return False
+        if self._failing() - {NO_SETPOINTS}:
+            self.checks.say("Arming denied: Resolve system health failures first")
+            self.checks.deny(CHECKS_FAIL)
+            return False
+        self._armed, self._landed_s = True, None
+        return True
+
+    def _failing(self) -> set[str]:
+        """The checks that fail now."""
+        missing = set() if self._signal() else {NO_SETPOINTS}
+        return missing | self.failing | (set() if self.estimate_ok else {"check_estimator_hor_pos_not_stable"})
+
+    def _disarm(self) -> None:
+        self._armed = False
+        self._intended = self._mode = "LOITER"
+
+    # Flight
+
+    def _fly(self, interval_s: float) -> None:
+        self._update_mode()
+        if not self._armed:
+            return
+        self._state = self._motion(self._demand(), interval_s)
+        height_m = -float(self._state.position[2])
+        if self._mode == "TAKEOFF" and height_m > self.parameters["MIS_TAKEOFF_ALT"] - 0.1:
+            self.pilot_selects("LOITER")
+        elif self._mode == "RTL" and float(np.linalg.norm(self._state.position[:2])) < ARRIVED_M:
+            self.pilot_selects("LAND")
+        elif self._mode == "LAND" and height_m < ON_GROUND_M:
+            self._landed_s = self._landed_s or self._clock()
+            if self._clock() - self._landed_s > DISARM_AFTER_LANDING_S:
+                self._disarm()
+
+    def _demand(self) -> Demand:
+        match self._mode:
+            case "OFFBOARD" if self.setpoints:
+                setpoint = self.setpoints[-1][1]
+                return Demand(setpoint.velocity, -setpoint.height_m, setpoint.yaw_rad)
+            case "POSCTL":
+                return Demand(self._by_hand(), self._hold_down_m, self._hold_yaw_rad)
+            case "TAKEOFF":
+                return Demand(np.zeros(2), -self.parameters["MIS_TAKEOFF_ALT"], self._hold_yaw_rad)
+            case "LAND":
+                return Demand(np.zeros(2), 0.5, self._hold_yaw_rad)
+            case "RTL":
+                home = -self._state.position[:2]
+                return Demand(
+                    home * min(1.0, 3.0 / max(float(np.linalg.norm(home)), 1e-9)), self._hold_down_m, self._hold_yaw_rad
+                )
+            case _:
+                return Demand(np.zeros(2), self._hold_down_m, self._hold_yaw_rad)
+
+    def _by_hand(self) -> FloatArray:
+        """(2,) m/s north and east that the sticks ask for; level, and at rest once they are not heard any more."""
+        moved_s, sticks = self._sticks
+        ahead, right = stick_curve(sticks, self.parameters["MAN_DEADZONE"])
+        if self._clock() - moved_s > STICKS_FRESH_S:
+            return np.zeros(2)
+        cos, sin = math.cos(self._hold_yaw_rad), math.sin(self._hold_yaw_rad)
+        return self.parameters["MPC_VEL_MANUAL"] * np.array([cos * ahead - sin * right, sin * ahead + cos * right])
+
+    # MAVLink, in
+
+    def _handle(self, message: Any, arrived_s: float) -> None:
+        if getattr(message, "target_system", self._mav.srcSystem) != self._mav.srcSystem:
+            return
+        match message.get_type():
+            case "SET_POSITION_TARGET_LOCAL_NED":
+                self._take_setpoint(message, arrived_s)
+            case "COMMAND_LONG":
+                result = self._obey(int(message.command), message)
+                self._mav.command_ack_send(
+                    message.command,
+                    result,
+                    target_system=message.get_srcSystem(),
+                    target_component=message.get_srcComponent(),
+                )
+            case "MANUAL_CONTROL" if message.target == self._mav.srcSystem:
+                self._sticks = arrived_s, np.clip([message.x, message.y], -1000, 1000) / 1000
+            case "TIMESYNC" if message.tc1 == 0:
+                own_ns = int(1e9 * (self._clock() + self.clock_offset_s))
+                self._mav.timesync_send(own_ns, message.ts1)
+            case "PARAM_REQUEST_READ":
+                self._send_parameter(message.param_id)
+            case _:
+                pass
+
+    def _take_setpoint(self, message: Any, arrived_s: float) -> None:
+        numbers = (message.vx, message.vy, message.z, message.yaw)
+        if message.type_mask != TYPE_MASK or message.coordinate_frame != 1 or not np.isfinite(numbers).all():
+            self.refused_setpoints += 1
+            return
+        velocity = np.array([message.vx, message.vy])
+        self.setpoints.append((arrived_s, Setpoint(arrived_s, velocity, height_m=-message.z, yaw_rad=message.yaw)))
+
+    def _obey(self, command: int, message: Any) -> int:
+        done: bool
+        match command:
+            case mavlink.MAV_CMD_DO_SET_MODE:
+                mode = mode_by_number(int(message.param2), int(message.param3))
+                if mode is None:
+                    return int(mavlink.MAV_RESULT_UNSUPPORTED)
+                done = self._select(mode)
+            case mavlink.MAV_CMD_COMPONENT_ARM_DISARM if message.param1 == 1:
+                done = self._arm()
+            case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+                done = int(message.param1) in self._streams.intervals_s
+                if done:
+                    self._streams.intervals_s[int(message.param1)] = message.param2 * 1e-6
+            case mavlink.MAV_CMD_RUN_PREARM_CHECKS:
+                self.checks.tell(self._failing())
+                done = True
+            case mavlink.MAV_CMD_REQUEST_MESSAGE if message.param1 == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
+                self._streams.send_version()
+                done = True
+            case _:
+                return int(mavlink.MAV_RESULT_UNSUPPORTED)
+        return int(mavlink.MAV_RESULT_ACCEPTED if done else mavlink.MAV_RESULT_TEMPORARILY_REJECTED)
+
+    def _send_parameter(self, name: str) -> None:
+        value = self.parameters.get(name)
+        if value is None:
+            return  # as PX4 does: the asker times out
+        kind = mavlink.MAV_PARAM_TYPE_INT32 if isinstance(value, int) else mavlink.MAV_PARAM_TYPE_REAL32
+        # PX4 puts an integer's bytes where MAVLink has a float.
+        wire = struct.unpack("<f", struct.pack("<i", value))[0] if isinstance(value, int) else value
+        index = list(self.parameters).index(name)
+        self._mav.param_value_send(name.encode(), wire, kind, len(self.parameters), index)
+
+
+def _age(ancillary: list[tuple[int, int, bytes]]) -> float:
+    """How long ago a packet came by the kernel's stamp, in real seconds."""
+    (stamp,) = (data for level, kind, data in ancillary if (level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS))
+    seconds, nanoseconds = struct.unpack("@ll", stamp)
+    return time.time() - float(seconds + nanoseconds * 1e-9)
+
+
+def main() -> None:
+    """Runs until it is interrupted."""
+    parser = argparse.ArgumentParser(description="A fake autopilot that speaks MAVLink over UDP. It is not PX4.")
+    parser.add_argument("--port", type=int, required=True, help="the UDP port on this computer to send to")
+    parser.add_argument("--system-id", type=int, default=1, help="its MAV_SYS_ID (1)")
+    parser.add_argument("--height", type=float, default=0.0, help="begin in the air, armed and in Hold, metres (0)")
+    options = parser.parse_args()
+    with FakeAutopilot(options.port, system_id=options.system_id, height_m=options.height):
+        threading.Event().wait()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,296 @@
+"""Flies many flights of one scenario at once, without images: the law, the missions and the vehicles alone."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+
+import numpy as np
+
+from flockd.core.config.perceived import PerceivedErrors
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.messages import SECTORS, FloatArray, IntArray
+from flockd.flight.obstacles.local_map import DIRECTIONS
+from flockd.sim.control_level import flock_figures, gate_limits, law_sums, motion, perceived_sums, ways_around
+from flockd.sim.control_level.cells import CELLS_A_DRONE, sort_flights
+from flockd.sim.control_level.flock_figures import FlightFigures
+from flockd.sim.control_level.many_missions import ManyMissions
+from flockd.sim.control_level.many_obstacles import FIGURES, ManyObstacles, Run
+from flockd.sim.control_level.ways_around import Rules
+
+Figures = dict[str, float | int | bool | None]
+_Errors = tuple[FloatArray, FloatArray, IntArray]
+_NO_ERRORS: _Errors = (np.empty((0, 9)), np.empty(12), np.empty(0, np.int64))
+_SETPOINT_RATE_HZ = 20.0
+"""Of a drone without an autopilot's section, as by default in one."""
+_LEAST_DRONES = 250
+"""Of a thread: fewer are computed sooner than handed over."""
+
+
+def fly_flocks(
+    scenarios: Sequence[ScenarioConfig],
+    *,
+    errors: PerceivedErrors | None = None,
+    gated: bool = False,
+    threads: int = 1,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Figures]:
+    """Flies each scenario once; the figures of each flight, in their order.
+
+    Those that differ in nothing but seed, start positions and start velocities fly side by side. A flight is the same
+    bit for bit whatever others are flown with it, in however many threads.
+
+    Args:
+        scenarios: with any number of vehicles (`flockd.sim.start`). The seed rules gusts,
+            obstacles and the errors of perception. Rig and sensors do not count.
+        errors: of what the drones perceive of each other; None: they are given exact states. Ranges to obstacles are
+            exact in any case.
+        gated: whether each drone's safety gate limits how fast it flies towards neighbours and obstacles
+            (`gate_limits`).
+        threads: to compute in.
+        progress: called with (flights done, flights in all).
+
+    Raises UsageError for what cannot be flown without images, and for obstacles that do not fit into their world.
+    """
+    found: dict[int, Figures] = {}
+    for numbers in _alike(scenarios):
+        flights = FlockFlights([scenarios[number] for number in numbers], errors, gated=gated)
+        with ExitStack() as stack:
+            pool = stack.enter_context(ThreadPoolExecutor(threads)) if threads > 1 else None
+            for step in range(flights.steps):
+                flights.step(step, pool, threads)
+        found |= zip(numbers, flights.figures(), strict=True)
+        progress(len(found), len(scenarios))
+    return [found[number] for number in range(len(scenarios))]
+
+
+class FlockFlights:
+    """A batch of flights that differ in seeds and starts only, all at the same time; see `fly_flocks`."""
+
+    def __init__(
+        self, scenarios: Sequence[ScenarioConfig], errors: PerceivedErrors | None = None, *, gated: bool = False
+    ) -> None:
+        scenario = scenarios[0]
+        drone, vehicle, seeds = scenario.drone, scenario.vehicle, [one.seed for one in scenarios]
+        self._drone, self._shape = drone, (len(scenarios), len(scenario.vehicles))
+        self.steps = round(scenario.duration_s / drone.step_s)
+        self._times = np.arange(self.steps, dtype=float) * drone.step_s
+        f, n = self._shape
+        self.states = np.ascontiguousarray(np.stack([_start(one) for one in scenarios], axis=1))
+        """(6, flights, n) m and m/s: position and velocity, NED."""
+        self._law = law_sums.law_figures(drone.flocking)
+        self._missions = ManyMissions(scenario, f)
+        self._errors: _Errors | None = None
+        if errors is not None:
+            tables = perceived_sums.by_distance(errors), perceived_sums.constants(errors, drone.step_s)
+            self._errors = (*tables, np.array(seeds, dtype=np.int64))
+        rate_hz = _SETPOINT_RATE_HZ if drone.autopilot is None else drone.autopilot.setpoint_rate_hz
+        self._ticks = max(round(drone.step_s * rate_hz), 1) if gated else 1
+        gate = drone.safety.gate
+        self._gate = gate_limits.gate_figures(gate, gate.min_separation_m) if gated else None
+        self._gate_obstacles = gate_limits.obstacle_figures(drone.obstacles, gate.obstacle_clearance_m)
+        self._obstacles = None if scenario.world.obstacles is None else ManyObstacles(scenarios)
+        self._avoids = self._obstacles is not None and drone.obstacles.enabled
+        self._rules, self._last_rad = Rules.of(drone), np.full(f * n, np.nan)
+        self._substeps = motion.Substeps.of(vehicle, drone.step_s / self._ticks)
+        self._gusts = [motion.Gusts(vehicle, n, seed) for seed in seeds] if vehicle.gust_m_s else []
+        self._figures = FlightFigures(f, n, self._times, drone.step_s, vehicle.radius_m)
+        self._arrival_s, self._away_m = np.full(f, np.nan), np.full(f, np.nan)
+        self._by_slot = np.empty((6, f, n))
+        self._grids = np.empty((f, 5))
+        self._starts = np.zeros((f, max(CELLS_A_DRONE * n, 16) + 1), np.int64)
+        self._order = np.empty((f, n), np.int64)
+        self.sums = np.zeros((2, f, n))
+        """u of Eq. 38 without u_vf, m/s^2, as last perceived."""
+        self.commands = np.zeros((2, f, n))
+        """Velocities that drones were asked to fly with in the last step, m/s."""
+        self._middles, self._own = (np.zeros((2, f, n)) for _ in range(2))
+        self._sent = np.full((2, f, n), np.nan)
+        self._level, self._straight, self._unsafe = (np.empty((f, n)) for _ in range(3))
+
+    def step(self, step: int, pool: ThreadPoolExecutor | None, threads: int) -> None:
+        """One step of all flights."""
+        f, n = self._shape
+        drones = _parts(f * n, threads, _LEAST_DRONES)
+        self.perceive(step, pool, threads)
+        self._measure(step, pool, threads)
+        desired, height_m = self._missions.step(float(self._times[step]), self.states[:2], self._middles)
+        self._note_goal(step)
+        gusts = self._next_gusts()
+        climbs = bool(np.isfinite(height_m).any())
+        states, flat = self.states.reshape(6, -1), height_m.reshape(-1)
+        own = states[3:5] if self._errors is None else self._own.reshape(2, -1)
+        commands = self.commands.reshape(2, -1)
+
+        def ask(a: int, b: int) -> None:
+            p = self._drone.flocking
+            motion.commands(
+                a, b, self.sums.reshape(2, -1), desired.reshape(2, -1), p.velocity * p.own_weight, own,
+                self._drone.step_s, p.max_acceleration_m_s2, p.max_speed_m_s, commands,
+            )  # fmt: skip
+
+        def climb(a: int, b: int) -> None:
+            if climbs:
+                motion.climb(a, b, states, flat, self._substeps._replace(times=self._ticks * self._substeps.times))
+
+        def fly(a: int, b: int) -> None:
+            motion.fly(a, b, states, commands, gusts, self._substeps)
+            climb(a, b)
+
+        _run(pool, drones, ask)
+        if self._avoids:
+            self._fly_around(step, desired, own, lambda work: _run(pool, drones, work))
+        if self._gate is None:
+            _run(pool, drones, fly)
+        else:
+            self._fly_gated(step, gusts, pool, drones)
+            _run(pool, drones, climb)
+
+    def _fly_around(self, step: int, desired: FloatArray, own: FloatArray, run: Run) -> None:
+        """Turns the commands of a step aside from obstacles."""
+        assert self._obstacles is not None
+        cells = self._by_slot, self._grids, self._starts, self._order
+        self._obstacles.look(self.states.reshape(6, -1), run)
+        to_obstacles = self._obstacles.ranges, self._obstacles.first
+        errors = self._errors or _NO_ERRORS
+
+        def around(a: int, b: int) -> None:
+            ways_around.fly_around(
+                a, b, *cells, self.sums.reshape(2, -1), desired.reshape(2, -1), own, *to_obstacles, self._rules, errors,
+                step, self._last_rad, self.commands.reshape(2, -1),
+            )  # fmt: skip
+
+        run(around)
+
+    def _fly_gated(
+        self, step: int, gusts: FloatArray, pool: ThreadPoolExecutor | None, drones: list[tuple[int, int]]
+    ) -> None:
+        """Towards the commands of a step, as far as the gates let each drone."""
+        cells = self._by_slot, self._grids, self._starts, self._order
+        fastest = np.hypot(self.states[3], self.states[4]).max(axis=1)
+        errors = self._errors or _NO_ERRORS
+        tick_s = self._drone.step_s / self._ticks
+        ranges = np.empty((0, SECTORS)) if self._obstacles is None or not self._avoids else self._obstacles.ranges
+        obstacles = self._gate_obstacles, DIRECTIONS, ranges
+
+        def fly(a: int, b: int) -> None:
+            gate_limits.fly_gated(
+                a, b, *cells, self.states.reshape(6, -1), self.commands.reshape(2, -1), self._sent.reshape(2, -1),
+                fastest, self._gate, self._ticks, tick_s, gusts, self._substeps, errors, step,
+                obstacles,
+            )  # fmt: skip
+
+        _run(pool, drones, fly)
+
+    def perceive(self, step: int, pool: ThreadPoolExecutor | None = None, threads: int = 1) -> None:
+        """What each drone sees of the others now, and what the law makes of it: `sums`."""
+        f, n = self._shape
+        flights = _parts(f, threads, least=max(_LEAST_DRONES // n, 1))
+        cells = self._grids, self._starts, self._order, self._by_slot
+        _run(pool, flights, lambda a, b: sort_flights(a, b, self.states, *cells))
+        _run(pool, _parts(f * n, threads, _LEAST_DRONES), lambda a, b: self._perceive(a, b, step))
+
+    def _perceive(self, a: int, b: int, step: int) -> None:
+        cells = self._by_slot, self._grids, self._starts, self._order
+        weight = self._drone.flocking.weight
+        if self._errors is not None:
+            nearest = weight.nearest if weight.kind == "nearest" else 0
+            perceived_sums.perceived_sums(
+                a, b, *cells, self._law, nearest, *self._errors, step, self._missions.goal() is not None, self.sums,
+                self._middles, self._own,
+            )  # fmt: skip
+            return
+        if weight.kind == "uniform" or self._missions.goal() is not None:
+            law_sums.uniform_sums(a, b, *cells, self._law, self.sums, self._middles)
+        if weight.kind == "nearest":
+            law_sums.nearest_sums(a, b, self.states, *cells, self._law, weight.nearest, self.sums)
+
+    def _measure(self, step: int, pool: ThreadPoolExecutor | None, threads: int) -> None:
+        """Takes the figures of a step."""
+        f, n = self._shape
+        cells = self._by_slot, self._grids, self._starts
+        found = self._level, self._straight, self._unsafe
+        parts = _parts(f * n, threads, _LEAST_DRONES)
+        _run(pool, parts, lambda a, b: flock_figures.nearest_distances(a, b, *cells, self._order, *found))
+        self._figures.add(step, *found)
+        if self._obstacles is not None:
+            flat, ends = self.states.reshape(6, -1), step == self.steps - 1
+            self._obstacles.measure(flat, lambda work: _run(pool, parts, work), ends=ends)
+        if self._figures.needs_union(step):
+            unions, reach = np.empty(f), self._drone.flocking.observation_distance_m
+            parts = _parts(f, threads, least=max(_LEAST_DRONES // n, 1))
+            _run(pool, parts, lambda a, b: flock_figures.unions(a, b, *cells, reach, unions))
+            self._figures.add_tail(self.states, unions)
+
+    def _next_gusts(self) -> FloatArray:
+        """(substeps, 2, flights * n) m/s^2."""
+        if not self._gusts:
+            return np.empty((0, 2, 0))
+        substeps = self._substeps._replace(times=self._ticks * self._substeps.times)
+        return np.concatenate([gusts.step(substeps) for gusts in self._gusts], axis=2)
+
+    def _note_goal(self, step: int) -> None:
+        """When each flock's true middle first was at the last goal, once that was the one to fly to."""
+        goal = self._missions.goal()
+        if goal is not None:
+            place, last = goal
+            self._away_m = np.hypot(*(self.states[:2].mean(axis=2) - place[:, None]))
+            there = last & (self._away_m <= self._missions.reached_m) & np.isnan(self._arrival_s)
+            self._arrival_s[there] = self._times[step]
+
+    def figures(self) -> list[Figures]:
+        """Of each flight."""
+        flights, obstacles = range(self._shape[0]), self._obstacles
+        of_obstacles = [dict.fromkeys(FIGURES) if obstacles is None else obstacles.of_flight(k) for k in flights]
+        return [{**self._figures.of_flight(k), **self._of_goal(k), **of_obstacles[k]} for k in flights]
+
+    def _of_goal(self, flight: int) -> Figures:
+        if self._missions.goal() is None:
+            return {"arrived": None, "arrival_time_s": None, "final_error_m": None}
+        since_s, away_m = float(self._arrival_s[flight]), float(self._away_m[flight])
+        return {
+            "arrived": away_m <= self._missions.reached_m,
+            "arrival_time_s": None if math.isnan(since_s) else since_s,
+            "final_error_m": away_m,
+        }
+
+
+def _start(scenario: ScenarioConfig) -> FloatArray:
+    """States (6, n) NED at the start."""
+    rows = [[*vehicle.position_m, *vehicle.velocity_m_s, 0.0] for vehicle in scenario.vehicles]
+    return np.array(rows, dtype=float).T
+
+
+def _alike(scenarios: Sequence[ScenarioConfig]) -> list[list[int]]:
+    """Numbers of scenarios that can be flown side by side."""
+    groups: list[tuple[object, list[int]]] = []
+    for number, scenario in enumerate(scenarios):
+        missions = [(vehicle.mission, vehicle.by_hand) for vehicle in scenario.vehicles]
+        key = scenario.model_copy(update={"seed": 0, "vehicles": ()}), missions
+        for known, numbers in groups:
+            if known == key:
+                numbers.append(number)
+                break
+        else:
+            groups.append((key, [number]))
+    return [numbers for _, numbers in groups]
+
+
+def _parts(count: int, threads: int, least: int) -> list[tuple[int, int]]:
+    """Divides 0 to `count` into as many parts as there are threads, of `least` or more each."""
+    parts = max(min(threads, count // least), 1)
+    edges = [count * k // parts for k in range(parts + 1)]
+    return list(itertools.pairwise(edges))
+
+
+def _run(pool: ThreadPoolExecutor | None, parts: list[tuple[int, int]], work: Callable[[int, int], None]) -> None:
+    """Calls `work` with each part."""
+    if pool is None or len(parts) == 1:
+        for part in parts:
+            work(*part)
+        return
+    for future in [pool.submit(work, *part) for part in parts]:
+        future.result()

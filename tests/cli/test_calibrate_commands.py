@@ -1,0 +1,358 @@
+"""`flockd calibrate` as a person runs it: from every kind of source to a file that checks, or to one sentence."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import threading
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from flockd.cli import main
+from flockd.core.config import DroneConfig, load_drone
+from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
+from flockd.core.messages import Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
+from flockd.ground.calibration.board import BoardFinder, BoardSpec
+from flockd.ground.calibration.image_sources import identity
+from flockd.onboard.recording import Recorder
+from flockd.onboard.sources import CameraStatus
+from tests.ground.calibration import darkroom
+from tests.ground.calibration.darkroom import PINHOLE, WIDE, facing, photograph
+from tests.ground.calibration.test_rig import MOUNTS, OFFSET_S, attitude, boards_between, in_camera
+from tests.onboard.recording.made_up import filled
+from tests.onboard.sources.fake_kernel import FakeCamera, FakeKernel
+
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope="module")
+def pictures() -> list[UInt8Array]:
+    return [photograph(PINHOLE, place, seed=k) for k, place in enumerate(darkroom.sight(PINHOLE, 12))]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, pictures: list[UInt8Array]) -> Path:
+    """Of pictures, two of which are of no use."""
+    path = tmp_path / "pictures"
+    path.mkdir()
+    for number, image in enumerate(pictures):
+        write(path / f"{number:02}.png", image)
+    write(path / "wall.png", photograph(PINHOLE, facing((0.0, 0.0, -1.0))))
+    write(path / "soft.png", photograph(PINHOLE, facing((0.03, 0.0, 0.28), 20.0), blur_px=2.0))
+    return path
+
+
+def write(path: Path, image: UInt8Array) -> None:
+    assert cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+
+
+def told(capsys: Capture, code: int, *arguments: object) -> str:
+    """What stands on stdout, or the one sentence on stderr."""
+    capsys.readouterr()
+    assert main([str(argument) for argument in arguments]) == code
+    captured = capsys.readouterr()
+    if code:
+        assert captured.err.count("\n") == 1, captured.err
+        assert captured.out == ""
+    return captured.out if code == 0 else captured.err
+
+
+def test_a_folder_of_images_becomes_a_camera_that_checks(folder: Path, capsys: Capture) -> None:
+    out, picture = folder.with_name("front.yaml"), folder.with_name("coverage.png")
+    command = ("calibrate", "camera", folder, "--camera", "front", "--out", out, "--picture", picture)
+    text = told(capsys, 0, *command, "--serial", "A1B2", "--model", "pinhole")
+    assert "refused: 1 no board: wall.png" in text
+    assert re.search(r"refused: 1 blurred, as edges wider than 4\.0 px are: soft\.png \(edges \d\.\d px wide\)", text)
+    assert re.search(r"residual: rms 0\.\d+ px; of a view 0\.\d+ to 0\.\d+; max \d\.\d+", text)
+    assert re.search(r"coverage: \d\d % of the image; ## where corners of the board were seen\n  (## |\.\. ){7}", text)
+    told(capsys, 0, "config", "check", out)
+    camera = load_drone(out).rig.cameras[0]
+    assert (camera.name, camera.size_px) == ("front", (480, 360))
+    assert camera.intrinsics.fx == pytest.approx(PINHOLE.fx, rel=0.005)
+    measured = camera.intrinsics.measured
+    assert measured is not None
+    assert (measured.camera, measured.views, measured.source) == ("A1B2", 12, str(folder))
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", measured.date)
+    assert measured.residual_px is not None
+    assert 0.02 < measured.residual_px < 0.12
+    drawn = cv2.imread(str(picture))
+    assert drawn is not None
+    assert drawn.shape == (36 + 720, 960, 3)
+    # A whole drone takes it as it is.
+    drone = folder.with_name("drone.yaml")
+    drone.write_text("name: d\nstep_s: 0.2\n" + out.read_text(), encoding="utf-8")
+    told(capsys, 0, "config", "check", drone)
+    # Nothing that is there is lost by accident.
+    before = out.read_bytes()
+    assert f"{out}: exists; name another file, or overwrite it with --force" in told(capsys, 2, *command)
+    assert out.read_bytes() == before
+    facts = json.loads(told(capsys, 0, *command, "--force", "--json"))
+    assert set(facts["models"]) == {"pinhole", "wide_angle"}
+    assert facts["intrinsics"]["model"] == "pinhole"
+    assert facts["refused"] == {"no board": 1, "blurred": 1}
+    assert set(facts["residual_px"]["views"]) == {f"{number:02}.png" for number in range(12)}
+
+
+def test_what_is_not_enough_is_said_in_one_sentence(folder: Path, capsys: Capture, tmp_path: Path) -> None:
+    out = tmp_path / "out.yaml"
+    command = ("calibrate", "camera", folder, "--out", out)
+    for file in sorted(folder.glob("0[4-9].png")) + sorted(folder.glob("1*.png")):
+        file.unlink()
+    assert "4 usable views of the board are too few; show it at least 6 times" in told(capsys, 1, *command)
+    write(folder / "zz.png", np.zeros((100, 100, 3), np.uint8))
+    assert "zz.png: is 100 x 100 pixels and 00.png is 480 x 360" in told(capsys, 1, *command)
+    for file in folder.glob("*.png"):
+        file.unlink()
+    assert "has no images" in told(capsys, 1, *command)
+    write(folder / "wall.png", np.full((360, 480, 3), 90, np.uint8))
+    assert "the board is in none of the 1 images (1 no board)" in told(capsys, 1, *command)
+    assert "does not exist" in told(capsys, 2, "calibrate", "camera", tmp_path / "nowhere", "--out", out)
+    assert "does not exist" in told(capsys, 1, "calibrate", "camera", tmp_path / "no.mcap", "--out", out)
+    assert "no SOURCE was given" in told(capsys, 2, "calibrate", "camera", "--out", out)
+    assert "needs 140 markers" in told(capsys, 2, *command, "--squares", "20x14")
+    broken = tmp_path / "film.mp4"
+    broken.write_bytes(b"no film")
+    assert "is no video that can be decoded" in told(capsys, 1, "calibrate", "camera", broken, "--out", out)
+    assert not out.exists()
+
+
+def test_a_video_is_read(pictures: list[UInt8Array], tmp_path: Path, capsys: Capture) -> None:
+    film, out = tmp_path / "film.avi", tmp_path / "film.yaml"
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, PINHOLE.size)
+    for image in pictures:
+        for _ in range(2):
+            writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    writer.release()
+    command = ("calibrate", "camera", film, "--out", out, "--json", "--model", "pinhole")
+    facts = json.loads(told(capsys, 0, *command))
+    assert facts["refused"] == {"like another": 12}
+    assert facts["intrinsics"]["fx"] == pytest.approx(PINHOLE.fx, rel=0.01)
+    facts = json.loads(told(capsys, 0, *command, "--every", "2", "--force"))
+    assert (facts["views"], facts["refused"]) == (12, {})
+
+
+class Film:
+    """A live camera that shows each picture twice, as a board held still; then somebody presses Ctrl-C."""
+
+    def __init__(self, images: Sequence[UInt8Array]) -> None:
+        self._images = iter([image for image in images for _ in range(2)])
+        self.began = self.ended = False
+
+    def start(self) -> None:
+        self.began = True
+
+    def newest(self, timeout_s: float = 0.0) -> FrameSet | None:
+        image = next(self._images, None)
+        if image is None:
+            raise KeyboardInterrupt
+        return FrameSet(1.0, {"front": Frame("front", image, 1.0, 1)})
+
+    def status(self) -> Mapping[str, CameraStatus]:
+        return {}
+
+    def notes(self) -> tuple[str, ...]:
+        return ()
+
+    def stop(self) -> None:
+        self.ended = True
+
+
+def test_before_a_live_camera_a_person_gets_instructions(
+    pictures: list[UInt8Array], tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    film = Film(pictures[:8])
+    monkeypatch.setattr("flockd.ground.calibration.image_sources.open_source", lambda config, file: film)
+    out = tmp_path / "live.yaml"
+    command = ("calibrate", "camera", "/dev/video7", "--size", "480x360", "--camera", "front", "--out", str(out))
+    assert main([*command, "--model", "pinhole", "--json"]) == 0
+    captured = capsys.readouterr()
+    facts = json.loads(captured.out)
+    assert (facts["views"], facts["refused"]) == (8, {"moving": 8})
+    assert facts["intrinsics"]["fx"] == pytest.approx(PINHOLE.fx, rel=0.01)
+    lines = captured.err.splitlines()
+    assert lines[0] == "0 views, 0 % covered: hold the board before the camera, and hold it still"
+    assert re.match(r"1 views, \d+ % covered: tilt the board by 30 to 45 degrees, .*: 0 of 1 views", lines[1])
+    assert film.ended
+    measured = load_drone(out).rig.cameras[0].intrinsics.measured
+    assert measured is not None
+    assert measured.camera == "not known, /dev/video7"
+
+
+def test_a_v4l2_camera_is_read(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    kernel = FakeKernel(video7=FakeCamera(formats=((480, 360, b"MJPG"),)))
+    monkeypatch.setattr("flockd.onboard.sources.v4l2.LinuxKernel", lambda: kernel)
+    monkeypatch.setattr("flockd.ground.calibration.image_sources.FIRST_FRAME_S", 60.0)
+    done = threading.Event()
+
+    def film() -> None:
+        rng = np.random.default_rng(1)
+        while not done.is_set():
+            image = rng.integers(0, 255, (360, 480, 3), dtype=np.uint8)
+            with contextlib.suppress(AssertionError):  # not streaming yet, or no more
+                kernel.send("video7", bytes(cv2.imencode(".jpg", image)[1]), wait_s=0.1)
+            done.wait(0.02)
+
+    thread = threading.Thread(target=film)
+    thread.start()
+    command = ("calibrate", "camera", "/dev/video7", "--size", "480x360", "--out", str(tmp_path / "a.yaml"))
+    assert main([*command, "--seconds", "3"]) == 1
+    done.set()
+    thread.join()
+    assert re.search(r"the board is in none of the \d+ images \(\d+ no board\)", capsys.readouterr().err)
+
+
+def test_a_camera_that_is_not_there_is_unavailable(tmp_path: Path, capsys: Capture, monkeypatch: Any) -> None:
+    monkeypatch.setattr("flockd.ground.calibration.image_sources.FIRST_FRAME_S", 0.2)
+    assert "/dev/video93 is not there; plug the camera in" in told(
+        capsys, 69, "calibrate", "camera", "/dev/video93", "--out", tmp_path / "a"
+    )
+
+
+def test_a_usb_camera_is_known_by_its_serial_number(tmp_path: Path) -> None:
+    usb = tmp_path / "devices" / "1-1"
+    (usb / "1-1:1.0").mkdir(parents=True)
+    for name, text in (("idVendor", "046d"), ("idProduct", "0825"), ("serial", "8A2B5C90")):
+        (usb / name).write_text(f"{text}\n")
+    entry = tmp_path / "class" / "video3"
+    entry.mkdir(parents=True)
+    (entry / "device").symlink_to(usb / "1-1:1.0")
+    assert identity(Path("/dev/video3"), tmp_path / "class") == "USB 046d:0825 serial 8A2B5C90"
+    assert identity(Path("/dev/video4"), tmp_path / "class") == "not known, /dev/video4"
+
+
+def test_the_board_is_printed_in_its_true_size(tmp_path: Path, capsys: Capture) -> None:
+    sheet, page = tmp_path / "board.png", tmp_path / "board.pdf"
+    assert "print it at 100 % on A4" in told(capsys, 0, "calibrate", "camera", "--print-board", sheet)
+    told(capsys, 0, "calibrate", "camera", "--print-board", page)
+    picture = cv2.imread(str(sheet), cv2.IMREAD_GRAYSCALE)
+    assert picture is not None
+    seen = BoardFinder(BoardSpec()).find(
+        np.asarray(cv2.copyMakeBorder(picture, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255), np.uint8)
+    )
+    assert seen is not None
+    assert len(seen.ids) == 24
+    data = sheet.read_bytes()
+    at = data.index(b"pHYs")
+    per_m = int.from_bytes(data[at + 4 : at + 8])
+    assert int.from_bytes(data[at + 13 : at + 17]) == zlib.crc32(data[at : at + 13])
+    assert picture.shape[1] / per_m == pytest.approx(7 * 0.036, abs=1e-4)
+    text = page.read_bytes()
+    box = re.search(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", text)
+    assert box is not None
+    assert [float(side) / 72 * 25.4 for side in box.groups()] == pytest.approx([297.0, 210.0], abs=0.01)
+    streams = [zlib.decompress(part.split(b"\nendstream")[0]) for part in text.split(b"stream\n")[1::2]]
+    across, down = (float(number) / 72 * 25.4 for number in (streams[0].split()[1], streams[0].split()[4]))
+    assert (across, down) == pytest.approx((252.0, 180.0), abs=0.01)
+    assert len(streams[1]) == picture.size
+    table = int(text.split(b"startxref\n")[1].split()[0])
+    for number, entry in enumerate(text[table:].split(b"\n")[3:8], start=1):
+        assert text[int(entry[:10]) :].startswith(b"%d 0 obj" % number)
+    assert "is written as .png or .pdf" in told(capsys, 2, "calibrate", "camera", "--print-board", tmp_path / "b.gif")
+    assert "exists" in told(capsys, 2, "calibrate", "camera", "--print-board", sheet)
+
+
+WIDE_LENS = IntrinsicsConfig(model="wide_angle", fx=WIDE.fx, fy=WIDE.fy, cx=WIDE.cx, cy=WIDE.cy, distortion=WIDE.k)
+
+
+def drone(*names: str) -> DroneConfig:
+    """Its front camera known, the others about where somebody thinks they are."""
+    places = {
+        "front": ExtrinsicsConfig(position_m=(0.10, 0.01, 0.02), yaw_deg=2.0, pitch_deg=-10.0, roll_deg=1.0),
+        "right": ExtrinsicsConfig(yaw_deg=90.0),
+        "left": ExtrinsicsConfig(position_m=(0.0, -0.1, 0.0), yaw_deg=-90.0),
+    }
+    cameras = tuple(
+        CameraConfig(name=name, size_px=WIDE.size, intrinsics=WIDE_LENS, extrinsics=places[name]) for name in names
+    )
+    return DroneConfig(rig=RigConfig(cameras=cameras))
+
+
+def test_a_rig_is_calibrated_from_folders(tmp_path: Path, capsys: Capture) -> None:
+    config, shots, out = tmp_path / "drone.yaml", tmp_path / "shots", tmp_path / "rig.yaml"
+    config.write_text(json.dumps(drone("front", "right").model_dump(mode="json", exclude_defaults=True)))
+    for name in ("front", "right"):
+        (shots / name).mkdir(parents=True)
+    for number, board in enumerate(boards_between("front", "right", 7, 1)):
+        for k, name in enumerate(("front", "right")):
+            write(
+                shots / name / f"{number}.png", photograph(WIDE, in_camera(board, MOUNTS[name]), seed=10 * number + k)
+            )
+    command = ("calibrate", "rig", shots, "--config", config, "--out", out)
+    text = told(capsys, 0, *command)
+    assert "front: is the reference and keeps its mounting" in text
+    assert re.search(r"right: yaw 8[78]\.\d+ pitch \d\.\d+ roll -\d\.\d+ \+- 0\.\d+ deg", text)
+    told(capsys, 0, "config", "check", out)
+    front, right = load_drone(out).rig.cameras
+    assert front.extrinsics == drone("front").rig.cameras[0].extrinsics
+    assert (right.extrinsics.yaw_deg, right.extrinsics.pitch_deg) == pytest.approx((88.0, 3.0), abs=0.2)
+    assert right.extrinsics.position_m == pytest.approx((-0.01, 0.11, 0.0), abs=0.002)
+    assert right.extrinsics.measured is not None
+    assert right.extrinsics.measured.source.endswith("against front")
+    assert "exists" in told(capsys, 2, *command)
+    assert "has no camera 'up'" in told(capsys, 2, *command, "--force", "--reference", "up")
+    assert "name the drone's file with --config" in told(capsys, 2, "calibrate", "rig", shots, "--out", tmp_path / "a")
+    assert "motion is measured in a recording" in told(capsys, 2, *command, "--force", "--by", "motion")
+    small = drone("front", "right").model_dump(mode="json", exclude_defaults=True)
+    small["rig"]["cameras"][1]["size_px"] = [640, 480]
+    config.write_text(json.dumps(small))
+    assert "of camera 'right' is 640 x 480, and its image 0 has 480 x 360 pixels" in told(
+        capsys, 78, *command, "--force"
+    )
+    for file in (shots / "right").glob("[3-9].png"):
+        file.unlink()
+    (shots / "right" / "0.png").unlink()
+    config.write_text(json.dumps(drone("front", "right").model_dump(mode="json", exclude_defaults=True)))
+    assert "camera 'right' shares 2 boards with front, and needs 3" in told(capsys, 1, *command, "--force")
+
+
+def record_turns(path: Path, axes: tuple[float, float, float] = (1.0, 1.0, 1.0), steps: int = 50) -> None:
+    """A drone that somebody turns about in a room, with one camera that looks left."""
+    lens = darkroom.Lens("wide_angle", (240, 180), 86.0, 86.0, 118.0, 92.0, WIDE.k)
+    intrinsics = IntrinsicsConfig(model="wide_angle", fx=86.0, fy=86.0, cx=118.0, cy=92.0, distortion=WIDE.k)
+    place = ExtrinsicsConfig(position_m=(0.0, -0.1, 0.0), yaw_deg=-90.0)
+    camera = CameraConfig(name="left", size_px=lens.size, intrinsics=intrinsics, extrinsics=place)
+    output: PilotOutput = filled(PilotOutput, 0.5)
+    with Recorder(path, drone="drone1", config=DroneConfig(rig=RigConfig(cameras=(camera,)))) as recorder:
+        for step in range(steps):
+            frame_s, state_s = 10.0 + 0.1 * step, 10.0 + 0.1 * step + 0.03 * (step % 2)
+            seen = attitude(frame_s + OFFSET_S, axes).as_matrix() @ MOUNTS["left"].rotation
+            image = darkroom.photograph_room(lens, seen, np.zeros(3), seed=step)
+            frames = FrameSet(frame_s, {"left": Frame("left", image, frame_s, step)})
+            recorder.step(frames, VehicleState(state_s, attitude(state_s, axes).as_matrix(), 1.0), output)
+            recorder.drain()
+
+
+def test_a_recording_of_motion_gives_how_a_camera_is_turned_and_its_time(tmp_path: Path, capsys: Capture) -> None:
+    flight, out = tmp_path / "drone1.mcap", tmp_path / "rig.yaml"
+    record_turns(flight)
+    text = told(capsys, 0, "calibrate", "rig", flight, "--by", "motion", "--out", out)
+    assert "position_m is kept from the configuration: attitude says nothing of where a camera sits" in text
+    told(capsys, 0, "config", "check", out)
+    rig = load_drone(out).rig
+    found = rig.cameras[0].extrinsics
+    assert (found.yaw_deg, found.pitch_deg, found.roll_deg) == pytest.approx((-92.5, -4.0, 3.0), abs=0.3)
+    assert found.position_m == (0.0, -0.1, 0.0)
+    assert rig.time_offset_s == pytest.approx(OFFSET_S, abs=5e-3)
+    assert found.measured is not None
+    assert found.measured.residual_deg is not None
+    assert "has one camera" in told(capsys, 2, "calibrate", "rig", flight, "--out", out, "--force")
+    facts = json.loads(told(capsys, 0, "calibrate", "rig", flight, "--by", "motion", "--out", out, "--force", "--json"))
+    assert facts["time_offset_s"] == pytest.approx(OFFSET_S, abs=5e-3)
+
+
+def test_a_recording_is_searched_for_the_board(tmp_path: Path, capsys: Capture) -> None:
+    flight = tmp_path / "drone1.mcap"
+    record_turns(flight, steps=3)
+    assert "the board is in none of the 3 images (3 no board)" in told(
+        capsys, 1, "calibrate", "camera", flight, "--out", tmp_path / "left.yaml"
+    )
+    assert "has no camera 'up'; choose with --camera from left" in told(
+        capsys, 2, "calibrate", "camera", flight, "--camera", "up"
+    )

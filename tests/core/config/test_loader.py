@@ -1,0 +1,474 @@
+"""A person writes a configuration, makes a slip, and is told where it is and how to mend it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from flockd.core.config import Overrides, load_drone, load_scenario, schema_of
+from flockd.core.config.document import core_scalar
+from flockd.core.errors import ConfigError, ConfigProblem, ModelError
+from flockd.flight.perception import load_networks
+
+CONFIG = Path(__file__).parents[3] / "config"
+
+DRONE = """\
+rig:
+  cameras:
+    - name: front
+      size_px: [640, 480]
+      intrinsics: {fx: 320, fy: 320.0, cx: 320, cy: 240}
+"""
+SCENARIO = """\
+scenario: two
+drone: drone.yaml
+vehicles:
+  - {position_m: [0, 0, -4]}
+  - {position_m: [0, 5, -4]}
+"""
+
+
+def _problems(path: Path) -> list[str]:
+    load = load_scenario if path.name == "scenario.yaml" else load_drone
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    lines = str(caught.value).splitlines()
+    assert len(lines) == len(caught.value.problems), "one line a problem"
+    return [line.replace(f"{path.parent}/", "") for line in lines]
+
+
+def _drone_problems(folder: Path, text: str) -> list[str]:
+    path = folder / "drone.yaml"
+    path.write_text(text, encoding="utf-8")
+    return _problems(path)
+
+
+def _with(line: str) -> str:
+    return DRONE + line + "\n"
+
+
+def test_the_papers_flight_is_table_1() -> None:
+    scenario = load_scenario(CONFIG / "paper_flight.yaml")
+    table_1 = [(-0.5, 0.9, -4.5), (0.5, -2.8, -4.0), (1.2, 4.5, -5.0), (3.9, 0.5, -3.5), (4.5, 1.4, -3.0)]
+    assert [vehicle.position_m for vehicle in scenario.vehicles] == table_1
+    assert {vehicle.velocity_m_s for vehicle in scenario.vehicles} == {(1.0, 0.0)}
+    assert scenario.duration_s == 110.0
+    assert scenario.drone.step_s == 0.5
+    assert scenario.drone.flocking.desired_distance_m == 3.5
+
+
+def test_whole_numbers_stand_for_floats_and_lists_for_tuples(tmp_path: Path) -> None:
+    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
+    (tmp_path / "scenario.yaml").write_text(SCENARIO, encoding="utf-8")
+    scenario = load_scenario(tmp_path / "scenario.yaml")
+    assert scenario.drone.rig.cameras[0].intrinsics.fx == 320.0
+    assert isinstance(scenario.drone.rig.cameras[0].intrinsics.fx, float)
+    assert scenario.vehicles[1].position_m == (0.0, 5.0, -4.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [  # YAML 1.2.2, section 10.3.2 and its example 10.9, then what YAML 1.1 reads as something else
+        ("null", None),
+        ("~", None),
+        ("", None),
+        ("true", True),
+        ("False", False),
+        ("0", 0),
+        ("0o7", 7),
+        ("0x3A", 58),
+        ("-19", -19),
+        ("0.", 0.0),
+        ("-0.0", 0.0),
+        (".5", 0.5),
+        ("+12e03", 12000.0),
+        ("-2E+05", -200000.0),
+        ("1e3", 1000.0),
+        ("010", 10),
+        ("-.INF", -math.inf),
+        ("on", "on"),
+        ("No", "No"),
+        ("y", "y"),
+        ("12:30", "12:30"),
+        ("1_000", "1_000"),
+        ("0b11", "0b11"),
+        ("2026-11-20", "2026-11-20"),
+        ("=", "="),
+    ],
+)
+def test_scalars_follow_the_core_schema(text: str, value: object) -> None:
+    read = core_scalar(text)
+    assert read == value
+    assert type(read) is type(value)
+
+
+def test_words_that_old_yaml_takes_for_truth_values_stay_words(tmp_path: Path) -> None:
+    path = tmp_path / "drone.yaml"
+    path.write_text(DRONE.replace("name: front", "name: on"), encoding="utf-8")
+    assert load_drone(path).rig.cameras[0].name == "on"
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("step_s: -0.5", "step_s: -0.5 is not greater than 0; write a number of seconds above 0 and up to 60"),
+        ("step_s: .nan", "step_s: .nan is not finite; write a number of seconds above 0 and up to 60"),
+        ("step_s: 1e999", "step_s: 1e999 is not finite; write a number of seconds above 0 and up to 60"),
+        (
+            "step_s: true",
+            "step_s: true is not a number of seconds above 0 and up to 60; "
+            "write a number of seconds above 0 and up to 60",
+        ),
+        ("step_s: '0.5'", "step_s: '0.5' is not a number of seconds above 0 and up to 60; write 0.5"),
+        ("step_s: 1_000", "step_s: 1_000 is not a number of seconds above 0 and up to 60; write 1000"),
+        ("step_s:", "step_s: has no value; write a number of seconds above 0 and up to 60"),
+        ("stepp_s: 1", "stepp_s: is not a known key; did you mean `step_s`?"),
+        ("yaw: corse", "yaw: corse is not known; did you mean `course`?"),
+        ("yaw: 5", "yaw: 5 is not known; write `hold` or `course`"),
+        ("geometry: {refine: yes}", "geometry.refine: yes is not true or false; write true"),
+        ("geometry: {hypotheses: 1e3}", "geometry.hypotheses: 1e3 is not a whole number from 1 to 100000; write 1000"),
+        (
+            "geometry: {min_inlier_ratio: 1}",
+            "geometry.min_inlier_ratio: 1 is not less than 1; write a number above 0 and below 1",
+        ),
+        ("perception: {flow: 5}", "perception.flow: 5 is not a text; put it in quotes"),
+        (
+            "perception: {threads: 99999999999999999999}",
+            "perception.threads: 99999999999999999999 is too large; write a number up to 9223372036854775807",
+        ),
+        ("flocking: {weight: [1]}", "flocking.weight: a list is not a section; write a section with kind, nearest"),
+        (
+            "desired: {speed_m_s: 1.0}",
+            "desired: is called `mission` now; write `mission:` with `kind: circle_then_tangent` and the same keys "
+            "below it",
+        ),
+        ("yaw: !!str hold", "yaw: the tag `tag:yaml.org,2002:str` is not supported; delete it"),
+        ("yaw: &way hold", "yaw: the anchor `&way` is not supported; delete it"),
+        ("<<: {yaw: hold}", "<<: merge keys are not supported; write the values out"),
+    ],
+)
+def test_a_slip_in_line_six_is_reported_with_what_to_do(tmp_path: Path, line: str, told: str) -> None:
+    assert _drone_problems(tmp_path, _with(line)) == [f"drone.yaml:6: {told}"]
+
+
+def test_a_key_given_twice_is_refused(tmp_path: Path) -> None:
+    assert _drone_problems(tmp_path, _with("step_s: 0.5\nyaw: hold\nstep_s: 0.1")) == [
+        "drone.yaml:8: step_s: is given twice, first in line 6; delete one"
+    ]
+
+
+def test_an_alias_is_refused_once_and_not_also_for_its_value(tmp_path: Path) -> None:
+    told = _drone_problems(tmp_path, _with("yaw: &way hold\nstep_s: *way"))
+    assert told == [
+        "drone.yaml:6: yaw: the anchor `&way` is not supported; delete it",
+        "drone.yaml:7: step_s: the alias `*way` is not supported; write the value out",
+    ]
+
+
+def test_a_rig_without_cameras_is_refused(tmp_path: Path) -> None:
+    assert _drone_problems(tmp_path, "rig:\n  cameras: []\n") == [
+        "drone.yaml:2: rig.cameras: has 0 entries; write a list of at least 1 entry"
+    ]
+    assert _drone_problems(tmp_path, "step_s: 1\n") == [
+        "drone.yaml:1: rig: is missing; add it with a section with cameras"
+    ]
+
+
+def test_faults_inside_a_camera_name_the_camera(tmp_path: Path) -> None:
+    text = DRONE.replace("[640, 480]", "[640]").replace("fx: 320,", "fx:320,").replace("cy: 240", "cy: 0")
+    assert _drone_problems(tmp_path, text) == [
+        "drone.yaml:4: rig.cameras[0].size_px: has 1 entry; write a list of 2 numbers of pixels",
+        "drone.yaml:5: rig.cameras[0].intrinsics.cy: 0 is not greater than 0; write a positive number",
+        "drone.yaml:5: rig.cameras[0].intrinsics.fx: is missing; add it with a positive number",
+        "drone.yaml:5: rig.cameras[0].intrinsics.fx:320: is not a key; put a space after the colon: `fx: 320`",
+    ]
+
+
+def test_two_cameras_of_one_name_are_refused(tmp_path: Path) -> None:
+    twice = DRONE + DRONE.split("cameras:\n")[1]
+    assert _drone_problems(tmp_path, twice) == [
+        "drone.yaml:1: rig: two cameras share the name 'front'; give each its own"
+    ]
+
+
+def test_all_problems_of_both_files_come_at_once(tmp_path: Path) -> None:
+    (tmp_path / "drone.yaml").write_text(_with("stepp_s: 0.5\nyaw: corse"), encoding="utf-8")
+    scenario = tmp_path / "scenario.yaml"
+    scenario.write_text(SCENARIO.replace("[0, 5, -4]", "[0, 5]") + "duration_s: 0\n", encoding="utf-8")
+    assert _problems(scenario) == [
+        "drone.yaml:6: stepp_s: is not a known key; did you mean `step_s`?",
+        "drone.yaml:7: yaw: corse is not known; did you mean `course`?",
+        "scenario.yaml:5: vehicles[1].position_m: has 2 entries; write a list of 3 numbers of metres",
+        "scenario.yaml:6: duration_s: 0 is not greater than 0; write a number of seconds above 0 and up to 86400",
+    ]
+
+
+def test_a_scenario_reports_a_drone_file_that_is_not_there(tmp_path: Path) -> None:
+    scenario = tmp_path / "scenario.yaml"
+    scenario.write_text(SCENARIO, encoding="utf-8")
+    assert _problems(scenario) == [
+        "drone.yaml: does not exist; check the path",
+        "scenario.yaml:2: drone: names drone.yaml, which cannot be used; correct it or name another",
+    ]
+    scenario.write_text(SCENARIO.replace("drone: drone.yaml\n", ""), encoding="utf-8")
+    assert _problems(scenario) == ["scenario.yaml:1: drone: is missing; write it as in `drone: simulator.yaml`"]
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"", ": is empty; write the configuration into it"),
+        (b"# only a remark\n", ": is empty; write the configuration into it"),
+        (b"---\n", ": is empty; write the configuration into it"),
+        (b"- rig\n", ":1: is a list at its top level; write keys with values, such as `seed: 0`"),
+        (b"rig\n", ":1: is a single value at its top level; write keys with values, such as `seed: 0`"),
+        (b"step_s: 1\nrig: \xff\n", ":2: is not UTF-8 text; save the file in UTF-8"),
+        (b"rig:\n\tcameras: []\n", ":2: a tab stands where YAML needs spaces; indent and separate with spaces"),
+        (b"yaw: hold\nstep_s:1\nrig: {}\n", ":2: put a space after the `:`"),
+        (
+            b"a: 1\nrig: {b: 1\n",
+            ":2: a bracket is opened here and not closed properly; check the commas and the closing bracket",
+        ),
+        (b"yaw: 'hold\n\n", ":1: a quote is opened here and never closed; close it"),
+        (b"yaw: @hold\n", ":1: a value cannot begin with `@`; put it in quotes"),
+        (b"yaw: hold\nrig: \x01\n", ":2: holds the control character 0x01; delete it"),
+        (b"a: " + b"[" * 100_000, ":1: is nested more than 32 levels deep; flatten it"),
+        (b"#" * (1 << 20) + b"\n", ": is larger than 1024 KiB, which no configuration is; check the path"),
+    ],
+)
+def test_a_file_that_cannot_be_read_gets_one_sentence(tmp_path: Path, content: bytes, told: str) -> None:
+    path = tmp_path / "drone.yaml"
+    path.write_bytes(content)
+    assert _problems(path) == [f"drone.yaml{told}"]
+
+
+def test_paths_that_are_no_files_get_one_sentence(tmp_path: Path) -> None:
+    assert _problems(tmp_path / "none.yaml") == ["none.yaml: does not exist; check the path"]
+    (tmp_path / "folder").mkdir()
+    assert _problems(tmp_path / "folder") == ["folder: is a folder; name the YAML file in it"]
+    assert _problems(Path("/dev/zero")) == ["zero: is not an ordinary file; copy the configuration to one"]
+
+
+def test_of_very_many_problems_the_first_are_told_and_the_others_counted(tmp_path: Path) -> None:
+    path = tmp_path / "drone.yaml"
+    path.write_text("rig:\n  cameras:\n" + "  - {lens: wide, colour: red}\n" * 300, encoding="utf-8")
+    with pytest.raises(ConfigError) as refused:
+        load_drone(path)
+    *told, last = str(refused.value).splitlines()
+    assert len(told) == 20
+    assert all("is not a known key" in line or "is missing; add it" in line for line in told)
+    assert told[0].startswith(f"{path}:3: rig.cameras[0]")
+    found = len(refused.value.problems)
+    assert found >= 300 * 4, "two unknown keys and two missing ones each"
+    assert last == f"and {found - 20} more problems; correct these first"
+
+
+def test_a_file_of_a_hundred_thousand_values_is_refused_before_it_is_read_through(tmp_path: Path) -> None:
+    """The first of them are enough: the rest took 48 s to complain about."""
+    path = tmp_path / "drone.yaml"
+    path.write_text("rig:\n  cameras:\n" + "  - {a: 1, b: 2}\n" * 50_000, encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"holds more than 30000 values, which no configuration does"):
+        load_drone(path)
+
+
+def test_a_windows_file_is_read_as_any_other(tmp_path: Path) -> None:
+    path = tmp_path / "drone.yaml"
+    path.write_bytes(b"\xef\xbb\xbf" + DRONE.replace("\n", "\r\n").encode())
+    assert load_drone(path).rig.cameras[0].size_px == (640, 480)
+
+
+def test_overrides_win_over_both_files() -> None:
+    overrides: Overrides = {"seed": 7, "drone.perception.flow": "dis", "drone.flocking.weight.kind": "nearest"}
+    scenario = load_scenario(CONFIG / "paper_flight.yaml", overrides)
+    assert scenario.seed == 7
+    assert scenario.drone.perception.flow == "dis"
+    assert scenario.drone.perception.depth == "neighbours_int8", "the rest of the section stays"
+    assert scenario.drone.flocking.weight.kind == "nearest"
+
+
+def test_a_relative_path_counts_from_the_folder_of_the_file_it_stands_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drones, elsewhere = tmp_path / "drones", tmp_path / "elsewhere"
+    drones.mkdir()
+    elsewhere.mkdir()
+    folders = "models_dir: ../models, engines_dir: e"
+    perception = f"perception: {{{folders}, flow: mine/flow.yaml, depth: /opt/depth.yaml, distance: none}}\n"
+    (drones / "drone.yaml").write_text(f"{DRONE}{perception}telemetry: {{zenoh_config: tls.json5}}\n", encoding="utf-8")
+    (tmp_path / "scenario.yaml").write_text(SCENARIO.replace("drone.yaml", "drones/drone.yaml"), encoding="utf-8")
+    monkeypatch.chdir(elsewhere)
+    alone, flown = load_drone("../drones/drone.yaml"), load_scenario("../scenario.yaml").drone
+    for drone in (alone, flown):
+        assert drone.perception.models_dir == str(tmp_path / "models")
+        assert drone.perception.engines_dir == str(drones / "e")
+        assert drone.perception.flow == str(drones / "mine" / "flow.yaml")
+        assert drone.telemetry.zenoh_config == str(drones / "tls.json5")
+        assert (drone.perception.depth, drone.perception.distance) == ("/opt/depth.yaml", "none")
+        assert drone.perception.segmentation == "neighbours_int8", "a name is not a path"
+    overridden = load_drone("../drones/drone.yaml", {"perception.models_dir": "here"})
+    assert overridden.perception.models_dir == "here", "who overrides it stands elsewhere"
+
+
+def test_models_that_are_not_there_are_reported_with_where_they_were_searched_for(tmp_path: Path) -> None:
+    (tmp_path / "models").mkdir()
+    (tmp_path / "drone.yaml").write_text(_with("perception: {models_dir: modles}"), encoding="utf-8")
+    with pytest.raises(ModelError, match=rf"^perception\.models_dir: {tmp_path}/modles is no folder; name the one "):
+        load_networks(load_drone(tmp_path / "drone.yaml").perception)
+    (tmp_path / "drone.yaml").write_text(_with("perception: {models_dir: models}"), encoding="utf-8")
+    with pytest.raises(
+        ModelError, match=rf"^perception\.flow: there is no model 'flow_int8' \({tmp_path}/models/flow_int8\.yaml "
+    ):
+        load_networks(load_drone(tmp_path / "drone.yaml").perception)
+    (tmp_path / "drone.yaml").write_text(_with("perception: {flow: my/flow.yaml}"), encoding="utf-8")
+    with pytest.raises(ModelError, match=rf"\({tmp_path}/my/flow\.yaml is missing\)"):
+        load_networks(load_drone(tmp_path / "drone.yaml").perception)
+
+
+def test_a_wrong_override_is_reported_as_such() -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_scenario(CONFIG / "paper_flight.yaml", {"duration_s": -3.0, "drone.perception.sclae": "height"})
+    assert caught.value.problems == (
+        ConfigProblem("override", 0, "drone.perception.sclae", "is not a known key; did you mean `scale`?"),
+        ConfigProblem(
+            "override",
+            0,
+            "duration_s",
+            "-3.0 is not greater than 0; write a number of seconds above 0 and up to 86400",
+        ),
+    )
+
+
+def test_the_schema_describes_the_file_and_not_the_merged_model() -> None:
+    drone = schema_of("scenario")["properties"]["drone"]
+    assert drone["anyOf"] == [{"type": "string"}, {"$ref": "#/$defs/DroneConfig"}], "a path, or the drone itself"
+    assert schema_of("drone")["required"] == ["rig"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        (
+            "[0, 0, -4]",
+            "[0, 0, 4.5]",
+            "scenario.yaml:4: vehicles[0].position_m: the third number points down, so that 4.5 is 4.5 m below the "
+            "ground; write -4.5",
+        ),
+        (
+            "[0, 0, -4]",
+            "[0, 0, -0.2]",
+            "scenario.yaml:4: vehicles[0].position_m: begins 0.2 m above the ground; write -0.5 or less as the third "
+            "number",
+        ),
+        (
+            "[0, 5, -4]",
+            "[0, 0, -4]",
+            "scenario.yaml:5: vehicles[1].position_m: is 0 m from vehicles[0], and drones touch below 0.7 m; move one "
+            "of them",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nfaults: [{drone: 3, camera: front, kind: uniform}]",
+            "scenario.yaml:2: faults[0].drone: is 3, but there are 2 vehicles; write one of theirs",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nfaults: [{drone: 1, camera: top, kind: uniform}]",
+            "scenario.yaml:2: faults[0].camera: is not in the rig; write one of front",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nfaults: [{drone: 1, camera: front, kind: gaussian, begin_s: 5.0, end_s: 4.0}]",
+            "scenario.yaml:2: faults[0].end_s: is not after begin_s 5; write a larger one",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nworld: {drone_family: 99}",
+            "scenario.yaml:2: world.drone_family: 99 is not at most 13; write a whole number from 0 to 13 or `any`",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nworld:\n  obstacles:\n    kind: jungle",
+            "scenario.yaml:4: world.obstacles.kind: jungle is not known; write `forest` or `village`",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nworld:\n  obstacles:\n    kind: forest\n    trees_per_hectare: 900",
+            "scenario.yaml:5: world.obstacles.trees_per_hectare: 900 is not at most 400; write a number from 50 to 400",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nworld:\n  obstacles:\n    kind: village\n    trees_per_hectare: 100",
+            "scenario.yaml:5: world.obstacles.trees_per_hectare: has no meaning with kind `village`, only with "
+            "`forest`; delete it",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nduration_s: 0.1",
+            "scenario.yaml:2: duration_s: 0.1 s is shorter than a step of 0.5 s; write 0.5 or more",
+        ),
+        (
+            "scenario: two",
+            "scenario: two\nduration_s: 1e6",
+            "scenario.yaml:2: duration_s: 1e6 is not at most 86400; write a number of seconds above 0 and up to 86400",
+        ),
+        (
+            "  - {position_m: [0, 0, -4]}\n",
+            "".join(f"  - {{position_m: [{north}, 0, -4]}}\n" for north in range(5000)),
+            "scenario.yaml:3: vehicles: has 5001 entries; write a list of 1 to 100 entries",
+        ),
+    ],
+)
+def test_a_flight_that_cannot_be_flown_is_refused_at_its_line(tmp_path: Path, old: str, new: str, told: str) -> None:
+    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
+    scenario = tmp_path / "scenario.yaml"
+    scenario.write_text(SCENARIO.replace(old, new), encoding="utf-8")
+    assert _problems(scenario) == [told]
+
+
+def test_a_principal_point_outside_the_image_is_refused_at_its_line(tmp_path: Path) -> None:
+    assert _drone_problems(tmp_path, DRONE.replace("cx: 320", "cx: 3200").replace("cy: 240", "cy: 480")) == [
+        "drone.yaml:5: rig.cameras[0].intrinsics.cx: 3200 is outside the image, which is 640 pixels wide; check cx and "
+        "size_px",
+        "drone.yaml:5: rig.cameras[0].intrinsics.cy: 480 is outside the image, which is 480 pixels high; check cy and "
+        "size_px",
+    ]
+
+
+def test_a_file_of_the_other_kind_is_named_as_such(tmp_path: Path) -> None:
+    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
+    (tmp_path / "flight.yaml").write_text(SCENARIO, encoding="utf-8")
+    assert _problems(tmp_path / "flight.yaml") == [
+        "flight.yaml: is a scenario, and a drone's own file is needed here; name that: drone.yaml"
+    ]
+    (tmp_path / "scenario.yaml").write_text(DRONE, encoding="utf-8")
+    assert _problems(tmp_path / "scenario.yaml") == [
+        "scenario.yaml: is a drone's own file, and a scenario is needed here; name one with the keys `vehicles` and "
+        "`drone`"
+    ]
+    (tmp_path / "scenario.yaml").write_text(SCENARIO.replace("drone.yaml", "flight.yaml"), encoding="utf-8")
+    assert "flight.yaml: is a scenario, and a drone's own file is needed here; name that: drone.yaml" in _problems(
+        tmp_path / "scenario.yaml"
+    )
+
+
+def test_a_scenario_may_hold_its_drone(tmp_path: Path) -> None:
+    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
+    (tmp_path / "named.yaml").write_text(SCENARIO, encoding="utf-8")
+    inline = "drone:\n" + "".join(f"  {line}\n" for line in DRONE.splitlines())
+    (tmp_path / "held.yaml").write_text(SCENARIO.replace("drone: drone.yaml\n", inline), encoding="utf-8")
+    assert load_scenario(tmp_path / "held.yaml") == load_scenario(tmp_path / "named.yaml")
+    (tmp_path / "scenario.yaml").write_text(
+        SCENARIO.replace("drone: drone.yaml\n", inline.replace("cx: 320", "cx: -1")), encoding="utf-8"
+    )
+    assert _problems(tmp_path / "scenario.yaml") == [
+        "scenario.yaml:7: drone.rig.cameras[0].intrinsics.cx: -1 is not greater than 0; write a positive number"
+    ]
+
+
+def test_the_configuration_knows_how_many_families_the_simulator_has() -> None:
+    from flockd.core.config.scenario import DRONE_FAMILIES
+    from flockd.sim.drone_models import FAMILIES
+
+    assert DRONE_FAMILIES == FAMILIES

@@ -1,5 +1,0 @@
-"""The autopilot stand-in of the autopilot's own stories."""
-
-from tests.autopilot.conftest import fake_autopilot, port
-
-__all__ = ["fake_autopilot", "port"]

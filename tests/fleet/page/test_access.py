@@ -1,0 +1,267 @@
+"""Who may open the fleet page, who may command from it, and what a stranger's page cannot do."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import socket
+from collections.abc import Awaitable, Callable, Mapping
+from pathlib import Path
+
+import pytest
+from aiohttp import WSMsgType, web
+from aiohttp.test_utils import TestClient, TestServer
+
+from flockd.fleet.page.drone_rows import Known, Row
+from flockd.fleet.page.fleet_source import Event
+from flockd.fleet.page.page_access import MAX_SESSIONS, PageAccess, is_own_host
+from flockd.fleet.page.page_server import PageServer
+from flockd.fleet.watcher import Watched
+from flockd.onboard.telemetry.topics import AnswerMessage
+
+HOLD = {"drones": ["f/one"], "command": "hold"}
+Client = TestClient[web.Request, web.Application]
+
+
+class Asked:
+    """A fleet of one drone that accepts everything, and notes it."""
+
+    span_s = None
+
+    def __init__(self) -> None:
+        self.commands: list[tuple[str, str, object]] = []
+
+    def now_s(self) -> float:
+        return 1.0
+
+    def wall_s(self, time_s: float) -> float:
+        return time_s
+
+    def drones(self, time_s: float) -> tuple[Watched, ...]:
+        return ()
+
+    def known(self) -> Mapping[str, Known]:
+        return {}
+
+    def rows(self, time_s: float) -> dict[str, Row]:
+        return {"f/one": {"state": "normal"}}
+
+    def events(self, time_s: float) -> list[Event]:
+        return [(0.5, "f/one", "took off")]
+
+    def history(self) -> Mapping[str, list[list[float | None]]]:
+        return {}
+
+    def ask(self, drone: str, command: str, order: Mapping[str, object] | None) -> AnswerMessage:
+        self.commands.append((drone, command, order))
+        return AnswerMessage(accepted=True, sentence="tried")
+
+    def image(self, drone: str, camera: str, time_s: float) -> bytes | None:
+        return b"jpeg" if (drone, camera) == ("f/one", "front") else None
+
+
+def served(story: Callable[[Client, PageAccess, Asked], Awaitable[None]], *, may_command: bool = True) -> None:
+    """Tells a story to a server and a browser without a page."""
+
+    async def tell() -> None:
+        access, fleet = PageAccess(), Asked()
+        server = TestServer(PageServer(fleet, access, may_command=may_command).application(), host="127.0.0.1")
+        async with TestClient(server) as client:
+            await story(client, access, fleet)
+
+    asyncio.run(tell())
+
+
+async def opened(client: Client, access: PageAccess) -> dict[str, str]:
+    """Opens the page; what it sends with a command."""
+    reply = await client.get("/", params={"key": access.key})
+    token = re.search('name="token" content="([^"]{20,})"', await reply.text())
+    assert token is not None
+    return {"Origin": f"http://127.0.0.1:{client.port}", "X-Flockd-Token": token[1]}
+
+
+def test_without_the_key_nothing_is_shown() -> None:
+    async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
+        paths = (
+            "/",
+            "/fleet_page.js",
+            "/plotly.js",
+            "/history",
+            "/image/f/one/front",
+            "/live",
+            "/?key=wrong",
+            "/?key=",
+        )
+        for path in paths:
+            assert (await client.get(path)).status == 403, path
+        assert (await client.post("/ask", json=HOLD)).status == 403
+        await opened(client, access)
+        for path in paths[:-3]:
+            assert (await client.get(path)).status == 200, path
+        assert fleet.commands == []
+
+    served(story)
+
+
+def test_the_key_moves_from_the_address_into_a_cookie_that_other_sites_cannot_send() -> None:
+    async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
+        reply = await client.get("/", params={"key": access.key}, allow_redirects=False)
+        assert (reply.status, reply.headers["Location"]) == (303, "/")
+        (cookie,) = reply.cookies.values()
+        assert (cookie["samesite"], cookie["httponly"], cookie["path"]) == ("Strict", True, "/")
+        assert access.key not in str(reply.cookies)
+
+    served(story)
+
+
+def test_a_command_needs_the_sessions_token_and_the_pages_own_origin() -> None:
+    async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
+        own = await opened(client, access)
+        other = await opened(client, access)  # a later session: the cookie is its own now
+        refused: tuple[dict[str, str], ...] = (
+            {},
+            {"Origin": own["Origin"]},
+            {"X-Flockd-Token": other["X-Flockd-Token"]},
+            {**other, "Origin": "http://stranger.example"},
+            {**other, "Origin": f"https://127.0.0.1:{client.port}"},
+            {**other, "Origin": "null"},
+            {**other, "Origin": "http://127.0.0.1:1"},
+            {**other, "X-Flockd-Token": "guessed"},
+            own,
+        )
+        for headers in refused:
+            reply = await client.post("/ask", json=HOLD, headers=headers)
+            assert reply.status == 403, headers
+        assert fleet.commands == []
+        reply = await client.post("/ask", json=HOLD, headers=other)
+        assert await reply.json() == {"f/one": {"accepted": True, "sentence": "tried"}}
+        assert fleet.commands == [("f/one", "hold", None)]
+
+    served(story)
+
+
+def test_a_name_that_was_made_to_lead_here_gets_nothing() -> None:
+    """DNS rebinding: to the browser the stranger's page is then of the same origin as this server."""
+
+    async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
+        own = await opened(client, access)
+        strange = {"Host": f"stranger.example:{client.port}", "Origin": f"http://stranger.example:{client.port}"}
+        assert (await client.get("/", params={"key": access.key}, headers=strange)).status == 403
+        assert (await client.get("/history", headers=strange)).status == 403
+        assert (await client.post("/ask", json=HOLD, headers={**own, **strange})).status == 403
+        assert fleet.commands == []
+
+    served(story)
+
+
+@pytest.mark.parametrize(
+    ("host", "own"),
+    [
+        ("127.0.0.1:8470", True),
+        ("192.168.1.7:8470", True),
+        ("[::1]:8470", True),
+        ("localhost", True),
+        (f"{socket.gethostname()}:8470", True),
+        ("localhost.stranger.example:8470", False),
+        ("127.0.0.1.stranger.example", False),
+        ("", False),
+        ("[", False),
+    ],
+)
+def test_the_host_of_a_request_is_an_address_or_this_computers_name(host: str, own: bool) -> None:
+    assert is_own_host(host) == own
+
+
+def test_every_reply_forbids_what_is_not_from_here_and_lets_no_other_site_read_it() -> None:
+    async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
+        own = await opened(client, access)
+        replies = [await client.get(path) for path in ("/", "/fleet_map.js", "/image/f/one/front", "/nothing.js", "/x")]
+        replies += [await client.post("/ask", json=HOLD), await client.post("/ask", json=HOLD, headers=own)]
+        replies += [await client.options("/ask", headers={"Origin": "http://stranger.example"})]
+        for reply in replies:
+            policy = reply.headers["Content-Security-Policy"]
+            assert "default-src 'none'" in policy
+            assert "http" not in policy
+            assert "unsafe-inline" not in policy.split("script-src")[1].split(";")[0]
+            assert not [name for name in reply.headers if name.startswith("Access-Control")]
+            assert reply.headers["Cross-Origin-Resource-Policy"] == "same-origin"
+
+    served(story)
+
+
+def test_live_data_go_to_the_sessions_own_page_only() -> None:
+    async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
+        own = await opened(client, access)
+        assert (await client.get("/live", headers={"Origin": "http://stranger.example"})).status == 403
+        async with client.ws_connect("/live", headers={"Origin": own["Origin"]}) as wrong:
+            await wrong.send_json({"token": "guessed"})
+            assert (await wrong.receive()).type == WSMsgType.CLOSE
+            assert wrong.close_code == 4403
+        async with client.ws_connect("/live", headers={"Origin": own["Origin"]}) as page:
+            await page.send_json({"token": own["X-Flockd-Token"]})
+            assert await page.receive_json() == {"kind": "hello", "span_s": None, "may_command": True}
+            shown = await page.receive_json()
+            assert shown["rows"] == {"f/one": {"state": "normal"}}
+            assert shown["events"] == [[0.5, "f/one", "took off"]]
+            again = await page.receive_json()
+            assert (again["order"], again["rows"], again["events"]) == (["f/one"], {}, []), "only what has changed"
+
+    served(story)
+
+
+def test_a_page_that_only_watches_commands_nothing() -> None:
+    async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
+        reply = await client.post("/ask", json=HOLD, headers=await opened(client, access))
+        assert reply.status == 403
+        assert "commands nothing" in await reply.text()
+        assert fleet.commands == []
+
+    served(story, may_command=False)
+
+
+@pytest.mark.parametrize(
+    ("body", "told"),
+    [
+        (b"{", ""),
+        (b"[]", "JSON object"),
+        (json.dumps({**HOLD, "drones": []}).encode(), "names its drones"),
+        (json.dumps({**HOLD, "drones": [1]}).encode(), "names its drones"),
+        (json.dumps({**HOLD, "command": "about"}).encode(), "hold, land, resume, goto"),
+        (json.dumps({**HOLD, "command": "goto", "order": {"north_m": 1}}).encode(), "`east_m`"),
+        (b'{"drones":["f/one"],"command":"goto","order":{"north_m":1,"east_m":NaN}}', "east_m has to be a number"),
+    ],
+)
+def test_what_is_no_command_is_refused_in_one_sentence(body: bytes, told: str) -> None:
+    async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
+        reply = await client.post("/ask", data=body, headers=await opened(client, access))
+        assert reply.status == 400
+        assert told in await reply.text()
+        assert fleet.commands == []
+
+    served(story)
+
+
+def test_an_order_reaches_every_drone_once() -> None:
+    async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
+        order = {"north_m": 3, "east_m": -2.5}
+        body = {"drones": ["f/one", "f/two", "f/one"], "command": "goto", "order": order}
+        await client.post("/ask", json=body, headers=await opened(client, access))
+        assert sorted(fleet.commands) == [("f/one", "goto", order), ("f/two", "goto", order)]
+
+    served(story)
+
+
+def test_the_oldest_session_ends_where_there_are_too_many() -> None:
+    access = PageAccess()
+    first = access.open_session(access.key)
+    for _ in range(MAX_SESSIONS):
+        newest = access.open_session(access.key)
+    assert access.token_of(first) is None
+    assert access.token_of(newest) is not None
+
+
+def test_the_page_names_no_place_outside_the_computer() -> None:
+    folder = Path(__file__).parents[3] / "flockd" / "fleet" / "page"
+    for path in (path for path in folder.iterdir() if path.suffix in {".html", ".js", ".css"}):
+        assert re.findall(r"(?:https?:)?//[a-z0-9]", path.read_text(encoding="utf-8")) == [], path

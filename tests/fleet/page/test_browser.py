@@ -1,0 +1,158 @@
+"""The fleet page in a real Chromium, with drones that are processes of their own: run with `make browser`.
+
+The times that it takes are printed, not checked: the computer may be busy.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from subprocess import Popen
+from typing import NamedTuple
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tools.measure.bench_fleet_page import NARROW, PATIENCE_MS, chromium, free_endpoint, made_up_drones, served_page
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+
+class Flock(NamedTuple):
+    """Five drones: three that take commands, one that takes none, one that will be killed."""
+
+    page: Page
+    address: str
+    doomed: Popen[bytes]
+    errors: list[str]
+    requests: list[str]
+
+
+@pytest.fixture(scope="module")
+def flock() -> Iterator[Flock]:
+    endpoint = free_endpoint()
+    with ExitStack() as stack:
+        address, _ = stack.enter_context(served_page(endpoint))
+        of_five = ("--flock", "5", "--drones")
+        stack.enter_context(made_up_drones(endpoint, *of_five, "3", "--commands", "hold,resume"))
+        stack.enter_context(made_up_drones(endpoint, *of_five, "1", "--first", "4"))
+        doomed = stack.enter_context(made_up_drones(endpoint, *of_five, "1", "--first", "5", "--commands", "hold"))
+        page = stack.enter_context(chromium()).new_context().new_page()
+        page.set_default_timeout(PATIENCE_MS)
+        expect.set_options(timeout=PATIENCE_MS)
+        errors: list[str] = []
+        requests: list[str] = []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        page.on("request", lambda request: requests.append(request.url))
+        page.goto(address)
+        expect(page.locator("article")).to_have_count(5)
+        yield Flock(page, address, doomed, errors, requests)
+
+
+def card(page: Page, drone: str) -> str:
+    """Of one drone."""
+    return f"article[data-key='made-up/{drone}']"
+
+
+def told(what: str, began_s: float) -> None:
+    took_s, load = time.monotonic() - began_s, os.getloadavg()[0]
+    sys.stdout.write(f"{what}: {took_s:.2f} s (load average {load:.1f} on {os.cpu_count()} cores)\n")
+
+
+def test_five_drones_appear(flock: Flock) -> None:
+    began_s = time.monotonic()
+    flock.page.goto(flock.address)
+    expect(flock.page.locator("article[data-tone=good], article[data-tone=fair]")).to_have_count(5)
+    told("from opening the page until five drones fly on it", began_s)
+    expect(flock.page.locator("#summary")).to_have_text("5 drones: 1 degraded, 4 normal")
+    expect(flock.page.locator(card(flock.page, "drone3"))).to_contain_text("camera back delivers no frames")
+    expect(flock.page.locator(".plot .js-line")).to_have_count(5)
+    marked = "c => c.getContext('2d').getImageData(0, 0, c.width, c.height).data.some(value => value > 0)"
+    assert flock.page.locator("#map canvas").evaluate(marked)
+
+
+def test_a_hold_is_confirmed_by_the_drone_and_resumed(flock: Flock) -> None:
+    page, of = flock.page, card(flock.page, "drone2")
+    page.locator(f"{of} [data-command=hold]").click()
+    expect(page.locator("#confirm h2")).to_have_text("Hold drone2?")
+    page.locator("#confirm [value=cancel]").click()
+    expect(page.locator("#confirm")).to_be_hidden()
+    expect(page.locator(f"{of} .state")).to_have_text("normal")
+    page.locator(f"{of} [data-command=hold]").click()
+    began_s = time.monotonic()
+    page.locator("#confirm .send").click()
+    expect(page.locator("#answers p")).to_have_text("drone2: hold is being tried; the drone's state shows the result")
+    told("from the confirmed hold to the drone's answer", began_s)
+    expect(page.locator(f"{of} .state")).to_have_text("asking")
+    expect(page.locator(of)).to_contain_text("an operator asked for Hold")
+    told("and until its card shows it", began_s)
+    expect(page.locator("#events")).to_contain_text("an operator asked for hold")
+    for _ in range(2):
+        page.locator(f"{of} [data-command=hold]").click()
+        page.locator("#confirm .send").click()
+    expect(page.locator("#events")).to_contain_text("an operator asked for hold (2 times)")
+    page.locator(f"{of} [data-command=resume]").click()
+    page.locator("#confirm .send").click()
+    expect(page.locator(f"{of} .state")).to_have_text("normal")
+
+
+def test_a_drone_that_allows_no_command_refuses(flock: Flock) -> None:
+    page, of = flock.page, card(flock.page, "drone4")
+    expect(page.locator(of)).to_contain_text("takes no commands: its telemetry.commands allows none")
+    for button in page.locator(f"{of} [data-command]").all():
+        expect(button).to_be_disabled()
+    answer = page.evaluate("""async () => (await fetch("ask", {method: "POST",
+        headers: {"X-Flockd-Token": document.querySelector("meta[name=token]").content},
+        body: JSON.stringify({drones: ["made-up/drone4"], command: "hold"})})).json()""")
+    refusal = {"accepted": False, "sentence": "'hold' is not allowed here; telemetry.commands allows none"}
+    assert answer == {"made-up/drone4": refusal}
+
+
+def test_a_stranger_in_the_same_browser_commands_nothing(flock: Flock) -> None:
+    """With the page's cookie in the browser, from a page of another origin."""
+    stranger = flock.page.context.new_page()
+    stranger.goto("about:blank")
+    sent = stranger.evaluate(
+        """async address => { try { const reply = await fetch(address + "ask", {method: "POST", mode: "no-cors",
+        credentials: "include", body: JSON.stringify({drones: ["made-up/drone1"], command: "hold"})});
+        return reply.status } catch { return "refused" } }""",
+        flock.address.split("?")[0],
+    )
+    assert sent in {0, "refused"}, "its reply cannot be read"
+    stranger.close()
+    expect(flock.page.locator(f"{card(flock.page, 'drone1')} .state")).to_have_text("normal")
+
+
+def test_pictures_of_cameras_come_on_request(flock: Flock) -> None:
+    of = card(flock.page, "drone1")
+    flock.page.locator(f"{of} .look").click()
+    for place in range(2):
+        expect(flock.page.locator(f"{of} img").nth(place)).to_have_js_property("naturalWidth", 320)
+    flock.page.locator(f"{of} .look").click()
+    expect(flock.page.locator(f"{of} .pictures")).to_be_hidden()
+
+
+def test_on_a_phone_nothing_is_wider_than_the_screen(flock: Flock) -> None:
+    flock.page.set_viewport_size(NARROW)
+    assert flock.page.evaluate("document.documentElement.scrollWidth") <= NARROW["width"]
+    expect(flock.page.locator("#map canvas")).to_be_visible()
+
+
+def test_a_killed_drone_is_shown_with_the_reason(flock: Flock) -> None:
+    of = card(flock.page, "drone5")
+    began_s = time.monotonic()
+    flock.doomed.kill()
+    expect(flock.page.locator(f"{of} .state")).to_have_text("gone")
+    told("from the kill until the drone is shown as gone", began_s)
+    expect(flock.page.locator(f"{of} .why")).to_contain_text("its process has ended or cannot be reached")
+    expect(flock.page.locator("#summary")).to_contain_text("1 gone")
+
+
+def test_nothing_was_loaded_from_elsewhere_and_nothing_failed(flock: Flock) -> None:
+    own = flock.address.split("?")[0]
+    assert [url for url in flock.requests if not url.startswith((own, "blob:", "data:"))] == []
+    assert flock.errors == []

@@ -1,0 +1,62 @@
+"""The page's view of drones that publish over zenoh: who they are, their clocks, their events, their answers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import pytest
+
+from flockd.fleet.page.live_fleet import LiveFleet
+from flockd.fleet.watcher import FleetWatcher, _heard
+from flockd.onboard.telemetry.publisher import ZenohTelemetry
+from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
+from tools.measure.bench_fleet_page import free_endpoint
+
+ABOUT = AboutMessage(version="1.2.3", configuration={"safety": {"gate": {"fence_radius_m": 40.0}}}, commands=["hold"])
+
+
+def until(true: Callable[[], bool]) -> None:
+    """Waits for it, and fails where it does not come."""
+    end_s = time.monotonic() + 60.0
+    while not true():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+def test_a_drone_is_shown_with_what_queries_tell_and_answers_for_itself() -> None:
+    endpoint = free_endpoint()
+
+    def ask(command: str, payload: bytes) -> AnswerMessage:
+        return AnswerMessage(accepted=command == "hold", sentence=f"{command} {payload.decode()}")
+
+    with (
+        FleetWatcher(None, listen=[endpoint], connect=[]) as watcher,
+        LiveFleet(watcher) as fleet,
+        ZenohTelemetry("f", listen=[], connect=[endpoint]) as drone,
+    ):
+        drone.announce("d", ABOUT, ask, lambda camera: b"jpeg" if camera == "front" else None)
+        until(lambda: "f/d" in fleet.rows(fleet.now_s()) and fleet.rows(fleet.now_s())["f/d"]["delay_ms"] is not None)
+        row = fleet.rows(fleet.now_s())["f/d"]
+        assert (row["version"], row["commands"], row["fence"]["radius_m"]) == ("1.2.3", ["hold"], 40.0)
+        assert row["state"] == "quiet", "it is there, and has published nothing"
+        assert abs(row["clock_s"]) <= row["delay_ms"] / 1000 / 2 + 0.001, "both ends read the same clock"
+        assert fleet.ask("f/d", "hold", None) == {"accepted": True, "sentence": "hold "}
+        assert fleet.ask("f/d", "goto", {"north_m": 1}) == {"accepted": False, "sentence": 'goto {"north_m": 1}'}
+        assert fleet.ask("f/other", "hold", None) == {"accepted": False, "sentence": "no drone of this name was heard"}
+        assert (fleet.image("f/d", "front", 0.0), fleet.image("f/d", "back", 0.0)) == (b"jpeg", None)
+        for number in range(3):
+            drone.publish("d", "events", {"time_s": float(number), "event": f"event {number}"})
+        until(lambda: len(fleet.events(fleet.now_s())) == 3)
+        assert [event[1:] for event in fleet.events(0.0)] == [("f/d", f"event {number}") for number in range(3)]
+        until(lambda: len(fleet.history()["f/d"]) >= 2)
+
+
+def test_the_period_of_a_topic_is_of_its_new_messages() -> None:
+    """Messages every half second, each sent once more in between."""
+    heard = None
+    for number in range(20):
+        heard = _heard(heard, 100.0 + 0.5 * number, {"time_s": 0.5 * number})
+        heard = _heard(heard, 100.2 + 0.5 * number, {"time_s": 0.5 * number})
+    assert heard is not None
+    assert heard.period_s == pytest.approx(0.5)

@@ -1,0 +1,229 @@
+"""The flocking law against figures worked out by hand from Eq. 38-43 and against the flock it must form."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from flockd.flight.flocking import FlockingLaw, FlockingParameters, WeightParameters, level_offsets, limit_norm
+from flockd.flight.flocking.metrics import min_distance, obj1, obj2, pair_distances
+from flockd.flight.mission import MissionParameters
+from flockd.flight.mission.circle_then_tangent import course, desired_velocity
+
+Array = NDArray[np.float64]
+NOBODY = np.empty((0, 2))
+STILL = np.zeros(2)
+ALL_OFF = FlockingParameters(cohesion=0.0, alignment=0.0, separation=0.0, velocity=0.0)
+
+TABLE_1 = np.array([[-0.5, 0.9], [0.5, -2.8], [1.2, 4.5], [3.9, 0.5], [4.5, 1.4]])
+
+
+def _flight(law: FlockingLaw, start: Array, *, duration_s: float, step_s: float = 0.5) -> list[tuple[Array, Array]]:
+    """Eq. 38-43 with exact states, everybody at once: position by the new velocity."""
+    desired = MissionParameters()
+    positions, velocities = start.copy(), np.tile([1.0, 0.0], (len(start), 1))
+    states = []
+    for step in range(round(duration_s / step_s)):
+        efv = desired_velocity(desired, step * step_s)
+        accelerations = np.array(
+            [
+                law.acceleration(
+                    velocities[i],
+                    np.delete(positions, i, axis=0) - positions[i],
+                    np.delete(velocities, i, axis=0),
+                    efv,
+                )
+                for i in range(len(start))
+            ]
+        )
+        velocities = velocities + accelerations * step_s
+        positions = positions + velocities * step_s
+        states.append((positions, velocities))
+    return states
+
+
+def test_alone_it_turns_to_the_desired_velocity() -> None:
+    u = FlockingLaw().acceleration([0.2, -0.3], NOBODY, NOBODY, [1.0, 0.5])
+    np.testing.assert_allclose(u, [0.8, 0.8])  # efv - V
+
+
+def test_cohesion_pulls_a_far_neighbour_and_is_nothing_at_the_desired_distance() -> None:
+    law = FlockingLaw(ALL_OFF.model_copy(update={"cohesion": 0.1}))
+    # 0.1 * 7 * ln(7 / 3.5) = 0.7 ln 2 towards it, 0 for the one at 3.5 m.
+    u = law.acceleration(STILL, [[0.0, 7.0], [3.5, 0.0]], np.zeros((2, 2)), STILL)
+    np.testing.assert_allclose(u, [0.0, 0.7 * math.log(2)], atol=1e-15)
+    # Nearer than desired it pushes: 0.1 * 1.75 * ln(1/2), away.
+    u = law.acceleration(STILL, [[0.0, 1.75]], np.zeros((1, 2)), STILL)
+    np.testing.assert_allclose(u, [0.0, -0.175 * math.log(2)], atol=1e-15)
+
+
+def test_nobody_beyond_the_observation_distance_counts() -> None:
+    law = FlockingLaw()
+    inside = law.acceleration(STILL, [[20.0, 0.0]], [[1.0, 0.0]], STILL)
+    outside = law.acceleration(STILL, [[20.001, 0.0]], [[1.0, 0.0]], STILL)
+    np.testing.assert_allclose(inside, [2.0 * math.log(20 / 3.5) + 0.1, 0.0])
+    np.testing.assert_array_equal(outside, [0.0, 0.0])
+
+
+def test_alignment_is_the_sum_of_the_velocity_differences() -> None:
+    law = FlockingLaw(ALL_OFF.model_copy(update={"alignment": 0.1}))
+    u = law.acceleration([1.0, 0.0], [[5.0, 0.0], [0.0, 5.0]], [[2.0, 1.0], [1.0, -3.0]], STILL)
+    np.testing.assert_allclose(u, [0.1 * (1 + 0) - 1.0, 0.1 * (1 - 3)])  # the -1 is -V of Eq. 38
+
+
+def test_separation_pushes_away_inside_its_distance_only() -> None:
+    law = FlockingLaw(ALL_OFF.model_copy(update={"separation": 10.0}))
+    # d = 0.5: 10 * (1/0.5 - 1/1.5)^2 = 10 * (4/3)^2 = 17.78, along (-3, -4)/5.
+    u = law.acceleration(STILL, [[0.3, 0.4]], np.zeros((1, 2)), STILL)
+    np.testing.assert_allclose(u, -160 / 9 * np.array([0.6, 0.8]))
+    np.testing.assert_array_equal(law.acceleration(STILL, [[1.5, 0.0]], np.zeros((1, 2)), STILL), [0.0, 0.0])
+
+
+def test_separation_heeds_everybody_though_only_the_nearest_have_weight() -> None:
+    ring = [[1.0, 0.0], [-1.0, 0.0], [0.0, 1.2]]
+    law = FlockingLaw(FlockingParameters(alignment=0.0, weight=WeightParameters(kind="nearest", nearest=2)))
+    u = law.acceleration(STILL, ring, np.zeros((3, 2)), STILL)
+    # The third one's share: 10 * (1/1.2 - 1/1.5)^2 = 10 / 36, to the west; its cohesion counts for nothing.
+    np.testing.assert_allclose(u, [0.0, -10 / 36], atol=1e-14)
+
+
+def test_own_weight_and_strength_scale_the_desired_velocity() -> None:
+    law = FlockingLaw(FlockingParameters(velocity=2.0, own_weight=1.5))
+    np.testing.assert_allclose(law.acceleration(STILL, NOBODY, NOBODY, [1.0, -1.0]), [3.0, -3.0])
+
+
+def test_a_neighbour_exactly_below_pushes_south_and_nothing_overflows() -> None:
+    law = FlockingLaw()
+    for tiny in (0.0, 1e-300, 1e-9, 1e-3):
+        velocity, acceleration = law.command(STILL, [[tiny, 0.0]], np.zeros((1, 2)), STILL, 0.5)
+        np.testing.assert_allclose(acceleration, [-2.0, 0.0])
+        np.testing.assert_allclose(velocity, [-1.0, 0.0])
+    assert np.isfinite(law.acceleration(STILL, [[1e308, 1e308]], np.zeros((1, 2)), STILL)).all()
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 1e-163, 0.02])
+def test_two_drones_at_one_level_spot_part_each_to_its_own_right(noise_m: float) -> None:
+    """One 0.8 m above the other, both on the same course: they come apart by the separation distance of 1.5 m."""
+    law, rng = FlockingLaw(), np.random.default_rng(1)
+    places, velocities = np.array([[0.0, 0.0, -5.8], [0.0, 0.0, -5.0]]), np.tile([1.0, 0.0], (2, 1))
+    for _ in range(20):
+        seen = [places[1] - places[0], places[0] - places[1]] + noise_m * np.array([1.0, 1.0, 0.0]) * rng.normal(
+            size=(2, 1)
+        )
+        velocities = np.array(
+            [
+                law.command(velocities[i], level_offsets(seen[i : i + 1]), velocities[[1 - i]], [1.0, 0.0], 0.5)[0]
+                for i in range(2)
+            ]
+        )
+        places[:, :2] += 0.5 * velocities
+    above, below = places[:, 1]
+    assert above > 0.5 > -0.5 > below  # looking down with north overhead, east is at the right; looking up, west
+    assert np.linalg.norm(places[0, :2] - places[1, :2]) > 1.5
+
+
+def test_neighbours_that_are_not_above_or_below_are_where_they_are_seen() -> None:
+    offsets = np.array([[0.1, 0.0, 1.0], [-2.0, 3.0, 0.5]])
+    np.testing.assert_array_equal(level_offsets(offsets), offsets[:, :2])
+    assert level_offsets(np.empty((0, 3))).shape == (0, 2)
+
+
+def test_the_command_limits_first_the_acceleration_and_then_the_speed() -> None:
+    law = FlockingLaw(FlockingParameters(max_acceleration_m_s2=2.0, max_speed_m_s=3.0))
+    velocity, acceleration = law.command([0.0, 0.0], NOBODY, NOBODY, [30.0, 40.0], 0.5)
+    np.testing.assert_allclose(acceleration, [1.2, 1.6])
+    np.testing.assert_allclose(velocity, [0.6, 0.8])
+    velocity, acceleration = law.command([3.0, 0.0], NOBODY, NOBODY, [30.0, 0.0], 0.5)
+    np.testing.assert_allclose(acceleration, [2.0, 0.0])
+    np.testing.assert_allclose(velocity, [3.0, 0.0])
+    velocity, acceleration = law.command([1.0, 0.0], NOBODY, NOBODY, [1.4, 0.2], 0.5)
+    np.testing.assert_allclose(acceleration, [0.4, 0.2])
+    np.testing.assert_allclose(velocity, [1.2, 0.1])
+
+
+def test_a_limit_keeps_the_direction() -> None:
+    np.testing.assert_allclose(limit_norm(np.array([3.0, -4.0]), 1.0), [0.6, -0.8])
+    np.testing.assert_array_equal(limit_norm(np.zeros(2), 1.0), [0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("velocity", "positions", "velocities", "desired", "reason"),
+    [
+        ([0.0, np.nan], NOBODY, NOBODY, [1.0, 0.0], "own velocity must be finite"),
+        ([0.0, 0.0], [[1.0, np.inf]], [[0.0, 0.0]], [1.0, 0.0], "positions must be finite"),
+        ([0.0, 0.0], [[1.0, 2.0]], [[0.0, np.nan]], [1.0, 0.0], "velocities must be finite"),
+        ([0.0, 0.0], NOBODY, NOBODY, [np.nan, 0.0], "desired velocity must be finite"),
+        ([0.0, 0.0], [[1.0, 2.0]], NOBODY, [1.0, 0.0], "velocities must have the shape"),
+        ([0.0, 0.0], [[1.0, 2.0, 3.0]], [[1.0, 2.0]], [1.0, 0.0], "positions must have the shape"),
+        ([0.0, 0.0, 0.0], NOBODY, NOBODY, [1.0, 0.0], "own velocity must have the shape"),
+    ],
+)
+def test_bad_input_is_refused_with_the_reason(
+    velocity: Array, positions: Array, velocities: Array, desired: Array, reason: str
+) -> None:
+    with pytest.raises(ValueError, match=reason):
+        FlockingLaw().acceleration(velocity, positions, velocities, desired)
+
+
+@pytest.mark.parametrize("step_s", [0.0, -0.5, math.nan, math.inf])
+def test_a_step_that_is_no_step_is_refused(step_s: float) -> None:
+    with pytest.raises(ValueError, match="step"):
+        FlockingLaw().command(STILL, NOBODY, NOBODY, [1.0, 0.0], step_s)
+
+
+def test_the_desired_velocity_goes_round_at_a_tenth_of_a_radian_a_second_until_66_s() -> None:
+    parameters = MissionParameters()
+    np.testing.assert_allclose(desired_velocity(parameters, 0.0), [1.0, 0.0])
+    np.testing.assert_allclose(desired_velocity(parameters, 5 * math.pi), [0.0, 1.0], atol=1e-12)  # east: clockwise
+    assert course(parameters, 30.0) == pytest.approx(3.0)
+    assert course(parameters, 66.0) == pytest.approx(6.6 - 2 * math.pi)
+    assert course(parameters, 109.5) == course(parameters, 66.0)
+    twice = MissionParameters(speed_m_s=2.0, radius_m=5.0)
+    assert course(twice, 1.0) == pytest.approx(0.4)
+    np.testing.assert_allclose(np.linalg.norm(desired_velocity(twice, 1.0)), 2.0)
+    for nonsense in (-0.1, math.nan, math.inf):
+        with pytest.raises(ValueError, match="time"):
+            course(parameters, nonsense)
+
+
+def test_five_from_table_1_become_the_pentagon() -> None:
+    """The reading notes' own figures: sides 2.47 m, diagonals 4.00 m, obj1 2e-5, obj2 15.2707 with 4e-5 of jitter."""
+    parameters = FlockingParameters()
+    states = _flight(FlockingLaw(parameters), TABLE_1, duration_s=110.0)
+    positions, _ = states[-1]
+    distances = np.sort(pair_distances(positions)[np.triu_indices(5, 1)])
+    np.testing.assert_allclose(distances[:5], 2.47, atol=0.005)
+    np.testing.assert_allclose(distances[5:], 4.00, atol=0.005)
+    efv = desired_velocity(MissionParameters(), 110.0)
+    tail = states[-20:]
+    sums_1 = np.array([obj1(v, efv, circling=False).sum() for _, v in tail])
+    sums_2 = np.array([obj2(p, v, parameters).sum() for p, v in tail])
+    assert sums_1.max() < 1e-4
+    assert sums_2.mean() == pytest.approx(15.2707, abs=2e-4)
+    assert np.ptp(sums_2) < 2e-4
+
+
+def test_twenty_stay_apart_with_weight_on_three_and_crowd_with_weight_on_all() -> None:
+    rng = np.random.default_rng(4)
+    start = np.stack(np.meshgrid(np.arange(5), np.arange(4)), axis=-1).reshape(-1, 2) * 4.0 + rng.normal(
+        0, 0.3, (20, 2)
+    )
+    nearest = FlockingLaw(FlockingParameters(weight=WeightParameters(kind="nearest", nearest=3)))
+    apart = [min_distance(positions) for positions, _ in _flight(nearest, start, duration_s=60.0)]
+    assert min(apart) > 1.5
+    on_all = FlockingLaw(FlockingParameters(weight=WeightParameters(kind="uniform")))
+    uniform = [min_distance(positions) for positions, _ in _flight(on_all, start, duration_s=60.0)]
+    assert max(uniform[60:]) < 1.5  # held apart by Eq. 41 alone
+
+
+def test_up_to_seven_drones_fly_by_default_as_with_weight_on_all() -> None:
+    rng = np.random.default_rng(5)
+    uniform = FlockingLaw(FlockingParameters(weight=WeightParameters(kind="uniform")))
+    for neighbours in (1, 4, 6, 7):
+        places, velocities = rng.normal(0, 4, (neighbours, 2)), rng.normal(0, 1, (neighbours, 2))
+        by_default = FlockingLaw().acceleration(STILL, places, velocities, STILL)
+        on_all = uniform.acceleration(STILL, places, velocities, STILL)
+        assert np.array_equal(by_default, on_all) == (neighbours <= 6)

@@ -1,0 +1,146 @@
+"""Matches lifted to pairs of points: a camera moves towards a slanted wall whose every depth is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flockd.core.messages import Float32Array, FloatArray, IntArray
+from flockd.flight.geometry import PointPairs, RigCamera, grid_pixels, label_pixels, lift_matches
+
+from .synthetic_world import four_camera_rig
+
+CAMERA = four_camera_rig((96, 128), focal=50.0).cameras["right"]
+SIZE = CAMERA.camera.size
+# The wall n . p = d, in the camera's axes; the camera steps 0.4 m ahead, straight along its optical axis.
+NORMAL = np.array([0.3, -0.1, 1.0])
+DISTANCE = 6.0
+STEP = np.array([0.0, 0.0, 0.4])
+
+
+def wall_depth(pixels: FloatArray, distance: float) -> FloatArray:
+    depth: FloatArray = distance / (CAMERA.camera.unproject(pixels, np.ones(len(pixels))) @ NORMAL)
+    return depth
+
+
+def wall_maps() -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Flow and both depth maps."""
+    pixels = grid_pixels(SIZE, 1)
+    depth = wall_depth(pixels, DISTANCE)
+    after = CAMERA.camera.project(CAMERA.camera.unproject(pixels, depth) - STEP)
+    shape = (SIZE[1], SIZE[0])
+    return (
+        (after - pixels).reshape(*shape, 2).astype(np.float32),
+        depth.reshape(shape).astype(np.float32),
+        wall_depth(pixels, DISTANCE - STEP @ NORMAL).reshape(shape).astype(np.float32),
+    )
+
+
+def no_labels() -> IntArray:
+    return np.zeros((SIZE[1], SIZE[0]), dtype=np.int64)
+
+
+def lift(
+    pixels: FloatArray,
+    maps: tuple[Float32Array, Float32Array, Float32Array],
+    labels: tuple[IntArray, IntArray] | None = None,
+    camera: RigCamera = CAMERA,
+    max_depth_m: float = 40.0,
+) -> PointPairs:
+    return lift_matches(camera, pixels, *maps, *(labels or (no_labels(), no_labels())), max_depth_m=max_depth_m)
+
+
+def test_both_ends_lie_on_the_wall_and_are_one_step_apart() -> None:
+    pairs = lift(grid_pixels(SIZE, 5), wall_maps())
+    # Between the border and the outermost pixel centres the depth is held, so there it is a little off.
+    u, v = pairs.pixels_current.T
+    pairs = pairs.select((u > 0.5) & (u < SIZE[0] - 0.5) & (v > 0.5) & (v < SIZE[1] - 0.5))
+    assert len(pairs) > 200
+    # Seen from the right camera the step is along the body's y axis. Sub-pixel ends meet the slanted wall too.
+    assert np.allclose(pairs.previous - pairs.current, [0.0, 0.4, 0.0], atol=1e-4)
+    in_camera = CAMERA.T_body_camera.inverse().apply(pairs.previous)
+    assert np.allclose(in_camera @ NORMAL, DISTANCE, atol=1e-5)
+    assert set(pairs.camera_names.tolist()) == {"right"}
+    assert np.allclose(CAMERA.pixels_of_points(pairs.current), pairs.pixels_current, atol=1e-6)
+    assert np.allclose(CAMERA.pixels_of_points(pairs.previous), pairs.pixels_previous, atol=1e-6)
+
+
+def test_ends_outside_either_image_are_dropped() -> None:
+    outward = lift(np.array([[0.5, 64.5], [95.5, 0.5], [-3.0, 5.0], [48.5, 64.5]]), wall_maps())
+    # Moving ahead, the border's pixels leave the image; the one in the middle stays.
+    assert outward.pixels_previous.tolist() == [[48.5, 64.5]]
+
+
+def test_a_match_keeps_its_class_only_where_both_ends_agree() -> None:
+    labels, labels_after = no_labels(), no_labels()
+    labels[:, 48:] = 2
+    labels_after[:, 60:] = 2
+    pairs = lift(grid_pixels(SIZE, 3), wall_maps(), (labels, labels_after))
+    left, right = pairs.pixels_previous[:, 0] < 48, pairs.pixels_current[:, 0] >= 60
+    assert (left | right).all()
+    assert set(pairs.labels[left].tolist()) == {0}
+    assert set(pairs.labels[right].tolist()) == {2}
+    assert pairs.labels.dtype == np.int64
+
+
+@pytest.mark.parametrize("which", ["before", "after"])
+@pytest.mark.parametrize("depth", [np.nan, np.inf, 0.0, -1.0, 9.5])
+def test_a_depth_that_says_nothing_drops_the_pair(which: str, depth: float) -> None:
+    flow, before, after = wall_maps()
+    {"before": before, "after": after}[which][:, :40] = depth
+    pairs = lift(grid_pixels(SIZE, 3), (flow, before, after), max_depth_m=9.0)
+    ends = pairs.pixels_previous if which == "before" else pairs.pixels_current
+    assert len(pairs) > 100
+    assert (ends[:, 0] >= 40.0).all()
+    assert np.isfinite(pairs.current).all()
+
+
+def test_between_two_surfaces_the_nearer_pixel_decides() -> None:
+    # The second image's left part is at 3 m, its right part at 10 m, with the border at u = 50.
+    shape = (SIZE[1], SIZE[0])
+    after = np.where(np.arange(SIZE[0]) < 50, 3.0, 10.0).astype(np.float32) * np.ones(shape, dtype=np.float32)
+    before = np.full(shape, 5.0, dtype=np.float32)
+    for end, expected in ((49.8, 3.0), (50.2, 10.0)):
+        flow = np.zeros((*shape, 2), dtype=np.float32)
+        flow[..., 0] = end - 48.5
+        pairs = lift(np.array([[48.5, 64.5]]), (flow, before, after))
+        assert CAMERA.T_body_camera.inverse().apply(pairs.current)[0, 2] == pytest.approx(expected)
+
+
+def test_nothing_left_is_an_empty_set_and_not_an_error() -> None:
+    pairs = lift(np.array([[48.5, 64.5]]), wall_maps(), max_depth_m=1.0)
+    assert len(pairs) == 0
+    assert pairs.previous.shape == (0, 3)
+
+
+def test_a_map_of_another_size_is_refused() -> None:
+    flow, before, _ = wall_maps()
+    with pytest.raises(ValueError, match="'right' is 96x128, but its depth map is 48x64"):
+        lift(grid_pixels(SIZE, 8), (flow, before, np.ones((64, 48), dtype=np.float32)))
+
+
+def test_pairs_of_two_cameras_join_and_part_again() -> None:
+    one = lift(grid_pixels(SIZE, 8), wall_maps())
+    other = lift(grid_pixels(SIZE, 16), wall_maps(), camera=RigCamera("elsewhere", CAMERA.camera, CAMERA.T_body_camera))
+    both = PointPairs.concatenate([one, other])
+    assert len(both) == len(one) + len(other)
+    parted = both.select(both.camera_names == "elsewhere")
+    assert np.array_equal(parted.previous, other.previous)
+    assert np.array_equal(parted.pixels_current, other.pixels_current)
+
+
+def test_the_grid_is_of_pixel_centres_inside_the_image() -> None:
+    assert grid_pixels((4, 3), 1)[:5].tolist() == [[0.5, 0.5], [1.5, 0.5], [2.5, 0.5], [3.5, 0.5], [0.5, 1.5]]
+    assert grid_pixels((10, 5), 4).tolist() == [[2.5, 2.5], [6.5, 2.5]]
+
+
+def test_label_pixels_are_spread_over_the_whole_patch() -> None:
+    labels = np.zeros((20, 30), dtype=np.int64)
+    labels[5:15, 10:20] = 7
+    assert len(label_pixels(labels, 7, 1000)) == 100
+    few = label_pixels(labels, 7, 10)
+    assert len(few) == 10
+    assert few.min(axis=0).tolist()[1] == 5.5
+    assert few.max(axis=0).tolist()[1] == 14.5
+    assert ((few - 0.5) % 1.0 == 0.0).all()
+    assert label_pixels(labels, 3, 10).shape == (0, 2)

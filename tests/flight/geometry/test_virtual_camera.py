@@ -1,0 +1,172 @@
+"""The virtual crop: what is painted into the real cameras' images lands where geometry says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flockd.core.messages import BoolArray, FloatArray, UInt8Array
+from flockd.flight.geometry import Rig, RigCamera, VirtualCrop, grid_pixels, virtual_crop
+
+from .synthetic_world import four_camera_rig
+
+RIG = four_camera_rig()
+BLACK = {name: np.zeros((640, 480, 3), dtype=np.uint8) for name in RIG.cameras}
+
+
+def sees_ball(start: FloatArray, rays: FloatArray, centre: FloatArray, radius: float) -> BoolArray:
+    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    along = unit @ (centre - start)
+    closest = start + along[:, None] * unit
+    hit: BoolArray = (np.linalg.norm(centre - closest, axis=1) < radius) & (along > 0.0)
+    return hit
+
+
+def picture_of_ball(camera: RigCamera, centre: FloatArray, radius: float) -> UInt8Array:
+    """White ball on black, cast pixel by pixel."""
+    pixels = grid_pixels(camera.camera.size, 1)
+    rays = camera.camera.rays(pixels) @ camera.T_body_camera.rotation.T
+    hit = sees_ball(camera.T_body_camera.translation, rays, centre, radius)
+    return np.repeat((255 * hit).astype(np.uint8), 3).reshape(640, 480, 3)
+
+
+def ball_in_crop(crop: VirtualCrop, centre: FloatArray, radius: float) -> BoolArray:
+    size = crop.camera.size[0]
+    rays = crop.camera.rays(grid_pixels(crop.camera.size, 1)) @ crop.T_body_virtual.rotation.T
+    return sees_ball(crop.T_body_virtual.translation, rays, centre, radius).reshape(size, size)
+
+
+def overlap(picture: UInt8Array, expected: BoolArray) -> float:
+    """Intersection over union."""
+    white = picture[:, :, 0] > 127
+    return float((white & expected).sum() / (white | expected).sum())
+
+
+def centroid(picture: UInt8Array) -> FloatArray:
+    weight = picture[:, :, 0].astype(np.float64)
+    rows, columns = np.indices(weight.shape) + 0.5
+    return np.array([np.average(columns, weights=weight), np.average(rows, weights=weight)])
+
+
+def test_it_sits_in_the_best_camera_and_faces_level_along_the_direction() -> None:
+    direction = np.array([0.9, 0.3, 0.2])
+    crop = virtual_crop(RIG, direction, 0.2, 96)
+    assert crop.main == "front"
+    assert crop.T_body_virtual.translation.tolist() == RIG.cameras["front"].T_body_camera.translation.tolist()
+    assert np.allclose(crop.T_body_virtual.rotation[:, 2], direction / np.linalg.norm(direction))
+    assert crop.T_body_virtual.rotation[2, 0] == 0.0  # x is horizontal
+    assert crop.T_body_virtual.rotation[2, 1] > 0.0  # y points down
+    # The image's border is half_angle off the axis.
+    assert np.allclose(crop.camera.project(np.array([[np.tan(0.2), 0.0, 1.0]])), [[96.0, 48.0]])
+    assert virtual_crop(RIG, np.array([-0.1, -2.0, 0.0]), 0.2, 96).main == "left"
+
+
+def test_straight_down_has_a_level_axis_too() -> None:
+    down = RIG.cameras["front"].T_body_camera.rotation[:, [0, 2, 1]] * [1.0, -1.0, 1.0]  # optical axis down
+    camera = RigCamera("down", RIG.cameras["front"].camera, type(RIG.cameras["front"].T_body_camera)(down, np.zeros(3)))
+    crop = virtual_crop(Rig({"down": camera}), np.array([0.0, 0.0, 1.0]), 0.2, 32)
+    assert crop.T_body_virtual.rotation[:, 0].tolist() == [0.0, 1.0, 0.0]
+
+
+def test_every_pixel_takes_the_colour_of_its_own_ray_to_a_fraction_of_a_pixel() -> None:
+    # Red and green of the image are its u and v, so the crop's colours say which pixel they were taken from.
+    rig = four_camera_rig((120, 160), focal=55.5)
+    pixels = grid_pixels((120, 160), 1).reshape(160, 120, 2)
+    image = np.zeros((160, 120, 3), dtype=np.uint8)
+    image[:, :, :2] = np.rint(1.5 * pixels)
+    crop = virtual_crop(rig, np.array([1.0, 0.15, -0.3]), 0.5, 80)
+    picture, valid = crop.sample({"front": image})
+    assert valid.all()
+    directions = crop.camera.rays(grid_pixels((80, 80), 1)) @ crop.T_body_virtual.rotation.T
+    expected = 1.5 * rig.cameras["front"].pixels_of_directions(directions).reshape(80, 80, 2)
+    difference = picture[:, :, :2] - expected
+    assert np.abs(difference).max() < 1.5  # rounding twice, on a value of 1.5 a pixel
+    assert np.abs(difference.mean(axis=(0, 1))).max() < 0.1  # half a pixel would be 0.75
+
+
+@pytest.mark.parametrize("range_m", [None, 4.0])
+def test_a_ball_seen_by_the_main_camera_is_exact_with_and_without_its_range(range_m: float | None) -> None:
+    centre = np.array([4.0, 0.6, 0.5])
+    images = {**BLACK, "front": picture_of_ball(RIG.cameras["front"], centre, 0.3)}
+    crop = virtual_crop(RIG, centre, 0.15, 96)
+    picture, valid = crop.sample(images, range_m=range_m)
+    assert valid.all()
+    assert overlap(picture, ball_in_crop(crop, centre, 0.3)) > 0.93
+    # Seen from the optical centre, 0.1 m ahead of the body's origin, the ball is a little off the crop's middle.
+    expected = crop.camera.project(crop.T_body_virtual.inverse().apply(centre[None]))[0]
+    assert np.abs(expected - 48.0).max() > 0.5
+    assert centroid(picture) == pytest.approx(expected, abs=0.5)
+
+
+def test_a_ball_across_two_cameras_is_seen_whole_and_its_range_closes_the_seam() -> None:
+    centre = np.array([1.5, 1.6, 0.2])
+    images = {name: picture_of_ball(camera, centre, 0.4) for name, camera in RIG.cameras.items()}
+    crop = virtual_crop(RIG, centre, 0.3, 96)
+    expected = ball_in_crop(crop, centre, 0.4)
+    _, in_main = crop.sample({crop.main: images[crop.main]})
+    assert 0.2 < (expected & ~in_main).sum() / expected.sum() < 0.8  # the main camera has only a part of it
+    distance = float(np.linalg.norm(centre - crop.T_body_virtual.translation))
+    with_range, valid = crop.sample(images, range_m=distance)
+    without, _ = crop.sample(images)
+    assert valid.all()
+    assert overlap(with_range, expected) > 0.95
+    assert overlap(without, expected) < 0.93  # 0.14 m between the cameras at 2.2 m: some 10 px of 96
+
+
+def test_what_no_camera_sees_is_grey_and_marked() -> None:
+    white = {name: np.full((640, 480, 3), 255, dtype=np.uint8) for name in RIG.cameras}
+    crop = virtual_crop(RIG, np.array([1.0, 0.0, 1.3]), 0.2, 64)  # 52 degrees down; the view ends at 55
+    picture, valid = crop.sample(white)
+    assert valid[:32].all()
+    assert not valid[-16:].any()
+    assert (picture[~valid] == 128).all()
+    assert (picture[valid] == 255).all()
+    nothing, none_valid = crop.sample({"back": white["back"]})
+    assert not none_valid.any()
+    assert (nothing == 128).all()
+
+
+def test_a_crop_of_a_whole_field_averages_instead_of_aliasing() -> None:
+    # A chequerboard of single pixels is flat grey once three pixels fall into one of the crop's.
+    chequers = np.where(np.indices((640, 480)).sum(axis=0) % 2 == 0, 255, 0).astype(np.uint8)
+    images = {"front": np.repeat(chequers[:, :, None], 3, axis=2)}
+    crop = virtual_crop(RIG, np.array([1.0, 0.0, 0.0]), 0.5, 48)
+    picture, valid = crop.sample(images)
+    assert valid.all()
+    assert np.abs(picture.astype(int) - 128).max() < 20
+    # And the averaging does not shift it: a bright half stays where it was.
+    split = np.zeros((640, 480, 3), dtype=np.uint8)
+    split[:, 240:] = 255
+    halves, _ = crop.sample({"front": split})
+    assert (halves[:, :23] == 0).all()
+    assert (halves[:, 25:] == 255).all()
+
+
+def test_a_direction_nobody_sees_and_an_impossible_angle_are_refused() -> None:
+    with pytest.raises(ValueError, match="no camera sees"):
+        virtual_crop(RIG, np.array([0.0, 0.0, 1.0]), 0.2, 96)
+    with pytest.raises(ValueError, match="half angle"):
+        virtual_crop(RIG, np.array([1.0, 0.0, 0.0]), 1.6, 96)
+
+
+def test_the_widest_crop_can_be_drawn_wherever_the_rig_sees() -> None:
+    """Also where a second camera sees no more than a corner of it, at a right angle to its middle."""
+    images = {name: np.full((640, 480, 3), 90, np.uint8) for name in RIG.cameras}
+    for azimuth in np.radians(np.arange(0.0, 93.0, 4.0)):
+        for elevation in np.radians(np.arange(-44.0, 45.0, 4.0)):
+            across = np.cos(elevation)
+            direction = np.array([across * np.cos(azimuth), across * np.sin(azimuth), -np.sin(elevation)])
+            picture, seen = virtual_crop(RIG, direction, np.radians(35.0), 24).sample(images)
+            assert (picture[seen] == 90).all()
+            assert seen.mean() > 0.5
+
+
+def test_a_map_over_the_image_is_sampled_at_places_of_the_body() -> None:
+    crop = virtual_crop(RIG, np.array([0.9, 0.3, 0.2]), 0.2, 96)
+    pixels = np.random.default_rng(0).uniform(1.0, 95.0, (40_000, 2))
+    points = crop.T_body_virtual.apply(crop.camera.unproject(pixels, np.full(len(pixels), 3.0)))
+    columns = np.broadcast_to(np.arange(96, dtype=np.float32) + 0.5, (96, 96))
+    np.testing.assert_allclose(crop.look_up(columns.copy(), points), pixels[:, 0], atol=0.05)
+    np.testing.assert_allclose(crop.look_up(columns.T.copy(), points), pixels[:, 1], atol=0.05)
+    beside = crop.T_body_virtual.apply(np.array([[0.0, 1.0, 3.0], [0.0, 0.0, -3.0]]))
+    assert np.isnan(crop.look_up(columns.copy(), beside)).all()

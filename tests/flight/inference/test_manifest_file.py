@@ -1,0 +1,112 @@
+"""Reading a manifest never hangs, never fills memory, and always says where the fault is."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from flockd.core.data import data_path
+from flockd.core.errors import ModelError
+from flockd.flight.inference import load_manifest, read_manifest
+from tests.flight.inference.foreign import one_channel_depth
+
+LIMIT_S = 2.0
+
+
+@contextmanager
+def refused(complaint: str) -> Iterator[None]:
+    """In one sentence that matches, within the limit."""
+    began_s = time.monotonic()
+    with pytest.raises(ModelError, match=complaint) as error:
+        yield
+    assert time.monotonic() - began_s < LIMIT_S
+    assert "\n" not in str(error.value)
+
+
+def test_a_fifo_is_refused_without_waiting_for_its_writer(tmp_path: Path) -> None:
+    path = tmp_path / "pipe.yaml"
+    os.mkfifo(path)
+    with refused(rf"^{path}: is not an ordinary file; copy the manifest to one"):
+        read_manifest(path)
+
+
+def test_an_endless_device_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "zero.yaml"
+    path.symlink_to("/dev/zero")
+    with refused(rf"^{path}: is not an ordinary file; copy the manifest to one"):
+        read_manifest(path)
+
+
+def test_a_model_file_that_is_a_fifo_or_a_device_is_refused(tmp_path: Path) -> None:
+    path = one_channel_depth(tmp_path, output={})
+    model = path.with_suffix(".onnx")
+    model.unlink()
+    os.mkfifo(model)
+    with refused(rf"^{path}:4: file: {model} is not an ordinary file; name the ONNX file"):
+        load_manifest(path)
+    model.unlink()
+    model.symlink_to("/dev/zero")
+    with refused(rf"^{path}:4: file: {model} is not an ordinary file"):
+        load_manifest(path)
+
+
+def test_a_model_file_larger_than_any_onnx_file_is_refused_unread(tmp_path: Path) -> None:
+    path = one_channel_depth(tmp_path, output={})
+    with path.with_suffix(".onnx").open("wb") as stream:
+        stream.truncate((2 << 30) + 1)  # sparse: it takes no room on the disk
+    with refused(rf"^{path}:4: file: .* is larger than 2 GiB"):
+        load_manifest(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (b"", r"yaml: is empty; write the manifest into it"),
+        (b"inputs: " + b"[" * 100_000, r"yaml:1: is nested more than 32 levels deep; flatten it"),
+        (b"a: " + b"{a: " * 100_000, r"yaml:1: is nested more than 32 levels deep; flatten it"),
+        (b"name: flow\ndescription: caf\xe9\n", r"yaml:2: is not UTF-8 text; save the file in UTF-8"),
+        (b"name: \x00\n", r"yaml:1: holds the control character 0x00; delete it"),
+        (b"name: a\n" * 200_000, r"yaml: is larger than 1024 KiB, which no manifest is; check the path"),
+        (b"name: flow\nname: flow\n", r"yaml:2: name: is given twice, first in line 1; delete one"),
+        (
+            b"a: &a [x, x]\nb: &b [*a, *a]\nc: &c [*b, *b]\nd: [*c, *c]\n",
+            r"yaml:1: a: the anchor `&a` is not supported; delete it",
+        ),
+        (b"name: !!python/object/apply:os.system ['true']\n", r"yaml:1: name: the tag `.*system` is not supported"),
+        (b"- flow\n", r"yaml:1: is a list at its top level"),
+        (b"name: [flow\n", r"yaml:1: a bracket is opened here and not closed properly"),
+        (b"name: flow\n---\nname: flow\n", r"yaml:2: a second document begins here; keep one in a file"),
+    ],
+    ids=lambda value: value[:20] if isinstance(value, bytes) else "",
+)
+def test_a_file_that_is_no_manifest_is_refused_in_one_sentence(tmp_path: Path, content: bytes, complaint: str) -> None:
+    path = tmp_path / "model.yaml"
+    path.write_bytes(content)
+    with refused(complaint):
+        read_manifest(path)
+
+
+def test_a_folder_and_nothing_are_refused(tmp_path: Path) -> None:
+    with refused(rf"^{tmp_path}: is a folder"):
+        read_manifest(tmp_path)
+    with refused(r"none\.yaml: does not exist; check the path"):
+        read_manifest(tmp_path / "none.yaml")
+
+
+def test_words_that_older_yaml_takes_for_booleans_are_words(tmp_path: Path) -> None:
+    """`n` is the free size of a batch, in shipped manifests without quotes."""
+    path = tmp_path / "model.yaml"
+    path.write_text((data_path("models") / "distance.yaml").read_text().replace("- n\n", "- y\n"))
+    assert read_manifest(path).manifest.inputs["picture"].shape == ("y", 96, 96, 3)
+
+
+def test_a_missing_model_file_is_reported_at_the_key_that_names_it(tmp_path: Path) -> None:
+    path = one_channel_depth(tmp_path, output={})
+    path.with_suffix(".onnx").unlink()
+    with refused(rf"^{path}:4: file: cannot read .*someones_depth\.onnx \(No such file.*; put the model file back or"):
+        load_manifest(path)

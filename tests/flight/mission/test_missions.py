@@ -1,0 +1,344 @@
+"""Missions flown by a point that goes as they want, and by flocks on exact states."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flockd.cli import main
+from flockd.core.config import load_drone, load_scenario
+from flockd.core.config.mission import fault_of_place
+from flockd.core.config.safety import GateParameters
+from flockd.core.errors import ConfigError
+from flockd.core.messages import FloatArray, MissionOrder, VehicleState
+from flockd.flight.mission import Guidance, MissionParameters, Moment, Navigator, order_fault
+from flockd.flight.mission.navigator import middle_of
+from flockd.flight.safety import outside_fence
+from flockd.onboard.telemetry.order_messages import order_message, parse_order
+from flockd.sim.exact_states import fly_exact_states
+from tests.core.config.test_loader import CONFIG, DRONE, SCENARIO
+
+GATE = GateParameters()
+ORIGIN = np.zeros(2)
+
+
+def mission(**keys: object) -> MissionParameters:
+    return MissionParameters.model_validate(keys)
+
+
+def to(*places: tuple[float, float], **keys: object) -> MissionParameters:
+    waypoints = tuple({"north_m": north, "east_m": east} for north, east in places)
+    return mission(kind="waypoints", waypoints=waypoints, **keys)
+
+
+class Point:
+    """A drone that flies just as its mission wants, alone, a step every half second."""
+
+    def __init__(self, parameters: MissionParameters, gate: GateParameters = GATE) -> None:
+        self.navigator = Navigator(parameters, gate)
+        self.position: FloatArray = ORIGIN
+        self.time_s = 0.0
+
+    def step(self, order: MissionOrder | None = None) -> Guidance:
+        guidance = self.navigator.step(Moment(self.time_s, self.position, order=order))
+        self.position = self.position + 0.5 * guidance.velocity
+        self.time_s += 0.5
+        return guidance
+
+    def fly(self, seconds: float) -> Guidance:
+        return [self.step() for _ in range(round(2 * seconds))][-1]
+
+
+def test_waypoints_are_flown_to_in_order_at_their_speed_and_the_last_is_held() -> None:
+    point = Point(to((10.0, 0.0), (10.0, 5.0), speed_m_s=2.0))
+    first = point.step()
+    np.testing.assert_allclose(first.velocity, [2.0, 0.0])
+    assert (first.course_rad, first.sentence, first.arrived) == (0.0, "10 m to waypoint 1 of 2", False)
+    point.fly(4.0)
+    np.testing.assert_allclose(point.position, [9.0, 0.0])  # as near as reached_m
+    second = point.step()
+    assert second.goal is not None
+    np.testing.assert_allclose(second.goal, [10.0, 5.0])
+    np.testing.assert_allclose(second.velocity, np.array([1.0, 5.0]) * (2.0 / math.sqrt(26.0)))
+    last = point.fly(20.0)
+    assert (last.arrived, last.takeover, last.sentence) == (True, None, "at waypoint 2 of 2")
+    np.testing.assert_allclose(point.position, [10.0, 5.0], atol=0.01)
+    point.position = np.array([10.0, 8.0])  # blown away
+    np.testing.assert_allclose(point.step().velocity, [0.0, -1.5])  # 3 m in SLOW_DOWN_S
+
+
+def test_a_flock_whose_drones_see_different_middles_does_not_stop_between_two_waypoints() -> None:
+    """Two drones pull a flock, each where it wants; one misses neighbours and sees the middle 1.6 m east of it."""
+    route = to((20.0, 0.0), (20.0, 20.0), (0.0, 20.0))
+    drones = [(Navigator(route, GATE), np.zeros(2)), (Navigator(route, GATE), np.array([0.0, 1.6]))]
+    middle, nearest_m = ORIGIN, {(20.0, 0.0): math.inf, (20.0, 20.0): math.inf, (0.0, 20.0): math.inf}
+    for step in range(200):
+        wanted = [drone.step(Moment(0.5 * step, middle, off)) for drone, off in drones]
+        middle = middle + 0.5 * np.mean([guidance.velocity for guidance in wanted], axis=0)
+        nearest_m = {goal: min(best, math.dist(goal, middle)) for goal, best in nearest_m.items()}
+    assert all(guidance.arrived for guidance in wanted)
+    assert max(nearest_m.values()) < 2.0
+
+
+@pytest.mark.parametrize("stops_at_m", [0.0, 10.0])
+def test_a_drone_that_has_not_come_near_has_not_been_there(stops_at_m: float) -> None:
+    """It waits on the ground, 4 m from its first waypoint, or is held 10 m before it, and knows where it is to go."""
+    begins_m = 4.0 if stops_at_m == 0.0 else 30.0
+    point = Point(to((begins_m, 0.0), (40.0, 40.0)))
+    for _ in range(240):
+        guidance = point.step()
+        point.position = np.minimum(point.position, [stops_at_m if stops_at_m == 0.0 else begins_m - stops_at_m, 0.0])
+    assert guidance.sentence.endswith("to waypoint 1 of 2")
+
+
+def test_a_position_that_jumps_near_a_waypoint_for_one_step_has_not_been_there() -> None:
+    """30 m away for the autopilot's estimate, 3 m for one step, and then 30 m again."""
+    point = Point(to((40.0, 0.0), (40.0, 40.0)))
+    point.fly(10.0)
+    before, point.position = point.position, np.array([37.0, 0.0])
+    point.step()
+    point.position = before
+    for _ in range(40):
+        guidance = point.step()
+        point.position = before
+    assert guidance.sentence == "30 m to waypoint 1 of 2"
+
+
+def test_the_middle_of_the_flock_is_led_not_the_drone() -> None:
+    neighbours = np.array([[3.0, 0.0], [3.0, 3.0]])
+    np.testing.assert_allclose(middle_of(neighbours), [2.0, 1.0])
+    navigator = Navigator(to((20.0, 1.0)), GATE)
+    guidance = navigator.step(Moment(0.0, ORIGIN, middle_of(neighbours)))
+    np.testing.assert_allclose(guidance.velocity, [1.0, 0.0])
+
+
+@pytest.mark.parametrize("end", ["land", "return"])
+def test_at_its_end_a_mission_has_the_autopilot_take_over(end: str) -> None:
+    point = Point(to((2.0, 0.0), at_end=end))
+    assert point.step().takeover is None
+    last = point.fly(10.0)
+    assert last.takeover == end
+    np.testing.assert_allclose(last.velocity, ORIGIN)
+
+
+def test_degrees_are_metres_from_home() -> None:
+    # On the WGS 84 ellipsoid at 47.4 degrees north: 111 170 m and 75 450 m a degree (NIMA TR8350.2's formulas).
+    place = {"latitude_deg": 47.4 + 10 / 111_170, "longitude_deg": 8.5 - 20 / 75_450}
+    navigator = Navigator(mission(kind="waypoints", waypoints=(place,)), GATE)
+    blind = navigator.step(Moment(0.0, ORIGIN))
+    assert blind.sentence == "waits for home in degrees, which the autopilot has not sent"
+    np.testing.assert_allclose(blind.velocity, ORIGIN)
+    goal = navigator.step(Moment(0.5, ORIGIN, home_deg=np.array([47.4, 8.5]))).goal
+    assert goal is not None
+    np.testing.assert_allclose(goal, [10.0, -20.0], atol=0.05)
+    far = Navigator(mission(kind="waypoints", waypoints=(place,)), GATE)
+    outside = far.step(Moment(0.0, ORIGIN, home_deg=np.array([47.5, 8.5])))
+    assert outside.sentence == "the goal is outside the fence"
+    np.testing.assert_allclose(outside.velocity, ORIGIN)
+
+
+def test_heights_have_the_drones_offset_and_stay_until_another() -> None:
+    waypoints = ({"north_m": 2.0, "east_m": 0.0, "height_m": 6.0}, {"north_m": 9.0, "east_m": 0.0})
+    point = Point(mission(kind="waypoints", waypoints=waypoints, height_offset_m=-1.0))
+    assert point.step().height_m == 5.0
+    assert point.fly(10.0).height_m == 5.0
+    assert Point(mission(kind="hover", height_m=4.0)).step().height_m == 4.0
+    assert Point(mission(kind="hover")).step().height_m is None
+
+
+def test_the_heading_turns_no_faster_than_cameras_stand() -> None:
+    point = Point(to((10.0, 0.0), (10.0, 30.0), speed_m_s=2.0))
+    courses = [point.step().course_rad for _ in range(40)]
+    turned = np.diff([course for course in courses if course is not None])
+    assert turned.max() == pytest.approx(0.1)  # 0.2 rad/s
+    assert courses[-1] == pytest.approx(math.atan2(30.0, 1.0))  # from where the first waypoint was reached
+
+
+def test_hover_and_follow_want_no_velocity_and_a_velocity_is_kept() -> None:
+    for kind in ("hover", "follow"):
+        np.testing.assert_allclose(Point(mission(kind=kind)).step().velocity, ORIGIN)
+    navigator = Navigator(mission(kind="velocity", velocity_m_s=(0.0, -1.0), pull=2.0), GATE)
+    guidance = navigator.step(Moment(0.0))  # needs no position
+    np.testing.assert_allclose(navigator.pull(guidance), [0.0, -2.0])
+    assert guidance.course_rad == pytest.approx(-math.pi / 2)
+
+
+def test_an_operators_velocity_and_goal_hold_for_two_seconds() -> None:
+    point = Point(mission(kind="operator"))
+    assert point.step().sentence == "hovers until an operator's next order"
+    for order in (MissionOrder(velocity=np.array([0.5, 0.0])), MissionOrder(place=np.array([40.0, 0.0]))):
+        speeds = [math.hypot(*point.step(order).velocity), *(math.hypot(*point.step().velocity) for _ in range(5))]
+        assert [speed > 0 for speed in speeds] == [True, True, True, True, False, False]
+
+
+def test_a_goal_takes_the_place_of_any_other_mission_for_good() -> None:
+    point = Point(mission(speed_m_s=1.5))
+    assert point.navigator.status(point.step()) is None
+    ordered = point.step(MissionOrder(place=np.array([0.0, 20.0]), height_m=7.0, speed_m_s=0.5))
+    assert ordered.height_m == 7.0
+    assert math.hypot(*ordered.velocity) == pytest.approx(0.5)
+    status = point.navigator.status(point.fly(60.0))
+    assert status is not None
+    assert (status.kind, status.arrived) == ("waypoints", True)
+    np.testing.assert_allclose(point.position, [0.0, 20.0], atol=1.0)
+
+
+@pytest.mark.parametrize(
+    ("message", "command", "refusal"),
+    [
+        ({"north_m": 90.0, "east_m": 0.0}, "goto", None),
+        ({"north_m": 90.0, "east_m": 80.0}, "goto", "the goal is 120.4 m from home, outside the fence of 100 m"),
+        ({"latitude_deg": 48.0, "longitude_deg": 8.0}, "goto", "does not know its home in degrees"),
+        ({"north_m": 9.0, "east_m": 0.0, "height_m": 31.0}, "goto", "leads to a height of 31 m"),
+        ({"north_m": 9.0, "east_m": 0.0, "speed_m_s": 3.5}, "goto", "3.5 m/s is above"),
+        ({"velocity_ne": [3.0, 0.0]}, "velocity", None),
+        ({"velocity_ne": [3.0, 2.0]}, "velocity", "3.60555 m/s is above"),
+    ],
+)
+def test_an_order_that_cannot_be_flown_is_refused_with_the_reason(
+    tmp_path: Path, message: dict[str, object], command: str, refusal: str | None
+) -> None:
+    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
+    config = load_drone(tmp_path / "drone.yaml")
+    order = parse_order(command, json.dumps(message).encode())
+    assert order_message(order) == message
+    vehicle = VehicleState(0.0, np.eye(3), 5.0, np.zeros(3), ORIGIN)
+    fault = order_fault(config, order, vehicle)
+    assert fault is None if refusal is None else fault is not None and refusal in fault
+    assert order_fault(config, order, None) is not None
+
+
+def test_a_velocity_that_leads_out_of_the_fence_is_refused_and_one_back_is_not(tmp_path: Path) -> None:
+    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
+    config = load_drone(tmp_path / "drone.yaml")
+    edge = VehicleState(0.0, np.eye(3), 5.0, np.zeros(3), np.array([98.0, 0.0]))
+    outward, inward = (MissionOrder(velocity=np.array([speed, 0.0])) for speed in (1.5, -1.5))
+    assert "in 2 s the drone is 101.0 m from home" in str(order_fault(config, outward, edge))
+    assert order_fault(config, inward, edge) is None
+    beyond = replace(edge, position=np.array([130.0, 0.0]))
+    assert order_fault(config, inward, beyond) is None
+
+
+@pytest.mark.parametrize(
+    "message",
+    [{"north_m": 2e5, "east_m": 0.0}, {"latitude_deg": 89.0, "longitude_deg": 8.0}],
+    ids=["metres", "degrees"],
+)
+def test_a_goal_that_no_mission_can_have_is_refused_without_a_fence_too(
+    tmp_path: Path, message: dict[str, float]
+) -> None:
+    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
+    config = load_drone(tmp_path / "drone.yaml")
+    gate = config.safety.gate.model_copy(update={"fence_radius_m": None, "fence_corners_m": ()})
+    config = config.model_copy(update={"safety": config.safety.model_copy(update={"gate": gate})})
+    vehicle = VehicleState(0.0, np.eye(3), 5.0, np.zeros(3), ORIGIN, np.array([47.4, 8.5]))
+    order = parse_order("goto", json.dumps(message).encode())
+    assert "farther than any mission leads" in str(order_fault(config, order, vehicle))
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"", b"[]", b"{", b'{"north_m": 1}', b'{"north_m": 1, "east_m": "2"}', b'{"north_m": NaN, "east_m": 0}',
+     b'{"north_m": true, "east_m": 0}', b'{"north_m": 1, "east_m": 0, "latitude_deg": 1}', b'{"colour": 1}',
+     b'{"velocity_ne": [1, 0]}', b'{"north_m": 1e300, "east_m": 0}', b'{"north_m": 1, "east_m": 0, "height_m": null}'],
+)  # fmt: skip
+def test_what_is_no_order_is_refused_with_a_sentence(payload: bytes) -> None:
+    with pytest.raises(ValueError, match=r"goto|order|has to be a number"):
+        parse_order("goto", payload)
+
+
+@pytest.mark.parametrize(
+    ("written", "told"),
+    [
+        ("{kind: spiral}", "drone.yaml:6: mission.kind: spiral is not known"),
+        ("{kind: hover, radius_m: 5.0}", "has no meaning with kind `hover`, only with `circle_then_tangent`"),
+        ("{kind: waypoints}", "mission.kind: `waypoints` needs `waypoints`"),
+        ("{kind: velocity}", "mission.kind: `velocity` needs `velocity_m_s`"),
+        ("{kind: velocity, velocity_m_s: [3, 3]}", "mission.velocity_m_s: 4.24264 m/s is above"),
+        ("{speed_m_s: 4.5}", "mission.speed_m_s: 4.5 m/s is above"),
+        ("{kind: hover, height_m: 40}", "mission.height_m: leads to a height of 40 m"),
+        (
+            "{kind: waypoints, waypoints: [{north_m: 1, east_m: 2}, {north_m: 90, east_m: 50}]}",
+            "mission.waypoints[1]: is 103.0 m from home, outside the fence of 100 m",
+        ),
+        ("{kind: waypoints, waypoints: [{north_m: 1}]}", "a waypoint needs `north_m` and `east_m`"),
+    ],
+)
+def test_a_bad_mission_is_refused_with_line_and_key(tmp_path: Path, written: str, told: str) -> None:
+    path = tmp_path / "drone.yaml"
+    path.write_text(f"{DRONE}mission: {written}\n", encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load_drone(path)
+    (line,) = str(caught.value).splitlines()
+    assert "drone.yaml:6" in line
+    assert told.removeprefix("drone.yaml:6: ") in line
+
+
+def test_in_a_scenario_the_mission_is_of_all_and_one_drone_may_have_its_own(tmp_path: Path) -> None:
+    (tmp_path / "drone.yaml").write_text(f"{DRONE}mission: {{kind: hover}}\n", encoding="utf-8")
+    path = tmp_path / "scenario.yaml"
+    own = "  - {position_m: [5, 0, -4], mission: {kind: velocity, velocity_m_s: [1, 0]}}\n"
+    path.write_text(f"{SCENARIO}{own}mission: {{kind: follow, pull: 2.0}}\n", encoding="utf-8")
+    scenario = load_scenario(path, {"drone.mission.pull": 3.0})
+    assert [scenario.drone_of(i).mission.kind for i in range(3)] == ["follow", "follow", "velocity"]
+    assert scenario.drone.mission.pull == 3.0
+    path.write_text(f"{SCENARIO}{own.replace('[1, 0]', '[9, 0]')}mission: {{kind: fly}}\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"scenario.yaml:7: drone.mission.kind|scenario.yaml:7: mission.kind"):
+        load_scenario(path)
+    path.write_text(f"{SCENARIO}{own.replace('[1, 0]', '[9, 0]')}", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"scenario.yaml:6: vehicles\[2\].mission.velocity_m_s: 9 m/s is above"):
+        load_scenario(path)
+
+
+def test_one_drone_at_least_is_left_to_flockd(tmp_path: Path) -> None:
+    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
+    path = tmp_path / "scenario.yaml"
+    path.write_text(SCENARIO.replace("4]}", "4], by_hand: true}"), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"scenario.yaml:4: vehicles\[0\].by_hand: flies the last drone by hand too"):
+        load_scenario(path)
+    assert main(["sim", str(CONFIG / "led_by_hand.yaml"), "--drones", "1", "--perception", "truth"]) == 2
+
+
+def test_the_configuration_and_the_gate_agree_on_what_is_outside() -> None:
+    corners = ((-8.0, -10.0), (-8.0, 10.0), (10.0, 10.0), (10.0, 2.0), (2.0, 2.0), (2.0, -10.0))
+    gate = GateParameters(fence_radius_m=12.0, fence_corners_m=corners)
+    rng = np.random.default_rng(0)
+    places = rng.uniform(-14.0, 14.0, (500, 2))
+    verdicts = [(fault_of_place(gate, *place.tolist()) is not None, outside_fence(gate, place)) for place in places]
+    assert all(one == other for one, other in verdicts)
+    assert 0 < sum(one for one, _ in verdicts) < 500
+
+
+def test_one_of_five_knows_the_goal_and_all_arrive_within_ten_metres() -> None:
+    times, position, _ = fly_exact_states(load_scenario(CONFIG / "one_knows.yaml"))
+    plan = position[-1, :, :2]
+    assert times[-1] == 109.5
+    assert np.linalg.norm(plan[:, None] - plan, axis=-1).max() < 10.0
+    assert np.linalg.norm(plan - [25.0, 10.0], axis=1).max() < 10.0
+
+
+def test_those_who_see_a_drone_that_is_flown_by_hand_go_with_it() -> None:
+    scenario = load_scenario(CONFIG / "led_by_hand.yaml")
+    _, position, velocity = fly_exact_states(scenario)
+    assert np.linalg.norm(position[-1, :, :2] - [20.0, 10.0], axis=1).max() < 10.0
+    # A person's drone goes as the person wants, wherever the others are: 0.5 m/s straight to the north at first.
+    np.testing.assert_allclose(velocity[20, 0], [0.5, 0.0, 0.0], atol=0.01)
+
+
+def test_a_mission_changes_the_height_and_lands_at_its_end() -> None:
+    scenario = load_scenario(CONFIG / "led_by_hand.yaml", {"duration_s": 30.0})
+    lands = MissionParameters.model_validate(
+        {"kind": "waypoints", "at_end": "land", "waypoints": ({"north_m": 6.0, "east_m": 0.0, "height_m": 6.0},)}
+    )
+    start = scenario.vehicles[0].model_copy(update={"mission": lands, "by_hand": False})
+    alone = scenario.model_copy(update={"vehicles": (start,)})
+    _, position, _ = fly_exact_states(alone)
+    heights = -position[:, 0, 2]
+    assert heights.max() == pytest.approx(6.0, abs=0.1)
+    assert heights[-1] == pytest.approx(0.0, abs=0.01)
+    assert np.diff(heights).max() / 0.5 < 1.6  # MAX_CLIMB_M_S

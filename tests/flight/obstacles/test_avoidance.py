@@ -1,0 +1,193 @@
+"""Around obstacles: which way, how fast, and what is asked for in the end."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from flockd.core.config import load_scenario
+from flockd.core.config.avoidance import ObstacleParameters
+from flockd.core.config.flocking import FlockingParameters
+from flockd.core.config.mission import MissionParameters
+from flockd.core.config.safety import GateParameters
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.data import data_path
+from flockd.core.messages import FloatArray, ObstacleRanges
+from flockd.flight.flocking import FlockingLaw
+from flockd.flight.obstacles import Avoidance
+from flockd.flight.obstacles.steering import Steering, free_way
+from flockd.sim.exact_states import ExactFlock
+from flockd.sim.vehicles import Vehicles
+from flockd.sim.worlds.obstacles import Box, Frustum, Obstacles, Solid, true_ranges
+
+PARAMETERS = ObstacleParameters(enabled=True)
+GATE = GateParameters()
+NOBODY = np.empty((0, 3))
+STILL = np.zeros(2)
+FREE = true_ranges(Obstacles(), 0.0, np.array([0.0, 0.0, -4.0]), limit_m=15.0)
+
+
+def around(*solids: Solid) -> ObstacleRanges:
+    """What a drone at the origin sees."""
+    return true_ranges(Obstacles(solids), 0.0, np.array([0.0, 0.0, -4.0]), limit_m=15.0)
+
+
+def trunk(north: float, east: float, radius: float = 0.2) -> Frustum:
+    return Frustum(north, east, radius, radius, -0.5, 10.0)
+
+
+def steered(wanted: tuple[float, float], ranges: ObstacleRanges, flock: FloatArray = STILL) -> FloatArray:
+    return Avoidance(PARAMETERS, GATE, 0.5).steered(np.array(wanted), ranges, flock)
+
+
+# The free way.
+
+
+def test_a_disc_meets_a_point_where_geometry_says() -> None:
+    """10 m ahead and 3 m aside, a disc of 5 m touches 4 m before it is abreast: a triangle of 3, 4 and 5 m."""
+    points = np.array([[10.0, 3.0]])
+    np.testing.assert_allclose(free_way(points, 5.0, np.array([0.0])), [10.0 - 4.0])
+    np.testing.assert_array_equal(free_way(points, 2.9, np.array([0.0])), [np.inf])
+    np.testing.assert_array_equal(free_way(points, 5.0, np.array([math.pi])), [np.inf])
+
+
+def test_from_within_its_clearance_a_drone_may_only_fly_off() -> None:
+    points = np.array([[0.5, 0.0]])
+    np.testing.assert_array_equal(free_way(points, 0.9, np.array([0.0, math.pi, 0.5, 2.0])), [0.0, np.inf, 0.0, np.inf])
+
+
+def test_without_obstacles_every_way_is_free() -> None:
+    np.testing.assert_array_equal(free_way(np.empty((0, 2)), 1.0, np.array([0.0, 1.0])), [np.inf, np.inf])
+
+
+# Steering.
+
+
+def test_where_nothing_stands_the_wanted_velocity_is_flown() -> None:
+    np.testing.assert_array_equal(steered((1.0, 1.0), FREE), [1.0, 1.0])
+    np.testing.assert_array_equal(steered((1.0, 0.0), around(trunk(3.0, 2.5), trunk(-1.2, 0.0))), [1.0, 0.0])
+    np.testing.assert_array_equal(steered((0.0, 0.0), around(trunk(3.0, 2.5))), [0.0, 0.0])
+
+
+@pytest.mark.parametrize(("east", "side"), [(0.3, -1.0), (-0.3, 1.0), (0.0, 1.0)])
+def test_a_trunk_is_passed_on_the_nearer_side_and_in_the_middle_on_the_right(east: float, side: float) -> None:
+    north, aside = steered((1.5, 0.0), around(trunk(4.0, east)))
+    assert north > 1.0
+    assert math.copysign(1.0, aside) == side
+    assert math.hypot(north, aside) == pytest.approx(1.5)
+    clearance_m = abs(4.0 * aside - east * north) / 1.5 - 0.2  # of the straight way to the trunk
+    assert clearance_m >= PARAMETERS.clearance_m
+
+
+def test_the_side_is_kept_though_the_other_has_become_a_little_nearer() -> None:
+    steering = Steering(PARAMETERS)
+    first, _ = steering.around(np.array([1.5, 0.0]), around(trunk(4.0, -0.1)), STILL)
+    then, _ = steering.around(np.array([1.5, 0.0]), around(trunk(3.5, 0.1)), STILL)
+    fresh, _ = Steering(PARAMETERS).around(np.array([1.5, 0.0]), around(trunk(3.5, 0.1)), STILL)
+    assert (first[1] > 0, then[1] > 0, fresh[1] > 0) == (True, True, False)
+
+
+def test_of_two_ways_alike_the_flocks_is_taken() -> None:
+    left = steered((1.5, 0.0), around(trunk(4.0, 0.0)), np.array([0.5, -1.0]))
+    assert left[1] < 0
+
+
+def test_before_a_wall_it_slides_along() -> None:
+    wall = around(Box(1.5, 0.0, 0.2, 30.0, 0.0, -0.5, 8.0))
+    north, east = steered((1.5, 0.0), wall)
+    assert east > 0.5
+    assert abs(north) < 0.3 * east
+
+
+def test_an_obstacle_that_may_be_nearer_is_met_more_slowly() -> None:
+    dead_end = around(
+        Box(3.0, 0.0, 0.2, 5.0, 0.0, -0.5, 8.0), Box(0.0, 1.8, 5.0, 0.2, 0.0, -0.5, 8.0),
+        Box(0.0, -1.8, 5.0, 0.2, 0.0, -0.5, 8.0), Box(-3.0, 0.0, 0.2, 5.0, 0.0, -0.5, 8.0),
+    )  # fmt: skip
+    sure = np.linalg.norm(steered((1.5, 0.0), dead_end))
+    found = np.isfinite(dead_end.range_m)
+    blurred = ObstacleRanges(0.0, dead_end.range_m, np.where(found, 0.3, 0.0), dead_end.seen_m)
+    assert 0.0 < np.linalg.norm(steered((1.5, 0.0), blurred)) < sure < 1.5
+
+
+def test_into_what_was_not_looked_at_it_does_not_fly() -> None:
+    unseen = ObstacleRanges(0.0, FREE.range_m, FREE.sigma_m, np.where(np.arange(72) < 36, 0.0, 15.0))
+    east = steered((0.0, 1.5), unseen)[1]  # the eastern half
+    assert east <= 1.5 * math.sin(math.radians(2.5)) + 1e-9  # half a sector
+    blind = ObstacleRanges(0.0, FREE.range_m, FREE.sigma_m, np.zeros(72))
+    np.testing.assert_array_equal(steered((0.0, 1.5), blind), [0.0, 0.0])
+
+
+def test_too_near_it_flies_off() -> None:
+    away = steered((0.0, 0.0), around(trunk(0.7, 0.0)))
+    assert away[0] == pytest.approx(-(0.9 - 0.5 + 2 * 0.01))  # the sigma of exact ranges is a centimetre
+    assert away[1] == pytest.approx(0.0, abs=1e-9)
+
+
+# The command.
+
+
+def test_the_command_can_be_stopped_a_step_later() -> None:
+    """From full speed towards a wall: however the law pulls, the way of a step, reaction and braking is left."""
+    avoidance, law = Avoidance(PARAMETERS, GATE, 0.5), FlockingLaw(FlockingParameters())
+    for away_m in np.arange(1.0, 8.0, 0.25):
+        wall = around(Box(away_m + 0.2, 0.0, 0.2, 30.0, 0.0, -0.5, 8.0))
+        command, _ = avoidance.command(law, np.array([1.5, 0.0]), NOBODY, NOBODY[:, :2], np.array([3.0, 0.0]), wall)
+        speed = max(float(command[0]), 0.0)
+        assert speed * 1.0 + speed**2 / 3.0 <= max(away_m - PARAMETERS.clearance_m, 0.0) + 1e-6
+
+
+def test_without_obstacles_the_command_is_the_laws() -> None:
+    avoidance, law = Avoidance(PARAMETERS, GATE, 0.5), FlockingLaw(FlockingParameters())
+    offsets = np.array([[3.0, 2.0, 1.0], [-4.0, 1.0, 0.5]])
+    velocities = np.array([[0.5, 0.1], [0.4, 0.0]])
+    own, desired = np.array([0.5, 0.2]), np.array([1.0, 0.0])
+    command, acceleration = avoidance.command(law, own, offsets, velocities, desired, FREE)
+    expected = law.command(own, offsets[:, :2], velocities, desired, 0.5)
+    np.testing.assert_allclose(command, expected[0])
+    np.testing.assert_allclose(acceleration, expected[1])
+
+
+# A flock on exact states.
+
+
+def flight(solids: list[Solid], duration_s: float) -> tuple[float, FloatArray]:
+    """The smallest clearance of five drones that fly north at 1.5 m/s, and where they end, (5, 3) m."""
+    scenario = load_scenario(data_path("config") / "square.yaml")
+    drone = scenario.drone.model_copy(
+        update={
+            "mission": MissionParameters(kind="velocity", velocity_m_s=(1.5, 0.0)),
+            "obstacles": PARAMETERS,
+        }
+    )
+    scenario = scenario.model_copy(update={"drone": drone})
+    flock, vehicles = _flock_among(scenario, solids), Vehicles(scenario.vehicles, scenario.vehicle)
+    nearest_m, obstacles = math.inf, Obstacles(solids)
+    for step in range(round(duration_s / 0.5)):
+        commands = flock.step(0.5 * step, vehicles.position, vehicles.velocity)
+        for _ in range(5):
+            vehicles.step(commands.velocity, np.zeros(5), 0.1)
+            nearest_m = min(nearest_m, float(obstacles.clearance(vehicles.position).min()))
+    return nearest_m, vehicles.position
+
+
+def _flock_among(scenario: ScenarioConfig, solids: list[Solid]) -> ExactFlock:
+    flock = ExactFlock(scenario)
+    flock._obstacles = Obstacles(solids)
+    return flock
+
+
+def test_a_flock_flies_between_trunks_and_hits_none() -> None:
+    trunks = [trunk(6.0 + 4.0 * row, 4.0 * column + 2.0 * (row % 2)) for row in range(4) for column in range(-4, 5)]
+    nearest_m, ends = flight(list(trunks), 16.0)
+    assert nearest_m > 0.6
+    assert ends[:, 0].min() > 6.0
+
+
+def test_a_flock_gets_around_a_wall_across_its_way() -> None:
+    nearest_m, ends = flight([Box(8.0, 2.0, 0.2, 6.0, 0.0, -0.5, 8.0)], 22.0)
+    assert nearest_m > 0.6
+    assert ends[:, 0].min() > 9.0
+    assert np.ptp(ends[:, :2], axis=0).max() < 12.0

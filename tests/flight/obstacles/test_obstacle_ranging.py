@@ -1,0 +1,167 @@
+"""Ranges from depth maps that are made by geometry: a trunk, a wall, the ground, the sky, a neighbour."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from flockd.core.config import load_scenario
+from flockd.core.config.avoidance import ObstacleParameters
+from flockd.core.data import data_path
+from flockd.core.messages import SECTORS, UNCLASSED, EgoMotion, FloatArray, ObstacleRanges, VehicleState
+from flockd.flight.geometry import Rig, build_rig, grid_pixels
+from flockd.flight.obstacles import ObstacleRanging
+from flockd.flight.perception import CameraObservation, Observation
+
+RIG = build_rig(load_scenario(data_path("config") / "square.yaml").drone.rig)
+PARAMETERS = ObstacleParameters(range_m=12.0, range_sigma=0.1, min_pixels=4)
+RANGING = ObstacleRanging(RIG, PARAMETERS)
+HEIGHT_M = 3.0
+SKY_M = 80.0
+LEVEL = np.eye(3)
+EAST = SECTORS // 4
+
+
+def towards_trunk(origin: FloatArray, rays: FloatArray, place: tuple[float, float], radius: float) -> FloatArray:
+    """(n,) factors of the rays (n, 3) up to an upright cylinder without ends: a quadratic equation."""
+    offset = origin[:2] - place
+    a, b, c = np.sum(rays[:, :2] ** 2, axis=1), rays[:, :2] @ offset, offset @ offset - radius**2
+    square = b**2 - a * c
+    ahead = np.where(square > 0, (-b - np.sqrt(np.maximum(square, 0.0))) / a, np.inf)
+    return np.where(ahead > 0, ahead, np.inf)
+
+
+def seen(
+    *trunks: tuple[float, float, float],
+    R_ned_body: FloatArray = LEVEL,
+    rig: Rig = RIG,
+    labels: int = 0,
+    of_label: tuple[float, float, float] | None = None,
+) -> ObstacleRanges:
+    """Over flat ground under a clear sky, from the middle of the world; `of_label`: a trunk that is masked so."""
+    cameras = {}
+    for name, camera in rig.cameras.items():
+        width, height = camera.camera.size
+        pixels = grid_pixels((width, height), 1)
+        to_ned = R_ned_body @ camera.T_body_camera.rotation
+        rays = camera.camera.unproject(pixels, np.ones(len(pixels))) @ to_ned.T
+        origin = R_ned_body @ camera.T_body_camera.translation
+        depth = np.where(rays[:, 2] > 0, (HEIGHT_M - origin[2]) / np.maximum(rays[:, 2], 1e-9), SKY_M)
+        mask = np.zeros(len(pixels), np.uint8)
+        for north, east, radius in trunks:
+            depth = np.minimum(depth, towards_trunk(origin, rays, (north, east), radius))
+        if of_label is not None:
+            masked = towards_trunk(origin, rays, of_label[:2], of_label[2])
+            mask[masked < depth] = labels
+            depth = np.minimum(depth, masked)
+        shape = (height, width)
+        image = np.zeros((*shape, 3), np.uint8)
+        cameras[name] = CameraObservation(image, depth.reshape(shape).astype(np.float32), mask.reshape(shape), None)
+    return RANGING.ranges(Observation(2.0, VehicleState(2.0, R_ned_body, HEIGHT_M), cameras, (), None))
+
+
+def found(ranges: ObstacleRanges) -> dict[int, float]:
+    return {int(k): float(ranges.range_m[k]) for k in np.flatnonzero(np.isfinite(ranges.range_m))}
+
+
+def test_over_open_ground_nothing_stands_and_all_is_seen() -> None:
+    ranges = seen()
+    assert found(ranges) == {}
+    np.testing.assert_array_equal(ranges.seen_m, 12.0)
+    np.testing.assert_array_equal(ranges.sigma_m, 0.0)
+    assert ranges.time_s == 2.0
+
+
+@pytest.mark.parametrize(("azimuth_deg", "away_m"), [(0.0, 3.0), (90.0, 8.0), (130.0, 1.5), (245.0, 6.0)])
+def test_a_trunk_is_seen_where_it_stands(azimuth_deg: float, away_m: float) -> None:
+    azimuth = math.radians(azimuth_deg)
+    ranges = seen((away_m * math.cos(azimuth), away_m * math.sin(azimuth), 0.15))
+    sector = round(azimuth_deg / 5)
+    assert ranges.range_m[sector] == pytest.approx(away_m - 0.15, rel=0.06)
+    assert ranges.sigma_m[sector] == pytest.approx(0.1 * ranges.range_m[sector])
+    assert ranges.seen_m[sector] == ranges.range_m[sector]
+    half_deg = math.degrees(math.asin(0.15 / away_m)) + 5.0
+    assert all(abs(5.0 * k - azimuth_deg) <= half_deg for k in found(ranges))
+
+
+def test_the_attitude_turns_the_directions_and_keeps_the_heights() -> None:
+    """Facing east and 20 degrees nose down, a trunk to the north stands where it stood."""
+    c, s = math.cos(math.radians(-20.0)), math.sin(math.radians(-20.0))
+    east = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    pitched = east @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+    ranges = seen((5.0, 0.0, 0.2), R_ned_body=pitched)
+    assert set(found(ranges)) <= {0, 1, SECTORS - 1}
+    assert ranges.range_m[0] == pytest.approx(4.8, rel=0.06)
+
+
+def test_of_two_trunks_in_a_line_the_nearer_one_counts() -> None:
+    assert seen((0.0, 4.0, 0.1), (0.0, 7.0, 0.6)).range_m[EAST] == pytest.approx(3.9, rel=0.06)
+
+
+@pytest.mark.parametrize("label", [1, UNCLASSED])
+def test_a_neighbour_is_no_obstacle(label: int) -> None:
+    ranges = seen(of_label=(0.0, 4.0, 0.4), labels=label)
+    assert found(ranges) == {}
+    seen_m = float(ranges.seen_m[EAST])  # it hides what is behind it; what is nowhere shown is not seen
+    assert seen_m == (pytest.approx(3.6, rel=0.1) if label == 1 else pytest.approx(0.0))
+
+
+def test_what_no_camera_shows_is_not_seen() -> None:
+    front = Rig({"front": RIG.cameras["front"]})
+    ranges = seen((4.0, 0.0, 0.2), (-4.0, 0.0, 0.2), rig=front)
+    assert set(found(ranges)) <= {0, 1, SECTORS - 1}
+    assert ranges.seen_m[SECTORS // 2] == 0.0
+    assert ranges.seen_m[5] == 12.0
+
+
+def test_depth_without_a_scale_shows_nothing() -> None:
+    shape = (640, 480)
+    blank = CameraObservation(
+        np.zeros((*shape, 3), np.uint8), np.full(shape, np.nan, np.float32), np.zeros(shape, np.uint8), None
+    )
+    vehicle = VehicleState(0.0, LEVEL, HEIGHT_M)
+    ranges = RANGING.ranges(Observation(0.0, vehicle, {"front": blank}, (), None))
+    assert found(ranges) == {}
+    np.testing.assert_array_equal(ranges.seen_m, 0.0)
+
+
+def test_a_few_wrong_pixels_are_no_obstacle() -> None:
+    pixels = np.full((640, 480), SKY_M, np.float32)
+    pixels[318:330:4, 242] = 1.0  # three of those that are taken
+    camera = CameraObservation(np.zeros((640, 480, 3), np.uint8), pixels, np.zeros((640, 480), np.uint8), None)
+    vehicle = VehicleState(0.0, LEVEL, HEIGHT_M)
+    assert found(RANGING.ranges(Observation(0.0, vehicle, {"front": camera}, (), None))) == {}
+
+
+def test_what_depth_does_not_show_the_flow_does() -> None:
+    """The drone flies 0.6 m north-east and yaws; depth is that of the sky, as of a network that knows no trunks."""
+    trunk, way = (3.0, -0.8, 0.3), np.array([0.5, 0.3, 0.05])
+    yaw = math.radians(8.0)
+    R_ned_body = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1.0]])
+    before, now = {}, {}
+    for name, camera in RIG.cameras.items():
+        width, height = camera.camera.size
+        blank = {"image": np.zeros((height, width, 3), np.uint8), "labels": np.zeros((height, width), np.uint8)}
+        sky = np.full((height, width), SKY_M, np.float32)
+        pixels = grid_pixels((width, height), 1)
+        turn, origin = camera.T_body_camera.rotation, camera.T_body_camera.translation
+        rays = camera.camera.unproject(pixels, np.ones(len(pixels))) @ turn.T
+        ground = np.where(rays[:, 2] > 0, (HEIGHT_M - origin[2]) / np.maximum(rays[:, 2], 1e-9), 1e4)
+        depth = np.minimum(ground, towards_trunk(origin, rays, trunk[:2], trunk[2]))
+        points = (origin + rays * depth[:, None] - way) @ R_ned_body  # in the body now
+        flow = camera.camera.project((points - origin) @ turn) - pixels
+        before[name] = CameraObservation(depth=sky, flow=None, **blank)
+        now[name] = CameraObservation(depth=sky, flow=flow.reshape(height, width, 2).astype(np.float32), **blank)
+    first = Observation(0.0, VehicleState(0.0, LEVEL, HEIGHT_M), before, (), None)
+    observation = Observation(0.5, VehicleState(0.5, R_ned_body, HEIGHT_M - way[2]), now, (), first)
+    assert found(RANGING.ranges(observation)) == {}
+    ego = EgoMotion(R_ned_body, way, 0.5, 100, 100, 0.01)
+    ranges = RANGING.ranges(observation, ego)
+    offset = np.array(trunk[:2]) - way[:2]
+    sector = round(math.degrees(math.atan2(offset[1], offset[0])) / 5) % SECTORS
+    away_m = float(np.hypot(*offset)) - trunk[2]
+    assert ranges.range_m[sector] == pytest.approx(away_m, rel=0.07)
+    assert 0.0 < ranges.sigma_m[sector] < 0.2 * away_m
+    assert all((k - sector + 3) % SECTORS <= 6 for k in found(ranges))

@@ -1,0 +1,183 @@
+"""A range finder that lies is found out by the barometer's height, and hills, steps and drift are no lies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.interpolate import RegularGridInterpolator
+
+from flockd.core.choices import HeightSource
+from flockd.core.config.perception import RangeFinderParameters
+from flockd.core.config.scenario import RangeFinderConfig
+from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, VehicleState
+from flockd.flight.perception.depth import GroundBelow, NoGround
+from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
+from flockd.sim.hills import hills
+from flockd.sim.vehicles import euler_rotation
+
+STEP_S = 0.5
+LIE = "height: the range contradicts the barometer; the barometer's is used"
+Told = tuple[GroundEstimate | NoGround, str | None]
+
+
+class Drone:
+    """One that flies over level ground with a sensor that says what a story wants."""
+
+    def __init__(self, source: HeightSource = "best", height_m: float = 4.0, **parameters: float) -> None:
+        self.below = GroundBelow(source, RangeFinderParameters.model_validate(parameters))
+        self.time_s, self.height_m, self.north_m, self.east_m = 0.0, height_m, 0.0, 0.0
+
+    def step(
+        self, range_m: float | None, *, climb_m_s: float = 0.0, north_m_s: float = 0.0, R: FloatArray | None = None
+    ) -> Told:
+        """Half a second on; by default the range is the height."""
+        self.time_s += STEP_S
+        self.height_m += climb_m_s * STEP_S
+        self.north_m += north_m_s * STEP_S
+        said = RangeReading(self.time_s, self.height_m if range_m is None else range_m, min_m=0.1, max_m=40.0)
+        place = np.array([self.north_m, self.east_m])
+        attitude = np.eye(3) if R is None else R
+        return self.below.update(
+            VehicleState(self.time_s, attitude, self.height_m, np.zeros(3), place, ground_range=said)
+        )
+
+    def hovers(self, seconds: float, range_m: float | None = None) -> list[Told]:
+        return [self.step(range_m) for _ in range(round(seconds / STEP_S))]
+
+
+def source(told: Told) -> str:
+    assert isinstance(told[0], GroundEstimate)
+    return told[0].source
+
+
+def test_stuck_while_the_drone_climbs_it_is_not_used_and_the_barometer_is() -> None:
+    """From the start on the height that is used never errs by more than the tolerance and 8 % of the range."""
+    drone = Drone(height_m=2.0)
+    drone.hovers(3.0)
+    climb = [drone.step(2.0, climb_m_s=0.3) for _ in range(30)]
+    for k, told in enumerate(climb):
+        assert isinstance(told[0], GroundEstimate)
+        assert abs(told[0].height_m - (2.0 + 0.15 * (k + 1))) <= 1.0 + 0.08 * 2.0 + 2 * 0.15
+    assert source(climb[-1]) == "barometer"
+    assert climb[-1][1] == LIE
+
+
+@pytest.mark.parametrize("range_m", [0.3, 7.0], ids=["landing gear in the beam", "a jump"])
+def test_what_is_suddenly_in_the_beam_is_not_the_ground(range_m: float) -> None:
+    drone = Drone()
+    drone.hovers(3.0)
+    first, *others = drone.hovers(10.0, range_m)
+    assert isinstance(first[0], GroundEstimate)
+    assert first[0].height_m == pytest.approx(4.0), "bridged: it may be a bird"
+    assert [told[1] for told in others] == [LIE] * len(others)
+    assert all(isinstance(told[0], GroundEstimate) and told[0].height_m == 4.0 for told in others)
+
+
+def test_alone_it_gives_no_scale() -> None:
+    drone = Drone("range_finder")
+    drone.hovers(3.0)
+    assert drone.hovers(2.0, 0.3)[-1] == (
+        NoGround("height: the range contradicts the barometer; there is no scale"),
+        None,
+    )
+
+
+def test_what_is_in_the_beam_from_the_start_contradicts_home() -> None:
+    """Where the height is zero the ground was, when the drone was armed there."""
+    drone = Drone()
+    assert drone.hovers(5.0, 0.3)[-1][1] == LIE
+    far = Drone()
+    far.north_m = 20.0
+    assert source(far.hovers(5.0, 0.3)[-1]) == "range_finder", "a slope of 18 % would do that"
+
+
+def test_it_is_believed_again_when_the_beam_is_free_and_not_sooner_than_after_three_seconds() -> None:
+    drone = Drone()
+    drone.hovers(3.0)
+    drone.hovers(4.0, 0.3)
+    sources = [source(told) for told in drone.hovers(5.0)]
+    assert sources == ["barometer"] * 6 + ["range_finder"] * 4
+
+
+def test_what_stays_the_same_is_not_believed_however_far_the_drone_flies() -> None:
+    """The ground could have risen by as much, further on: but then the range would have changed on the way."""
+    drone = Drone()
+    drone.hovers(3.0)
+    for k in range(200):
+        told = drone.step(0.3 + 0.01 * (k % 3), north_m_s=2.0, R=euler_rotation(0.0, 0.2 * math.sin(k), 0.0))
+    assert source(told) == "barometer"
+
+
+def test_a_step_in_the_ground_is_believed_once_the_range_follows_the_height() -> None:
+    drone = Drone()
+    drone.hovers(3.0)
+    assert source(drone.hovers(20.0, 6.0)[-1]) == "barometer", "over a cliff of 2 m, level"
+    for k in range(20):
+        told = drone.step(6.0 + 0.1 * (k + 1), climb_m_s=0.2)
+    assert isinstance(told[0], GroundEstimate)
+    assert told[0].source == "range_finder"
+    assert told[0].height_m == pytest.approx(8.0)
+
+
+def test_one_that_jumps_to_and_fro_is_not_believed() -> None:
+    drone = Drone()
+    drone.hovers(3.0)
+    sources = {source(drone.step(1.0 if k // 3 % 2 else 7.0)) for k in range(60)}
+    last = [source(drone.step(1.0 if k // 3 % 2 else 7.0)) for k in range(12)]
+    assert set(last) == {"barometer"}
+    assert sources == {"range_finder", "barometer"}, "the first is bridged"
+
+
+def test_the_barometers_drift_is_no_lie() -> None:
+    """2 cm a second, as in a storm: over the time that is compared it stays within the tolerance."""
+    drone, true_m = Drone(), 4.0
+    for _ in range(600):
+        assert source(drone.step(true_m, climb_m_s=0.02)) == "range_finder"
+
+
+@pytest.mark.parametrize("speed_m_s", [0.0, 1.0, 3.0])
+def test_after_a_pause_the_places_before_do_not_count(speed_m_s: float) -> None:
+    drone = Drone()
+    drone.hovers(3.0)
+    drone.time_s += 60.0
+    drone.north_m = 12.0
+    assert source(drone.step(6.0, north_m_s=speed_m_s)) == "range_finder"
+
+
+def _over_hills(seed: int) -> Callable[[FloatArray, FloatArray], FloatArray]:
+    extent_m = 160.0
+    heights = hills(np.random.default_rng(seed), extent_m, 5.0, 0.15)
+    axis = np.linspace(-extent_m, extent_m, len(heights))
+    at = RegularGridInterpolator((axis, axis), heights)
+    return lambda north, east: np.asarray(at(np.column_stack([north, east])))
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_hills_of_fifteen_per_cent_never_contradict_the_barometer(seed: int) -> None:
+    """150 s at 1 m/s with the simulator's sensor, rolling, while the barometer drifts by 0.3 m a minute."""
+    rng = np.random.default_rng([seed, 1])
+    ground = _over_hills(seed)
+    sensor = FakeRangeFinder(RangeFinderConfig(dropouts_per_min=0.0), ground, (seed,))
+    below, heading = GroundBelow("best", RangeFinderParameters()), float(rng.uniform(0.0, 2 * math.pi))
+    velocity = np.array([math.cos(heading), math.sin(heading), 0.0])
+    told, rises_m = set(), []
+    for k in range(300):
+        time_s = STEP_S * k
+        R = euler_rotation(float(rng.normal(0.0, 0.1)), float(rng.normal(0.0, 0.1)), heading)
+        position = velocity * time_s + np.array([0.0, 0.0, -8.0])
+        reading = sensor.read(time_s, position, velocity, R)
+        drift_m = 0.3 / 60.0 * time_s + float(rng.normal(0.0, 0.02))
+        told.add(below.update(VehicleState(time_s, R, 8.0 + drift_m, velocity, position[:2], ground_range=reading))[1])
+        rises_m.append(float(ground(position[:1], position[1:2])[0]))
+    assert told == {None}
+    assert np.ptp(rises_m) > 1.0, "there were hills"
+
+
+def test_over_level_ground_a_lie_of_less_than_the_tolerance_is_not_noticed() -> None:
+    """That is the limit of the check, as the documentation says."""
+    drone = Drone(tolerance_m=1.0)
+    drone.hovers(3.0)
+    assert source(drone.hovers(5.0, 3.1)[-1]) == "range_finder"

@@ -1,0 +1,149 @@
+"""The ground below, from ranges along the body's down axis: analytic planes, and all that a range finder may do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from flockd.core.choices import HeightSource
+from flockd.core.config.perception import RangeFinderParameters
+from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, VehicleState
+from flockd.flight.perception.depth import GroundBelow, NoGround
+from flockd.sim.vehicles import euler_rotation
+
+STEP_S = 0.5
+LEVEL = np.eye(3)
+
+
+def state(
+    time_s: float,
+    range_m: float | None,
+    *,
+    height_m: float = 4.0,
+    north_m: float = 0.0,
+    R: FloatArray = LEVEL,
+    age_s: float = 0.02,
+    quality: float | None = 1.0,
+    vertical: bool = False,
+) -> VehicleState:
+    """Of a drone whose sensor measures from 0.2 to 12 m."""
+    reading = None
+    if range_m is not None:
+        reading = RangeReading(time_s - age_s, range_m, vertical=vertical, min_m=0.2, max_m=12.0, quality=quality)
+    return VehicleState(time_s, R, height_m, np.zeros(3), np.array([north_m, 0.0]), ground_range=reading)
+
+
+def follower(source: HeightSource = "best") -> GroundBelow:
+    return GroundBelow(source, RangeFinderParameters())
+
+
+def known(found: tuple[GroundEstimate | NoGround, str | None]) -> GroundEstimate:
+    assert isinstance(found[0], GroundEstimate)
+    return found[0]
+
+
+def test_a_slant_range_is_turned_upright() -> None:
+    R = euler_rotation(math.radians(10.0), math.radians(-20.0), 1.0)
+    upright_m = 5.0 * math.cos(math.radians(10.0)) * math.cos(math.radians(20.0))
+    ground = known(follower().update(state(0.0, 5.0, R=R)))
+    assert ground.source == "range_finder"
+    assert ground.height_m == pytest.approx(upright_m, abs=1e-9)
+    of_autopilot = known(follower().update(state(0.0, 5.0, R=R, vertical=True)))
+    assert of_autopilot.height_m == pytest.approx(5.0), "PX4's distance to bottom is straight down already"
+
+
+def test_successive_ranges_over_a_hillside_tell_its_slope() -> None:
+    """The drone flies north at one height above home; the ground rises by 12 %, from 4 m below it."""
+    below, rng = follower(), np.random.default_rng(0)
+    ground = None
+    for k in range(30):
+        north_m = 0.5 * k
+        true_m = 4.0 + 3.0 - 0.12 * north_m
+        reading_m = true_m * (1.0 + 0.015 * float(rng.standard_normal()))
+        ground = known(below.update(state(STEP_S * k, reading_m, height_m=7.5, north_m=north_m)))
+    assert ground is not None
+    assert ground.slope[0] == pytest.approx(0.12, abs=0.03)
+    assert ground.slope[1] == pytest.approx(0.0, abs=1e-9)
+    assert ground.height_m == pytest.approx(7.0 - 0.12 * 14.5, rel=0.02)
+
+
+def test_the_own_climb_is_no_change_of_the_ground() -> None:
+    below = follower()
+    for k in range(10):
+        ground = known(below.update(state(STEP_S * k, 3.0 + 0.2 * k, height_m=3.1 + 0.2 * k)))
+        assert ground.height_m == pytest.approx(3.0 + 0.2 * k)
+
+
+def test_ranges_are_smoothed() -> None:
+    """Over level ground, the error of the height is less than half of a reading's."""
+    below, rng, errors = follower(), np.random.default_rng(1), []
+    for k in range(200):
+        reading_m = 4.0 + 0.06 * float(rng.standard_normal())
+        ground = known(below.update(state(STEP_S * k, reading_m, north_m=0.1 * k)))
+        errors.append(ground.height_m - 4.0)
+    assert np.std(errors[20:]) < 0.03
+
+
+FAULTS: dict[str, Callable[[float], VehicleState]] = {
+    "no range finder is heard": lambda t: state(t, None),
+    "the range is not a number": lambda t: state(t, math.nan),
+    "the range is too old": lambda t: state(t, 4.0, age_s=0.31),
+    "the range finder's signal is too weak": lambda t: state(t, 4.0, quality=0.05),
+    "the ground is nearer than the range finder measures": lambda t: state(t, 0.2),
+    "the ground is farther than the range finder measures": lambda t: state(t, 12.0),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_without_a_good_range_the_barometer_serves_or_there_is_no_scale(fault: str) -> None:
+    found, why = follower("best").update(FAULTS[fault](0.0))
+    assert isinstance(found, GroundEstimate)
+    assert (found.source, found.height_m, why) == ("barometer", 4.0, f"height: {fault}; the barometer's is used")
+    assert follower("range_finder").update(FAULTS[fault](0.0)) == (
+        NoGround(f"height: {fault}; there is no scale"),
+        None,
+    )
+    level, nothing = follower("barometer").update(FAULTS[fault](0.0))
+    assert isinstance(level, GroundEstimate)
+    assert (level.source, nothing) == ("barometer", None)
+
+
+def test_a_short_dropout_is_bridged_by_the_own_motion_and_a_long_one_is_not() -> None:
+    below = follower()
+    below.update(state(0.0, 3.5))
+    for time_s in (0.5, 1.0, 1.5, 2.0):
+        ground = known(below.update(state(time_s, None, height_m=4.0 + time_s)))
+        assert ground.source == "range_finder"
+        assert ground.height_m == pytest.approx(3.5 + time_s)
+    fallen = known(below.update(state(2.5, None, height_m=6.5)))
+    assert (fallen.source, fallen.height_m) == ("barometer", 6.5)
+    assert known(below.update(state(3.0, 6.0, height_m=6.5))).source == "range_finder", "it works again"
+
+
+def test_one_reading_of_something_else_is_not_the_ground_and_two_are() -> None:
+    below = follower()
+    for k in range(4):
+        below.update(state(STEP_S * k, 4.0))
+    assert known(below.update(state(2.0, 2.5))).height_m == pytest.approx(4.0), "a crate, or a drone below"
+    assert known(below.update(state(2.5, 4.0))).height_m == pytest.approx(4.0)
+    below.update(state(3.0, 3.2))
+    assert known(below.update(state(3.5, 3.2))).height_m == pytest.approx(3.2), "a terrace"
+
+
+def test_a_slope_that_images_show_counts_with_its_uncertainty() -> None:
+    below = follower()
+    below.update(state(0.0, 4.0))
+    for k in range(1, 20):
+        below.see_slope(np.array([0.0, 0.1]))
+        ground = known(below.update(state(STEP_S * k, 4.0)))
+    assert ground.slope == pytest.approx([0.0, 0.1], abs=0.01)
+
+
+def test_after_a_long_gap_the_ground_is_found_anew() -> None:
+    below = follower()
+    below.update(state(0.0, 4.0))
+    assert known(below.update(state(9.0, 4.9))).height_m == pytest.approx(4.9)
+    assert known(below.update(state(8.0, 3.0))).height_m == pytest.approx(3.0), "time ran backwards"

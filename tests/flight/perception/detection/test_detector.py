@@ -1,0 +1,162 @@
+"""The detection pipeline on true maps: proposals, masks, and what one stage does not know of the other's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flockd.core.config.perception import DetectionParameters
+from flockd.core.messages import UNCLASSED, BoolArray, Detection, UInt8Array
+from flockd.flight.perception import Crop, Instance, RangeEstimate, SceneMaps
+from flockd.flight.perception.detection.detector import DetectionTrace, Detector
+from flockd.flight.perception.detection.masks import DroneLogits, DroneMasks, first_stage_labels, without_borders
+from flockd.flight.perception.detection.proposals import largest_blobs, propose_residuals
+from flockd.sim.truth_perception import TruthPerception
+from tests.flight.perception.shipped import SECOND_STAGE
+from tests.flight.pilot.flyer import Flyer, scenario_with
+
+PARAMETERS = DetectionParameters()
+COLOUR_WEIGHT = PARAMETERS.colour_weight
+
+
+class Scene:
+    """One camera's true maps of a moment, which a test may spoil before the detector gets them."""
+
+    def __init__(self, flyer: Flyer) -> None:
+        self._flyer = flyer
+        self.frames, self.vehicle = flyer.take_frames()
+        cameras = flyer.cameras.rig.cameras
+        maps = {n: flyer.truth.scene(frame, cameras[n], None) for n, frame in self.frames.frames.items()}
+        (self.camera,) = [name for name, scene in maps.items() if scene.instances]
+        self.maps = maps[self.camera]
+
+    def detect(self, image: UInt8Array | None = None) -> tuple[tuple[Detection, ...], UInt8Array]:
+        """By the true second stage."""
+        images = {self.camera: self.frames.frames[self.camera].image if image is None else image}
+        detector = Detector(self._flyer.cameras.rig, self._flyer.truth, PARAMETERS)
+        scenes = {self.camera: self.maps}
+        detections, masks = detector.detect(images, scenes, self.vehicle, (), DetectionTrace())
+        return detections, masks[self.camera]
+
+
+@pytest.mark.parametrize(("probability", "certain", "uncertain"), [(0.05, 0, 0), (0.35, 255, 255), (0.9, 1, 255)])
+def test_what_is_no_drone_belongs_to_the_background_again(
+    monkeypatch: pytest.MonkeyPatch, probability: float, certain: int, uncertain: int
+) -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -4.0)))
+    scene = Scene(flyer)
+    estimates = flyer.truth.ranges
+    monkeypatch.setattr(
+        flyer.truth, "ranges", lambda crops: tuple(replace(e, drone_probability=probability) for e in estimates(crops))
+    )
+    drone = scene.maps.labels > 0
+    upper = drone & (np.cumsum(drone.any(axis=1)) < np.ptp(np.flatnonzero(drone.any(axis=1))) / 2)[:, None]
+    scene.maps = replace(scene.maps, uncertain=upper)
+    _, labels = scene.detect()
+    assert set(labels[drone & ~upper]) == {certain}
+    assert set(labels[upper]) == {uncertain}
+
+
+def with_discs(truth: TruthPerception, height: float) -> Callable[[Sequence[Crop]], tuple[RangeEstimate, ...]]:
+    """The second stage, with masks: a disc somewhat wider than the drone, so high inside and so deep outside."""
+    estimates = truth.ranges
+
+    def ranges(crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+        v, u = np.mgrid[0:96, 0:96] + 0.5
+        masked = []
+        for crop, estimate in zip(crops, estimates(crops), strict=True):
+            reach_px = 0.6 * estimate.size_m * crop.camera.focal_px / np.exp(estimate.log_range)
+            inside = np.hypot(u - estimate.centre[0], v - estimate.centre[1]) < reach_px
+            masked.append(replace(estimate, mask=np.where(inside, height, -height).astype(np.float32)))
+        return tuple(masked)
+
+    return ranges
+
+
+def test_two_drones_that_the_first_stage_takes_for_one_are_two(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The far one's pixels count for the near one's, until the second stage says which of them are the near one's."""
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0), (6.0, -0.6, -4.0)))
+    monkeypatch.setattr(flyer.truth, "ranges", with_discs(flyer.truth, 9.0))
+    scene = Scene(flyer)
+    near, far = scene.maps.instances
+    true = scene.maps.labels
+    pixels = true > 0
+    both = replace(near, box=np.concatenate([np.minimum(near.box, far.box)[:2], np.maximum(near.box, far.box)[2:]]))
+    labels = np.where(pixels, np.uint8(near.label), np.uint8(0))
+    logit = np.where(pixels, np.float32(3.0), np.float32(-3.0))[1::2, 1::2]
+    scene.maps = replace(scene.maps, labels=labels, instances=(both,), uncertain=~pixels, logit=logit)
+    detections, seen = scene.detect()
+    assert sorted(d.range_m for d in detections) == pytest.approx([3.01, 6.03], abs=0.1)
+    assert {*seen[true == near.label]} & {*seen[true == far.label]} <= {0, 255}
+
+
+def test_masks_are_drawn_as_colours_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0)))
+    monkeypatch.setattr(flyer.truth, "ranges", with_discs(flyer.truth, 3.0))
+    scene = Scene(flyer)
+    scene.maps = replace(scene.maps, logit=np.zeros(scene.maps.labels[1::2, 1::2].shape, np.float32))
+
+    def drawn(image: UInt8Array) -> BoolArray:
+        detections, labels = scene.detect(image)
+        return np.asarray(labels == detections[0].label)
+
+    meadow = np.full_like(scene.frames.frames[scene.camera].image, 90)
+    disc = drawn(meadow)
+    columns = np.nonzero(disc)[1]
+    sliver = disc & (np.arange(disc.shape[1]) > np.quantile(columns, 0.9))
+    found = drawn(np.where((disc & ~sliver)[:, :, None], np.array([200, 30, 30], np.uint8), meadow))
+    assert found[disc & ~sliver].mean() > 0.95
+    assert found[sliver].mean() < 0.05, "what has the meadow's colour is the meadow"
+
+
+def test_a_drone_painted_like_the_one_before_it_is_still_proposed() -> None:
+    """By colours, its pixels are the other one's; by the networks alone they are a residual."""
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0), (6.0, -0.6, -4.0)))
+    scene, rig = Scene(flyer), flyer.cameras.rig
+    near, far = (scene.maps.labels == instance.label for instance in scene.maps.instances)
+    image = np.where((near | far)[:, :, None], np.array([200, 30, 30], np.uint8), np.array([90, 120, 160], np.uint8))
+    logit = np.where(near, np.float32(3.0), np.where(far, np.float32(-3.0), np.float32(-7.0)))
+    first = np.where(near | far, np.uint8(UNCLASSED), np.uint8(0))
+    masks = DroneMasks(first, (DroneLogits(1, (slice(None), slice(None)), logit),))
+    by_colours = masks.by_colours(image, COLOUR_WEIGHT)
+    assert (by_colours == np.where(near | far, 1, 0)).mean() > 0.99
+    scenes = {scene.camera: replace(scene.maps, uncertain=~(near | far))}
+    (proposal,) = propose_residuals(rig, scenes, {scene.camera: masks.by_networks()}, SECOND_STAGE.rules, PARAMETERS)
+    place = flyer.vehicles.R_ned_body[0].T @ (flyer.vehicles.position[2] - flyer.vehicles.position[0])
+    assert proposal.roi.direction @ place / np.linalg.norm(place) > np.cos(0.02)
+    assert not propose_residuals(rig, scenes, {scene.camera: by_colours}, SECOND_STAGE.rules, PARAMETERS)
+
+
+def test_an_image_full_of_false_ones_gives_only_the_largest_residuals() -> None:
+    """What the first stage is certain of in a hundred places; only the largest are proposed, and no mere specks."""
+    pixels = np.zeros((640, 480), np.bool_)
+    for k in range(100):
+        pixels[60 * (k // 10) : 60 * (k // 10) + 5 + k // 5, 45 * (k % 10) : 45 * (k % 10) + 20] = True
+    blobs = largest_blobs(pixels, max_blobs=6, min_px=24)
+    assert [blob.area_px for blob in blobs] == [20.0 * (5 + k // 5) for k in (95, 96, 97, 98, 99, 90)]
+    assert list(blobs[0].box) == [225.0, 540.0, 245.0, 564.0]
+    speck = np.zeros((640, 480), np.bool_)
+    speck[100:103, 200:207] = True
+    assert not largest_blobs(speck, max_blobs=6, min_px=24)
+
+
+def test_instances_get_the_labels_of_their_detections() -> None:
+    """Detected, rejected, and neither."""
+    instances = tuple(Instance(k, np.zeros(2), np.zeros(4), 1.0) for k in (1, 2, 3))
+    labels = np.array([[0, 1, 2, 3, 1]], np.uint8)
+    uncertain = np.array([[False, False, False, False, True]])
+    scene = SceneMaps(np.ones((1, 5), np.float32), labels, instances, uncertain=uncertain)
+    relabelled = first_stage_labels(scene, {1: 7}, rejected=[instances[1]])
+    assert relabelled.tolist() == [[0, 7, 0, UNCLASSED, UNCLASSED]]
+
+
+def test_background_beside_a_drone_is_not_used() -> None:
+    labels = np.zeros((9, 9), np.uint8)
+    labels[4, 4] = 1
+    bordered = without_borders(labels, 2)
+    assert bordered[4, 4] == 1
+    assert (bordered == UNCLASSED).sum() == 24  # of 5 x 5, all but the drone
+    assert (without_borders(np.zeros((9, 9), np.uint8), 2) == 0).all()

@@ -1,0 +1,55 @@
+"""Regions of interest: how wide, and which are alike."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from flockd.flight.geometry import Rig
+from flockd.flight.perception import Instance
+from flockd.flight.perception.detection.roi import Roi, angle_between, roi_of_instance, take_crops
+from tests.flight.perception.cameras import camera_of
+from tests.flight.perception.shipped import SECOND_STAGE
+
+RULES = SECOND_STAGE.rules
+CAMERA = camera_of(320.0, (640, 480))
+
+
+def test_of_a_drone_that_the_images_border_cuts_a_wider_region_is_taken() -> None:
+    def half_angle(left: float) -> float:
+        box = np.array([left, 220.0, left + 60.0, 260.0])
+        return roi_of_instance(CAMERA, Instance(1, np.array([left + 30.0, 240.0]), box, 900.0), RULES).half_angle
+
+    assert half_angle(0.0) > 1.3 * half_angle(10.0)
+    assert half_angle(640 - 60.0) > 1.3 * half_angle(640 - 70.0)
+    assert half_angle(2.0) < 1.1 * half_angle(10.0), "the first stage's maps have two image pixels a pixel"
+
+
+def test_a_region_suits_a_drones_size_and_stays_near_the_last_one() -> None:
+    assert RULES.half_angle(0.5, 4.0) == pytest.approx(math.atan(0.68 * 0.125))
+    assert RULES.half_angle(0.5, 4.0, before=0.4) == pytest.approx(0.4 / 1.7)
+    assert RULES.half_angle(0.5, 400.0) == pytest.approx(math.radians(1.0))
+    assert RULES.half_angle(50.0, 1.0) == pytest.approx(math.radians(35.0))
+
+
+@pytest.mark.parametrize(
+    ("moved", "factor", "alike"), [(0.0, 1.0, True), (0.004, 1.0, False), (0.002, 1.04, True), (0.0, 1.06, False)]
+)
+def test_a_crop_would_repeat_when_it_is_hardly_moved_or_resized(moved: float, factor: float, alike: bool) -> None:
+    ahead = Roi(np.array([0.0, 0.0, 1.0]), 0.1)
+    further = Roi(np.array([math.sin(moved), 0.0, math.cos(moved)]), 0.1 * factor)
+    assert ahead.resembles(further, shift=0.03, resize=1.05) is alike
+
+
+def test_a_crop_shows_what_lies_in_its_direction() -> None:
+    image = np.zeros((480, 640, 3), np.uint8)
+    image[230:250, 470:490] = 255  # 160 px right of the centre: half a focal length
+    direction = np.array([0.5, 0.0, 1.0]) / math.hypot(0.5, 1.0)
+    (crop,), (view,) = take_crops(Rig({"front": CAMERA}), {"front": image}, [Roi(direction, 0.1)], 96)
+    assert crop.image.shape == (96, 96, 3)
+    assert angle_between(view.T_body_virtual.rotation[:, 2], direction) < 1e-9
+    assert crop.image[48, 48].min() == 255
+    assert crop.image[5, 5].max() == 0
+    assert crop.camera.focal_px == pytest.approx(48 / math.tan(0.1))

@@ -1,0 +1,119 @@
+"""Images that are noise are told from images of scenes, and camera by camera from what it showed before."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from flockd.core.config.perception import NoiseParameters
+from flockd.core.messages import UInt8Array
+from flockd.flight.perception.image_noise import NoiseMonitor, noise_shares
+
+SIZE = (480, 640)
+PARAMETERS = NoiseParameters()
+STEP_S = 0.5
+
+
+def white_share(image: UInt8Array) -> float:
+    return noise_shares(image, PARAMETERS).white
+
+
+def scene(slope: float, contrast: float, seed: int = 0, size: tuple[int, int] = SIZE) -> UInt8Array:
+    """A random texture whose amplitude falls with this power of the spatial frequency, as photographs' does with 1."""
+    rng = np.random.default_rng(seed)
+    spectrum = np.fft.rfft2(rng.standard_normal(size))
+    rows, columns = np.fft.fftfreq(size[0])[:, None], np.fft.rfftfreq(size[1])[None]
+    frequency = np.hypot(rows, columns)
+    frequency[0, 0] = np.inf
+    texture = np.fft.irfft2(spectrum * frequency**-slope, s=size)
+    grey = 128 + contrast * texture / texture.std()
+    image: UInt8Array = np.clip(grey, 0, 255).astype(np.uint8)[..., None].repeat(3, axis=2)
+    return image
+
+
+def noisy(image: UInt8Array, sigma: float, share: float = 1.0, seed: int = 1) -> UInt8Array:
+    """Its upper rows with noise."""
+    rows = round(share * len(image))
+    added = image[:rows] + sigma * np.random.default_rng(seed).standard_normal(image[:rows].shape)
+    return np.concatenate([np.clip(added, 0, 255).astype(np.uint8), image[rows:]])
+
+
+def test_fine_texture_of_photographs_is_no_noise_however_strong_it_is() -> None:
+    """Amplitudes as 1/f, at 55 grey levels more than any grass, and half as steep: gravel, seen without any blur."""
+    assert white_share(scene(1.0, 55.0)) < 0.01
+    assert white_share(scene(0.7, 55.0)) < PARAMETERS.max_white_rise
+
+
+@pytest.mark.parametrize("sigma", [35.0, 50.0, 80.0])
+def test_noise_that_invents_drones_is_noise_before_a_plain_sky_and_before_texture(sigma: float) -> None:
+    assert white_share(noisy(scene(1.0, 2.0), sigma)) > 0.85
+    assert white_share(noisy(scene(1.0, 40.0), sigma)) > 1.5 * PARAMETERS.max_white
+
+
+def test_noise_of_a_good_camera_is_none_and_so_are_images_of_one_colour_or_too_small() -> None:
+    assert white_share(noisy(scene(1.0, 30.0), 8.0)) < 0.02
+    assert white_share(np.full((*SIZE, 3), 70, np.uint8)) == 0.0
+    assert white_share(noisy(scene(1.0, 10.0, size=(24, 640)), 80.0)) == 0.0
+
+
+def test_noise_is_found_in_what_jpeg_leaves_of_it() -> None:
+    done, data = cv2.imencode(".jpg", noisy(scene(1.0, 20.0), 50.0), [cv2.IMWRITE_JPEG_QUALITY, 70])
+    assert done
+    assert white_share(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)) > 0.85
+
+
+def test_the_share_is_that_of_the_noisy_part() -> None:
+    """240 of 480 rows: 7.5 of 15 rows of blocks."""
+    assert white_share(noisy(scene(1.0, 5.0), 60.0, share=0.5)) == pytest.approx(0.5, abs=1 / 15)
+
+
+class Camera:
+    """Says of one image after the other, a step apart, whether it is noisy."""
+
+    def __init__(self) -> None:
+        self._monitor = NoiseMonitor(PARAMETERS)
+        self._time_s = 100.0
+
+    def shows(self, *images: UInt8Array, after_s: float = STEP_S) -> list[bool]:
+        found = []
+        for image in images:
+            self._time_s += after_s
+            found.append(self._monitor.is_noisy("front", image, self._time_s))
+            assert not self._monitor.is_noisy("back", SCENE, self._time_s), "each camera has its own history"
+        return found
+
+
+SCENE = scene(1.0, 20.0)
+NOISE = noisy(SCENE, 50.0)
+
+
+def test_a_camera_counts_as_noisy_until_two_of_its_images_in_a_row_were_clean() -> None:
+    shown = [SCENE, NOISE, NOISE, SCENE, NOISE, SCENE, SCENE, SCENE]
+    assert Camera().shows(*shown) == [False, True, True, True, True, True, False, False]
+
+
+def test_a_band_of_noise_is_noticed_by_what_the_camera_showed_before() -> None:
+    """An eighth of the image, less than the share that is too much for any camera."""
+    band = noisy(SCENE, 60.0, share=0.14)
+    assert white_share(band) < PARAMETERS.max_white
+    assert Camera().shows(band, band) == [False, False], "it may always have shown that"
+    assert Camera().shows(SCENE, band, band) == [False, True, True], "refused images are no history"
+
+
+@pytest.mark.parametrize("blur_px", [1.0, 2.0])
+def test_noise_that_was_filtered_is_noticed_as_it_comes_all_at_once(blur_px: float) -> None:
+    """Noise of 35 grey levels, as soft as the scene: at the finest scale there is none of it."""
+    added = cv2.GaussianBlur(np.random.default_rng(2).standard_normal((*SIZE, 3)), (0, 0), blur_px)
+    soft = np.clip(SCENE + 35.0 / added.std() * added, 0, 255).astype(np.uint8)
+    assert white_share(soft) < 0.01
+    assert Camera().shows(SCENE, soft, soft, soft, soft, soft, soft) == [False, *[True] * 6]
+    assert Camera().shows(SCENE) + Camera().shows(soft, after_s=5.0) == [False, False], "it may be another view"
+
+
+def test_a_turn_from_the_sky_to_the_finest_texture_is_no_noise() -> None:
+    """A view of 90 degrees that turns by 60 degrees a second, towards gravel that nothing blurs: in 0.5 s a third."""
+    sky, gravel = scene(1.2, 3.0), scene(0.8, 50.0, seed=3)
+    columns = [round(SIZE[1] * share) for share in (0.0, 1 / 3, 2 / 3, 1.0, 1.0)]
+    turned = [np.concatenate([gravel[:, :count], sky[:, count:]], axis=1) for count in columns]
+    assert Camera().shows(*turned) == [False] * 5

@@ -1,0 +1,292 @@
+"""The shipped models: whole, as their manifests say, and refused in one sentence when they are not."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import onnxruntime as ort
+import pytest
+
+from flockd.cli import main
+from flockd.core.choices import ROLES
+from flockd.core.config.perception import PerceptionConfig
+from flockd.core.data import data_path
+from flockd.core.errors import ModelError
+from flockd.core.messages import BoolArray, Float32Array, Frame, UInt8Array
+from flockd.flight.inference import OnnxModel, find_manifests, load_manifest
+from flockd.flight.perception import DisFlow, OnnxFlow, OnnxNetworks
+from flockd.flight.perception.flow import background_flow
+from flockd.flight.perception.networks import CROPS_PER_RUN
+from flockd.sim.drone_models import drone_model
+from flockd.sim.renderer import Renderer
+from flockd.sim.world import World
+from tests.flight.perception.cameras import camera_of, crop_of
+
+MODELS = data_path("models")
+NETWORKS = ("distance", "flow", "neighbours", "verification")
+NAMES = [f"{network}{twin}" for network in NETWORKS for twin in ("", "_int8")]
+ROOT = Path(__file__).parents[3]
+
+
+def test_four_models_and_their_twins_fill_the_five_roles() -> None:
+    manifests = [load_manifest(path)[0] for path in find_manifests(MODELS)]
+    assert [m.name for m in manifests] == NAMES
+    for twins in (False, True):
+        roles = [role for m in manifests if m.name.endswith("_int8") == twins for role in m.roles]
+        assert sorted(roles) == sorted(ROLES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_model_opens_and_gives_its_golden_output(name: str) -> None:
+    OnnxModel(MODELS / f"{name}.yaml", threads=1)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_manifest_names_what_the_model_file_has(name: str) -> None:
+    manifest, file = load_manifest(MODELS / f"{name}.yaml")
+    session = ort.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    assert {i.name: i.type for i in session.get_inputs()} == {
+        key: f"tensor({'float' if spec.dtype == 'float32' else spec.dtype})" for key, spec in manifest.inputs.items()
+    }
+    assert {o.name for o in session.get_outputs()} == set(manifest.outputs)
+
+
+def test_a_flipped_bit_is_refused(copies: Path) -> None:
+    file = copies / "flow.onnx"
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(ModelError, match=r"flow\.yaml:5: sha256: .*flow\.onnx .* was changed or damaged; restore it"):
+        OnnxModel(copies / "flow.yaml", threads=1)
+
+
+def test_a_truncated_file_whose_hash_was_updated_is_still_refused(copies: Path) -> None:
+    file = copies / "flow.onnx"
+    content = file.read_bytes()
+    old = load_manifest(copies / "flow.yaml")[0].sha256
+    file.write_bytes(content[: len(content) // 2])
+    manifest = copies / "flow.yaml"
+    manifest.write_text(manifest.read_text().replace(old, hashlib.sha256(file.read_bytes()).hexdigest()))
+    with pytest.raises(ModelError, match=r"flow\.yaml:4: file: .*flow\.onnx cannot be loaded"):
+        OnnxModel(manifest, threads=1)
+
+
+def test_another_models_weights_do_not_give_the_golden_output(copies: Path) -> None:
+    manifest = copies / "distance.yaml"
+    text = manifest.read_text()
+    golden = next(line for line in text.splitlines() if "golden_mean" in line)
+    manifest.write_text(text.replace(golden, golden.split(":")[0] + ": 123.0"))
+    with pytest.raises(ModelError, match=r"distance\.yaml:\d+: outputs\.range: the golden input gives mean"):
+        OnnxModel(manifest, threads=1)
+
+
+def test_an_input_that_does_not_fit_the_manifest_is_refused(copies: Path) -> None:
+    manifest = copies / "distance.yaml"
+    manifest.write_text(manifest.read_text().replace("  picture:", "  photograph:"))
+    with pytest.raises(ModelError, match=r"inputs: the manifest names \['photograph'\] but the model file has"):
+        OnnxModel(manifest, threads=1)
+
+
+def test_the_simulator_refuses_a_flipped_bit_in_one_sentence(
+    copies: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = bytearray((copies / "neighbours_int8.onnx").read_bytes())
+    content[-100] ^= 8
+    (copies / "neighbours_int8.onnx").write_bytes(content)
+    drone = (ROOT / "config" / "simulator.yaml").read_text()
+    drone = drone.replace("perception:\n", f"perception:\n  models_dir: {copies}\n")
+    (tmp_path / "simulator.yaml").write_text(drone)
+    flight = tmp_path / "flight.yaml"
+    flight.write_text((ROOT / "config" / "paper_flight.yaml").read_text())
+    assert main(["sim", str(flight), "--duration", "1", "--quiet", "--out", str(tmp_path / "out")]) == 78
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert f"{copies / 'neighbours_int8.yaml'}:6: sha256: {copies / 'neighbours_int8.onnx'}" in error
+    assert "restore it" in error
+
+
+def test_a_model_in_the_wrong_role_is_refused() -> None:
+    with pytest.raises(ModelError, match=r"perception\.flow: model 'distance' fills distance and not flow"):
+        OnnxNetworks(PerceptionConfig(flow="distance"), MODELS)
+
+
+def test_a_model_that_is_not_there_is_refused_with_those_that_are() -> None:
+    with pytest.raises(
+        ModelError, match=r"perception\.flow: there is no model 'raft'.*distance_int8, flow, flow_int8, neighbours"
+    ):
+        OnnxNetworks(PerceptionConfig(flow="raft"), MODELS)
+
+
+@pytest.mark.parametrize(
+    ("named", "said"),
+    [
+        (
+            "../mine",
+            r"'\.\./mine' is no model's name, and no manifest; name the manifest, as in \.\./mine/distance\.yaml",
+        ),
+        (
+            "/mine/range.onnx",
+            r"/mine/range\.onnx is a model's ONNX file; name the manifest beside it, /mine/range\.yaml",
+        ),
+    ],
+    ids=["folder", "ONNX file"],
+)
+def test_who_names_something_beside_a_manifest_is_told_what_to_name(named: str, said: str) -> None:
+    with pytest.raises(ModelError, match=rf"^perception\.distance: {said}$"):
+        OnnxNetworks(PerceptionConfig(distance=named), MODELS)
+
+
+def shifted_pictures(shift: tuple[int, int], size: tuple[int, int]) -> tuple[UInt8Array, UInt8Array]:
+    """Two windows of one rendered picture, so that all of the first has moved by ``shift`` px right and down."""
+    width, height = size
+    margin = 16
+    matrix = np.array([[250.0, 0.0, width / 2], [0.0, 250.0, height / 2], [0.0, 0.0, 1.0]])
+    R_ned_camera = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    large = (width + 2 * margin, height + 2 * margin)
+    view = Renderer(World.generate(11), []).render(
+        matrix, large, R_ned_camera, np.array([0.0, 0.0, -4.0]),
+        drone_rotations=np.zeros((0, 3, 3)), drone_positions=np.zeros((0, 3)), shown=[],
+    )  # fmt: skip
+
+    def window(right: int, down: int) -> UInt8Array:
+        top, left = margin + down, margin + right
+        return np.ascontiguousarray(view.rgb[top : top + height, left : left + width])
+
+    return window(0, 0), window(-shift[0], -shift[1])
+
+
+@pytest.mark.parametrize("size", [(480, 640), (640, 480), (330, 250)])
+def test_flow_finds_a_known_shift_at_any_image_size(size: tuple[int, int]) -> None:
+    first, second = shifted_pictures((9, -5), size)
+    ground = np.s_[size[1] // 2 + 16 : -32, 32:-32]
+    dis = DisFlow().flow(first, second)[ground]
+    assert np.abs(np.median(dis, axis=(0, 1)) - [9.0, -5.0]).max() < 0.2
+    network = OnnxFlow(OnnxModel(MODELS / "flow.yaml", threads=1)).flow(first, second)
+    assert network.shape == (size[1], size[0], 2)
+    assert np.abs(np.median(network[ground], axis=(0, 1)) - [9.0, -5.0]).max() < 2.5
+
+
+class Roughly:
+    """A flow that is off by 3 px."""
+
+    name = "roughly"
+
+    def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
+        return np.full((*first.shape[:2], 2), [-57.0, 0.0], np.float32)
+
+
+def test_dis_loses_what_moves_far_unless_it_begins_near() -> None:
+    coarse = np.random.default_rng(0).integers(0, 255, (80, 120, 3), dtype=np.uint8)
+    large = cv2.resize(coarse, (720, 480), interpolation=cv2.INTER_CUBIC)
+    first, second = (np.ascontiguousarray(large[:, left : left + 560], dtype=np.uint8) for left in (0, 60))
+    inside = np.s_[40:-40, 100:-40]
+    assert np.abs(np.median(DisFlow().flow(first, second)[inside], axis=(0, 1)) - [-60.0, 0.0]).max() > 10.0
+    refined = DisFlow(Roughly())
+    assert refined.name == "roughly+dis"
+    assert np.abs(np.median(refined.flow(first, second)[inside], axis=(0, 1)) - [-60.0, 0.0]).max() < 0.1
+
+
+def test_the_twins_in_8_bits_say_what_the_float_networks_say() -> None:
+    matrix = np.array([[222.0, 0.0, 160.0], [0.0, 222.0, 160.0], [0.0, 0.0, 1.0]])
+    R_ned_camera = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    view = Renderer(World.generate(11), [drone_model(0, 0), drone_model(6, 1)]).render(
+        matrix, (320, 320), R_ned_camera, np.array([0.0, 0.0, -4.0]),
+        drone_rotations=np.stack([cv2.Rodrigues(np.array([0.2, -0.4, 0.3]))[0]] * 2), shown=[True, True],
+        drone_positions=np.array([[1.5, -0.5, -4.2], [1.5, 0.5, -3.8]]),
+    )  # fmt: skip
+    image = np.ascontiguousarray(view.rgb)
+    roles = {"depth": "neighbours", "segmentation": "neighbours"}
+    roles |= {name: name for name in ("flow", "distance", "verification")}
+    twins = PerceptionConfig.model_validate({role: f"{name}_int8" for role, name in roles.items()})
+    ours, theirs = (OnnxNetworks(config, MODELS) for config in (twins, PerceptionConfig.model_validate(roles)))
+    camera, frame = camera_of(222.0, (320, 320)), Frame("camera", image, 0.0, 0)
+    our, their = (networks.scene(frame, camera, None) for networks in (ours, theirs))
+    assert np.median(np.abs(our.depth / their.depth - 1)[their.depth < 50]) < 0.03
+    both, any_ = ((f(our.labels > 0, their.labels > 0)).sum() for f in (np.logical_and, np.logical_or))
+    assert both / any_ > 0.8
+    windows = [image[v - 48 : v + 48, u - 48 : u + 48] for u, v in ((86, 130), (234, 190))]
+    pictures = [crop_of(window, 222.0) for window in windows]
+    for mine, other in zip(ours.ranges(pictures), theirs.ranges(pictures), strict=True):
+        assert other.drone_probability > 0.5
+        assert mine.log_range == pytest.approx(other.log_range, abs=0.05)
+        np.testing.assert_allclose(mine.centre, other.centre, atol=1.5)
+
+
+def test_what_a_mirror_shows_is_estimated_as_if_there_were_none() -> None:
+    view = Renderer(World.generate(11), [drone_model(0, 0)]).render(
+        np.array([[100.0, 0.0, 48.0], [0.0, 100.0, 48.0], [0.0, 0.0, 1.0]]), (96, 96),
+        np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([0.0, 0.0, -4.0]),
+        drone_rotations=np.stack([cv2.Rodrigues(np.array([0.2, -0.4, 0.3]))[0]]), shown=[True],
+        drone_positions=np.array([[1.5, -0.1, -4.1]]),
+    )  # fmt: skip
+    image = np.ascontiguousarray(view.rgb)
+    direct, mirrored = (crop_of(image, 100.0, mirrored=m) for m in (False, True))
+    shown_so = crop_of(image[:, ::-1], 100.0)
+    one, other, raw = OnnxNetworks(PerceptionConfig(), MODELS).ranges([direct, mirrored, shown_so])
+    assert other.log_range != pytest.approx(one.log_range, abs=1e-4), "the network errs on both apart"
+    assert other.log_range == pytest.approx(raw.log_range, abs=1e-3)
+    np.testing.assert_allclose(other.centre, [96 - raw.centre[0], raw.centre[1]], atol=0.05)
+    for told in (one, other):
+        assert told.centre[0] == pytest.approx(48 - 100 / 15, abs=3.0)
+        assert math.exp(told.log_range) == pytest.approx(1.5, rel=0.25)
+
+
+def test_many_images_go_in_batches_no_larger_than_what_is_prepared(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 256, (31, 96, 96, 3), dtype=np.uint8)
+    pictures = [crop_of(image, 100.0) for image in images]
+    config = PerceptionConfig(verification="none")
+    perception, answer, batches = OnnxNetworks(config, MODELS), OnnxModel.infer, []
+
+    def noted(model: OnnxModel, contents: dict[Any, Any]) -> dict[Any, Float32Array]:
+        batches.append(len(contents["crop"]))
+        return answer(model, contents)
+
+    monkeypatch.setattr(OnnxModel, "infer", noted)
+    ranges = [estimate.log_range for estimate in perception.ranges(pictures)]
+    assert max(batches) == CROPS_PER_RUN
+    assert sum(batches) == 31
+    np.testing.assert_allclose(ranges, [perception.ranges([picture])[0].log_range for picture in pictures], atol=1e-3)
+
+
+def test_the_network_of_flow_is_sharpened_by_dis_unless_configured_otherwise() -> None:
+    first, second = shifted_pictures((9, -5), (480, 640))
+    network = OnnxFlow(OnnxModel(MODELS / "flow_int8.yaml", threads=1))
+    for refinement, expected in (
+        ("none", network),
+        ("dis", DisFlow(network)),
+        ("quick_dis", DisFlow(network, quick=True)),
+    ):
+        config = PerceptionConfig.model_validate({"flow_refinement": refinement})
+        no_drones = np.zeros(first.shape[:2], np.uint8)
+        found = OnnxNetworks(config, MODELS).flow(
+            Frame("camera", first, 0.0, 0), Frame("camera", second, 0.5, 1), no_drones
+        )
+        flow = expected.flow(first, second)
+        settled = background_flow(flow, first, second, no_drones) if refinement == "quick_dis" else flow
+        np.testing.assert_allclose(found, settled, atol=1e-4)
+
+
+def test_the_second_stage_marks_which_pixels_are_the_drones_in_a_mirror_too() -> None:
+    K = np.array([[200.0, 0.0, 48.0], [0.0, 200.0, 48.0], [0.0, 0.0, 1.0]])
+    view = Renderer(World.generate(11), [drone_model(0, 0)]).render(
+        K, (96, 96), np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([0.0, 0.0, -4.0]),
+        drone_rotations=np.stack([cv2.Rodrigues(np.array([0.2, -0.4, 0.3]))[0]]), shown=[True],
+        drone_positions=np.array([[1.5, 0.0, -4.0]]),
+    )  # fmt: skip
+    pictures = [crop_of(view.rgb, 200.0, mirrored=m) for m in (False, True)]
+    for told in OnnxNetworks(PerceptionConfig(), MODELS).ranges(pictures):
+        assert told.mask is not None
+        assert told.mask.shape == (96, 96)
+        drone, said = view.ids > 0, told.mask > 0
+
+        def overlap(true: BoolArray, said: BoolArray = said) -> float:
+            return float((true & said).sum() / (true | said).sum())
+
+        assert overlap(drone) > 0.45  # its arms are a pixel wide
+        assert overlap(drone) > 1.3 * overlap(drone[:, ::-1])

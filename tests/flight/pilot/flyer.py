@@ -1,0 +1,81 @@
+"""True networks for tests of the pilot and of perception: what is left is the code's own doing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from flockd.core.choices import ROLES
+from flockd.core.config import ScenarioConfig, load_scenario
+from flockd.core.data import data_path
+from flockd.core.messages import Float32Array, Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
+from flockd.flight.geometry import RigCamera
+from flockd.flight.perception import Crop, Perception, RangeEstimate, SceneMaps
+from flockd.flight.pilot import FlockPilot
+from flockd.sim.camera_simulator import CameraSimulator
+from flockd.sim.truth_perception import TruthPerception
+from flockd.sim.vehicles import Vehicles
+from tests.flight.perception.shipped import SECOND_STAGE
+
+STEP_S = 0.5
+BAROMETER = {"drone.perception.height": "barometer"}
+"""Its vehicle states hold no range."""
+CRUISE = np.array([[1.0, 0.0], [0.8, 0.2]])
+TURNED = np.array([0.2, 0.0])
+
+
+class NoNetworks:
+    """A fake: every role is answered by the truth before it comes here."""
+
+    map_stride = 2
+    second_stage = SECOND_STAGE
+
+    def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
+        raise AssertionError("asked for a learned flow")
+
+    def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
+        raise AssertionError("asked for a learned scene")
+
+    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+        raise AssertionError("asked for a learned range")
+
+
+def scenario_with(*places: tuple[float, float, float]) -> ScenarioConfig:
+    scenario = load_scenario(data_path("config") / "paper_flight.yaml", {"seed": 4, **BAROMETER})
+    start = scenario.vehicles[0]
+    drones = tuple(start.model_copy(update={"position_m": place, "velocity_m_s": (1.0, 0.0)}) for place in places)
+    return scenario.model_copy(update={"vehicles": drones})
+
+
+class Flyer:
+    """Drone 0 of a scenario with true networks, while the others fly straight on."""
+
+    def __init__(self, scenario: ScenarioConfig) -> None:
+        self.scenario = scenario
+        self.cameras = CameraSimulator(scenario)
+        self.truth = TruthPerception(NoNetworks(), frozenset(ROLES), self.cameras.rig)
+        self.pilot = FlockPilot(scenario.drone, self.truth)
+        self.vehicles = Vehicles(scenario.vehicles, scenario.vehicle)
+        self.time_s = 100.0
+        self.steps = 0
+
+    def perception(self) -> Perception:
+        """A fresh one."""
+        config = self.scenario.drone.perception.model_copy(update={"scale": "network"})
+        return Perception(self.cameras.rig, self.truth, config)
+
+    def take_frames(self) -> tuple[FrameSet, VehicleState]:
+        frames, truth = self.cameras.capture(0, self.steps, self.time_s, self.vehicles)
+        self.truth.show(truth)
+        v = self.vehicles
+        return frames, VehicleState(self.time_s, v.R_ned_body[0], -float(v.position[0, 2]), v.velocity[0])
+
+    def step(self) -> PilotOutput:
+        return self.pilot.step(*self.take_frames())
+
+    def move(self) -> None:
+        count = len(self.scenario.vehicles)
+        self.vehicles.step(CRUISE[:count], TURNED[:count], STEP_S)
+        self.time_s += STEP_S
+        self.steps += 1

@@ -1,0 +1,204 @@
+"""The pure line on rendered frames, with perception answered by the truth: what is left is the pilot's own doing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockd.core.messages import Float32Array, Frame, FrameSet
+from flockd.flight.geometry import RigCamera, rotation_angle_deg
+from flockd.flight.perception import SceneMaps
+from tests.flight.pilot.flyer import STEP_S, Flyer, scenario_with
+
+
+@pytest.fixture(scope="module")
+def flyer() -> Flyer:
+    """A neighbour 3 m ahead to the right: after the turn on the border between the front and the right camera."""
+    return Flyer(scenario_with((0.0, 0.0, -4.0), (1.8, 2.4, -3.6)))
+
+
+def test_true_maps_give_true_motions(flyer: Flyer) -> None:
+    first = flyer.step()
+    assert first.ego_motion is None
+    before = flyer.vehicles
+    R_before, p_before = before.R_ned_body[0], before.position[0]
+    q_before = before.position[1]
+    flyer.move()
+    second = flyer.step()
+    after = flyer.vehicles
+    assert second.ego_motion is not None
+    true_translation = R_before.T @ (after.position[0] - p_before)
+    assert np.allclose(second.ego_motion.translation, true_translation, atol=0.002)
+    assert rotation_angle_deg(second.ego_motion.rotation.T @ R_before.T @ after.R_ned_body[0]) < 0.02
+    assert second.velocity is not None
+    assert np.allclose(second.velocity, (after.position[0] - p_before) / STEP_S, atol=0.005)
+    assert len(second.neighbours) == 1, "a neighbour that straddles two cameras is one neighbour"
+    assert np.allclose(second.neighbours[0].position, after.position[1] - after.position[0], atol=0.02)
+    (motion,) = second.neighbour_motions.values()
+    assert np.allclose(R_before @ motion.velocity, (after.position[1] - q_before) / STEP_S, atol=0.1)
+    (detection,) = second.detections
+    assert set(detection.cameras) == {"front", "right"}
+
+
+def test_a_repeated_time_stamp_restarts_the_pair_and_says_so(flyer: Flyer) -> None:
+    flyer.step()
+    output = flyer.step()
+    assert output.ego_motion is None
+    assert any("time stamps" in reason for reason in output.reasons)
+
+
+def test_the_others_of_the_rig_fly_on_without_one_camera() -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+    flyer.step()
+    flyer.move()
+    frames, state = flyer.take_frames()
+    without_left = FrameSet(frames.time_s, {n: f for n, f in frames.frames.items() if n != "left"})
+    output = flyer.pilot.step(without_left, state)
+    assert output.counts["camera left: no frame"] == 1
+    assert output.ego_motion is not None
+    assert len(output.detections) == 1
+
+
+@pytest.mark.parametrize(("gone", "less_probable"), [("front", False), ("back", True)])
+def test_a_neighbour_before_a_camera_that_is_gone_is_as_probable_as_before(gone: str, less_probable: bool) -> None:
+    """It flies ahead and then is not found twice: because no camera points there, or although one does."""
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+    for _ in range(3):
+        (before,) = flyer.step().neighbours
+        flyer.move()
+    flyer.vehicles.position[1] += [0.0, 0.0, -60.0]  # far above, where no camera points
+    for _ in range(2):
+        frames, state = flyer.take_frames()
+        output = flyer.pilot.step(FrameSet(frames.time_s, {n: f for n, f in frames.frames.items() if n != gone}), state)
+        flyer.move()
+    (neighbour,) = output.neighbours
+    assert neighbour.unseen_s == pytest.approx(2 * STEP_S)
+    left = neighbour.existence_probability / before.existence_probability
+    assert left == pytest.approx(np.exp(-2 * STEP_S / 60.0), rel=1e-3) or less_probable, "only leaving counts, 60 s"
+    assert (left < 0.95) is less_probable
+
+
+def test_an_output_that_is_not_finite_costs_its_frame_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+    sound = flyer.truth.scene
+
+    def spoilt(frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
+        if frame.camera == "back":
+            raise FloatingPointError("model x: output depth is not finite")
+        return sound(frame, camera, ground)
+
+    monkeypatch.setattr(flyer.truth, "scene", spoilt)
+    flyer.step()
+    flyer.move()
+    output = flyer.step()
+    assert output.counts["camera back: model x: output depth is not finite"] == 1
+    assert output.ego_motion is not None
+
+
+@pytest.mark.parametrize("still_there", [True, False])
+def test_a_drone_that_segmentation_misses_is_found_where_it_is_predicted(
+    monkeypatch: pytest.MonkeyPatch, still_there: bool
+) -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+    for _ in range(3):
+        flyer.step()
+        flyer.move()
+    sound = flyer.truth.scene
+
+    def blind(frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
+        scene = sound(frame, camera, ground)
+        return SceneMaps(scene.depth, np.zeros_like(scene.labels), ())
+
+    monkeypatch.setattr(flyer.truth, "scene", blind)
+    if not still_there:
+        flyer.vehicles.position[1] += [0.0, 40.0, 0.0]
+    output = flyer.step()
+    assert len(output.detections) == (1 if still_there else 0)
+    if still_there:
+        place = flyer.vehicles.R_ned_body[0] @ output.detections[0].position
+        assert np.allclose(place, flyer.vehicles.position[1] - flyer.vehicles.position[0], atol=0.02)
+
+
+def test_blind_cameras_still_give_a_finite_command() -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0)))
+    _, state = flyer.take_frames()
+    output = flyer.pilot.step(FrameSet(flyer.time_s, {}), state)
+    assert output.ego_motion is None
+    assert len(output.reasons) == 4
+    assert np.isfinite(output.command.velocity).all()
+    assert math.isfinite(output.command.yaw_rad)
+
+
+@pytest.mark.parametrize(("height_m", "blind"), [(0.0, 2), (-0.5, 4), (-2.0, 4)], ids=["at", "below", "far below"])
+def test_at_the_ground_or_below_there_is_no_depth_and_the_flight_goes_on_above(height_m: float, blind: int) -> None:
+    """At a height of 0, a tilted drone has cameras on one side below the ground."""
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+    flyer.step()
+    flyer.move()
+    frames, state = flyer.take_frames()
+    output = flyer.pilot.step(frames, replace(state, height_m=height_m))
+    assert sum("is not above the ground" in reason for reason in output.reasons) >= blind
+    assert output.ego_motion is None or blind < len(frames.frames)
+    assert np.isfinite(output.command.velocity).all()
+    flyer.move()
+    flyer.step()
+    flyer.move()
+    assert flyer.step().ego_motion is not None
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"frames_s": math.nan}, "a time is not finite"),
+        ({"frames_s": math.inf}, "a time is not finite"),
+        ({"time_s": math.nan}, "a time is not finite"),
+        ({"R_ned_body": np.full((3, 3), math.nan)}, "the attitude is not a rotation"),
+        ({"R_ned_body": 2.0 * np.eye(3)}, "the attitude is not a rotation"),
+        ({"height_m": -math.inf}, "the height is not finite"),
+        ({"velocity_ned": np.array([0.0, math.nan, 0.0])}, "the autopilot's velocity is not finite"),
+    ],
+)
+def test_input_that_cannot_be_is_refused_and_the_next_step_is_as_if_it_had_not_come(
+    changes: dict[str, Any], reason: str
+) -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+    flyer.step()
+    frames, state = flyer.take_frames()
+    spoilt = replace(state, **{name: value for name, value in changes.items() if name != "frames_s"})
+    output = flyer.pilot.step(FrameSet(changes.get("frames_s", frames.time_s), frames.frames), spoilt)
+    assert output.reasons == (f"input refused: {reason}",)
+    np.testing.assert_array_equal(output.command.velocity, [0.0, 0.0])
+    assert math.isfinite(output.time_s)
+    assert math.isfinite(output.command.yaw_rad)
+    flyer.move()
+    after = flyer.step()
+    assert after.reasons == ()
+    assert after.ego_motion is not None
+    assert after.ego_motion.interval_s == pytest.approx(STEP_S)
+
+
+def test_a_time_before_the_first_step_is_no_error() -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0)))
+    flyer.step()
+    flyer.time_s -= 5.0
+    assert np.isfinite(flyer.step().command.velocity).all()
+
+
+def test_an_impossible_ego_motion_is_refused_but_not_for_ever() -> None:
+    """No vehicle jumps 4 m in a step. If it goes on, it was the past that was wrong."""
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0)))
+    flyer.step()
+    flyer.move()
+    assert flyer.step().ego_motion is not None
+    known = []
+    for _ in range(4):
+        flyer.move()
+        flyer.vehicles.position = flyer.vehicles.position + np.array([4.0, 0.0, 0.0])
+        output = flyer.step()
+        known.append(output.ego_motion is not None)
+        assert (output.ego_motion is not None) != any("that fast" in reason for reason in output.reasons)
+    assert known == [False, False, True, True]

@@ -1,0 +1,89 @@
+"""A pilot among obstacles: what it sees goes into its map, its command and its recording."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockd.core.config import DroneConfig, load_scenario
+from flockd.core.data import data_path
+from flockd.core.messages import SECTORS, FloatArray, FrameSet, ObstacleRanges, PilotOutput, VehicleState
+from flockd.flight.perception import Observation
+from flockd.flight.pilot import FlockPilot
+from flockd.onboard.recording.codec import from_json, parsed, to_json
+from flockd.sim.worlds.obstacles import Box, Obstacles, true_ranges
+
+WALL = Obstacles([Box(3.0, 0.0, 0.2, 30.0, 0.0, -0.5, 8.0)])
+"""Its surface is 2.8 m north."""
+
+
+class Observer:
+    """Sees a wall to the north, or nothing at all."""
+
+    def __init__(self, *, sees: bool) -> None:
+        self.sees = sees
+
+    def observe(
+        self, frames: FrameSet, vehicle: VehicleState, predictions: Any, trace: Any, lap: Callable[[str], None]
+    ) -> Observation:
+        ranges = true_ranges(WALL, frames.time_s, np.array([0.0, 0.0, -4.0])) if self.sees else None
+        return Observation(frames.time_s, vehicle, {}, (), None, obstacles=ranges)
+
+    def see_slope(self, slope: FloatArray) -> None:
+        raise AssertionError("exact ranges need no slope")
+
+
+def drone(*, enabled: bool) -> DroneConfig:
+    config = load_scenario(data_path("config") / "square.yaml").drone
+    mission = config.mission.model_copy(update={"kind": "velocity", "velocity_m_s": (1.5, 0.0), "waypoints": ()})
+    obstacles = config.obstacles.model_copy(update={"enabled": enabled})
+    return config.model_copy(update={"mission": mission, "obstacles": obstacles, "own_velocity": "autopilot"})
+
+
+def flown(config: DroneConfig, sees: Sequence[bool]) -> list[PilotOutput]:
+    """A drone that is held at its place, each 0.5 s; `sees`: in which steps it sees anything."""
+    observer = Observer(sees=True)
+    networks: Any = object()  # never asked for anything
+    pilot = FlockPilot(config, networks, observer=observer)
+    outputs = []
+    for step, observer.sees in enumerate(sees):
+        state = VehicleState(0.5 * step, np.eye(3), 4.0, np.zeros(3), np.zeros(2))
+        outputs.append(pilot.step(FrameSet(0.5 * step, {}), state))
+    return outputs
+
+
+def test_switched_off_the_wall_is_flown_at_and_nothing_is_kept() -> None:
+    output = flown(drone(enabled=False), [True])[-1]
+    assert output.obstacles is None
+    assert output.command.velocity[0] > 0.5
+
+
+def test_switched_on_it_flies_along_the_wall() -> None:
+    output = flown(drone(enabled=True), [True, True])[-1]
+    assert output.obstacles is not None
+    assert output.obstacles.range_m[0] == pytest.approx(2.8)
+    assert np.isinf(output.obstacles.range_m[SECTORS // 2])
+    north, east = output.command.velocity
+    assert abs(east) > 0.3
+    assert north < 0.5
+
+
+def test_where_it_sees_nothing_more_the_wall_stays_for_a_while_and_then_it_stands_still() -> None:
+    outputs = flown(drone(enabled=True), [True] + [False] * 8)
+    kept = [bool(np.isfinite(output.obstacles.range_m[0])) for output in outputs if output.obstacles is not None]
+    assert kept == [True] * 7 + [False] * 2  # 3 s
+    np.testing.assert_allclose(outputs[-1].command.velocity, 0.0, atol=1e-9)
+
+
+def test_a_recorded_map_is_the_map() -> None:
+    output = flown(drone(enabled=True), [True])[-1]
+    assert output.obstacles is not None
+    written = parsed(json.dumps(to_json(output)).encode())
+    read = from_json(PilotOutput, written)
+    for name in ("range_m", "sigma_m", "seen_m"):
+        np.testing.assert_array_equal(getattr(read.obstacles, name), getattr(output.obstacles, name))
+    assert isinstance(read.obstacles, ObstacleRanges)

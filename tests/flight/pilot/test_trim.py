@@ -1,0 +1,77 @@
+"""The trim against an autopilot that believes wrongly of its own velocity."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from flockd.core.messages import EgoMotion, FloatArray, VehicleState
+from flockd.flight.pilot.trim import VelocityTrim
+
+STEP_S = 0.5
+YAW_RAD = 0.7
+R_NED_BODY = np.array(
+    [[math.cos(YAW_RAD), -math.sin(YAW_RAD), 0], [math.sin(YAW_RAD), math.cos(YAW_RAD), 0], [0, 0, 1]]
+)
+
+
+def vehicle(step: int, believed: FloatArray | None) -> VehicleState:
+    return VehicleState(STEP_S * step, R_NED_BODY, 4.0, believed)
+
+
+def ego(moved_with: FloatArray | None) -> EgoMotion | None:
+    """As measured by a pilot whose drone moved so (NED m/s) since the last step."""
+    if moved_with is None:
+        return None
+    return EgoMotion(np.eye(3), R_NED_BODY.T @ moved_with * STEP_S, STEP_S, 100, 90, 0.1)
+
+
+def test_a_drone_flies_as_commanded_although_its_autopilot_errs() -> None:
+    """The autopilot makes its own estimate what it is told; the truth is less by what it errs."""
+    wanted, errs = np.array([1.0, 0.3]), np.array([0.2, -0.15, 0.05])
+    trim = VelocityTrim(0.5, 0.7)
+    moved = np.full(3, np.nan)
+    for step in range(20):
+        moved = np.array([*(wanted + trim.velocity), 0.0]) - errs
+        trim.update(vehicle(step, moved + errs), ego(moved if step else None))
+    assert moved[:2] == pytest.approx(wanted, abs=5e-3)
+
+
+def test_an_autopilot_that_is_right_is_left_alone() -> None:
+    trim = VelocityTrim(0.5, 0.7)
+    for step in range(10):
+        speeding_up = np.array([0.2 * step, -0.1 * step, 0.0])
+        mean = speeding_up - np.array([0.1, -0.05, 0.0])
+        trim.update(vehicle(step, speeding_up), ego(mean if step else None))
+    assert trim.velocity == pytest.approx([0, 0], abs=1e-12)
+
+
+@pytest.mark.parametrize("limit_m_s", [0.0, 0.3])
+def test_no_trim_is_larger_than_allowed_and_a_wild_measurement_is_soon_forgotten(limit_m_s: float) -> None:
+    trim, still = VelocityTrim(limit_m_s, 0.7), np.zeros(3)
+    trim.update(vehicle(0, still), ego(None))
+    for step in range(1, 10):
+        trim.update(vehicle(step, still), ego(np.array([-9.0, 12.0, 0.0])))
+    assert trim.velocity == pytest.approx(limit_m_s * np.array([0.6, -0.8]))
+    for step in range(10, 20):
+        trim.update(vehicle(step, still), ego(still))
+    assert np.linalg.norm(trim.velocity) <= 0.1 * limit_m_s
+
+
+def test_what_cannot_be_compared_leaves_the_trim_as_it_is() -> None:
+    trim, drift = VelocityTrim(0.5, 0.7), np.array([0.2, 0.0, 0.0])
+    for step in range(30):
+        trim.update(vehicle(step, np.zeros(3)), ego(-drift if step else None))
+    before = trim.velocity
+    assert before == pytest.approx([0.2, 0.0], abs=1e-3)
+    away = np.array([3.0, 3.0, 0.0])
+    trim.update(vehicle(30, np.zeros(3)), ego(None))
+    trim.update(vehicle(31, None), ego(away))
+    trim.update(vehicle(32, np.zeros(3)), ego(away))
+    trim.update(vehicle(40, np.zeros(3)), ego(away))
+    for unheard_of in (math.nan, math.inf):
+        trim.update(vehicle(41, np.full(3, unheard_of)), ego(away))
+        trim.update(vehicle(42, np.zeros(3)), ego(away))
+    assert trim.velocity == pytest.approx(before)

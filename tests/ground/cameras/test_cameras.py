@@ -1,0 +1,262 @@
+"""`flockd cameras` on computers with USB cameras, a Raspberry Pi's, a Jetson's, and none. All devices are fakes."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from flockd.cli import main
+from flockd.core.config import load_drone
+from flockd.ground.cameras.gstreamer_listing import cameras_of_monitor
+from flockd.ground.cameras.listing import Computer
+from flockd.ground.cameras.measuring import edge_width_px
+from flockd.ground.datasets.image_files import read_image
+from tests.onboard.sources.camera_images import jpeg, scene
+from tests.onboard.sources.fake_kernel import METADATA_CAPTURE, STREAMING, FakeCamera, FakeKernel
+
+JPEGS = [jpeg(scene(number)) for number in range(4)]
+Capture = pytest.CaptureFixture[str]
+BY_PATH = "platform-xhci-usb-0:{port}:1.0-video-index0"
+USB = FakeCamera(card=b"HD Camera", formats=((1280, 720, b"MJPG"), (640, 480, b"MJPG"), (640, 480, b"YUYV")))
+MONITOR = """\
+Probing devices...
+
+
+Device found:
+
+\tname  : /base/soc/i2c0mux/i2c@1/imx219@10
+\tclass : Source/Video
+\tcaps  : video/x-raw, format=NV12, width=1640, height=1232
+\t        video/x-raw, format=NV12, width=640, height=480, framerate={ (fraction)30/1, (fraction)60/1 }
+\t        video/x-raw, format=(string)YV12, width=320, height=240
+\tgst-launch-1.0 libcamerasrc camera-name="/base/soc/i2c0mux/i2c\\@1/imx219\\@10" ! ...
+
+
+Device found:
+
+\tname  : HD Camera
+\tclass : Video/Source
+\tcaps  : image/jpeg, width=640, height=480, framerate=30/1
+\tproperties:
+\t\tdevice.path = /dev/video0
+\tgst-launch-1.0 v4l2src ! ...
+"""
+SENSOR = FakeCamera(card=b"unicam", formats=((1640, 1232, b"RG10"),))
+
+
+def _link(port: int) -> str:
+    """By which a camera's socket is known."""
+    return f"/dev/v4l/by-path/{BY_PATH.format(port=port)}"
+
+
+@pytest.fixture
+def computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[type[_Shelf]]:
+    """Gives `_Shelf`, whose `has` puts cameras into the computer that the command looks at."""
+    _Shelf.folder, _Shelf.patch = tmp_path / "computer", monkeypatch
+    yield _Shelf
+
+
+class _Shelf:
+    folder: Path
+    patch: pytest.MonkeyPatch
+
+    @classmethod
+    def has(cls, kernel: FakeKernel, printed: dict[str, str] | None = None) -> FakeKernel:
+        """``printed``: what programs print, by their names; what is not there fails."""
+        nodes, links = cls.folder / "nodes", cls.folder / "links"
+        for path in (nodes, links):
+            path.mkdir(parents=True)
+        for port, (device, camera) in enumerate(list(kernel.cameras.items())):
+            name = Path(device).name
+            kernel.cameras[_link(port)] = camera
+            (nodes / name).mkdir()
+            (links / BY_PATH.format(port=port)).symlink_to(f"../../{name}")
+            (links / BY_PATH.format(port=port).replace("usb-", "usbv2-")).symlink_to(f"../../{name}")
+
+        def run(command: Sequence[str]) -> str | None:
+            return (printed or {}).get(command[0])
+
+        made = Computer(kernel, nodes, links, run)
+        cls.patch.setattr("flockd.ground.cameras.listing.Computer", lambda: made)
+        return kernel
+
+
+@contextmanager
+def _filming(kernel: FakeKernel, *names: str, hz: float = 30.0) -> Iterator[None]:
+    """Cameras that send images whenever they stream."""
+    ended = threading.Event()
+
+    def film(name: str) -> None:
+        number = 0
+        while not ended.wait(1.0 / hz):
+            if kernel.cameras[f"/dev/{name}"].streaming:
+                kernel.send(name, JPEGS[number % len(JPEGS)])
+                number += 1
+
+    threads = [threading.Thread(target=film, args=(name,), daemon=True) for name in names]
+    for thread in threads:
+        thread.start()
+    yield
+    ended.set()
+    for thread in threads:
+        thread.join()
+
+
+def test_usb_cameras_are_listed_by_the_path_of_their_socket(computer: type[_Shelf], capsys: Capture) -> None:
+    metadata = FakeCamera(capabilities=METADATA_CAPTURE | STREAMING)
+    kernel = computer.has(FakeKernel(video0=USB, video1=metadata, video10=USB))
+    assert main(["cameras", "--json"]) == 0
+    first, second = json.loads(capsys.readouterr().out)
+    assert (first["node"], first["device"]) == ("/dev/video0", _link(0))
+    assert (second["node"], second["device"]) == ("/dev/video10", _link(2))
+    assert first["name"] == "HD Camera"
+    assert first["modes"] == [
+        {"pixel_format": "mjpeg", "size_px": [1280, 720], "rates_hz": [30.0, 15.0]},
+        {"pixel_format": "mjpeg", "size_px": [640, 480], "rates_hz": [30.0, 15.0]},
+        {"pixel_format": "yuyv", "size_px": [640, 480], "rates_hz": [30.0, 15.0]},
+    ]
+    assert first["used"] == {"pixel_format": "mjpeg", "size_px": [640, 480], "rates_hz": [30.0]}
+    assert first["controls"]["exposure_time_absolute"] == [1, 5000]
+    assert not kernel.open_files, "all are given back"
+
+
+def test_the_list_for_people_names_what_is_used(computer: type[_Shelf], capsys: Capture) -> None:
+    computer.has(FakeKernel(video0=USB))
+    assert main(["cameras", "--size", "1280x720"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "camera 0: HD Camera (/dev/video0)",
+        f"  {_link(0)}",
+        "  mjpeg: 1280x720 at 30, 15; 640x480 at 30, 15",
+        "  yuyv: 640x480 at 30, 15",
+        "  used: mjpeg 1280x720 at 30",
+    ]
+
+
+def test_all_are_measured_side_by_side_and_pictured(computer: type[_Shelf], capsys: Capture, tmp_path: Path) -> None:
+    kernel = computer.has(FakeKernel(video0=FakeCamera(), video1=FakeCamera(), video2=FakeCamera()))
+    begun_s = time.monotonic()
+    with _filming(kernel, "video0", "video1"):  # the third is silent
+        assert main(["cameras", "--seconds", "0.5", "--picture", str(tmp_path / "pictures"), "--json"]) == 1
+    first, second, third = json.loads(capsys.readouterr().out)
+    assert time.monotonic() - begun_s > 0.5
+    for row in (first, second):
+        assert row["measured"]["fault"] is None
+        assert row["measured"]["rate_hz"] > 0.0
+        image = read_image(Path(row["picture"]))
+        assert image[240, 100, 0] > 200
+        assert image[240, 600, 0] < 100
+        assert row["measured"]["mean_grey"] == pytest.approx(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).mean(), abs=0.1)
+        assert row["measured"]["black_share"] == row["measured"]["white_share"] == 0.0
+    assert third["picture"] is None
+    assert third["measured"]["fault"].startswith("no image came within 3 s")
+
+
+def test_what_is_written_checks_and_names_the_devices(computer: type[_Shelf], capsys: Capture, tmp_path: Path) -> None:
+    computer.has(FakeKernel(video0=USB, video2=FakeCamera(rates=(15, 5))))
+    file = tmp_path / "cameras.yaml"
+    assert main(["cameras", "--write", str(file)]) == 0
+    config = load_drone(file)
+    assert main(["config", "check", str(file)]) == 0
+    assert config.source is not None
+    assert [camera.name for camera in config.rig.cameras] == ["front", "back"]
+    assert [camera.size_px for camera in config.rig.cameras] == [(640, 480), (640, 480)]
+    assert [camera.extrinsics.yaw_deg for camera in config.rig.cameras] == [0.0, 180.0]
+    assert [(camera.device, camera.rate_hz) for camera in config.source.cameras] == [
+        (_link(0), 30.0),
+        (_link(1), 15.0),
+    ]
+    assert {control.name: control.value for control in config.source.cameras[0].controls} == {
+        "auto_exposure": 1,
+        "exposure_time_absolute": 50,
+    }
+    text = file.read_text(encoding="utf-8")
+    assert "# also: gain 0 to 255" in text
+    capsys.readouterr()
+
+    assert main(["cameras", "--write", str(file)]) == 2
+    assert capsys.readouterr().err == f"{file} exists; name another file, or overwrite it with --force\n"
+    assert main(["cameras", "--write", str(file), "--force", "--names", "left", "right"]) == 0
+    assert [camera.name for camera in load_drone(file).rig.cameras] == ["left", "right"]
+    capsys.readouterr()
+    assert main(["cameras", "--write", str(file), "--force", "--names", "left", "left"]) == 2
+    assert "--names gives 1 names for 2 cameras; give each its own" in capsys.readouterr().err
+
+
+def test_a_raspberry_pis_camera_becomes_a_pipeline(computer: type[_Shelf], tmp_path: Path) -> None:
+    """Its sensor is a V4L2 device too, which gives raw values only; the USB camera beside it goes through GStreamer."""
+    computer.has(FakeKernel(video0=SENSOR, video1=USB), {"gst-device-monitor-1.0": MONITOR})
+    file = tmp_path / "cameras.yaml"
+    assert main(["cameras", "--write", str(file)]) == 0
+    config = load_drone(file)
+    assert config.source is not None
+    assert config.source.kind == "gstreamer"
+    assert [camera.pipeline for camera in config.source.cameras] == [
+        f"v4l2src device={_link(1)} ! image/jpeg,width=640,height=480,framerate=30/1",
+        'libcamerasrc camera-name="/base/soc/i2c0mux/i2c\\@1/imx219\\@10" '
+        "! video/x-raw,format=NV12,width=640,height=480,framerate=30/1",
+    ]
+
+
+def test_a_jetsons_sensors_are_nvidias_cameras_in_the_kernels_order(computer: type[_Shelf], capsys: Capture) -> None:
+    computer.has(FakeKernel(video0=SENSOR, video1=USB, video2=SENSOR), {"gst-inspect-1.0": "anything"})
+    assert main(["cameras", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [(one["node"], one["element"]) for one in found] == [
+        ("/dev/video0", "nvarguscamerasrc sensor-id=0"),
+        ("/dev/video1", None),
+        ("/dev/video2", "nvarguscamerasrc sensor-id=1"),
+    ]
+
+
+def test_a_camera_that_cannot_be_used_says_why(computer: type[_Shelf], capsys: Capture) -> None:
+    kernel = computer.has(FakeKernel(video0=SENSOR, video1=FakeCamera(formats=((640, 480, b"H264"),)), video2=USB))
+    kernel.cameras["/dev/video2"] = FakeCamera(plugged=False)
+    assert main(["cameras"]) == 1
+    told = capsys.readouterr().out
+    assert "fault: sends a sensor's raw values only; read it by a pipeline of libcamerasrc" in told
+    assert "fault: offers H264, and flockd reads MJPG and YUYV; use a pipeline of GStreamer" in told
+    assert "fault: cannot be opened (No such file or directory)" in told
+
+
+def test_a_computer_without_cameras_gets_one_sentence(computer: type[_Shelf], capsys: Capture, tmp_path: Path) -> None:
+    computer.has(FakeKernel())
+    assert main(["cameras", "--write", str(tmp_path / "cameras.yaml")]) == 69
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("no camera is plugged in; check cable and port")
+    assert printed.err.count("\n") == 1
+    assert not (tmp_path / "cameras.yaml").exists()
+
+
+def test_modes_of_the_monitor_are_those_that_can_be_decoded() -> None:
+    (camera,) = cameras_of_monitor(MONITOR)
+    assert camera.name == "/base/soc/i2c0mux/i2c@1/imx219@10"
+    assert [(mode.pixel_format, mode.size, mode.rates_hz) for mode in camera.modes] == [
+        ("NV12", (1640, 1232), ()),
+        ("NV12", (640, 480), (60.0, 30.0)),
+    ]
+    assert cameras_of_monitor("Probing devices...\n") == []
+
+
+@pytest.mark.parametrize("blur_px", [2.0, 3.0, 4.0])
+def test_the_width_of_edges_is_two_and_a_half_deviations_of_the_blur(blur_px: float) -> None:
+    """A step blurred by a Gaussian has the slope contrast / (s sqrt(2 pi)) in its middle: sqrt(2 pi) = 2.507."""
+    image = np.full((240, 320, 3), 40, np.uint8)
+    image[60:180, 100:220] = 200
+    blurred = cv2.GaussianBlur(image, (0, 0), blur_px)
+    assert edge_width_px(np.asarray(blurred, np.uint8)) == pytest.approx(2.507 * blur_px, rel=0.15)
+
+
+def test_a_sharp_scene_is_told_from_an_empty_one() -> None:
+    image = np.full((240, 320, 3), 40, np.uint8)
+    assert np.isnan(edge_width_px(image))
+    image[60:180, 100:220] = 200
+    assert edge_width_px(image) < 3.0

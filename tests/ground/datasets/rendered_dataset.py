@@ -1,0 +1,193 @@
+"""A short scene of a rendered world with exact depth and poses, written down in each layout."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
+from flockd.flight.geometry import RigCamera
+from flockd.flight.perception import Crop, DisFlow, RangeEstimate, SceneMaps
+from flockd.sim.renderer import Renderer
+from flockd.sim.world import World
+from tests.flight.perception.shipped import SECOND_STAGE
+
+WIDTH, HEIGHT = 320, 240
+FOCAL = 200.0
+FRAMES = 6
+PERIOD_S = 0.1
+START_S = 1403636579.75
+MATRIX = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
+OTHERS_MATRIX = MATRIX - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+"""Of the same camera for whoever counts pixel centres from 0."""
+R_FRD_RDF = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    images: list[UInt8Array]
+    depth: list[FloatArray]
+    """Metres, infinite for the sky."""
+    poses: FloatArray
+    """(n, 4, 4) camera to world."""
+
+    def motion(self, first: int, second: int) -> FloatArray:
+        return np.asarray(np.linalg.inv(self.poses[first]) @ self.poses[second])
+
+
+def scene() -> Scene:
+    """Ahead, down and to the side, with all three turns, 4 m above ground."""
+    renderer = Renderer(World.generate(5), [])
+    images, depth, poses = [], [], []
+    for k in range(FRAMES):
+        R = Rotation.from_euler("ZYX", np.radians([1.5 * k, -12.0 + k, 0.7 * k])).as_matrix() @ R_FRD_RDF
+        position = np.array([0.12 * k, 0.05 * k, -4.0 + 0.03 * k])
+        none = np.zeros((0, 3))
+        view = renderer.render(
+            MATRIX, (WIDTH, HEIGHT), R, position, drone_rotations=np.zeros((0, 3, 3)), drone_positions=none, shown=[]
+        )
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = R, position
+        images.append(view.rgb)
+        depth.append(view.depth.astype(np.float64))
+        poses.append(pose)
+    return Scene(images, depth, np.array(poses))
+
+
+class Onlooker:
+    """In the place of the networks: OpenCV's flow, no drones, and the scene's depth in its order."""
+
+    map_stride = 2
+    second_stage = SECOND_STAGE
+
+    def __init__(self, depth: Sequence[FloatArray]) -> None:
+        self._flow = DisFlow()
+        self._depth: Iterator[FloatArray] = iter(depth)
+
+    def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
+        return self._flow.flow(first.image, second.image)
+
+    def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
+        depth = np.minimum(next(self._depth), 1000.0).astype(np.float32)
+        return SceneMaps(depth, np.zeros(frame.image.shape[:2], np.uint8), ())
+
+    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+        return ()
+
+
+def times_s() -> list[float]:
+    return [START_S + PERIOD_S * k for k in range(FRAMES)]
+
+
+def write_rgbd_folder(scene: Scene, path: Path) -> Path:
+    for folder in ("images", "depth"):
+        (path / folder).mkdir(parents=True)
+    for k, (image, depth) in enumerate(zip(scene.images, scene.depth, strict=True)):
+        name = f"{10 + 3 * k:05}.png"  # numbers have gaps
+        _write(path / "images" / name, image)
+        cv2.imwrite(str(path / "depth" / name), _units(depth, 1000.0))
+    np.savetxt(path / "K.txt", OTHERS_MATRIX)
+    np.savetxt(path / "poses.txt", scene.poses.reshape(-1, 16), fmt="%.6e")
+    return path
+
+
+def write_tum(scene: Scene, path: Path) -> Path:
+    """Depth 4 ms after its image; one image more, without any; poses at other times than the images."""
+    for folder in ("rgb", "depth"):
+        (path / folder).mkdir(parents=True)
+    rgb, maps = ["# color images", "# timestamp filename"], ["# depth maps"]
+    for k, (image, depth) in enumerate(zip(scene.images, scene.depth, strict=True)):
+        time_s = times_s()[k]
+        rgb.append(f"{time_s:.6f} rgb/{time_s:.6f}.png")
+        _write(path / "rgb" / f"{time_s:.6f}.png", image)
+        maps.append(f"{time_s + 0.004:.6f} depth/{time_s + 0.004:.6f}.png")
+        cv2.imwrite(str(path / "depth" / f"{time_s + 0.004:.6f}.png"), _units(depth, 5000.0))
+    late_s = times_s()[-1] + PERIOD_S / 2
+    rgb.append(f"{late_s:.6f} rgb/{late_s:.6f}.png")
+    _write(path / "rgb" / f"{late_s:.6f}.png", scene.images[-1])
+    (path / "rgb.txt").write_text("\n".join(rgb) + "\n")
+    (path / "depth.txt").write_text("\n".join(maps) + "\n")
+    np.savetxt(path / "K.txt", OTHERS_MATRIX)
+    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    for time_s, pose in zip(times_s(), scene.poses, strict=True):
+        for shift_s in (-0.01, 0.01):  # as if it stood still there: between the two lies the pose itself
+            numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
+            lines.append(f"{time_s + shift_s:.6f} {' '.join(f'{number:.9f}' for number in numbers)}")
+    (path / "groundtruth.txt").write_text("\n".join(lines) + "\n")
+    return path
+
+
+T_BODY_CAMERA = np.array(
+    [
+        [0.0149, -0.9999, 0.0041, -0.0216],
+        [0.9996, 0.0150, 0.0257, -0.0647],
+        [-0.0258, 0.0038, 0.9997, 0.0098],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+"""Rounded as files are; its rotation is put right when it is used."""
+
+
+def write_euroc(scene: Scene, path: Path) -> Path:
+    camera, truth = path / "mav0" / "cam0", path / "mav0" / "state_groundtruth_estimate0"
+    (camera / "data").mkdir(parents=True)
+    truth.mkdir()
+    mount = T_BODY_CAMERA.copy()
+    u, _, vt = np.linalg.svd(mount[:3, :3])
+    mount[:3, :3] = u @ vt
+    table, states = ["#timestamp [ns],filename"], ["#timestamp,p x,p y,p z,q w,q x,q y,q z,v x,v y,v z"]
+    for k, (image, pose) in enumerate(zip(scene.images, scene.poses, strict=True)):
+        time_ns = round(times_s()[k] * 1e9)
+        table.append(f"{time_ns},{time_ns}.png")
+        cv2.imwrite(str(camera / "data" / f"{time_ns}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+        body = pose @ np.linalg.inv(mount)
+        x, y, z, w = Rotation.from_matrix(body[:3, :3]).as_quat()
+        states.append(f"{time_ns}," + ",".join(f"{n:.9f}" for n in (*body[:3, 3], w, x, y, z, 0.1, 0.2, 0.3)))
+    (camera / "data.csv").write_text("\n".join(table) + "\n")
+    (truth / "data.csv").write_text("\n".join(states) + "\n")
+    numbers = ", ".join(f"{n:.4f}" for n in T_BODY_CAMERA.ravel())
+    (camera / "sensor.yaml").write_text(
+        "%YAML:1.0\n# Sensor\nsensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n"
+        f"  data: [{numbers}]\nrate_hz: 10\nresolution: [{WIDTH}, {HEIGHT}]\ncamera_model: pinhole\n"
+        f"intrinsics: [{FOCAL}, {FOCAL}, {WIDTH / 2 - 0.5}, {HEIGHT / 2 - 0.5}] #fu, fv, cu, cv\n"
+        "distortion_model: radial-tangential\ndistortion_coefficients: [0.0, 0.0, 0.0, 0.0]\n"
+    )
+    return path
+
+
+def write_video(scene: Scene, path: Path) -> Path:
+    """The video, and a drone's YAML beside it as its calibration."""
+    path.mkdir(parents=True, exist_ok=True)
+    video = path / "clip.avi"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 1 / PERIOD_S, (WIDTH, HEIGHT))
+    for image in scene.images:
+        writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    writer.release()
+    write_camera(path / "camera.yaml", (WIDTH, HEIGHT))
+    return video
+
+
+def write_camera(file: Path, size: tuple[int, int]) -> Path:
+    """Our own kind of calibration: pixel centres at +0.5, and mounted in some odd way."""
+    width, height = size
+    file.write_text(
+        f"rig:\n  cameras:\n    - name: left\n      size_px: [{width}, {height}]\n      intrinsics: {{fx: {FOCAL}, "
+        f"fy: {FOCAL}, cx: {width / 2}, cy: {height / 2}}}\n"
+        "      extrinsics: {position_m: [0.1, 0.2, -0.3], yaw_deg: 270.0, pitch_deg: 20.0}\n"
+    )
+    return file
+
+
+def _write(path: Path, image: UInt8Array) -> None:
+    cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+
+
+def _units(depth: FloatArray, per_m: float) -> np.ndarray[tuple[int, ...], np.dtype[np.uint16]]:
+    """0 for what 16 bits cannot hold."""
+    units = np.round(depth * per_m)
+    return np.where(units < 65536, units, 0).astype(np.uint16)

@@ -1,0 +1,104 @@
+"""What an image claims to be is known, and refused, before memory is taken for it. OpenCV writes the images."""
+
+from __future__ import annotations
+
+import os
+import tracemalloc
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from flockd.cli import main
+from flockd.core.image_header import image_size
+from flockd.ground.datasets.errors import DatasetError
+from flockd.ground.datasets.image_files import read_image
+
+HUGE = 60_000
+
+
+def _written(suffix: str, width: int = 37, height: int = 21, channels: int = 3) -> bytes:
+    shape = (height, width, channels) if channels > 1 else (height, width)
+    image = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+    done, data = cv2.imencode(suffix, image)
+    assert done
+    return bytes(data)
+
+
+def _claiming(suffix: str) -> bytes:
+    """An image whose header was changed to say 60000 x 60000."""
+    small, huge = (37, 21), HUGE
+    data = bytearray(_written(suffix))
+    match suffix:
+        case ".bmp":
+            data[18:26] = huge.to_bytes(4, "little") * 2
+        case ".ppm":
+            data = bytearray(data.replace(b"37 21", b"60000 60000", 1))
+        case ".tif":
+            at = int.from_bytes(data[4:8], "little")
+            for entry in range(at + 2, at + 2 + 12 * int.from_bytes(data[at : at + 2], "little"), 12):
+                if int.from_bytes(data[entry : entry + 2], "little") in {256, 257}:
+                    data[entry + 2 : entry + 4] = (4).to_bytes(2, "little")
+                    data[entry + 8 : entry + 12] = huge.to_bytes(4, "little")
+        case ".jpg":
+            at = data.index(small[1].to_bytes(2) + small[0].to_bytes(2))
+            data[at : at + 4] = huge.to_bytes(2) * 2
+        case _:
+            data[16:24] = huge.to_bytes(4) * 2
+            import zlib
+
+            data[29:33] = zlib.crc32(data[12:29]).to_bytes(4)
+    return bytes(data)
+
+
+SUFFIXES = (".png", ".jpg", ".bmp", ".ppm", ".tif")
+
+
+@pytest.mark.parametrize("suffix", [*SUFFIXES, ".pgm"])
+def test_the_size_is_that_which_was_written(suffix: str) -> None:
+    data = _written(suffix, channels=1 if suffix == ".pgm" else 3)
+    assert image_size(data) == (37, 21)
+    for end in range(0, len(data), 7):
+        assert image_size(data[:end]) in {None, (37, 21)}
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_an_image_that_claims_to_be_huge_is_refused_before_it_is_decoded(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"huge{suffix}"
+    path.write_bytes(_claiming(suffix))
+    tracemalloc.start()
+    try:
+        with pytest.raises(DatasetError) as refused:
+            read_image(path)
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert str(refused.value) == (
+        f"{path}: claims to be 60000 x 60000 pixels, more than any camera has; restore it, or leave its frame out"
+    )
+    assert most < 5e6
+
+
+@pytest.mark.parametrize("suffix", [*SUFFIXES, ".pgm"])
+def test_an_ordinary_image_is_read_as_before(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"image{suffix}"
+    path.write_bytes(_written(suffix, channels=1 if suffix == ".pgm" else 3))
+    np.testing.assert_array_equal(read_image(path), cv2.imread(str(path), cv2.IMREAD_COLOR_RGB))
+
+
+def test_a_pipe_is_refused_without_waiting_for_its_writer(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.png")
+    with pytest.raises(DatasetError, match=r"pipe\.png: is not an ordinary file"):
+        read_image(tmp_path / "pipe.png")
+    with pytest.raises(DatasetError, match="is not an ordinary file"):
+        read_image(Path("/dev/zero"))
+
+
+def test_a_calibration_from_such_an_image_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    (images / "one.jpg").write_bytes(_claiming(".jpg"))
+    assert main(["calibrate", "camera", str(images), "--out", str(tmp_path / "lens.yaml")]) == 1
+    told = capsys.readouterr().err
+    assert "one.jpg: claims to be 60000 x 60000 pixels" in told

@@ -1,0 +1,376 @@
+"""Datasets of others, replayed: each layout gives the motions that were rendered, or one sentence about itself."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from flockd.cli import main
+
+from . import rendered_dataset
+from .rendered_dataset import FRAMES, HEIGHT, WIDTH, Onlooker, Scene
+
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return rendered_dataset.scene()
+
+
+@pytest.fixture
+def onlooker(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flockd.review.replay.dataset_flight.load_networks", lambda config: Onlooker(scene.depth))
+
+
+@pytest.fixture
+def folder(scene: Scene, tmp_path: Path, onlooker: None) -> Path:
+    return rendered_dataset.write_rgbd_folder(scene, tmp_path / "folder")
+
+
+def replayed(capsys: Capture, *arguments: str | Path) -> dict[str, Any]:
+    assert main(["replay", *map(str, arguments), "--json"]) == 0
+    result: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return result
+
+
+def rgbd_folder(scene: Scene, path: Path) -> list[str | Path]:
+    return [rendered_dataset.write_rgbd_folder(scene, path), "--depth", "recorded"]
+
+
+def tum(scene: Scene, path: Path) -> list[str | Path]:
+    return [rendered_dataset.write_tum(scene, path), "--depth", "recorded"]
+
+
+def euroc(scene: Scene, path: Path) -> list[str | Path]:
+    return [rendered_dataset.write_euroc(scene, path)]
+
+
+@pytest.mark.parametrize("layout", [rgbd_folder, tum, euroc])
+@pytest.mark.parametrize("stride", [1, 2])
+def test_each_layout_gives_the_motions_that_were_rendered(
+    layout: Callable[[Scene, Path], list[str | Path]],
+    stride: int,
+    scene: Scene,
+    tmp_path: Path,
+    onlooker: None,
+    capsys: Capture,
+) -> None:
+    result = replayed(capsys, *layout(scene, tmp_path), "--stride", f"{stride}", "--flow", "dis")
+    assert [(pair["from"], pair["to"]) for pair in result["pairs"]] == [(k, k + stride) for k in range(FRAMES - stride)]
+    for pair in result["pairs"]:
+        motion = scene.motion(pair["from"], pair["to"])
+        turn = np.degrees(Rotation.from_matrix(motion[:3, :3]).magnitude())
+        assert pair["true_rotation_deg"] == pytest.approx(turn, abs=1e-3)
+        assert pair["true_translation_m"] == pytest.approx(np.linalg.norm(motion[:3, 3]), abs=1e-4)
+        assert pair["estimated"]
+        assert pair["inlier_ratio"] > 0.2
+    assert result["estimated_ratio"] == 1.0
+    assert result["rotation_error_deg"]["max"] < 0.1
+    assert result["translation_error_m"]["max"] < 0.02
+
+
+def test_the_figures_are_those_of_the_pairs(folder: Path, capsys: Capture) -> None:
+    result = replayed(capsys, folder, "--depth", "recorded")
+    for error in ("rotation_error_deg", "translation_error_m"):
+        errors = [pair[error] for pair in result["pairs"]]
+        expected = {"median": np.median(errors), "p95": np.percentile(errors, 95), "max": max(errors)}
+        assert result[error] == pytest.approx(expected)
+
+
+def test_a_video_is_flown_with_a_drones_camera_and_without_truth(
+    scene: Scene, tmp_path: Path, onlooker: None, capsys: Capture
+) -> None:
+    video, path = rendered_dataset.write_video(scene, tmp_path), tmp_path / "path.txt"
+    result = replayed(capsys, video, "--calibration", tmp_path / "camera.yaml", "--trajectory", path)
+    assert result["estimated_ratio"] == 1.0
+    assert result["rotation_error_deg"] == {"median": None, "p95": None, "max": None}
+    assert {pair["true_translation_m"] for pair in result["pairs"]} == {None}
+    # From the origin, along the camera's axes, wherever the camera sits in the drone.
+    end = scene.motion(0, FRAMES - 1)[:3, 3]
+    assert np.allclose(np.loadtxt(path)[-1, 1:4], end, atol=0.05)
+
+
+def test_the_trajectory_is_the_path_that_was_rendered(
+    scene: Scene, folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    path = tmp_path / "path.txt"
+    replayed(capsys, folder, "--depth", "recorded", "--stride", "2", "--trajectory", path)
+    rows = np.loadtxt(path)
+    assert rows[:, 0].tolist() == [0.0, 2.0, 4.0]
+    for row, pose in zip(rows, scene.poses[::2], strict=True):
+        assert np.allclose(row[1:4], pose[:3, 3], atol=0.03)
+        off = Rotation.from_quat(row[4:]) * Rotation.from_matrix(pose[:3, :3]).inv()
+        assert np.degrees(off.magnitude()) < 0.2
+
+
+def test_a_pair_without_an_estimate_says_why_and_is_no_standstill(
+    folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    image = sorted((folder / "images").iterdir())[3]
+    cv2.imwrite(str(image), np.full((HEIGHT, WIDTH, 3), 90, np.uint8))  # somebody's hand over the lens
+    path = tmp_path / "path.txt"
+    assert main(["replay", str(folder), "--depth", "recorded", "--json", "--trajectory", str(path)]) == 0
+    captured = capsys.readouterr()
+    pairs = json.loads(captured.out)["pairs"]
+    assert [pair["estimated"] for pair in pairs] == [True, True, False, False, True]
+    for pair in pairs[2:4]:
+        assert "frame 3: camera camera: no frame" in pair["reason"]
+        assert pair["rotation_error_deg"] is pair["translation_error_m"] is pair["inlier_ratio"] is None
+    assert json.loads(captured.out)["estimated_ratio"] == pytest.approx(0.6)
+    assert len(np.loadtxt(path)) == 3  # where it went then, nobody saw
+    assert "path.txt: ends at frame 2" in captured.err
+
+
+def test_too_little_depth_is_no_motion(folder: Path, capsys: Capture) -> None:
+    for file in (folder / "depth").iterdir():
+        depth = np.zeros((HEIGHT, WIDTH), np.uint16)
+        depth[100, 100] = 2000
+        cv2.imwrite(str(file), depth)
+    assert main(["replay", str(folder), "--depth", "recorded"]) == 1
+    captured = capsys.readouterr()
+    assert "estimated: 0 (0.0 %)" in captured.out
+    assert "no motion could be estimated: ego-motion: fewer than three pairs" in captured.err
+
+
+def test_an_image_without_depth_of_its_time_is_left_out_and_reported(
+    scene: Scene, tmp_path: Path, onlooker: None, capsys: Capture
+) -> None:
+    rendered_dataset.write_tum(scene, tmp_path)
+    assert main(["replay", str(tmp_path), "--depth", "recorded"]) == 0
+    assert "1 of 7 images have no depth map within 0.02 s" in capsys.readouterr().err
+
+
+# What people's files come with.
+
+
+def first(folder: Path) -> Path:
+    return min(folder.iterdir())
+
+
+def cut_short(folder: Path) -> None:
+    file = sorted((folder / "images").iterdir())[2]
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+def flip_a_bit(folder: Path) -> None:
+    file = sorted((folder / "images").iterdir())[2]
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.write_bytes(data)
+
+
+def cut_jpeg(folder: Path) -> None:
+    file = sorted((folder / "images").iterdir())[2]
+    _, data = cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8))
+    file.write_bytes(data.tobytes()[:-500])
+
+
+def lose_an_image(folder: Path) -> None:
+    sorted((folder / "images").iterdir())[2].unlink()
+
+
+def lose_a_depth_map(folder: Path) -> None:
+    sorted((folder / "depth").iterdir())[2].unlink()
+
+
+def lose_a_pose(folder: Path) -> None:
+    lines = (folder / "poses.txt").read_text().splitlines()
+    (folder / "poses.txt").write_text("\n".join(lines[1:]))
+
+
+def turn_poses_round(folder: Path) -> None:
+    """Transposed matrices have their translation in the last row."""
+    poses = np.loadtxt(folder / "poses.txt").reshape(-1, 4, 4).transpose(0, 2, 1)
+    np.savetxt(folder / "poses.txt", poses.reshape(-1, 16))
+
+
+def scale_a_pose(folder: Path) -> None:
+    poses = np.loadtxt(folder / "poses.txt")
+    poses[4, :12] *= 1.1
+    np.savetxt(folder / "poses.txt", poses)
+
+
+def lose_track(folder: Path) -> None:
+    poses = np.loadtxt(folder / "poses.txt")
+    poses[4] = -np.inf
+    np.savetxt(folder / "poses.txt", poses)
+
+
+def zero_depth(folder: Path) -> None:
+    file = sorted((folder / "depth").iterdir())[2]
+    cv2.imwrite(str(file), np.zeros((HEIGHT, WIDTH), np.uint16))
+
+
+def coarse_depth(folder: Path) -> None:
+    cv2.imwrite(str(first(folder / "depth")), np.full((HEIGHT, WIDTH), 200, np.uint8))
+
+
+def small_depth(folder: Path) -> None:
+    cv2.imwrite(str(first(folder / "depth")), np.full((HEIGHT // 2, WIDTH // 2), 2000, np.uint16))
+
+
+def one_small_image(folder: Path) -> None:
+    file = sorted((folder / "images").iterdir())[2]
+    cv2.imwrite(str(file), np.zeros((HEIGHT // 2, WIDTH // 2, 3), np.uint8))
+
+
+def doubled_calibration(folder: Path) -> None:
+    np.savetxt(folder / "K.txt", 2 * rendered_dataset.OTHERS_MATRIX - np.diag([0.0, 0.0, 1.0]))
+
+
+def halved_calibration(folder: Path) -> None:
+    np.savetxt(folder / "K.txt", np.diag([0.5, 0.5, 1.0]) @ rendered_dataset.OTHERS_MATRIX)
+
+
+def no_calibration(folder: Path) -> None:
+    (folder / "K.txt").unlink()
+
+
+def odd_calibration(folder: Path) -> None:
+    (folder / "K.txt").write_text("200 0 160\n0 200 120\n0 0 one\n")
+
+
+@pytest.mark.parametrize(
+    ("happen", "code", "words"),
+    [
+        (cut_short, 1, "00016.png: the PNG ends too early"),
+        (flip_a_bit, 1, "00016.png: the PNG is damaged at byte"),
+        (cut_jpeg, 1, "00016.png: the JPEG ends too early"),
+        (lose_an_image, 1, "depth/00016.png: its image is missing"),
+        (lose_a_depth_map, 1, "depth/00016.png: is missing; each image needs its depth"),
+        (lose_a_pose, 1, "poses.txt: has 5 poses, and"),
+        (turn_poses_round, 1, "poses.txt: pose 1: its last row is not 0 0 0 1"),
+        (scale_a_pose, 1, "poses.txt: pose 5: its first three columns are no rotation"),
+        (lose_track, 1, "poses.txt:5: does not fit"),
+        (zero_depth, 1, "00016.png: its depth is 0 everywhere"),
+        (coarse_depth, 1, "00010.png: is no depth map; it needs one channel of 16 bits"),
+        (small_depth, 1, "00010.png: is 160 x 120 pixels, and the camera 320 x 240"),
+        (one_small_image, 1, "00016.png: is 160 x 120 pixels, and the camera 320 x 240"),
+        (doubled_calibration, 78, "K.txt: is the calibration of another size"),
+        (halved_calibration, 78, "K.txt: is the calibration of another size"),
+        (no_calibration, 78, "K.txt: does not exist"),
+        (odd_calibration, 1, "K.txt:3: does not fit; it needs a 3x3 matrix"),
+    ],
+)
+def test_what_is_wrong_is_one_sentence(
+    happen: Callable[[Path], None],
+    code: int,
+    words: str,
+    folder: Path,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    happen(folder)
+    path = tmp_path / "path.txt"
+    assert main(["replay", str(folder), "--depth", "recorded", "--json", "--trajectory", str(path)]) == code
+    captured = capfd.readouterr()
+    assert words in captured.err
+    assert captured.err.count("\n") == 1
+    assert captured.out == ""
+    assert not list(tmp_path.glob("*path.txt*"))
+
+
+def test_a_listed_image_that_is_gone_is_named(
+    scene: Scene, tmp_path: Path, onlooker: None, capfd: pytest.CaptureFixture[str]
+) -> None:
+    rendered_dataset.write_tum(scene, tmp_path)
+    gone = sorted((tmp_path / "rgb").iterdir())[3]
+    gone.unlink()
+    assert main(["replay", str(tmp_path), "--depth", "network"]) == 1
+    assert f"{gone}: is missing" in capfd.readouterr().err
+
+
+def test_poses_of_another_time_are_named(scene: Scene, tmp_path: Path, onlooker: None, capsys: Capture) -> None:
+    rendered_dataset.write_tum(scene, tmp_path)
+    truth = tmp_path / "groundtruth.txt"
+    rows = np.loadtxt(truth)
+    rows[:, 0] += 1000.0
+    np.savetxt(truth, rows)
+    assert main(["replay", str(tmp_path), "--depth", "recorded"]) == 1
+    assert "groundtruth.txt: has no pose at the time of any image" in capsys.readouterr().err
+
+
+def test_a_video_that_breaks_off_is_distinguished_from_one_that_ends(
+    scene: Scene, tmp_path: Path, onlooker: None, capsys: Capture
+) -> None:
+    video = rendered_dataset.write_video(scene, tmp_path)
+    data = video.read_bytes()
+    video.write_bytes(data[: len(data) // 2])
+    assert main(["replay", str(video), "--calibration", str(tmp_path / "camera.yaml"), "--json"]) == 1
+    captured = capsys.readouterr()
+    assert re.fullmatch(r".*clip.avi: ends after [23] of 6 frames; restore it\n", captured.err)
+    assert captured.out == ""
+
+
+def test_what_is_no_video_is_one_sentence_whatever_the_decoder_thinks(tmp_path: Path) -> None:
+    video = tmp_path / "clip.mp4"
+    video.write_bytes(b"\0\0\0\x1cftypisom\0\0\x02\0isomiso2mp41" + bytes(1000))
+    command = [sys.executable, "-c", "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"]
+    done = subprocess.run([*command, "replay", str(video)], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr == f"{video}: is no video that can be decoded; restore it, or convert it to MP4\n"
+
+
+def test_a_videos_calibration_is_of_its_size(scene: Scene, tmp_path: Path, capsys: Capture) -> None:
+    video = rendered_dataset.write_video(scene, tmp_path)
+    other = rendered_dataset.write_camera(tmp_path / "other.yaml", (2 * WIDTH, 2 * HEIGHT))
+    assert main(["replay", str(video), "--calibration", str(other)]) == 78
+    assert "rig.cameras[0].size_px: is the calibration of another size, 640 x 480" in capsys.readouterr().err
+    assert main(["replay", str(video)]) == 78
+    assert "clip.avi: brings no calibration; name one with --calibration" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--diff"], "--diff is for recordings of flockd"),
+        (["--stride", "6"], "has 6 frames, and none 6 after another"),
+        (["--trajectory", "K.txt"], "K.txt: exists; name a new file with --trajectory"),
+    ],
+)
+def test_what_cannot_be_asked_of_a_dataset(arguments: list[str], words: str, folder: Path, capsys: Capture) -> None:
+    arguments = [str(folder / "K.txt") if argument == "K.txt" else argument for argument in arguments]
+    assert main(["replay", str(folder), *arguments]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_euroc_has_no_depth_to_use(scene: Scene, tmp_path: Path, capsys: Capture) -> None:
+    rendered_dataset.write_euroc(scene, tmp_path)
+    assert main(["replay", str(tmp_path), "--depth", "recorded"]) == 2
+    assert "has no recorded depth; replay it with --depth network" in capsys.readouterr().err
+
+
+def test_a_folder_of_something_else_is_no_dataset(tmp_path: Path, capsys: Capture) -> None:
+    assert main(["replay", str(tmp_path)]) == 1
+    assert "is in none of the layouts that can be read" in capsys.readouterr().err
+
+
+def test_real_images_give_real_motions(tmp_path: Path, capsys: Capture) -> None:
+    """Six frames of somebody's walk through an office, with the networks that come with flockd."""
+    data = Path(os.environ.get("FLOCKD_DATA", "/nonexistent")) / "hololens"
+    if not data.is_dir():
+        pytest.skip("FLOCKD_DATA does not name a folder with hololens/ in it")
+    for folder in ("images", "depth"):
+        (tmp_path / folder).mkdir()
+        for file in sorted((data / folder).iterdir())[:6]:
+            shutil.copy(file, tmp_path / folder)
+    shutil.copy(data / "K.txt", tmp_path)
+    poses = (data / "poses.txt").read_text().splitlines()[:6]
+    (tmp_path / "poses.txt").write_text("\n".join(poses))
+    result = replayed(capsys, tmp_path, "--depth", "recorded", "--flow", "dis")
+    assert result["estimated_ratio"] == 1.0
+    assert result["rotation_error_deg"]["median"] < 0.3
+    assert result["translation_error_m"]["median"] < 0.012

@@ -1,0 +1,307 @@
+"""Cameras as they come: steady, slow, uneven, dark, gone, stuck in their driver. The kernel's side is a fake."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockd.core.config import DroneConfig
+from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.core.config.source import (
+    CameraDeviceParameters,
+    ControlParameters,
+    SharedMemoryParameters,
+    SourceParameters,
+)
+from flockd.core.messages import Frame
+from flockd.ground.cameras import watching
+from flockd.ground.doctor import Finding, Level
+from flockd.ground.doctor.camera_checks import check_cameras
+from flockd.onboard.sources import FramePublisher
+from flockd.onboard.sources.gstreamer import open_pipeline
+from flockd.onboard.sources.v4l2_device import V4l2Device
+from tests.onboard.daemon.aboard import free_endpoint
+from tests.onboard.sources.camera_images import SIZE, jpeg, scene
+from tests.onboard.sources.fake_kernel import FLAG_CLOCK_UNKNOWN, FLAG_ERROR, FakeCamera, FakeKernel
+
+RATE_HZ = 30.0
+SECONDS = 0.7
+JPEGS = [jpeg(scene(number)) for number in range(4)]
+BLACK = [jpeg(np.full((SIZE[1], SIZE[0], 3), 4, np.uint8) + scene(n) // 32) for n in range(4)]
+BY_HAND = (
+    ControlParameters(name="auto_exposure", value=1),
+    ControlParameters(name="exposure_time_absolute", value=50),
+)
+
+
+def _config(*names: str, controls: Sequence[ControlParameters] = BY_HAND) -> DroneConfig:
+    lens = IntrinsicsConfig(fx=300.0, fy=300.0, cx=320.0, cy=240.0)
+    rig = RigConfig(cameras=tuple(CameraConfig(name=name, size_px=SIZE, intrinsics=lens) for name in names))
+    devices = tuple(
+        CameraDeviceParameters(name=name, device=f"/dev/{name}", rate_hz=RATE_HZ, controls=tuple(controls))
+        for name in names
+    )
+    return DroneConfig(rig=rig, source=SourceParameters(kind="v4l2", cameras=devices))
+
+
+@contextmanager
+def _filming(
+    kernel: FakeKernel,
+    *names: str,
+    beats_s: Callable[[int], float] = lambda number: number / RATE_HZ,
+    pictures: Sequence[bytes] = JPEGS,
+    lost: Callable[[int], int] = lambda number: 0,
+    flags: Callable[[int], int] | None = None,
+    old_s: float = 0.0,
+) -> Iterator[None]:
+    """Each camera takes picture n at its time stamp, as soon as it streams; a busy computer delays the hand-over."""
+    ended = threading.Event()
+
+    def film(name: str) -> None:
+        begun_s, number = time.monotonic(), 0
+        while not ended.is_set():
+            stamp = begun_s + beats_s(number)
+            if stamp > time.monotonic():
+                ended.wait(stamp - time.monotonic())
+            elif kernel.cameras[f"/dev/{name}"].streaming:
+                more = {} if flags is None else {"flags": flags(number)}
+                try:
+                    kernel.send(
+                        name,
+                        pictures[number % len(pictures)],
+                        time_s=stamp - old_s,
+                        lost_before=lost(number),
+                        wait_s=0.5,
+                        **more,
+                    )
+                except AssertionError:  # nobody takes it any more
+                    return
+                number += 1
+            else:
+                begun_s = time.monotonic() - beats_s(number)
+                time.sleep(0.005)
+
+    threads = [threading.Thread(target=film, args=(name,)) for name in names]
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        for thread in threads:
+            thread.join()
+
+
+def _examined(config: DroneConfig, kernel: FakeKernel) -> dict[str, list[Finding]]:
+    found: dict[str, list[Finding]] = {}
+    for finding in check_cameras(config, SECONDS, kernel):
+        found.setdefault(finding.about, []).append(finding)
+    return found
+
+
+def test_two_cameras_that_run_as_they_should() -> None:
+    kernel = FakeKernel(front=FakeCamera(), back=FakeCamera())
+    with _filming(kernel, "front", "back"):
+        found = _examined(_config("front", "back"), kernel)
+    for name in ("front", "back"):
+        (finding,) = found[f"camera {name}"]
+        assert finding.level is Level.PASS, finding
+        assert "30.0 of 30 images a second, jitter 0.0 ms, no gaps, 2 controls accepted" in finding.measured
+        assert "calibration fits 640x480, 94 degrees wide" in finding.measured
+    assert found["rig"][0].level is Level.WARNING, "both look forward"
+    assert not kernel.open_files, "all are given back"
+
+
+def _problem(found: dict[str, list[Finding]], level: Level, told: str, about: str = "camera front") -> Finding:
+    (problem,) = found[about]
+    assert problem.level is level, problem
+    assert told in problem.measured, problem
+    assert problem.fix
+    return problem
+
+
+@pytest.mark.parametrize(("rate_hz", "level"), [(15.0, Level.FAILURE), (27.0, Level.WARNING)])
+def test_a_camera_that_is_slower_than_it_says(rate_hz: float, level: Level) -> None:
+    kernel = FakeKernel(front=FakeCamera())
+    with _filming(kernel, "front", beats_s=lambda number: number / rate_hz):
+        found = _examined(_config("front"), kernel)
+    _problem(found, level, f"{rate_hz:.1f} images a second instead of 30")
+
+
+@pytest.mark.parametrize(("off_s", "level"), [(0.012, Level.WARNING), (0.03, Level.FAILURE)])
+def test_a_camera_out_of_step(off_s: float, level: Level) -> None:
+    kernel = FakeKernel(front=FakeCamera())
+    # Every fourth is late: two of four intervals are off by as much.
+    with _filming(kernel, "front", beats_s=lambda number: number / RATE_HZ + (off_s if number % 4 == 3 else 0.0)):
+        found = _examined(_config("front"), kernel)
+    _problem(found, level, "images come unevenly")
+
+
+@pytest.mark.parametrize(
+    ("film", "level", "told"),
+    [
+        ({"lost": lambda number: int(number % 10 == 9)}, Level.WARNING, " lost ("),
+        ({"lost": lambda number: 1}, Level.FAILURE, " lost ("),
+        (
+            {"flags": lambda number: 0x2000 | (FLAG_ERROR if number % 2 else 0)},
+            Level.FAILURE,
+            "damaged, as the driver reports",
+        ),
+        ({"pictures": JPEGS[:1]}, Level.FAILURE, "frozen"),
+        ({"pictures": [*JPEGS[:3], JPEGS[3][:-100]]}, Level.FAILURE, "corrupt (JPEG ends too early)"),
+    ],
+    ids=["some lost", "many lost", "flagged", "frozen", "corrupt"],
+)
+def test_images_that_are_worth_nothing(film: dict[str, Any], level: Level, told: str) -> None:
+    kernel = FakeKernel(front=FakeCamera())
+    with _filming(kernel, "front", **film):
+        found = _examined(_config("front"), kernel)
+    problem = found["camera front"][0]
+    assert problem.level is level, problem
+    assert told in problem.measured, problem
+
+
+def test_time_stamps_of_another_clock_are_no_image_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some drivers do not name their clock: what counts is whether the stamps are of now."""
+    monkeypatch.setattr(V4l2Device, "start_s", 0.3)
+    kernel = FakeKernel(front=FakeCamera())
+    with _filming(kernel, "front", flags=lambda number: FLAG_CLOCK_UNKNOWN):
+        (finding,) = _examined(_config("front"), kernel)["camera front"]
+    assert finding.level is Level.PASS, finding
+    with _filming(kernel, "front", old_s=2.0):
+        found = _examined(_config("front"), kernel)
+    _problem(found, Level.FAILURE, "no usable image came within 0.3 s (")
+    _problem(found, Level.FAILURE, "with a time stamp far from now")
+
+
+def test_a_cap_on_the_lens() -> None:
+    kernel = FakeKernel(front=FakeCamera())
+    with _filming(kernel, "front", pictures=BLACK):
+        found = _examined(_config("front"), kernel)
+    _problem(found, Level.WARNING, "the image is too dark")
+
+
+def test_an_exposure_that_is_not_configured() -> None:
+    kernel = FakeKernel(front=FakeCamera())
+    with _filming(kernel, "front"):
+        found = _examined(_config("front", controls=()), kernel)
+    _problem(found, Level.WARNING, "its exposure is not configured")
+
+
+def test_cameras_that_do_not_open_are_reported_one_by_one() -> None:
+    taken, small, busless = FakeCamera(), FakeCamera(formats=((320, 240, b"MJPG"),)), FakeCamera(rates=(10,))
+    kernel = FakeKernel(taken=taken, small=small, busless=busless, controlled=FakeCamera())
+    taken.owner = 1
+    config = _config("gone", "taken", "small", "busless")
+    found = _examined(config, kernel)
+    _problem(found, Level.FAILURE, "/dev/gone is not there", "camera gone")
+    _problem(found, Level.FAILURE, "/dev/taken is in use by another program", "camera taken")
+    _problem(found, Level.FAILURE, "offers 320x240 MJPG instead of 640x480", "camera small")
+    problem = _problem(found, Level.FAILURE, "runs at 10 instead of 30 images a second", "camera busless")
+    assert problem.fix == "write rate_hz: 10"
+    refused = _config("controlled", controls=(ControlParameters(name="exposure_time_absolute", value=9999),))
+    _problem(
+        _examined(refused, kernel), Level.FAILURE, "takes exposure_time_absolute from 1 to 5000", "camera controlled"
+    )
+
+
+def test_a_driver_that_hangs_is_reported_and_the_other_camera_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(watching, "LONGEST_START_S", 1.0)
+    monkeypatch.setattr(watching, "STOP_S", 0.2)
+    ended = threading.Event()
+
+    class Stuck(FakeKernel):
+        def open(self, path: str) -> int:
+            if path == "/dev/back":
+                ended.wait()
+            return super().open(path)
+
+    kernel = Stuck(front=FakeCamera(), back=FakeCamera())
+    with _filming(kernel, "front"):
+        found = _examined(_config("front", "back"), kernel)
+    ended.set()
+    assert found["camera front"][0].level is Level.PASS
+    _problem(found, Level.FAILURE, "its driver does not respond", "camera back")
+
+
+def test_a_pipeline_is_watched_as_a_device_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = (sys.executable, "-IS", str(Path(__file__).parents[2] / "onboard" / "sources" / "fake_pipeline.py"))
+    monkeypatch.setattr(watching, "open_pipeline", lambda camera, size: open_pipeline(camera, size, fake))
+    lens = IntrinsicsConfig(model="wide_angle", fx=30.0, fy=30.0, cx=32.0, cy=24.0)
+    names = {"front": "caps:64x48 500 stall", "back": "fail:has_failed_(no_such_sensor)"}
+    rig = RigConfig(cameras=tuple(CameraConfig(name=name, size_px=(64, 48), intrinsics=lens) for name in names))
+    cameras = tuple(CameraDeviceParameters(name=n, pipeline=text, rate_hz=40.0) for n, text in names.items())
+    config = DroneConfig(rig=rig, source=SourceParameters(kind="gstreamer", cameras=cameras))
+    found: dict[str, list[Finding]] = {}
+    for finding in check_cameras(config, SECONDS):
+        found.setdefault(finding.about, []).append(finding)
+    told = " ".join(finding.measured for finding in found["camera front"])
+    assert "images a second" in told
+    assert "exposure is not configured" not in told, "a pipeline sets its own"
+    _problem(found, Level.FAILURE, "its pipeline has failed (no such sensor)", "camera back")
+
+
+def _shared(endpoint: str) -> DroneConfig:
+    lens = IntrinsicsConfig(fx=32.0, fy=32.0, cx=32.0, cy=24.0)
+    rig = RigConfig(cameras=(CameraConfig(name="front", size_px=(64, 48), intrinsics=lens),))
+    where = SharedMemoryParameters(drone="tiny", connect=(endpoint,), rate_hz=20.0)
+    return DroneConfig(rig=rig, source=SourceParameters(kind="shared_memory", shared_memory=where))
+
+
+@contextmanager
+def _publishing(endpoint: str, size: tuple[int, int]) -> Iterator[None]:
+    ended = threading.Event()
+    publisher = FramePublisher(listen=[endpoint])
+
+    def publish() -> None:
+        rng, number, began_s = np.random.default_rng(0), 0, time.monotonic()
+        while not ended.wait(0.05):
+            number += 1
+            image = rng.integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+            publisher.publish("tiny", Frame("front", image, began_s + 0.05 * number, number))
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        publisher.close()
+
+
+def test_frames_of_another_program() -> None:
+    endpoint = free_endpoint()
+    with _publishing(endpoint, (64, 48)):
+        found = {finding.about: finding for finding in check_cameras(_shared(endpoint), SECONDS)}
+    assert "jitter 0.0 ms, no gaps, calibration fits 64x48" in found["camera front"].measured or (
+        "images a second instead of 20" in found["camera front"].measured  # on a computer too busy to publish
+    )
+
+
+def test_frames_of_the_wrong_size_and_none_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(watching, "START_S", 2.0)
+    endpoint = free_endpoint()
+    with _publishing(endpoint, (32, 48)):
+        problem = next(iter(check_cameras(_shared(endpoint), SECONDS)))
+    assert (problem.level, problem.measured) == (Level.FAILURE, "frames are 32x48, but the rig has 64x48")
+    monkeypatch.setattr(watching, "START_S", 0.3)
+    problem = next(iter(check_cameras(_shared(endpoint), SECONDS)))
+    assert problem.level is Level.FAILURE
+    assert problem.measured == f"no frame of tiny/front came from {endpoint} within 0.3 s"
+
+
+def test_a_drone_without_a_source_is_only_for_the_simulator() -> None:
+    config = _config("front").model_copy(update={"source": None})
+    first, camera, _ = check_cameras(config, SECONDS)
+    assert (first.level, first.about) == (Level.WARNING, "cameras")
+    assert camera.level is Level.PASS
+    assert camera.measured == "calibration fits 640x480, 94 degrees wide"

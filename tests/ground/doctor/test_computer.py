@@ -1,0 +1,154 @@
+"""Disk, memory, temperature and clocks of computers that are well and of computers that are not."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from flockd.core.config import DroneConfig, load_drone
+from flockd.core.config.recording import RecordingConfig
+from flockd.core.data import data_path
+from flockd.ground.doctor import Finding, Level, computer_checks
+from flockd.ground.doctor.computer_checks import (
+    check_clock,
+    check_disk,
+    check_memory,
+    check_temperature,
+    judge_monotonic,
+    judge_room,
+    wall_clock_error_us,
+)
+
+QUADROTOR = load_drone(data_path("config") / "quadrotor.yaml")
+SUMMER = datetime(2026, 7, 1, 12, tzinfo=UTC)
+
+
+def test_a_folder_that_can_be_written_is_left_as_it_was(tmp_path: Path) -> None:
+    small = QUADROTOR.model_copy(update={"recording": RecordingConfig(file_mb=1.0, quota_mb=1.0)})
+    (finding,) = check_disk(small, tmp_path)
+    assert finding.level is Level.PASS
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    (finding,) = check_disk(QUADROTOR, tmp_path / "none")
+    assert (finding.level, finding.about) == (Level.FAILURE, "disk")
+    assert finding.measured == f"{tmp_path / 'none'} cannot be written (No such file or directory)"
+
+
+def test_without_a_folder_none_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(computer_checks, "STATE_FOLDER", tmp_path / "none")
+    (finding,) = check_disk(QUADROTOR, None)
+    assert finding.level is Level.WARNING
+    monkeypatch.setattr(computer_checks, "STATE_FOLDER", tmp_path)
+    assert str(tmp_path) in next(iter(check_disk(QUADROTOR, None))).measured
+
+
+@pytest.mark.parametrize(
+    ("free_mb", "own_mb", "level"),
+    [
+        (21_000.0, 0.0, Level.PASS),
+        (5_000.0, 16_000.0, Level.PASS),  # what it has recorded makes room for what it will
+        (19_000.0, 0.0, Level.WARNING),
+        (1_500.0, 400.0, Level.FAILURE),  # less than one file
+    ],
+)
+def test_room_for_the_quota(free_mb: float, own_mb: float, level: Level) -> None:
+    assert (QUADROTOR.recording.file_mb, QUADROTOR.recording.quota_mb) == (2000.0, 20000.0)
+    assert judge_room(QUADROTOR, Path("/r"), free_mb, own_mb).level is level
+
+
+def test_only_the_drones_own_recordings_make_room(tmp_path: Path) -> None:
+    (tmp_path / "drone1-20260101T000000000000Z.mcap").write_bytes(b"x" * 2_000_000)
+    (tmp_path / "drone2-20260101T000000000000Z.mcap").write_bytes(b"x" * 4_000_000)
+    (finding,) = check_disk(QUADROTOR, tmp_path)
+    assert "0.0 GB are this drone's recordings" in finding.measured
+    assert judge_room(QUADROTOR, tmp_path, 1e5, 2e3).measured.startswith("100.0 GB free")
+
+
+@pytest.mark.parametrize(
+    ("available_kb", "level"), [(4_000_000, Level.PASS), (500_000, Level.WARNING), (300_000, Level.FAILURE)]
+)
+def test_memory(available_kb: int, level: Level, tmp_path: Path) -> None:
+    meminfo = tmp_path / "meminfo"
+    meminfo.write_text(f"MemTotal:  8000000 kB\nMemFree: 1 kB\nMemAvailable: {available_kb} kB\n", encoding="ascii")
+    (finding,) = check_memory(QUADROTOR, meminfo)
+    assert finding.level is level
+    assert f"{available_kb * 1024 / 1e6:.0f} of 8192 MB" in finding.measured
+
+
+def _computer(folder: Path, **hot: tuple[str, str]) -> Path:
+    for name, (kind, reading) in hot.items():
+        (folder / name).mkdir()
+        (folder / name / "type").write_text(f"{kind}\n", encoding="ascii")
+        file = "cur_state" if name.startswith("cooling") else "temp"
+        (folder / name / file).write_text(f"{reading}\n", encoding="ascii")
+    return folder
+
+
+def _temperature(folder: Path) -> list[Finding]:
+    return list(check_temperature(QUADROTOR, folder))
+
+
+@pytest.mark.parametrize(
+    ("reading", "level"), [("51000", Level.PASS), ("78000", Level.WARNING), ("86000", Level.FAILURE)]
+)
+def test_the_hottest_zone_counts(reading: str, level: Level, tmp_path: Path) -> None:
+    zones = {"thermal_zone0": ("board", "40000"), "thermal_zone1": ("cpu", reading), "thermal_zone2": ("off", "")}
+    (finding,) = _temperature(_computer(tmp_path, **zones))
+    assert (finding.level, finding.about) == (level, "temperature")
+    assert finding.measured.startswith(f"{reading[:2]} °C (cpu)")
+
+
+def test_a_processor_that_is_slowed_down_and_a_fan_that_runs(tmp_path: Path) -> None:
+    devices = {"cooling_device0": ("pwm-fan", "3"), "cooling_device1": ("cpufreq-cpu0", "0")}
+    folder = _computer(tmp_path, thermal_zone0=("cpu", "50000"), **devices)
+    assert [finding.level for finding in _temperature(folder)] == [Level.PASS]
+    (folder / "cooling_device1" / "cur_state").write_text("2\n", encoding="ascii")
+    slowed, _ = _temperature(folder)
+    assert slowed.level is Level.WARNING
+    assert "slowed down (cpufreq-cpu0)" in slowed.measured
+
+
+def test_a_computer_that_reports_no_temperature(tmp_path: Path) -> None:
+    (finding,) = _temperature(tmp_path)
+    assert finding.level is Level.WARNING
+
+
+def _clock(error_us: int = 500, today: datetime = SUMMER) -> list[Finding]:
+    return list(check_clock(lambda: error_us, lambda: today))
+
+
+def test_clocks() -> None:
+    wall, monotonic = _clock()
+    assert (wall.level, wall.about) == (Level.PASS, "wall clock")
+    assert wall.measured == "2026-07-01 12:00 UTC, synchronised to 0 ms"
+    assert (monotonic.level, monotonic.about) == (Level.PASS, "monotonic clock")
+    assert _clock(16_000_000)[0].level is Level.WARNING
+    assert "not synchronised" in _clock(16_000_000)[0].measured
+    assert _clock(today=datetime(1970, 1, 1, tzinfo=UTC))[0].level is Level.FAILURE
+    assert 0 <= wall_clock_error_us() <= 16_000_000
+
+
+@pytest.mark.parametrize(
+    ("ticks", "told"),
+    [
+        ([0.0, 0.02, 0.01, 0.03], "went back by 10.0 ms"),
+        ([0.0, 0.02, 0.02], "it stood"),
+        ([0.0, 0.02, 0.03], "10.0 ms went by in a pause of 20 ms"),
+    ],
+)
+def test_a_monotonic_clock_that_is_none(ticks: list[float], told: str) -> None:
+    finding = judge_monotonic(ticks)
+    assert finding.level is Level.FAILURE
+    assert told in finding.measured
+    assert judge_monotonic([0.0, 0.0201, 0.15, 0.17]).level is Level.PASS, "a busy computer sleeps longer"
+
+
+def test_a_drone_with_a_larger_queue_needs_more(tmp_path: Path) -> None:
+    meminfo = tmp_path / "meminfo"
+    meminfo.write_text("MemTotal: 8000000 kB\nMemAvailable: 1000000 kB\n", encoding="ascii")
+    larger: DroneConfig = QUADROTOR.model_copy(update={"recording": RecordingConfig(queue_mb=1000.0)})
+    assert next(iter(check_memory(larger, meminfo))).level is Level.FAILURE

@@ -1,0 +1,128 @@
+"""An examination ends, whatever its checks do, and says what became of each."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from flockd.cli import main
+from flockd.core.data import data_path
+from flockd.core.errors import ModelError
+from flockd.ground.doctor import CHECKS, Check, Finding, Level, passed, run_checks
+
+QUADROTOR = str(data_path("config") / "quadrotor.yaml")
+
+
+def _examined(check: Check) -> tuple[Finding, ...]:
+    told: list[tuple[int, int]] = []
+    found = run_checks([check], lambda done, total: told.append((done, total)))
+    assert told == [(1, 1)]
+    return found[check.name]
+
+
+def test_a_check_that_hangs_is_a_failure_and_what_it_found_before_counts() -> None:
+    for_ever = threading.Event()
+
+    def hangs() -> Iterator[Finding]:
+        yield passed("camera front", "fine")
+        for_ever.wait()
+        yield passed("camera back", "too late")
+
+    first, late = _examined(Check("cameras", hangs, limit_s=0.2))
+    for_ever.set()
+    assert (first.level, first.about) == (Level.PASS, "camera front")
+    assert (late.level, late.about) == (Level.FAILURE, "cameras")
+    assert late.measured == "the check has not ended within 0.2 s"
+    assert late.fix
+
+
+def test_the_other_checks_are_run_whatever_one_does() -> None:
+    def breaks() -> Iterator[Finding]:
+        raise ArithmeticError("1 / 0")
+        yield
+
+    checks = [Check("models", breaks, 5.0), Check("disk", lambda: [passed("disk", "fine")], 5.0)]
+    found = run_checks(checks, lambda done, total: None)
+    (broken,) = found["models"]
+    assert broken.level is Level.FAILURE
+    assert "ArithmeticError('1 / 0')" in broken.measured
+    assert found["disk"] == (passed("disk", "fine"),)
+
+
+@pytest.mark.parametrize(
+    ("error", "measured", "fix"),
+    [
+        (
+            ModelError("a.yaml: sha256: changed; and more; restore it"),
+            "a.yaml: sha256: changed; and more",
+            "restore it",
+        ),
+        (ModelError("all is lost"), "all is lost", "correct it, and run `flockd doctor` again"),
+        (
+            OSError(5, "Input/output error", "/dev/x"),
+            "/dev/x: Input/output error",
+            "check that it responds",
+        ),
+        (
+            ImportError("libmavsdk.so is not there"),
+            "a library cannot be loaded (libmavsdk.so is not there)",
+            "install flockd again, for this computer",
+        ),
+    ],
+)
+def test_an_error_is_reported_with_its_fix(error: Exception, measured: str, fix: str) -> None:
+    def breaks() -> Iterator[Finding]:
+        raise error
+        yield
+
+    assert _examined(Check("x", breaks, 5.0)) == (Finding(Level.FAILURE, "x", measured, fix),)
+
+
+def test_json_for_machines_and_exit_code_1_when_a_check_failed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["doctor", "--config", QUADROTOR, "--only", "disk", "--only", "memory", "--json"]
+    assert main([*command, "--record", str(tmp_path / "none")]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert (told["drone"], told["ok"]) == ("drone1", False)
+    memory, disk = told["findings"]
+    assert (memory["check"], memory["level"], memory["mend"]) == ("memory", "PASS", None)
+    assert (disk["check"], disk["about"], disk["level"]) == ("disk", "disk", "FAILURE")
+    assert disk["measured"] == f"{tmp_path / 'none'} cannot be written (No such file or directory)"
+    assert disk["mend"].startswith("make the folder")
+
+    assert main(["doctor", "--config", QUADROTOR, "--only", "memory", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["ok"] is True
+
+
+def test_a_table_for_people_with_the_worst_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["doctor", "--config", QUADROTOR, "--only", "disk", "--only", "memory"]
+    assert main([*command, "--record", str(tmp_path / "none")]) == 1
+    lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+    assert lines[0].startswith("FAILURE  disk")
+    assert any(line.strip().startswith("fix: make the folder") for line in lines)
+    assert lines[-3].startswith("PASS     memory")
+    assert lines[-1] == "drone1: 1 failure, 0 warnings, 1 passed"
+
+
+def test_what_cannot_be_examined_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wrong = tmp_path / "wrong.yaml"
+    wrong.write_text("step_s: -1.0\n", encoding="utf-8")
+    assert main(["doctor", "--config", str(wrong)]) == 78
+    assert f"{wrong}:1: step_s: -1.0 is not greater than 0; write " in capsys.readouterr().err
+    assert main(["doctor", "--config", QUADROTOR, "--unit", str(tmp_path / "no.service")]) == 2
+    assert capsys.readouterr().err == f"{tmp_path / 'no.service'}: is no file; name the unit with --unit\n"
+    with pytest.raises(SystemExit) as exit_:
+        main(["doctor", "--config", QUADROTOR, "--only", "soul"])
+    assert exit_.value.code == 2
+
+
+def test_the_documentation_names_every_check() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "real_drone.md").read_text(encoding="utf-8")
+    section = page[page.index("## 3. Check the drone on the ground") :]
+    for name in CHECKS:
+        assert f"`{name}`" in section[: section.index("\n## ")], name

@@ -1,0 +1,138 @@
+"""Who else is there: on the fleet, on this computer; and how much its unit leaves open."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from flockd.core.config import DroneConfig, load_drone
+from flockd.core.config.telemetry import TelemetryParameters
+from flockd.core.data import data_path
+from flockd.ground.doctor import Check, Finding, Level, run_checks, service_checks
+from flockd.ground.doctor.service_checks import check_instance, check_unit, judge_exposure
+from flockd.ground.doctor.telemetry_checks import check_fleet
+from flockd.onboard.daemon import only_instance
+from flockd.onboard.telemetry.publisher import ZenohTelemetry
+from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
+from tests.onboard.daemon.aboard import free_endpoint
+
+QUADROTOR = load_drone(data_path("config") / "quadrotor.yaml")
+needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not here")
+
+
+def _config(*, listen: tuple[str, ...] = (), connect: tuple[str, ...] = ()) -> DroneConfig:
+    telemetry = TelemetryParameters(fleet="meadow", listen=listen, connect=connect)
+    return QUADROTOR.model_copy(update={"telemetry": telemetry})
+
+
+def _fleet(config: DroneConfig, listen_s: float = 1.5) -> Finding:
+    (finding,) = run_checks([Check("zenoh", lambda: check_fleet(config, listen_s), 20.0)], lambda done, total: None)[
+        "zenoh"
+    ]
+    return finding
+
+
+def _appears(telemetry: ZenohTelemetry, drone: str) -> None:
+    about = AboutMessage(version="1", configuration={}, commands=[])
+    telemetry.announce(
+        drone, about, lambda what, payload: AnswerMessage(accepted=False, sentence=""), lambda camera: None
+    )
+
+
+def test_another_drone_is_seen_and_one_of_the_same_name_is_a_failure() -> None:
+    endpoint = free_endpoint()
+    with ZenohTelemetry("meadow", listen=[endpoint]) as others:
+        _appears(others, "drone2")
+        finding = _fleet(_config(connect=(endpoint,)))
+        assert (finding.level, finding.about) == (Level.PASS, "zenoh")
+        assert finding.measured == f"fleet meadow at {endpoint}: sees drone2"
+        _appears(others, "drone1")
+        finding = _fleet(_config(connect=(endpoint,)))
+        assert finding.level is Level.FAILURE
+        assert finding.measured == "another process flies as meadow/drone1"
+
+
+def test_alone_is_well_and_nobody_where_somebody_should_be_is_not() -> None:
+    alone = _fleet(_config(listen=(free_endpoint(),)), 0.2)
+    assert alone.level is Level.PASS
+    assert alone.measured.endswith("sees no other drone")
+    endpoint = free_endpoint()
+    waiting = _fleet(_config(connect=(endpoint,)), 0.2)
+    assert (waiting.level, waiting.measured) == (Level.WARNING, f"nothing listens at {endpoint}")
+
+
+def test_an_endpoint_that_is_taken_is_a_failure() -> None:
+    endpoint = free_endpoint()
+    with ZenohTelemetry("meadow", listen=[endpoint]):
+        finding = _fleet(_config(listen=(endpoint,)))
+    assert finding.level is Level.FAILURE
+    assert finding.measured.startswith(f"telemetry cannot use {endpoint} (")
+    assert finding.fix == "name another endpoint"
+
+
+def test_a_second_instance(tmp_path: Path) -> None:
+    environment = {"XDG_RUNTIME_DIR": str(tmp_path)}
+    assert next(iter(check_instance("drone1", environment))).level is Level.PASS
+    with only_instance("drone1", environment):
+        (finding,) = check_instance("drone1", environment)
+        assert finding.level is Level.FAILURE
+        assert "flies drone 'drone1'" in finding.measured
+        assert "systemctl stop flockd" in finding.fix
+        assert next(iter(check_instance("drone2", environment))).level is Level.PASS
+    assert next(iter(check_instance("drone1", environment))).level is Level.PASS
+
+
+def test_a_lock_of_another_user_cannot_be_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(drone: str, environment: object) -> None:
+        raise PermissionError(13, "Permission denied", f"/run/flockd/flockd-{drone}.lock")
+
+    monkeypatch.setattr(service_checks, "only_instance", forbidden)
+    (finding,) = check_instance("drone1", {})
+    assert finding.level is Level.WARNING
+    assert "/run/flockd/flockd-drone1.lock belongs to another user" in finding.measured
+
+
+def test_the_lock_of_the_service_cannot_be_seen_by_who_may_not_write_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock = tmp_path / "flockd-drone1.lock"
+    lock.write_text("1234\n", encoding="ascii")
+    monkeypatch.setattr(service_checks, "service_lock", lambda drone: tmp_path / f"flockd-{drone}.lock")
+    access = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: path != lock and access(path, mode))
+    environment = {"XDG_RUNTIME_DIR": str(tmp_path)}
+    (finding,) = check_instance("drone1", environment)
+    assert finding.level is Level.WARNING
+    assert finding.measured.startswith(f"{lock} belongs to another user")
+    assert next(iter(check_instance("drone2", environment))).level is Level.PASS
+
+
+@needs_systemd
+def test_the_unit_that_comes_with_flockd_and_one_that_is_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(service_checks, "UNIT_FOLDERS", (tmp_path,))
+    (finding,) = check_unit(None)
+    assert finding.level is Level.PASS, finding
+    assert "flockd.service (not installed) exposes 1." in finding.measured
+    (tmp_path / "flockd.service").write_text("[Service]\nExecStart=/bin/true\n", encoding="utf-8")
+    (finding,) = check_unit(None)
+    assert finding.level is Level.FAILURE
+    assert finding.measured.startswith(f"{tmp_path / 'flockd.service'} exposes 9.")
+    broken = tmp_path / "broken.service"
+    broken.write_text("[Service]\n", encoding="utf-8")
+    (finding,) = check_unit(broken)
+    assert finding.level is Level.FAILURE
+
+
+def test_without_systemd_the_unit_is_not_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "/nowhere")
+    (finding,) = check_unit(None)
+    assert finding.level is Level.WARNING
+    assert "systemd-analyze is not installed" in finding.measured
+
+
+def test_how_open_is_too_open() -> None:
+    levels = [judge_exposure(score, Path("u"), "").level for score in (1.5, 1.6, 4.9, 5.0)]
+    assert levels == [Level.PASS, Level.WARNING, Level.WARNING, Level.FAILURE]

@@ -1,0 +1,90 @@
+"""Networks that are whole, one that is not, and steps that take too long."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from flockd.core.config.drone import DroneConfig
+from flockd.core.config.perception import PerceptionConfig
+from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.core.data import data_path
+from flockd.core.messages import PilotOutput
+from flockd.ground.doctor import Check, Level, run_checks
+from flockd.ground.doctor.model_checks import STEPS, check_models, judge_steps, meadow, time_steps
+from tests.onboard.daemon.aboard import TinyPerceiver
+
+LENS = IntrinsicsConfig(fx=32.0, fy=32.0, cx=32.0, cy=24.0)
+TINY = DroneConfig(rig=RigConfig(cameras=(CameraConfig(name="front", size_px=(64, 48), intrinsics=LENS),)))
+
+
+def _with(**perception: object) -> DroneConfig:
+    return TINY.model_copy(update={"perception": PerceptionConfig.model_validate({"threads": 1, **perception})})
+
+
+@pytest.fixture
+def copies(tmp_path: Path) -> Path:
+    """The shipped models, to be spoilt."""
+    folder = tmp_path / "models"
+    shutil.copytree(data_path("models"), folder)
+    return folder
+
+
+def test_a_flipped_bit_is_a_failure_of_that_model_alone(copies: Path) -> None:
+    content = bytearray((copies / "distance_int8.onnx").read_bytes())
+    content[len(content) // 2] ^= 1
+    (copies / "distance_int8.onnx").write_bytes(content)
+    flow, neighbours, distance, verification = check_models(_with(models_dir=str(copies)))
+    good = {"flow_int8": flow, "neighbours_int8": neighbours, "verification_int8": verification}
+    for name, finding in good.items():
+        assert (finding.level, finding.about) == (Level.PASS, f"model {name}")
+        assert "hash and golden output are right" in finding.measured
+        assert "run by CPUExecutionProvider" in finding.measured
+    assert (distance.level, distance.about) == (Level.FAILURE, "model distance_int8")
+    assert "was changed or damaged" in distance.measured
+    assert distance.fix == "restore it, or export it again with its manifest"
+
+
+def test_a_folder_that_is_not_there_is_a_failure(tmp_path: Path) -> None:
+    check = Check("models", lambda: check_models(_with(models_dir=str(tmp_path / "none"))), 60.0)
+    (finding,) = run_checks([check], lambda done, total: None)["models"]
+    assert finding.level is Level.FAILURE
+    assert finding.measured == f"perception.models_dir: {tmp_path / 'none'} is no folder"
+
+
+def test_whole_steps_are_timed_and_the_pilot_sees_its_way() -> None:
+    timed = time_steps(TINY, TinyPerceiver())
+    assert len(timed) == STEPS
+    assert all(seconds > 0.0 for seconds, _ in timed)
+    assert timed[-1][1].stages_ms.keys() >= {"scene", "flow", "detection"}
+
+
+def test_the_grass_passes_by() -> None:
+    first, second = meadow((64, 48), 0), meadow((64, 48), 1)
+    assert first.shape == (48, 64, 3)
+    assert (first[24:, 4:] == second[24:, :-4]).all()
+    assert (first != second).any()
+
+
+def _timed(seconds: float) -> list[tuple[float, PilotOutput]]:
+    output = time_steps(TINY, TinyPerceiver())[-1][1]
+    return [(99.0, output), *[(seconds, output)] * 3]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "level"), [(0.2, Level.PASS), (0.39, Level.PASS), (0.45, Level.WARNING), (0.55, Level.FAILURE)]
+)
+def test_the_first_step_warms_up_and_the_others_have_half_a_second(seconds: float, level: Level) -> None:
+    assert TINY.step_s == 0.5
+    finding = judge_steps(TINY, _timed(seconds))
+    assert (finding.level, finding.about) == (level, "step")
+    assert f"a step takes {1e3 * seconds:.0f} of 500 ms with 2 threads and 1 camera" in finding.measured
+
+
+def test_a_busy_computer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "getloadavg", lambda: (9.0, 9.0, 9.0))
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    assert judge_steps(TINY, _timed(0.7)).fix.startswith("stop other programs first (a load of 9 on 2 cores)")

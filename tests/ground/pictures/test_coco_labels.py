@@ -1,0 +1,114 @@
+"""Label files: what is read of them, and what is refused in one sentence."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flockd.ground.datasets.errors import DatasetError
+from flockd.ground.pictures import find_pictures, read_labels
+from flockd.ground.pictures.coco_labels import check_size
+
+Document = dict[str, Any]
+
+
+def document() -> Document:
+    return {
+        "info": {"year": 2026},
+        "images": [
+            {"id": 7, "file_name": "a.png", "width": 64, "height": 48, "license": 1},
+            {"id": 8, "file_name": "sub/b.png"},
+        ],
+        "annotations": [
+            {"id": 1, "image_id": 7, "category_id": 3, "bbox": [10, 20.5, 6, 4], "area": 24, "iscrowd": 0},
+            {"id": 2, "image_id": 7, "category_id": 4, "bbox": [1, 2, 3, 4]},
+        ],
+        "categories": [{"id": 3, "name": "drone"}, {"id": 4, "name": "bird"}],
+    }
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """With pictures, which are not opened, and no labels yet."""
+    for name in ("a.png", "sub/b.png", "c.png"):
+        path = tmp_path / "pictures" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    return tmp_path
+
+
+@pytest.mark.parametrize("place", ["labels.json", "pictures/labels.json"])
+def test_boxes_of_drones_are_read(folder: Path, place: str) -> None:
+    """File names count from the label file's folder or from the folder of the pictures; what is no drone has no box."""
+    path = folder / place
+    path.write_text(json.dumps(document()))
+    labels = read_labels(path, find_pictures([folder / "pictures"]))
+    by_name = {str(picture.relative): one for picture, one in labels.items()}
+    assert {name: one.boxes for name, one in by_name.items()} == {
+        "a.png": ((10.0, 20.5, 16.0, 24.5),), "sub/b.png": (),
+    }  # fmt: skip
+    check_size(path, "a.png", by_name["a.png"], (64, 48))
+    check_size(path, "sub/b.png", by_name["sub/b.png"], (1, 1))
+    with pytest.raises(DatasetError, match=r"a\.png was 64 x 48 pixels when it was labelled and is 48 x 64; label"):
+        check_size(path, "a.png", by_name["a.png"], (48, 64))
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda d: d["annotations"][0].update(category_id=9), r"annotations\[0\]\.category_id: there is no category 9"),
+        (lambda d: d["annotations"][1].update(image_id=9), r"annotations\[1\]\.image_id: there is no image 9; correct"),
+        (lambda d: d["annotations"][0].update(bbox=[1, 2, 3]), r"annotations\[0\]\.bbox\[3\]: is missing; add it"),
+        (
+            lambda d: d["annotations"][0].update(bbox="1 2 3 4"),
+            r"annotations\[0\]\.bbox: input should be .*\"1 2 3 4\"",
+        ),
+        (
+            lambda d: d["annotations"][0].update(bbox=[1, 2, 0, 4]),
+            r"annotations\[0\]\.bbox\[2\]: input should be great",
+        ),
+        (lambda d: d["annotations"][0].update(iscrowd=1), r"annotations\[0\]\.iscrowd: is 1; give each drone a box"),
+        (lambda d: d["images"][0].update(id="7"), r"images\[0\]\.id: input should be a valid integer, and not \"7\""),
+        (lambda d: d["images"][1].update(id=7), r"images: two have the id 7; give each its own"),
+        (lambda d: d["images"][1].update(file_name="a.png"), r"a\.png is in the images twice; delete one"),
+        (lambda d: d["images"][1].update(file_name="d.png"), r"d\.png is labelled and is not among the pictures; add"),
+        (lambda d: d["images"][0].pop("file_name"), r"images\[0\]\.file_name: is missing; add it"),
+        (lambda d: d.pop("annotations"), r"labels\.json: annotations: is missing; add it"),
+        (lambda d: d.update(images={}), r"labels\.json: images: input should be a valid"),
+        (
+            lambda d: d["categories"][0].update(name="Drone"),
+            r"categories: has Drone, bird, and the drones' must be named `drone`; rename or add it",
+        ),
+    ],
+)
+def test_wrong_labels_are_refused(folder: Path, change: Callable[[Document], object], sentence: str) -> None:
+    wrong = document()
+    change(wrong)
+    path = folder / "labels.json"
+    path.write_text(json.dumps(wrong))
+    with pytest.raises(DatasetError, match=sentence) as raised:
+        read_labels(path, find_pictures([folder / "pictures"]))
+    assert str(raised.value).startswith(f"{path}: ")
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (b"", "is no JSON"),
+        (b"[1, 2", "is no JSON"),
+        (b"\xff\xfe", "is no JSON"),
+        (b"[" * 100_000, "is no JSON"),
+        (b"[1, 2]", "is no COCO file; write images, annotations and categories"),
+        (b'{"images": [], "annotations": [NaN], "categories": []}', "annotations"),
+    ],
+)
+def test_what_is_no_coco_file_is_refused(folder: Path, content: bytes, sentence: str) -> None:
+    path = folder / "labels.json"
+    path.write_bytes(content)
+    with pytest.raises(DatasetError, match=sentence):
+        read_labels(path, find_pictures([folder / "pictures"]))

@@ -1,0 +1,223 @@
+"""`flockd detect` as a person runs it: on rendered photographs of a known drone, and on what it cannot use."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import struct
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from flockd.cli import main
+from tests.ground.pictures.photographs import DRONE_SIZE_M, FOCAL_PX, FOV_DEG, LABELS, RENDERED, SIZE, truth
+
+Capture = pytest.CaptureFixture[str]
+FOV = ("--fov", f"{FOV_DEG:g}")
+NEAR, NOTHING = RENDERED / "2.5_m_0.jpg", RENDERED / "nothing.jpg"
+
+
+def told(capsys: Capture, code: int, *arguments: object) -> str:
+    """What stands on stdout, or the one sentence on stderr."""
+    capsys.readouterr()
+    assert main([str(argument) for argument in arguments]) == code
+    captured = capsys.readouterr()
+    if code:
+        assert captured.err.count("\n") == 1, captured.err
+        assert captured.out == ""
+    return captured.out if code == 0 else captured.err
+
+
+def told_json(capsys: Capture, *arguments: object) -> dict[str, Any]:
+    result: dict[str, Any] = json.loads(told(capsys, 0, "detect", *arguments, "--json"))
+    return result
+
+
+def test_a_labelled_folder_is_measured(capsys: Capture) -> None:
+    result = told_json(capsys, RENDERED, *FOV, "--labels", LABELS)
+    assert list(result) == [
+        "images", "pictures", "proposals_per_image", "ms_per_image", "boxes", "by_width", "ap50",
+        "false_per_500_images",
+    ]  # fmt: skip
+    assert (result["images"], result["boxes"]) == (10, 9)
+    assert result["proposals_per_image"] > 0
+    assert result["ms_per_image"] > 0
+    distances, boxes = truth()
+    widths = [box[2] for box in boxes.values()]
+    by_width = result["by_width"]
+    assert {name: counts["boxes"] for name, counts in by_width.items()} == {
+        "0-6": 0, "6-12": 0, "12-30": 0, "30-80": sum(30 <= w < 80 for w in widths),
+        "80-": sum(w >= 80 for w in widths),
+    }  # fmt: skip
+    assert sum(counts["found"] for counts in by_width.values()) >= 8
+    assert sum(counts["found_iou30"] for counts in by_width.values()) >= 8
+    assert result["ap50"] > 0.4
+    before_sky = {"2.5_m_0.jpg", "4_m_3.jpg", "6_m_6.jpg"}
+    for picture in result["pictures"]:
+        name = Path(picture["file"]).name
+        assert picture["file"] == str(RENDERED / name)
+        if name in before_sky:
+            (one,) = picture["detections"]
+            assert list(one) == ["box", "probability", "range_m", "range_sigma_m", "size_m"]
+            left, top, width, height = boxes[name]
+            assert np.allclose(one["box"], (left, top, left + width, top + height), atol=8)
+            assert one["range_m"] == pytest.approx(distances[name], rel=0.06)
+            assert 0 < one["range_sigma_m"] < 0.1 * one["range_m"]
+            assert one["size_m"] == pytest.approx(DRONE_SIZE_M, rel=0.06)
+
+
+def test_a_known_size_gives_the_range(capsys: Capture) -> None:
+    """Twice the size, twice the range, and the size's own deviation (1 cm by default) beside the network's."""
+    (free,) = told_json(capsys, NEAR, *FOV)["pictures"][0]["detections"]
+    (known,) = told_json(capsys, NEAR, *FOV, "--drone-size", 2 * free["size_m"])["pictures"][0]["detections"]
+    assert known["size_m"] == pytest.approx(2 * free["size_m"])
+    assert known["range_m"] == pytest.approx(2 * free["range_m"], rel=0.02)
+    share = free["range_sigma_m"] / free["range_m"]
+    wanted = np.hypot(share, 0.01 / (2 * free["size_m"]))
+    assert known["range_sigma_m"] / known["range_m"] == pytest.approx(wanted, rel=0.3)
+    assert known["box"] == pytest.approx(free["box"], abs=4)
+
+
+def test_copies_show_what_was_found_and_nothing_is_lost(capsys: Capture, tmp_path: Path) -> None:
+    shutil.copy(NEAR, tmp_path / "a.jpg")
+    (tmp_path / "._a.jpg").write_bytes(b"a note of another program")
+    out = tmp_path / "drawn"
+    for force in ((), ("--force",)):  # the second time, copies of before lie in the folder
+        text = told(capsys, 0, "detect", tmp_path, *FOV, "--out", out, *force)
+        assert "1 detections in 1 pictures" in text
+    assert [path.name for path in out.rglob("*")] == ["a.jpg"]
+    before, after = (cv2.imread(str(path)) for path in (tmp_path / "a.jpg", out / "a.jpg"))
+    assert before is not None
+    assert after is not None
+    assert after.shape == before.shape
+    left, top, width, height = (round(value) for value in truth()[1]["2.5_m_0.jpg"])
+    changed = np.abs(after.astype(int) - before).max(axis=2) > 40
+    assert changed[top - 4 : top + height + 4, left - 4 : left + width + 4].mean() > 0.1
+    assert changed[:, left + width + 80 :].mean() < 0.001
+    assert "exists; name another folder, or overwrite it with --force" in told(
+        capsys, 2, "detect", tmp_path / "a.jpg", *FOV, "--out", out
+    )
+    assert "is one of the pictures themselves" in told(
+        capsys, 2, "detect", tmp_path / "a.jpg", *FOV, "--out", tmp_path, "--force"
+    )
+    told(capsys, 0, "detect", tmp_path / "a.jpg", *FOV, "--out", out, "--force", "--min-probability", 1)
+    again = cv2.imread(str(out / "a.jpg"))
+    assert again is not None
+    assert np.abs(again.astype(int) - before).max() < 40, "nothing is that probable"
+
+
+def test_frames_of_a_video_are_pictures(capsys: Capture, tmp_path: Path) -> None:
+    clip, frame = tmp_path / "clip.avi", cv2.imread(str(NEAR))
+    assert frame is not None
+    writer = cv2.VideoWriter(str(clip), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, SIZE)
+    for _ in range(5):
+        writer.write(frame)
+    writer.release()
+    result = told_json(capsys, clip, *FOV, "--every", 2, "--out", tmp_path / "drawn")
+    assert [picture["file"] for picture in result["pictures"]] == [f"{clip}#{k}" for k in (0, 2, 4)]
+    assert all(len(picture["detections"]) == 1 for picture in result["pictures"])
+    drawn = cv2.VideoCapture(str(tmp_path / "drawn" / "clip.mp4"))
+    assert drawn.get(cv2.CAP_PROP_FRAME_COUNT) == 3
+    assert drawn.get(cv2.CAP_PROP_FPS) == pytest.approx(5.0)
+
+
+def drone_file(path: Path, cameras: tuple[str, ...] = ("front",)) -> Path:
+    lens = f"intrinsics: {{fx: {FOCAL_PX}, fy: {FOCAL_PX}, cx: {SIZE[0] / 2}, cy: {SIZE[1] / 2}}}"
+    mounts = (f"{{yaw_deg: {90.0 * k}}}" for k in range(len(cameras)))
+    rows = [
+        f"    - {{name: {name}, size_px: [{SIZE[0]}, {SIZE[1]}], {lens}, extrinsics: {mount}}}"
+        for name, mount in zip(cameras, mounts, strict=True)
+    ]
+    path.write_text("\n".join(["name: d", "rig:", "  cameras:", *rows]) + "\n", encoding="utf-8")
+    return path
+
+
+def test_a_drones_own_camera_is_taken(capsys: Capture, tmp_path: Path) -> None:
+    config = drone_file(tmp_path / "drone.yaml", ("front", "left"))
+    by_fov, by_config = (
+        told_json(capsys, NEAR, *options)["pictures"][0]["detections"][0]
+        for options in (FOV, ("--config", config, "--camera", "left"))
+    )
+    assert by_config["range_m"] == pytest.approx(by_fov["range_m"], rel=0.01)
+    assert by_config["box"] == pytest.approx(by_fov["box"], abs=1)
+    assert "has cameras front, left; choose one with --camera" in told(capsys, 2, "detect", NEAR, "--config", config)
+    other = ("--config", config, "--camera", "right")
+    assert "has no camera 'right'; choose --camera from front, left" in told(capsys, 2, "detect", NEAR, *other)
+    assert cv2.imwrite(str(tmp_path / "small.png"), np.zeros((60, 80, 3), np.uint8))
+    small = (tmp_path / "small.png", "--config", config, "--camera", "left")
+    assert "is 80 x 60 pixels, and the camera of" in told(capsys, 2, "detect", *small)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "sentence"),
+    [
+        ((NEAR,), 2, "the pictures' camera is not known; give its field of view with --fov"),
+        ((NEAR, *FOV, "--config", "d.yaml"), 2, "--fov and --config exclude each other"),
+        ((NEAR, *FOV, "--camera", "front"), 2, "--camera is one of --config's"),
+        ((NEAR, *FOV, "--force"), 2, "--force has no meaning without --out"),
+        (("nowhere.jpg", *FOV), 2, "nowhere.jpg: does not exist; name an image, a video or a folder"),
+        ((LABELS, *FOV), 2, "drones.json: is no image or video by its name"),
+        ((NEAR, *FOV, "--models", "nowhere"), 78, "nowhere is no folder; name the one that holds the models"),
+        ((NEAR, *FOV, "--second-stage", "range9"), 78, "there is no model 'range9'"),
+        ((NEAR, *FOV, "--drone-size", "0.01"), 2, "perception.drone_size_m: "),
+        ((NEAR, *FOV, "--drone-size", "0.7", "--second-stage", "none"), 2, "needs the apparent size, which a second"),
+        ((NEAR, *FOV, "--labels", LABELS), 1, "2.5_m_1.jpg is labelled and is not among the pictures; add it"),
+        ((NEAR, *FOV, "--labels", "no.json"), 1, "no.json: cannot be read (No such file or directory)"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_sentence(
+    capsys: Capture, arguments: tuple[object, ...], code: int, sentence: str
+) -> None:
+    assert sentence in told(capsys, code, "detect", *arguments)
+
+
+@pytest.mark.parametrize("option", [("--fov", "0"), ("--fov", "180"), ("--fov", "nan"), ("--min-probability", "1.1")])
+def test_options_out_of_range_are_usage_errors(capsys: Capture, option: tuple[str, str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["detect", str(NEAR), *FOV, *option])
+    assert ended.value.code == 2
+    assert f"argument {option[0]}: " in capsys.readouterr().err
+
+
+def huge_png() -> bytes:
+    """A header that claims 60,000 x 60,000 pixels, and nothing behind it."""
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBBBBB", 13, b"IHDR", 60000, 60000, 8, 2, 0, 0, 0) + bytes(4)
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (huge_png(), "claims to be 60000 x 60000 pixels, more than any camera has"),
+        (b"", "is empty"),
+        (b"no picture", "is no image"),
+        (NEAR.read_bytes()[:9000], "the JPEG ends too early"),
+        (b"P6\n60000 60000\n255\n", "claims to be 60000 x 60000 pixels, more than any camera has"),
+        (b"P6\n600 600\n255\n", "is no image"),
+    ],
+    ids=["huge", "empty", "text", "cut", "huge PPM", "cut PPM"],
+)
+def test_a_picture_that_cannot_be_read_ends_it(capsys: Capture, tmp_path: Path, content: bytes, sentence: str) -> None:
+    (tmp_path / "a.jpg").write_bytes(content)
+    assert f"{tmp_path / 'a.jpg'}: {sentence}" in told(capsys, 1, "detect", tmp_path, *FOV)
+
+
+def test_a_video_that_cannot_be_decoded_ends_it(capsys: Capture, tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").write_bytes(b"no video")
+    assert "is no video that can be decoded" in told(capsys, 1, "detect", tmp_path, *FOV)
+
+
+def test_a_phones_picture_is_turned_as_it_was_held(capsys: Capture, tmp_path: Path) -> None:
+    """EXIF orientation 6: the sensor's image is to be turned to the right for showing."""
+    plain = cv2.imread(str(NEAR))
+    assert plain is not None
+    _, jpeg = cv2.imencode(".jpg", cv2.rotate(plain, cv2.ROTATE_90_COUNTERCLOCKWISE))
+    tag = b"Exif\0\0II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0x0112, 3, 1, 6, 0, 0)
+    data = jpeg.tobytes()
+    path = tmp_path / "held.jpg"
+    path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(tag) + 2) + tag + data[2:])
+    (turned,) = told_json(capsys, path, *FOV)["pictures"][0]["detections"]
+    left, top, width, height = truth()[1]["2.5_m_0.jpg"]
+    assert np.allclose(turned["box"], (left, top, left + width, top + height), atol=8)

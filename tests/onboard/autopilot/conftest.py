@@ -1,0 +1,31 @@
+"""A free UDP port, and an autopilot stand-in that hovers there."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+
+HOVER_M = 2.5
+HEARTBEAT_S = 0.25
+"""Quicker than PX4's, so that a story does not begin with a second of waiting."""
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.fixture
+def port() -> int:
+    return free_port()
+
+
+@pytest.fixture
+def fake_autopilot(port: int) -> Iterator[FakeAutopilot]:
+    with FakeAutopilot(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
+        yield fake_autopilot

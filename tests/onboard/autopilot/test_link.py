@@ -1,0 +1,296 @@
+"""MAVSDK itself against the fake autopilot over real UDP: what the link says is true, and what it is told happens."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from flockd.core.config.autopilot import AutopilotParameters
+from flockd.core.config.scenario import RangeFinderConfig
+from flockd.core.messages import Setpoint
+from flockd.onboard.autopilot.autopilot_status import AutopilotError, Firmware
+from flockd.onboard.autopilot.mavsdk_link import SETPOINT_TYPE_MASK, AutopilotLink
+from flockd.sim.autopilot.fake_autopilot import TICK_S, FakeAutopilot
+from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
+from flockd.sim.autopilot.fake_telemetry import TelemetryStreams
+from flockd.sim.autopilot.fake_vehicle import Demand, MotionState
+from tests.onboard.autopilot.conftest import HEARTBEAT_S, free_port
+from tests.onboard.autopilot.flight import flying, north, until
+
+
+def _parameters(port: int, system_id: int | None = None) -> AutopilotParameters:
+    return AutopilotParameters(address=f"udpin://127.0.0.1:{port}", system_id=system_id)
+
+
+def test_the_type_mask_says_horizontal_velocity_height_and_yaw() -> None:
+    ignored = (
+        mavlink.POSITION_TARGET_TYPEMASK_X_IGNORE
+        | mavlink.POSITION_TARGET_TYPEMASK_Y_IGNORE
+        | mavlink.POSITION_TARGET_TYPEMASK_VZ_IGNORE
+        | mavlink.POSITION_TARGET_TYPEMASK_AX_IGNORE
+        | mavlink.POSITION_TARGET_TYPEMASK_AY_IGNORE
+        | mavlink.POSITION_TARGET_TYPEMASK_AZ_IGNORE
+        | mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
+    )
+    assert ignored == SETPOINT_TYPE_MASK
+
+
+def test_telemetry_is_what_the_vehicle_does(port: int) -> None:
+    # Nose east, 30 degrees right side down; climbing to the north-east.
+    sin, cos = math.sin(math.radians(30.0)), math.cos(math.radians(30.0))
+    east_and_leaning = np.array([[0.0, -cos, sin], [1.0, 0.0, 0.0], [0.0, sin, cos]])
+    truth = MotionState(np.array([3.0, -4.0, -7.5]), np.array([1.0, 2.0, -0.5]), east_and_leaning)
+
+    def still(_demand: Demand, _interval_s: float) -> MotionState:
+        return truth
+
+    async def story() -> None:
+        link = await AutopilotLink.connect(_parameters(port))
+        await until(lambda: link.vehicle_state() is not None and link.status().battery_share is not None)
+        await until(lambda: None not in {link.status().estimate_ok, link.status().gps_ok} and link.status().in_air)
+        state, status = link.vehicle_state(), link.status()
+        assert state is not None
+        np.testing.assert_allclose(state.R_ned_body, east_and_leaning, atol=1e-6)
+        assert state.velocity_ned is not None
+        assert status.position_ned is not None
+        np.testing.assert_allclose(state.velocity_ned, truth.velocity, atol=1e-6)
+        assert state.height_m == pytest.approx(7.5, abs=1e-5)
+        assert 0.0 <= status.time_s - state.time_s < 0.5
+        np.testing.assert_allclose(status.position_ned, truth.position, atol=1e-6)
+        assert (status.flight_mode, status.armed, status.failsafe, status.in_air) == ("hold", True, False, True)
+        assert status.heartbeat_age_s < 2 * HEARTBEAT_S
+        assert (status.estimate_ok, status.gps_ok) == (True, True)
+        assert status.battery_share == pytest.approx(0.42)
+        assert status.battery_v == pytest.approx(14.0 + 2.8 * 0.42, abs=1e-3)
+
+        fake_autopilot.estimate_ok = False
+        await until(lambda: link.status().estimate_ok is False)
+        fake_autopilot.silent = True
+        await until(lambda: link.status().heartbeat_age_s > 4 * HEARTBEAT_S)
+        await link.close()
+
+    with FakeAutopilot(port, height_m=7.5, motion=still, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
+        fake_autopilot.battery_share = 0.42
+        asyncio.run(story())
+
+
+def test_a_landed_state_that_mavlink_does_not_have_is_unknown_and_counted(
+    port: int, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A vehicle in the air reports 2, then 5: MAV_LANDED_STATE ends at 4."""
+
+    def sends_5(self: TelemetryStreams) -> None:
+        self._mav.extended_sys_state_send(0, 5)
+
+    async def story() -> None:
+        link = await AutopilotLink.connect(_parameters(port))
+        await until(lambda: link.status().landed_state == "air")
+        monkeypatch.setattr(TelemetryStreams, "_send_landed", sends_5)
+        await until(lambda: link.status().landed_state == "unknown")
+        assert not link.status().in_air
+        assert link.unknown_values().keys() == {"EXTENDED_SYS_STATE.landed_state = 5"}
+        assert link.status().heartbeat_age_s < 2 * HEARTBEAT_S, "the link still receives"
+        await link.close()
+
+    asyncio.run(story())
+
+
+def test_firmware_and_failsafe_parameters_can_be_read(port: int, fake_autopilot: FakeAutopilot) -> None:
+    fake_autopilot.parameters |= {"COM_OF_LOSS_T": 0.75, "COM_OBL_RC_ACT": 4, "COM_LOW_BAT_ACT": -3}
+
+    async def story() -> None:
+        link = await AutopilotLink.connect(_parameters(port))
+        assert await link.parameter("COM_OF_LOSS_T", float) == 0.75
+        assert await link.parameter("COM_OBL_RC_ACT", int) == 4
+        assert await link.parameter("COM_LOW_BAT_ACT", int) == -3
+        assert await link.firmware() == Firmware("PX4", "0.0.1")
+        with pytest.raises(AutopilotError, match="parameter COM_OBL_RC_ACT could not be read"):
+            await link.parameter("COM_OBL_RC_ACT", float)
+        await link.close()
+
+    asyncio.run(story())
+
+
+def test_offboard_without_setpoints_is_refused_and_the_reason_told(port: int, fake_autopilot: FakeAutopilot) -> None:
+    async def story() -> None:
+        link = await AutopilotLink.connect(_parameters(port))
+        with pytest.raises(
+            AutopilotError, match=r"asked for offboard, which was refused for now: .*no offboard signal"
+        ):
+            await link.request_offboard()
+        assert fake_autopilot.mode == "LOITER"
+        await link.close()
+
+    asyncio.run(story())
+
+
+def test_the_vehicle_follows_the_velocity_and_holds_its_own_height(port: int, fake_autopilot: FakeAutopilot) -> None:
+    def setpoint() -> Setpoint:
+        return Setpoint(north().time_s, np.array([0.6, -0.8]), height_m=3.0, yaw_rad=-0.5)
+
+    async def story() -> None:
+        async with flying(port, setpoint) as flight:
+            await flight.enter_offboard()
+            assert fake_autopilot.mode == "OFFBOARD"
+            await asyncio.sleep(1.5)
+            state = flight.link.vehicle_state()
+            assert state is not None
+            assert state.velocity_ned is not None
+            np.testing.assert_allclose(state.velocity_ned, np.array([0.6, -0.8, 0.0]), atol=0.15)
+            assert state.height_m == pytest.approx(3.0, abs=0.15)
+            assert math.atan2(state.R_ned_body[1, 0], state.R_ned_body[0, 0]) == pytest.approx(-0.5, abs=0.05)
+            assert fake_autopilot.refused_setpoints == 0
+
+    asyncio.run(story())
+
+
+def test_a_setpoint_that_is_not_finite_never_leaves(port: int, fake_autopilot: FakeAutopilot) -> None:
+    async def story() -> None:
+        link = await AutopilotLink.connect(_parameters(port))
+        for broken in (
+            Setpoint(0.0, np.array([math.nan, 0.0]), 2.5, 0.0),
+            Setpoint(0.0, np.zeros(2), math.inf, 0.0),
+            Setpoint(0.0, np.zeros(2), 2.5, math.nan),
+        ):
+            with pytest.raises(AutopilotError, match="not finite"):
+                link.send_setpoint(broken)
+        await asyncio.sleep(0.1)
+        assert not fake_autopilot.setpoints
+        assert fake_autopilot.refused_setpoints == 0
+        await link.close()
+
+    asyncio.run(story())
+
+
+def test_arming_taking_off_and_landing_from_offboard(port: int) -> None:
+    async def story() -> None:
+        async with flying(port) as flight:
+            assert not flight.link.status().armed
+            await flight.link.arm()
+            await flight.link.take_off()
+            await until(lambda: fake_autopilot.mode == "LOITER" and fake_autopilot.state.position[2] < -2.3)
+            await until(lambda: flight.link.status().armed and flight.link.status().in_air)
+            await flight.enter_offboard()
+            await flight.link.land()
+            await until(lambda: fake_autopilot.mode == "LAND")
+            await until(lambda: not flight.streamer.report().streaming)
+
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
+        asyncio.run(story())
+
+
+def test_return_flies_home(port: int, fake_autopilot: FakeAutopilot) -> None:
+    async def story() -> None:
+        async with flying(port) as flight:
+            await flight.enter_offboard()
+            await until(lambda: fake_autopilot.state.position[0] > 1.0)
+            await flight.link.return_home()
+            await until(lambda: flight.link.status().flight_mode == "return")
+            await until(lambda: flight.link.status().flight_mode == "land")
+            assert abs(fake_autopilot.state.position[0]) < 0.5
+
+    asyncio.run(story())
+
+
+def test_two_links_on_two_ports_mind_their_own_vehicle(port: int, fake_autopilot: FakeAutopilot) -> None:
+    async def story() -> None:
+        async with flying(port) as one, flying(second_port, lambda: north(-0.5, height_m=4.0)) as two:
+            await asyncio.gather(one.enter_offboard(), two.enter_offboard())
+            await asyncio.sleep(1.5)
+            assert fake_autopilot.state.velocity[0] == pytest.approx(1.0, abs=0.15)
+            assert second.state.velocity[0] == pytest.approx(-0.5, abs=0.15)
+            assert (one.link.system_id, two.link.system_id) == (1, 9)
+
+    second_port = free_port()
+    with FakeAutopilot(second_port, system_id=9, height_m=4.0, heartbeat_s=HEARTBEAT_S) as second:
+        asyncio.run(story())
+
+
+def test_the_stand_in_runs_as_a_program_too(port: int) -> None:
+    async def story() -> None:
+        link = await AutopilotLink.connect(_parameters(port, system_id=4))
+        await until(lambda: link.vehicle_state() is not None)
+        state = link.vehicle_state()
+        assert state is not None
+        assert state.height_m == pytest.approx(6.0)
+        await link.close()
+
+    options = ["--port", str(port), "--system-id", "4", "--height", "6"]
+    with subprocess.Popen([sys.executable, "-m", "flockd.sim.autopilot.fake_autopilot", *options]) as program:
+        try:
+            asyncio.run(story())
+        finally:
+            program.kill()
+
+
+def test_a_stand_in_that_is_late_for_every_tick_still_hears(port: int) -> None:
+    """As on a busy computer: to fly on takes it longer than a tick."""
+
+    def slow(demand: Demand, interval_s: float) -> MotionState:
+        if interval_s > 0.0:
+            time.sleep(2 * TICK_S)
+        return MotionState(np.array([0.0, 0.0, -2.5]), np.zeros(3), np.eye(3))
+
+    async def story() -> None:
+        link = await AutopilotLink.connect(_parameters(port))
+        assert await link.parameter("COM_OBL_RC_ACT", int) == 5
+        link.send_setpoint(north())
+        await until(lambda: len(fake_autopilot.setpoints) == 1)
+        await link.close()
+
+    with FakeAutopilot(port, height_m=2.5, motion=slow, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
+        asyncio.run(story())
+
+
+def test_nobody_there_is_told_with_what_to_check(port: int) -> None:
+    with pytest.raises(AutopilotError, match=f"no autopilot was heard at udpin://127.0.0.1:{port} within 0.3 s"):
+        asyncio.run(AutopilotLink.connect(_parameters(port), timeout_s=0.3))
+
+
+def test_somebody_elses_autopilot_is_not_taken_for_the_own(port: int, fake_autopilot: FakeAutopilot) -> None:
+    with pytest.raises(AutopilotError, match=r"no autopilot with system id 5 .* heard instead: 1"):
+        asyncio.run(AutopilotLink.connect(_parameters(port, system_id=5), timeout_s=0.7))
+
+
+def test_two_programs_cannot_command_one_drone(port: int, fake_autopilot: FakeAutopilot) -> None:
+    async def story() -> None:
+        link = await AutopilotLink.connect(_parameters(port))
+        with pytest.raises(AutopilotError, match="is another program on it"):
+            await AutopilotLink.connect(_parameters(port))
+        await link.close()
+
+    asyncio.run(story())
+
+
+def test_the_range_finder_is_heard_along_the_bodys_down_axis_and_falls_silent_with_it(port: int) -> None:
+    """Leaning by 30 degrees at 6 m: the slant range is 6 m / cos 30; out of its reach it sends no signal."""
+    sin, cos = math.sin(math.radians(30.0)), math.cos(math.radians(30.0))
+    leaning = np.array([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])
+    place = np.array([0.0, 0.0, -6.0])
+    config = RangeFinderConfig(noise=0.0, tilt_deg=0.0, dropouts_per_min=0.0, max_m=12.0)
+
+    def still(_demand: Demand, _interval_s: float) -> MotionState:
+        return MotionState(place.copy(), np.zeros(3), leaning)
+
+    async def story() -> None:
+        link = await AutopilotLink.connect(_parameters(port))
+        await until(lambda: (state := link.vehicle_state()) is not None and state.ground_range is not None)
+        reading = link.ground_range()
+        assert reading is not None
+        assert reading.range_m == pytest.approx(6.0 / cos, abs=0.05)  # 0.01 m of noise, and centimetres
+        assert (reading.min_m, reading.max_m, reading.quality) == pytest.approx((0.15, 12.0, 1.0))
+        place[2] = -15.0
+        await until(lambda: (reading := link.ground_range()) is not None and reading.quality == 0.0)
+        assert set(link.range_finders()) == {25}
+        await link.close()
+
+    finder = FakeRangeFinder(config, level_ground, (0,))
+    with FakeAutopilot(port, height_m=6.0, motion=still, heartbeat_s=HEARTBEAT_S, range_finder=finder):
+        asyncio.run(story())

@@ -1,0 +1,206 @@
+"""What received MAVLink messages say, among them values that no enumeration has."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from flockd.onboard.autopilot.mavlink_messages import ENUMERATIONS, RESULTS, ReceivedMessages, result_text
+
+
+def _received(*messages: tuple[str, dict[str, Any]]) -> tuple[ReceivedMessages, list[str]]:
+    log: list[str] = []
+    received = ReceivedMessages(log.append)
+    for number, (name, fields) in enumerate(messages):
+        received.add(name, fields, float(number))
+    return received, log
+
+
+def _values(enumeration: str) -> set[int]:
+    return {value for value, entry in mavlink.enums[enumeration].items() if not entry.name.endswith("_ENUM_END")}
+
+
+def test_the_enumerations_are_those_of_mavlink() -> None:
+    fields = {"landed_state": "MAV_LANDED_STATE", "fix_type": "GPS_FIX_TYPE", "system_status": "MAV_STATE"}
+    for (_, field), count in ENUMERATIONS.items():
+        assert _values(fields[field]) == set(range(count))
+    assert _values("MAV_RESULT") <= set(range(len(RESULTS)))  # pymavlink lacks the newest
+
+
+@pytest.mark.parametrize("landed_state", [5, 77, 255])
+def test_an_unknown_landed_state_is_unknown_counted_and_logged_once(landed_state: int) -> None:
+    message = ("EXTENDED_SYS_STATE", {"landed_state": landed_state})
+    received, log = _received(("EXTENDED_SYS_STATE", {"landed_state": 2}), message, message)
+    status = received.status(now_s=3.0)
+    assert (status.landed_state, status.in_air) == ("unknown", False)
+    value = f"EXTENDED_SYS_STATE.landed_state = {landed_state}"
+    assert received.unknown_values() == {value: 2}
+    assert log == [f"the autopilot sends {value}, which flockd does not know; it counts as unknown"]
+    received.add(*("EXTENDED_SYS_STATE", {"landed_state": 1}), 3.0)
+    assert received.status(now_s=4.0).landed_state == "ground", "a known value counts again"
+
+
+def test_an_unknown_fix_or_system_status_says_nothing() -> None:
+    received, _ = _received(("GPS_RAW_INT", {"fix_type": 9}), ("HEARTBEAT", {"system_status": 9, "custom_mode": 0}))
+    status = received.status(now_s=2.0)
+    assert (status.gps_ok, status.failsafe, status.heartbeat_age_s) == (None, False, 1.0)
+    assert sum(received.unknown_values().values()) == 2
+
+
+@pytest.mark.parametrize("percent", [-128, -2, 101, 127])
+def test_a_battery_that_cannot_be_is_unknown_and_not_empty(percent: int) -> None:
+    received, log = _received(("SYS_STATUS", {"battery_remaining": percent}))
+    assert received.status(now_s=2.0).battery_share is None
+    assert received.unknown_values() == {f"SYS_STATUS.battery_remaining = {percent}": 1}
+    assert len(log) == 1
+
+
+@pytest.mark.parametrize("quaternion", [(0.0, 0.0, 0.0, 0.0), (1e30, 0.0, 0.0, 0.0), (0.5, 0.5, 0.5, 0.0)])
+def test_a_quaternion_without_direction_is_no_attitude(quaternion: tuple[float, ...]) -> None:
+    place = dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 0.0)
+    fields = dict(zip(("q1", "q2", "q3", "q4"), quaternion, strict=True))
+    received, _ = _received(("LOCAL_POSITION_NED", place), ("ATTITUDE_QUATERNION", fields))
+    assert received.vehicle_state() is None
+    received.add("ATTITUDE_QUATERNION", {"q1": 1.0, "q2": 0.0, "q3": 0.0, "q4": 0.0}, 3.0)
+    assert received.vehicle_state() is not None
+
+
+def test_known_values_are_not_counted() -> None:
+    received, log = _received(
+        ("EXTENDED_SYS_STATE", {"landed_state": 4}),
+        ("GPS_RAW_INT", {"fix_type": 8}),
+        ("HEARTBEAT", {"system_status": 5, "custom_mode": 6 << 16}),
+    )
+    status = received.status(now_s=3.0)
+    assert (status.landed_state, status.gps_ok, status.failsafe, status.flight_mode) == (
+        "landing", True, True, "offboard",
+    )  # fmt: skip
+    assert (received.unknown_values(), log) == ({}, [])
+
+
+def test_a_home_that_moves_counts_on_the_ground_only_and_with_an_unknown_landed_state_never_raises() -> None:
+    home = [("HOME_POSITION", {"x": 0.0, "y": 0.0, "z": float(down)}) for down in (-1, -2, -3)]
+    landed = [("EXTENDED_SYS_STATE", {"landed_state": value}) for value in (2, 5)]
+    received, _ = _received(home[0], landed[0], home[1])
+    assert received.home_down_m == -1.0
+    received, _ = _received(home[0], landed[1], home[2])
+    assert received.home_down_m == -3.0
+
+
+def test_an_unknown_result_of_a_command_has_words_too() -> None:
+    assert result_text(4) == "failed"
+    assert result_text(200) == "answered with the unknown result 200"
+
+
+ARMED, DISARMED = {"base_mode": 128, "custom_mode": 6 << 16}, {"base_mode": 0, "custom_mode": 6 << 16}
+GROUND, AIR = {"landed_state": 1}, {"landed_state": 2}
+
+
+def _home(north_m: float, down_m: float) -> tuple[str, dict[str, Any]]:
+    return "HOME_POSITION", {"x": north_m, "y": 0.0, "z": down_m}
+
+
+def test_home_stays_while_armed_whatever_landed_state_and_home_say_and_moves_after() -> None:
+    position = ("LOCAL_POSITION_NED", {"x": 0.0, "y": 0.0, "z": -5.0, "vx": 0.0, "vy": 0.0, "vz": 0.0})
+    attitude = ("ATTITUDE_QUATERNION", {"q1": 1.0, "q2": 0.0, "q3": 0.0, "q4": 0.0})
+    received, log = _received(_home(0.0, 0.0), ("HEARTBEAT", ARMED), ("EXTENDED_SYS_STATE", GROUND), position, attitude)
+    received.add(*_home(1.0, -0.2), 6.0)
+    assert received.home_down_m == -0.2, "PX4 sets home when it is armed, still on the ground"
+    received.add("EXTENDED_SYS_STATE", AIR, 7.0)
+    received.add("EXTENDED_SYS_STATE", GROUND, 8.0)  # a second sender with the autopilot's ids
+    received.add(*_home(50.0, 20.0), 9.0)
+    received.add(*_home(60.0, 20.0), 10.0)
+    status, vehicle = received.status(11.0), received.vehicle_state()
+    assert status.home_ned is not None and vehicle is not None
+    assert list(status.home_ned) == [1.0, 0.0, -0.2]
+    assert vehicle.height_m == pytest.approx(4.8)  # -0.2 + 5.0
+    assert log == [
+        "the autopilot reports that the drone is on the ground, still armed",
+        "the autopilot's home moved by 53.0 m in flight; "  # sqrt(49^2 + 20.2^2)
+        "height band and fence stay where they were until it is disarmed",
+    ]
+    received.add("HEARTBEAT", DISARMED, 12.0)
+    received.add(*_home(2.0, -0.1), 13.0)
+    assert received.home_down_m == -0.1
+
+
+def test_a_home_that_is_not_finite_is_none() -> None:
+    received, _ = _received(("HOME_POSITION", {"x": None, "y": 0.0, "z": 0.0}), _home(float("inf"), 0.0))
+    assert received.home_down_m is None
+    assert received.status(3.0).home_ned is None
+
+
+def _text(chunk: str, number: int = 0, sequence: int = 0) -> tuple[str, dict[str, Any]]:
+    return "STATUSTEXT", {"severity": 4, "text": chunk, "id": number, "chunk_seq": sequence}
+
+
+def test_a_text_in_chunks_is_seen_whole_and_not_before() -> None:
+    sentence = "Preflight Fail: the battery is far below what a take-off needs, and the compass disagrees with the yaw"
+    received, _ = _received(_text("short"), _text(sentence[:50], 7, 0), _text(sentence[50:100], 7, 1))
+    newest = received.newest("STATUSTEXT")
+    assert newest is not None
+    assert newest.fields["text"] == "short"
+    received.add(*_text(sentence[100:], 7, 2), 3.0)
+    newest = received.newest("STATUSTEXT")
+    assert newest is not None
+    assert (newest.fields["text"], newest.time_s) == (sentence, 3.0)
+
+
+def test_a_chunk_that_is_lost_is_marked_and_does_not_mix_texts() -> None:
+    received, _ = _received(_text("a" * 50, 7, 0), _text("end", 7, 2), _text("b" * 50, 8, 0), _text("tail", 8, 1))
+    newest = received.newest("STATUSTEXT")
+    assert newest is not None
+    assert newest.fields["text"] == "b" * 50 + "tail"
+    lost, _ = _received(_text("a" * 50, 7, 0), _text("end", 7, 2))
+    newest = lost.newest("STATUSTEXT")
+    assert newest is not None
+    assert newest.fields["text"] == "a" * 50 + "...end"
+
+
+POSE = (
+    ("ATTITUDE_QUATERNION", {"q1": 1.0, "q2": 0.0, "q3": 0.0, "q4": 0.0}),
+    ("LOCAL_POSITION_NED", {"x": 0.0, "y": 0.0, "z": -4.0, "vx": 0.0, "vy": 0.0, "vz": 0.0}),
+)
+
+
+def _distance(orientation: int, current: int, signal: int = 0) -> tuple[str, dict[str, Any]]:
+    limits = {"min_distance": 15, "max_distance": 2000}
+    return "DISTANCE_SENSOR", {
+        **limits, "current_distance": current, "orientation": orientation, "signal_quality": signal
+    }  # fmt: skip
+
+
+def test_the_range_is_that_of_the_sensor_which_faces_down() -> None:
+    down = int(mavlink.MAV_SENSOR_ROTATION_PITCH_270)
+    received, _ = _received(*POSE, _distance(down, 412, 100), _distance(0, 90))
+    state = received.vehicle_state()
+    assert state is not None
+    reading = state.ground_range
+    assert reading is not None
+    assert (reading.time_s, reading.range_m, reading.min_m, reading.max_m) == pytest.approx((2.0, 4.12, 0.15, 20.0))
+    assert (reading.quality, reading.vertical) == (1.0, False)
+    assert received.range_finders() == {down: (2.0,), 0: (3.0,)}
+    for signal, quality in ((0, None), (1, 0.0), (51, pytest.approx(0.505, abs=0.001))):
+        received.add(*_distance(down, 412, signal), 4.0)
+        newest = received.ground_range()
+        assert newest is not None
+        assert newest.quality == quality
+
+
+def test_px4s_distance_to_bottom_serves_where_no_sensor_is_heard() -> None:
+    nothing, _ = _received(*POSE, _distance(0, 90), ("ALTITUDE", {"bottom_clearance": None}))
+    assert nothing.ground_range() is None
+    received, _ = _received(*POSE, ("ALTITUDE", {"bottom_clearance": 3.9}))
+    reading = received.ground_range()
+    assert reading is not None
+    assert (reading.time_s, reading.range_m, reading.vertical, reading.max_m) == (2.0, 3.9, True, None)
+    received.add(*_distance(25, 412), 2.1)
+    newest = received.ground_range()
+    assert newest is not None
+    assert not newest.vertical, "the sensor's own reading is preferred"
+    received.add("ALTITUDE", {"bottom_clearance": 3.8}, 2.7)
+    newest = received.ground_range()
+    assert newest is not None
+    assert newest.vertical, "until it is silent"

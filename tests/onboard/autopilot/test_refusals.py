@@ -1,0 +1,269 @@
+"""Why an autopilot refuses to arm or to fly offboard, from its messages: PX4's own events, flags and texts."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+from typing import Any
+
+import pytest
+
+from flockd.core.config.autopilot import AutopilotParameters
+from flockd.onboard.autopilot.autopilot_status import AutopilotError
+from flockd.onboard.autopilot.mavlink_messages import ReceivedMessages
+from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
+from flockd.onboard.autopilot.refusal_reasons import NAMES, REASONS, event_number
+from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from tests.onboard.autopilot.flight import flying, until
+
+HOLD, POSITION, LAND, OFFBOARD = (4 << 16 | 3 << 24), 3 << 16, (4 << 16 | 6 << 24), 6 << 16
+ARMED = 128
+ALL_MODES = 0xFFFFFFFF
+SUMMARY, END = 16777216 + 11047904, 16777216 + 1914663
+"""PX4 1.18's numbers, from the metadata it was built with."""
+
+
+class Story:
+    """What an autopilot has sent, and when."""
+
+    def __init__(self, mode: int = HOLD, base_mode: int = 0) -> None:
+        self.log: list[str] = []
+        self.received = ReceivedMessages(self.log.append)
+        self.now_s, self._sequence = 100.0, 65533
+        self.send("HEARTBEAT", custom_mode=mode, base_mode=base_mode, system_status=3)
+
+    def send(self, name: str, **fields: Any) -> None:
+        self.received.add(name, fields, self.now_s)
+
+    def event(self, number: int, arguments: bytes, level: int = 3) -> None:
+        self._sequence = (self._sequence + 1) & 0xFFFF
+        data = list(arguments.ljust(40, b"\0"))
+        self.send("EVENT", id=number, arguments=data, log_levels=level, sequence=self._sequence)
+
+    def report(self, can_arm: int, can_run: int, *checks: tuple[int, int, int]) -> None:
+        self.event(SUMMARY, struct.pack("<BIIII", 0, 0, 0, can_arm, can_run), 8)
+        for number, modes, level in checks:
+            self.event(16777216 + number, struct.pack("<IB", modes, 20), level)
+        self.event(END, b"", 8)
+
+    def lose_an_event(self) -> None:
+        self._sequence += 1
+
+    def sentences(self, *, streams: bool = False) -> list[str]:
+        return [refusal.sentence for refusal in self.received.refusals(self.now_s, streams=streams)]
+
+
+def test_numbers_follow_from_names_as_px4_makes_them() -> None:
+    numbers = {
+        "check_gyro_not_calibrated": 1326449,
+        "check_modes_offboard_signal_lost": 11464574,
+        "check_battery_low": 5049764,
+        "commander_arming_check_summary": 11047904,
+        "check_open_drone_id_missing": 10161216,
+    }
+    assert {name: event_number(name) - 16777216 for name in numbers} == numbers
+    assert len(NAMES) == len(REASONS), "no two reasons share a number"
+    assert all(reason.what and reason.remedy for reason in REASONS.values())
+
+
+IDLE_IN_SITL = ((11464574, 0x4000, 3), (377561, 0x8, 6), (453929, ALL_MODES, 4), (6801787, ALL_MODES, 6))
+"""What PX4 SITL 1.18 sends while all is well: no setpoints, no mission, no sticks, no ground station."""
+
+
+def test_a_drone_that_may_be_armed_has_nothing_to_say_while_flockd_does_not_stream() -> None:
+    story = Story()
+    story.report(0x807F3AB0, 0x807F3AB0, *IDLE_IN_SITL)
+    assert story.sentences() == []
+    assert not story.received.check_events.incomplete
+    (refusal,) = story.received.refusals(story.now_s, streams=True)
+    assert (refusal.reason, refusal.refused) == ("check_modes_offboard_signal_lost", "offboard")
+    assert refusal.sentence.startswith(
+        "the autopilot refuses offboard: it receives no setpoints although flockd sends them; check that"
+    )
+
+
+def test_landed_in_land_mode_it_cannot_be_armed_and_says_which_mode_to_select() -> None:
+    story = Story(LAND)
+    story.report(0x80430A90, 0x807F3AB0, *IDLE_IN_SITL, (1871713, 0x3C3020 | 1 << 18, 6))
+    assert story.sentences() == [
+        "the autopilot refuses to arm: it cannot be armed in its flight mode; "
+        "select another mode first, as Hold or Position"
+    ]
+
+
+def test_sticks_are_missed_in_position_mode_alone() -> None:
+    story = Story(POSITION)
+    story.report(0x807F3AB0, 0x807F3AB0, *IDLE_IN_SITL)
+    (sentence,) = story.sentences()
+    assert sentence.startswith("the autopilot refuses to arm: its flight mode needs sticks")
+    story.send("HEARTBEAT", custom_mode=HOLD, base_mode=0, system_status=3)
+    assert story.sentences() == []
+
+
+def test_the_cause_comes_first_each_reason_once_and_no_more_than_five() -> None:
+    story = Story()
+    names = [
+        "check_battery_low",
+        "check_gyro_missing",
+        "check_mag_missing",
+        "check_baro_missing",
+        "check_accel_missing",
+    ]
+    checks = [(event_number(name) - 16777216, ALL_MODES, 3) for name in names]
+    lost = (event_number("check_estimator_missing_data") - 16777216, ALL_MODES, 3)
+    story.report(0, 0, *checks, lost, lost)
+    sentences = story.sentences()
+    assert len(sentences) == 5
+    assert "its estimator has not started" in sentences[0]
+    assert "the battery is low" in sentences[1]
+    assert sentences[-1].endswith("(1 further reason)")
+
+
+def test_a_list_with_a_lost_event_is_not_believed_and_asked_for_anew() -> None:
+    story = Story()
+    story.report(0, 0, (5049764, ALL_MODES, 3))
+    story.event(SUMMARY, struct.pack("<BIIII", 0, 0, 0, ALL_MODES, ALL_MODES), 8)
+    story.lose_an_event()
+    story.event(END, b"", 8)
+    assert story.received.check_events.incomplete
+    assert "the battery is low" in story.sentences()[0], "the last whole list holds"
+    story.report(ALL_MODES, ALL_MODES)
+    assert (story.sentences(), story.received.check_events.incomplete) == ([], False)
+
+
+def test_a_check_without_words_here_is_told_by_its_number() -> None:
+    story = Story()
+    story.report(0, 0, (4711, ALL_MODES, 2))
+    (sentence,) = story.sentences()
+    assert "a check fails that flockd has no words for (event 16781927); read its checks" in sentence
+
+
+def test_in_the_air_only_what_keeps_it_from_offboard_is_told_and_in_offboard_nothing() -> None:
+    story = Story(HOLD, ARMED)
+    speed = (event_number("check_modes_offboard_no_local_velocity") - 16777216, 0x4000, 3)
+    story.report(0, ALL_MODES & ~0x4000, (5049764, ALL_MODES, 3), speed)
+    assert story.sentences(streams=True) == [
+        "the autopilot refuses offboard: it has no velocity, which flockd's setpoints need; "
+        "wait for satellites under open sky, or give it another source of position"
+    ]
+    story.send("HEARTBEAT", custom_mode=OFFBOARD, base_mode=ARMED, system_status=4)
+    assert story.sentences(streams=True) == []
+
+
+def test_who_switches_to_offboard_too_early_is_told_for_a_while() -> None:
+    story = Story()
+    story.report(ALL_MODES, ALL_MODES & ~0x4000, (11464574, 0x4000, 3))
+    assert story.sentences() == []
+    story.event(event_number("commander_modeswitch_not_avail"), struct.pack("<IB", OFFBOARD, 14), 2)
+    (sentence,) = story.sentences()
+    assert "as flockd sends none yet; fly in Hold or Position until flockd's state is ready" in sentence
+    story.now_s += 20.0
+    assert story.sentences() == []
+    story.send("HEARTBEAT", custom_mode=HOLD, base_mode=ARMED, system_status=4)
+    assert story.sentences() == [sentence], "in the air it counts whether somebody tries or not"
+
+
+@pytest.mark.parametrize(
+    ("event", "words"),
+    [
+        ("commander_arm_denied_throttle_unsafe", "the throttle is not at its lowest; move the stick down"),
+        ("commander_arm_denied_calibrating", "a calibration is under way; wait until the calibration is over"),
+    ],
+)
+def test_arming_that_was_refused_is_told_for_a_while(event: str, words: str) -> None:
+    story = Story()
+    story.report(ALL_MODES, ALL_MODES)
+    story.event(event_number(event), b"", 2)
+    assert words in story.sentences()[0]
+    story.now_s += 20.0
+    assert story.sentences() == []
+
+
+def test_a_firmware_without_events_is_understood_by_its_texts_and_flags() -> None:
+    story = Story()
+    story.send("HOME_POSITION", x=0.0, y=0.0, z=0.0)
+    story.send("SYS_STATUS", onboard_control_sensors_enabled=0x10200007, onboard_control_sensors_health=0x00200003)
+    assert story.sentences() == [
+        "the autopilot refuses to arm: not healthy: the compass; check the sensor and its cable, "
+        "or correct how many the autopilot's parameters SYS_HAS_... name"
+    ]
+    story.send("SYS_STATUS", onboard_control_sensors_enabled=0x10200007, onboard_control_sensors_health=0x10200003)
+    assert story.sentences() == [], "all checks pass: what is not healthy is not needed"
+    story.send("SYS_STATUS", onboard_control_sensors_enabled=0x10200007, onboard_control_sensors_health=0x00200003)
+    story.send("STATUSTEXT", severity=2, text="Preflight Fail: Gyro 0 uncalibrated", id=0, chunk_seq=0)
+    story.send("ESTIMATOR_STATUS", flags=1)
+    sentences = " ".join(story.sentences())
+    assert 'a gyroscope is not calibrated ("Preflight Fail: Gyro 0 uncalibrated"); calibrate it' in sentences
+    assert "its estimator gives no attitude, height, velocity or position" in sentences
+    assert story.log == ["the autopilot says: Preflight Fail: Gyro 0 uncalibrated"]
+
+
+def test_state_and_failed_checks_alone_are_reasons_too() -> None:
+    story = Story()
+    story.send("HOME_POSITION", x=0.0, y=0.0, z=0.0)
+    story.send("SYS_STATUS", onboard_control_sensors_enabled=0x10000000, onboard_control_sensors_health=0)
+    assert "its checks before the flight fail; read its checks" in story.sentences()[0]
+    story.send("HEARTBEAT", custom_mode=HOLD, base_mode=0, system_status=2)
+    assert "a calibration is under way" in story.sentences()[0]
+
+
+def test_another_onboard_computer_is_a_reason_while_it_is_heard() -> None:
+    story = Story(OFFBOARD, ARMED)
+    story.received.add_other_heartbeat({"type": 6}, story.now_s)
+    assert story.sentences() == [], "a ground station is none"
+    story.received.add_other_heartbeat({"type": 18}, story.now_s)
+    assert story.sentences() == [
+        "the autopilot: another onboard computer is on its link, and both may send setpoints; "
+        "end one of the programs, or take it off the autopilot's links"
+    ]
+    story.now_s += 6.0
+    assert story.sentences() == []
+
+
+REFUSING = (
+    "check_estimator_missing_data",
+    "check_system_no_home_pos",
+    "check_man_control_kill_engaged",
+    "check_rc_dl_no_dllink",
+    "check_gf_violation_max_hor_dist",
+    "check_battery_critical",
+    "check_gyro_not_calibrated",
+    "check_mag_sys_has_mag_missing",
+    "check_avionics_power_low",
+    "check_cpuload_too_high",
+    "check_parachute_missing",
+    "check_system_safety_button",
+)
+
+
+def test_twelve_refusals_of_the_fake_autopilot_one_by_one_through_mavsdk(port: int) -> None:
+    async def story() -> None:
+        link = await AutopilotLink.connect(AutopilotParameters(address=f"udpin://127.0.0.1:{port}"))
+        await link.ask_for_checks()
+        await until(link.knows_checks)
+        for name in REFUSING:
+            fake_autopilot.failing = {name}
+            await until(lambda name=name: [r.reason for r in link.refusals()] == [name])  # type: ignore[misc]
+        with pytest.raises(AutopilotError) as refused:
+            await link.arm()
+        assert str(refused.value) == (
+            "the autopilot was asked to arm, which was refused for now: Arming denied: Resolve system health failures "
+            "first; its safety button was not pressed; press the safety button until its light stays on"
+        )
+        fake_autopilot.failing = set()
+        await until(lambda: not link.refusals())
+        await link.arm()
+        await link.close()
+
+    with FakeAutopilot(port) as fake_autopilot:
+        asyncio.run(story())
+
+
+def test_offboard_that_is_possible_is_not_refused_by_anything(port: int, fake_autopilot: FakeAutopilot) -> None:
+    async def story() -> None:
+        async with flying(port) as flight:
+            await flight.enter_offboard()
+            assert flight.link.refusals() == ()
+
+    asyncio.run(story())
+    assert fake_autopilot.armed

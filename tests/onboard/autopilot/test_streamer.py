@@ -1,0 +1,237 @@
+"""When setpoints are sent and when not, told on a fake clock with a fake autopilot."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flockd.core.config.autopilot import AutopilotParameters
+from flockd.core.messages import Setpoint
+from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus
+from flockd.onboard.autopilot.streamer import SetpointStreamer
+
+PERIOD_S = 0.05
+
+HOVERING = AutopilotStatus(
+    time_s=0.0,
+    heartbeat_age_s=0.1,
+    flight_mode="hold",
+    armed=True,
+    failsafe=False,
+    landed_state="air",
+    battery_share=1.0,
+    battery_v=16.0,
+    estimate_ok=True,
+    gps_ok=True,
+    position_ned=np.zeros(3),
+    home_ned=np.zeros(3),
+)
+
+
+class Story:
+    """A streamer that is stepped by hand every 50 ms, and what it sent."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.status = HOVERING
+        self.sent: list[tuple[float, Setpoint]] = []
+        self.gate_says: Setpoint | str | None = "pass"
+        self.cable_is_in = True
+        self.streamer = SetpointStreamer(
+            self._send, lambda: self.status, self._gate, AutopilotParameters(), clock=lambda: self.now
+        )
+
+    def _gate(self, setpoint: Setpoint) -> Setpoint | None:
+        return setpoint if isinstance(self.gate_says, str) else self.gate_says
+
+    def _send(self, setpoint: Setpoint) -> None:
+        if not self.cable_is_in:
+            raise AutopilotError("the cable is out")
+        self.sent.append((self.now, setpoint))
+
+    def go_on(self, duration_s: float, *, beating: bool = True, deciding: bool = True) -> int:
+        """Lets time pass; how many setpoints were sent in it."""
+        before = len(self.sent)
+        for _ in range(round(duration_s / PERIOD_S)):
+            self.now += PERIOD_S
+            if deciding:
+                self.streamer.offer(Setpoint(self.now, np.array([1.0, 0.0]), 2.5, 0.0))
+            if beating:
+                self.streamer.beat()
+            self.streamer.step()
+        return len(self.sent) - before
+
+    def autopilot(self, **changes: object) -> None:
+        self.status = replace(self.status, **changes)  # type: ignore[arg-type]
+
+    @property
+    def silence(self) -> str | None:
+        return self.streamer.report().silence
+
+
+@pytest.fixture
+def story() -> Story:
+    return Story()
+
+
+@pytest.fixture
+def in_offboard(story: Story) -> Story:
+    story.streamer.begin()
+    assert story.go_on(1.0) == 20
+    story.autopilot(flight_mode="offboard")
+    assert story.go_on(1.0) == 20
+    return story
+
+
+def test_nothing_is_sent_before_it_is_begun(story: Story) -> None:
+    assert story.go_on(1.0) == 0
+    assert story.silence == "not begun"
+
+
+def test_setpoints_flow_before_the_pilot_switches_to_offboard_whatever_the_mode_is(story: Story) -> None:
+    story.streamer.begin()
+    assert story.go_on(1.0) == 20
+    story.autopilot(flight_mode="position")
+    assert story.go_on(1.0) == 20
+    assert not story.streamer.report().offboard
+
+
+def test_a_dead_control_loop_is_silence_within_its_time_limit(in_offboard: Story) -> None:
+    died_s = in_offboard.now
+    in_offboard.go_on(3.0, beating=False)
+    assert in_offboard.sent[-1][0] - died_s <= 0.3
+
+
+def test_a_beating_loop_that_decides_nothing_any_more_is_silence_too(in_offboard: Story) -> None:
+    stopped_s = in_offboard.now
+    in_offboard.go_on(3.0, deciding=False)
+    assert in_offboard.sent[-1][0] - stopped_s <= 1.0
+
+
+def test_a_setpoint_from_the_future_or_with_no_date_is_not_sent(story: Story) -> None:
+    story.streamer.begin()
+    for date in (story.now + 60.0, math.nan):
+        story.streamer.offer(Setpoint(date, np.zeros(2), 2.5, 0.0))
+        assert story.go_on(0.5, deciding=False) == 0
+        assert story.silence == "the setpoint is not fresh"
+
+
+def test_a_setpoint_from_before_the_beginning_is_not_sent(story: Story) -> None:
+    story.go_on(0.2)
+    story.streamer.begin()
+    assert story.go_on(0.2, deciding=False) == 0
+
+
+def test_a_short_stumble_of_the_loop_is_forgiven(in_offboard: Story) -> None:
+    in_offboard.go_on(0.5, beating=False)
+    assert in_offboard.go_on(1.0) == 20
+
+
+def test_after_a_long_one_nothing_brings_the_stream_back_but_a_new_beginning(in_offboard: Story) -> None:
+    in_offboard.go_on(1.5, beating=False)
+    assert in_offboard.go_on(5.0) == 0
+    assert in_offboard.silence == "the control loop is late, for more than 0.5 s in offboard flight"
+    in_offboard.streamer.begin()
+    assert in_offboard.go_on(1.0) == 20
+
+
+def test_a_process_that_was_stopped_between_two_deadlines_does_not_go_on_where_it_was(in_offboard: Story) -> None:
+    in_offboard.now += 0.7
+    assert in_offboard.go_on(1.0) == 0
+    assert in_offboard.silence == "the thread was stopped, for more than 0.5 s in offboard flight"
+
+
+def test_a_gap_before_offboard_ends_nothing(story: Story) -> None:
+    story.streamer.begin()
+    story.go_on(3.0, beating=False)
+    assert story.go_on(1.0) == 20
+
+
+@pytest.mark.parametrize("mode", ["position", "hold", "return", "land", "manual", "other"])
+def test_when_the_pilot_takes_over_it_is_silent_at_once_and_for_good(in_offboard: Story, mode: str) -> None:
+    in_offboard.autopilot(flight_mode=mode)
+    assert in_offboard.go_on(1.0) == 0
+    assert in_offboard.silence == f"the autopilot left offboard for {mode}"
+    in_offboard.autopilot(flight_mode="offboard")
+    assert in_offboard.go_on(1.0) == 0
+    in_offboard.streamer.begin()
+    assert in_offboard.go_on(1.0) == 20
+
+
+def test_a_lost_link_is_silence_for_good(in_offboard: Story) -> None:
+    in_offboard.autopilot(heartbeat_age_s=2.1)
+    assert in_offboard.go_on(1.0) == 0
+    in_offboard.autopilot(heartbeat_age_s=0.1)
+    assert in_offboard.go_on(1.0) == 0
+    assert in_offboard.silence == "the autopilot's heartbeat is lost"
+
+
+def test_a_vehicle_in_its_failsafe_is_left_alone(story: Story) -> None:
+    """PX4 would go back to offboard as soon as setpoints come, though nobody asked for it."""
+    story.autopilot(failsafe=True)
+    story.streamer.begin()
+    assert story.go_on(1.0) == 0
+    assert story.silence == "the autopilot is in its failsafe"
+    story.autopilot(failsafe=False)
+    assert story.go_on(1.0) == 20
+
+
+def test_what_the_gate_makes_of_a_setpoint_is_what_is_sent(story: Story) -> None:
+    tamed = Setpoint(0.0, np.array([0.1, 0.0]), 2.0, 0.0)
+    story.gate_says = tamed
+    story.streamer.begin()
+    story.go_on(0.1)
+    assert story.sent[-1][1] is tamed
+
+
+def test_what_the_gate_refuses_is_counted_and_not_sent(story: Story) -> None:
+    story.gate_says = None
+    story.streamer.begin()
+    assert story.go_on(1.0) == 0
+    assert story.streamer.report().refused == {"the gate refused": 20}
+
+
+def test_a_cable_that_comes_out_is_told(story: Story) -> None:
+    story.streamer.begin()
+    story.cable_is_in = False
+    story.go_on(0.5)
+    assert story.streamer.report().refused == {"the cable is out": 10}
+
+
+def test_the_first_reason_for_an_end_is_kept(in_offboard: Story) -> None:
+    in_offboard.streamer.end("the supervisor holds")
+    in_offboard.streamer.end("closed")
+    assert in_offboard.go_on(1.0) == 0
+    assert in_offboard.silence == "the supervisor holds"
+
+
+def test_the_thread_keeps_its_rate_and_ends_when_the_gate_breaks() -> None:
+    sent: list[float] = []
+    gate_works = True
+
+    def gate(setpoint: Setpoint) -> Setpoint | None:
+        if not gate_works:
+            raise ZeroDivisionError("a bug")
+        return setpoint
+
+    streamer = SetpointStreamer(lambda _: sent.append(time.monotonic()), lambda: HOVERING, gate, AutopilotParameters())
+    streamer.start()
+    streamer.begin()
+    until_s = time.monotonic() + 1.0
+    while time.monotonic() < until_s:
+        streamer.offer(Setpoint(time.monotonic(), np.zeros(2), 2.5, 0.0))
+        streamer.beat()
+        time.sleep(0.02)
+    assert 10 <= len(sent) <= 22
+    gate_works = False
+    streamer.beat()
+    time.sleep(0.15)
+    before = len(sent)
+    time.sleep(0.2)
+    assert len(sent) == before
+    assert streamer.report().silence == "the streamer failed: ZeroDivisionError('a bug')"
+    streamer.close()

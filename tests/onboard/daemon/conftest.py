@@ -1,0 +1,5 @@
+"""The autopilot stand-in of the autopilot's own stories."""
+
+from tests.onboard.autopilot.conftest import fake_autopilot, port
+
+__all__ = ["fake_autopilot", "port"]

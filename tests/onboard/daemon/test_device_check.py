@@ -1,0 +1,54 @@
+"""The device check itself needs a virtual machine; these need nothing."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from flockd.core.config import load_drone
+
+ROOT = Path(__file__).parents[3]
+
+
+def test_without_its_programs_it_says_what_to_install(tmp_path: Path) -> None:
+    result = subprocess.run(
+        [sys.executable, "-m", "tools.checks.check_device"],
+        env={"PATH": str(tmp_path)},
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (result.returncode, result.stdout) == (69, "")
+    assert result.stderr == (
+        "check_device: e2fsprogs, mmdebstrap, qemu-system-x86 is not installed; "
+        "`sudo apt install e2fsprogs mmdebstrap qemu-system-x86`\n"
+    )
+
+
+def test_the_documentation_installs_what_the_unit_starts() -> None:
+    """The check runs these lines; a drone's owner does so by hand."""
+    _, _, section = (
+        (ROOT / "docs" / "real_drone.md").read_text(encoding="utf-8").partition("## Install it as a service")
+    )
+    install, start = re.findall(r"```sh\n(.*?)```", section, re.DOTALL)[:2]
+    unit = (ROOT / "systemd" / "flockd.service").read_text(encoding="utf-8")
+    command = re.search(r"^ExecStart=(\S+)/bin/flockd run --config (\S+)", unit, re.MULTILINE)
+    assert command is not None
+    environment, config = command.groups()
+    assert f"\npython3 -m venv {environment}\n" in install
+    assert f"\n{environment}/bin/pip install --require-hashes -r requirements/service.txt\n" in install
+    assert f"\n{environment}/bin/pip install --no-deps --no-build-isolation .\n" in install
+    assert re.findall(r"sudo.*(?:pip|venv)", install) == [], "no code of a package runs as root"
+    assert config in install
+    assert start == "sudo systemctl enable --now flockd\n"
+    for name in re.findall(r" ((?:config|systemd|requirements)/\S+)", install):
+        assert (ROOT / name).is_file(), name
+
+
+def test_its_drone_can_be_flown() -> None:
+    config = load_drone(ROOT / "tools" / "checks" / "device_check" / "drone.yaml")
+    assert config.source is not None
+    assert {camera.device for camera in config.source.cameras} == {"/dev/video10", "/dev/video20"}

@@ -1,0 +1,293 @@
+"""The daemon's small parts, one at a time."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flockd.core.config.drone import DroneConfig
+from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.core.config.source import SourceParameters
+from flockd.core.data import data_path
+from flockd.core.errors import UnavailableError
+from flockd.core.messages import Frame, RangeReading, VehicleState
+from flockd.flight.inference import OnnxModel
+from flockd.onboard.daemon.host_monitors import LoopLag, WallClock, hottest_zone_c
+from flockd.onboard.daemon.lock import only_instance
+from flockd.onboard.daemon.service_manager import ServiceManager
+from flockd.onboard.daemon.supervisor_inputs import CameraMonitor
+from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
+from flockd.onboard.daemon.worker import BusyError, LateError, Worker
+from flockd.onboard.sources import CameraStatus, Count
+from tests.onboard.daemon.aboard import TinyPerceiver
+
+IMAGE = np.zeros((48, 64, 3), np.uint8)
+FRAME = Frame("front", IMAGE, 0.0, 0)
+NO_DRONES = np.zeros((48, 64), np.uint8)
+
+
+def test_a_worker_answers_passes_errors_on_and_is_not_kept_by_a_job_that_hangs() -> None:
+    hang = threading.Event()
+
+    async def story() -> None:
+        worker = Worker("test")
+        assert await worker.do(5.0, divmod, 7, 2) == (3, 1)
+        with pytest.raises(ZeroDivisionError):
+            await worker.do(5.0, divmod, 7, 0)
+        with pytest.raises(TimeoutError, match="the job's own"):
+            await worker.do(5.0, _raises_timeout)
+        with pytest.raises(LateError, match=r"test: not done within 0\.05 s"):
+            await worker.do(0.05, hang.wait)
+        worker.submit(hang.wait)
+        with pytest.raises(BusyError, match="test: too many jobs wait"):
+            worker.submit(hang.wait)
+        hang.set()
+        worker.leave()
+
+    asyncio.run(story())
+
+
+def _raises_timeout() -> None:
+    raise TimeoutError("the job's own")
+
+
+def test_a_stuck_network_is_ended_then_abandoned_then_hopeless() -> None:
+    tiny = TinyPerceiver()
+    networks = WatchedNetworks(tiny, deadline_s=0.05)
+    networks.flow(FRAME, FRAME, NO_DRONES)
+    assert (networks.stuck, networks.hopeless) == (False, False)
+
+    tiny.hangs.set()
+    with pytest.raises(NetworkStuckError, match=r"took longer than 0\.05 s"):
+        networks.flow(FRAME, FRAME, NO_DRONES)
+    assert (networks.stuck, networks.ended, tiny.told_to_end, networks.hopeless) == (True, 1, 1, False)
+    networks.flow(FRAME, FRAME, NO_DRONES)
+    assert not networks.stuck, "it answers again"
+
+    tiny.ends_when_told = False
+    tiny.hangs.set()
+    for hopeless in (False, True):
+        with pytest.raises(NetworkStuckError):
+            networks.flow(FRAME, FRAME, NO_DRONES)
+        assert networks.hopeless is hopeless
+    tiny.hangs.clear()
+    networks.flow(FRAME, FRAME, NO_DRONES)
+    assert not networks.hopeless, "a worker of its own answers"
+
+
+def test_the_shipped_networks_end_when_told() -> None:
+    """A picture of 16 megapixels takes a flow network many seconds on any computer that flies."""
+    model = OnnxModel(data_path("models") / "flow.yaml", threads=1)
+    image = np.zeros((1, 4096, 4096, 3), np.uint8)
+    worker = Worker("test")
+    call = worker.submit(model.run, dict.fromkeys(model.manifest.inputs, image))
+    time.sleep(0.3)
+    assert not call.done()
+    told_s = time.monotonic()
+    while not call.done():
+        model.terminate()
+        time.sleep(0.01)
+    assert time.monotonic() - told_s < 5.0
+    with pytest.raises(Exception, match="terminate"):
+        call.result()
+    worker.leave(5.0)
+
+
+def test_a_network_with_an_output_that_is_not_finite_is_counted() -> None:
+    tiny = TinyPerceiver()
+    tiny.not_finite = 1
+    networks = WatchedNetworks(tiny, deadline_s=5.0)
+    with pytest.raises(FloatingPointError):
+        networks.flow(FRAME, FRAME, NO_DRONES)
+    assert (networks.faults, networks.stuck) == (1, False)
+
+
+@pytest.mark.parametrize("abstract", [False, True])
+def test_a_service_manager_hears_the_protocol_of_sd_notify(abstract: bool, tmp_path: Path) -> None:
+    name = f"@flockd-test-{os.getpid()}" if abstract else str(tmp_path / "notify")
+    now_s = 100.0
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(name.replace("@", "\0"))
+        manager.settimeout(1.0)
+        environment = {"NOTIFY_SOCKET": name, "WATCHDOG_USEC": "2000000", "WATCHDOG_PID": str(os.getpid())}
+        service = ServiceManager(environment, clock=lambda: now_s)
+        service.starting("waits", 2.5)
+        assert manager.recv(999) == b"EXTEND_TIMEOUT_USEC=2500000\nSTATUS=waits"
+        service.ready("idle")
+        assert manager.recv(999) == b"READY=1\nSTATUS=idle"
+        service.reloading()
+        lines = manager.recv(999).decode().splitlines()
+        assert lines[0] == "RELOADING=1"
+        assert int(lines[1].removeprefix("MONOTONIC_USEC=")) == pytest.approx(time.monotonic() * 1e6, abs=1e6)
+        for now_s in (100.0, 100.1, 100.4, 100.6, 100.7):  # noqa: B007 - read by the service's clock
+            service.alive()
+        service.stopping()
+        assert [manager.recv(999) for _ in range(3)] == [b"WATCHDOG=1", b"WATCHDOG=1", b"STOPPING=1"]
+
+
+def test_without_a_service_manager_or_its_watchdog_nothing_is_said_and_nothing_fails(tmp_path: Path) -> None:
+    ServiceManager({}).ready("idle")
+    ServiceManager({"NOTIFY_SOCKET": str(tmp_path / "none"), "WATCHDOG_USEC": "1"}).alive()
+    other = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "1", "WATCHDOG_PID": "1"}
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(other["NOTIFY_SOCKET"])
+        manager.setblocking(False)
+        ServiceManager(other).alive()
+        with pytest.raises(BlockingIOError):
+            manager.recv(999)
+
+
+def test_the_lock_is_free_again_when_its_holder_was_killed(tmp_path: Path) -> None:
+    environment = {"XDG_RUNTIME_DIR": str(tmp_path)}
+    hold = (
+        "import sys, time\nfrom flockd.onboard.daemon.lock import only_instance\n"
+        f"with only_instance('one', {environment!r}):\n    print('held', flush=True)\n    time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", hold], stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        told = rf"another flockd \(process {holder.pid}\) flies drone 'one'"
+        with pytest.raises(UnavailableError, match=told), only_instance("one", environment):
+            pytest.fail("two hold it")
+        with only_instance("two", environment):
+            holder.kill()
+    with only_instance("one", environment):
+        assert (tmp_path / "flockd-one.lock").read_text(encoding="utf-8") == f"{os.getpid()}\n"
+
+
+def test_the_hottest_zone_counts_and_one_that_cannot_be_read_does_not(tmp_path: Path) -> None:
+    assert hottest_zone_c(tmp_path) is None
+    for number, reading in enumerate(("41500", "67250", "", "off")):
+        (tmp_path / f"thermal_zone{number}").mkdir()
+        (tmp_path / f"thermal_zone{number}" / "temp").write_text(reading, encoding="ascii")
+    assert hottest_zone_c(tmp_path) == 67.25
+
+
+def test_a_blocked_event_loop_is_seen_while_it_is_and_after() -> None:
+    async def story() -> tuple[float, float]:
+        lag = LoopLag(time.monotonic)
+        task = asyncio.create_task(lag.run())
+        await asyncio.sleep(0.2)
+        before_s = lag.worst_s()
+        time.sleep(0.5)
+        await asyncio.sleep(0.1)
+        task.cancel()
+        return before_s, lag.worst_s()
+
+    before_s, after_s = asyncio.run(story())
+    assert after_s > 0.4
+    assert before_s < after_s
+
+
+def test_a_clock_that_was_set_is_told_once() -> None:
+    told: list[str] = []
+    ahead_s = 1.7e9
+    watch = WallClock(told.append, lambda: 5.0, lambda: 5.0 + ahead_s)
+    watch.check()
+    assert told == []
+    ahead_s -= 3600.0
+    watch.check()
+    watch.check()
+    assert told == ["the wall clock was set by -3600.0 s; the flight does not use it"]
+
+
+def _status(fault: str | None, **counts: int) -> dict[str, CameraStatus]:
+    known: dict[Count, int] = {"received": 0, **counts}  # type: ignore[dict-item]
+    return {"front": CameraStatus(0.1, fault, known)}
+
+
+def test_monitor_tell_frozen_from_unplugged_and_count_bad_frames_of_late() -> None:
+    monitor = CameraMonitor(_flyable("front"))
+    fine = monitor.update(0.0, _status(None, received=100, frozen=3)).cameras["front"]
+    assert (fine.unplugged, fine.frozen, fine.period_s) == (False, False, 0.1)
+    gone = monitor.update(1.0, _status("front: no such device", received=100, frozen=3)).cameras["front"]
+    assert (gone.unplugged, gone.frozen) == (True, False)
+    monitor.update(2.0, _status(None, received=110, frozen=3))
+    frozen = monitor.update(3.0, _status("front: the image is frozen", received=120, frozen=5)).cameras["front"]
+    assert (frozen.unplugged, frozen.frozen) == (False, True)
+    late = monitor.update(4.0, _status(None, received=140, corrupt=10))
+    assert late.dropped_share == 10 / 40
+    assert monitor.update(12.0, _status(None, received=150, corrupt=10)).dropped_share == 0.0
+
+
+def _flyable(*cameras: str) -> DroneConfig:
+    lens = IntrinsicsConfig(fx=32.0, fy=32.0, cx=32.0, cy=24.0)
+    rig = RigConfig(cameras=tuple(CameraConfig(name=name, size_px=(64, 48), intrinsics=lens) for name in cameras))
+    return DroneConfig(rig=rig, source=SourceParameters(kind="shared_memory"))
+
+
+def test_images_found_useless_when_decoded_count_against_the_few_that_are_decoded() -> None:
+    """A camera at 30 Hz of which every fifteenth image is used: 20 of 300, and yet all that anybody saw of it."""
+    monitor = CameraMonitor(_flyable("front"))
+    monitor.update(0.0, _status(None, received=0, used=0))
+    assert monitor.update(1.0, _status(None, received=300, used=15, corrupt=5, undecodable=5)).dropped_share == 5 / 20
+    assert monitor.update(2.0, _status(None, received=600, used=40), noisy_images=10).dropped_share == 10 / 40
+    assert monitor.update(3.0, _status(None, received=900, used=40, corrupt=600)).dropped_share == 600 / 900
+
+
+def test_a_camera_whose_images_are_noise_for_three_of_its_periods_is_lost() -> None:
+    monitor = CameraMonitor(_flyable("front", "back"))
+    status = {**_status(None), "back": _status(None)["front"]}
+
+    def lost(now: float, *noisy: str) -> list[str]:
+        return [name for name, health in monitor.update(now, status, noisy).cameras.items() if health.noisy]
+
+    assert lost(10.0) == []
+    assert lost(10.25, "front") == []  # at 10 Hz, 0.3 s are allowed
+    assert lost(10.35, "front") == ["front"]
+    assert lost(10.4) == []
+
+
+def test_frames_get_the_vehicle_state_of_their_time() -> None:
+    from flockd.onboard.daemon.vehicle_history import VehicleHistory
+
+    history = VehicleHistory()
+    assert history.at(1.0) is None
+    for number in range(100):
+        yaw = math.radians(number)
+        turned = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+        velocity = np.array([0.1 * number, 0.0, 0.0])
+        history.add(VehicleState(100.0 + 0.05 * number, turned, height_m=float(number), velocity_ned=velocity))
+    found = [history.at(time_s) for time_s in (104.62, 104.95, 103.0, math.inf, 7.0)]
+    assert [state and state.height_m for state in found] == pytest.approx([92.4, 99.0, 60.0, 99.0, 99.0])
+    between = found[0]
+    assert between is not None
+    assert between.velocity_ned is not None
+    assert between.velocity_ned[0] == pytest.approx(9.24)
+    assert math.degrees(math.atan2(between.R_ned_body[1, 0], between.R_ned_body[0, 0])) == pytest.approx(92.4)
+
+
+def test_frames_get_the_range_that_was_taken_nearest_to_them() -> None:
+    """Between two ranges there is none: over an edge, their mean would be of nothing."""
+    from flockd.onboard.daemon.vehicle_history import VehicleHistory
+
+    history, level = VehicleHistory(), np.eye(3)
+    for time_s, reading in (
+        (1.0, RangeReading(0.98, 4.0)),
+        (1.1, RangeReading(1.09, 2.5)),
+        (1.2, None),
+    ):
+        history.add(VehicleState(time_s, level, 4.0, ground_range=reading))
+    found = [history.at(time_s) for time_s in (1.02, 1.06, 1.18)]
+    assert [state and state.ground_range and state.ground_range.range_m for state in found] == [4.0, 2.5, 2.5]
+
+
+def test_a_range_finder_that_fails_is_an_event_and_so_is_its_return() -> None:
+    from flockd.onboard.daemon.pilot_loop import HeightReports
+
+    reports = HeightReports()
+    weak = "height: the range finder's signal is too weak; the barometer's is used"
+    old = "height: the range is too old; the barometer's is used"
+    steps = ((), ("camera left: no frame", weak), (weak,), (old,), ("camera left: no frame",), ())
+    found = [reports.update(reasons) for reasons in steps]
+    assert found == [None, weak, None, old, "height: the range finder works again", None]

@@ -1,0 +1,148 @@
+"""A simulated drone's daemon lives in simulated time, and steps with each frame of a camera as slow as its steps."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flockd.core.config import load_drone
+from flockd.core.errors import ConfigError
+from flockd.core.messages import Frame, FrameSet, VehicleState
+from flockd.onboard.daemon import clock_at, event_loop_at
+from flockd.onboard.daemon.pilot_loop import PilotLoop
+from flockd.onboard.daemon.watched_networks import WatchedNetworks
+from flockd.onboard.sources import CameraStatus
+from tests.onboard.daemon.aboard import STEP_S, TinyPerceiver, config_for
+
+
+def test_sleeps_and_timeouts_count_in_simulated_seconds() -> None:
+    """At four times the speed, two seconds' sleep takes half a real one, and a second's patience a quarter."""
+
+    async def story() -> tuple[float, float]:
+        begun = loop.time()
+        await asyncio.sleep(2.0)
+        slept = loop.time() - begun
+        begun = loop.time()
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(1.0):
+                await asyncio.Event().wait()
+        return slept, loop.time() - begun
+
+    loop, clock = event_loop_at(4.0), clock_at(4.0)
+    try:
+        real_s, simulated_s = [time.monotonic()], [clock()]
+        real_s.append(time.monotonic())
+        slept, waited = loop.run_until_complete(story())
+        real_s.append(time.monotonic())
+        simulated_s.append(clock())
+        real_s.append(time.monotonic())
+    finally:
+        loop.close()
+    passed_s = simulated_s[1] - simulated_s[0]
+    assert 4.0 * (real_s[2] - real_s[1]) <= passed_s <= 4.0 * (real_s[3] - real_s[0])
+    assert slept >= 2.0
+    assert waited >= 1.0
+    assert slept + waited <= passed_s
+    assert slept + waited < 4.0 * 3.0  # as three real seconds would be
+
+
+def test_the_clock_of_a_real_drone_is_the_computers() -> None:
+    assert clock_at(1.0) is time.monotonic
+
+
+@pytest.mark.parametrize(
+    ("source", "autopilot", "told"),
+    [
+        (
+            "{kind: v4l2, cameras: [{name: front, device: /dev/video0}], shared_memory: {speed_factor: 0.5}}",
+            "udpin://127.0.0.1:14540",
+            "real cameras know real time only; delete `shared_memory.speed_factor`",
+        ),
+        (
+            "{kind: shared_memory, shared_memory: {speed_factor: 0.5}}",
+            "serial:///dev/ttyS1:921600",
+            "an autopilot on a cable is none; delete it",
+        ),
+        ("{kind: shared_memory, shared_memory: {speed_factor: 0.01}}", "udpin://127.0.0.1:14540", "0.02"),
+    ],
+)
+def test_what_is_real_cannot_be_slow(source: str, autopilot: str, told: str, tmp_path: Path) -> None:
+    lens = "{fx: 32.0, fy: 32.0, cx: 32.0, cy: 24.0}"
+    file = tmp_path / "drone.yaml"
+    file.write_text(
+        f"rig: {{cameras: [{{name: front, size_px: [64, 48], intrinsics: {lens}}}]}}\n"
+        f"source: {source}\nautopilot: {{address: '{autopilot}'}}\n",
+        encoding="utf-8",
+    )
+    with pytest.raises(ConfigError, match="speed_factor") as caught:
+        load_drone(file)
+    assert told in str(caught.value)
+
+
+class SlowCamera:
+    """Has a frame set each step, on time, whoever looks; the newest that was not handed out."""
+
+    def __init__(self) -> None:
+        self._begun_s = time.monotonic()
+        self._handed_out = 0
+        self.waited_s: list[float] = []
+        """How long each set that was taken had been there."""
+
+    def newest(self, timeout_s: float = 0.0) -> FrameSet | None:
+        until_s = time.monotonic() + timeout_s
+        while (number := int((time.monotonic() - self._begun_s) / STEP_S)) <= self._handed_out:
+            if time.monotonic() > until_s:
+                return None
+            time.sleep(0.005)
+        self._handed_out = number
+        taken_s = self._begun_s + number * STEP_S
+        self.waited_s.append(time.monotonic() - taken_s)
+        image = np.random.default_rng(number).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+        return FrameSet(taken_s, {name: Frame(name, image, taken_s, number) for name in ("front", "back")})
+
+    def start(self) -> None: ...
+
+    def stop(self) -> None: ...
+
+    def notes(self) -> tuple[str, ...]:
+        return ()
+
+    def status(self) -> Mapping[str, CameraStatus]:
+        return {}
+
+
+def test_a_late_step_does_not_make_all_later_ones_late() -> None:
+    """Frames come as often as steps are due: whoever missed his moment once must not look at old frames for ever."""
+    config = config_for(1, "tcp/127.0.0.1:1", "tcp/127.0.0.1:2")
+    assert config.source is not None
+    slow = config.source.shared_memory.model_copy(update={"rate_hz": 1.0 / STEP_S})
+    config = config.model_copy(update={"source": config.source.model_copy(update={"shared_memory": slow})})
+    camera, times = SlowCamera(), []
+    hiccup = [1.5 * STEP_S]
+
+    def on_step(frames: FrameSet, *_: object) -> None:
+        times.append(frames.time_s)
+        if len(times) == 2:
+            time.sleep(hiccup.pop())
+
+    level = VehicleState(0.0, np.eye(3), 2.0, np.zeros(3))
+    networks = WatchedNetworks(TinyPerceiver(), 1.0)
+    pilot_loop = PilotLoop(config, camera, networks, lambda _: level, on_step, lambda _: None, time.monotonic)
+
+    async def story() -> None:
+        running = asyncio.create_task(pilot_loop.run())
+        while len(times) < 9:
+            await asyncio.sleep(0.01)
+        running.cancel()
+
+    asyncio.run(story())
+    pilot_loop.leave()
+    assert np.median(camera.waited_s[4:9]) < 0.3 * STEP_S
+    spans = [round((b - a) / STEP_S) for a, b in pairwise(times[3:])]
+    assert np.median(spans) == 1

@@ -1,0 +1,54 @@
+"""The systemd units: what systemd itself says of them, and that they start what there is."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from flockd.cli import main
+
+UNITS = Path(__file__).parents[3] / "systemd"
+NAMES = ("flockd.service", "flockd@.service")
+MAX_EXPOSURE = 1.5
+needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not here")
+
+
+@needs_systemd
+@pytest.mark.parametrize("name", NAMES)
+def test_systemd_finds_nothing_wrong(name: str, tmp_path: Path) -> None:
+    unit = (UNITS / name).read_text(encoding="utf-8")
+    (tmp_path / name).write_text(unit.replace("/opt/flockd/bin/flockd", "/bin/true"), encoding="utf-8")
+    result = subprocess.run(
+        ["systemd-analyze", "verify", str(tmp_path / name)], capture_output=True, text=True, check=False
+    )
+    assert (result.returncode, result.stderr) == (0, "")
+
+
+@needs_systemd
+@pytest.mark.parametrize("name", NAMES)
+def test_little_is_exposed(name: str) -> None:
+    threshold = f"--threshold={MAX_EXPOSURE * 10:.0f}"
+    command = ["systemd-analyze", "security", "--offline=true", threshold, str(UNITS / name)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout.splitlines()[-1]
+
+
+def test_the_template_is_the_unit_but_for_its_names() -> None:
+    unit, template = ((UNITS / name).read_text(encoding="utf-8").splitlines() for name in NAMES)
+    differ = {line.partition("=")[0] for line in set(unit) ^ set(template) if not line.startswith("#")}
+    assert differ == {"Description", "ExecStart", "TemporaryFileSystem"}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_starts_a_command_that_there_is(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    unit = (UNITS / name).read_text(encoding="utf-8")
+    (start,) = (line for line in unit.splitlines() if line.startswith("ExecStart="))
+    _, *arguments = shlex.split(start.partition("=")[2])
+    with pytest.raises(SystemExit) as exit_:
+        main([*arguments, "--help"])
+    assert exit_.value.code == 0
+    capsys.readouterr()

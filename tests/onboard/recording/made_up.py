@@ -1,0 +1,120 @@
+"""A made-up flight: small pictures, numbers hard to write down, and a pilot that uses all of what it is given."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import is_dataclass, replace
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from flockd.core.config import DroneConfig
+from flockd.core.config.recording import RecordingConfig
+from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig
+from flockd.core.messages import (
+    EgoMotion,
+    Frame,
+    FrameSet,
+    MissionOrder,
+    Neighbour,
+    PilotOutput,
+    RangeReading,
+    VehicleState,
+    VelocityCommand,
+)
+from flockd.onboard.recording import Recorder
+
+WIDTH, HEIGHT = 160, 120
+MODELS = {"flow": "ab" * 32}
+
+
+def drone_config() -> DroneConfig:
+    lens = IntrinsicsConfig(fx=80.0, fy=81.0, cx=79.5, cy=60.25)
+    places = {
+        "front": ExtrinsicsConfig(position_m=(0.1, 0.0, -0.02), yaw_deg=10.0, pitch_deg=-20.0, roll_deg=5.0),
+        "left": ExtrinsicsConfig(yaw_deg=270.0),
+    }
+    cameras = tuple(
+        CameraConfig(name=name, size_px=(WIDTH, HEIGHT), intrinsics=lens, extrinsics=place)
+        for name, place in places.items()
+    )
+    return DroneConfig(rig=RigConfig(cameras=cameras))
+
+
+class MadeUpPilot:
+    """Its outputs hang on every pixel, every number of the vehicle's state, and all that came before."""
+
+    def __init__(self, config: DroneConfig, stopwatch: Callable[[], float] | None = None) -> None:
+        self._memory = 0.1
+        self.gain = config.flocking.cohesion
+
+    def step(self, frames: FrameSet, vehicle: VehicleState, *, order: MissionOrder | None = None) -> PilotOutput:
+        seen = sum(float((frame.image * np.arange(1.0, 4.0)).sum()) for frame in frames.frames.values()) / 1e6
+        felt = float(vehicle.R_ned_body.sum()) + vehicle.height_m / 3.0
+        felt += 0.0 if vehicle.velocity_ned is None else float(vehicle.velocity_ned.sum())
+        felt += 0.0 if vehicle.ground_range is None else vehicle.ground_range.range_m + vehicle.ground_range.time_s / 7
+        self._memory = math.sin(self._memory + seen + felt + self.gain)
+        m = self._memory
+        whole: PilotOutput = filled(PilotOutput, m)
+        return replace(
+            whole,
+            time_s=frames.time_s,
+            ego_motion=replace(filled(EgoMotion, m), translation=np.array([m, 1e-310, -0.0])),
+            velocity=np.array([m, 1 / 3, math.nan]),
+            neighbours=(replace(filled(Neighbour, m), velocity_sigma_m_s=math.inf),),
+            command=VelocityCommand(np.array([m, -m]), np.array([0.1 * m, 0.2]), m),
+        )
+
+
+def filled(kind: Any, number: float) -> Any:
+    """A message of this type with something in every field, whatever fields it has."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if is_dataclass(kind) and isinstance(kind, type):
+        return kind(
+            **{field: filled(hint, number) for field, hint in get_type_hints(kind, include_extras=True).items()}
+        )
+    if origin is Annotated:
+        return np.full(parts[1].sizes, number)
+    if origin in (Union, UnionType, tuple):
+        inner = filled(parts[0], number)
+        return (inner,) if origin is tuple else inner
+    if origin is not None:
+        return {filled(parts[0], number): filled(parts[1], number)}
+    return {float: number, int: 3, bool: True, str: "front"}[kind]
+
+
+def inputs(
+    steps: int, period_s: float = 0.1, seed: int = 0, levels: int = 256
+) -> Iterator[tuple[FrameSet, VehicleState]]:
+    """Frame sets and vehicle states at times that no decimal fraction hits; pictures of few levels compress well."""
+    rng = np.random.default_rng(seed)
+    for step in range(steps):
+        time_s = 1000.0 + period_s * step + 1 / 3e6
+        frames = {
+            name: Frame(name, rng.integers(0, levels, (HEIGHT, WIDTH, 3), dtype=np.uint8), time_s - 1e-3 / 7, 10 + step)
+            for name in ("front", "left")
+        }
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        velocity = None if step == 1 else rng.normal(size=3)
+        reading = None if step % 3 == 1 else RangeReading(time_s - 0.01, 4.0 + step / 3, min_m=0.2, quality=0.7 / 9)
+        height_m = float(rng.normal(5.0))
+        yield FrameSet(time_s, frames), VehicleState(time_s, turn, height_m, velocity, ground_range=reading)
+
+
+def record(
+    path: Path, steps: int = 10, settings: RecordingConfig | None = None, period_s: float = 0.1
+) -> list[PilotOutput]:
+    """Records a made-up flight, and gives what its pilot said."""
+    config = drone_config()
+    pilot = MadeUpPilot(config)
+    outputs = []
+    with Recorder(path, drone="drone1", config=config, settings=settings, models=MODELS) as recorder:
+        for frames, vehicle in inputs(steps, period_s):
+            outputs.append(pilot.step(frames, vehicle))
+            recorder.drain()
+            recorder.step(frames, vehicle, outputs[-1])
+    assert recorder.failure is None
+    return outputs

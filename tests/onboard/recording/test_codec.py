@@ -1,0 +1,106 @@
+"""Numbers go through JSON and come back the same to the last bit."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockd.core.messages import PilotOutput, VehicleState
+from flockd.onboard.recording.codec import from_json, json_schema, to_json
+from flockd.onboard.recording.streams import StepFrames
+from flockd.onboard.recording.truth import Truth
+from tests.onboard.recording.made_up import MadeUpPilot, drone_config, inputs
+
+
+def through_text(kind: Any, value: object) -> Any:
+    return from_json(kind, json.loads(json.dumps(to_json(value), allow_nan=False)))
+
+
+def assert_same(a: Any, b: Any) -> None:
+    assert type(a) is type(b) or {type(a), type(b)} <= {dict, type(b)}
+    if is_dataclass(a):
+        for part in fields(a):
+            assert_same(getattr(a, part.name), getattr(b, part.name))
+    elif isinstance(a, np.ndarray):
+        assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
+    elif isinstance(a, float):
+        assert struct.pack("d", a) == struct.pack("d", b)
+    elif isinstance(a, tuple):
+        assert len(a) == len(b)
+        for one, other in zip(a, b, strict=True):
+            assert_same(one, other)
+    elif isinstance(a, dict):
+        assert a.keys() == b.keys()
+        for key in a:
+            assert_same(a[key], b[key])
+    else:
+        assert a == b
+
+
+@pytest.mark.parametrize("step", [0, 1], ids=["all fields", "without an optional one"])
+def test_messages_come_back_to_the_last_bit(step: int) -> None:
+    frames, vehicle = list(inputs(2))[step]
+    output = MadeUpPilot(drone_config()).step(frames, vehicle)
+    assert_same(vehicle, through_text(VehicleState, vehicle))
+    assert_same(output, through_text(PilotOutput, output))
+
+
+def test_any_double_comes_back() -> None:
+    bits = np.random.default_rng(1).integers(0, 2**64, 20_000, dtype=np.uint64)
+    for value in bits.view(np.float64).tolist():
+        back = through_text(float, value)
+        assert back == value or (math.isnan(back) and math.isnan(value))
+
+
+def test_what_is_no_message_is_refused() -> None:
+    good = to_json(next(inputs(1))[1])
+    spoilt: object
+    for spoilt in ({**good, "height_m": "high"}, {**good, "height_m": True}, {**good, "R_ned_body": 3}, [], None):
+        with pytest.raises(ValueError, match=r"."):
+            from_json(VehicleState, spoilt)
+    del good["height_m"]
+    with pytest.raises(ValueError, match="a VehicleState has no height_m"):
+        from_json(VehicleState, good)
+
+
+def test_the_schema_names_every_field_with_its_type() -> None:
+    schema = json_schema(PilotOutput)
+    assert schema["properties"].keys() == {part.name for part in fields(PilotOutput)}
+    assert schema["properties"]["command"]["properties"]["yaw_rad"] == {"type": "number"}
+    assert schema["properties"]["detections"]["items"]["properties"]["cameras"] == {
+        "type": "array",
+        "items": {"type": "string"},
+    }
+    assert "ego_motion" not in schema["required"]
+
+
+def test_an_array_of_another_shape_is_refused() -> None:
+    """Nine numbers are a matrix only where a matrix belongs, and nothing else is."""
+    good = to_json(next(inputs(1))[1])
+    for name, numbers, sentence in (
+        ("R_ned_body", [1.0] * 8, "R_ned_body of VehicleState: 8 numbers, where an array of 3 x 3 has 9"),
+        ("velocity_ned", [1.0] * 9, "velocity_ned of VehicleState: 9 numbers, where an array of 3 has 3"),
+        ("velocity_ned", [], "velocity_ned of VehicleState: 0 numbers, where an array of 3 has 3"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            from_json(VehicleState, {**good, name: numbers})
+    assert from_json(VehicleState, good).R_ned_body.shape == (3, 3)
+
+
+def test_the_schema_says_the_shape_of_arrays() -> None:
+    properties = json_schema(VehicleState)["properties"]
+    assert properties["velocity_ned"] == {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
+    assert (properties["R_ned_body"]["minItems"], properties["R_ned_body"]["maxItems"]) == (9, 9)
+    assert properties["R_ned_body"]["description"] == "3 x 3 matrix, row by row"
+
+
+@pytest.mark.parametrize("kind", [VehicleState, PilotOutput, Truth, StepFrames])
+def test_every_recorded_array_declares_its_shape(kind: type) -> None:
+    """Else this raises TypeError."""
+    assert json_schema(kind)["type"] == "object"

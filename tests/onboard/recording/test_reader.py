@@ -1,0 +1,301 @@
+"""What a kill leaves can be played, what is not ours is refused, and what is edited is whole."""
+
+from __future__ import annotations
+
+import csv
+import json
+import struct
+import subprocess
+import sys
+import tracemalloc
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+from mcap.writer import Writer
+
+from flockd.onboard.recording import RecordingError
+from flockd.onboard.recording.codec import to_json
+from flockd.onboard.recording.editing import cut, recover
+from flockd.onboard.recording.export import export_images, export_tables
+from flockd.onboard.recording.mcap_file import Damage, Entry, McapFile, Note, read_records
+from flockd.onboard.recording.reader import Recording, is_image
+from tests.onboard.recording.made_up import record
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("flight") / "drone1.mcap"
+    record(path)
+    return path
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(RecordingError) as caught:
+        Recording(path)
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(f"{path}: ")
+    return str(caught.value).removeprefix(f"{path}: ")
+
+
+def test_what_is_no_recording_is_refused_in_one_sentence(tmp_path: Path, whole: Path) -> None:
+    path = tmp_path / "x.mcap"
+    assert refusal(path) == "does not exist; check the path"
+    assert refusal(tmp_path) == "is a folder; name a recording in it"
+    for content in (b"", b"hello", b"\x89MCAP"):
+        path.write_bytes(content)
+        assert refusal(path) == "is not a recording (it does not begin as MCAP files do); name another file"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/speed", "json", writer.register_schema("x", "jsonschema", b"{}"))
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()  # type: ignore[no-untyped-call]
+    assert refusal(path) == "is an MCAP file, but not a recording of flockd; name one that flockd wrote"
+    content = whole.read_bytes()
+    path.write_bytes(content.replace(b"\x01\x00\x00\x001", b"\x01\x00\x00\x002", 1))
+    assert refusal(path) == "is of format '2', and this flockd reads '1'; use the flockd that wrote it"
+
+
+def test_a_file_cut_off_anywhere_is_refused_or_played_as_far_as_it_goes(tmp_path: Path, whole: Path) -> None:
+    content = whole.read_bytes()
+    path = tmp_path / "drone1.mcap"
+    outcomes = []
+    for length in np.linspace(8, len(content) - 1, 120).astype(int):
+        path.write_bytes(content[:length])
+        try:
+            recording = Recording(path)
+        except RecordingError as error:
+            assert "\n" not in str(error)
+            outcomes.append(0)
+        else:
+            assert not recording.contents.finished
+            steps = list(recording.steps())
+            assert [step.number for step in steps] == list(range(len(steps)))
+            outcomes.append(len(steps))
+    assert outcomes == sorted(outcomes)
+    assert (outcomes[0], outcomes[-1]) == (0, 10)
+
+
+def test_damage_within_is_reported_and_recovered_from(tmp_path: Path, whole: Path) -> None:
+    content = bytearray(whole.read_bytes())
+    at = len(content) // 2
+    content[at : at + 2000] = bytes(2000)
+    path = tmp_path / "drone1.mcap"
+    path.write_bytes(content)
+    damaged = Recording(path)
+    ((where, damage),) = damaged.contents.damages
+    assert where == path
+    assert at - 200_000 < damage.offset <= at
+    assert not damage.at_end
+    with pytest.raises(RecordingError, match=r"step \d lost its message .*; `flockd record recover` makes"):
+        list(damaged.steps())
+    steps = recover(damaged, tmp_path / "mended.mcap")
+    mended = Recording(tmp_path / "mended.mcap")
+    assert mended.contents.finished
+    assert not mended.contents.damages
+    assert len(list(mended.steps())) == steps
+    assert 7 <= steps <= 9
+    ((first, last),) = mended.contents.gaps
+    assert last - first + 1 == 10 - steps
+
+
+def _chunk(compression: str, uncompressed_size: int, data: bytes) -> bytes:
+    """As the MCAP specification writes a chunk: times, size, no checksum, compression, data."""
+    name = compression.encode()
+    body = struct.pack("<QQQII", 0, 0, uncompressed_size, 0, len(name)) + name + struct.pack("<Q", len(data)) + data
+    return struct.pack("<BQ", 6, len(body)) + body
+
+
+_BOMB = zstandard.compress(b"\0" * (300 << 20))
+_LZ4 = lz4.frame.compress(bytes(range(256)) * 100)
+
+
+@pytest.mark.parametrize(
+    ("record_bytes", "reason"),
+    [
+        (_chunk("zstd", 3 << 30, _BOMB), "3,221,225,472 bytes uncompressed"),
+        (_chunk("zstd", 1000, _BOMB), "uncompressed size"),
+        (_chunk("zstd", (1 << 63) + 5, b"x"), "bytes uncompressed"),
+        (_chunk("lz4", 25600, _LZ4[:200]), "uncompressed size"),
+        (_chunk("lz4", 25600, b"no lz4 at all"), "chunk"),
+        (_chunk("", 9, struct.pack("<BQ", 5, (1 << 63) + 1)), "chunk"),
+        (_chunk("brotli", 9, b"x"), "chunk"),
+    ],
+)
+def test_a_hostile_chunk_is_damage_and_takes_little_memory(
+    tmp_path: Path, whole: Path, record_bytes: bytes, reason: str
+) -> None:
+    content = whole.read_bytes()
+    end = content.rindex(struct.pack("<BQ", 15, 4))  # DATA_END: a checksum of 4 bytes
+    path = tmp_path / "x.mcap"
+    path.write_bytes(content[:end] + record_bytes + content[end:])
+    tracemalloc.start()
+    (damage,) = [record for record in read_records(path) if isinstance(record, Damage)]
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert reason in damage.reason
+    assert not damage.at_end
+    assert peak < 100 << 20
+    assert len(list(Recording(path).steps())) == len(list(Recording(whole).steps()))
+
+
+def test_an_image_that_claims_to_be_huge_is_not_decoded(tmp_path: Path, whole: Path) -> None:
+    """A PNG's width and height are bytes 16 to 24; zlib packs an all-black image of 60000x60000 into some megabytes."""
+    path = tmp_path / "x.mcap"
+    with McapFile(path) as file:
+        for entry in read_records(whole):
+            if isinstance(entry, Entry) and is_image(entry.stream.topic):
+                at = entry.data.index(b"IHDR") + 4
+                huge = entry.data[:at] + struct.pack(">II", 60000, 60000) + entry.data[at + 8 :]
+                entry = replace(entry, data=huge)  # noqa: PLW2901 - the rest of the loop is the same
+            if not isinstance(entry, Damage):
+                file.write(entry)
+    with pytest.raises(RecordingError, match="claims 60000x60000 pixels"):
+        list(Recording(path).steps())
+
+
+@pytest.mark.parametrize("number", ["NaN", "-1", "1e9", "9" * 5000, ""])
+def test_a_number_of_lost_steps_that_is_none_is_refused(tmp_path: Path, whole: Path, number: str) -> None:
+    path = tmp_path / "x.mcap"
+    with McapFile(path) as file:
+        for entry in read_records(whole):
+            if isinstance(entry, Note) and "lost" in entry.facts:
+                entry = replace(entry, facts={**entry.facts, "lost": number})  # noqa: PLW2901
+            if not isinstance(entry, Damage):
+                file.write(entry)
+    assert "which is no number" in refusal(path)
+
+
+def test_a_step_without_its_vehicle_is_the_last_of_a_killed_one_or_an_error(tmp_path: Path, whole: Path) -> None:
+    records = [record for record in read_records(whole) if not isinstance(record, Damage)]
+    vehicles = [n for n, r in enumerate(records) if isinstance(r, Entry) and r.stream.topic == "/vehicle"]
+    killed = McapFile(tmp_path / "killed.mcap")
+    for written in records[: vehicles[-1]]:
+        killed.write(written)
+    killed.flush()
+    killed.abandon()
+    assert [step.number for step in Recording(killed.path).steps()] == list(range(9))
+    with McapFile(tmp_path / "odd.mcap") as odd:
+        for number, written in enumerate(records):
+            if number != vehicles[4]:
+                odd.write(written)
+    with pytest.raises(RecordingError, match="step 4 lost its message '/vehicle'"):
+        list(Recording(odd.path).steps())
+
+
+KILLS = 20
+FLYING = f"""
+import os, random, select, signal, sys, time
+from pathlib import Path
+from tests.onboard.recording.made_up import MadeUpPilot, drone_config, inputs
+from flockd.onboard.recording import Recorder
+
+def fly(path, pipe):
+    config = drone_config()
+    pilot = MadeUpPilot(config)
+    recorder = Recorder(path, drone="drone1", config=config)
+    for frames, vehicle in inputs(1000, period_s=0.1, levels=1):  # so little that nothing is written for its size
+        recorder.step(frames, vehicle, pilot.step(frames, vehicle))
+        os.write(pipe, f"{{frames.time_s!r}}\\n".encode())
+        time.sleep(0.1)
+
+children = []
+for number in range({KILLS}):
+    pipe = os.pipe()
+    path = Path(sys.argv[1]) / f"flight{{number}}.mcap"
+    child = os.fork()
+    if child == 0:
+        fly(path, pipe[1])
+    children.append((random.Random(number).uniform(0.5, 2.5), child, pipe))
+for _, _, (reading, writing) in children:
+    select.select([reading], [], [])  # all have begun
+began = time.monotonic()
+for moment, child, (reading, writing) in sorted(children):
+    time.sleep(max(0.0, began + moment - time.monotonic()))
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+for _, _, (reading, writing) in children:
+    os.close(writing)
+    print(os.read(reading, 1 << 20).split()[-1].decode())
+"""
+
+
+def test_a_kill_at_any_moment_loses_half_a_second_at_most(tmp_path: Path) -> None:
+    flown = subprocess.run(
+        [sys.executable, "-c", FLYING, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    last_flown = [float(line) for line in flown.stdout.split()]
+    for number in range(KILLS):
+        recording = Recording(tmp_path / f"flight{number}.mcap")
+        assert not recording.contents.finished
+        mended = tmp_path / f"mended{number}.mcap"
+        steps = recover(recording, mended)
+        back = Recording(mended)
+        assert back.contents.finished
+        assert not back.contents.gaps
+        assert len(list(back.steps())) == steps
+        assert back.start_s + back.duration_s >= last_flown[number] - 0.5
+
+
+def test_a_cut_holds_its_stretch_and_what_is_needed_to_play_it(tmp_path: Path, whole: Path) -> None:
+    recording = Recording(whole)
+    target = tmp_path / "cut.mcap"
+    assert cut(recording, target, recording.start_s + 0.25, recording.start_s + 0.65) == 4
+    piece = Recording(target)
+    assert piece.contents.finished
+    assert piece.config == recording.config
+    assert piece.contents.flight["cut_from"] == "drone1.mcap"
+    originals = {step.number: step for step in recording.steps()}
+    for step in piece.steps():
+        original = originals[step.number]
+        assert step.output == original.output
+        assert np.array_equal(step.frames.frames["front"].image, original.frames.frames["front"].image)
+    assert [step.number for step in piece.steps()] == [3, 4, 5, 6]
+    assert piece.contents.streams["/camera/front/calibration"].messages == 1
+    assert piece.contents.streams["/health"].messages == 4
+    with pytest.raises(RecordingError, match="holds no whole step there; nothing was written"):
+        cut(recording, tmp_path / "none.mcap", 0.0, 1.0)
+    assert [path.name for path in tmp_path.iterdir()] == ["cut.mcap"]
+
+
+def test_tables_and_images_hold_what_was_flown(tmp_path: Path) -> None:
+    outputs = record(tmp_path / "drone1.mcap", steps=3)
+    recording = Recording(tmp_path / "drone1.mcap")
+    folder = tmp_path / "tables"
+    folder.mkdir()
+    export_tables(recording, folder, "csv")
+    with (folder / "output.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["command.yaw_rad"]) for row in rows] == [output.command.yaw_rad for output in outputs]
+    assert [row["velocity.2"] for row in rows] == ["nan"] * 3
+    assert rows[0]["reasons"] == "front"
+    with (folder / "output.neighbours.csv").open(encoding="utf-8") as file:
+        neighbours = list(csv.DictReader(file))
+    assert [float(row["time_s"]) for row in neighbours] == [output.time_s for output in outputs]
+    assert [float(row["position.0"]) for row in neighbours] == [o.neighbours[0].position[0] for o in outputs]
+
+    assert export_images(recording, tmp_path / "images") == 6
+    first = sorted((tmp_path / "images" / "left").iterdir())[0]
+    assert first.name == "000000_999.999857.png"
+    step = next(recording.steps())
+    picture = cv2.imread(str(first))
+    assert picture is not None
+    written = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+    assert np.array_equal(written, step.frames.frames["left"].image)
+    assert json.dumps(step.output) == json.dumps(to_json(outputs[0]))
+
+
+def test_tables_as_parquet(tmp_path: Path) -> None:
+    from pyarrow import parquet
+
+    outputs = record(tmp_path / "drone1.mcap", steps=3)
+    export_tables(Recording(tmp_path / "drone1.mcap"), tmp_path, "parquet")
+    table = parquet.read_table(tmp_path / "output.parquet").to_pydict()
+    assert table["command.yaw_rad"] == [output.command.yaw_rad for output in outputs]

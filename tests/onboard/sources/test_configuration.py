@@ -1,0 +1,169 @@
+"""What a person writes about cameras is checked, and becomes the source that it asks for."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from flockd.core.config import load_drone
+from flockd.core.errors import ConfigError
+from flockd.onboard.sources import open_source
+from flockd.onboard.sources.gstreamer import GstreamerSource
+from flockd.onboard.sources.shared_memory import SharedMemorySource
+from flockd.onboard.sources.v4l2 import V4l2Source
+
+QUADROTOR = Path(__file__).parents[3] / "config" / "quadrotor.yaml"
+RIG = """\
+rig:
+  cameras:
+    - {name: front, size_px: [640, 480], intrinsics: {fx: 320, fy: 320, cx: 320, cy: 240}}
+    - {name: back, size_px: [640, 480], intrinsics: {fx: 320, fy: 320, cx: 320, cy: 240}}
+"""
+TWO = """\
+  cameras:
+    - {name: front, device: /dev/video0}
+    - {name: back, device: /dev/video2}
+"""
+PIPELINES = """\
+  cameras:
+    - {name: front, pipeline: nvarguscamerasrc sensor-id=0}
+    - {name: back, pipeline: libcamerasrc}
+"""
+
+
+def _problems(folder: Path, source: str) -> list[str]:
+    path = folder / "drone.yaml"
+    path.write_text(RIG + source, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load_drone(path)
+    return [line.removeprefix(f"{folder}/") for line in str(caught.value).splitlines()]
+
+
+def test_the_quadrotors_file_is_four_wide_usb_cameras() -> None:
+    config = load_drone(QUADROTOR)
+    assert config.source is not None
+    assert [camera.name for camera in config.source.cameras] == ["front", "right", "back", "left"]
+    assert {camera.pixel_format for camera in config.source.cameras} == {"mjpeg"}
+    assert {camera.size_px for camera in config.rig.cameras} == {(640, 480)}
+    assert len({camera.device for camera in config.source.cameras}) == 4
+    for camera in config.source.cameras:
+        assert [control.name for control in camera.controls] == ["auto_exposure", "exposure_time_absolute", "gain"]
+    # An equidistant lens images 120 degrees on the width: r = f theta.
+    assert config.rig.cameras[0].intrinsics.fx * 1.0471976 == pytest.approx(320.0, abs=0.1)
+    assert isinstance(open_source(config, "quadrotor.yaml"), V4l2Source)
+
+
+def test_frames_may_come_from_another_program(tmp_path: Path) -> None:
+    path = tmp_path / "drone.yaml"
+    path.write_text(RIG + "source: {kind: shared_memory, shared_memory: {drone: '3'}}\n", encoding="utf-8")
+    config = load_drone(path)
+    assert config.source is not None
+    assert config.source.shared_memory.connect == ("tcp/127.0.0.1:7448",)
+    assert isinstance(open_source(config, str(path)), SharedMemorySource)
+
+
+def test_frames_may_come_from_a_pipeline_a_camera(tmp_path: Path) -> None:
+    path = tmp_path / "drone.yaml"
+    path.write_text(RIG + "source:\n  kind: gstreamer\n" + PIPELINES, encoding="utf-8")
+    config = load_drone(path)
+    assert config.source is not None
+    assert [camera.place for camera in config.source.cameras] == ["nvarguscamerasrc sensor-id=0", "libcamerasrc"]
+    assert isinstance(open_source(config, str(path)), GstreamerSource)
+
+
+def test_the_pipelines_of_the_documentation_check(tmp_path: Path) -> None:
+    page = (QUADROTOR.parents[1] / "docs" / "cameras.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```yaml\n(source:.*?)```", page, re.DOTALL)
+    names = re.findall(r"- name: (\w+)", example)
+    rig = "".join(RIG.splitlines(keepends=True)[:2]) + "".join(
+        RIG.splitlines(keepends=True)[2].replace("front", name) for name in names
+    )
+    path = tmp_path / "drone.yaml"
+    path.write_text(rig + example, encoding="utf-8")
+    source = load_drone(path).source
+    assert source is not None
+    assert [camera.pipeline.split()[0] for camera in source.cameras] == [
+        "nvarguscamerasrc", "libcamerasrc", "rtspsrc", "v4l2src",
+    ]  # fmt: skip
+
+
+def test_a_drone_without_source_can_be_simulated_but_opens_none(tmp_path: Path) -> None:
+    path = tmp_path / "drone.yaml"
+    path.write_text(RIG, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        open_source(load_drone(path), "drone.yaml")
+    assert str(caught.value) == "drone.yaml: source: is missing; add one, as in config/quadrotor.yaml"
+
+
+def test_slips_inside_the_optional_section_are_reported_with_what_to_do(tmp_path: Path) -> None:
+    text = (
+        "source:\n  kind: v4l3\n  silence: 1\n  cameras:\n"
+        "    - {name: front, device: /dev/video0, rate_hz: 0, controls: [{name: gain, value: 1.5}]}\n"
+        "    - {name: back, device: video2, pixel_format: mjpg}\n"
+    )
+    assert _problems(tmp_path, text) == [
+        "drone.yaml:6: source.kind: v4l3 is not known; did you mean `v4l2`?",
+        "drone.yaml:7: source.silence: is not a known key; did you mean `silence_s`?",
+        "drone.yaml:9: source.cameras[0].controls[0].value: 1.5 is not a whole number; write a whole number",
+        "drone.yaml:9: source.cameras[0].rate_hz: 0 is not greater than 0; write a number above 0 and up to 1000",
+        "drone.yaml:10: source.cameras[1].device: video2 is not a text that matches ^/dev/; "
+        "write a text that matches ^/dev/",
+        "drone.yaml:10: source.cameras[1].pixel_format: mjpg is not known; did you mean `mjpeg`?",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("source", "problem"),
+    [
+        (
+            "source:\n  kind: v4l2\n" + TWO.replace("back", "rear"),
+            "drone.yaml:1: source.cameras names front, rear, but the rig has front, back; "
+            "give each camera of the rig one entry of the same name",
+        ),
+        (
+            "source:\n  kind: v4l2\n",
+            "drone.yaml:1: source.cameras names none, but the rig has front, back; "
+            "give each camera of the rig one entry of the same name",
+        ),
+        (
+            "source:\n  kind: v4l2\n" + TWO.replace("video2", "video0"),
+            "drone.yaml:5: source: two cameras share /dev/video0; give each its own device",
+        ),
+        (
+            "source:\n  kind: shared_memory\n" + TWO,
+            "drone.yaml:5: source: a source of kind `shared_memory` has no devices; delete `cameras`",
+        ),
+        (
+            "source:\n  kind: v4l2\n" + TWO.replace("device: /dev/video2", "rate_hz: 20"),
+            "drone.yaml:9: source.cameras[1]: has no `device`; write the camera's path, as `flockd cameras` lists it",
+        ),
+        (
+            "source:\n  kind: v4l2\n" + PIPELINES.replace("back, pipeline", "back, device").replace("lib", "/dev/"),
+            "drone.yaml:8: source.cameras[0].pipeline: is of a source of kind `gstreamer`; delete it, or write "
+            "`kind: gstreamer`",
+        ),
+        (
+            "source:\n  kind: gstreamer\n" + PIPELINES.replace("libcamerasrc", "libcamerasrc, pixel_format: yuyv"),
+            "drone.yaml:9: source.cameras[1].pixel_format: is of a source of kind `v4l2`; let the pipeline say it, "
+            "and delete this",
+        ),
+        (
+            "source:\n  kind: gstreamer\n" + PIPELINES.replace("pipeline: libcamerasrc", "rate_hz: 20"),
+            "drone.yaml:9: source.cameras[1]: has no `pipeline`; write elements such as `v4l2src device=/dev/video0`",
+        ),
+        (
+            "source:\n  kind: v4l2\n  set_tolerance_s: 0.01\n" + TWO,
+            "drone.yaml:5: source: set_tolerance_s 0.01 is less than half a frame period of camera 'front'; "
+            "write 0.017 or more",
+        ),
+        (
+            "source:\n  kind: v4l2\n  silence_s: 0.05\n" + TWO,
+            "drone.yaml:5: source: silence_s 0.05 is less than two frame periods of camera 'front'; "
+            "write 0.067 or more",
+        ),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(tmp_path: Path, source: str, problem: str) -> None:
+    assert _problems(tmp_path, source) == [problem]

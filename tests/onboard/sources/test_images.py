@@ -1,0 +1,110 @@
+"""A camera's bytes become the picture it took, or are refused."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat, RgbFormat, YuyvFormat
+from tests.onboard.sources.camera_images import SIZE, jpeg, scene, yuyv
+
+
+def _without_huffman_tables(data: bytes) -> bytes:
+    at, out = 2, data[:2]
+    while data[at + 1] != 0xDA:
+        length = 2 + int.from_bytes(data[at + 2 : at + 4])
+        if data[at + 1] != 0xC4:
+            out += data[at : at + length]
+        at += length
+    return out + data[at:]
+
+
+def test_a_jpeg_keeps_its_colours_and_its_place() -> None:
+    image = MjpegFormat(SIZE).decode(jpeg(scene()))
+    assert image.shape == (480, 640, 3)
+    assert image.dtype == np.uint8
+    left, right = image[:, :310].mean((0, 1)), image[:, 330:].mean((0, 1))
+    np.testing.assert_allclose(left, scene()[:, :310].mean((0, 1)), atol=3)
+    assert left[0] > 200, "red is the first channel"
+    assert right[2] > 200
+
+
+def test_a_jpeg_may_leave_out_the_tables_that_all_cameras_share_and_end_in_zeros() -> None:
+    whole = jpeg(scene())
+    bare = _without_huffman_tables(whole)
+    assert len(bare) < len(whole) - 400
+    np.testing.assert_array_equal(MjpegFormat(SIZE).decode(bare + bytes(513)), MjpegFormat(SIZE).decode(whole))
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (lambda data: b"", "no JPEG begins here"),
+        (lambda data: data[: len(data) // 2], "JPEG ends too early"),
+        (lambda data: data[2:], "no JPEG begins here"),
+        (lambda data: data[:2] + data[-2:], "JPEG has no size"),
+        (lambda data: data[:200] + b"\xff\xd9", "JPEG has|JPEG cannot be decoded"),
+        (lambda data: jpeg(scene()[::2, ::2]), "JPEG has 320x240 instead of 640x480"),
+        (lambda data: data[: len(data) // 2] + b"\xff\xd9", "image stops short of its last rows"),
+        (lambda data: jpeg(np.full((480, 640, 3), 128, np.uint8)), "all of one colour"),
+    ],
+)
+def test_a_damaged_jpeg_is_refused_with_a_reason(damage: object, reason: str) -> None:
+    assert callable(damage)
+    with pytest.raises(CorruptImageError, match=reason):
+        MjpegFormat(SIZE).decode(damage(jpeg(scene())))
+
+
+def test_a_white_sky_and_a_black_ground_are_no_damage() -> None:
+    image = scene()
+    image[:200] = 255
+    image[400:] = 0
+    assert MjpegFormat(SIZE).decode(jpeg(image)).shape == (480, 640, 3)
+
+
+def test_random_damage_is_refused_or_gives_an_image_of_the_right_shape() -> None:
+    whole = jpeg(scene())
+    rng = np.random.default_rng(1)
+    for _ in range(60):
+        data = bytearray(whole)
+        for at in rng.integers(2, len(data) - 2, 5):
+            data[at] = rng.integers(256)
+        try:
+            image = MjpegFormat(SIZE).decode(bytes(data))
+        except CorruptImageError:
+            continue
+        assert image.shape == (480, 640, 3)
+
+
+def test_yuyv_is_bt_601() -> None:
+    """The colour bars of BT.601 at 100 %: white, red, green, blue, and mid grey."""
+    bars = [(235, 128, 128), (81, 90, 240), (145, 54, 34), (41, 240, 110), (126, 128, 128)]
+    image = YuyvFormat((640, 480), 1280).decode(yuyv(bars, (640, 480)))
+    expected = [(255, 255, 255), (255, 0, 0), (0, 255, 0), (0, 0, 255), (128, 128, 128)]
+    for bar, colour in enumerate(expected):
+        np.testing.assert_allclose(image[:, 128 * bar + 10 : 128 * bar + 118].mean((0, 1)), colour, atol=2)
+
+
+def test_yuyv_rows_may_be_padded_and_must_be_all_there() -> None:
+    bars = [(235, 128, 128), (81, 90, 240)]
+    padded = yuyv(bars, (64, 32), padding=16)
+    np.testing.assert_array_equal(
+        YuyvFormat((64, 32), 144).decode(padded), YuyvFormat((64, 32), 128).decode(yuyv(bars, (64, 32)))
+    )
+    with pytest.raises(CorruptImageError, match="4464 bytes instead of 4608"):
+        YuyvFormat((64, 32), 144).decode(padded[:-144])
+
+
+def test_plain_rgb_is_handed_on_as_it_is_even_if_it_shows_nothing() -> None:
+    for image in (scene(), np.zeros((480, 640, 3), np.uint8)):
+        np.testing.assert_array_equal(RgbFormat(SIZE).decode(image.tobytes()), image)
+    with pytest.raises(CorruptImageError, match="921599 bytes instead of 921600"):
+        RgbFormat(SIZE).decode(scene().tobytes()[:-1])
+
+
+def test_the_decoders_agree_with_opencv() -> None:
+    data = jpeg(scene(3))
+    by_opencv = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert by_opencv is not None
+    np.testing.assert_array_equal(MjpegFormat(SIZE).decode(data), by_opencv[..., ::-1])

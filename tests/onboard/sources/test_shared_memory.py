@@ -1,0 +1,249 @@
+"""A simulator publishes frames; a drone's source receives them byte for byte."""
+
+from __future__ import annotations
+
+import math
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import zenoh
+
+from flockd.core.config.drone import DroneConfig
+from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.core.config.source import SharedMemoryParameters, SourceParameters
+from flockd.core.errors import UnavailableError
+from flockd.core.messages import Frame, FrameSet
+from flockd.onboard.sources import FramePublisher, shared_memory
+from flockd.onboard.sources.shared_memory import SharedMemorySource
+from flockd.onboard.telemetry import zenoh_session
+from tests.onboard.sources.camera_images import SIZE, scene
+
+CAMERAS = ("front", "back")
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture
+def source(endpoint: str) -> Iterator[SharedMemorySource]:
+    """Drone 3 of a flock, waiting for its frames."""
+    lens = IntrinsicsConfig(fx=300.0, fy=300.0, cx=320.0, cy=240.0)
+    rig = RigConfig(cameras=tuple(CameraConfig(name=name, size_px=SIZE, intrinsics=lens) for name in CAMERAS))
+    parameters = SourceParameters(
+        kind="shared_memory", shared_memory=SharedMemoryParameters(drone="3", connect=(endpoint,))
+    )
+    source = SharedMemorySource(DroneConfig(rig=rig, source=parameters), parameters)
+    source.start()
+    yield source
+    source.stop()
+
+
+def _send(publisher: FramePublisher, number: int, drone: str = "3") -> float:
+    """Gives the time stamp."""
+    time_s = time.monotonic()
+    for offset, camera in enumerate(CAMERAS):
+        publisher.publish(drone, Frame(camera, scene(2 * number + offset), time_s, number))
+    return time_s
+
+
+def _first(publisher: FramePublisher, source: SharedMemorySource) -> tuple[FrameSet, int]:
+    """The first set that arrives, and the number after the last sent; the two find each other within a second or so."""
+    for number in range(200):
+        _send(publisher, number)
+        frames = source.newest(0.1)
+        if frames is not None and len(frames.frames) == 2:
+            return frames, number + 1
+    pytest.fail("nothing arrived")
+
+
+def _assert_same(frames: FrameSet, number: int) -> None:
+    assert frames.frames.keys() == set(CAMERAS)
+    for offset, camera in enumerate(CAMERAS):
+        frame = frames.frames[camera]
+        assert (frame.camera, frame.time_s, frame.sequence) == (camera, frames.time_s, number)
+        np.testing.assert_array_equal(frame.image, scene(2 * number + offset))
+
+
+def _shared_memory_works() -> bool:
+    from zenoh import shm
+
+    try:
+        shm.ShmProvider.default_backend(1 << 20)
+    except zenoh.ZError:
+        return False
+    return True
+
+
+def test_frames_arrive_byte_for_byte_in_one_process(endpoint: str, source: SharedMemorySource) -> None:
+    with FramePublisher(listen=[endpoint]) as publisher:
+        frames, number = _first(publisher, source)
+        _assert_same(frames, frames.frames["front"].sequence)
+        for later in range(number, number + 10):
+            time_s = _send(publisher, later)
+            received = source.newest(5.0)
+            assert received is not None
+            assert received.time_s == time_s
+            _assert_same(received, later)
+        status = source.status()["front"]
+        assert status.fault is None
+        assert status.age_s < 5.0
+        if _shared_memory_works():
+            assert publisher.notes() == source.notes() == (), "it went through shared memory"
+
+
+def test_frames_arrive_byte_for_byte_from_another_process(endpoint: str, source: SharedMemorySource) -> None:
+    simulator = f"""
+import time
+from flockd.core.messages import Frame
+from flockd.onboard.sources import FramePublisher
+from tests.onboard.sources.camera_images import scene
+scenes = [scene(number) for number in range(40)]
+with FramePublisher(listen=[{endpoint!r}]) as publisher:
+    for number in range(4000):
+        time_s = time.monotonic()
+        for offset, camera in enumerate({CAMERAS!r}):
+            image = scenes[(2 * number + offset) % 40]
+            publisher.publish("3", Frame(camera, image, time_s, number))
+        time.sleep(0.05)
+"""
+    with subprocess.Popen([sys.executable, "-c", simulator]) as process:
+        try:
+            received = [source.newest(20.0) for _ in range(20)]
+        finally:
+            process.kill()
+    whole = [frames for frames in received if frames is not None and len(frames.frames) == 2]
+    assert len(whole) >= 18, "the first may lack a camera that was not connected yet"
+    for frames in whole:
+        number = frames.frames["front"].sequence
+        for offset, camera in enumerate(CAMERAS):
+            assert frames.frames[camera].sequence == number
+            np.testing.assert_array_equal(frames.frames[camera].image, scene((2 * number + offset) % 40))
+    if _shared_memory_works():
+        assert source.notes() == ()
+
+    gone_s = time.monotonic()
+    while (age_s := source.status()["front"].age_s) < 0.3:
+        assert time.monotonic() - gone_s < 5.0
+        source.newest(0.02)
+    assert age_s >= 0.3, "a simulator that has died shows in the age"
+
+
+def test_without_shared_memory_the_same_bytes_come_through_the_socket_with_a_note(
+    endpoint: str, source: SharedMemorySource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole_config = zenoh_session._config
+    refusals: list[bool] = []
+
+    def without(listen: object, connect: object, settings: None, shared_memory: bool | None) -> zenoh.Config:
+        if shared_memory:
+            refusals.append(True)
+            raise zenoh.ZError("Unable to create POSIX shm segment: OS error 30 at segment.rs:85.")
+        return whole_config([endpoint], [], None, False)
+
+    monkeypatch.setattr(zenoh_session, "_config", without)
+    with FramePublisher(listen=[endpoint]) as publisher:
+        assert refusals == [True]
+        assert publisher.notes() == (
+            "frames go through a socket instead of shared memory (Unable to create POSIX shm segment: OS error 30): "
+            "slower, and otherwise the same",
+        )
+        frames, _ = _first(publisher, source)
+        _assert_same(frames, frames.frames["front"].sequence)
+        assert len(source.notes()) == 1
+        assert "through a socket instead of shared memory" in source.notes()[0]
+
+
+def test_a_pool_that_is_full_sends_through_the_socket_and_says_so_once(
+    endpoint: str, source: SharedMemorySource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shared_memory, "_POOL_BYTES", 1 << 16)
+    with FramePublisher(listen=[endpoint]) as publisher:
+        frames, _ = _first(publisher, source)
+        _assert_same(frames, frames.frames["front"].sequence)
+        assert len(publisher.notes()) == 1
+        assert "instead of shared memory" in publisher.notes()[0]
+
+
+def test_a_drone_sees_its_own_frames_only(endpoint: str, source: SharedMemorySource) -> None:
+    with FramePublisher(listen=[endpoint]) as publisher:
+        _, number = _first(publisher, source)
+        source.newest()
+        before = source.status()["front"].counts["received"]
+        for later in range(number, number + 5):
+            _send(publisher, later, drone="4")
+        assert source.newest(0.3) is None
+        assert source.status()["front"].counts["received"] == before
+
+
+def test_messages_that_are_no_frames_are_counted_and_ignored(endpoint: str, source: SharedMemorySource) -> None:
+    header = struct.Struct("<4sHHQd")
+    with FramePublisher(listen=[endpoint]) as publisher:
+        _, number = _first(publisher, source)
+        stranger = publisher._publisher("3", "front")
+        stranger.put(b"hello")
+        stranger.put(b"hello", attachment=b"hello")
+        stranger.put(scene().tobytes(), attachment=header.pack(b"bgr8", 640, 480, 1, 1e6))
+        wrong_size = "front: frames are 320x240, but the rig has 640x480; correct one"
+        for corrupt, fault in enumerate([None, None, wrong_size]):
+            stranger.put(scene()[::2, ::2].tobytes(), attachment=header.pack(b"rgb8", 320, 240, 1, 1e6))
+            until_s = time.monotonic() + 5.0
+            while (status := source.status()["front"]).counts.get("corrupt") != corrupt + 1:
+                assert time.monotonic() < until_s
+                time.sleep(0.01)
+            assert status.fault == fault, "one bad frame is no lost camera"
+        assert status.counts["malformed"] == 3
+        stranger.put(b"too short", attachment=header.pack(b"rgb8", 640, 480, number, time.monotonic()))
+        publisher.publish("3", Frame("back", scene(), time.monotonic(), number))
+        frames = source.newest(5.0)
+        assert frames is not None
+        assert frames.frames.keys() == {"back"}
+
+
+@pytest.mark.parametrize("wrong_by_s", [3.0, 86400.0, 1e300, -86400.0, math.nan, math.inf])
+def test_stamps_of_another_clock_are_dropped_and_good_frames_go_on_at_once(
+    endpoint: str, source: SharedMemorySource, wrong_by_s: float
+) -> None:
+    with FramePublisher(listen=[endpoint]) as publisher:
+        _, number = _first(publisher, source)
+        while source.newest(0.1) is not None:
+            pass
+        for bad in range(3):
+            publisher.publish("3", Frame("front", scene(), time.monotonic() + wrong_by_s, number))
+            assert source.newest(0.2) is None
+            status = source.status()["front"]
+            assert status.counts["time_stamp"] == bad + 1
+            assert (status.fault is not None) == (bad == 2), "one bad frame is no lost camera"
+        assert status.fault == "front: a time stamp is not of this computer's clock; correct the program"
+        _send(publisher, number + 1)
+        received = source.newest(5.0)
+        assert received is not None
+        _assert_same(received, number + 1)
+        assert source.status()["front"].fault is None
+
+
+def test_an_endpoint_that_is_none_is_reported_in_one_sentence() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(UnavailableError, match=rf"^frames cannot use {endpoint} \(.*\); name another endpoint$"):
+            FramePublisher(listen=[endpoint])
+
+
+def test_a_source_without_simulator_starts_and_stops_quickly(source: SharedMemorySource) -> None:
+    assert source.newest(0.05) is None
+    began_s = time.monotonic()
+    source.stop()
+    assert time.monotonic() - began_s < 1.0
+    assert source.newest(5.0) is None
+    assert time.monotonic() - began_s < 2.0

@@ -1,0 +1,482 @@
+"""Cameras are plugged in, pulled out, disturbed and taken by others; the kernel's side of it is a fake."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import mmap
+import os
+import struct
+import termios
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockd.core.config.drone import DroneConfig
+from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
+from flockd.core.config.source import CameraDeviceParameters, ControlParameters, SourceParameters
+from flockd.core.messages import FrameSet
+from flockd.onboard.sources import CameraStatus, v4l2_kernel
+from flockd.onboard.sources.v4l2 import V4l2Source
+from flockd.onboard.sources.v4l2_device import control_name
+from flockd.onboard.sources.v4l2_kernel import Kernel, LinuxKernel
+from tests.onboard.sources.camera_images import SIZE, jpeg, scene, yuyv
+from tests.onboard.sources.fake_kernel import (
+    FLAG_CLOCK_UNKNOWN,
+    FLAG_ERROR,
+    FLAG_MONOTONIC,
+    GAIN,
+    METADATA_CAPTURE,
+    STREAMING,
+    FakeCamera,
+    FakeKernel,
+    Request,
+)
+
+JPEGS = [jpeg(scene(number)) for number in range(8)]
+BY_HAND = (
+    ControlParameters(name="auto_exposure", value=1),
+    ControlParameters(name="exposure_time_absolute", value=50),
+    ControlParameters(name="gain", value=32),
+)
+Start = Callable[..., V4l2Source]
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Starts a source of the given cameras; each camera's device is /dev/ and its name."""
+    started: list[V4l2Source] = []
+
+    def begin(kernel: Kernel, *cameras: CameraDeviceParameters, silence_s: float = 0.3) -> V4l2Source:
+        lens = IntrinsicsConfig(fx=300.0, fy=300.0, cx=320.0, cy=240.0)
+        rig = RigConfig(cameras=tuple(CameraConfig(name=c.name, size_px=SIZE, intrinsics=lens) for c in cameras))
+        parameters = SourceParameters(kind="v4l2", cameras=cameras, silence_s=silence_s, set_tolerance_s=0.2)
+        source = V4l2Source(DroneConfig(rig=rig, source=parameters), parameters, kernel=kernel)
+        started.append(source)
+        source.start()
+        return source
+
+    yield begin
+    for source in started:
+        source.stop()
+
+
+def _camera(name: str = "front", **changes: object) -> CameraDeviceParameters:
+    return CameraDeviceParameters.model_validate({"name": name, "device": f"/dev/{name}", **changes})
+
+
+def _until(source: V4l2Source, holds: Callable[[CameraStatus], bool], camera: str = "front") -> CameraStatus:
+    until_s = time.monotonic() + 5.0
+    while not holds(status := source.status()[camera]):
+        assert time.monotonic() < until_s, status
+        time.sleep(0.005)
+    return status
+
+
+def _received(source: V4l2Source, **counts: int) -> None:
+    """Waits until so many frames of each camera have come."""
+    until_s = time.monotonic() + 5.0
+    for camera, count in counts.items():
+        while (status := source.status()[camera]).counts.get("received", 0) < count:
+            assert time.monotonic() < until_s, status
+            time.sleep(0.005)
+
+
+def _next(source: V4l2Source) -> FrameSet:
+    frames = source.newest(5.0)
+    assert frames is not None
+    return frames
+
+
+def test_the_structures_are_those_of_the_header() -> None:
+    """Sizes and numbers as a C compiler gives them for linux/videodev2.h on 64-bit machines."""
+    sizes = {
+        v4l2_kernel.Capability: 104,
+        v4l2_kernel.Format: 208,
+        v4l2_kernel.StreamParameters: 204,
+        v4l2_kernel.RequestBuffers: 20,
+        v4l2_kernel.Buffer: 88,
+        v4l2_kernel.QueryControl: 68,
+        v4l2_kernel.Control: 8,
+        v4l2_kernel.FormatDescription: 64,
+        v4l2_kernel.FrameSize: 44,
+        v4l2_kernel.FrameInterval: 52,
+    }
+    for structure, size in sizes.items():
+        assert ctypes.sizeof(structure) == size, structure
+    for request in Request:
+        assert getattr(v4l2_kernel, f"VIDIOC_{request.name}") == request
+    offsets = {"timestamp": 24, "timecode": 40, "sequence": 56, "memory": 60, "m": 64, "length": 72, "request_fd": 80}
+    names = {"timestamp": "seconds", "m": "offset"}
+    for name, offset in offsets.items():
+        assert getattr(v4l2_kernel.Buffer, names.get(name, name)).offset == offset
+
+
+def test_two_cameras_become_one_set_with_the_kernels_times_and_numbers(start: Start) -> None:
+    kernel = FakeKernel(front=FakeCamera(), back=FakeCamera())
+    source = start(kernel, _camera("front"), _camera("back"), silence_s=30.0)
+    stamps = {"front": kernel.send("front", JPEGS[0]), "back": kernel.send("back", JPEGS[1])}
+    _received(source, front=1, back=1)
+    frames = _next(source)
+
+    assert frames.frames.keys() == {"front", "back"}
+    assert frames.time_s == pytest.approx(stamps["back"], abs=2e-6)
+    for number, (name, stamp) in enumerate(stamps.items()):
+        frame = frames.frames[name]
+        assert (frame.camera, frame.sequence) == (name, 0)
+        assert frame.time_s == pytest.approx(stamp, abs=2e-6), "microseconds, as the kernel gives them"
+        assert np.abs(frame.image.astype(int) - scene(number)).mean() < 3.0
+        status = source.status()[name]
+        assert status.fault is None
+        assert 0.0 < status.age_s < 1.0
+        assert status.counts == {"received": 1, "used": 1, "opened": 1}
+    assert source.newest() is None, "no frame is handed out twice"
+
+
+def test_the_driver_is_asked_for_what_the_configuration_says_in_its_order(start: Start) -> None:
+    kernel = FakeKernel(front=FakeCamera())
+    source = start(kernel, _camera(pixel_format="mjpeg", rate_hz=15.0, controls=BY_HAND))
+    kernel.send("front", JPEGS[0])
+    _next(source)
+    assert kernel.cameras["/dev/front"].settings == [
+        ("format", (640, 480, b"MJPG")),
+        ("rate", 15.0),
+        ("Auto Exposure", 1),
+        ("Exposure Time, Absolute", 50),
+        ("Gain", 32),
+    ]
+
+
+def test_names_of_controls_are_those_that_v4l2_ctl_prints() -> None:
+    names = [b"Exposure Time, Absolute", b"White Balance Temperature, Auto", b"Gain", b"Exposure (Absolute)"]
+    assert [control_name(name) for name in names] == [
+        "exposure_time_absolute",
+        "white_balance_temperature_auto",
+        "gain",
+        "exposure_absolute",
+    ]
+
+
+def test_uncompressed_images_may_have_padded_rows(start: Start) -> None:
+    kernel = FakeKernel(front=FakeCamera(padding=64))
+    source = start(kernel, _camera(pixel_format="yuyv"))
+    kernel.send("front", yuyv([(81, 90, 240), (41, 240, 110)], SIZE, padding=64))
+    image = _next(source).frames["front"].image
+    np.testing.assert_allclose(image[:, 10:300].mean((0, 1)), (255, 0, 0), atol=2)
+    np.testing.assert_allclose(image[:, 340:630].mean((0, 1)), (0, 0, 255), atol=2)
+
+
+def test_the_newest_frame_wins_and_the_others_are_counted(start: Start) -> None:
+    kernel = FakeKernel(front=FakeCamera())
+    source = start(kernel, _camera())
+    for number in range(4):
+        kernel.send("front", JPEGS[number])
+    _received(source, front=4)
+    assert _next(source).frames["front"].sequence == 3
+    assert source.status()["front"].counts == {"received": 4, "used": 1, "superseded": 3, "opened": 1}
+
+
+def test_gaps_in_the_sequence_are_frames_lost(start: Start) -> None:
+    kernel = FakeKernel(front=FakeCamera())
+    source = start(kernel, _camera())
+    kernel.send("front", JPEGS[0])
+    kernel.send("front", JPEGS[1], lost_before=3)
+    _received(source, front=2)
+    assert source.status()["front"].counts["lost"] == 3
+
+
+@pytest.mark.parametrize(
+    ("data", "flags", "offset_s", "count"),
+    [
+        (JPEGS[1], FLAG_MONOTONIC | FLAG_ERROR, 0.0, "flagged"),
+        (JPEGS[1][:20_000], FLAG_MONOTONIC, 0.0, "corrupt"),
+        (b"", FLAG_MONOTONIC, 0.0, "corrupt"),
+        (jpeg(scene()[::2, ::2]), FLAG_MONOTONIC, 0.0, "corrupt"),
+        (JPEGS[1], FLAG_CLOCK_UNKNOWN, 1.7e9, "time_stamp"),
+        (JPEGS[1], FLAG_MONOTONIC, 5.0, "time_stamp"),
+        (JPEGS[1], FLAG_MONOTONIC, 1.7e9, "time_stamp"),
+        (JPEGS[1], FLAG_MONOTONIC, -100.0, "time_stamp"),
+    ],
+    ids=["error flag", "truncated", "empty", "other size", "unknown clock", "ahead", "wall clock", "long ago"],
+)
+def test_what_is_worth_nothing_is_dropped_and_counted_and_the_next_is_fine(
+    start: Start, data: bytes, flags: int, offset_s: float, count: str
+) -> None:
+    kernel = FakeKernel(front=FakeCamera())
+    source = start(kernel, _camera())
+    kernel.send("front", JPEGS[0])
+    assert _next(source).frames["front"].sequence == 0
+    kernel.send("front", data, flags=flags, time_s=time.monotonic() + offset_s)
+    _received(source, front=2)
+    assert source.newest(0.05) is None
+    kernel.send("front", JPEGS[2])
+    assert _next(source).frames["front"].sequence == 2
+    counts = dict(source.status()["front"].counts)
+    assert counts.pop("lost", 0) in {0, 1}
+    assert counts == {"received": 3, "used": 2, "opened": 1, count: 1}
+
+
+def test_a_driver_may_leave_the_name_of_its_clock_out_if_its_stamps_are_of_now(start: Start) -> None:
+    kernel = FakeKernel(front=FakeCamera())
+    source = start(kernel, _camera())
+    kernel.send("front", JPEGS[0], flags=FLAG_CLOCK_UNKNOWN, time_s=time.monotonic())
+    assert _next(source).frames["front"].sequence == 0
+
+
+def test_what_only_the_decoder_notices_leaves_its_camera_out_of_the_set(start: Start) -> None:
+    kernel = FakeKernel(front=FakeCamera(), back=FakeCamera())
+    source = start(kernel, _camera("front"), _camera("back"))
+    kernel.send("front", JPEGS[0][: len(JPEGS[0]) // 2] + b"\xff\xd9")
+    kernel.send("back", JPEGS[1])
+    _received(source, front=1, back=1)
+    assert _next(source).frames.keys() == {"back"}
+    counts = source.status()["front"].counts
+    assert counts == {"received": 1, "corrupt": 1, "undecodable": 1, "missing": 1, "opened": 1}
+
+
+def test_a_camera_whose_images_show_nothing_has_a_fault_until_one_shows_something(start: Start) -> None:
+    kernel = FakeKernel(front=FakeCamera(), back=FakeCamera())
+    source = start(kernel, _camera("front"), _camera("back"))
+    plain = [jpeg(np.full_like(scene(), level)) for level in (60, 61, 62)]
+    for number, data in enumerate([*plain, JPEGS[0]]):
+        kernel.send("front", data)
+        kernel.send("back", JPEGS[number + 1])
+        _received(source, front=number + 1, back=number + 1)
+        fault = source.status()["front"].fault
+        assert fault == (None if number < 3 else "front: its images show nothing; check its lens and cable")
+        assert _next(source).frames.keys() == ({"back"} if number < 3 else {"front", "back"})
+    assert source.status()["front"].fault is None
+    assert source.status()["front"].counts["undecodable"] == 3
+
+
+def test_a_stamp_that_does_not_increase_is_dropped(start: Start) -> None:
+    kernel = FakeKernel(front=FakeCamera())
+    source = start(kernel, _camera())
+    stamp = kernel.send("front", JPEGS[0])
+    kernel.send("front", JPEGS[1], time_s=stamp)
+    kernel.send("front", JPEGS[2], time_s=stamp - 0.01)
+    _received(source, front=3)
+    assert source.status()["front"].counts["time_stamp"] == 2
+    assert _next(source).frames["front"].sequence == 0
+
+
+def test_an_unplugged_camera_is_reported_at_once_and_comes_back_when_plugged_in(start: Start) -> None:
+    kernel = FakeKernel(front=FakeCamera(), back=FakeCamera())
+    source = start(kernel, _camera("front", controls=BY_HAND), _camera("back"))
+    kernel.send("front", JPEGS[0])
+    kernel.send("back", JPEGS[1])
+    _received(source, front=1, back=1)
+    assert _next(source).frames.keys() == {"front", "back"}
+
+    pulled_s = time.monotonic()
+    kernel.unplug("front")
+    fault = _until(source, lambda status: status.fault is not None).fault
+    assert time.monotonic() - pulled_s < 0.5
+    assert fault == "front: /dev/front is not there; plug the camera in, or correct the path"
+
+    asked_s = time.monotonic()
+    kernel.send("back", JPEGS[2])
+    assert _next(source).frames.keys() == {"back"}, "the others go on"
+    assert time.monotonic() - asked_s < 0.5, "and wait only for a while"
+    assert source.status()["front"].counts["missing"] == 1
+
+    kernel.plug("front")
+    kernel.send("front", JPEGS[0])
+    kernel.send("front", JPEGS[3])
+    kernel.send("back", JPEGS[4])
+    _received(source, front=3, back=3)
+    assert _next(source).frames.keys() == {"front", "back"}
+    status = source.status()["front"]
+    assert status.fault is None
+    assert status.counts["opened"] == 2
+    assert status.counts.get("lost", 0) == 0, "a camera that begins anew has lost nothing"
+    assert kernel.cameras["/dev/front"].settings.count(("Gain", 32)) == 2, "it is set up again"
+
+
+def test_a_silent_camera_is_noticed_and_opened_again(start: Start) -> None:
+    kernel = FakeKernel(front=FakeCamera())
+    source = start(kernel, _camera(), silence_s=0.2)
+    kernel.send("front", JPEGS[0])
+    _next(source)
+    silent_since = time.monotonic()
+    status = _until(source, lambda status: status.fault is not None)
+    assert 0.15 < time.monotonic() - silent_since < 0.6
+    assert status.fault == "front: /dev/front gave no usable image for 0.2 s"
+    kernel.send("front", JPEGS[0])  # as v4l2loopback does: the last picture of before, stamped as of now
+    _received(source, front=2)
+    assert source.newest(0.05) is None
+    assert source.status()["front"].fault is not None
+    kernel.send("front", JPEGS[1])
+    assert _next(source).frames["front"].sequence == 1
+    assert source.status()["front"].counts["opened"] == 2
+
+
+def test_a_frozen_camera_counts_as_silent(start: Start) -> None:
+    kernel = FakeKernel(front=FakeCamera())
+    source = start(kernel, _camera(), silence_s=0.2)
+    used = 0
+    for _ in range(5 + 4):
+        kernel.send("front", JPEGS[0])
+        used += source.newest(0.05) is not None
+    assert used == 5, "the picture and four repetitions; the fifth is one too many"
+    counts = source.status()["front"].counts
+    assert counts["frozen"] == 4
+    _until(source, lambda status: status.fault == "front: /dev/front gave no usable image for 0.2 s; "
+           "the last was refused (frozen)")  # fmt: skip
+    kernel.send("front", JPEGS[0])
+    kernel.send("front", JPEGS[1])
+    _next(source)
+    assert source.status()["front"].fault is None
+
+
+def test_a_camera_that_another_program_uses_is_reported_and_taken_when_it_is_free(start: Start) -> None:
+    kernel = FakeKernel(front=FakeCamera(owner=1))
+    source = start(kernel, _camera())
+    status = _until(source, lambda status: status.fault is not None)
+    assert status.fault == "front: /dev/front is in use by another program; stop that one"
+    assert status.age_s == float("inf")
+    kernel.cameras["/dev/front"].owner = None
+    kernel.send("front", JPEGS[0])
+    _next(source)
+    assert source.status()["front"].fault is None
+
+
+def test_an_error_of_the_stream_closes_the_camera_and_opens_it_again(start: Start) -> None:
+    kernel = FakeKernel(front=FakeCamera())
+    source = start(kernel, _camera())
+    kernel.send("front", JPEGS[0])
+    _next(source)
+    kernel.fail("front", errno.EIO)
+    status = _until(source, lambda status: status.fault is not None)
+    assert status.fault == "front: /dev/front has failed (Input/output error)"
+    kernel.fail("front", 0)
+    kernel.send("front", JPEGS[0])
+    kernel.send("front", JPEGS[1])
+    _next(source)
+
+
+@pytest.mark.parametrize(
+    ("camera", "asked", "sentence"),
+    [
+        (
+            FakeCamera(formats=((1280, 720, b"MJPG"),)),
+            {},
+            "front: /dev/front offers 1280x720 MJPG instead of 640x480 mjpeg; "
+            "choose from what `v4l2-ctl --list-formats-ext` lists",
+        ),
+        (
+            FakeCamera(),
+            {"rate_hz": 60.0},
+            "front: /dev/front runs at 30 instead of 60 images a second; write rate_hz: 30",
+        ),
+        (
+            FakeCamera(capabilities=METADATA_CAPTURE | STREAMING),
+            {},
+            "front: /dev/front does not capture images; many cameras have a second device for their metadata: "
+            "name the other one",
+        ),
+        (
+            FakeCamera(),
+            {"controls": (ControlParameters(name="iris", value=1),)},
+            "front: /dev/front has no control 'iris'; it has auto_exposure, exposure_time_absolute, gain",
+        ),
+        (
+            FakeCamera(),
+            {"controls": (ControlParameters(name="gain", value=300),)},
+            "front: /dev/front takes gain from 0 to 255, not 300",
+        ),
+        (
+            FakeCamera(),
+            {"controls": BY_HAND[1:]},
+            "front: /dev/front cannot set exposure_time_absolute to 50 (Permission denied)",
+        ),
+    ],
+    ids=["size", "rate", "metadata", "no such control", "range", "automatic on"],
+)
+def test_what_the_camera_cannot_do_is_said_in_one_sentence(
+    start: Start, camera: FakeCamera, asked: dict[str, Any], sentence: str
+) -> None:
+    source = start(FakeKernel(front=camera), _camera("front", **asked))
+    assert _until(source, lambda status: status.fault is not None).fault == sentence
+
+
+def test_a_control_that_takes_no_such_step_is_reported(start: Start) -> None:
+    camera = FakeCamera()
+    camera.controls[GAIN].step = 16
+    source = start(FakeKernel(front=camera), _camera(controls=(ControlParameters(name="gain", value=40),)))
+    sentence = "front: /dev/front makes 32 of gain 40; write a value it can keep"
+    assert _until(source, lambda status: status.fault is not None).fault == sentence
+
+
+def test_openings_become_rarer_while_nothing_is_there(start: Start) -> None:
+    kernel = FakeKernel()
+    attempts: list[float] = []
+    missing = kernel.open
+
+    def counted(path: str) -> int:
+        attempts.append(time.monotonic())
+        return missing(path)
+
+    kernel.open = counted  # type: ignore[method-assign]
+    start(kernel, _camera())
+    time.sleep(1.2)
+    assert 2 <= len(attempts) <= 4, "at 0, 0.1, 0.3, 0.7 and 1.5 s"
+
+
+def test_stopping_is_quick_and_gives_the_devices_back(start: Start) -> None:
+    kernel = FakeKernel(front=FakeCamera(), back=FakeCamera(), left=FakeCamera(plugged=False))
+    source = start(kernel, _camera("front"), _camera("back"), _camera("left"))
+    kernel.send("front", JPEGS[0])
+    kernel.send("back", JPEGS[0])
+    began_s = time.monotonic()
+    source.stop()
+    assert time.monotonic() - began_s < 0.5
+    assert not kernel.open_files
+    assert kernel.cameras["/dev/front"].owner is None
+    assert source.newest(5.0) is None
+    assert time.monotonic() - began_s < 1.0, "who waits for frames is let go"
+
+
+def test_a_buffer_written_by_the_headers_offsets_is_read_field_by_field() -> None:
+    raw = bytearray(88)
+    struct.pack_into("<IIIII", raw, 0, 3, 1, 4711, 0x2040, 1)
+    struct.pack_into("<qq", raw, 24, 1_234_567, 654_321)
+    struct.pack_into("<IIII", raw, 56, 99, 1, 0x300000, 0)
+    struct.pack_into("<I", raw, 72, 614_400)
+    buffer = v4l2_kernel.Buffer.from_buffer(raw)
+    assert (buffer.index, buffer.bytesused, buffer.flags, buffer.field) == (3, 4711, 0x2040, 1)
+    assert (buffer.seconds, buffer.microseconds, buffer.sequence) == (1_234_567, 654_321, 99)
+    assert (buffer.offset, buffer.length) == (0x300000, 614_400)
+
+
+def test_the_real_system_calls_write_into_the_structures_they_are_given() -> None:
+    """Without a camera: a pipe tells how many bytes wait in it (FIONREAD), and when; a file is mapped."""
+    kernel = LinuxKernel()
+    reading, writing = os.pipe()
+    try:
+        assert not kernel.wait(reading, 0.0)
+        os.write(writing, b"12345")
+        assert kernel.wait(reading, 0.0)
+        waiting = ctypes.c_int(0)
+        kernel.ioctl(reading, termios.FIONREAD, waiting)
+        assert waiting.value == 5
+    finally:
+        kernel.close(reading)
+        kernel.close(writing)
+    file = os.memfd_create("buffer")
+    os.write(file, bytes(mmap.PAGESIZE) + b"the second page")
+    os.ftruncate(file, 2 * mmap.PAGESIZE)
+    memory = kernel.map(file, mmap.PAGESIZE, mmap.PAGESIZE)
+    kernel.close(file)
+    assert memory[slice(0, 15)] == b"the second page"
+    memory.close()
+
+
+def test_what_is_no_camera_is_reported_by_the_real_kernel(start: Start) -> None:
+    camera = CameraDeviceParameters(name="front", device="/dev/null")
+    source = start(LinuxKernel(), camera)
+    sentence = "front: /dev/null is not a V4L2 camera (Inappropriate ioctl for device)"
+    assert _until(source, lambda status: status.fault is not None).fault == sentence

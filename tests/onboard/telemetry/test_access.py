@@ -1,0 +1,113 @@
+"""`config/zenoh_tls.json5` holds what it says: who has no certificate hears nothing, who may watch may not command."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from flockd.core.data import data_path
+from flockd.core.errors import UnavailableError
+from flockd.fleet.watcher import FleetWatcher
+from flockd.onboard.telemetry.publisher import ZenohTelemetry
+from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
+from flockd.onboard.telemetry.zenoh_session import close_session, open_session
+
+EXAMPLE = (data_path("config") / "zenoh_tls.json5").read_text(encoding="utf-8")
+ABOUT = AboutMessage(version="1.2.3", configuration={"name": "d"}, commands=["hold"])
+KEY = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"]
+DRONE, WATCHER, OPERATOR = "drone", "watcher", "operator"
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The example's settings for each of the three, with certificates made by openssl."""
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is not here to make certificates")
+    folder = tmp_path_factory.mktemp("tls")
+
+    def openssl(*arguments: str) -> None:
+        subprocess.run(["openssl", *arguments], cwd=folder, check=True, capture_output=True)
+
+    openssl("req", "-x509", *KEY, "-keyout", "ca.key", "-out", "ca.pem", "-subj", "/CN=ca")
+    (folder / "names").write_text("subjectAltName=DNS:localhost\n", encoding="ascii")
+    files = {}
+    for who in (DRONE, WATCHER, OPERATOR):
+        openssl("req", *KEY, "-keyout", f"{who}.key", "-out", f"{who}.csr", "-subj", f"/CN={who}")
+        signed_by = ["-CA", "ca.pem", "-CAkey", "ca.key", "-CAcreateserial", "-extfile", "names"]
+        openssl("x509", "-req", "-in", f"{who}.csr", *signed_by, "-out", f"{who}.pem")
+        text = EXAMPLE.replace("/etc/flockd/tls/own", f"{folder}/{who}").replace("/etc/flockd/tls", str(folder))
+        if who != DRONE:  # "For the drones; who only watches may leave it out."
+            text = text[: text.index("  // For the drones")] + "}\n"
+        files[who] = folder / f"{who}.json5"
+        files[who].write_text(text, encoding="utf-8")
+    return files
+
+
+def _may(endpoint: str, drone: ZenohTelemetry, settings: Path | None) -> tuple[bool, list[object]]:
+    """Whether somebody hears the drone, and what it answers to a question and a command."""
+    with FleetWatcher("f", listen=[], connect=[endpoint], settings=settings) as watcher:
+        until_s = time.monotonic() + (2.0 if settings is None else 15.0)
+        while time.monotonic() < until_s and not (watcher.drones() and watcher.drones()[0].topics):
+            drone.publish("d", "events", {"time_s": 0.0, "event": "hello"})
+            time.sleep(0.05)
+        hears = [(watched.drone, watched.alive, set(watched.topics)) for watched in watcher.drones()]
+    session = open_session("a test", [], [endpoint], settings=settings)
+    time.sleep(0.5)
+    answers = [answer for what in ("about", "ask/hold") for answer in _answers(session, f"flockd/v1/f/d/{what}")]
+    close_session(session)
+    return hears == [("d", True, {"events"})], answers
+
+
+def _answers(session: zenoh.Session, key: str) -> list[object]:
+    samples = [reply.ok for reply in session.get(key, timeout=1.0)]
+    return [json.loads(sample.payload.to_bytes()) for sample in samples if sample is not None]
+
+
+def test_who_may_watch_hears_and_who_may_command_commands(settings: dict[str, Path]) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tls/localhost:{probe.getsockname()[1]}"
+    asked: list[str] = []
+
+    def ask(command: str, payload: bytes) -> AnswerMessage:
+        assert payload == b""
+        asked.append(command)
+        return AnswerMessage(accepted=True, sentence="tried")
+
+    with ZenohTelemetry("f", listen=[endpoint], settings=settings[DRONE]) as drone:
+        drone.announce("d", ABOUT, ask, lambda camera: None)
+        assert _may(endpoint, drone, None) == (False, [])
+        assert _may(endpoint, drone, settings[WATCHER]) == (True, [ABOUT])
+        assert asked == []
+        assert _may(endpoint, drone, settings[OPERATOR]) == (True, [ABOUT, {"accepted": True, "sentence": "tried"}])
+        assert asked == ["hold"]
+
+
+def test_settings_that_are_not_there_are_reported(tmp_path: Path) -> None:
+    with pytest.raises(
+        UnavailableError, match=f"telemetry cannot use no endpoint with the settings of {tmp_path}/none"
+    ):
+        open_session("telemetry", [], [], settings=tmp_path / "none")
+
+
+def test_what_is_no_message_is_counted_and_not_taken() -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    with FleetWatcher(None, listen=[endpoint], connect=[]) as watcher:
+        session = open_session("a test", [], [endpoint])
+        until_s = time.monotonic() + 15.0
+        while watcher.malformed < 3 and time.monotonic() < until_s:
+            for payload in (b"\xff\x00", b"[]", b'{"time_s": 0.0}'):
+                session.put("flockd/v1/f/d/flight", payload)
+            time.sleep(0.05)
+        close_session(session)
+        assert watcher.malformed >= 3
+        assert watcher.drones() == ()

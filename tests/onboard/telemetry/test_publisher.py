@@ -1,0 +1,180 @@
+"""A watcher on the same machine reads what a drone publishes."""
+
+from __future__ import annotations
+
+import json
+import math
+import queue
+import socket
+import time
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import pytest
+import zenoh
+
+from flockd.core.errors import UnavailableError
+from flockd.core.messages import (
+    SECTORS,
+    MissionStatus,
+    Neighbour,
+    ObstacleRanges,
+    PilotOutput,
+    VehicleState,
+    VelocityCommand,
+)
+from flockd.onboard.telemetry import TOPICS, publish_step
+from flockd.onboard.telemetry.publisher import ZenohTelemetry
+
+Received = queue.Queue[tuple[str, dict[str, object]]]
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture
+def watched(endpoint: str) -> Iterator[tuple[ZenohTelemetry, Received]]:
+    """A publishing peer and, in the queue, what a second peer of this process receives from it."""
+    received: Received = queue.Queue()
+    config = zenoh.Config()
+    config.insert_json5("mode", '"peer"')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("listen/endpoints", "[]")
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    with ZenohTelemetry("meadow", listen=[endpoint]) as telemetry, zenoh.open(config) as watcher:
+        watcher.declare_subscriber(
+            "flockd/v1/meadow/**",
+            lambda sample: received.put((str(sample.key_expr), json.loads(sample.payload.to_bytes()))),
+        )
+        _wait_until_heard(telemetry, received)
+        yield telemetry, received
+
+
+def _wait_until_heard(telemetry: ZenohTelemetry, received: Received) -> None:
+    for _ in range(200):
+        telemetry.publish("hello", "events", {"time_s": 0.0, "event": "hello"})
+        try:
+            received.get(timeout=0.05)
+        except queue.Empty:
+            continue
+        time.sleep(0.1)
+        while not received.empty():
+            received.get_nowait()
+        return
+    pytest.fail("the watcher heard nothing")
+
+
+def _yawed(yaw_deg: float) -> VehicleState:
+    cosine, sine = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
+    attitude = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    return VehicleState(time_s=12.5, R_ned_body=attitude, height_m=4.5, position=np.array([3.0, -4.0]))
+
+
+def _output(velocity: np.ndarray | None) -> PilotOutput:
+    neighbour = Neighbour(
+        track=3, position=np.array([1.0, -2.5, 0.5]), velocity=np.array([1.0, 0.0, 0.0]), position_sigma_m=0.1,
+        velocity_sigma_m_s=math.inf, age_s=2.0, unseen_s=0.5, hits=4, confirmed=True,
+    )  # fmt: skip
+    command = VelocityCommand(velocity=np.array([0.9, 0.1]), acceleration=np.array([0.2, -0.2]), yaw_rad=math.pi / 2)
+    return PilotOutput(
+        time_s=12.5, ego_motion=None, velocity=velocity, detections=(), detection_tracks=(), neighbour_motions={},
+        neighbours=(neighbour,), command=command,
+        reasons=("no ego-motion: 12 pairs are too few",), counts={"ego": 1}, stages_ms={"flow": 14.0},
+        mission=MissionStatus("waypoints", np.array([1.0, 0.0]), "9 m to the goal", goal=np.array([9.0, 2.0])),
+        obstacles=ObstacleRanges(12.5, np.full(SECTORS, np.inf), np.zeros(SECTORS), np.full(SECTORS, 4.0)),
+    )  # fmt: skip
+
+
+def test_a_step_arrives_under_the_documented_keys_and_fields(watched: tuple[ZenohTelemetry, Received]) -> None:
+    telemetry, received = watched
+    publish_step(telemetry, "1", _yawed(-90.0), _output(np.array([1.0, 0.0, np.nan])))
+    messages = dict(received.get(timeout=10) for _ in range(7))
+
+    of_a_step = set(TOPICS) - {"events", "flight", "computer", "clock"}
+    assert set(messages) == {f"flockd/v1/meadow/1/{topic}" for topic in of_a_step}
+    for topic in of_a_step:
+        assert set(messages[f"flockd/v1/meadow/1/{topic}"]) == set(TOPICS[topic].type.__annotations__)
+    state = messages["flockd/v1/meadow/1/state"]
+    assert state["yaw_deg"] == pytest.approx(-90.0)
+    assert state["velocity_ned"] == [1.0, 0.0, None], "a number that is not finite is null"
+    neighbours = messages["flockd/v1/meadow/1/neighbours"]["neighbours"]
+    assert isinstance(neighbours, list)
+    assert neighbours[0]["position_ned"] == [1.0, -2.5, 0.5]
+    assert neighbours[0]["velocity_sigma_m_s"] is None
+    assert messages["flockd/v1/meadow/1/command"]["yaw_deg"] == pytest.approx(90.0)
+    assert (state["position_ne"], state["home_deg"]) == ([3.0, -4.0], None)
+    obstacles = messages["flockd/v1/meadow/1/obstacles"]
+    assert (obstacles["range_m"], obstacles["seen_m"]) == ([None] * 72, [4.0] * 72)
+    health = messages["flockd/v1/meadow/1/health"]
+    assert (health["ok"], health["refused"]) == (False, {"ego": 1})
+
+
+def test_messages_of_one_stream_arrive_in_order(watched: tuple[ZenohTelemetry, Received]) -> None:
+    telemetry, received = watched
+    for number in range(100):
+        telemetry.publish("2", "timings", {"time_s": float(number), "stages_ms": {}})
+    assert [received.get(timeout=10)[1]["time_s"] for _ in range(100)] == list(range(100))
+
+
+def test_attitude_angles_are_those_of_scipy() -> None:
+    from scipy.spatial.transform import Rotation
+
+    angles = (25.0, -50.0, 170.0)
+    attitude = Rotation.from_euler("ZYX", angles[::-1], degrees=True).as_matrix()
+    seen: dict[str, Mapping[str, object]] = {}
+
+    class Sink:
+        def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
+            seen[topic] = message
+
+    publish_step(Sink(), "1", VehicleState(time_s=0.0, R_ned_body=attitude, height_m=3.0), _output(None))
+    state = seen["state"]
+    assert [state[f"{name}_deg"] for name in ("roll", "pitch", "yaw")] == pytest.approx(angles)
+    assert state["velocity_ned"] is None
+
+
+def test_nobody_listening_costs_nothing_and_a_closed_session_counts_its_losses(endpoint: str) -> None:
+    telemetry = ZenohTelemetry("meadow", listen=[endpoint])
+    telemetry.publish("1", "events", {"time_s": 0.0, "event": "take-off"})
+    assert telemetry.lost == 0
+    telemetry.close()
+    telemetry.publish("1", "events", {"time_s": 1.0, "event": "landed"})
+    assert telemetry.lost == 1
+
+
+def test_numpy_numbers_are_plain_numbers_on_the_wire(watched: tuple[ZenohTelemetry, Received]) -> None:
+    telemetry, received = watched
+    telemetry.publish("1", "timings", {"time_s": np.float32(0.5), "stages_ms": {"flow": np.array([1, 2])}})
+    assert received.get(timeout=10)[1] == {"time_s": 0.5, "stages_ms": {"flow": [1, 2]}}
+
+
+def test_names_that_would_break_a_key_are_refused(endpoint: str) -> None:
+    for fleet in ("", "a/b", "*", "a b", "#"):
+        with pytest.raises(ValueError, match="does not fit into a key"):
+            ZenohTelemetry(fleet, listen=[endpoint])
+    with ZenohTelemetry("meadow", listen=[endpoint]) as telemetry, pytest.raises(ValueError, match="is not a topic"):
+        telemetry.publish("1", "stat", {})
+
+
+def test_a_taken_port_is_reported_in_one_sentence() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(UnavailableError) as caught:
+            ZenohTelemetry("meadow", listen=[endpoint])
+    reason = f"Can not create a new TCP listener bound to {endpoint}"
+    assert str(caught.value) == f"telemetry cannot use {endpoint} ({reason}); name another endpoint"
+
+
+def test_a_stream_is_stale_after_it_missed_two_messages() -> None:
+    for topic in TOPICS.values():
+        if topic.rate_hz is None:
+            assert topic.stale_after_s is None
+        else:
+            assert topic.stale_after_s is not None
+            assert topic.stale_after_s * topic.rate_hz >= 3.0

@@ -1,0 +1,540 @@
+"""The flight report, written from flights whose figures are known beforehand: a regular polygon that flies Eq. 43."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from numpy.typing import NDArray
+from scipy.spatial import Delaunay
+
+from flockd.review.flight_log.key_frames import KeyFrame, load_key_frames, save_key_frames
+from flockd.review.flight_log.log import FlightLog
+from flockd.review.flight_log.metadata import FlightMetadata
+from flockd.review.report.curves import error_curves, flight_curves
+from flockd.review.report.filmstrip import filmstrip_figure
+from flockd.review.report.obstacle_figures import obstacle_figure
+from flockd.review.report.page import write_report
+from flockd.review.report.summary import summarise, write_summary
+from flockd.review.report.trajectories import gabriel_edges, trajectories
+
+Array = NDArray[np.float64]
+RADIUS_M = 2.1
+SIDE_M = 2 * RADIUS_M * math.sin(math.pi / 5)  # of the pentagon: 2.4687 m
+STEP_S = 0.5
+
+
+def _flight(*, drones: int = 5, duration_s: float = 110.0, perception: str = "learned") -> FlightLog:
+    """A polygon of drones at one height, noses north, on the paper's circle and its tangent at 1 m/s.
+
+    By sight every translation is 0.02 m too long forward and -0.01 m to the right, every turn 0.5 degrees too far in
+    yaw, every neighbour 1 % too far.
+    """
+    time_s = np.arange(0.0, duration_s, STEP_S)
+    steps = len(time_s)
+    course = np.minimum(time_s, 66.0) / 10
+    desired = np.stack([np.cos(course), np.sin(course)], axis=1)
+    middle = np.vstack([np.zeros(2), np.cumsum(desired * STEP_S, axis=0)[:-1]])
+    around = 2 * np.pi * np.arange(drones) / drones
+    corners = RADIUS_M * np.stack([np.cos(around), np.sin(around)], axis=1) if drones > 1 else np.zeros((1, 2))
+    position = np.full((steps, drones, 3), -4.0)
+    position[..., :2] = middle[:, None] + corners
+    velocity = np.zeros((steps, drones, 3))
+    velocity[..., :2] = desired[:, None]
+
+    rotation, translation = np.full((steps, drones, 3, 3), np.nan), np.full((steps, drones, 3), np.nan)
+    neighbours = np.full((steps, drones, drones, 3), np.nan)
+    if perception != "truth":
+        c, s = math.cos(math.radians(0.5)), math.sin(math.radians(0.5))
+        rotation[1:] = [[c, -s, 0], [s, c, 0], [0, 0, 1]]
+        translation[1:] = np.diff(position, axis=0) + np.array([0.02, -0.01, 0.0])
+        others = ~np.eye(drones, dtype=bool)
+        neighbours[:, others] = 1.01 * (position[:, None] - position[:, :, None])[:, others]
+    return FlightLog(
+        time_s=time_s,
+        position=position,
+        velocity=velocity,
+        attitude=np.broadcast_to(np.eye(3), (steps, drones, 3, 3)).copy(),
+        desired=desired,
+        command_velocity=velocity[..., :2],
+        command_acceleration=np.zeros((steps, drones, 2)),
+        ego_rotation=rotation,
+        ego_translation=translation,
+        ego_inlier_ratio=np.full((steps, drones), 0.8),
+        own_velocity_estimate=velocity,
+        neighbour_position=neighbours,
+        neighbour_velocity=np.broadcast_to(velocity[:, None], neighbours.shape).copy(),
+        detection_position=neighbours,
+        false_tracks=np.zeros((steps, drones), dtype=np.int64),
+        truth_position=position,
+        truth_velocity=velocity,
+        stages_ms={} if perception == "truth" else {"flow": np.array([40.0, 60.0]), "ego_motion": np.array([5.0])},
+        metadata=FlightMetadata(
+            scenario="polygon",
+            perception=perception,
+            flow="flow",
+            scale="height",
+            drones=drones,
+            duration_s=duration_s,
+            step_s=STEP_S,
+            seed=7,
+            wall_s=duration_s * 4,
+            circle_until_s=66.0,
+            desired_distance_m=3.5,
+            observation_distance_m=20.0,
+            separation_distance_m=1.5,
+        ),
+    )
+
+
+def _moment(*, time_s: float = 3.0) -> KeyFrame:
+    """Two cameras; the same drone, label 2 and track 4, sits on the border between them."""
+    rng = np.random.default_rng(0)
+    cameras = ("back", "left")
+    yy, xx = np.mgrid[0:96, 0:64]
+    image = np.stack([xx * 3, yy * 2, 120 + 0 * xx], axis=2).astype(np.uint8)
+    depth = np.where(yy < 40, np.inf, 1.5 + 0.13 * yy).astype(np.float32)
+    labels = np.zeros((96, 64), np.uint8)
+    labels[50:60, 0:12] = 2
+    flow = rng.uniform(-8, 8, (96, 64, 2)).astype(np.float32)
+    flow[:10] = np.nan
+    return KeyFrame(
+        time_s=time_s,
+        drone=0,
+        cameras=cameras,
+        images=dict.fromkeys(cameras, image),
+        depth=dict.fromkeys(cameras, depth),
+        labels=dict.fromkeys(cameras, labels),
+        flow=dict.fromkeys(cameras, flow),
+        track_ids={2: 4},
+        ranges={2: 3.214},
+    )
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Texts need no figures, which take seconds."""
+    monkeypatch.setattr("flockd.review.report.page._embed", lambda *_, **__: Markup("<svg></svg>"))
+
+
+def _report(folder: Path, log: FlightLog, *moments: KeyFrame, processes: int = 1) -> str:
+    log.save(folder / "flight.npz")
+    write_summary(summarise(log), folder / "summary.json")
+    if moments:
+        save_key_frames(folder / "filmstrip.npz", moments)
+    page = write_report(folder, processes=processes)
+    assert page == folder / "report.html"
+    return page.read_text(encoding="utf-8")
+
+
+class _Page(HTMLParser):
+    """Reads a page: its text, the links it follows, its table cells, and whether every tag is closed in turn."""
+
+    _VOID = frozenset({"meta", "img", "br", "link", "input", "hr"})
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.text = ""
+        self.links: list[tuple[str, str]] = []
+        self.tags: set[str] = set()
+        self.rows: list[list[tuple[str, bool]]] = []
+        self._open: list[str] = []
+        self.feed(html)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        self.links += [
+            (tag, value or "") for name, value in attrs if name in ("src", "href", "srcset", "data", "action")
+        ]
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append(("", ("class", "met") in attrs))
+        if tag not in self._VOID:
+            self._open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        self.links += [(tag, value or "") for name, value in attrs if name in ("src", "href")]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if {"style", "script"} & set(self._open):
+            return
+        self.text += data
+        if self._open and self._open[-1] in ("td", "th"):
+            text, met = self.rows[-1][-1]
+            self.rows[-1][-1] = (text + data, met)
+
+    def row(self, name: str, number: int = 0) -> list[tuple[str, bool]]:
+        """Text and mark of the cells right of the heading `name`, where it comes for the `number`-th time."""
+        return [row[1:] for row in self.rows if row and row[0][0] == name][number]
+
+
+@pytest.fixture(scope="module")
+def five(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("five")
+    _report(folder, _flight(), _moment(), _moment(time_s=50.0))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def five_page(five: Path) -> _Page:
+    return _Page((five / "report.html").read_text(encoding="utf-8"))
+
+
+def test_the_page_needs_nothing_but_itself(five: Path, five_page: _Page) -> None:
+    html = (five / "report.html").read_text(encoding="utf-8")
+    assert "http" not in html
+    assert "@import" not in html
+    assert not five_page.tags & {"link", "iframe", "object", "embed"}
+    assert "script" not in {tag for tag, _ in five_page.links}, "scripts stand in the page"
+    assert [link for tag, link in five_page.links if tag == "img" and not link.startswith("data:image/")] == []
+    assert [link for _, link in five_page.links if not link.startswith(("data:", "#"))] == []
+    assert set(re.findall(r"url\(([^)]{0,1})", html)) <= {"#"}
+    assert len(html) < 6e6
+
+
+def test_every_reference_inside_the_page_has_one_target(five: Path) -> None:
+    html = (five / "report.html").read_text(encoding="utf-8")
+    targets = re.findall(r' id="([^"]+)"', html)
+    references = set(re.findall(r'href="#([^"]+)"|url\(#([^)]+)\)', html))
+    assert len(targets) == len(set(targets))
+    assert {one or other for one, other in references} == set(targets)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_reader_chooses_drone_and_moment_and_plays_the_flight(tmp_path: Path) -> None:
+    moments = [replace(_moment(time_s=time_s), drone=drone) for drone in (0, 2) for time_s in (3.0, 9.0)]
+    log = _flight(drones=3, duration_s=10.0)
+    html = _report(tmp_path, log, *moments)
+    assert re.findall(r'data-drone="([^"]+)" data-time="([^"]+)"', html) == [
+        ("drone 1", "3.000"), ("drone 1", "9.000"), ("drone 3", "3.000"), ("drone 3", "9.000"),
+    ]  # fmt: skip
+    assert "<option>drone 1</option><option>drone 3</option>" in html
+    data = json.loads(re.search(r'<script type="application/json">(.*?)</script>', html)[1])  # type: ignore[index]
+    assert data["time"] == log.time_s.tolist()
+    north, east, down = log.position[4, 2]
+    assert data["position"][4][2] == pytest.approx([north, east, -down], abs=0.005)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_the_page_speaks_of_the_flight_it_shows(tmp_path: Path) -> None:
+    log = _flight(drones=3, duration_s=20.0)
+    log.position[:, 0, 2] = -6.25
+    metadata = log.metadata.model_copy(update={"began": "2026-11-21T09:05:00+00:00", "version": "0.1.0"})
+    text = " ".join(_Page(_report(tmp_path, FlightLog(**{**vars(log), "metadata": metadata}))).text.split())
+    assert "begun 2026-11-21 09:05 UTC, flockd 0.1.0" in text
+    assert "–6.2 m" in text
+    assert "in 3D, drones" in text
+    assert "Five drones" not in text, "this flight is of three"
+    assert "The paper’s are of 5 drones, this flight is of 3." in text
+
+
+def test_figures_have_a_form_for_narrow_windows(five: Path) -> None:
+    html = (five / "report.html").read_text(encoding="utf-8")
+    for name in ("wide", "narrow"):
+        assert len(re.findall(rf'<div class="{name}"><(?:svg|img)', html)) == 3, "paths, curves and errors"
+    assert len({axes.get_position().x1 for axes in flight_curves(_flight(), narrow=True).axes}) == 1, "one column"
+
+
+def test_the_headline_tells_what_happened(five_page: _Page) -> None:
+    text = five_page.text
+    assert "Five drones flew 110 s by sight and stayed one flock" in text
+    assert "seed 7" in text
+    assert f"{SIDE_M:.2f}" == "2.47"
+    assert "2.47" in text
+    assert "0.25" in text  # times real time: 440 s of computing for 110 s
+    assert "100.0" in text  # per cent of the neighbours
+
+
+def test_table_2_has_our_errors_and_marks_those_that_meet_the_paper(five_page: _Page) -> None:
+    # x 0.02 m, y 0.01 m, yaw 0.5 degrees, no pitch and roll; 1 % of the diagonal is the largest error of distance.
+    diagonal_m = 2 * RADIUS_M * math.sin(2 * math.pi / 5)
+    expected = ["0.0200", "0.0100", "0.5000", "0.0000", "0.0000", f"{0.01 * diagonal_m:.4f}"]
+    circle, straight = five_page.row("maximum", 0), five_page.row("maximum", 1)
+    assert [cell.lstrip("-") for cell, _ in circle] == expected
+    assert [met for _, met in circle] == [True] * 6
+    # The paper's maxima after 66 s: 0.0099 m forward, the rest is met; 0.0399 m of distance against 0.0333 m is not.
+    assert [met for _, met in straight] == [False, True, True, True, True, False]
+    assert [met for _, met in five_page.row("mean", 1)] == [False, True, True, True, True, True]
+    assert [cell for cell, _ in five_page.row("the paper’s maximum", 1)][:2] == ["0.0099", "0.0155"]
+
+
+def test_table_3_and_the_flock(five_page: _Page) -> None:
+    # Nothing ever moves within the polygon: converged from the start in shape, from the end of the circle in velocity.
+    cells = [cell.lstrip("-") for cell, _ in five_page.row("By sight")]
+    assert cells == ["66.0", "0.0000", "0.0000", "0.0", "0.0000", "0.0000"]
+    assert [cell for cell, _ in five_page.row("the paper’s", 1)] == ["67.0", "0.0000", "–", "67.0", "0.1273", "–"]
+    assert five_page.row("smallest distance in 3D, m")[0][0] == f"{SIDE_M:.3f}"
+    assert five_page.row("order, last 10 s")[0][0] == "1.0000"
+    assert five_page.row("share known of those within 10 m")[0][0] == "1.0000"
+    assert five_page.row("ego motion")[0][0] == "5.0"
+    assert five_page.row("flow")[0][0] == "50.0"
+
+
+def test_figures_are_also_files(five: Path) -> None:
+    names = {path.name for path in (five / "figures").iterdir()}
+    assert names == {"trajectories.png", "curves.png", "errors.png", "filmstrip_1.png", "filmstrip_2.png"}
+    for name in names:
+        picture = cv2.imread(str(five / "figures" / name))
+        assert picture is not None
+        assert picture.std() > 5, f"{name} is empty"
+
+
+def test_the_same_flight_gives_the_same_page_in_however_many_processes(five: Path, tmp_path: Path) -> None:
+    again = _report(tmp_path, _flight(), _moment(), _moment(time_s=50.0), processes=2)
+    assert again == (five / "report.html").read_text(encoding="utf-8")
+    files = sorted((five / "figures").iterdir())
+    assert len(files) == 5
+    for file in files:
+        assert (tmp_path / "figures" / file.name).read_bytes() == file.read_bytes(), file.name
+
+
+def test_a_flight_with_exact_states_says_what_it_lacks(tmp_path: Path) -> None:
+    page = _Page(_report(tmp_path, _flight(perception="truth")))
+    assert "Five drones flew 110 s with exact states and stayed one flock" in page.text
+    assert "there is no estimate to compare with the truth" in page.text
+    assert "No camera images were kept of this flight." in page.text
+    assert "No stage of this flight was timed." in page.text
+    assert "it stands alone" in page.text
+    assert not [row for row in page.rows if row and row[0][0] in ("maximum", "By sight")]
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"trajectories.png", "curves.png"}
+
+
+def test_a_flight_shorter_than_the_circle_has_no_convergence(tmp_path: Path) -> None:
+    html = _report(tmp_path, _flight(duration_s=20.0))
+    page = _Page(html)
+    assert "this flight was too short" in " ".join(page.text.split())
+    assert "On the circle, t < 66 s" in page.text
+    assert "Straight on" not in page.text
+    assert ">circle ends<" not in html  # the legend of the figures
+
+
+def test_one_drone_is_no_flock(tmp_path: Path) -> None:
+    log = _flight(drones=1, duration_s=10.0)
+    page = _Page(_report(tmp_path, log))
+    assert "One drone flew 10 s by sight" in page.text
+    assert "Closest" not in page.text
+    assert not {"distance, m", "Σ obj2"} & {axes.get_ylabel() for axes in flight_curves(log).axes}
+    assert "never estimated" in page.text  # the panel of distances
+
+
+def test_fifty_drones_fit_on_a_page(tmp_path: Path) -> None:
+    html = _report(tmp_path, _flight(drones=50, duration_s=20.0))
+    text = _Page(html).text
+    assert "50 drones flew 20 s by sight, but came within 0.26 m of each other" in text  # 2 * 2.1 * sin(pi / 50)
+    assert "drone 50" in text
+    assert "drone 25" not in text
+    assert "median drone" in text
+    assert len(html) < 6e6
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_flock_that_falls_apart_is_not_praised(tmp_path: Path) -> None:
+    log = _flight(duration_s=20.0)
+    log.position[:, 0, 0] -= 40.0
+    assert "but did not stay one flock" in _report(tmp_path, log)
+
+
+def test_a_folder_without_a_flight_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"flight\.npz is missing"):
+        write_report(tmp_path)
+    _flight(duration_s=5.0).save(tmp_path / "flight.npz")
+    with pytest.raises(FileNotFoundError, match=r"summary\.json is missing"):
+        write_report(tmp_path)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_name_cannot_break_the_page(tmp_path: Path) -> None:
+    log = _flight(drones=1, duration_s=5.0)
+    metadata = log.metadata.model_copy(update={"scenario": "<script>alert(1)</script>"})
+    html = _report(tmp_path, FlightLog(**{**vars(log), "metadata": metadata}))
+    assert "<script>alert" not in html
+    assert "&lt;script&gt;alert" in html
+
+
+# -------------------------------------------------------------------------------------------------------- the figures
+
+
+def _axes(figure_axes: list[Axes], *, label: str) -> Axes:
+    return next(axes for axes in figure_axes if label in (axes.get_ylabel(), axes.get_title(loc="left")))
+
+
+def test_the_course_is_drawn_without_jumps_through_a_full_turn() -> None:
+    # Eq. 43 turns by 6.6 rad = 378.15 degrees; the flight follows exactly.
+    course = _axes(flight_curves(_flight()).axes, label="course, °")
+    for line in course.get_lines()[:5]:
+        drawn = np.asarray(line.get_ydata())
+        assert drawn[0] == pytest.approx(0.0, abs=1e-9)
+        assert drawn[-1] == pytest.approx(math.degrees(6.6))
+        assert np.abs(np.diff(drawn)).max() < 3.0
+
+
+def test_the_sums_of_the_polygon_are_the_analytic_ones() -> None:
+    curves = flight_curves(_flight()).axes
+    before, after = (np.asarray(line.get_ydata()) for line in _axes(curves, label="Σ obj1").get_lines()[:2])
+    np.testing.assert_allclose(before, -2.5)
+    np.testing.assert_allclose(after, 0.0, atol=1e-12)
+    # Each of five sees two at the side's and two at the diagonal's distance (Eq. 45 with equal velocities).
+    diagonal_m = 2 * RADIUS_M * math.sin(2 * math.pi / 5)
+    shape = 5 * (2 * abs(3.5 - SIDE_M) + 2 * abs(3.5 - diagonal_m))
+    np.testing.assert_allclose(np.asarray(_axes(curves, label="Σ obj2").get_lines()[0].get_ydata()), shape)
+
+
+def test_paths_have_equal_axes_with_north_up() -> None:
+    figure = trajectories(_flight())
+    paths = _axes(figure.axes, label="Paths")
+    assert paths.get_aspect() == 1.0
+    assert paths.get_ylim()[0] < paths.get_ylim()[1]
+    texts = [text.get_text() for text in _axes(figure.axes, label="Formation at the end, t = 109.5 s").texts]
+    assert texts.count("2.47") == 5
+
+
+def test_obstacles_are_drawn_where_they_stand_and_as_they_were_known() -> None:
+    log = _flight(duration_s=10.0)
+    steps, drones = log.position.shape[:2]
+    clearance, known = np.full((steps, drones), 4.0), np.full((steps, drones, 72), np.inf)
+    clearance[6, 2], known[6, 2, 18] = 0.5, 0.85
+    north, east, down = log.position[6, 2]
+    pole = [north, east + 1.0, 0.15, 0.0, 0.0, 0.0, 8.0]
+    wall = [north - 5.0, east, 2.0, 0.1, math.pi / 2, 0.0, -down + 1.0]
+    log = replace(
+        log, obstacles=np.array([pole, wall]), clearance=clearance, obstacle_range=known,
+        metadata=log.metadata.model_copy(update={"drone_radius_m": 0.35}),
+    )  # fmt: skip
+    figure = obstacle_figure(log)
+    assert figure is not None
+    local = _axes(figure.axes, label="Drone 3 at its nearest, t = 3 s")
+    shapes = [path.get_extents() for group in local.collections for path in group.get_paths()]
+    assert [shape.width for shape in shapes] == pytest.approx([0.3, 4.0], abs=0.01), "the wall's length points east"
+    assert (shapes[0].x0 + shapes[0].x1) / 2 == pytest.approx(east + 1.0, abs=0.01)
+    (known_range,) = local.get_lines()
+    x, y = np.asarray(known_range.get_xdata()), np.asarray(known_range.get_ydata())
+    assert np.mean(x) == pytest.approx(east + 0.85, abs=0.01)
+    assert np.mean(y) == pytest.approx(north, abs=0.01)
+    curves = _axes(figure.axes, label="clearance, m")
+    assert np.min([np.asarray(line.get_ydata()) for line in curves.get_lines()[:5]]) == pytest.approx(0.15)
+    assert obstacle_figure(_flight(duration_s=10.0)) is None
+
+
+def test_errors_are_drawn_signed() -> None:
+    figure = error_curves(_flight(duration_s=10.0))
+    assert figure is not None
+    y = np.asarray(_axes(figure.axes, label="Translation y, m").get_lines()[0].get_ydata())
+    assert np.isnan(y[0])
+    np.testing.assert_allclose(y[1:], -0.01)
+
+
+def test_formation_edges_have_nobody_between() -> None:
+    pentagon = np.stack([np.cos(np.arange(5) * 0.4 * np.pi), np.sin(np.arange(5) * 0.4 * np.pi)], axis=1)
+    sides = {tuple(sorted((i, (i + 1) % 5))) for i in range(5)}
+    assert {(i, j) for i, j in np.argwhere(np.triu(gabriel_edges(pentagon))).tolist()} == sides
+
+    plan = np.random.default_rng(3).uniform(-10, 10, (30, 2))
+    edges = {(i, j) for i, j in np.argwhere(np.triu(gabriel_edges(plan))).tolist()}
+    triangles = Delaunay(plan).simplices
+    delaunay = {tuple(sorted((t[a], t[b]))) for t in triangles.tolist() for a, b in ((0, 1), (1, 2), (0, 2))}
+    clear = {
+        (i, j)
+        for i, j in delaunay
+        if np.linalg.norm(np.delete(plan, [i, j], axis=0) - (plan[i] + plan[j]) / 2, axis=1).min()
+        >= np.linalg.norm(plan[i] - plan[j]) / 2
+    }
+    assert edges == clear  # Gabriel's graph is that part of Delaunay's
+
+
+# ------------------------------------------------------------------------------------------------------ the filmstrip
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_key_frame_without_cameras_is_left_out(tmp_path: Path) -> None:
+    """As flights kept them in which a drone touched the ground: the report has all the others."""
+    grounded = KeyFrame(
+        time_s=2.0, drone=0, cameras=(), images={}, depth={}, labels={}, flow={}, track_ids={}, ranges={}
+    )
+    page = _report(tmp_path, _flight(duration_s=20.0), grounded, _moment())
+    assert len(load_key_frames(tmp_path / "filmstrip.npz")) == 2
+    assert "drone 1 at 3.0 s" in page
+    assert "at 2.0 s" not in page
+    assert sorted(path.name for path in (tmp_path / "figures").glob("filmstrip*")) == ["filmstrip_1.png"]
+
+
+def test_a_filmstrip_survives_its_file(tmp_path: Path) -> None:
+    moment = _moment()
+    save_key_frames(tmp_path / "filmstrip.npz", [moment, _moment(time_s=9.5)])
+    loaded, later = load_key_frames(tmp_path / "filmstrip.npz")
+    assert (loaded.time_s, later.time_s, loaded.drone, loaded.cameras) == (3.0, 9.5, 0, ("back", "left"))
+    assert loaded.track_ids == {2: 4}
+    assert loaded.ranges == {2: 3.214}
+    assert loaded.shrink == 2
+    np.testing.assert_array_equal(loaded.labels["left"], moment.labels["left"][::2, ::2])
+    depth = moment.depth["left"][::2, ::2]
+    np.testing.assert_array_equal(np.isinf(loaded.depth["left"]), np.isinf(depth))
+    known = np.isfinite(depth)
+    np.testing.assert_allclose(loaded.depth["left"][known], depth[known], atol=0.00501)
+    # The flow stays in pixels of the camera, not of the thinned picture.
+    np.testing.assert_allclose(loaded.flow["left"], moment.flow["left"][::2, ::2], atol=1 / 16 + 1e-6)
+    colour = loaded.images["left"].astype(float) - moment.images["left"].reshape(48, 2, 32, 2, 3).mean(axis=(1, 3))
+    assert np.abs(colour).mean() < 3.0
+
+
+def test_a_moment_shows_its_cameras_in_rig_order_with_named_drones() -> None:
+    figure = filmstrip_figure(_moment())
+    names = [text.get_text() for axes in figure.axes for text in axes.texts]
+    assert [name for name in names if name in {"left", "back"}] == ["left", "back"]
+    assert names.count("#4  3.21 m") == 2
+
+
+def test_an_arrow_ends_at_the_border_of_its_image() -> None:
+    """At the left border of each image everything moves 100 px to the left, which is drawn 6 px long."""
+    moment = _moment()
+    flow = np.ones((96, 64, 2), np.float32)
+    flow[:, :4] = -100.0, 0.0
+    canvas = FigureCanvasAgg(filmstrip_figure(KeyFrame(**{**vars(moment), "flow": {"left": flow, "back": flow}})))
+    canvas.draw()  # type: ignore[no-untyped-call]
+    drawn = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
+    plate = drawn[-700:, :, :3]  # 160 pixels an inch: within the row of the flow
+    assert np.ptp(plate[:, 49:560].astype(int)) > 100
+    for beside in (plate[:, 40:47], plate[:, 561:567]):
+        assert np.array_equal(np.unique(beside.reshape(-1, 3), axis=0), [(0x14, 0x18, 0x1F)])
+
+
+def test_a_camera_may_lack_a_map() -> None:
+    moment = _moment()
+    bare = KeyFrame(**{**vars(moment), "flow": {}, "depth": {"left": moment.depth["left"]}, "labels": {}})
+    assert filmstrip_figure(bare).axes
+
+
+def test_maps_of_another_size_are_refused() -> None:
+    moment = _moment()
+    with pytest.raises(ValueError, match=r"camera 'left': the depth is \(48, 32\), the image \(96, 64\)"):
+        KeyFrame(**{**vars(moment), "depth": {"left": moment.depth["left"][::2, ::2]}})
+
+
+def test_names_of_close_drones_do_not_cover_each_other() -> None:
+    moment = _moment()
+    labels = np.zeros((96, 64), np.uint8)
+    labels[50:56, 20:28], labels[50:56, 32:40] = 1, 2
+    figure = filmstrip_figure(
+        KeyFrame(**{**vars(moment), "labels": {"left": labels}, "ranges": {1: 3.0, 2: 3.1}, "track_ids": {2: 4}})
+    )
+    figure.canvas.draw()
+    names = [text for axes in figure.axes for text in axes.texts if text.get_text().startswith(("#", "new"))]
+    assert sorted(name.get_text() for name in names) == ["#4  3.10 m", "new  3.00 m"]
+    one, other = (name.get_window_extent() for name in names)
+    assert not one.overlaps(other)

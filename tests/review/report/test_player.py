@@ -1,0 +1,256 @@
+"""The report's script, run on a whole report: it plays the flight and shows the chosen plate."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import shutil
+import subprocess
+import time
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import pytest
+from markupsafe import Markup
+from py_mini_racer import MiniRacer
+
+from tests.review.report.test_page import _flight, _moment, _report
+
+VOID = frozenset({"meta", "img", "br", "link", "input", "hr"})
+SIDE_M = 2.1 * 3**0.5
+"""Of a triangle whose corners are 2.1 m from its middle."""
+
+
+class _Tree(HTMLParser):
+    """The elements of a page, as the stand-in for a browser wants them, and its script."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.root = self._node("page", [])
+        self._open = [self.root]
+        self.feed(html)
+        self.close()
+
+    @staticmethod
+    def _node(tag: str, attributes: list[tuple[str, str | None]]) -> dict[str, Any]:
+        named = {name: value or "" for name, value in attributes}
+        return {"tag": tag, "attributes": named, "children": [], "text": ""}
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        node = self._node(tag, attrs)
+        self._open[-1]["children"].append(node)
+        if tag not in VOID:
+            self._open.append(node)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._open[-1]["children"].append(self._node(tag, attrs))
+
+    def handle_endtag(self, tag: str) -> None:
+        self._open.pop()
+
+    def handle_data(self, data: str) -> None:
+        self._open[-1]["text"] += data
+
+
+class _Browser:
+    """A page with its script running, and the parts of its player."""
+
+    def __init__(self, html: str) -> None:
+        self._engine = MiniRacer()
+        script = html.rpartition("<script>")[2].partition("</script>")[0]
+        self._engine.eval(f"const page = {json.dumps(_Tree(html).root)};")
+        self._engine.eval((Path(__file__).parent / "browser.js").read_text(encoding="utf-8"))
+        self._engine.eval(f"{{{script}}}")
+
+    def __call__(self, expression: str) -> Any:
+        return json.loads(str(self._engine.eval(f"JSON.stringify({expression})")))
+
+    def do(self, element: str, event: str, **values: object) -> None:
+        """Sets properties of the first such element, and tells it of an event."""
+        changes = "".join(f"e.{name} = {json.dumps(value)};" for name, value in values.items())
+        self._engine.eval(
+            f"{{const e = document.querySelector({json.dumps(element)}); {changes} e.dispatch('{event}');}}"
+        )
+
+    def shown(self) -> str:
+        return str(self("document.querySelector('.player').querySelector('output').textContent"))
+
+    def button(self) -> str:
+        return str(self("document.querySelector('button').textContent"))
+
+    def circles(self) -> list[tuple[float, float]]:
+        """Where the drones are drawn, in pixels right and down."""
+        drawn = self("document.querySelector('canvas').drawn.filter((one) => !one.text)")
+        return [(one["x"], one["y"]) for one in drawn]
+
+
+@pytest.fixture(scope="module")
+def html(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Three drones on a triangle fly 10 s; plates of two of them at two moments; without figures."""
+    moments = [replace(_moment(time_s=time_s), drone=drone) for drone in (0, 2) for time_s in (3.0, 9.0)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("flockd.review.report.page._embed", lambda *_, **__: Markup(""))
+        return _report(tmp_path_factory.mktemp("played"), _flight(drones=3, duration_s=10.0), *moments)
+
+
+def test_play_runs_the_flight_to_its_end_at_the_chosen_speed(html: str) -> None:
+    page = _Browser(html)
+    assert page("document.querySelector('.player').hidden") is False
+    assert (page.button(), page.shown()) == ("Play", f"0.0 s, closest {SIDE_M:.2f} m in 3D")
+    page.do("button", "click")
+    assert page.button() == "Pause"
+    page("frame(500)")
+    assert page.shown().startswith("2.0 s"), "half a second at four times real time"
+    page.do("[name=rate]", "input", value="10")
+    page("frame(300)")
+    assert page.shown().startswith("5.0 s")
+    assert page("document.querySelector('[name=time]').value") == pytest.approx(5.0)
+    page("frame(2000)")
+    assert page("frame(100)") == 0, "after the end nothing waits for another frame"
+    assert (page.button(), page.shown()[:5]) == ("Play", "9.5 s")
+    page.do("button", "click")
+    page("frame(100)")
+    assert page.shown().startswith("1.0 s"), "once more from the beginning"
+
+
+def test_pause_and_the_timeline_stop_the_flight_where_it_is(html: str) -> None:
+    page = _Browser(html)
+    page.do("button", "click")
+    page("frame(500)")
+    page.do("button", "click")
+    page("frame(500)")
+    assert (page.button(), page.shown()[:5]) == ("Play", "2.0 s")
+    page.do("button", "click")
+    page.do("[name=time]", "input", value="7.25")
+    page("frame(500)")
+    assert (page.button(), page.shown()[:5]) == ("Play", "7.3 s")
+
+
+def test_drones_are_drawn_with_north_up_and_true_to_scale(html: str) -> None:
+    page = _Browser(html)
+    first, second, third = page.circles()
+    # The corners lie north, and 120 and 240 degrees clockwise from there.
+    assert first[1] < second[1] == pytest.approx(third[1])
+    assert second[0] > first[0] > third[0]
+    side_px = second[0] - third[0]
+    assert (second[1] - first[1]) / side_px == pytest.approx(3**0.5 / 2, rel=0.01)
+    page.do("[name=follow]", "input", checked=True)
+    followed = page.circles()
+    assert sum(x for x, _ in followed) / 3 == pytest.approx(300.0, abs=0.5), "the middle of the canvas"
+    assert sum(y for _, y in followed) / 3 == pytest.approx(200.0, abs=0.5)
+    assert followed[1][0] - followed[2][0] > side_px
+
+
+def test_a_round_obstacle_is_drawn_where_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flockd.review.report.page._embed", lambda *_, **__: Markup(""))
+    log = _flight(drones=3, duration_s=10.0)
+    under_the_second = [*log.position[0, 1, :2], 0.3, 0.0, 0.0, 0.0, 8.0]
+    page = _Browser(_report(tmp_path, replace(log, obstacles=np.array([under_the_second]))))
+    obstacle, _, second, _ = page.circles()
+    assert obstacle == pytest.approx(second, abs=0.2)
+
+
+def test_a_reader_chooses_the_plate_of_a_drone_and_moment(html: str) -> None:
+    page = _Browser(html)
+    plates = "document.querySelectorAll('figure').filter((one) => !one.hidden)"
+    visible = f"{plates}.map((one) => [one.dataset.drone, one.dataset.time])"
+    assert page(visible) == [["drone 1", "3.000"]]
+    page.do("[name=moment]", "input", value="1")
+    assert page(visible) == [["drone 1", "9.000"]]
+    page.do("[name=drone]", "input", value="drone 3")
+    assert page(visible) == [["drone 3", "9.000"]]
+    page.do("figure", "click")
+    assert page("document.querySelector('figure').classList.contains('large')") is True
+
+
+def test_a_browser_plays_the_flight(html: str, tmp_path: Path) -> None:
+    """A real one, driven over the DevTools protocol: `Play` is pressed, and the page tells how far the flight is."""
+    names = ("chromium", "chromium-browser", "google-chrome")
+    browser = next((found for name in names if (found := shutil.which(name))), None)
+    if browser is None:
+        pytest.skip("chromium is not here")
+    page = tmp_path / "report.html"
+    page.write_text(html, encoding="utf-8")
+    with _DevTools(browser, tmp_path / "profile") as tools:
+        tools.open(page.as_uri())
+        before = tools.evaluate("document.querySelector('.player output').textContent")
+        assert before == f"0.0 s, closest {SIDE_M:.2f} m in 3D"
+        tools.evaluate("document.querySelector('.player button').click()")
+        played = tools.evaluate("""new Promise((resolve) => {
+          const output = document.querySelector(".player output");
+          const wait = () => (parseFloat(output.textContent) >= 1 ? resolve(output.textContent) : setTimeout(wait, 50));
+          wait();
+        })""")
+        assert 1.0 <= float(played.partition(" s")[0]) <= 9.5
+        closest_m = float(played.split()[3])
+        assert closest_m == pytest.approx(SIDE_M, abs=0.015), "positions are kept to the centimetre"
+
+
+class _DevTools:
+    """A browser without a window, which takes commands over a pair of pipes."""
+
+    FLAGS = (
+        "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+        "--disable-background-networking", "--disable-component-update", "--disable-sync", "--remote-debugging-pipe",
+    )  # fmt: skip
+
+    def __init__(self, browser: str, profile: Path) -> None:
+        reads, self._write = os.pipe()
+        self._read, writes = os.pipe()
+        pipes = f'exec "$@" 3<&{reads} 4>&{writes}'  # the browser's descriptors 3 and 4
+        command = ["bash", "-c", pipes, "bash", browser, *self.FLAGS, f"--user-data-dir={profile}"]
+        self._process = subprocess.Popen(command, pass_fds=(reads, writes), stderr=subprocess.DEVNULL)
+        os.close(reads)
+        os.close(writes)
+        self._received, self._number, self._session = b"", 0, ""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.wait()
+        os.close(self._write)
+        os.close(self._read)
+
+    def open(self, address: str) -> None:
+        """Opens a page and waits until it is there."""
+        target = self._command("Target.createTarget", url=address)["targetId"]
+        self._session = self._command("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        loaded = "document.readyState === 'complete' && location.href !== 'about:blank'"
+        until_s = time.monotonic() + 60.0
+        while not self.evaluate(loaded):
+            assert time.monotonic() < until_s
+            time.sleep(0.05)
+
+    def evaluate(self, expression: str) -> Any:
+        """The value of an expression in the page, of a promise when it is kept."""
+        answer = self._command("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
+        assert "exceptionDetails" not in answer, answer
+        return answer["result"].get("value")
+
+    def _command(self, method: str, **parameters: object) -> dict[str, Any]:
+        self._number += 1
+        message = {"id": self._number, "method": method, "params": parameters}
+        if self._session:
+            message["sessionId"] = self._session
+        os.write(self._write, json.dumps(message).encode() + b"\0")
+        while (answer := self._next()).get("id") != self._number:
+            pass
+        assert "result" in answer, answer
+        result: dict[str, Any] = answer["result"]
+        return result
+
+    def _next(self) -> dict[str, Any]:
+        while b"\0" not in self._received:
+            assert select.select([self._read], [], [], 60.0)[0], "the browser is silent"
+            received = os.read(self._read, 65536)
+            assert received, "the browser has ended"
+            self._received += received
+        message, _, self._received = self._received.partition(b"\0")
+        answer: dict[str, Any] = json.loads(message)
+        return answer

@@ -1,0 +1,174 @@
+"""Flights at control level against one drone's law and the simulator's exact flights."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockd.core.config import load_scenario
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.data import data_path
+from flockd.core.errors import UsageError
+from flockd.core.messages import FloatArray
+from flockd.flight.flocking import FlockingLaw, FlockingParameters, WeightParameters
+from flockd.flight.flocking.metrics import min_distance, order, safety, union
+from flockd.sim.control_level import fly_flocks
+from flockd.sim.control_level.flock_figures import orders
+from flockd.sim.control_level.flock_flights import FlockFlights
+from flockd.sim.exact_states import fly_exact_states
+from flockd.sim.start import scattered, with_drones
+
+UNIFORM = WeightParameters(kind="uniform")
+
+
+@lru_cache
+def _scenario(name: str = "paper_flight", **overrides: Any) -> ScenarioConfig:
+    keys = {key.replace("__", "."): value for key, value in overrides.items()}
+    return load_scenario(data_path("config") / f"{name}.yaml", keys)
+
+
+def _seeded(scenario: ScenarioConfig, seed: int) -> ScenarioConfig:
+    return scattered(scenario.model_copy(update={"seed": seed}), 0.5)
+
+
+def _flown(flights: FlockFlights, threads: int = 1) -> tuple[FloatArray, FloatArray]:
+    """Positions and velocities (S, flights, n, 3) as each step begins."""
+    states = []
+    for step in range(flights.steps):
+        states.append(flights.states.copy())
+        flights.step(step, None, threads)
+    moved = np.array(states).transpose(0, 2, 3, 1)
+    return moved[..., :3], moved[..., 3:]
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        FlockingParameters(),
+        FlockingParameters(weight=UNIFORM),
+        FlockingParameters(weight=WeightParameters(kind="nearest", nearest=3)),
+        FlockingParameters(weight=WeightParameters(kind="nearest", nearest=12), observation_distance_m=6.0),
+        FlockingParameters(weight=UNIFORM, separation_distance_m=4.0, observation_distance_m=3.0),
+        FlockingParameters(
+            weight=WeightParameters(kind="nearest", nearest=2), separation_distance_m=4.0, observation_distance_m=3.0
+        ),
+        FlockingParameters(weight=UNIFORM, cohesion=0.3, alignment=0.7, separation=2.0, velocity=0.5, own_weight=3.0),
+    ],
+)
+@pytest.mark.parametrize(("drones", "spread_m"), [(2, 1.0), (7, 3.0), (60, 1.5), (60, 12.0), (40, 200.0)])
+def test_each_drone_accelerates_as_the_law_says(parameters: FlockingParameters, drones: int, spread_m: float) -> None:
+    scenario = with_drones(_scenario(), drones)
+    drone = scenario.drone.model_copy(update={"flocking": parameters})
+    flights = FlockFlights([scenario.model_copy(update={"drone": drone})] * 2)
+    random = np.random.default_rng(drones)
+    flights.states[:] = random.normal(0.0, spread_m, flights.states.shape)
+    flights.states[:2, 1, 1] = flights.states[:2, 1, 0] + [0.0, 4e-4]  # nearer than the law's pole
+    flights.perceive(0)
+    following = parameters.velocity * parameters.own_weight
+    law = FlockingLaw(parameters)
+    for flight in range(2):
+        x, v = flights.states[:2, flight].T, flights.states[3:5, flight].T
+        for i in range(drones):
+            others = np.arange(drones) != i
+            u = law.acceleration(v[i], x[others] - x[i], v[others], [0.3, -0.2])
+            ours = flights.sums[:, flight, i] + following * np.array([0.3, -0.2])
+            np.testing.assert_allclose(ours, u, rtol=1e-10, atol=1e-10)
+
+
+def test_two_drones_at_one_spot_are_pushed_as_the_law_pushes_them() -> None:
+    for parameters in (FlockingParameters(weight=UNIFORM), FlockingParameters()):
+        scenario = with_drones(_scenario(), 2)
+        drone = scenario.drone.model_copy(update={"flocking": parameters})
+        flights = FlockFlights([scenario.model_copy(update={"drone": drone})])
+        flights.states[:] = 0.0
+        flights.perceive(0)
+        u = FlockingLaw(parameters).acceleration([0.0, 0.0], [[0.0, 0.0]], [[0.0, 0.0]], [0.0, 0.0])
+        np.testing.assert_allclose(flights.sums[:, 0], np.column_stack([u, u]))
+
+
+@pytest.mark.parametrize(
+    ("scenario", "drones"),
+    [
+        (_scenario(duration_s=20.0, drone__flocking__weight__kind="uniform"), 5),
+        (_scenario(duration_s=15.0, vehicle__gust_m_s=0.2, seed=3), 3),
+        (_scenario(duration_s=10.0, drone__flocking__weight__nearest=3), 12),
+        (_scenario("square", duration_s=50.0), 2),
+        (_scenario("one_knows", duration_s=15.0), 3),
+        (_scenario(duration_s=15.0, drone__mission__height_m=9.0), 2),
+    ],
+)
+def test_a_flight_is_the_simulators_flight_with_exact_states(scenario: ScenarioConfig, drones: int) -> None:
+    scenario = with_drones(scenario, drones)
+    positions, velocities = _flown(FlockFlights([scenario]))
+    _, true_positions, true_velocities = fly_exact_states(scenario)
+    np.testing.assert_allclose(positions[:, 0], true_positions, atol=1e-9)
+    np.testing.assert_allclose(velocities[:, 0], true_velocities, atol=1e-9)
+
+
+def test_the_figures_are_those_of_the_metrics() -> None:
+    scenario = with_drones(_scenario(duration_s=15.0), 9)
+    flights = FlockFlights([_seeded(scenario, seed) for seed in (4, 5)])
+    positions, velocities = _flown(flights)
+    for flight, figures in enumerate(flights.figures()):
+        x, v = positions[:, flight], velocities[:, flight]
+        nearest = np.array([min_distance(step) for step in x])
+        assert figures["min_distance_m"] == pytest.approx(nearest.min(), abs=1e-12)
+        assert figures["min_distance_after_10s_m"] == pytest.approx(nearest[20:].min(), abs=1e-12)
+        assert figures["min_distance_tail_m"] == pytest.approx(nearest[10:].min(), abs=1e-12)
+        assert figures["min_level_distance_m"] == pytest.approx(min(min_distance(step[:, :2]) for step in x), abs=1e-12)
+        assert figures["order_tail"] == pytest.approx(np.mean([order(step[:, :2]) for step in v[10:]]), abs=1e-12)
+        assert figures["union_tail"] == pytest.approx(np.mean([union(step[:, :2], 20.0) for step in x[10:]]))
+        assert figures["safety"] == pytest.approx(np.mean([safety(step) for step in x]))
+
+
+def test_a_flock_that_has_fallen_apart_is_told_by_its_union() -> None:
+    scenario = with_drones(_scenario(duration_s=1.0), 4)
+    flights = FlockFlights([scenario])
+    flights.states[0, 0] = [0.0, 15.0, 300.0, 310.0]
+    flights.states[1, 0] = 0.0
+    _flown(flights)
+    assert flights.figures()[0]["union_tail"] == pytest.approx(2 / 3)
+
+
+def test_contacts_are_counted_from_touch_to_free() -> None:
+    scenario = with_drones(_scenario(duration_s=4.0, drone__flocking__max_acceleration_m_s2=0.001), 2)
+    flights = FlockFlights([scenario])
+    flights.states[:, 0] = np.array([[0.0, 0.0, -4.0, 1.0, 0.0, 0.0], [3.0, 0.0, -4.0, -1.0, 0.0, 0.0]]).T
+    figures = _and_fly(flights)  # 3 m apart, at 2 m/s towards each other: within 0.7 m at 1.5 s only
+    assert figures["drone_collisions"] == 2  # each of the two drones has one
+    assert figures["first_collision_s"] == 1.5
+    assert figures["min_distance_m"] == pytest.approx(0.0, abs=0.01)
+
+
+def _and_fly(flights: FlockFlights) -> dict[str, Any]:
+    _flown(flights)
+    return dict(flights.figures()[0])
+
+
+def test_order_of_one_that_stands_still_counts_as_in_the_metrics() -> None:
+    velocity = np.array([[[1.0, 0.0, 2.0]], [[0.0, 0.0, 1.0]]])
+    assert orders(velocity)[0] == pytest.approx(order(velocity[:, 0].T))
+
+
+@pytest.mark.parametrize("weight", ["uniform", "nearest"])
+def test_a_flight_is_the_same_in_any_batch_and_in_any_number_of_threads(weight: str) -> None:
+    scenario = with_drones(_scenario(duration_s=5.0, drone__flocking__weight__kind=weight), 300)
+    flown = [_seeded(scenario, seed) for seed in (7, 8, 3)]
+    alone = [fly_flocks([one])[0] for one in flown[:2]]
+    shorter = scenario.model_copy(update={"duration_s": 1.0})
+    assert fly_flocks([flown[2], flown[1], shorter, flown[0]], threads=2)[1::2] == alone[::-1]
+    assert alone[0] != alone[1]  # the seed moves the starts
+
+
+def test_a_flight_that_arrives_says_when() -> None:
+    figures = fly_flocks([_scenario("square", duration_s=190.0)])[0]
+    assert figures["arrived"] is True
+    assert figures["arrival_time_s"] == 160.0  # as `flockd sim config/square.yaml --perception truth` says
+
+
+def test_drones_flown_by_hand_are_refused() -> None:
+    with pytest.raises(UsageError, match=r"vehicles\[0\] is flown by hand"):
+        fly_flocks([_scenario("led_by_hand")])

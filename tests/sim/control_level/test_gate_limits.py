@@ -1,0 +1,129 @@
+"""Flights at control level with safety gates against the gates themselves, one object a drone."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockd.core.config import load_scenario
+from flockd.core.config.loader import load_perceived_errors
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.data import data_path
+from flockd.core.messages import FloatArray, VelocityCommand
+from flockd.flight.obstacles import nearest_points
+from flockd.flight.safety import half_planes
+from flockd.flight.safety.gate import Gate, Objection, Permission, Surroundings, Wanted
+from flockd.flight.safety.policy import Action
+from flockd.sim.control_level import fly_flocks
+from flockd.sim.control_level.flock_flights import FlockFlights
+from flockd.sim.control_level.gate_limits import nearest_within
+from flockd.sim.exact_states import ExactFlock
+from flockd.sim.start import scattered, with_drones
+from flockd.sim.vehicles import Vehicles
+
+TICKS, TICK_S = 10, 0.05
+
+
+def _scenario(drones: int, **overrides: Any) -> ScenarioConfig:
+    """A flock that is too dense: its gates have to limit it."""
+    keys = {key.replace("__", "."): value for key, value in overrides.items()}
+    keys |= {"duration_s": 6.0, "drone.safety.gate.fence_radius_m": None, "drone.flocking.weight.kind": "uniform"}
+    scenario = with_drones(load_scenario(data_path("config") / "paper_flight.yaml", keys), drones)
+    level = [v.model_copy(update={"position_m": (*v.position_m[:2], -4.0)}) for v in scenario.vehicles]
+    return scattered(scenario.model_copy(update={"vehicles": tuple(level)}), 0.8)
+
+
+def _flown_by_gates(scenario: ScenarioConfig) -> tuple[FloatArray, Counter[Objection]]:
+    """Positions (S, n, 2) m as each step begins, and how often the gates objected to what."""
+    drone, n = scenario.drone, len(scenario.vehicles)
+    flock, gates = ExactFlock(scenario), [Gate(drone.safety.gate) for _ in range(n)]
+    vehicles = Vehicles(scenario.vehicles, scenario.vehicle, seed=scenario.seed)
+    found = []
+    for step in range(round(scenario.duration_s / drone.step_s)):
+        begin_s, position, velocity = step * drone.step_s, vehicles.position, vehicles.velocity
+        found.append(position[:, :2])
+        commands = flock.step(begin_s, position, velocity)
+        for tick in range(TICKS):
+            age_s = tick * TICK_S
+            now_s = begin_s + age_s
+            setpoints = np.zeros((n, 2))
+            for i, gate in enumerate(gates):
+                others = np.arange(n) != i
+                own, seen = vehicles.velocity[i], commands.obstacles[i]
+                points = np.empty((0, 2)) if seen is None else nearest_points(seen, drone.obstacles.sigmas)
+                setpoint = gate.step(
+                    now_s,
+                    Permission(Action.FLY, now_s),
+                    Wanted(VelocityCommand(commands.velocity[i], np.zeros(2), 0.0), begin_s, 4.0),
+                    Surroundings(
+                        vehicles.position[i, :2],
+                        own[:2],
+                        0.0,
+                        position[others] - position[i] + age_s * (velocity[others] - own),
+                        velocity[others, :2],
+                        4.0,
+                        points - age_s * own[:2],
+                    ),
+                ).setpoint
+                assert setpoint is not None
+                setpoints[i] = setpoint.velocity
+            vehicles.step(setpoints, np.zeros(n), TICK_S)
+    return np.array(found), sum((gate.counts for gate in gates), Counter())
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {},
+        {"drone__flocking__cohesion": 0.5, "drone__safety__gate__min_separation_m": 1.4},
+        {"vehicle__gust_m_s": 0.3, "seed": 4, "drone__safety__gate__max_acceleration_m_s2": 1.0},
+        {
+            "world__obstacles__kind": "forest",
+            "world__obstacles__trees_per_hectare": 400.0,
+            "world__obstacles__free_start_m": 1.0,
+            "drone__obstacles__enabled": True,
+            "drone__safety__gate__obstacle_clearance_m": 1.5,
+        },
+    ],
+)
+def test_each_drone_flies_as_its_gate_says(keys: dict[str, Any]) -> None:
+    scenario = _scenario(9, **keys)
+    expected, objections = _flown_by_gates(scenario)
+    assert objections[Objection.SEPARATION if scenario.world.obstacles is None else Objection.OBSTACLE] > 50
+    flights = FlockFlights([scenario], gated=True)
+    for step in range(flights.steps):
+        np.testing.assert_allclose(flights.states[:2, 0].T, expected[step], atol=1e-9)
+        flights.step(step, None, 1)
+
+
+def test_the_velocity_within_half_planes_is_the_gates() -> None:
+    random = np.random.default_rng(0)
+    for count in (1, 2, 3, 8, 30):
+        for _ in range(40):
+            angles, most = random.uniform(0, 2 * np.pi, count), random.uniform(-0.3, 1.5, count).clip(0)
+            directions = np.column_stack([np.cos(angles), np.sin(angles)])
+            velocity = random.normal(size=2)
+            expected = half_planes.nearest_within(velocity, directions, most)
+            found = nearest_within(velocity[0], velocity[1], np.column_stack([directions, most]), count)
+            np.testing.assert_allclose(found, expected, atol=1e-8)
+
+
+def test_drones_that_fly_at_each_other_stop_in_time() -> None:
+    """With the law's command held away from 0 two drones meet head-on; 1 m is the gate's separation."""
+    keys = {"drone__flocking__separation": 0.0, "drone__flocking__desired_distance_m": 0.2}
+    scenario = _scenario(2, **keys)
+    without, gated = (fly_flocks([scenario], gated=gated)[0] for gated in (False, True))
+    assert without["min_distance_m"] < 0.7  # type: ignore[operator]
+    assert gated["min_distance_m"] >= 0.99  # type: ignore[operator]
+
+
+def test_a_gated_flight_is_the_same_in_any_batch_and_in_any_number_of_threads() -> None:
+    errors = load_perceived_errors(data_path("config") / "perceived" / "shipped_networks.yaml")
+    flock = _scenario(130).model_copy(update={"duration_s": 2.0})
+    flown = [scattered(flock.model_copy(update={"seed": seed}), 0.1) for seed in range(4)]
+    alone = fly_flocks(flown[2:3], errors=errors, gated=True)
+    assert fly_flocks(flown, errors=errors, gated=True, threads=2)[2:3] == alone
+    assert fly_flocks(flown[2:3], errors=errors) != alone

@@ -1,0 +1,161 @@
+"""Flights at control level among obstacles against one drone's avoidance, and against the simulator's exact flights."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockd.core.config import load_scenario
+from flockd.core.config.loader import load_perceived_errors
+from flockd.core.config.perceived import PerceivedErrors
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.data import data_path
+from flockd.core.messages import SECTORS
+from flockd.review.report.summary import obstacle_figures
+from flockd.sim.clearances import clearances
+from flockd.sim.control_level import fly_flocks
+from flockd.sim.control_level.flock_flights import FlockFlights
+from flockd.sim.control_level.solid_distances import sector_ranges, solid_rows, way_clearances
+from flockd.sim.exact_states import ExactFlock
+from flockd.sim.start import scattered, with_drones
+from flockd.sim.swarm import fly
+from flockd.sim.worlds.obstacles import (
+    HEIGHT_BAND_M,
+    POINTS_A_STEP,
+    RANGE_LIMIT_M,
+    Box,
+    Capsule,
+    Frustum,
+    Obstacles,
+    true_ranges,
+)
+
+STEP_S = 0.5
+SOLIDS = Obstacles(
+    (
+        Frustum(6.0, 1.0, 0.4, 0.2, -0.6, 9.0),
+        Frustum(-3.0, 4.0, 0.9, 0.0, 0.3, 5.0),
+        Box(2.0, -7.0, 3.0, 0.2, 0.7, -0.6, 4.4),
+        Box(-9.0, -2.0, 2.0, 4.0, -2.4, -0.6, 7.0),
+        Capsule(0.0, 9.0, 7.0, 8.0, 3.0, 3.0, 0.012),  # a wire
+        Capsule(-6.0, 9.0, 4.0, -6.0, 9.0, 6.0, 1.2),
+        Capsule(9.0, 9.0, 5.0, 9.0, 9.0, 5.0, 0.8),  # a ball
+        Capsule(-2.0, -12.0, 4.5, 5.0, -14.0, 4.5, 0.5),
+    )
+)
+FIRST = np.array([0, len(SOLIDS.solids)])
+
+
+def _scenario(kind: str, drones: int, **overrides: Any) -> ScenarioConfig:
+    """A small, dense world around the drones."""
+    keys: dict[str, Any] = {"world.obstacles.extent_m": 20.0, "world.obstacles.free_start_m": 1.0}
+    keys |= {key.replace("__", "."): value for key, value in overrides.items()}
+    keys["drone.safety.gate.fence_radius_m"] = None
+    scenario = load_scenario(data_path("config") / f"{kind}.yaml", keys)
+    flock = with_drones(scenario, drones).vehicles
+    away = np.mean([vehicle.position_m[:2] for vehicle in flock], axis=0)
+    places = [(v.position_m[0] - away[0], v.position_m[1] - away[1], v.position_m[2]) for v in flock]
+    moved = tuple(v.model_copy(update={"position_m": place}) for v, place in zip(flock, places, strict=True))
+    return scattered(scenario.model_copy(update={"vehicles": moved}), 0.5)
+
+
+def _faultless() -> PerceivedErrors:
+    """Of perception that measures and misses nothing wrongly."""
+    errors = load_perceived_errors(data_path("config") / "perceived" / "shipped_networks.yaml")
+    exact = {"median": 0.0, "p95": 0.0}
+    entry = dict.fromkeys(("range_error", "bearing_error_deg", "velocity_error_m_s"), exact)
+    values = errors.model_dump() | {
+        "by_distance": ({"distance_m": 1.0, "missed": 0.0, "range_bias": 0.0, "samples": 0, **entry},),
+        "range_limit_m": 100.0,
+        "elevation_limit_deg": 90.0,
+        "hidden_limit": 1.0,
+        "own_velocity_error_m_s": exact,
+        "false_neighbours": {"at_once": 0.0, "lifetime_s": 1.0, "distances_m": (1.0, 2.0, 3.0)},
+    }
+    return PerceivedErrors.model_validate(values)
+
+
+def _states(count: int, seed: int) -> np.ndarray:
+    """(6, count) m and m/s NED, all over the solids and up to their tops."""
+    random = np.random.default_rng(seed)
+    places = np.vstack([random.uniform(-14.0, 14.0, (2, count)), random.uniform(-8.0, -0.5, (1, count))])
+    return np.vstack([places, random.normal(0.0, 1.0, (3, count))])
+
+
+def test_ranges_and_clearances_are_those_of_the_solids() -> None:
+    before, now = _states(150, seed=0), _states(150, seed=1)
+    now[:3] = before[:3] + 0.5 * now[3:]
+    rows, ranges, clearance = solid_rows(SOLIDS), np.empty((150, SECTORS)), np.empty(150)
+    sector_ranges(0, 150, 150, before, rows, FIRST, np.array(HEIGHT_BAND_M), RANGE_LIMIT_M, ranges)
+    way_clearances(0, 150, 150, before, now, STEP_S, POINTS_A_STEP, rows, FIRST, clearance)
+    expected = np.array([true_ranges(SOLIDS, 0.0, place).range_m for place in before[:3].T])
+    np.testing.assert_allclose(ranges, expected, atol=1e-9)
+    assert (expected == 0.0).any() and np.isinf(expected).any()
+    position, velocity = (np.stack([before[rows].T, now[rows].T]) for rows in (slice(3), slice(3, 6)))
+    on_the_way = clearances(SOLIDS, np.array([0.0, STEP_S]), position, velocity)[0]
+    np.testing.assert_allclose(clearance, on_the_way, atol=1e-9)
+    assert on_the_way.min() < 0.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "faultless", "keys"),
+    [
+        ("forest", False, {"world__obstacles__trees_per_hectare": 400.0, "drone__flocking__weight__nearest": 3}),
+        ("village", True, {"world__obstacles__extent_m": 25.0, "drone__obstacles__clearance_m": 1.2}),
+    ],
+)
+def test_each_drone_is_asked_to_fly_as_its_own_avoidance_says(kind: str, faultless: bool, keys: dict[str, Any]) -> None:
+    scenarios = [_scenario(kind, 6, seed=seed, **keys) for seed in (0, 1)]
+    blind = [_scenario(kind, 6, seed=seed, **keys, drone__obstacles__enabled=False) for seed in (0, 1)]
+    flights = FlockFlights(scenarios, _faultless() if faultless else None)
+    flocks = [(ExactFlock(scenario), ExactFlock(unseen)) for scenario, unseen in zip(scenarios, blind, strict=True)]
+    flights.states[:3, :, 1] = flights.states[:3, :, 0] + [[0.02], [0.05], [-0.6]]  # above the first: in no direction
+    turned = 0
+    for step in range(8):
+        flights.states[3:5] += np.random.default_rng(step).normal(0.0, 0.4, flights.states[3:5].shape)
+        before = flights.states.copy()
+        flights.step(step, None, 1)
+        for flight, pair in enumerate(flocks):
+            states = before[:3, flight].T, before[3:, flight].T
+            expected, unseen = (flock.step(step * STEP_S, *states).velocity for flock in pair)
+            np.testing.assert_allclose(flights.commands[:, flight].T, expected, atol=1e-9)
+            turned += (np.hypot(*(expected - unseen).T) > 0.1).sum()
+    assert turned > 40
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_the_figures_are_those_of_a_flight_on_exact_states(enabled: bool) -> None:
+    keys = {"world__obstacles__trees_per_hectare": 400.0, "drone__obstacles__enabled": enabled, "duration_s": 6.0}
+    scenarios = [_scenario("forest", 4, seed=seed, **keys) for seed in (2, 3)]
+    flown = fly_flocks(scenarios)
+    for scenario, figures in zip(scenarios, flown, strict=True):
+        expected = obstacle_figures(fly(scenario, perception="truth", pictured=False).log)
+        assert {key: figures[key] for key in expected} == pytest.approx(expected, abs=1e-8)
+    assert (max(one["collisions"] or 0 for one in flown) > 0) is not enabled
+
+
+@pytest.mark.slow  # the simulator's flights take 2.5 s each
+@pytest.mark.parametrize("seed", range(4))
+def test_the_shipped_forest_is_flown_as_the_simulator_flies_it(seed: int) -> None:
+    scenario = load_scenario(data_path("config") / "forest.yaml", {"seed": seed})
+    flights, log = FlockFlights([scenario]), fly(scenario, perception="truth", pictured=False).log
+    for step in range(flights.steps):
+        np.testing.assert_allclose(flights.states[:3, 0].T, log.position[step], atol=1e-9)
+        flights.step(step, None, 1)
+    expected = obstacle_figures(log)
+    assert {key: flights.figures()[0][key] for key in expected} == pytest.approx(expected, abs=1e-8)
+
+
+def test_a_flight_among_obstacles_is_the_same_in_any_batch_and_in_any_number_of_threads() -> None:
+    keys = {"world__obstacles__trees_per_hectare": 400.0, "duration_s": 1.0}
+    flown = [_scenario("forest", 150, seed=seed, **keys) for seed in (4, 5)]
+    alone = [fly_flocks([one])[0] for one in flown]
+    assert fly_flocks(flown[::-1], threads=2) == alone[::-1]
+    assert alone[0]["min_clearance_m"] != alone[1]["min_clearance_m"]  # each seed has its own forest
+
+
+def test_a_flight_without_obstacles_has_no_figures_of_them() -> None:
+    scenario = load_scenario(data_path("config") / "paper_flight.yaml", {"duration_s": 1.0})
+    assert fly_flocks([scenario])[0]["collisions"] is None

@@ -1,0 +1,36 @@
+"""What must hold of the networks' arithmetic while they are trained. Needs the extra `train`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tools.training.networks import DistanceNet
+from tools.training.train import is_faster_in_16_bits
+
+CPU = Path("/proc/cpuinfo")
+
+
+@pytest.mark.skipif(not CPU.is_file() or "flags" not in CPU.read_text(), reason="its instructions are not known")
+def test_a_processor_without_instructions_for_16_bit_numbers_trains_on_32() -> None:
+    if {"avx512_bf16", "amx_bf16", "avx_ne_convert"} & set(CPU.read_text().split()):
+        pytest.skip("this processor has 16-bit instructions")
+    assert not is_faster_in_16_bits(torch.device("cpu"))
+
+
+def test_training_on_16_bit_numbers_reads_the_motors_places_to_a_fraction_of_a_pixel() -> None:
+    maps = torch.full((1, DistanceNet.maps, 48, 48), -60.0)
+    across = []
+    for motor, column in enumerate((8, 19, 30, 39)):
+        maps[0, motor, 24, column], maps[0, motor, 24, column + 1] = 0.0, np.log(9.0)
+        across.append(2 * column + 1 - 48 + 0.9 * 2)
+    net = DistanceNet().train()
+    net.look.register_forward_hook(lambda _layer, _given, _answer: maps.expand(2, -1, -1, -1))
+    net.head.weight.data.zero_()
+    net.head.bias.data.zero_()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        apparent = net(torch.zeros(2, 96, 96, 3, dtype=torch.uint8))[0][:, 5]
+    assert apparent.tolist() == pytest.approx([np.log(np.std(across)) + 1.0] * 2, abs=1e-4)

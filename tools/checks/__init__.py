@@ -1,0 +1,1 @@
+"""Does it survive: faults, fuzzing, mutants, PX4, devices."""

@@ -1,0 +1,1 @@
+"""What `tools/checks/check_device.py` runs inside its virtual machine."""

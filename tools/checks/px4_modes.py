@@ -1,0 +1,387 @@
+"""Provokes faults in PX4 SITL and prints the mode that PX4 ends in, beside the mode that its parameters promise.
+
+    FLOCKD_PX4=~/PX4-Autopilot/build/px4_sitl_default python -m tools.checks.px4_modes
+    python -m tools.checks.px4_modes --only gps_off wind --speed-factor 0.5 --json
+
+Each fault has a PX4 of its own, which hovers or flies in offboard at setpoints that flockd's autopilot link sends, from
+a process of its own; for `daemon_killed` a whole `flockd run` flies by rendered images. Exit code 1: a mode differs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from flockd.core.config import DroneConfig, ScenarioConfig, load, load_scenario
+from flockd.core.config.autopilot import AutopilotParameters
+from flockd.core.data import data_path
+from flockd.core.errors import FlockdError, UnavailableError
+from flockd.core.messages import Setpoint
+from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
+from flockd.onboard.sources import clock_at
+from flockd.sim.autopilots import Ports, Px4s, px4_folder
+from flockd.sim.camera_simulator import CameraSimulator
+from flockd.sim.daemons import Daemons, fleet_configs
+from flockd.sim.frame_server import FrameServer
+from flockd.sim.ground_station import GroundStation
+from flockd.sim.processes import Program, Programs
+from flockd.sim.start import with_drones
+from tools.checks.soak import small
+from tools.measure.bench_daemon import free_port
+
+HEIGHT_M = 4.0
+SETPOINTS_HZ = 20.0
+FRAMES_HZ = 2.0
+SHELL_PORT = 14580
+"""Of this computer, where PX4's instance 0 listens to its companion computer."""
+START_S = 120.0
+"""Real seconds for PX4 and for the link to come up."""
+REQUEST_S, SETTLE_S, WATCH_S, STAY_S = 60.0, 5.0, 30.0, 3.0
+"""Simulated seconds: for each step of the take-off; of offboard flight before the fault; in which PX4 has to reach its
+mode; and for which it has to stay in it."""
+POLL_S = 0.05
+STICK = 700
+"""Of 1000: how far a pilot pushes the stick, within 0.3 s."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault, and what PX4 has to make of it."""
+
+    name: str
+    promised: str
+    """A mode by pymavlink's name; MAVLink shows PX4's Descend, a landing without a position, as LAND too."""
+    because: str
+    """The parameters that promise it, or PX4's rule."""
+    inject: Callable[[Px4Flight], None]
+    parameters: Mapping[str, str] = field(default_factory=dict)
+    north_m_s: float = 0.0
+    """The commanded velocity."""
+    by_daemon: bool = False
+    """A whole daemon flies, and not a process that sends setpoints alone."""
+
+
+def _shell(*command: str) -> Callable[[Px4Flight], None]:
+    return lambda flight: flight.shell(*command)
+
+
+FAULTS = (
+    Fault(
+        "gps_off", "LAND", "no position: neither Hold nor Return can run, so Descend",
+        _shell("failure", "gps", "off"), {"SYS_FAILURE_EN": "1"},
+    ),
+    Fault(
+        "estimator_lost", "LAND", "no position and no height: Descend, which needs neither",
+        lambda flight: flight.lose_estimates(), {"SYS_FAILURE_EN": "1"},
+    ),
+    Fault(
+        "battery_low", "RTL", "COM_LOW_BAT_ACT 3: Return when critical, Land when at its end",
+        _shell("param", "set", "SIM_BAT_MIN_PCT", "6"), {"COM_LOW_BAT_ACT": "3", "SIM_BAT_DRAIN": "10"},
+    ),
+    Fault(
+        "battery_low_warned", "OFFBOARD", "COM_LOW_BAT_ACT 0: a warning only",
+        _shell("param", "set", "SIM_BAT_MIN_PCT", "6"), {"COM_LOW_BAT_ACT": "0", "SIM_BAT_DRAIN": "10"},
+    ),
+    Fault(
+        "rc_override", "POSCTL", "MAN_OVERRIDE_SPD 1: sticks moved fast take over (before PX4 1.18 COM_RC_OVERRIDE 3)",
+        lambda flight: flight.move_sticks(), {"MAN_OVERRIDE_SPD": "1", "COM_RC_IN_MODE": "1"},
+    ),
+    Fault(
+        "geofence", "LOITER", "GF_ACTION 2: Hold outside GF_MAX_HOR_DIST",
+        lambda flight: None, {"GF_ACTION": "2", "GF_MAX_HOR_DIST": "15"}, north_m_s=1.5,
+    ),
+    Fault(
+        "geofence_return", "RTL", "GF_ACTION 3: Return outside GF_MAX_HOR_DIST",
+        lambda flight: None, {"GF_ACTION": "3", "GF_MAX_HOR_DIST": "15"}, north_m_s=1.5,
+    ),
+    Fault(
+        "daemon_killed", "LOITER", "COM_OBL_RC_ACT 5: Hold", lambda flight: flight.kill_companion(), by_daemon=True
+    ),
+    Fault("sender_killed", "LOITER", "COM_OBL_RC_ACT 5: Hold", lambda flight: flight.kill_companion()),
+    Fault(
+        "sender_killed_land", "LAND", "COM_OBL_RC_ACT 4: Land",
+        lambda flight: flight.kill_companion(), {"COM_OBL_RC_ACT": "4"},
+    ),
+    Fault(
+        "sender_killed_return", "RTL", "COM_OBL_RC_ACT 3: Return",
+        lambda flight: flight.kill_companion(), {"COM_OBL_RC_ACT": "3"},
+    ),
+    Fault(
+        "link_lost", "LOITER", "COM_OBL_RC_ACT 5: Hold",
+        _shell("mavlink", "stop", "-u", str(SHELL_PORT)),
+    ),
+    Fault("wind", "OFFBOARD", "8 m/s are within what a multirotor holds", _shell("param", "set", "SIH_WIND_N", "8")),
+)  # fmt: skip
+
+
+@dataclass
+class Result:
+    """What became of a fault."""
+
+    fault: str
+    promised: str
+    because: str
+    ended_in: str
+    """The last mode; what stopped the trial, if anything did."""
+    reaction_s: float | None
+    """Simulated seconds from the fault to that mode; None if it stayed in offboard."""
+    modes: tuple[str, ...]
+    """All modes since the fault, in order."""
+    drift_m_s: float
+    """How far the true velocity was off the commanded one in the last seconds of offboard flight, mean."""
+
+    @property
+    def kept(self) -> bool:
+        """PX4 ended where its parameters promise."""
+        return self.ended_in == self.promised
+
+
+class Px4Flight:
+    """One PX4 in offboard flight between ``__enter__`` and ``__exit__``."""
+
+    def __init__(self, fault: Fault, speed_factor: float) -> None:
+        self._fault, self._speed_factor = fault, speed_factor
+        self._clock = clock_at(speed_factor)
+        self._stack = ExitStack()
+        self._sticks = False
+
+    def __enter__(self) -> Self:
+        try:
+            self._come_up()
+        except BaseException:
+            self._stack.close()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def _come_up(self) -> None:
+        folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="px4-modes-")))
+        scenario = with_drones(load_scenario(data_path("config") / "px4_flight.yaml"), 1)
+        place = scenario.vehicles[0].model_copy(update={"position_m": (0.0, 0.0, -HEIGHT_M)})
+        scenario = scenario.model_copy(update={"vehicles": (place,)})
+        px4s = Px4s(scenario, self._speed_factor, os.environ, folder, self._fault.parameters)
+        self._px4 = self._stack.enter_context(px4s)
+        self._px4.start()
+        port = self._px4.ports[0]
+        self.station = self._stack.enter_context(GroundStation([port.truth], self._clock))
+        self._until(lambda: self.station.is_connected(0), START_S * self._speed_factor, "PX4 sends nothing")
+        self.station.request_messages()
+        start = self._start_daemon if self._fault.by_daemon else self._start_sender
+        self._companion = start(scenario, port, folder)
+        station = self.station
+        self._request(lambda: station.is_armed(0), lambda: station.arm(0), "was not armed")
+        self._request(self._is_up, self._climb, "did not climb")
+        self._request(
+            lambda: station.mode(0) == "OFFBOARD", lambda: station.select(0, "OFFBOARD"), "did not go into offboard"
+        )
+
+    def _start_sender(self, scenario: ScenarioConfig, port: Ports, folder: Path) -> Program:
+        """A process that sends setpoints."""
+        companions = self._stack.enter_context(Programs())
+        options = ["--companion", *map(str, (port.offboard, self._speed_factor, self._fault.north_m_s))]
+        log = folder / "companion.log"
+        command = [sys.executable, "-m", "tools.checks.px4_modes", *options]
+        companion = companions.start("companion", command, os.environ, Path(__file__).parents[2], log)
+        self._until(lambda: "streaming" in log.read_text(), START_S * self._speed_factor, "no setpoints")
+        return companion
+
+    def _start_daemon(self, scenario: ScenarioConfig, port: Ports, folder: Path) -> Program:
+        """A whole `flockd run`, with small images of the scenario's world and nobody else in it."""
+        sitl = load(data_path("config") / "px4_sitl.yaml")
+        assert isinstance(sitl, DroneConfig)
+        endpoint, speed_factor = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", self._speed_factor
+        scenario = scenario.model_copy(update={"drone": small(scenario.drone)})
+        (config,) = fleet_configs(scenario, sitl, ports=[port], endpoint=endpoint, speed_factor=speed_factor)
+        config = config.model_copy(update={"safety": config.safety.model_copy(update={"alone_s": None})})
+        server = self._stack.enter_context(
+            FrameServer(
+                CameraSimulator(scenario),
+                [config.name],
+                endpoint=endpoint,
+                rate_hz=FRAMES_HZ,
+                poses=self.station.poses,
+                clock=self._clock,
+                speed_factor=speed_factor,
+            )
+        )
+        daemons = self._stack.enter_context(Daemons([config], folder=folder, recordings=folder, environment=os.environ))
+        server.start()
+        daemons.start()
+        self._until(lambda: daemons.is_ready(0), START_S * speed_factor, "the daemon did not become ready")
+        return daemons.programs()[0]
+
+    def trial(self) -> Result:
+        """Injects the fault and watches what comes."""
+        fault, began_s = self._fault, self._clock()
+        if not fault.north_m_s:
+            self.wait(SETTLE_S)
+        injected_s = self._clock()
+        modes, since_s, drifts = [self.mode], None, []
+        fault.inject(self)
+        while (now := self._clock()) < injected_s + WATCH_S:
+            self.wait(POLL_S * self._speed_factor)
+            if self.mode != modes[-1]:
+                modes.append(self.mode)
+                since_s = now
+            if self.mode == "OFFBOARD":
+                velocity = self.station.poses().velocity[0, :2] - (fault.north_m_s, 0.0)
+                drifts.append((now, float(np.linalg.norm(velocity))))
+            if since_s is not None and self.mode == fault.promised and now - since_s > STAY_S:
+                break
+        last = [drift for time_s, drift in drifts if time_s > drifts[-1][0] - SETTLE_S]
+        return Result(
+            fault=fault.name,
+            promised=fault.promised,
+            because=fault.because,
+            ended_in=self.mode,
+            reaction_s=None if since_s is None else round(since_s - (began_s if fault.north_m_s else injected_s), 2),
+            modes=tuple(modes),
+            drift_m_s=round(float(np.mean(last)), 2) if last else 0.0,
+        )
+
+    @property
+    def mode(self) -> str:
+        """PX4's, now."""
+        return self.station.mode(0)
+
+    def shell(self, *command: str) -> None:
+        """Runs a command in PX4's shell. Raises UnavailableError."""
+        program = px4_folder(os.environ) / f"bin/px4-{command[0]}"
+        done = subprocess.run(
+            [program, "--instance", "0", *command[1:]], capture_output=True, text=True, check=False, timeout=60.0
+        )
+        if done.returncode != 0:
+            raise UnavailableError(f"PX4 refused `{' '.join(command)}`: {(done.stdout + done.stderr).strip()}")
+
+    def lose_estimates(self) -> None:
+        """The estimator has neither position nor height any more. Stopping EKF2 would stop PX4's simulated time."""
+        for sensor in ("gps", "baro"):
+            self.shell("failure", sensor, "off")
+
+    def kill_companion(self) -> None:
+        """The process that sends the setpoints is gone at once."""
+        os.killpg(self._companion.process.pid, signal.SIGKILL)
+
+    def move_sticks(self) -> None:
+        """A pilot's joystick: in the middle for two seconds, then pushed forward and kept there from now on."""
+        for forward in (*[0] * 40, *range(0, STICK, STICK // 10)):
+            self.station.push_sticks(0, forward=forward)
+            time.sleep((0.05 if forward == 0 else 0.03) / self._speed_factor)
+        self._sticks = True
+
+    def wait(self, seconds: float) -> None:
+        """Lets simulated time pass."""
+        until_s = self._clock() + seconds
+        while self._clock() < until_s:
+            if self._sticks:
+                self.station.push_sticks(0, forward=STICK)
+            time.sleep(min(POLL_S, seconds / self._speed_factor))
+        ended = [program for program in self._px4.programs() if program.ended is not None]
+        if ended:
+            raise UnavailableError(f"PX4 ended with exit code {ended[0].ended} ({ended[0].last_output()})")
+
+    def _is_up(self) -> bool:
+        poses = self.station.poses()
+        level = abs(float(poses.velocity[0, 2])) < 0.1
+        return level and -poses.position[0, 2] > 0.7 * HEIGHT_M and self.station.mode_is(0, "LOITER")
+
+    def _climb(self) -> None:
+        if -self.station.poses().position[0, 2] < 0.5:
+            self.station.select(0, "TAKEOFF")
+
+    def _request(self, done: Callable[[], bool], request: Callable[[], None], otherwise: str) -> None:
+        def again() -> bool:
+            if done():
+                return True
+            request()
+            self.wait(1.0)
+            return done()
+
+        self._until(again, REQUEST_S, f"the drone {otherwise} ({self.station.last_text(0)})")
+
+    def _until(self, done: Callable[[], bool], timeout_s: float, otherwise: str) -> None:
+        until_s = self._clock() + timeout_s
+        while not done():
+            if self._clock() > until_s:
+                raise UnavailableError(f"{otherwise} within {timeout_s:g} simulated seconds")
+            self.wait(POLL_S * self._speed_factor)
+
+
+async def _send_setpoints(port: str, speed_factor: float, north_m_s: float) -> None:
+    """What the process of the companion computer does until it is killed."""
+    address = f"udpin://127.0.0.1:{port}"
+    clock = clock_at(speed_factor)
+    link = await AutopilotLink.connect(AutopilotParameters(address=address), timeout_s=START_S, clock=clock)
+    velocity = np.array([north_m_s, 0.0])
+    print("streaming", flush=True)
+    while True:
+        link.send_setpoint(Setpoint(clock(), velocity, height_m=HEIGHT_M, yaw_rad=0.0))
+        await asyncio.sleep(1.0 / (SETPOINTS_HZ * speed_factor))
+
+
+def run(faults: Sequence[Fault], speed_factor: float, told: Callable[[Result], None]) -> list[Result]:
+    """One flight for each fault. A flight that cannot be flown counts as not kept, with the reason as its mode."""
+    results = []
+    for fault in faults:
+        try:
+            with Px4Flight(fault, speed_factor) as flight:
+                result = flight.trial()
+        except UnavailableError as error:
+            result = Result(fault.name, fault.promised, fault.because, f"not tried: {error}", None, (), 0.0)
+        results.append(result)
+        told(result)
+    return results
+
+
+def _line(result: Result) -> str:
+    after = "" if result.reaction_s is None else f" after {result.reaction_s:.1f} s"
+    verdict = "as promised" if result.kept else "NOT AS PROMISED"
+    way = " > ".join(result.modes)
+    return (
+        f"{result.fault:22}{result.promised:13}{result.ended_in + after:24}{verdict:17}{way}; {result.because}; "
+        f"velocity off by {result.drift_m_s:.2f} m/s"
+    )
+
+
+def main() -> int:
+    """Prints a table, or JSON."""
+    if sys.argv[1:2] == ["--companion"]:
+        asyncio.run(_send_setpoints(sys.argv[2], float(sys.argv[3]), float(sys.argv[4])))
+    parser = argparse.ArgumentParser(description="Which modes PX4 SITL ends in after faults.")
+    parser.add_argument("--only", nargs="+", choices=[fault.name for fault in FAULTS], help="these faults alone")
+    parser.add_argument("--speed-factor", type=float, default=1.0, help="how fast simulated time passes (1)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    args = parser.parse_args()
+    chosen = [fault for fault in FAULTS if args.only is None or fault.name in args.only]
+    try:
+        px4_folder(os.environ)
+        if not args.json:
+            print(f"{'fault':22}{'promised':13}{'ended in':24}{'':17}modes since the fault; why; drift")
+        results = run(chosen, args.speed_factor, lambda result: None if args.json else print(_line(result), flush=True))
+    except FlockdError as error:
+        print(error, file=sys.stderr)
+        return int(error.exit_code)
+    if args.json:
+        print(json.dumps({"faults": [{**vars(result), "kept": result.kept} for result in results]}, indent=2))
+    return 0 if all(result.kept for result in results) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

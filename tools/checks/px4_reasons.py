@@ -1,0 +1,380 @@
+"""Provokes reasons for which PX4 SITL refuses to arm or to fly offboard, and prints what `flockd status` shows of each.
+
+    FLOCKD_PX4=~/PX4-Autopilot/build/px4_sitl_default python -m tools.checks.px4_reasons
+    python -m tools.checks.px4_reasons --only no_home battery --instance 3 --json
+
+One `flockd run` watches all; each reason is provoked and taken back in one PX4, or in a PX4 of its own where it needs
+parameters from the start. Exit code 1: status did not show a reason, or kept it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+from pymavlink import mavutil
+
+from flockd.core.config import DroneConfig, load, load_scenario
+from flockd.core.config.autopilot import AutopilotParameters
+from flockd.core.data import data_path
+from flockd.core.errors import FlockdError, UnavailableError
+from flockd.fleet.fleet_status import status_rows
+from flockd.fleet.watcher import FleetWatcher
+from flockd.onboard.autopilot.refusal_reasons import NOT_STREAMING, REASONS, SEVERAL_SENDERS
+from flockd.sim.autopilots import Px4s, px4_folder
+from flockd.sim.daemons import Daemons
+from flockd.sim.start import with_drones
+from tools.measure.bench_daemon import free_port
+
+FLEET = "reasons"
+START_S, SHOWN_S, GONE_S = 300.0, 60.0, 60.0
+"""For PX4 and the daemon to come up without a reason; for a reason to be shown; and to be gone again."""
+POLL_S = 0.2
+OTHER_PORT = 14030
+"""Where PX4's instance 0 looks for a further onboard computer."""
+SAYS = re.compile(
+    r"(Preflight Fail: .*|Arming denied: .*|Switching to .*|Geofence: .*|(Low|Critical|Emergency) battery.*)"
+)
+"""Lines of PX4's console that say why it refuses."""
+COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+
+
+@dataclass(frozen=True)
+class Provocation:
+    """One reason, and how it is provoked."""
+
+    name: str
+    how: str
+    """For people."""
+    reason: str
+    """Its name in the table of reasons."""
+    begin: Callable[[Bench], None] = lambda bench: None
+    end: Callable[[Bench], None] = lambda bench: None
+    parameters: Mapping[str, str] = field(default_factory=dict)
+    """From the start, of a PX4 of its own."""
+    lasting: bool = False
+    """It cannot be taken back, nor be waited for to be gone."""
+
+
+def _set(parameter: str, value: str, normal: str, reason: str, name: str) -> Provocation:
+    """By a parameter that PX4 reads at any time."""
+    return Provocation(
+        name,
+        f"`param set {parameter} {value}`",
+        reason,
+        lambda bench: bench.shell("param", "set", parameter, value),
+        lambda bench: bench.shell("param", "set", parameter, normal),
+    )
+
+
+def _fail(unit: str, reason: str, *, lasting: bool = False) -> Provocation:
+    """By PX4's own injection of failures."""
+    return Provocation(
+        f"{unit}_failed",
+        f"`failure {unit} off`",
+        reason,
+        lambda bench: bench.shell("failure", unit, "off"),
+        lambda bench: bench.shell("failure", unit, "ok"),
+        {"SYS_FAILURE_EN": "1"},
+        lasting,
+    )
+
+
+def _mode(mode: str, reason: str, name: str) -> Provocation:
+    return Provocation(
+        name,
+        f"`commander mode {mode}` on the ground",
+        reason,
+        lambda bench: bench.shell("commander", "mode", mode),
+        lambda bench: bench.shell("commander", "mode", "auto:loiter"),
+    )
+
+
+def _switch_too_early(bench: Bench) -> None:
+    """In the air, while flockd does not stream: it has no images here."""
+    bench.shell("commander", "takeoff")
+    bench.wait_for(lambda: bench.height_m() > 1.5, SHOWN_S, "PX4 did not take off")
+    bench.shell("commander", "mode", "offboard")
+
+
+def _land(bench: Bench) -> None:
+    bench.shell("commander", "land")
+    bench.wait_for(lambda: not bench.armed(), START_S, "PX4 did not land")
+    bench.shell("commander", "mode", "auto:loiter")
+
+
+PROVOCATIONS = (
+    _mode("auto:land", "check_modes_cannot_takeoff", "land_mode"),
+    _mode("posctl", "check_modes_manual_control", "no_sticks"),
+    _mode("offboard", NOT_STREAMING, "no_setpoints"),
+    Provocation(
+        "too_early", "take-off, then `commander mode offboard` while flockd waits for images", NOT_STREAMING,
+        _switch_too_early, _land,
+    ),
+    Provocation(
+        "several_senders", "a second onboard computer sends heartbeats", SEVERAL_SENDERS,
+        lambda bench: bench.begin_other_computer(), lambda bench: bench.end_other_computer(),
+    ),
+    _set("NAV_DLL_ACT", "2", "0", "check_rc_dl_no_dllink", "no_ground_station"),
+    _set("GF_MAX_HOR_DIST", "0.0001", "0", "check_gf_violation_max_hor_dist", "geofence_distance"),
+    _set("COM_ARM_MIS_REQ", "1", "0", "check_modes_mission", "no_mission"),
+    _set("COM_ARMABLE", "0", "1", "check_armable_configuration", "not_armable"),
+    _set("SYS_HAS_MAG", "3", "1", "check_mag_sys_has_mag_missing", "compass_missing"),
+    _set("SYS_HAS_NUM_DIST", "3", "0", "check_distance_sensor_missing", "range_finder_missing"),
+    _set("SYS_HAS_NUM_OF", "1", "0", "check_optical_sensor_missing", "optical_flow_missing"),
+    _set("COM_CPU_MAX", "1", "95", "check_cpuload_too_high", "processor_busy"),
+    _set("COM_PARACHUTE", "1", "0", "check_parachute_missing", "parachute_missing"),
+    _set("COM_ARM_ODID", "2", "0", "check_open_drone_id_missing", "remote_id_missing"),
+    _set("COM_ARM_TRAFF", "2", "0", "check_traffic_avoidance_missing", "traffic_missing"),
+    _fail("gps", "check_modes_local_pos"),
+    _fail("battery", "check_battery_critical", lasting=True),  # PX4 then shuts down
+    Provocation(
+        "no_home", "`COM_HOME_EN` 0 and `COM_ARM_WO_GPS` 0", "check_system_no_home_pos",
+        parameters={"COM_HOME_EN": "0", "COM_ARM_WO_GPS": "0"}, lasting=True,
+    ),
+    Provocation(
+        "geofence_without_home", "`COM_HOME_EN` 0 and `GF_ACTION` 3", "check_gf_no_home",
+        parameters={"COM_HOME_EN": "0", "GF_ACTION": "3"}, lasting=True,
+    ),
+    Provocation(
+        "no_satellites", "`SIM_GPS_USED` 0", "check_modes_local_pos", parameters={"SIM_GPS_USED": "0"}, lasting=True
+    ),
+)  # fmt: skip
+
+
+@dataclass
+class Result:
+    """What became of a provocation."""
+
+    name: str
+    how: str
+    px4_says: str
+    """In its console; empty where it only sends an event."""
+    status_shows: str
+    """Word for word; empty if the reason was not shown."""
+    shown_s: float | None
+    gone: bool
+
+    @property
+    def kept(self) -> bool:
+        """Status showed it, and not for ever."""
+        return self.shown_s is not None and self.gone
+
+
+class Bench:
+    """One PX4 and one `flockd run`, between ``__enter__`` and ``__exit__``, and what `flockd status` shows of them."""
+
+    def __init__(self, instance: int, parameters: Mapping[str, str], *, well: bool) -> None:
+        """``well``: waits at the start until nothing is refused."""
+        self._instance, self._parameters, self._well = instance, parameters, well
+        self._stack = ExitStack()
+        self._other: threading.Thread | None = None
+        self._other_ends = threading.Event()
+
+    def __enter__(self) -> Self:
+        try:
+            self._come_up()
+        except BaseException:
+            self._stack.close()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end_other_computer()
+        self._stack.close()
+
+    def _come_up(self) -> None:
+        folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="px4-reasons-")))
+        scenario = with_drones(load_scenario(data_path("config") / "px4_flight.yaml"), 1)
+        px4s = Px4s(scenario, 1.0, os.environ, folder, {"GF_ACTION": "2", **self._parameters}, self._instance)
+        self._stack.enter_context(px4s).start()
+        self._console = folder / f"px4_{self._instance}.log"
+        endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+        config = _config(px4s.ports[0].offboard, endpoint)
+        daemons = Daemons([config], folder=folder, recordings=folder, environment=os.environ)
+        self._stack.enter_context(daemons).start()
+        self._watcher = self._stack.enter_context(FleetWatcher(FLEET, listen=[], connect=[endpoint]))
+        self.wait_for(lambda: bool(self._flight()), START_S, "the daemon says nothing")
+        if self._well:
+            self.wait_for(self.ready, START_S, "PX4 did not become ready to be armed")
+
+    def ready(self) -> bool:
+        """Nothing is refused."""
+        return self._flight().get("height_m") is not None and not self.refused()
+
+    def refused(self) -> dict[str, str]:
+        """What `flockd status` shows of the autopilot's refusals: sentences by the reason's name."""
+        rows = status_rows(self._watcher.drones(), time.monotonic())
+        shown = {sentence for row in rows for sentence in row["matters"]}
+        reasons = self._flight().get("reasons", ())
+        return {
+            str(reason["event"]): str(reason["sentence"])
+            for reason in reasons
+            if reason["event"] in REASONS and reason["sentence"] in shown
+        }  # fmt: skip
+
+    def armed(self) -> bool:
+        """Motors on."""
+        return bool(self._flight().get("armed"))
+
+    def height_m(self) -> float:
+        """Above home."""
+        return float(self._flight().get("height_m") or 0.0)
+
+    def said(self, since: int) -> str:
+        """What PX4's console says of refusals after so many characters."""
+        text = COLOUR.sub("", self._console.read_text(errors="replace")[since:])
+        return "; ".join(dict.fromkeys(found.group(0).strip() for found in SAYS.finditer(text)))
+
+    def console_length(self) -> int:
+        """Characters so far."""
+        return len(self._console.read_text(errors="replace"))
+
+    def shell(self, *command: str) -> None:
+        """Runs a command in PX4's shell. Raises UnavailableError."""
+        program = px4_folder(os.environ) / f"bin/px4-{command[0]}"
+        done = subprocess.run(
+            [program, "--instance", str(self._instance), *command[1:]],
+            capture_output=True, text=True, check=False, timeout=60.0,
+        )  # fmt: skip
+        if done.returncode != 0:
+            raise UnavailableError(f"PX4 refused `{' '.join(command)}`: {(done.stdout + done.stderr).strip()}")
+
+    def begin_other_computer(self) -> None:
+        """Starts a thread that sends the heartbeats of an onboard computer."""
+        self._other_ends.clear()
+        self._other = threading.Thread(target=self._send_heartbeats, daemon=True)
+        self._other.start()
+
+    def end_other_computer(self) -> None:
+        """Ends it."""
+        self._other_ends.set()
+        if self._other is not None:
+            self._other.join()
+            self._other = None
+
+    def _send_heartbeats(self) -> None:
+        """To PX4's link for a second computer, from where PX4 forwards them."""
+        link = mavutil.mavlink_connection(
+            f"udpin:127.0.0.1:{OTHER_PORT + self._instance}", source_system=self._instance + 1, source_component=197
+        )
+        kind, nobody = mavutil.mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavutil.mavlink.MAV_AUTOPILOT_INVALID
+        while not self._other_ends.wait(0.5):
+            if link.recv_match(blocking=True, timeout=0.5) is not None:
+                link.mav.heartbeat_send(kind, nobody, 0, 0, mavutil.mavlink.MAV_STATE_ACTIVE)
+        link.close()
+
+    def wait_for(self, condition: Callable[[], bool], timeout_s: float, otherwise: str) -> float:
+        """Seconds until it holds. Raises UnavailableError."""
+        begun_s = time.monotonic()
+        while not condition():
+            if time.monotonic() - begun_s > timeout_s:
+                raise UnavailableError(f"{otherwise} within {timeout_s:g} s ({self.refused()})")
+            time.sleep(POLL_S)
+        return time.monotonic() - begun_s
+
+    def _flight(self) -> Mapping[str, Any]:
+        return next(
+            (drone.message("flight", time.monotonic()) or {} for drone in self._watcher.drones()), {}
+        )  # fmt: skip
+
+    def trial(self, provocation: Provocation) -> Result:
+        """Provokes a reason, waits until it is shown, and takes it back."""
+        before = 0 if provocation.lasting else self.console_length()
+        provocation.begin(self)
+        shown: dict[str, str] = {}
+
+        def is_shown() -> bool:
+            shown.update(self.refused())
+            return provocation.reason in shown
+
+        result = Result(provocation.name, provocation.how, "", "", None, gone=True)
+        try:
+            result.shown_s = round(self.wait_for(is_shown, SHOWN_S, "status does not show it"), 1)
+            result.status_shows = shown[provocation.reason]
+        except UnavailableError as error:
+            result.px4_says = str(error)
+            return result
+        finally:
+            provocation.end(self)
+        result.px4_says = self.said(before)
+        if not provocation.lasting:
+            try:
+                self.wait_for(self.ready, GONE_S, "it was not gone again")
+            except UnavailableError:
+                result.gone = False
+        return result
+
+
+def _config(port: int, endpoint: str) -> DroneConfig:
+    """The SITL's drone, whose frames never come: what flockd itself lacks is not what this is about."""
+    config = load(data_path("config") / "px4_sitl.yaml")
+    assert isinstance(config, DroneConfig)
+    assert config.source is not None
+    nowhere = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    frames = config.source.shared_memory.model_copy(update={"connect": (nowhere,)})
+    return config.model_copy(
+        update={
+            "autopilot": AutopilotParameters(address=f"udpin://127.0.0.1:{port}"),
+            "source": config.source.model_copy(update={"shared_memory": frames}),
+            "telemetry": config.telemetry.model_copy(update={"fleet": FLEET, "listen": (endpoint,), "connect": ()}),
+        }
+    )
+
+
+def run(provocations: Sequence[Provocation], instance: int, told: Callable[[Result], None]) -> list[Result]:
+    """Each in turn; those with equal parameters share a PX4."""
+    results = []
+    for parameters in dict.fromkeys(tuple(sorted(one.parameters.items())) for one in provocations):
+        chosen = [one for one in provocations if tuple(sorted(one.parameters.items())) == parameters]
+        well = not chosen[0].lasting
+        with Bench(instance, dict(parameters), well=well) as bench:
+            for provocation in chosen:
+                results.append(bench.trial(provocation))
+                told(results[-1])
+    return results
+
+
+def _row(result: Result) -> str:
+    verdict = result.status_shows or "NOT SHOWN"
+    return f"| {result.name} | {result.how} | {result.px4_says or '(an event)'} | {verdict} | {result.shown_s} |"
+
+
+def main() -> int:
+    """Prints a table, or JSON."""
+    parser = argparse.ArgumentParser(description="Why PX4 SITL refuses, and what `flockd status` shows of it.")
+    parser.add_argument("--only", nargs="+", choices=[one.name for one in PROVOCATIONS], help="these alone")
+    parser.add_argument("--instance", type=int, default=0, help="of PX4, 0 to 9 (0)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    args = parser.parse_args()
+    chosen = [one for one in PROVOCATIONS if args.only is None or one.name in args.only]
+    try:
+        px4_folder(os.environ)
+        if not args.json:
+            print("| reason | provoked by | PX4 says | status shows | after s |\n|---|---|---|---|---|", flush=True)
+        results = run(chosen, args.instance, lambda result: None if args.json else print(_row(result), flush=True))
+    except FlockdError as error:
+        print(error, file=sys.stderr)
+        return int(error.exit_code)
+    if args.json:
+        print(json.dumps({"reasons": [asdict(result) for result in results]}, indent=2))
+    else:
+        print(f"{sum(result.kept for result in results)} of {len(results)} reasons shown, and gone again")
+    return 0 if all(result.kept for result in results) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,363 @@
+"""Run for long and see what grows: the pilot's steps, or a whole daemon.
+
+python -m tools.checks.soak --steps 100000              # the pilot with the shipped networks on small images
+python -m tools.checks.soak --steps 100000 --minutes 80 # as many of them as this computer does in that time
+python -m tools.checks.soak --daemon --minutes 60       # a real `flockd run`, a fake autopilot, rendered frames
+python -m tools.checks.soak --steps 5000 --json
+python -m tools.checks.soak --daemon --samples soak.csv # each sample too, to draw the curve
+
+Prints for memory, file descriptors, threads, latency and what waits or is lost: how much it grew in the first tenth of
+the run, which is the warm-up; the mean of the next and of the last tenth; and the slope over the rest with its 95 %
+confidence interval. The slope is a straight line through the means of 20
+stretches of the run after the warm-up, so that neighbouring samples, which are alike, do not count as independent.
+Exit code 1 if something grows by more than its allowance, all of the interval above it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import ctypes
+import json
+import os
+import socket
+import sys
+import tempfile
+import time
+from array import array
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+from flockd.core.config import DroneConfig, ScenarioConfig, load_scenario
+from flockd.core.data import data_path
+from flockd.core.messages import FloatArray, Frame, FrameSet, VehicleState
+from flockd.fleet.watcher import FleetWatcher
+from flockd.flight.pilot import FlockPilot
+from flockd.onboard.telemetry.zenoh_session import close_session, open_session
+from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from flockd.sim.camera_simulator import CameraSimulator
+from flockd.sim.daemons import Daemons
+from flockd.sim.frame_server import FrameServer
+from flockd.sim.ground_station import Poses
+from tools.measure.bench_daemon import at, free_port, of_the_unit
+
+SHRINK = 4
+"""Of the simulator's front camera, the only one: 120 x 160 pixels, so that 100,000 steps are hours and not days."""
+ROUND_STEPS = 40
+"""After so many steps the drone is where it began: the same images again."""
+SWING_M, HEIGHT_M = 2.0, 4.0
+NEIGHBOUR_M, PILOTS_NEIGHBOUR_M = 2.0, 1.0
+"""How far away the other drone is. In images as small as this it is detected up to a metre; a daemon that really flies
+would keep away from it there, for ever, so that it flies as if alone."""
+STRETCHES = 20
+SAMPLES, MIN_SAMPLES = 400, 40
+MOST_STEPS = 8
+"""From one sample to the next: a run that is bounded in time may end after few."""
+SAMPLE_S = 2.0
+DAEMON_MINUTES = 60.0
+PATIENCE_S = 600.0
+"""For the daemon to become ready: a busy computer compiles the renderer for minutes."""
+MALLINFO = ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost")
+ALLOWED = {
+    "memory, MB": 0.03,
+    "own memory, MB": 0.03,
+    "python blocks": 0.01,
+    "descriptors": 0.02,
+    "threads": 0.02,
+    "step, ms": 0.15,
+}
+"""Growth over the run, as a share of the mean, that is noise; of any other quantity, none is judged."""
+
+
+@dataclass(frozen=True)
+class Slope:
+    """How one quantity went."""
+
+    warm_up: float
+    """Growth in the first tenth, from its first samples to its last."""
+    first: float
+    """Mean of the second tenth."""
+    last: float
+    """Mean of the last tenth."""
+    slope: float
+    """Over the run without its first tenth, in the quantity's unit."""
+    low: float
+    high: float
+    """Of the 95 % confidence interval of the slope."""
+    grows: bool
+
+
+def slope_of(name: str, values: Sequence[float]) -> Slope:
+    """Of samples evenly spread over a run; at least 40."""
+    samples = np.asarray(values, float)
+    tenth = max(len(samples) // 10, 1)
+    means = np.array([stretch.mean() for stretch in np.array_split(samples[tenth:], STRETCHES)])
+    line = stats.linregress(np.linspace(0.0, 1.0, STRETCHES), means)
+    margin = float(np.nan_to_num(stats.t.ppf(0.975, STRETCHES - 2) * line.stderr))  # NaN: the same all the time
+    low, high = float(line.slope) - margin, float(line.slope) + margin
+    allowed = ALLOWED.get(name, np.inf) * abs(float(samples.mean()))
+    edge = max(tenth // 10, 1)
+    return Slope(
+        warm_up=float(samples[tenth - edge : tenth].mean() - samples[:edge].mean()),
+        first=float(samples[tenth : 2 * tenth].mean()),
+        last=float(samples[-tenth:].mean()),
+        slope=float(line.slope),
+        low=low,
+        high=high,
+        grows=low > allowed,
+    )
+
+
+def process_facts(pid: int) -> dict[str, float]:
+    """What Linux counts of a process. Raises OSError when it has ended."""
+    folder = Path(f"/proc/{pid}")
+    lines = (line.split() for line in (folder / "status").read_text(encoding="ascii").splitlines())
+    kilobytes = {words[0]: int(words[1]) for words in lines if words[-1] == "kB"}
+    return {
+        "memory, MB": 1.024e-3 * kilobytes["VmRSS:"],
+        "own memory, MB": 1.024e-3 * kilobytes["RssAnon:"],  # without files' pages, as of libraries first used late
+        "descriptors": float(len(list((folder / "fd").iterdir()))),
+        "threads": float(len(list((folder / "task").iterdir()))),
+    }
+
+
+# --------------------------------------------------------------------------------------------------------------- pilot
+
+
+def small(config: DroneConfig) -> DroneConfig:
+    """With a front camera of a quarter of the width and height, and no other."""
+    cameras = []
+    for camera in config.rig.cameras[:1]:
+        width, height = camera.size_px
+        shrunk = {name: getattr(camera.intrinsics, name) / SHRINK for name in ("fx", "fy", "cx", "cy")}
+        intrinsics = camera.intrinsics.model_copy(update=shrunk)
+        size_px = (width // SHRINK, height // SHRINK)
+        cameras.append(camera.model_copy(update={"size_px": size_px, "intrinsics": intrinsics}))
+    return config.model_copy(update={"rig": config.rig.model_copy(update={"cameras": tuple(cameras)})})
+
+
+def scenario() -> ScenarioConfig:
+    """The paper's world with two drones and small cameras."""
+    paper = load_scenario(data_path("config") / "paper_flight.yaml", {"seed": 5})
+    return paper.model_copy(update={"drone": small(paper.drone), "vehicles": paper.vehicles[:2]})
+
+
+def round_trip(phase: float) -> tuple[Poses, FloatArray]:
+    """Both drones at a phase from 0 to 1 of a swing to and fro, level, and the first's velocity a phase."""
+    angle = 2 * np.pi * phase
+    place = np.array([SWING_M * np.sin(angle), SWING_M * np.cos(angle), -HEIGHT_M])
+    velocity = 2 * np.pi * SWING_M * np.array([np.cos(angle), -np.sin(angle), 0.0])
+    return follower(place, velocity, np.eye(3), PILOTS_NEIGHBOUR_M), velocity
+
+
+def follower(place: FloatArray, velocity: FloatArray, rotation: FloatArray, distance_m: float = NEIGHBOUR_M) -> Poses:
+    """The drone, and a neighbour north of it that does as it does."""
+    beside = np.array([distance_m, 0.0, 0.0])
+    return Poses(np.stack([place, place + beside]), np.stack([velocity, velocity]), np.stack([rotation, rotation]))
+
+
+class _Malloc(ctypes.Structure):
+    """glibc's ``struct mallinfo2``."""
+
+    _fields_ = tuple((name, ctypes.c_size_t) for name in MALLINFO)
+
+
+def allocated() -> dict[str, float]:
+    """What this process has asked for and not given back: memory that grows without it is kept by the allocator."""
+    mallinfo2 = ctypes.CDLL(None).mallinfo2  # of all arenas; glibc from 2.33 on
+    mallinfo2.restype = _Malloc
+    told = mallinfo2()
+    return {"malloc in use, MB": 1e-6 * (told.uordblks + told.hblkhd), "python blocks": float(sys.getallocatedblocks())}
+
+
+def soak_pilot(steps: int, minutes: float) -> tuple[int, dict[str, array[float]]]:
+    """How many steps were made in the time, and samples of each quantity."""
+    world = scenario()
+    cameras, pilot, period_s = CameraSimulator(world), FlockPilot(world.drone), world.drone.step_s
+    scenes = []
+    for number in range(ROUND_STEPS):
+        poses, velocity = round_trip(number / ROUND_STEPS)
+        scenes.append((cameras.capture(0, number, 0.0, poses)[0], velocity / (ROUND_STEPS * period_s)))
+    samples: dict[str, array[float]] = {}
+    every, took_s = min(max(steps // SAMPLES, 1), MOST_STEPS), 0.0
+    until_s = time.monotonic() + 60.0 * minutes
+    for number in range(steps):
+        if time.monotonic() > until_s and number >= MIN_SAMPLES * every:
+            return number, samples
+        seen, velocity = scenes[number % ROUND_STEPS]
+        time_s = 1000.0 + number * period_s
+        frames = {name: Frame(name, frame.image, time_s, number) for name, frame in seen.frames.items()}
+        vehicle = VehicleState(time_s, np.eye(3), HEIGHT_M, velocity)
+        begun_s = time.perf_counter()
+        output = pilot.step(FrameSet(time_s, frames), vehicle)
+        took_s += time.perf_counter() - begun_s
+        if (number + 1) % every == 0:
+            facts = {
+                **process_facts(os.getpid()),
+                **allocated(),
+                "step, ms": 1e3 * took_s / every,
+                "tracks": float(len(output.neighbours)),
+                "detections": float(len(output.detections)),
+            }
+            _add(samples, facts)
+            took_s = 0.0
+    return steps, samples
+
+
+def _add(samples: dict[str, array[float]], facts: Mapping[str, float]) -> None:
+    for name, value in facts.items():
+        samples.setdefault(name, array("d")).append(value)  # a list's would be counted among the pilot's blocks
+
+
+# -------------------------------------------------------------------------------------------------------------- daemon
+
+
+def soak_daemon(minutes: float) -> dict[str, array[float]]:
+    """Samples of each quantity, from the moment in which the daemon is ready and flies."""
+    port = free_port(socket.SOCK_DGRAM)
+    frames_at, telemetry_at = (f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}" for _ in range(2))
+    config = daemon_config(port, frames_at, telemetry_at)
+    world = scenario().model_copy(update={"drone": config})
+    with tempfile.TemporaryDirectory() as name, FakeAutopilot(port, height_m=HEIGHT_M) as autopilot:
+
+        def poses() -> Poses:
+            state = autopilot.state
+            return follower(state.position, state.velocity, state.R_ned_body)
+
+        folder = Path(name)
+        with (
+            FrameServer(
+                CameraSimulator(world),
+                [config.name],
+                endpoint=frames_at,
+                rate_hz=2.0,
+                poses=poses,
+                clock=time.monotonic,
+                speed_factor=1.0,
+            ) as server,
+            Daemons([config], folder=folder, recordings=folder, environment={**os.environ, **of_the_unit()}) as daemons,
+        ):
+            server.start()
+            daemons.start()
+            _wait_for(daemons, server)
+            with FleetWatcher(None, listen=(), connect=(telemetry_at,)) as watcher:
+                return _watched(daemons, autopilot, watcher, telemetry_at, 60.0 * minutes)
+
+
+def daemon_config(port: int, frames_at: str, telemetry_at: str) -> DroneConfig:
+    """One that flies its circle for ever."""
+    config = small(at(port, frames_at))
+    telemetry = config.telemetry.model_copy(update={"listen": (telemetry_at,), "connect": ()})
+    mission = config.mission.model_copy(update={"circle_until_s": 1e9})
+    safety = config.safety.model_copy(update={"alone_s": None})
+    return config.model_copy(update={"telemetry": telemetry, "mission": mission, "safety": safety})
+
+
+def _wait_for(daemons: Daemons, server: FrameServer) -> None:
+    program, until_s = daemons.programs()[0], time.monotonic() + PATIENCE_S
+    while not daemons.is_ready(0):
+        server.frames()  # raises what ended its thread
+        if program.ended is not None or time.monotonic() > until_s:
+            raise SystemExit(f"soak: the daemon did not become ready: {program.last_output()}")
+        time.sleep(0.1)
+
+
+def _watched(
+    daemons: Daemons, autopilot: FakeAutopilot, watcher: FleetWatcher, endpoint: str, seconds: float
+) -> dict[str, array[float]]:
+    samples: dict[str, array[float]] = {}
+    program, until_s = daemons.programs()[0], time.monotonic() + seconds
+    resumed, session = 0, open_session("soak", (), (endpoint,))
+    resume = f"flockd/v1/*/{program.name}/ask/resume"
+    try:
+        while time.monotonic() < until_s:
+            if autopilot.mode != "OFFBOARD":  # the first time; and again when this computer was too busy to fly
+                resumed += _fly(autopilot, watcher, lambda: session.get(resume, timeout=1.0))
+            time.sleep(SAMPLE_S)
+            if program.ended is not None:
+                raise SystemExit(f"soak: the daemon has ended: {program.last_output()}")
+            _add(samples, {**process_facts(program.process.pid), **_told(watcher), "offboard selected": float(resumed)})
+    finally:
+        close_session(session)
+    return samples
+
+
+def _fly(autopilot: FakeAutopilot, watcher: FleetWatcher, resume: Callable[[], Iterable[object]]) -> bool:
+    """As people do it: in Hold until the drone is ready, and offboard then; whether that was selected.
+
+    With the switch left at offboard the autopilot stays in its failsafe, into which flockd sends nothing.
+    """
+    drones = watcher.drones()
+    flight = (drones[0].message("flight", time.monotonic()) if drones else None) or {}
+    ready = flight.get("state") == "ready" and flight.get("flight_mode") == "hold"
+    autopilot.pilot_selects("OFFBOARD" if ready else "LOITER")
+    if not ready:
+        list(resume())
+    return ready
+
+
+def _told(watcher: FleetWatcher) -> Mapping[str, float]:
+    """What the daemon publishes of itself; NaN while it has not yet."""
+    drones, now_s = watcher.drones(), time.monotonic()
+    message = drones[0].message if drones else lambda topic, at_s: None
+    timings, computer, flight = (message(topic, now_s) or {} for topic in ("timings", "computer", "flight"))
+    return {
+        "step, ms": float(sum(timings["stages_ms"].values())) if timings else np.nan,
+        "load": float(computer.get("load", np.nan)),
+        "loop lag, s": float(computer.get("loop_lag_s", np.nan)),
+        "steps": float(computer.get("steps", np.nan)),
+        "steps failed": float(computer.get("steps_failed", np.nan)),
+        "messages lost": float(computer.get("messages_lost", np.nan)),
+        "setpoints missed": float(flight.get("setpoints_missed", np.nan)),
+    }
+
+
+# -------------------------------------------------------------------------------------------------------------- report
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=5000, help="of the pilot (default: 5000)")
+    parser.add_argument("--daemon", action="store_true", help="a whole daemon instead")
+    parser.add_argument("--minutes", type=float, help="of the daemon (default: 60), or the most that steps may take")
+    parser.add_argument("--samples", type=Path, metavar="FILE", help="write every sample to a CSV file")
+    parser.add_argument("--json", action="store_true", help="print the slopes as JSON")
+    args = parser.parse_args()
+    if args.daemon:
+        minutes = args.minutes or DAEMON_MINUTES
+        what, samples = f"{minutes:g} minutes of a daemon", soak_daemon(minutes)
+    else:
+        done, samples = soak_pilot(args.steps, args.minutes or np.inf)
+        what = f"{done} steps of the pilot"
+    if args.samples is not None:
+        with args.samples.open("w", encoding="utf-8", newline="") as file:
+            csv.writer(file).writerows([samples.keys(), *zip(*samples.values(), strict=True)])
+    slopes = {name: slope_of(name, _filled(values)) for name, values in samples.items()}
+    if args.json:
+        print(json.dumps({name: asdict(slope) for name, slope in slopes.items()}, indent=1))
+    else:
+        print(f"{what}, {len(next(iter(samples.values())))} samples")
+        print(f"{'':20}{'warm-up':>10}{'first':>10}{'last':>10}{'growth after the warm-up, 95 %':>34}")
+        for name, one in slopes.items():
+            verdict = "  GROWS" if one.grows else ""
+            interval = f"{one.slope:+.3f} ({one.low:+.3f} to {one.high:+.3f})"
+            print(f"{name:20}{one.warm_up:+10.2f}{one.first:10.2f}{one.last:10.2f}{interval:>34}{verdict}")
+    return 1 if any(slope.grows for slope in slopes.values()) else 0
+
+
+def _filled(values: Sequence[float]) -> list[float]:
+    """With the last known value where one is missing; zeros before the first."""
+    known, filled = 0.0, []
+    for value in values:
+        known = value if np.isfinite(value) else known
+        filled.append(known)
+    return filled
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,1 +1,0 @@
-"""What `tools/check_device.py` runs inside its virtual machine."""

@@ -1,0 +1,385 @@
+"""Writes the reference pages of the documentation from the code: configuration, commands, telemetry, faults.
+
+python -m tools.docs.docs_reference            # writes docs/reference/*.md
+python -m tools.docs.docs_reference --check    # exit code 1 when a page is not up to date
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import inspect
+import math
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from flockd.cli import _parser
+from flockd.core.config import schema_of
+from flockd.core.config.safety import SafetyParameters
+from flockd.flight.safety.policy import Barrier, Reaction, rules
+from flockd.onboard.autopilot.refusal_reasons import REASONS
+from flockd.onboard.telemetry import topics
+
+FOLDER = Path(__file__).parents[2] / "docs" / "reference"
+NOTICE = "<!-- Written by tools/docs/docs_reference.py; do not edit. -->"
+SCENARIO_KEY = "drone"
+"""Of a scenario: the path of a drone's file, which has its own part of the page."""
+
+
+def main() -> int:
+    """Reads the command line; writes or checks the pages."""
+    parser = argparse.ArgumentParser(description="Writes the reference pages of the documentation.")
+    parser.add_argument("--check", action="store_true", help="write nothing; exit code 1 when a page is out of date")
+    args = parser.parse_args()
+    outdated = [name for name, text in pages().items() if read(FOLDER / name) != text]
+    if args.check:
+        for name in outdated:
+            print(f"docs/reference/{name}: out of date; run python -m tools.docs.docs_reference", file=sys.stderr)
+        return 1 if outdated else 0
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    for name, text in pages().items():
+        (FOLDER / name).write_text(text, encoding="utf-8")
+    return 0
+
+
+def read(path: Path) -> str:
+    """A file's text; empty where there is none."""
+    return path.read_text(encoding="utf-8") if path.is_file() else ""
+
+
+def pages() -> dict[str, str]:
+    """File name to text."""
+    return {
+        "configuration.md": configuration_page(),
+        "commands.md": commands_page(),
+        "messages.md": messages_page(),
+        "faults.md": faults_page(),
+        "refusals.md": refusals_page(),
+    }
+
+
+# ---------------------------------------------------------------------------------------------------------- refusals
+
+
+def refusals_page() -> str:
+    """Every reason to refuse arming or offboard, with what to do."""
+    lines = [
+        "# Why the autopilot refuses",
+        "",
+        NOTICE,
+        "",
+        "Every reason that flockd knows for which an autopilot refuses to arm or to fly offboard, and what to do, in",
+        "the words of `flockd status`, `flockd doctor` and the log; [Why not offboard](../why_not_offboard.md) shows",
+        "how they are found. Names that begin with `check_` or `commander_` are those of PX4's events; the others are",
+        "flockd's.",
+        "",
+        "| what is the matter | what to do | name |",
+        "|---|---|---|",
+        *(f"| {reason.what} | {reason.remedy} | `{name}` |" for name, reason in REASONS.items()),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+# ----------------------------------------------------------------------------------------------------- configuration
+
+
+def configuration_page() -> str:
+    """Every key of drone and scenario files."""
+    lines = [
+        "# Configuration reference",
+        "",
+        NOTICE,
+        "",
+        "Every key of the three kinds of file: its default, its type and limits, and what it means. Units are part of",
+        "the names: `_m` metres, `_s` seconds, `_deg` degrees, `_px` pixels, `_hz` per second. Ranges and positions",
+        "of a drone are in the body frame, of a scenario in the world frame: see [Frames](../concepts/frames.md).",
+        "`required` has no default; `none` means that the key may be left out or be `null`.",
+        "",
+        "The [shipped files](files.md) are good to start from. `flockd config check FILE` reports everything that is",
+        "wrong in a file, and `flockd config schema drone` prints the JSON schema that this page was made from.",
+        "",
+        "## Drone files",
+        "",
+    ]
+    drone = schema_of("drone")
+    lines += _described(drone) + _section(drone, drone, "")
+    scenario = schema_of("scenario")
+    lines += ["## Scenario files", "", *_described(scenario), *_section(scenario, scenario, "", level=3)]
+    campaign = schema_of("campaign")
+    lines += ["## Campaign files", "", *_described(campaign), *_section(campaign, campaign, "", level=3)]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _described(schema: Mapping[str, Any]) -> list[str]:
+    text = _one_line(schema.get("description", ""))
+    return [text, ""] if text else []
+
+
+def _section(root: Mapping[str, Any], schema: Mapping[str, Any], path: str, level: int = 3) -> list[str]:
+    """The table of a section's own keys, then its sub-sections."""
+    rows, below = [], []
+    required = schema.get("required", ())
+    for key, value in schema["properties"].items():
+        inner, many = _inner(root, value)
+        dotted = f"{path}.{key}" if path else key
+        if inner is None:
+            rows.append((key, _default(key, value, required), _meaning(value)))
+            continue
+        shown = f"{dotted}{many}"
+        kind = {"": "section", "[]": "list of sections", ".KEY": "section for each key"}[many]
+        rows.append((key, _default(key, value, required), f"{kind}, see [`{shown}`](#{_slug(shown)})"))
+        below += [f"{'#' * level} `{shown}`", "", *_described({**inner, **_own_description(value)})]
+        below += _section(root, inner, shown, level + 1 if level < 5 else level)
+    table = ["| key | default | meaning |", "|---|---|---|"]
+    table += [f"| `{key}` | {default} | {meaning} |" for key, default, meaning in rows]
+    return [*table, "", *below]
+
+
+def _own_description(value: Mapping[str, Any]) -> dict[str, Any]:
+    return {"description": value["description"]} if value.get("description") else {}
+
+
+def _inner(root: Mapping[str, Any], value: Mapping[str, Any]) -> tuple[Mapping[str, Any] | None, str]:
+    """The section that a key holds, or a list of (`[]`), or one for each key (`.KEY`); None: a plain value."""
+    for choice in (value, *value.get("allOf", ()), *value.get("anyOf", ())):
+        others = choice.get("additionalProperties")
+        for many, one in (("", choice), ("[]", choice.get("items")), (".KEY", others)):
+            if isinstance(one, Mapping) and "$ref" in one:
+                found = _resolve(root, one)
+                if "properties" in found:
+                    return found, many
+    return None, ""
+
+
+def _resolve(root: Mapping[str, Any], value: Mapping[str, Any]) -> Mapping[str, Any]:
+    found: Mapping[str, Any] = root["$defs"][value["$ref"].rpartition("/")[2]]
+    return found
+
+
+def _default(key: str, value: Mapping[str, Any], required: Sequence[str]) -> str:
+    if key in required:
+        return "required"
+    default = value.get("default")
+    if default is None:
+        return "none"
+    if isinstance(default, Mapping):
+        return "its own"
+    return f"`{_yaml(default)}`"
+
+
+def _yaml(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(_yaml(part) for part in value) + "]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _meaning(value: Mapping[str, Any]) -> str:
+    text = _one_line(value.get("description", ""))
+    kind = _kind(value)
+    return f"{kind}. {text}" if text else kind
+
+
+def _kind(value: Mapping[str, Any]) -> str:
+    """Type and limits in words."""
+    if "anyOf" in value:
+        return " or ".join(_kind(choice) for choice in value["anyOf"] if choice.get("type") != "null")
+    if "enum" in value:
+        return ", ".join(f"`{choice}`" for choice in value["enum"])
+    if "const" in value:
+        return f"`{value['const']}`"
+    kind = {"number": "number", "integer": "whole number", "string": "text", "boolean": "`true` or `false`"}
+    if value.get("type") == "array":
+        parts = value.get("prefixItems")
+        if parts:
+            return f"list of {len(parts)} numbers" if all("type" in part for part in parts) else "list"
+        return f"list of {_kind(value.get('items', {}))}"
+    limits = []
+    for name, sign in (("exclusiveMinimum", ">"), ("minimum", "≥"), ("exclusiveMaximum", "<"), ("maximum", "≤")):
+        if name in value:
+            limits.append(f"{sign} {value[name]:g}")
+    return " ".join([kind.get(value.get("type", ""), "value"), ", ".join(limits)]).strip()
+
+
+# ---------------------------------------------------------------------------------------------------------- commands
+
+
+def commands_page() -> str:
+    """Every command with its options and examples."""
+    lines = [
+        "# Command-line reference",
+        "",
+        NOTICE,
+        "",
+        "Every command prints this with `--help`. `--json` prints for programs what is otherwise printed for people.",
+        "",
+        "| exit code | meaning |",
+        "|---|---|",
+        "| 0 | done |",
+        "| 1 | a check failed |",
+        "| 2 | wrong usage of the command line |",
+        "| 69 | something needed is unavailable: a device, a program, an optional package |",
+        "| 78 | a configuration file is wrong |",
+        "| 130 | interrupted by Ctrl-C; what there is of the flight's report is written |",
+        "",
+        "No command overwrites a file or an earlier flight, unless `--force` is given.",
+        "",
+    ]
+    for command in _leaves(_parser()):
+        lines += _command(command)
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """The commands that do something, in the order of the help: some that have commands do so without one too."""
+    inner = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    idle = (argparse._HelpAction, argparse._VersionAction)
+    if not inner or any(action.option_strings and not isinstance(action, idle) for action in parser._actions):
+        yield parser
+    for action in inner:
+        for command in dict.fromkeys(action.choices.values()):
+            yield from _leaves(command)
+
+
+def _command(parser: argparse.ArgumentParser) -> list[str]:
+    hidden = (argparse._HelpAction, argparse._SubParsersAction)
+    shown = [a for a in parser._actions if a.help != argparse.SUPPRESS and not isinstance(a, hidden)]
+    positional = [action for action in shown if not action.option_strings]
+    words = [parser.prog, *(_positional(action) for action in positional)]
+    words += [_option(action) for action in shown if action.option_strings and action.required]
+    if any(action.option_strings and not action.required for action in shown):
+        words.append("[OPTIONS]")
+    lines = [f"## {parser.prog}", "", parser.description or "", "", "```", " ".join(words), "```", ""]
+    if shown:
+        lines += ["| option | meaning |", "|---|---|"]
+        lines += [f"| {_named(action)} | {_help(parser, action)} |" for action in shown]
+        lines.append("")
+    examples, _, notes = (parser.epilog or "").partition("\n\n")
+    commands = [line.strip() for line in examples.splitlines()[1:]]
+    if commands:
+        lines += ["```sh", *commands, "```", ""]
+    return [*lines, *notes.splitlines(), ""] if notes else lines
+
+
+def _positional(action: argparse.Action) -> str:
+    name = str(action.metavar or action.dest)
+    if action.choices is not None and action.metavar is None:
+        name = f"{{{','.join(map(str, action.choices))}}}"
+    return {"?": f"[{name}]", "*": f"[{name} ...]", "+": f"{name} ..."}.get(str(action.nargs), name)
+
+
+def _option(action: argparse.Action) -> str:
+    name = action.option_strings[-1]
+    if action.nargs == 0:
+        return name
+    if action.metavar is None and action.choices is not None:
+        return f"{name} {{{','.join(map(str, action.choices))}}}"
+    metavar = action.metavar or action.dest.upper()
+    words = metavar if isinstance(metavar, tuple) else (metavar,)
+    return f"{name} {' '.join(words)}"
+
+
+def _named(action: argparse.Action) -> str:
+    text = _option(action) if action.option_strings else _positional(action)
+    return f"`{text}`"
+
+
+def _help(parser: argparse.ArgumentParser, action: argparse.Action) -> str:
+    text = _one_line(parser._get_formatter()._expand_help(action)) if action.help else ""
+    if action.choices is not None and action.metavar is not None and not all(map(text.__contains__, action.choices)):
+        text += f" ({', '.join(map(str, action.choices))})"
+    return text
+
+
+# --------------------------------------------------------------------------------------------------------- telemetry
+
+
+def messages_page() -> str:
+    """Topics and the fields of their messages."""
+    lines = [
+        "# Telemetry messages",
+        "",
+        NOTICE,
+        "",
+        "A key is `flockd/v1/<fleet>/<drone>/<topic>`; a message is a JSON object in UTF-8. Every number is finite or",
+        "`null`. Vectors are lists in [NED](../concepts/frames.md). Times are seconds on the drone's monotonic clock.",
+        "How to connect: [Telemetry](../telemetry.md).",
+        "",
+        "| topic | message | expected rate, Hz | stale after, s | recorded |",
+        "|---|---|---|---|---|",
+    ]
+    for topic in topics.TOPICS.values():
+        name = topic.type.__name__
+        rate = "on events" if topic.rate_hz is None else f"{topic.rate_hz:g}"
+        stale = "never" if topic.stale_after_s is None else f"{topic.stale_after_s:g}"
+        recorded = "yes" if topic.recorded else "no"
+        lines.append(f"| `{topic.key}` | [{name}](#{_slug(name)}) | {rate} | {stale} | {recorded} |")
+    lines.append("")
+    for node in ast.parse(inspect.getsource(topics)).body:
+        if isinstance(node, ast.ClassDef) and any(isinstance(b, ast.Name) and b.id == "TypedDict" for b in node.bases):
+            lines += [f"## {node.name}", "", _one_line(ast.get_docstring(node) or ""), ""]
+            lines += ["| field | type | meaning |", "|---|---|---|"]
+            for name, kind, text in _fields(node):
+                lines.append(f"| `{name}` | `{kind.replace(' | None', ' or null')}` | {text} |")
+            lines.append("")
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _fields(node: ast.ClassDef) -> Iterator[tuple[str, str, str]]:
+    """Name, type and the string below each field."""
+    for here, following in zip(node.body, [*node.body[1:], None], strict=True):
+        if isinstance(here, ast.AnnAssign) and isinstance(here.target, ast.Name):
+            text = ""
+            if isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant):
+                text = str(following.value.value)
+            yield here.target.id, ast.unparse(here.annotation), _one_line(text)
+
+
+# ------------------------------------------------------------------------------------------------------------ faults
+
+
+BEFORE = {Barrier.NONE: "may fly", Barrier.WAIT: "waits until it has passed", Barrier.LATCH: "waits for the ground"}
+
+
+def faults_page() -> str:
+    """Every event that the supervisor knows, and its rule."""
+    lines = [
+        "# Faults and reactions",
+        "",
+        NOTICE,
+        "",
+        "Every event that the supervisor notices, by its name in telemetry, with the defaults of",
+        "[`safety`](configuration.md#safety). [Safety](../concepts/safety.md) explains the columns.",
+        "",
+        "| event | before the flight | in flight | if it lasts |",
+        "|---|---|---|---|",
+    ]
+    for event, rule in rules(SafetyParameters()).items():
+        later = "" if math.isinf(rule.after_s) else f"{_reaction(rule.later)} after {rule.after_s:g} s"
+        lines.append(f"| `{event.value}` | {BEFORE[rule.barrier]} | {_reaction(rule.reaction)} | {later} |")
+    return "\n".join(lines) + "\n"
+
+
+def _reaction(reaction: Reaction) -> str:
+    return reaction.name.lower()
+
+
+# -------------------------------------------------------------------------------------------------------------- text
+
+
+def _one_line(text: str) -> str:
+    """As one line that can stand in a table."""
+    return re.sub(r"\s+", " ", text.replace("``", "`")).strip().replace("|", "\\|").replace("<", "&lt;")
+
+
+def _slug(heading: str) -> str:
+    """The anchor that Python-Markdown gives a heading."""
+    return re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", heading.replace("`", "")).strip().lower())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,175 @@
+"""Measure single-frame detection on real pictures, and print one table.
+
+python -m tools.measure.evaluate_real --data SKYDRONES --without-drones office=FOLDER --without-drones streets=FOLDER
+[--json]
+
+SKYDRONES holds `clips/` and `labels.json` of drones, birds, airplanes and helicopters before the sky; its clips 31-40
+and 91-100 of each kind are measured on. Pictures of the other folders hold no drone: all that is found there is false.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from flockd.core.config.perception import PerceptionConfig
+from flockd.core.data import data_path
+from flockd.flight.geometry import Camera
+from flockd.flight.perception import OnnxNetworks
+from flockd.ground.pictures import Labelled, PictureDetector, PictureFile, camera_with_fov, find_pictures, summary
+from flockd.ground.pictures.scoring import WIDTH_CLASSES
+from flockd.ground.pictures.single_frame import Box
+from tools.training.skydrones import SPLITS, split_of
+
+Image = NDArray[np.uint8]
+Picture = tuple[str, Callable[[], Image], tuple[Box, ...]]
+"""Its name, what reads it (RGB), and the drones in it."""
+
+PROBABILITIES = (0.0, 0.9, 0.95, 0.98, 0.99)
+"""What is counted when only detections at least so probable count; 0: all that the pipeline reports."""
+
+
+def main() -> None:
+    """Run the pipeline over every set."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, help="folder with clips/ and labels.json")
+    parser.add_argument("--without-drones", action="append", default=[], metavar="NAME=FOLDER")
+    parser.add_argument("--models", type=Path, default=data_path("models"), help="folder of the networks")
+    parser.add_argument("--distance", default="distance_int8")
+    parser.add_argument("--verification", default="verification_int8")
+    parser.add_argument("--neighbours", default="neighbours_int8")
+    parser.add_argument("--fov", type=float, default=90.0, metavar="DEG", help="across the longer side")
+    parser.add_argument("--scale", type=float, default=1.0, help="resize every picture first")
+    parser.add_argument("--split", choices=SPLITS, default="validation", help="of the clips")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--detections", type=Path, help="write every detection of every picture as JSON")
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    sets: dict[str, list[Picture]] = {}
+    if arguments.data:
+        sets |= sky_pictures(arguments.data, arguments.split)
+    for given in arguments.without_drones:
+        name, _, folder = given.partition("=")
+        sets[name] = list(free_pictures(Path(folder)))
+    if not sets:
+        parser.error("give --data, --without-drones or both")
+    config = PerceptionConfig(
+        depth=arguments.neighbours, segmentation=arguments.neighbours, distance=arguments.distance,
+        verification=arguments.verification, flow="dis", threads=arguments.threads,
+    )  # fmt: skip
+    detector = PictureDetector(OnnxNetworks(config, arguments.models), config)
+    results: dict[str, dict[str, object]] = {}
+    written: dict[str, list[dict[str, object]]] = {}
+    cameras: dict[tuple[int, int], Camera] = {}
+    for name, pictures in sets.items():
+        begin = time.monotonic()
+        measured, proposals = [], 0
+        shown = track(pictures, name, console=Console(stderr=True), disable=not sys.stderr.isatty())
+        for _, read, boxes in shown:
+            image, scale = read(), arguments.scale
+            if scale != 1.0:
+                image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+            resized = tuple((scale * a, scale * b, scale * c, scale * d) for a, b, c, d in boxes)
+            size = (image.shape[1], image.shape[0])
+            if size not in cameras:
+                cameras[size] = camera_with_fov(size, arguments.fov)
+            found = detector.detect(image, cameras[size])
+            measured.append(Labelled(found.detections, resized))
+            proposals += found.proposals
+        ms = 1e3 * (time.monotonic() - begin) / max(len(pictures), 1)
+        results[name] = {
+            "images": len(pictures),
+            **summary(measured),
+            "proposals_per_image": round(proposals / max(len(pictures), 1), 2),
+            "ms_per_image": round(ms, 1),
+            "at_probability": {str(p): summary(measured, p) for p in PROBABILITIES[1:]},
+        }
+        written[name] = [
+            {"picture": picture, "boxes": one.boxes, "found": [asdict(drone) for drone in one.detections]}
+            for (picture, _, _), one in zip(pictures, measured, strict=True)
+        ]
+    if arguments.detections:
+        arguments.detections.write_text(json.dumps(written), encoding="utf-8")
+    if arguments.json:
+        print(json.dumps(results, indent=1))
+    else:
+        _print_table(results)
+
+
+def sky_pictures(folder: Path, split: str) -> dict[str, list[Picture]]:
+    """The labelled frames by kind of object; drones whose box is not known are left out."""
+    sets: dict[str, list[Picture]] = {}
+    clips = _Clips()
+    for label in json.loads((folder / "labels.json").read_text(encoding="utf-8")):
+        kind, box = label["object"], label["box"]
+        if split_of(label["clip"]) != split or (kind == "drone" and box is None):
+            continue
+        boxes: tuple[Box, ...] = (tuple(box),) if kind == "drone" else ()
+        clip, frame = folder / "clips" / label["clip"], int(label["frame"])
+        sets.setdefault(kind, []).append((f"{clip.stem}_{frame:04d}", partial(clips.frame, clip, frame), boxes))
+    return sets
+
+
+def free_pictures(folder: Path) -> Iterator[Picture]:
+    """Every picture in a folder and those below it, in which no drone is."""
+    for picture in find_pictures([folder]):
+        if not picture.is_video:
+            yield str(picture.relative), partial(_image, picture), ()
+
+
+def _image(picture: PictureFile) -> Image:
+    (_, image) = next(picture.images(1))
+    return image
+
+
+class _Clips:
+    """Frames of videos by their number, by decoding from the beginning: seeking is not exact in every container."""
+
+    def __init__(self) -> None:
+        self._clip: Path | None = None
+        self._next = 0
+
+    def frame(self, clip: Path, number: int) -> Image:
+        """RGB; quick while frames of one clip are asked for in their order."""
+        if clip != self._clip or number < self._next:
+            self._capture, self._clip, self._next = cv2.VideoCapture(str(clip)), clip, 0
+        for _ in range(number - self._next):
+            self._capture.grab()
+        is_read, image = self._capture.read()
+        self._next = number + 1
+        if not is_read:
+            raise SystemExit(f"{clip}: frame {number} cannot be read")
+        return np.ascontiguousarray(image[:, :, ::-1], dtype=np.uint8)
+
+
+def _print_table(results: dict[str, dict[str, object]]) -> None:
+    table = Table("set", "images", *(f"{w} px" for w in WIDTH_CLASSES), "AP50", "false in 500", "proposals", "ms")
+    for name, all_of in results.items():
+        rows = {"": all_of, **{f" p >= {p}": one for p, one in all_of["at_probability"].items()}}  # type: ignore[attr-defined]
+        for note, one in rows.items():
+            cells = [
+                f"{100 * c['found'] / c['boxes']:.0f} % of {c['boxes']}" if (c := one["by_width"][w])["boxes"] else ""
+                for w in WIDTH_CLASSES
+            ]
+            table.add_row(
+                name + note, str(all_of["images"]), *cells, "" if one["ap50"] is None else f"{one['ap50']:.3f}",
+                str(one["false_per_500_images"]), str(all_of["proposals_per_image"]), str(all_of["ms_per_image"]),
+            )  # fmt: skip
+    Console(width=200).print(table)
+
+
+if __name__ == "__main__":
+    main()

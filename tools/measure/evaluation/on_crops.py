@@ -1,0 +1,86 @@
+"""What a distance network makes of single crops of one shape of drone whose truth is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockd.flight.inference import OnnxModel
+from flockd.flight.perception.requirements import check_roles
+from tools.training.crop_files import is_aimed
+
+Array = NDArray[Any]
+RANGES_M = ((1.5, 5.0), (5.0, 10.0))
+_BATCH = 64
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Crops that no network has learnt from."""
+
+    picture: Array
+    """(n, 96, 96, 3) with the drone in the middle, as the cascade's last crop has it."""
+    log_range: Array
+    """(n,) true log(range / focal length)."""
+    range_m: Array
+    """(n,)"""
+    none: Array
+    """(m, 96, 96, 3) without a drone."""
+    size_m: float
+
+    @classmethod
+    def of(cls, folder: Path, none: Array, size_m: float) -> HeldOut:
+        """Of the files of ``render_drone_crops`` in ``folder``: whole drones, aimed at as the cascade's last crop is.
+
+        ``none``: crops without a drone, besides these files' own.
+        """
+        rows: list[dict[str, Array]] = []
+        for path in sorted(folder.glob("*.npz")):
+            with np.load(path) as arrays:
+                rows.append(dict(arrays))
+        joined = {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+        shown = joined["whole"] & is_aimed(joined)
+        return cls(
+            joined["picture"][shown],
+            joined["target"][shown, 0],
+            joined["range_m"][shown],
+            np.concatenate([joined["picture"][joined["drone"] < 0.5], none]),
+            size_m,
+        )
+
+
+def measured(manifest: Path, crops: HeldOut) -> dict[str, str]:
+    """Figures of a network by what they are; relative errors of range are of one crop, without the cascade's mean."""
+    model = OnnxModel(manifest, threads=1, check=check_roles)
+    out = _columns(model, crops.picture)
+    no = _columns(model, crops.none)
+    error = np.expm1(out["log_range_per_focal"] - crops.log_range)
+    by_size = np.expm1(np.log(crops.size_m) - out["log_apparent_size"] - crops.log_range)
+    figures: dict[str, str] = {}
+    for name, errors in (("range", error), ("range by the known size", by_size)):
+        for low, high in RANGES_M:
+            at = (low <= crops.range_m) & (crops.range_m < high)
+            if at.any():
+                off = np.abs(errors[at])
+                figures[f"error of {name}, {low:g}-{high:g} m, median / p95 / bias"] = (
+                    f"{np.median(off):.2%} / {np.quantile(off, 0.95):.2%} / {np.median(errors[at]):+.2%}"
+                )
+    sigmas = np.abs(out["log_range_per_focal"] - crops.log_range) / np.exp(out["log_relative_sigma"])
+    figures["errors inside 1 and 2 sigma"] = f"{np.mean(sigmas < 1):.0%}, {np.mean(sigmas < 2):.0%}"
+    least = np.log(1 / (1 / model.manifest.threshold("drone_probability") - 1))
+    figures["drones called a drone"] = f"{np.mean(out['drone_logit'] > least):.1%}"
+    figures["crops without a drone called one"] = f"{np.mean(no['drone_logit'] > least):.1%}"
+    return figures
+
+
+def _columns(model: OnnxModel, pictures: Array) -> dict[str, Array]:
+    (name,) = model.manifest.inputs
+    spec = model.manifest.results["range"]
+    parts = [
+        spec.by_column(model.run({name: pictures[k : k + _BATCH]})["range"]) for k in range(0, len(pictures), _BATCH)
+    ]
+    return {column: np.concatenate([part[column] for part in parts]).astype(float) for column in spec.columns}

@@ -1,0 +1,1 @@
+"""Packages, lock file, licences."""

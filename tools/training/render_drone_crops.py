@@ -1,0 +1,217 @@
+"""Render crops of single drones as the distance network is shown them: many more than whole images would give.
+
+    python -m tools.training.render_drone_crops OUT --worlds 300 --scenes 300
+
+Only the window of the camera's image that the crops show is drawn. Every drone stands in another place. One file
+a world, which `train.py distance --crops OUT` takes up as they appear.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockd.sim.airframe import DroneModel
+from flockd.sim.drone_models import drone_model
+from tools.training import worlds
+from tools.training.dataset import FOCAL_PX, HEIGHT, R_BODY_CAMERA, WIDTH
+from tools.training.distractions import drawn_distraction
+from tools.training.drone_generator import generated_drone
+from tools.training.samples import DroneInView, crop_around, crop_at, sample_of, sample_without_drone
+from tools.training.scenes import drawn_attitude, outline_of
+
+Array = NDArray[Any]
+PICTURES_A_SCENE = 3
+PAINTED, SHAPES_PAINTED = 8, 3
+"""Drones of each family and of each generated shape in a world, painted differently."""
+MOST_DRONES = 3
+MIN_PIXELS = 8
+"""That much of it must be seen: a drone six pixels wide is still to be told from a bird."""
+HIDDEN_SHARE = 0.02
+"""Of its outline: a drone of which something hides less is whole."""
+WITH_DISTRACTORS, DISTRACTOR_ALONE = 0.3, 0.1
+"""Shares of the scenes: a bird or the like before or behind the drone, and in its place, where half are too far."""
+
+
+class DrawModels(Protocol):
+    """Whatever says which drones fly in a world; workers are given it."""
+
+    def __call__(self, rng: np.random.Generator) -> list[list[DroneModel]]:
+        """Shapes, each painted in several ways."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class CropJob:
+    """One file of crops."""
+
+    file: Path
+    seed: int
+    """Of the world."""
+    scenes: int
+    draw_models: DrawModels
+    measures: bool = False
+    """Also note `range_m`, and whether the drone is `whole`: within the image, and nothing before it."""
+
+
+def main() -> None:
+    """Render every world, one file each."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--worlds", type=int, default=300)
+    parser.add_argument("--skip", type=int, default=0, help="worlds, of which there are crops already elsewhere")
+    parser.add_argument("--scenes", type=int, default=400, help="drones a world")
+    parser.add_argument("--processes", type=int, default=os.cpu_count())
+    arguments = parser.parse_args()
+    # From the far end of the training worlds: other places than those of whole images.
+    seeds = worlds.TRAINING[::-1][arguments.skip :][: arguments.worlds]
+    jobs = [CropJob(arguments.out / f"{seed}.npz", seed, arguments.scenes, drones_of_training) for seed in seeds]
+    begin = time.monotonic()
+    for done, total in render_crops(jobs, arguments.processes):
+        print(f"{done}/{total} worlds, {time.monotonic() - begin:.0f} s", flush=True)
+
+
+def drones_of_training(rng: np.random.Generator) -> list[list[DroneModel]]:
+    """Every family of the training, and as many shapes of the generator as the drones of a world are to have."""
+    families = [[drone_model(family, _paint(rng)) for _ in range(PAINTED)] for family in worlds.FAMILIES]
+    drawn = rng.choice(worlds.SHAPES, round(len(families) * worlds.SHAPES_SHARE / (1 - worlds.SHAPES_SHARE)))
+    shapes = [[generated_drone(int(shape), _paint(rng)) for _ in range(SHAPES_PAINTED)] for shape in drawn]
+    return [*families, *shapes]
+
+
+def _paint(rng: np.random.Generator) -> int:
+    return int(rng.integers(1 << 31))
+
+
+def render_crops(jobs: Sequence[CropJob], processes: int | None) -> Iterator[tuple[int, int]]:
+    """Write each job's file that is not there yet; yields how many of how many are done."""
+    missing = [job for job in jobs if not job.file.is_file()]
+    for job in missing:
+        job.file.parent.mkdir(parents=True, exist_ok=True)
+    os.environ["NUMBA_NUM_THREADS"] = "1"
+    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+        for done, _ in enumerate(pool.imap_unordered(_render_world, missing), start=1):
+            yield done, len(missing)
+
+
+def _render_world(job: CropJob) -> None:
+    from flockd.sim.world import World  # noqa: PLC0415 - numba starts in the worker
+
+    rng = np.random.Generator(np.random.PCG64([job.seed, 1]))
+    world = World.generate(job.seed, ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])), keep_out=None)
+    places = world.free_points(job.scenes, rng, 2.0)
+    models = job.draw_models(rng)
+    samples = [sample for place in places for sample in _scene(world, place, models, rng, measures=job.measures)]
+    joined = {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
+    draft = job.file.with_suffix(".part")
+    with draft.open("wb") as file:
+        np.savez(file, allow_pickle=False, **joined)
+    draft.replace(job.file)
+
+
+def _scene(
+    world: Any, place: Array, models: list[list[DroneModel]], rng: np.random.Generator, *, measures: bool
+) -> list[dict[str, Array]]:
+    """Pictures of one drone from one camera; other drones and distractors may stand before or behind it."""
+    from flockd.sim.renderer import Renderer  # noqa: PLC0415
+
+    focal = FOCAL_PX * float(np.exp(rng.normal(0, 0.08)))
+    ground = float(world.height_at(place[:1], place[1:2])[0])
+    position = np.array([place[0], place[1], -(ground + rng.uniform(1.5, 8.0))])
+    R_ned_camera = drawn_attitude(rng) @ R_BODY_CAMERA
+    count = int(rng.choice([1, 2, MOST_DRONES], p=[0.6, 0.25, 0.15]))
+    shapes = rng.choice(len(models), count)
+    drones = [models[shape][int(rng.integers(len(models[shape])))] for shape in shapes]
+    positions = _places(position, R_ned_camera, focal, count, rng)
+    positions[:, 2] = np.minimum(positions[:, 2], -(ground + 0.5))
+    rotations = np.array([drawn_attitude(rng) for _ in range(count)])
+    seen = DroneInView(focal, R_ned_camera.T @ (positions[0] - position), R_ned_camera.T @ rotations[0], drones[0])
+    if seen.centre[2] < 0.3:
+        return []
+    alone, beside = rng.random() < DISTRACTOR_ALONE, rng.random() < WITH_DISTRACTORS
+    others = []
+    if alone or beside:
+        ray = positions[0] - position + (0.0 if alone else 0.25) * rng.normal(0, 0.5, 3)
+        others = [drawn_distraction(position, ray / np.linalg.norm(ray), ground, rng).at(0.0)]
+    if alone:
+        positions[:] = np.nan  # nobody, and nobody's shadow
+        centre = R_ned_camera.T @ (others[0].position - position)
+        if centre[2] < 0.3:
+            return []
+        crops = [crop_at(centre, others[0].thing.size_m, focal, rng) for _ in range(PICTURES_A_SCENE)]
+    else:
+        crops = [crop_around(seen, rng) for _ in range(PICTURES_A_SCENE)]
+    left, top, right, bottom = _window(crops)
+    matrix = np.array([[focal, 0.0, WIDTH / 2 - left], [0.0, focal, HEIGHT / 2 - top], [0.0, 0.0, 1.0]])
+    view = Renderer(world, drones).render(
+        matrix, (right - left, bottom - top), R_ned_camera, position,
+        drone_rotations=rotations, drone_positions=positions, shown=np.full(count, not alone), distractors=others,
+    )  # fmt: skip
+    if np.count_nonzero(view.distractors if alone else view.ids == 1) < MIN_PIXELS:
+        return []
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    image[top:bottom, left:right] = view.rgb
+    mine = np.zeros((HEIGHT, WIDTH), np.bool_)
+    if alone:
+        samples = [sample_without_drone(crop, image) for crop in crops]
+    else:
+        mine[top:bottom, left:right] = view.ids == 1
+        samples = [sample_of(seen, crop, image, mine) for crop in crops]
+    if not measures:
+        return samples
+    whole = not alone and _is_whole(seen, view, matrix, (left, top))
+    return [{**s, "range_m": np.array(np.linalg.norm(seen.centre)), "whole": np.array(whole)} for s in samples]
+
+
+def _is_whole(drone: DroneInView, view: Any, matrix: Array, corner: tuple[int, int]) -> bool:
+    """Within the camera's image, whose part from ``corner`` on the view shows, and hardly anything before it."""
+    places = drone.model.vertices @ drone.rotation.T + drone.centre
+    if places[:, 2].min() < 0.05:
+        return False
+    pixels = places @ matrix.T
+    pixels = pixels[:, :2] / pixels[:, 2:] + corner
+    if (pixels < 1).any() or (pixels > (WIDTH - 1, HEIGHT - 1)).any():
+        return False
+    outline = outline_of(places, matrix, view.ids.shape)
+    before = (view.depth < drone.centre[2] - drone.model.size_m / 2) | view.distractors | (view.ids > 1)
+    return bool((before & outline).sum() < HIDDEN_SHARE * outline.sum())
+
+
+def _places(position: Array, R_ned_camera: Array, focal: float, count: int, rng: np.random.Generator) -> Array:
+    """The first drone anywhere in the picture or just across its border, the others in about the same direction."""
+    u = rng.uniform(-15, WIDTH + 15) - WIDTH / 2
+    v = np.clip(rng.normal(HEIGHT / 2, HEIGHT / 5), 0, HEIGHT) - HEIGHT / 2
+    rays = np.array([[u / focal, v / focal, 1.0]]) + np.vstack([np.zeros(3), rng.normal(0, 0.12, (count - 1, 3))])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    near = np.exp(rng.uniform(np.log(1.2), np.log(7.0), count))
+    ranges = np.where(rng.random(count) < 0.75, near, rng.uniform(7.0, 20.0, count))
+    return np.asarray(position + (rays * ranges[:, None]) @ R_ned_camera.T)
+
+
+def _window(crops: list[Any]) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom of the part of the image that the crops look at."""
+    edge = np.array([[u, v] for u in np.linspace(0, 96, 7) for v in np.linspace(0, 96, 7)])
+    pixels = np.vstack(
+        [
+            crop.rig.cameras["camera"].camera.project(
+                crop.camera.unproject(edge, np.ones(len(edge))) @ crop.T_body_virtual.rotation.T @ R_BODY_CAMERA
+            )
+            for crop in crops
+        ]
+    )
+    low = np.clip(np.floor(np.nanmin(pixels, 0)) - 3, 0, (WIDTH - 8, HEIGHT - 8)).astype(int)
+    high = np.clip(np.ceil(np.nanmax(pixels, 0)) + 3, low + 8, (WIDTH, HEIGHT)).astype(int)
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
+if __name__ == "__main__":
+    main()

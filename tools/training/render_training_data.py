@@ -1,0 +1,233 @@
+"""Render training pairs: two camera images a fraction of a second apart, with depth, drones and flow as truth.
+
+python -m tools.training.render_training_data OUT --worlds 120 --pairs 30 --split training
+
+A third of the scenes have birds and the like in them. Half of the drones of training worlds are of generated
+shapes. With ``--families unseen`` the drones are of the families that no network is trained on. With
+``--obstacles 0.4`` four in ten worlds have a forest or a village, with the camera between trunks and before walls.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flockd.sim.airframe import DroneModel
+from flockd.sim.drone_models import drone_model
+from flockd.sim.worlds.obstacle_worlds import LOWEST_CROWN_M, generate_obstacles
+from tools.training import worlds
+from tools.training.dataset import FOCAL_PX, HEIGHT, MAX_DRONES, R_BODY_CAMERA, WIDTH, create_part, note
+from tools.training.drone_generator import generated_drone
+from tools.training.scenes import attitude, drawn_attitude
+
+Array = NDArray[Any]
+SHAPES_A_WORLD = 24
+"""Of the generator, where it is drawn from."""
+NEAREST_M = 1.2
+"""To an obstacle: a camera moves by up to a metre within a pair."""
+WITH_DISTRACTORS = 1 / 3
+"""Share of the scenes."""
+
+
+def main() -> None:
+    """Render every world of the split in parallel, one part folder a world."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--split", choices=["training", "validation", "test"], default="training")
+    parser.add_argument("--families", choices=["training", "unseen"], default="training")
+    parser.add_argument("--worlds", type=int, default=120)
+    parser.add_argument("--skip", type=int, default=0, help="worlds of the split, which are rendered already")
+    parser.add_argument("--pairs", type=int, default=30, help="pairs a world")
+    parser.add_argument("--obstacles", type=float, default=0.0, metavar="SHARE", help="of the worlds; default: none")
+    parser.add_argument("--processes", type=int, default=os.cpu_count())
+    arguments = parser.parse_args()
+    seeds = {"training": worlds.TRAINING, "validation": worlds.VALIDATION, "test": worlds.TEST}[arguments.split]
+    families = {"training": worlds.FAMILIES, "unseen": worlds.UNSEEN_FAMILIES}[arguments.families]
+    share = worlds.SHAPES_SHARE if (arguments.split, arguments.families) == ("training", "training") else 0.0
+    wanted = range(arguments.skip, arguments.skip + arguments.worlds)
+    jobs = [
+        PairJob(arguments.out / f"part-{i:04d}", seeds[i], arguments.pairs, families, share, arguments.obstacles)
+        for i in wanted
+    ]
+    begin = time.monotonic()
+    for done, total in render_pairs(jobs, arguments.processes):
+        print(f"{done}/{total} worlds, {time.monotonic() - begin:.0f} s", flush=True)
+
+
+@dataclass(frozen=True)
+class PairJob:
+    """One part of a folder of pairs."""
+
+    folder: Path
+    seed: int
+    """Of the world."""
+    pairs: int
+    families: range
+    shapes_share: float = 0.0
+    """Of the drones, how many are of the generator's shapes instead."""
+    obstacles_share: float = 0.0
+    """Of worlds: how likely this one has a forest or a village."""
+
+
+def render_pairs(jobs: Sequence[PairJob], processes: int | None) -> Iterator[tuple[int, int]]:
+    """Write each job's part that is not there yet; yields how many of how many are done."""
+    missing = [job for job in jobs if not (job.folder / "made.json").is_file()]
+    os.environ["NUMBA_NUM_THREADS"] = "1"
+    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+        for done, _ in enumerate(pool.imap_unordered(_render_world, missing), start=1):
+            yield done, len(missing)
+
+
+def _render_world(job: PairJob) -> None:
+    from flockd.sim.camera_simulator import FIELD_GRID_M, field_grid  # noqa: PLC0415 - numba starts in the worker
+    from flockd.sim.renderer import Renderer  # noqa: PLC0415
+    from flockd.sim.world import World  # noqa: PLC0415
+
+    folder, seed, count = job.folder, job.seed, job.pairs
+    rng = np.random.Generator(np.random.PCG64(seed))
+    field = worlds.drawn_obstacles(seed, job.obstacles_share)
+    world = World.generate(
+        seed,
+        ground_relief_m=float(rng.choice([0.0, 0.1, 0.2, 0.3])),
+        keep_out=None if field is None else field_grid(field.extent_m),
+        clearance_m=9.0 if field is None else FIELD_GRID_M,
+        obstacles=None if field is None else generate_obstacles(field, seed, np.zeros((0, 2))),
+    )
+    drawn = rng.choice(worlds.SHAPES, SHAPES_A_WORLD) if job.shapes_share else ()
+    shapes = [generated_drone(int(shape), int(rng.integers(1 << 31))) for shape in drawn]
+    part = create_part(folder, count)
+    places = world.free_points(count, rng, 2.0) if field is None else _places_among(world, count, rng, field.extent_m)
+    highest_m = 8.0 if field is None else LOWEST_CROWN_M - 0.5
+    for index in range(count):
+        drones = [_drawn_drone(job, shapes, rng) for _ in range(MAX_DRONES)]
+        families = np.array([drone.family for drone in drones])
+        renderer = Renderer(world, drones)
+        _render_pair(renderer, world, places[index], highest_m, families, part, index, rng)
+    for array in part.values():
+        array.flush()  # type: ignore[attr-defined]
+    note(
+        folder, seed=seed, pairs=count, families=list(job.families), shapes_share=job.shapes_share,
+        obstacles=None if field is None else field.kind,
+    )  # fmt: skip
+
+
+def _places_among(world: Any, count: int, rng: np.random.Generator, extent_m: float) -> Array:
+    """(count, 2) between obstacles, half of them in front of the nearest of four times as many."""
+    free = world.free_points(4 * count, rng, NEAREST_M, within_m=extent_m)
+    near = free[np.argsort(world.obstacle_distance(free))[: count // 2]]
+    return np.concatenate([near, free[rng.permutation(len(free))[: count - len(near)]]])
+
+
+def _drawn_drone(job: PairJob, shapes: list[DroneModel], rng: np.random.Generator) -> DroneModel:
+    if rng.random() < job.shapes_share:
+        return shapes[int(rng.integers(len(shapes)))]
+    return drone_model(int(rng.choice(job.families)), int(rng.integers(1 << 31)))
+
+
+def _render_pair(
+    renderer: Any,
+    world: Any,
+    place: Array,
+    highest_m: float,
+    families: Array,
+    part: dict[str, Array],
+    index: int,
+    rng: np.random.Generator,
+) -> None:
+    from flockd.sim.renderer import true_flow  # noqa: PLC0415
+    from tools.training.distractions import drawn_distractions  # noqa: PLC0415
+
+    focal = FOCAL_PX * float(np.exp(rng.normal(0, 0.08)))
+    matrix = np.array([[focal, 0.0, WIDTH / 2], [0.0, focal, HEIGHT / 2], [0.0, 0.0, 1.0]])
+    height = float(rng.uniform(1.5, highest_m))
+    ground = float(world.height_at(place[:1], place[1:2])[0])
+    position = np.array([place[0], place[1], -(ground + height)])
+    start = drawn_attitude(rng)
+    interval = float(rng.uniform(0.1, 0.5))
+    velocity = np.append(_direction(rng) * rng.uniform(0, 2.0), rng.normal(0, 0.2))
+    turn = attitude(rng.normal(0, np.radians(10)) * interval, rng.normal(0, np.radians(4), 2) * interval)
+    positions = [position, position + velocity * interval]
+    attitudes = [start, start @ turn]
+    shown = np.arange(MAX_DRONES) < rng.choice([0, 1, 2, 3, 4, 5, 6], p=[0.05, 0.15, 0.2, 0.2, 0.15, 0.15, 0.1])
+    places = _drone_places(position, start, focal, rng)
+    places[:, 2] = np.minimum(places[:, 2], -(ground + 0.5))
+    moves = (velocity + rng.normal(0, 0.4, (MAX_DRONES, 3))) * interval
+    turns = [drawn_attitude(rng) for _ in range(MAX_DRONES)]
+    wobble = [attitude(rng.normal(0, 0.1) * interval, rng.normal(0, 0.07, 2)) for _ in range(MAX_DRONES)]
+    places[~shown] = np.nan
+    drone_positions = [places, places + moves]
+    drone_rotations = [np.array(turns), np.array([r @ w for r, w in zip(turns, wobble, strict=True)])]
+    count = int(rng.integers(1, 5)) if rng.random() < WITH_DISTRACTORS else 0
+    others = drawn_distractions(count, position, start @ R_BODY_CAMERA, focal, ground, rng)
+    views = []
+    for k in range(2):
+        R_ned_camera = attitudes[k] @ R_BODY_CAMERA
+        view = renderer.render(
+            matrix, (WIDTH, HEIGHT), R_ned_camera, positions[k],
+            drone_rotations=drone_rotations[k], drone_positions=drone_positions[k], shown=shown,
+            distractors=[other.at(k * interval) for other in others],
+        )  # fmt: skip
+        views.append(view)
+        part["image"][index, k] = view.rgb
+        part["depth"][index, k] = np.minimum(view.depth[1::2, 1::2], 1000.0)
+        part["ids"][index, k] = view.ids[1::2, 1::2]
+        part["R_ned_camera"][index, k] = R_ned_camera
+        part["height"][index, k] = -positions[k][2] - world.height_at(positions[k][:1], positions[k][1:2])[0]
+        _note_drones(part, index, k, view, R_ned_camera, positions[k], drone_positions[k], shown)
+        part["drone_rotation"][index, k] = R_ned_camera.T @ drone_rotations[k]
+    flow, valid = true_flow(
+        views[0], views[1], matrix,
+        R_ned_camera=(attitudes[0] @ R_BODY_CAMERA, attitudes[1] @ R_BODY_CAMERA),
+        position_ned=(positions[0], positions[1]),
+        drone_rotations=(drone_rotations[0], drone_rotations[1]),
+        drone_positions=(drone_positions[0], drone_positions[1]),
+    )  # fmt: skip
+    part["flow"][index] = np.moveaxis(flow[1::2, 1::2], 2, 0)
+    part["flow_valid"][index] = valid[1::2, 1::2]
+    part["focal"][index] = focal
+    part["drone_family"][index] = families
+
+
+def _note_drones(
+    part: dict[str, Array], index: int, k: int, view: Any, R_ned_camera: Array, position: Array, places: Array,
+    shown: Array,
+) -> None:  # fmt: skip
+    part["drone_centre"][index, k] = np.nan
+    for d in np.nonzero(shown)[0]:
+        part["drone_centre"][index, k, d] = R_ned_camera.T @ (places[d] - position)
+        rows, columns = np.nonzero(view.ids == d + 1)
+        part["drone_pixels"][index, k, d] = rows.size
+        if rows.size:
+            part["drone_box"][index, k, d] = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+
+
+def _drone_places(position: Array, attitude: Array, focal: float, rng: np.random.Generator) -> Array:
+    """Drones all over the picture, most of them near, a few across its borders."""
+    u = rng.uniform(-20, WIDTH + 20, MAX_DRONES) - WIDTH / 2
+    v = np.clip(rng.normal(HEIGHT / 2, HEIGHT / 5, MAX_DRONES), 0, HEIGHT) - HEIGHT / 2
+    rays = np.stack([u / focal, v / focal, np.ones(MAX_DRONES)], 1)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    ranges = np.where(
+        rng.random(MAX_DRONES) < 0.75,
+        np.exp(rng.uniform(np.log(1.2), np.log(7.0), MAX_DRONES)),
+        rng.uniform(7.0, 20.0, MAX_DRONES),
+    )
+    return np.asarray(position + (rays * ranges[:, None]) @ (attitude @ R_BODY_CAMERA).T)
+
+
+def _direction(rng: np.random.Generator) -> Array:
+    angle = rng.uniform(-np.pi, np.pi)
+    return np.array([np.cos(angle), np.sin(angle)])
+
+
+if __name__ == "__main__":
+    main()

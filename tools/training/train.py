@@ -1,0 +1,234 @@
+"""Train one network on rendered pairs; resumes from its last checkpoint.
+
+    python -m tools.training.train neighbours --data DATA --out RUNS/neighbours --minutes 40
+    python -m tools.training.train distance   --data DATA --out RUNS/distance --minutes 90 --crops P --negatives N.npy
+    python -m tools.training.train flow       --data DATA --out RUNS/flow --minutes 40
+
+Writes OUT/checkpoint.pt, OUT/curve.csv and a picture of it every few minutes. Uses a GPU where there is one.
+With --start it goes on from another run's weights, or from a network of models/, and keeps them as OUT/start.pt.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
+
+from tools.training.dataset import open_pairs
+from tools.training.from_onnx import begin_with_onnx
+from tools.training.real_scenes import RealScenes
+from tools.training.samples import Sample
+from tools.training.tasks import Batch, DistanceTask, FlowTask, NeighboursTask, Task
+
+NETWORKS = ("neighbours", "distance", "flow")
+
+
+def _task(arguments: argparse.Namespace) -> Task:
+    pairs = open_pairs(arguments.data)
+    if arguments.network == "flow":
+        return FlowTask(pairs)
+    if arguments.network == "neighbours":
+        return NeighboursTask(pairs, RealScenes.of(arguments.pictures, arguments.labels))
+    if arguments.negatives is None or arguments.crops is None:
+        raise SystemExit("the distance network needs --crops and --negatives")
+    return DistanceTask(pairs, arguments.negatives, arguments.crops)
+
+
+def main() -> None:
+    """Train until the minutes are over."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("network", choices=NETWORKS)
+    parser.add_argument("--data", type=Path, required=True, help="folder of render_training_data.py")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--minutes", type=float, default=60.0, help="of training in all, over every resumption")
+    parser.add_argument("--negatives", type=Path, help="what is no drone, for `distance`: file of mine_negatives.py")
+    parser.add_argument("--crops", type=Path, help="drones, for `distance`: folder of render_drone_crops.py")
+    parser.add_argument("--pictures", type=Path, help="real pictures without drones, for `neighbours`: their folder")
+    parser.add_argument("--labels", type=Path, help="real drones, for `neighbours`: COCO file beside its pictures")
+    parser.add_argument("--rate", type=float, help="learning rate to begin with")
+    parser.add_argument("--start", type=Path, help="weights to begin with: another run's checkpoint.pt, or an .onnx")
+    parser.add_argument("--compile", action="store_true", help="`distance` a fifth faster; needs a C++ compiler")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    compiler = os.environ.get("CXX", "g++")
+    if arguments.compile and shutil.which(compiler) is None:
+        raise SystemExit(f"--compile needs a C++ compiler, and there is no {compiler} here; leave --compile out")
+    torch.manual_seed(arguments.seed)
+    torch.set_num_threads(arguments.threads)
+    cv2.setNumThreads(1)
+    task = _task(arguments)
+    task.rate = arguments.rate or task.rate
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    if arguments.start and not (arguments.out / "checkpoint.pt").is_file():
+        try:
+            start(task, arguments.start, arguments.seed)
+        except ValueError as error:
+            raise SystemExit(f"--start: {error}") from None
+        torch.save({"net": task.net.state_dict()}, arguments.out / "start.pt")
+    if arguments.compile:
+        task.net.compile(dynamic=False)
+    train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed)
+
+
+def start(task: Task, weights: Path, seed: int) -> None:
+    """Give the task's network the weights of another run, or of a network that it or another one exported.
+
+    Raises ValueError where an ONNX file is of another network.
+    """
+    if weights.suffix != ".onnx":
+        begin_with(task.net, torch.load(weights, map_location="cpu")["net"])
+        return
+    batch = _stack(task.batch_samples(np.random.default_rng(seed)), torch.device("cpu"))
+    begin_with_onnx(task.net, weights, lambda: task.loss(batch))
+
+
+def begin_with(net: nn.Module, weights: dict[str, Tensor]) -> None:
+    """Take over what fits; of a layer that has grown, the part that was there."""
+    own = net.state_dict()
+    for name, value in weights.items():
+        if name in own and own[name].dim() == value.dim():
+            part = tuple(slice(0, min(a, b)) for a, b in zip(own[name].shape, value.shape, strict=True))
+            own[name][part] = value[part]
+    net.load_state_dict(own)
+
+
+def train(task: Task, out: Path, budget_s: float, seed: int) -> None:
+    """One cosine-shaped run of ``budget_s`` seconds of training.
+
+    What is kept is the mean of the weights over about the last thousand steps: each step's own errs to all sides.
+    """
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    net = task.net.to(device).to(memory_format=torch.channels_last)
+    mean = AveragedModel(net, avg_fn=_recent_mean, use_buffers=True)
+    optimiser = torch.optim.AdamW(net.parameters(), lr=task.rate, weight_decay=1e-4)
+    spent, step = 0.0, 0
+    checkpoint = out / "checkpoint.pt"
+    if checkpoint.is_file():
+        state = torch.load(checkpoint, map_location=device)
+        net.load_state_dict(state["last"])
+        mean.module.load_state_dict(state["net"])
+        mean.n_averaged.fill_(state["step"])
+        optimiser.load_state_dict(state["optimiser"])
+        spent, step = state["spent"], state["step"]
+    rng = np.random.Generator(np.random.PCG64([seed, step]))
+    in_16_bits = is_faster_in_16_bits(device)
+    net.train()
+    last_save = last_print = spent
+    recent: list[dict[str, float]] = []
+    batches = _batches(task, rng, device)
+    while spent < budget_s:
+        begin = time.monotonic()
+        share = spent / budget_s
+        rate = task.rate * min(1.0, (step + 1) / 300) * (0.5 + 0.5 * math.cos(math.pi * share)) + 1e-6
+        for group in optimiser.param_groups:
+            group["lr"] = rate
+        batch = next(batches)
+        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=in_16_bits):
+            loss, figures = task.loss(batch)
+        if torch.isfinite(loss):
+            optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+            optimiser.step()
+            mean.update_parameters(net)
+        else:
+            print(f"step {step}: the loss is not finite; its batch was left out", flush=True)
+        recent.append({"loss": float(loss.detach()), **figures})
+        step += 1
+        spent += time.monotonic() - begin
+        if spent - last_print > 30 or spent >= budget_s:
+            _note(out, step, spent, recent)
+            recent, last_print = [], spent
+        if spent - last_save > 150 or spent >= budget_s:
+            state = {
+                "net": mean.module.state_dict(), "last": net.state_dict(), "optimiser": optimiser.state_dict(),
+                "spent": spent, "step": step,
+            }  # fmt: skip
+            torch.save(state, checkpoint.with_suffix(".new"))
+            checkpoint.with_suffix(".new").replace(checkpoint)
+            _draw_curve(out)
+            last_save = spent
+
+
+def is_faster_in_16_bits(device: torch.device) -> bool:
+    """Whether training with bfloat16 pays. Measured: a processor without instructions for it takes eightfold."""
+    layer = nn.Conv2d(32, 32, 3, padding=1).to(device).to(memory_format=torch.channels_last)
+    pictures = torch.randn(8, 32, 64, 64, device=device).to(memory_format=torch.channels_last)
+
+    def took_s(in_16_bits: bool) -> float:
+        begin = time.monotonic()
+        for _ in range(3):
+            with torch.autocast(device.type, dtype=torch.bfloat16, enabled=in_16_bits):
+                answer = layer(pictures)
+            float(answer.detach().sum())
+        return time.monotonic() - begin
+
+    tries = [(took_s(in_16_bits=True), took_s(in_16_bits=False)) for _ in range(3)]
+    return min(first for first, _ in tries) < min(second for _, second in tries)
+
+
+def _recent_mean(mean: Tensor, new: Tensor, count: Tensor) -> Tensor:
+    """Of floating-point weights; counters are taken as they are."""
+    if not mean.is_floating_point():
+        return new
+    share = max(1e-3, 1.0 / (1.0 + 0.1 * float(count)))
+    return mean + share * (new - mean)
+
+
+def _batches(task: Task, rng: np.random.Generator, device: torch.device) -> Iterator[Batch]:
+    """Without end; the next one is made while the last one is learnt from."""
+    with ThreadPoolExecutor(1) as loader:
+        upcoming = loader.submit(task.batch_samples, rng)
+        while True:
+            samples, upcoming = upcoming.result(), loader.submit(task.batch_samples, rng)
+            yield _stack(samples, device)
+
+
+def _stack(samples: list[Sample], device: torch.device) -> Batch:
+    def joined(name: str) -> NDArray[Any]:
+        return np.stack([sample[name] for sample in samples])
+
+    return {name: torch.from_numpy(joined(name)).to(device) for name in samples[0]}
+
+
+def _note(out: Path, step: int, spent: float, recent: list[dict[str, float]]) -> None:
+    known = {name: [figures[name] for figures in recent if not np.isnan(figures[name])] for name in recent[0]}
+    means = {name: float(np.mean(values)) if values else float("nan") for name, values in known.items()}
+    print(f"step {step:6d} {spent:6.0f} s  " + "  ".join(f"{n} {v:.4f}" for n, v in means.items()), flush=True)
+    curve = out / "curve.csv"
+    if not curve.is_file():
+        curve.write_text("step,seconds," + ",".join(means) + "\n")
+    with curve.open("a") as file:
+        file.write(f"{step},{spent:.0f}," + ",".join(f"{v:.6f}" for v in means.values()) + "\n")
+
+
+def _draw_curve(out: Path) -> None:
+    """One small plot a figure, over minutes of training."""
+    with (out / "curve.csv").open() as file:
+        names = file.readline().strip().split(",")[2:]
+        rows = np.array([[float(value) for value in line.split(",")] for line in file])
+    figure = Figure(figsize=(4.0 * len(names), 3.0), layout="constrained")
+    for name, axes, values in zip(names, figure.subplots(1, len(names)), rows[:, 2:].T, strict=True):
+        axes.plot(rows[:, 1] / 60.0, values, linewidth=0.8)
+        axes.set(title=name, xlabel="minutes", yscale="log" if (values > 0).all() else "linear")
+        axes.grid(alpha=0.3, which="both")
+    figure.savefig(out / "curve.png", dpi=80)
+
+
+if __name__ == "__main__":
+    main()

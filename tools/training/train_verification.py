@@ -1,0 +1,168 @@
+"""Train the network that says whether a crop shows a drone, on rendered and real pictures.
+
+    python -m tools.training.train_verification --rendered CROPS --patches PATCHES --start models/distance.onnx --out
+    RUN
+
+CROPS is the folder of tools.training.render_drone_crops, PATCHES that of tools.training.mine_pictures. Resumes like
+tools.training.train, and writes the same files.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from tools.training import real_samples
+from tools.training.augment import photometric
+from tools.training.crop_files import CropFiles
+from tools.training.from_onnx import begin_with_onnx
+from tools.training.networks import DistanceNet, VerificationNet
+from tools.training.real_patches import RealPatches
+from tools.training.samples import Sample
+from tools.training.tasks import Batch, Task
+from tools.training.train import begin_with, train
+
+MIX = {"rendered": 30, "composite": 16, "real drone": 10, "cut out": 6, "negative": 34}
+"""Samples of a batch."""
+KINDS = tuple(MIX)
+SOFTENED_SHARE = 0.5
+"""Of the rendered ones."""
+PLACES_SHARE = 0.15
+"""Of the negatives: cut anywhere, not where the first stage proposed a drone."""
+NOISE_SHARE = 0.05
+"""Of the negatives: what a failing sensor delivers."""
+NEGATIVE_WEIGHTS = {"skyothers": 130.0, "rendered": 80.0}
+"""What flies besides drones, and what the first stage proposes in the worlds of the test flights, are drawn more often
+than the number of their patches says."""
+HARD_PROBABILITY, HARD_SHARE, HARD_ONES, FEWEST_HARD = 0.3, 0.35, 4000, 200
+"""A negative of more than this probability is remembered, the last so many are, and drawn so often."""
+
+NO_PLACE = np.array([-1, -1])
+"""Of a sample that is no negative patch."""
+
+
+class VerificationTask(Task):
+    """Drones and what is none: rendered, rendered before real backgrounds, and real."""
+
+    net: VerificationNet
+
+    def __init__(self, rendered: Path, patches: Path, mix: Mapping[str, int] = MIX) -> None:
+        """``mix``: samples of a batch, by kinds of ``KINDS``."""
+        super().__init__(VerificationNet(), sum(mix.values()), 6e-4)
+        self.mix = mix
+        self.rendered = CropFiles(rendered)
+        self.negatives = RealPatches(patches, "negative", weights=NEGATIVE_WEIGHTS)
+        self.places = RealPatches(patches, "place", weights={"skydrones": 8.0, "skyothers": 8.0})
+        self.drones = RealPatches(patches, "drone")
+        self.hard: deque[tuple[int, int]] = deque(maxlen=HARD_ONES)
+
+    def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
+        """As many of each kind as the mix says."""
+        self.rendered.look_for_more()
+        kinds = [(number, kind) for number, kind in enumerate(KINDS) for _ in range(self.mix.get(kind, 0))]
+        return [{"place": NO_PLACE} | self._of_kind(kind, rng) | {"kind": np.array(number)} for number, kind in kinds]
+
+    def _of_kind(self, kind: str, rng: np.random.Generator) -> Sample:
+        if kind == "negative":
+            return self._negative(rng)
+        if kind == "real drone":
+            return real_samples.real_drone(self.drones, rng)
+        backgrounds = self.places if rng.random() < 0.6 else self.negatives
+        if kind == "cut out":
+            return real_samples.real_drone(self.drones, rng, backgrounds=backgrounds)
+        drawn = self.rendered.draw(rng)
+        if kind == "composite":
+            while drawn["drone"] < 0.5 or drawn["mask"].mean() < 8:
+                drawn = self.rendered.draw(rng)
+            return real_samples.composite(drawn, backgrounds, rng)
+        if rng.random() < SOFTENED_SHARE:
+            return real_samples.softened(drawn, rng)
+        (picture,) = photometric([drawn["picture"]], rng)
+        return real_samples.sharp({**drawn, "picture": picture})
+
+    def _negative(self, rng: np.random.Generator) -> Sample:
+        """Often one that was taken for a drone when it was shown before."""
+        if rng.random() < NOISE_SHARE:
+            return real_samples.noise(*self.places.draw(rng)[:2], rng)
+        if rng.random() < PLACES_SHARE:
+            return real_samples.negative(*self.places.draw(rng)[:2], rng)
+        is_hard = len(self.hard) >= FEWEST_HARD and rng.random() < HARD_SHARE
+        place = self.hard[int(rng.integers(len(self.hard)))] if is_hard else self.negatives.draw_place(rng)
+        return real_samples.negative(*self.negatives.at(place)[:2], rng) | {"place": np.array(place)}
+
+    def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
+        """See ``Task``. A drone that can hardly be seen has little weight."""
+        crops = batch["picture"]
+        crops = torch.where(torch.rand(len(crops))[:, None, None, None] < 0.5, crops.flip(2), crops)
+        logits, there, kind = self.net(crops)[:, 0], batch["drone"], batch["kind"]
+        loss = F.binary_cross_entropy_with_logits(logits, there, weight=batch["exists_weight"])
+        probability = torch.sigmoid(logits.detach())
+        mistaken = (batch["place"][:, 0] >= 0) & (probability > HARD_PROBABILITY)
+        self.hard.extend((source, row) for source, row in batch["place"][mistaken].tolist())
+        figures = {"rendered none": float((probability[(kind == 0) & (there < 0.5)] > 0.8).float().mean())}
+        for number, name in enumerate(KINDS):
+            if name not in self.mix:
+                continue
+            mine = (kind == number) & (there > 0.5) if name != "negative" else kind == number
+            figures[name] = float((probability[mine] > 0.8).float().mean())
+        return loss, figures
+
+
+def begin_with_encoder(net: VerificationNet, distance: Path, run: Callable[[DistanceNet], object]) -> None:
+    """The encoder of an exported ``DistanceNet``; ``run`` calls that on a batch of crops. Raises ValueError."""
+    other = DistanceNet()
+    begin_with_onnx(other, distance, lambda: run(other))
+    layers = ("stem.", "down.", "body.", "more.")
+    begin_with(net, {name: value for name, value in other.state_dict().items() if name.startswith(layers)})
+
+
+def main() -> None:
+    """Train until the minutes are over."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rendered", type=Path, required=True)
+    parser.add_argument("--patches", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--start", type=Path, help="another run's checkpoint.pt, or verification.onnx or distance.onnx")
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--rate", type=float, help="learning rate to begin with")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    torch.manual_seed(arguments.seed)
+    torch.set_num_threads(arguments.threads)
+    cv2.setNumThreads(1)
+    task = VerificationTask(arguments.rendered, arguments.patches)
+    task.rate = arguments.rate or task.rate
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    if arguments.start and not (arguments.out / "checkpoint.pt").is_file():
+        _start(task, arguments.start, arguments.seed)
+        torch.save({"net": task.net.state_dict()}, arguments.out / "start.pt")
+    train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed)
+
+
+def _start(task: VerificationTask, weights: Path, seed: int) -> None:
+    net = task.net
+    if weights.suffix != ".onnx":
+        begin_with(net, torch.load(weights, map_location="cpu")["net"])
+        return
+    samples = task.batch_samples(np.random.default_rng(seed))
+    crops = torch.from_numpy(np.stack([sample["picture"] for sample in samples]))
+    try:
+        begin_with_onnx(net, weights, lambda: net(crops))
+    except ValueError:
+        try:
+            begin_with_encoder(net, weights, lambda other: other(crops))
+        except ValueError as error:
+            raise SystemExit(f"--start: {error}") from None
+
+
+if __name__ == "__main__":
+    main()
