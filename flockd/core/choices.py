@@ -21,7 +21,7 @@ PROVIDERS: tuple[Provider, ...] = get_args(Provider)
 FlowRefinement = Literal["dis", "quick_dis", "none"]
 """What sharpens a network's flow."""
 
-ScaleSource = Literal["network", "height", "velocity"]
+ScaleSource = Literal["network", "height"]
 """Where the metric scale of the background comes from."""
 
 HeightSource = Literal["range_finder", "barometer", "best"]

@@ -141,8 +141,8 @@ class PerceptionConfig(Section):
     drone_size_sigma_m: NonNegative = 0.01
     """Standard deviation of `drone_size_m`: by default of a tape measure. It adds to the deviation of every range."""
     scale: ScaleSource = "height"
-    """The background's metric scale: `network` (pure RGB, as in the paper), `height` (attitude and height above ground
-    from the autopilot) or `velocity` (attitude and velocity from the autopilot; the drone has to move)."""
+    """The background's metric scale: `network` (pure RGB, as in the paper) or `height` (attitude and height above
+    ground from the autopilot)."""
     height: HeightSource = "barometer"
     """What measures the height for `scale: height`. `barometer`: the autopilot's height above home, so that the ground
     must be level. `range_finder`: a sensor that faces down; without a good reading there is no scale. `best`: the range

@@ -87,7 +87,7 @@ class DepthMeaning(Section):
 
     quantity: Literal["depth", "inverse_depth"] = "depth"
     unknown: Unknown = "nothing"
-    """What the network cannot know. `perception.scale` then has to say what fixes it: `height` or `velocity`."""
+    """What the network cannot know. `perception.scale` then has to be `height`, which fixes it."""
     focal_px: Positive | None = None
     """Metric only for cameras of this focal length, in pixels of the input; others' depth is scaled by theirs."""
 

@@ -218,16 +218,16 @@ class OnnxNetworks:
         return replace(scene, open=OpenDepth(np.asarray(inverse, np.float32), shift=self._unknown == "scale_and_shift"))
 
     def _what_is_unknown(self, config: PerceptionConfig) -> Unknown:
-        """What of the depth is left for the autopilot's height or velocity to fix. Raises ModelError."""
+        """What of the depth is left for the height above ground to fix. Raises ModelError."""
         manifest = self._depth.manifest
         unknown = manifest.results["depth"].depth.unknown
         if config.scale == "network" and unknown != "nothing":
             raise ModelError(
                 f"perception.scale: depth model {config.depth!r} has no metric scale for `network` to take; "
-                "write height or velocity, or choose a metric model"
+                "write height, or choose a metric model"
             )
         takes_ground = "geometry" in manifest.contents
-        if unknown == "nothing" and (config.scale == "velocity" or (config.scale == "height" and not takes_ground)):
+        if unknown == "nothing" and config.scale == "height" and not takes_ground:
             return "scale"
         return unknown
 

@@ -13,7 +13,7 @@ from flockd.flight.geometry import Rig, ground_inverse_depth
 from flockd.flight.inference import models_folder
 from flockd.flight.inference.checks import Deadline, no_deadline
 from flockd.flight.perception.continuity import ContinuityMonitor
-from flockd.flight.perception.depth import GroundBelow, NoGround, VelocityScale, fix_by_height
+from flockd.flight.perception.depth import GroundBelow, NoGround, fix_by_height
 from flockd.flight.perception.detection.detector import DetectionTrace, Detector
 from flockd.flight.perception.detection.masks import depth_of_drones, without_borders
 from flockd.flight.perception.image_noise import NoiseMonitor
@@ -33,7 +33,6 @@ class Perception:
         size_m = config.drone_size_m
         known_size = None if size_m is None else KnownSize(size_m, config.drone_size_sigma_m)
         self._detector = Detector(rig, networks, config.detection, known_size)
-        self._velocity_scale = VelocityScale(rig) if config.scale == "velocity" else None
         self._ground = GroundBelow(config.height, config.range_finder) if config.scale == "height" else None
         self._noise = NoiseMonitor(config.noise)
         self._continuity = ContinuityMonitor(config.noise)
@@ -63,7 +62,6 @@ class Perception:
         previous, restarted = self._pair(frames)
         flows = self._flows(previous, {name: usable[name] for name in scenes})
         lap("flow")
-        scenes, unscaled = self._scaled(previous, vehicle, scenes, flows)
         images = {name: usable[name].image for name in scenes}
         detections, masks = self._detector.detect(images, scenes, vehicle, predictions, trace or DetectionTrace())
         cameras = {}
@@ -71,7 +69,7 @@ class Perception:
             depth = depth_of_drones(scene.depth, masks[name], self._rig.cameras[name], detections)
             labels = without_borders(masks[name], self._config.detection.mask_border_px)
             cameras[name] = CameraObservation(images[name], depth, labels, flows.get(name))
-        reasons = (*unusable, *ungrounded, *failed, *restarted, *unscaled)
+        reasons = (*unusable, *ungrounded, *failed, *restarted)
         found = ground if isinstance(ground, GroundEstimate) and self._config.height != "barometer" else None
         track = None if found is None or self._ground is None else self._ground.track(vehicle)
         self._last = Observation(frames.time_s, vehicle, cameras, detections, previous, reasons, noisy, found, track)
@@ -155,20 +153,6 @@ class Perception:
                 first = Frame(name, before.image, previous.time_s, 0)
                 flows[name] = self._networks.flow(first, frame, before.labels)
         return flows
-
-    def _scaled(
-        self,
-        previous: Observation | None,
-        vehicle: VehicleState,
-        scenes: dict[str, SceneMaps],
-        flows: Mapping[str, Float32Array],
-    ) -> tuple[dict[str, SceneMaps], Reasons]:
-        """The maps with the scale that the autopilot's velocity gives where it is to give it."""
-        if self._velocity_scale is None:
-            return scenes, []
-        before = previous.vehicle if previous else None
-        labels = {name: camera.labels for name, camera in previous.cameras.items()} if previous else {}
-        return self._velocity_scale.fix(before, vehicle, labels, scenes, flows)
 
 
 def load_networks(config: PerceptionConfig, deadline: Deadline = no_deadline) -> OnnxNetworks:

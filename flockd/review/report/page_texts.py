@@ -115,7 +115,6 @@ def _means(summary: Summary) -> str:
 _SCALES = {
     "network": "metric scale from the images alone",
     "height": "metric scale from attitude and height above ground",
-    "velocity": "metric scale from the autopilot's attitude and velocity",
 }
 
 

@@ -91,20 +91,19 @@ def test_depth_for_one_focal_length_is_scaled_to_the_cameras(tmp_path: Path) -> 
 def test_a_relative_network_is_refused_where_nothing_fixes_its_scale(tmp_path: Path) -> None:
     relative = {"depth": {"quantity": "inverse_depth", "unknown": "scale_and_shift"}}
     path = one_channel_depth(tmp_path, output=relative)
-    with pytest.raises(ModelError, match=r"perception\.scale: .* has no metric scale .* write height or velocity"):
+    with pytest.raises(ModelError, match=r"perception\.scale: .* has no metric scale .* write height, or choose"):
         perception_with(path, scale="network")
-    for scale in ("height", "velocity"):
-        seen = perception_with(path, scale=scale).scene(front(plain((51, 0, 0))), camera_of(40.0, SIZE), None)
-        assert np.isnan(seen.depth).all()
-        assert seen.open is not None
-        assert seen.open.shift
-        np.testing.assert_allclose(seen.open.inverse, 0.2, rtol=1e-5)
+    seen = perception_with(path, scale="height").scene(front(plain((51, 0, 0))), camera_of(40.0, SIZE), None)
+    assert np.isnan(seen.depth).all()
+    assert seen.open is not None
+    assert seen.open.shift
+    np.testing.assert_allclose(seen.open.inverse, 0.2, rtol=1e-5)
 
 
 def test_a_metric_network_leaves_its_scale_to_the_autopilot_where_that_is_asked_for(tmp_path: Path) -> None:
     path = one_channel_depth(tmp_path, output={})
-    for scale in ("height", "velocity"):  # it takes no ground as an input, so height has to align what it says
-        seen = perception_with(path, scale=scale).scene(front(plain((51, 0, 0))), camera_of(40.0, SIZE), None)
-        assert seen.open is not None
-        assert not seen.open.shift
-        np.testing.assert_allclose(seen.open.inverse, 5.0, rtol=1e-5)
+    # it takes no ground as an input, so height has to align what it says
+    seen = perception_with(path, scale="height").scene(front(plain((51, 0, 0))), camera_of(40.0, SIZE), None)
+    assert seen.open is not None
+    assert not seen.open.shift
+    np.testing.assert_allclose(seen.open.inverse, 5.0, rtol=1e-5)

@@ -1,4 +1,4 @@
-"""Depth without metres: the autopilot's height or velocity says how far away things are."""
+"""Depth without metres: the height above ground says how far away things are."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flockd.core.data import data_path
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, Frame, FrameSet, UInt8Array, VehicleState
 from flockd.flight.geometry import Rig, RigCamera, build_rig, ground_inverse_depth
 from flockd.flight.perception import Instance, OnnxNetworks, OpenDepth, Perception, SceneMaps
-from flockd.flight.perception.depth import VelocityScale, fix_by_height
+from flockd.flight.perception.depth import fix_by_height
 from tests.flight.inference.foreign import SIZE, one_channel_depth
 
 WIDTH, HEIGHT = 160, 120
@@ -80,70 +80,6 @@ def test_without_ground_in_view_height_says_nothing() -> None:
     _, level, _ = depth_of_ground(3.0)
     with pytest.raises(ValueError, match="too little flat ground"):
         fix_by_height(opened(wall, shift=True), level)  # nothing in this picture looks like ground
-
-
-def seen_from(time_s: float, velocity: tuple[float, float, float], yaw: float = 0.0) -> VehicleState:
-    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
-    return VehicleState(time_s, turn, 3.0, np.array(velocity))
-
-
-def flow_of(before: VehicleState, now: VehicleState, depth_before: FloatArray) -> Float32Array:
-    """By the definition of a camera: every point's pixel now minus its pixel before."""
-    camera = camera_of(rig_of())
-    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    pixels = np.stack([u.ravel(), v.ravel()], 1)
-    points = camera.T_body_camera.apply(camera.camera.unproject(pixels, depth_before.ravel()))
-    assert before.velocity_ned is not None
-    travelled = before.velocity_ned * (now.time_s - before.time_s)
-    body_now = (points @ before.R_ned_body.T - travelled) @ now.R_ned_body
-    ends = camera.camera.project(camera.T_body_camera.inverse().apply(body_now))
-    return np.asarray(np.nan_to_num(ends - pixels, nan=1e4).reshape(HEIGHT, WIDTH, 2), np.float32)
-
-
-def wall_now(before: VehicleState, now: VehicleState, wall_north_m: float) -> tuple[FloatArray, FloatArray]:
-    """Depth of an upright wall to the north, slanted eastwards, before and now."""
-    camera = camera_of(rig_of())
-    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    rays = camera.camera.unproject(np.stack([u.ravel(), v.ravel()], 1), np.ones(u.size))
-    normal = np.array([1.0, 0.5, 0.0])
-    depths = []
-    position = np.zeros(3)
-    for state in (before, now):
-        along = (rays @ camera.T_body_camera.rotation.T) @ state.R_ned_body.T
-        depths.append(((wall_north_m - position @ normal) / (along @ normal)).reshape(HEIGHT, WIDTH))
-        assert state.velocity_ned is not None
-        position = position + state.velocity_ned * (now.time_s - before.time_s)
-    return depths[0], depths[1]
-
-
-@pytest.mark.parametrize("shift", [False, True])
-def test_velocity_gives_how_far_away_things_are_by_how_they_pass(shift: bool) -> None:
-    scale = VelocityScale(rig_of())
-    before, now = seen_from(0.0, (0.3, 1.0, -0.2)), seen_from(0.5, (0.3, 1.0, -0.2), yaw=0.05)
-    depth_before, depth_now = wall_now(before, now, 6.0)
-    labels = {"front": np.zeros((HEIGHT, WIDTH), np.uint8)}
-    maps = {"front": opened(depth_now, shift=shift)}
-    fixed, reasons = scale.fix(before, now, labels, maps, {"front": flow_of(before, now, depth_before)})
-    assert reasons == []
-    np.testing.assert_allclose(fixed["front"].depth, depth_now, rtol=0.02)
-
-    # It then stands still: what it has learned stays.
-    standing = seen_from(1.0, (0.0, 0.0, 0.0))
-    still = {"front": np.zeros((HEIGHT, WIDTH, 2), np.float32)}
-    fixed, reasons = scale.fix(standing, seen_from(1.5, (0.0, 0.0, 0.0)), labels, maps, still)
-    assert reasons == []
-    np.testing.assert_allclose(fixed["front"].depth, depth_now, rtol=0.02)
-
-
-def test_before_it_moved_a_relative_depth_stays_unknown_and_a_metric_one_is_taken_as_it_is() -> None:
-    depth = np.random.default_rng(0).uniform(2.0, 9.0, (HEIGHT, WIDTH))
-    scale = VelocityScale(rig_of())
-    relative, reasons = scale.fix(None, seen_from(0.0, (0.0, 0.0, 0.0)), {}, {"front": opened(depth, shift=True)}, {})
-    assert reasons == ["camera front: the drone has not yet moved enough for its velocity to fix the scale"]
-    assert np.isnan(relative["front"].depth).all()
-    metric, reasons = scale.fix(None, seen_from(0.0, (0.0, 0.0, 0.0)), {}, {"front": opened(depth, shift=False)}, {})
-    assert reasons == []
-    np.testing.assert_allclose(metric["front"].depth, FACTOR * depth, rtol=1e-5)
 
 
 def test_a_foreign_relative_network_sees_metres_by_height(tmp_path: Path) -> None:
