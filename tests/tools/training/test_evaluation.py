@@ -6,7 +6,7 @@ import numpy as np
 
 from flockd.core.messages import Detection
 from flockd.flight.geometry import log_polar, log_polar_covariance
-from tools.measure.evaluation.on_pairs import Findings, _pairings, _view, compare_drones
+from tools.measure.evaluation.on_pairs import Findings, _pairings, compare_drones
 from tools.training.dataset import HEIGHT, WIDTH, PairSet
 
 
@@ -29,27 +29,6 @@ def test_one_detection_is_not_two_drones_and_none_is_found_in_another_direction(
     assert not _pairings((detection(0.0, 2.0, 0.0),), [near, far], [0.5, 0.5])
 
 
-def test_a_grey_drone_before_the_sky_seen_from_below_is_said_to_be_that() -> None:
-    depth, ids = np.full((HEIGHT // 2, WIDTH // 2), 80.0, np.float32), np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8)
-    ids[100:110, 50:70] = 1
-    image = np.full((HEIGHT, WIDTH, 3), 200, np.uint8)
-    image[200:220, 100:140] = 140
-    # Camera axes: right, down, forward. The drone hovers level, 3 m ahead of the camera and 3 m above it.
-    level = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
-    pairs = PairSet(
-        {
-            "drone_centre": np.array([[[[0.0, -3.0, 3.0]]]]),
-            "drone_rotation": level[None, None, None],
-            "image": image[None, None],
-        },
-        1,
-    )
-    below_deg, sky_share, contrast = _view(pairs, 0, 0, depth, ids)
-    assert np.isclose(below_deg, 45.0)
-    assert sky_share == 1.0
-    assert np.isclose(contrast, 60.0)
-
-
 def test_a_drone_is_proposed_where_the_second_stage_was_asked_about_its_direction() -> None:
     """Of two drones 10 m ahead and 2 m apart, without a detection, only the one is that a proposal points to."""
     depth, ids = np.full((HEIGHT // 2, WIDTH // 2), 80.0, np.float32), np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8)
@@ -61,7 +40,6 @@ def test_a_drone_is_proposed_where_the_second_stage_was_asked_about_its_directio
             "drone_box": np.array([[[[310, 230, 330, 250], [374, 230, 394, 250]]]]),
             "drone_centre": np.array([[[[0.0, 0.0, 10.0], [2.0, 0.0, 10.0]]]]),
             "drone_rotation": np.broadcast_to(np.eye(3), (1, 1, 2, 3, 3)),
-            "image": np.zeros((1, 1, HEIGHT, WIDTH, 3), np.uint8),
         },
         1,
     )

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,8 +26,6 @@ MIN_PIXELS = 6
 MASK_WITHIN_M = 10.0
 HEIGHT_SIGMAS_M = {"barometer": 0.1, "range finder": 0.03}
 """Standard deviations of the height above ground that an autopilot gives, by what it measures it with."""
-SKY_M = 79.0
-"""Depth from which on a rendered pixel shows the sky."""
 WHOLE_HIDES = 0.02
 """A drone is whole when it is inside the image and no more of its outline is hidden than this."""
 
@@ -45,12 +42,6 @@ class Drone:
     """Of its range, relative; 0 where it was not found."""
     sigma: float
     """What was said of that error's standard deviation."""
-    below_deg: float = 0.0
-    """How far below the drone's own horizontal plane the camera is, as the drone sees it; negative: above it."""
-    sky_share: float = 0.0
-    """Of what surrounds the drone in the image."""
-    contrast: float = 0.0
-    """Between the drone's mean colour and that of what surrounds it, grey levels."""
     proposed: bool = True
     """Whether the second stage was asked about it: some proposal is no farther from it than the drone is large."""
 
@@ -174,25 +165,9 @@ def compare_drones(
             distance = float(np.linalg.norm(best.position))
             error, sigma = distance / range_m - 1.0, best.range_sigma_m / distance
         whole = inside and _hidden_share(pairs, index, int(drone), depth, ids) < WHOLE_HIDES
-        view = _view(pairs, index, int(drone), depth, ids)
         drone_found, asked = best is not None, any(_angle(one, true) <= size_m / range_m for one in proposed)
-        found.drones.append(Drone(range_m, float(right - left), bool(whole), drone_found, error, sigma, *view, asked))
+        found.drones.append(Drone(range_m, float(right - left), bool(whole), drone_found, error, sigma, asked))
     found.false += len(detections) - len(detection_of)
-
-
-def _view(pairs: PairSet, index: int, drone: int, depth: Array, ids: Array) -> tuple[float, float, float]:
-    """A drone's ``below_deg``, ``sky_share`` and ``contrast``."""
-    towards_camera = -np.asarray(pairs["drone_centre"][index, 0, drone], np.float64)
-    down = towards_camera @ np.asarray(pairs["drone_rotation"][index, 0, drone], np.float64)[:, 2]
-    below_deg = float(np.degrees(np.arcsin(np.clip(down / np.linalg.norm(towards_camera), -1, 1))))
-    own = (ids == drone + 1).astype(np.uint8)
-    around = (cv2.dilate(own, np.ones((9, 9), np.uint8)) > 0) & (cv2.dilate(own, np.ones((3, 3), np.uint8)) == 0)
-    around &= ids == 0
-    if not own.any() or not around.any():
-        return below_deg, 0.0, 0.0
-    image = np.asarray(pairs["image"][index][0])[::2, ::2].astype(np.float32)
-    contrast = np.abs(image[own > 0].mean(0) - image[around].mean(0)).max()
-    return below_deg, float((depth[around] >= SKY_M).mean()), float(contrast)
 
 
 def _pairings(detections: tuple[Detection, ...], places: list[Array], sizes_m: list[float]) -> dict[int, Detection]:
