@@ -235,7 +235,7 @@ def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
     from flockd.flight.inference import OnnxModel
     from flockd.flight.inference.feeds import feeds_for, golden_feeds, shapes_of
     from flockd.flight.inference.providers import builds_engines, engines_folder
-    from flockd.flight.perception.networks import CROPS_PER_RUN
+    from flockd.flight.perception.onnx import CROPS_PER_RUN
     from flockd.flight.perception.requirements import check_roles
 
     wanted = config.perception

@@ -2,10 +2,11 @@
 
 from flockd.flight.perception.detection.instances import Instance, group_instances
 from flockd.flight.perception.flow import DisFlow, Flow, OnnxFlow
+from flockd.flight.perception.interface import Networks
 from flockd.flight.perception.maps import Crop, OpenDepth, RangeEstimate, SceneMaps
-from flockd.flight.perception.networks import Networks, OnnxNetworks
 from flockd.flight.perception.observation import CameraObservation, Observation
-from flockd.flight.perception.pipeline import Perception, load_networks
+from flockd.flight.perception.onnx import OnnxNetworks, load_networks
+from flockd.flight.perception.pipeline import Perception
 
 __all__ = [
     "CameraObservation",

@@ -10,15 +10,13 @@ import numpy as np
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.messages import Float32Array, FloatArray, Frame, FrameSet, GroundEstimate, VehicleState
 from flockd.flight.geometry import Rig, ground_inverse_depth
-from flockd.flight.inference import models_folder
-from flockd.flight.inference.checks import Deadline, no_deadline
 from flockd.flight.perception.continuity import ContinuityMonitor
 from flockd.flight.perception.depth import GroundBelow, NoGround, fix_by_height
 from flockd.flight.perception.detection.detector import DetectionTrace, Detector
 from flockd.flight.perception.detection.masks import depth_of_drones, without_borders
 from flockd.flight.perception.image_noise import NoiseMonitor
+from flockd.flight.perception.interface import Networks
 from flockd.flight.perception.maps import KnownSize, SceneMaps
-from flockd.flight.perception.networks import Networks, OnnxNetworks
 from flockd.flight.perception.observation import CameraObservation, Observation
 from flockd.flight.tracking import Prediction
 
@@ -153,8 +151,3 @@ class Perception:
                 first = Frame(name, before.image, previous.time_s, 0)
                 flows[name] = self._networks.flow(first, frame, before.labels)
         return flows
-
-
-def load_networks(config: PerceptionConfig, deadline: Deadline = no_deadline) -> OnnxNetworks:
-    """The networks that a configuration names; `deadline` is for the golden input of each. Raises ModelError."""
-    return OnnxNetworks(config, models_folder(config), deadline)

@@ -21,7 +21,7 @@ from flockd.core.messages import BoolArray, Float32Array, Frame, UInt8Array
 from flockd.flight.inference import OnnxModel, find_manifests, load_manifest
 from flockd.flight.perception import DisFlow, OnnxFlow, OnnxNetworks
 from flockd.flight.perception.flow import background_flow
-from flockd.flight.perception.networks import CROPS_PER_RUN
+from flockd.flight.perception.onnx import CROPS_PER_RUN
 from flockd.sim.drone_models import drone_model
 from flockd.sim.renderer import Renderer
 from flockd.sim.world import World

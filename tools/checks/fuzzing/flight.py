@@ -43,7 +43,7 @@ def _networks(folder: Path) -> Check:
     config = load_drone(CORPUS / "drone.yaml", {"perception.flow": "flow_int8", "perception.threads": 1})
     networks = load_networks(config.perception)
     source = Random(0)
-    for model in networks._models.values():
+    for model in networks._models._opened.values():
         outputs = {name: spec.shape for name, spec in model.manifest.outputs.items()}
         model._run = _invented(outputs, lambda: source)  # type: ignore[method-assign]
     size = config.rig.cameras[0].size_px

@@ -19,8 +19,8 @@ from flockd.flight.perception.detection.proposals import (
     propose_residuals,
 )
 from flockd.flight.perception.detection.refinement import Candidate, Cascade
+from flockd.flight.perception.interface import Networks
 from flockd.flight.perception.maps import KnownSize, SceneMaps
-from flockd.flight.perception.networks import Networks
 from flockd.flight.tracking import Prediction
 
 

@@ -51,7 +51,7 @@ class Candidate:
 
 
 class RangeNetwork(Protocol):
-    """Of `flockd.flight.perception.networks.Networks`, what refinement needs."""
+    """Of `flockd.flight.perception.interface.Networks`, what refinement needs."""
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         """Range and centre of the drone in the middle of each crop."""

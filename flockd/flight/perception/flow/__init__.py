@@ -2,8 +2,8 @@
 
 from flockd.flight.perception.flow.background import background_flow
 from flockd.flight.perception.flow.dis import DisFlow
-from flockd.flight.perception.flow.interface import Flow
 from flockd.flight.perception.flow.network import OnnxFlow
 from flockd.flight.perception.flow.objects import object_flow
+from flockd.flight.perception.interface import Flow
 
 __all__ = ["DisFlow", "Flow", "OnnxFlow", "background_flow", "object_flow"]

@@ -11,7 +11,7 @@ from flockd.core.messages import Float32Array, UInt8Array
 from flockd.flight.perception.flow.cross_correlation import flow_correlation, translation_flow
 from flockd.flight.perception.flow.features import feature_flow
 from flockd.flight.perception.flow.images import grey
-from flockd.flight.perception.flow.interface import Flow
+from flockd.flight.perception.interface import Flow
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The networks' side of perception: flow of a pair of images, depth and drones of one, range of the drone in a crop."""
+"""The networks that a configuration names, as ONNX models: flow, depth, segmentation, distance and verification."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -20,7 +19,7 @@ from flockd.flight.geometry import RigCamera
 from flockd.flight.inference.checks import Deadline, no_deadline
 from flockd.flight.inference.fitting import fit
 from flockd.flight.inference.manifest import Unknown
-from flockd.flight.inference.manifest_file import manifest_path
+from flockd.flight.inference.manifest_file import manifest_path, models_folder
 from flockd.flight.inference.providers import engines_folder
 from flockd.flight.inference.session import OnnxModel
 from flockd.flight.perception.detection.instances import group_instances
@@ -37,40 +36,9 @@ _MIN_RAY_Z = 0.1
 """Of a unit ray, for its tangents to stay finite: 84 degrees off the optical axis."""
 
 
-class Networks(Protocol):
-    """What perception asks of networks: `OnnxNetworks`, or exact ones that a simulator puts in their place."""
-
-    @property
-    def map_stride(self) -> int:
-        """Image pixels per pixel of the first stage's maps."""
-        ...
-
-    @property
-    def second_stage(self) -> SecondStage | None:
-        """How the crops are cut that `ranges` takes; None: there is no second stage."""
-        ...
-
-    def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
-        """(h, w, 2) pixels from the first image to the second.
-
-        ``labels`` (h, w) of the first image: one value a drone, 0 and 255 none.
-        """
-        ...
-
-    def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
-        """Depth and drones of one image.
-
-        ``ground`` (h / map_stride, w / map_stride) is the inverse depth (1/m) of flat ground, where attitude and height
-        are to fix the scale.
-        """
-        ...
-
-    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
-        """Range and centre of the drone in the middle of each crop.
-
-        The range may be NaN where the probability is no more than `second_stage` asks for another crop.
-        """
-        ...
+def load_networks(config: PerceptionConfig, deadline: Deadline = no_deadline) -> OnnxNetworks:
+    """The networks that a configuration names; `deadline` is for the golden input of each. Raises ModelError."""
+    return OnnxNetworks(config, models_folder(config), deadline)
 
 
 class OnnxNetworks:
@@ -78,18 +46,16 @@ class OnnxNetworks:
 
     def __init__(self, config: PerceptionConfig, models_dir: Path, deadline: Deadline = no_deadline) -> None:
         """``deadline`` is for each network's run on its golden input. Raises ModelError."""
-        self._models: dict[str, OnnxModel] = {}
-        self._dir = models_dir
-        self._config = config
-        self._deadline = deadline
+        self._models = _Models(config, models_dir, deadline)
+        self._flow_refinement = config.flow_refinement
         cv2.setNumThreads(config.threads)
         self._flow = self._build_flow(config)
-        self._depth = self._model(config.depth, "depth")
-        self._segmentation = self._model(config.segmentation, "segmentation")
+        self._depth = self._models.open(config.depth, "depth")
+        self._segmentation = self._models.open(config.segmentation, "segmentation")
         self._unknown = self._what_is_unknown(config)
-        self._distance = None if config.distance == NO_MODEL else self._model(config.distance, "distance")
+        self._distance = None if config.distance == NO_MODEL else self._models.open(config.distance, "distance")
         has_verification = self._distance is not None and config.verification != NO_MODEL
-        self._verification = self._model(config.verification, "verification") if has_verification else None
+        self._verification = self._models.open(config.verification, "verification") if has_verification else None
         self.map_stride = self._segmentation.manifest.map_stride or 1
         self.second_stage = None
         if self._distance is not None:
@@ -98,14 +64,13 @@ class OnnxNetworks:
 
     def terminate(self) -> None:
         """Ends every run of a network that is under way; its caller gets an error."""
-        for model in self._models.values():
-            model.terminate()
+        self._models.terminate()
 
     def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
         """See `Networks`. The flow of each drone is found by itself."""
         before, after = first.image, second.image
         flow = self._flow.flow(before, after)
-        if self._config.flow_refinement == "quick_dis":
+        if self._flow_refinement == "quick_dis":
             flow = background_flow(flow, before, after, labels)
         return object_flow(flow, before, after, labels)
 
@@ -234,18 +199,26 @@ class OnnxNetworks:
     def _build_flow(self, config: PerceptionConfig) -> Flow:
         if config.flow == "dis":
             return DisFlow()
-        network = OnnxFlow(self._model(config.flow, "flow"))
+        network = OnnxFlow(self._models.open(config.flow, "flow"))
         if config.flow_refinement == "none":
             return network
         return DisFlow(network, config.flow_refinement_scale, quick=config.flow_refinement == "quick_dis")
 
-    def _model(self, name: str, role: Role) -> OnnxModel:
-        path = manifest_path(self._dir, name)
-        key = str(path)
-        if key not in self._models:
+
+class _Models:
+    """Opens each model once, however many roles it fills."""
+
+    def __init__(self, config: PerceptionConfig, folder: Path, deadline: Deadline) -> None:
+        self._config, self._folder, self._deadline = config, folder, deadline
+        self._opened: dict[Path, OnnxModel] = {}
+
+    def open(self, name: str, role: Role) -> OnnxModel:
+        """The model for a role. Raises ModelError where there is none, or where it does not fill the role."""
+        path = manifest_path(self._folder, name)
+        if path not in self._opened:
             if not path.is_file():
-                raise ModelError(f"perception.{role}: {_what_to_name_instead(name, role, path, self._dir)}")
-            self._models[key] = OnnxModel(
+                raise ModelError(f"perception.{role}: {_what_to_name_instead(name, role, path, self._folder)}")
+            self._opened[path] = OnnxModel(
                 path,
                 threads=self._config.threads,
                 provider=self._config.provider,
@@ -253,13 +226,18 @@ class OnnxNetworks:
                 check=check_roles,
                 deadline=self._deadline,
             )
-        model = self._models[key]
+        model = self._opened[path]
         if role not in model.manifest.roles:
             raise ModelError(
                 f"perception.{role}: model {name!r} fills {', '.join(model.manifest.roles)} and not {role}; "
                 "choose another"
             )
         return model
+
+    def terminate(self) -> None:
+        """Ends every run that is under way."""
+        for model in self._opened.values():
+            model.terminate()
 
 
 def _what_to_name_instead(name: str, role: Role, path: Path, folder: Path) -> str:
