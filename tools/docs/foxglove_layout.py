@@ -13,10 +13,9 @@ from typing import Any
 
 import foxglove.layouts as fl
 
-from flockd.fleet.foxglove.camera_messages import frame_of
-from flockd.fleet.foxglove.fleet_channels import FLEET, LOG
-from flockd.fleet.foxglove.map_places import MAP
-from flockd.fleet.foxglove.scene_messages import COLOURS, SCENE_TOPICS
+from flockd.fleet.foxglove.drone_cameras import frame_of
+from flockd.fleet.foxglove.fleet_publisher import FLEET, LOG
+from flockd.fleet.foxglove.fleet_scene import COLOURS, MAP, SCENE_TOPICS
 
 LAYOUT = Path(__file__).resolve().parents[2] / "config" / "foxglove_layout.json"
 DRONES = tuple(f"drone{number + 1}" for number in range(len(COLOURS)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
 from typing import Self
 
@@ -11,7 +12,7 @@ from foxglove.websocket import Capability, PlaybackStatus, WebSocketServer
 
 from flockd.core.errors import UnavailableError
 from flockd.fleet.foxglove.fleet_publisher import FleetPublisher
-from flockd.fleet.foxglove.time_line import LiveTime, ReplayTime
+from flockd.fleet.foxglove.playback import Playback
 from flockd.fleet.page.fleet_source import FleetSource
 
 UPDATE_EVERY_S = 0.25
@@ -23,58 +24,52 @@ class FoxgloveServer:
     def __init__(self, source: FleetSource, address: str, port: int) -> None:
         """``source``: stays its owner's. ``port``: 0 for any. Raises UnavailableError where it cannot listen."""
         context = foxglove.Context()
-        self._replay = None if source.span_s is None else ReplayTime(source)
-        self._server = _listening(context, address, port, self._replay)
+        self._playback = None if source.span_s is None else Playback(source)
+        self._server = _listening(context, address, port, self._playback)
         self.port = self._server.port
-        self._publisher = FleetPublisher(source, self._replay or LiveTime(source), context)
-        self._failure: Exception | None = None
+        self._source, self._publisher = source, FleetPublisher(source, context)
         self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="Foxglove server", daemon=True)
+        self._thread = ThreadPoolExecutor(1, "Foxglove server")
 
     def __enter__(self) -> Self:
-        self._thread.start()
+        self._publishing = self._thread.submit(self._publish)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._over.set()
-        self._thread.join()
+        self._thread.shutdown()
         self._server.stop()
         self._publisher.close()
 
     def wait(self) -> None:
         """Until it is closed. Raises what ended it before."""
-        self._thread.join()
-        if self._failure is not None:
-            raise self._failure
-
-    def _run(self) -> None:
-        try:
-            self._publish()
-        except Exception as error:  # noqa: BLE001 - raised again by `wait`
-            self._failure = error
+        self._publishing.result()
 
     def _publish(self) -> None:
         status = PlaybackStatus.Paused
         while not self._over.wait(UPDATE_EVERY_S):
-            self._publisher.update()
-            if self._replay is not None:
-                state = self._replay.state()
+            if self._playback is None:
+                self._publisher.update(self._source.now_s())
+            else:
+                time_s, jumped = self._playback.moved()
+                self._publisher.update(time_s, jumped=jumped)
+                state = self._playback.state()
                 self._server.broadcast_time(state.current_time)
                 if state.status != status:
                     status = state.status
                     self._server.broadcast_playback_state(state)
 
 
-def _listening(context: foxglove.Context, address: str, port: int, replay: ReplayTime | None) -> WebSocketServer:
+def _listening(context: foxglove.Context, address: str, port: int, playback: Playback | None) -> WebSocketServer:
     """Without any capability through which a client could send something, but for where a replay is."""
     try:
-        if replay is None:
+        if playback is None:
             return foxglove.start_server(name="flockd", host=address, port=port, context=context)
         return foxglove.start_server(
-            name="flockd recordings", host=address, port=port, context=context, server_listener=replay,
-            capabilities=[Capability.Time, Capability.PlaybackControl], playback_time_range=replay.range_ns,
+            name="flockd recordings", host=address, port=port, context=context, server_listener=playback,
+            capabilities=[Capability.Time, Capability.PlaybackControl], playback_time_range=playback.range_ns,
         )  # fmt: skip
     except RuntimeError as error:  # of which FoxgloveError is a kind
         reason = str(error).rpartition(": ")[2]

@@ -44,7 +44,7 @@ def drone_rows(drones: Iterable[Watched], known: Mapping[str, Known], now_s: flo
     for key in sorted(rows):  # the map's origin is always the same drone's home
         origin = origin or rows[key]["home_deg"]
     for row in rows.values():
-        row["home_ne"] = _offset(origin, row.pop("home_deg"))
+        row["home_ne"] = _offset(origin, row["home_deg"])
     return rows
 
 
@@ -77,13 +77,14 @@ def _row(drone: Watched, status: Mapping[str, Any], known: Known, now_s: float) 
         "armed": flight.get("armed"),
         "in_air": flight.get("in_air"),
         "silence": flight.get("silence"),
-        "yaw_deg": _rounded(state.get("yaw_deg"), 1),
-        "velocity_ne": _vector(state.get("velocity_ned")),
+        **{f"{angle}_deg": _rounded(state.get(f"{angle}_deg"), 1) for angle in ("roll", "pitch", "yaw")},
+        "velocity_ned": _vector(state.get("velocity_ned"), size=3),
         "speed_m_s": _speed(state.get("velocity_ned")),
         "command_ne": _vector(of("command").get("velocity_ne")),
         "position_ne": _vector(state.get("position_ne")),
         "home_deg": _vector(state.get("home_deg"), 7),
         "goal_ne": _vector(of("mission").get("goal_ne")),
+        "goal_height_m": _rounded(of("mission").get("goal_height_m"), 2),
         "sees": [_seen(one) for one in of("neighbours").get("neighbours", ())],
         "obstacles_m": of("obstacles").get("range_m"),
         "rate_hz": _rate(drone.topics.get("state"), now_s),
@@ -127,23 +128,24 @@ def _rate(heard: Heard | None, now_s: float) -> float | None:
 
 
 def _seen(neighbour: Mapping[str, Any]) -> Row:
-    """A neighbour as its observer has it, metres north and east of that one."""
+    """A neighbour as its observer has it, metres north, east and down of that one."""
     return {
-        "ne": _vector(neighbour["position_ned"]),
+        "track": neighbour["track"],
+        "ned": _vector(neighbour["position_ned"], size=3),
         "sigma_m": _rounded(neighbour["position_sigma_m"], 2),
         "confirmed": neighbour["confirmed"],
         "unseen_s": _rounded(neighbour["unseen_s"], 1),
     }
 
 
-def _vector(values: object, digits: int = 2) -> list[float] | None:
-    """The first two of a list from a peer; None where one of them is missing."""
-    if not isinstance(values, list) or len(values) < 2:
+def _vector(values: object, digits: int = 2, *, size: int = 2) -> list[float] | None:
+    """The first of a list from a peer; None where one of them is missing."""
+    if not isinstance(values, list) or len(values) < size:
         return None
-    pair = values[:2]
-    if not all(isinstance(value, int | float) and math.isfinite(value) for value in pair):
+    first = values[:size]
+    if not all(isinstance(value, int | float) and math.isfinite(value) for value in first):
         return None
-    return [round(float(value), digits) for value in pair]
+    return [round(float(value), digits) for value in first]
 
 
 def _speed(velocity: object) -> float | None:

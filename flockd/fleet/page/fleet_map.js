@@ -146,8 +146,8 @@ export class FleetMap {
 
   seenBy(key) {
     const [place, row] = [this.places.get(key), state.rows.get(key)];
-    return row.sees.filter((one) => one.ne).map((one) => ({
-      ...one, place: [place[0] + one.ne[0], place[1] + one.ne[1]],
+    return row.sees.filter((one) => one.ned).map((one) => ({
+      ...one, place: [place[0] + one.ned[0], place[1] + one.ned[1]],
     }));
   }
 
@@ -302,7 +302,7 @@ export class FleetMap {
     const row = state.rows.get(key);
     const [x, y] = this.pixel(this.places.get(key));
     const lost = row.state === "gone" || row.state === "quiet";
-    const [north, east] = row.velocity_ne || [0, 0];
+    const [north, east] = row.velocity_ned || [0, 0];
     pen.strokeStyle = pen.fillStyle = colourOf(key);
     pen.lineWidth = 2;
     pen.globalAlpha = lost ? 0.45 : 1;

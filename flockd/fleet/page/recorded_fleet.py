@@ -138,6 +138,10 @@ class RecordedFleet:
 
     def history(self) -> Mapping[str, list[list[float | None]]]:
         """Of all."""
+        return self._history
+
+    @functools.cached_property
+    def _history(self) -> dict[str, list[list[float | None]]]:
         history: dict[str, list[list[float | None]]] = {}
         time_s, end_s = self.span_s
         while time_s <= end_s:

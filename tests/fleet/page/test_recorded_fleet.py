@@ -30,8 +30,8 @@ def test_a_recording_shows_what_its_drone_knew_at_each_time(folder: Path) -> Non
         assert key.endswith(f"/{recording.drone}")
         assert step.output is not None
         assert row["height_m"] == pytest.approx(step.vehicle.height_m, abs=0.01)
-        places = [one["position"][:2] for one in step.output["neighbours"]]
-        assert [one["ne"] for one in row["sees"]] == [pytest.approx(place, abs=0.01) for place in places]
+        places = [one["position"] for one in step.output["neighbours"]]
+        assert [one["ned"] for one in row["sees"]] == [pytest.approx(place, abs=0.01) for place in places]
         assert set(row["cameras"]) == set(step.frames.frames)
         assert {camera for camera in row["cameras"] if fleet.image(key, camera, step.frames.time_s)} == set(
             row["cameras"]

@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
+import numpy as np
 import pytest
 from foxglove.messages import Timestamp
 
-from flockd.fleet.foxglove.camera_messages import Cameras
-from flockd.fleet.foxglove.map_places import enu, location_fix
-from flockd.fleet.foxglove.scene_messages import SCENE_TOPICS, Scene, scene_update
-from flockd.fleet.page.drone_rows import Known, drone_rows
-from flockd.fleet.watcher import Heard, Watched
-
-
-@pytest.mark.parametrize(
-    ("ned", "expected"),
-    [
-        ([1, 2, 3], [2, 1, -3]),
-        ([1, None, 3], [0, 1, -3]),
-        ([1], [0, 1, 0]),
-        ([], [0, 0, 0]),
-        ([1, 2, 3, 4], [2, 1, -3]),
-    ],
+from flockd.fleet.foxglove.fleet_scene import (
+    SCENE_TOPICS,
+    SceneDrone,
+    body_transform,
+    location_fix,
+    place_of,
+    scene_update,
 )
-def test_north_east_down_becomes_east_north_up(ned: list[float | None], expected: list[float]) -> None:
-    assert enu(ned).tolist() == expected
+from flockd.fleet.page.drone_rows import drone_rows
+from flockd.fleet.watcher import Heard, Watched
 
 
 @pytest.mark.parametrize("vector", [[], [1.0], [None, None, None], [1.0, 2.0, 3.0, 4.0]])
@@ -42,11 +33,11 @@ def test_a_scene_is_drawn_whatever_a_peer_sends(vector: list[float | None]) -> N
         "obstacles": {"range_m": vector},
     }
     watched = Watched("f", "d", True, {topic: Heard(0.0, message) for topic, message in messages.items()}, seen=True)
-    row = drone_rows([watched], {}, 0.0)["f/d"]
-    drone, stamp = Scene().drone("d", row, enu(()), messages), Timestamp(1)
+    row, stamp = drone_rows([watched], {}, 0.0)["f/d"], Timestamp(1)
+    drone = SceneDrone("d", row, np.zeros(3), [], "#0072b2")
+    assert body_transform(stamp, drone)
     for topic in SCENE_TOPICS:
         assert scene_update(topic, [drone], stamp)
-    fix = location_fix(stamp, "d", messages["state"])
-    assert (fix is None) == (len(vector) < 2 or None in vector)
-    assert Cameras(Known()).tracks(stamp, "front", b"no picture", messages)
-    assert math.isfinite(drone.place.sum())
+    known = len(vector) >= 2 and None not in vector
+    assert (location_fix(stamp, "d", row) is not None) == known
+    assert (place_of(row) is not None) == known

@@ -1,52 +1,18 @@
-"""Which time of the fleet is shown: now, or where the playback of recordings is."""
+"""Where the playback of recordings is, as the app's controls move it."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Callable
-from typing import Protocol
 
-from foxglove.websocket import (
-    ChannelView,
-    Client,
-    PlaybackCommand,
-    PlaybackControlRequest,
-    PlaybackState,
-    PlaybackStatus,
-    ServerListener,
-)
+import foxglove.websocket as fw
 
 from flockd.fleet.page.fleet_source import FleetSource
 
 
-class TimeLine(Protocol):
-    """Asked before each update, on the thread that publishes."""
-
-    def now_s(self) -> float:
-        """The time to show, on the source's time line."""
-
-    def jumped(self) -> bool:
-        """Whether it went elsewhere since the last call: what was published says nothing of what comes."""
-
-
-class LiveTime:
-    """A `TimeLine` of a live fleet."""
-
-    def __init__(self, source: FleetSource) -> None:
-        self._source = source
-
-    def now_s(self) -> float:
-        """See `TimeLine`."""
-        return self._source.now_s()
-
-    def jumped(self) -> bool:
-        """Never."""
-        return False
-
-
-class ReplayTime(ServerListener):
-    """A `TimeLine` of recordings, moved by the app's playback controls; it starts when somebody first subscribes."""
+class Playback(fw.ServerListener):
+    """The time line of recordings: it starts when somebody first subscribes."""
 
     def __init__(self, source: FleetSource, clock: Callable[[], float] = time.monotonic) -> None:
         """``source``: of recordings, whose ``span_s`` is not None."""
@@ -64,30 +30,25 @@ class ReplayTime(ServerListener):
         """Begin and end, in nanoseconds since 1970."""
         return self._wall_ns(self._begin_s), self._wall_ns(self._end_s)
 
-    def now_s(self) -> float:
-        """See `TimeLine`; so `jumped`."""
-        with self._lock:
-            return self._advanced()
-
-    def jumped(self) -> bool:
-        """To a place that somebody chose, or back to the begin."""
+    def moved(self) -> tuple[float, bool]:
+        """The time to show, and whether it jumped since the last call: somebody chose it, or it began anew."""
         with self._lock:
             jumped, self._jumped = self._jumped, False
-            return jumped
+            return self._advanced(), jumped
 
-    def state(self) -> PlaybackState:
+    def state(self) -> fw.PlaybackState:
         """For the app's controls."""
         with self._lock:
             return self._state()
 
-    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
+    def on_subscribe(self, client: fw.Client, channel: fw.ChannelView) -> None:
         """Called by the server, on a thread of its own; so what follows."""
         with self._lock:
             if not self._started:
                 self._started = self._playing = True
                 self._read_s = self._clock()
 
-    def on_playback_control_request(self, playback_control_request: PlaybackControlRequest) -> PlaybackState:
+    def on_playback_control_request(self, playback_control_request: fw.PlaybackControlRequest) -> fw.PlaybackState:
         """Plays, pauses, changes the speed, goes elsewhere; after the end, playing begins anew."""
         request = playback_control_request
         with self._lock:
@@ -95,7 +56,7 @@ class ReplayTime(ServerListener):
             self._started = True
             if request.playback_speed > 0:
                 self._speed = request.playback_speed
-            self._playing = request.playback_command == PlaybackCommand.Play
+            self._playing = request.playback_command == fw.PlaybackCommand.Play
             wanted_s = self._at_s
             if request.seek_time is not None:
                 wanted_s = self._begin_s + 1e-9 * (request.seek_time - self._wall_ns(self._begin_s))
@@ -103,7 +64,7 @@ class ReplayTime(ServerListener):
                 wanted_s = self._begin_s
             seeks = wanted_s != self._at_s
             self._at_s = min(max(wanted_s, self._begin_s), self._end_s)
-            self._jumped = self._jumped or seeks
+            self._jumped |= seeks
             return self._state(did_seek=seeks, request_id=request.request_id)
 
     def _advanced(self) -> float:
@@ -114,10 +75,16 @@ class ReplayTime(ServerListener):
         self._read_s = now_s
         return self._at_s
 
-    def _state(self, *, did_seek: bool = False, request_id: str | None = None) -> PlaybackState:
+    def _state(self, *, did_seek: bool = False, request_id: str | None = None) -> fw.PlaybackState:
         ended = self._at_s >= self._end_s
-        status = PlaybackStatus.Playing if self._playing else PlaybackStatus.Ended if ended else PlaybackStatus.Paused
-        return PlaybackState(status, self._wall_ns(self._at_s), self._speed, did_seek, request_id)
+        status = (
+            fw.PlaybackStatus.Playing
+            if self._playing
+            else fw.PlaybackStatus.Ended
+            if ended
+            else fw.PlaybackStatus.Paused
+        )
+        return fw.PlaybackState(status, self._wall_ns(self._at_s), self._speed, did_seek, request_id)
 
     def _wall_ns(self, time_s: float) -> int:
         return round(1e9 * self._wall_s(time_s))
