@@ -1,3 +1,74 @@
-"""flockd: drones that flock by sight alone."""
+"""flockd: drones that flock by sight alone.
+
+The names below are what other programs may rely on; "Use it from Python" in the documentation has programs with them.
+Each loads what it needs when it is first used, so that `import flockd` loads nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from flockd.core.config import load_drone
+    from flockd.core.messages import Frame, FrameSet, PilotOutput, VehicleState
+    from flockd.flight.flocking import FlockingLaw, FlockingParameters
+    from flockd.flight.geometry import PinholeCamera, RigidTransform, build_rig, fit_rigid, ransac_rigid
+    from flockd.flight.perception import Perception, load_networks
+    from flockd.flight.pilot import FlockPilot
+    from flockd.flight.safety import Gate
+    from flockd.flight.tracking import Measurement, Tracker, TrackingParameters
+    from flockd.ground.pictures import PictureDetector
+    from flockd.onboard.recording import Recording
 
 __version__ = "0.2.0"
+
+__all__ = [
+    "FlockPilot",
+    "FlockingLaw",
+    "FlockingParameters",
+    "Frame",
+    "FrameSet",
+    "Gate",
+    "Measurement",
+    "Perception",
+    "PictureDetector",
+    "PilotOutput",
+    "PinholeCamera",
+    "Recording",
+    "RigidTransform",
+    "Tracker",
+    "TrackingParameters",
+    "VehicleState",
+    "build_rig",
+    "fit_rigid",
+    "load_drone",
+    "load_networks",
+    "ransac_rigid",
+]
+
+_HOMES = {
+    "flockd.core.config": ("load_drone",),
+    "flockd.core.messages": ("Frame", "FrameSet", "PilotOutput", "VehicleState"),
+    "flockd.flight.flocking": ("FlockingLaw", "FlockingParameters"),
+    "flockd.flight.geometry": ("PinholeCamera", "RigidTransform", "build_rig", "fit_rigid", "ransac_rigid"),
+    "flockd.flight.perception": ("Perception", "load_networks"),
+    "flockd.flight.pilot": ("FlockPilot",),
+    "flockd.flight.safety": ("Gate",),
+    "flockd.flight.tracking": ("Measurement", "Tracker", "TrackingParameters"),
+    "flockd.ground.pictures": ("PictureDetector",),
+    "flockd.onboard.recording": ("Recording",),
+}
+"""Where each name is defined: the imports above, for when the program runs."""
+
+
+def __getattr__(name: str) -> object:
+    for module, names in _HOMES.items():
+        if name in names:
+            value = globals()[name] = getattr(import_module(module), name)
+            return value
+    raise AttributeError(f"module 'flockd' has no attribute {name!r}", name=name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from flockd.cli.calibrate_options import refuse_overwriting
 from flockd.cli.output import progress, say, say_json
 from flockd.cli.parser import Commands, positive_count, positive_number
-from flockd.cli.picture_options import PictureCameras, add_picture_options, detector_of, perception_of
+from flockd.cli.picture_options import PictureCameras, add_picture_options, perception_of
 from flockd.cli.recording_options import opened
 from flockd.core.errors import ExitCode, UsageError
 
@@ -95,12 +95,13 @@ def _distances(args: argparse.Namespace) -> list[tuple[float, Path]]:
 def _photographs(args: argparse.Namespace, distances: Sequence[tuple[float, Path]]) -> Iterator[Photograph]:
     """With what is detected in each picture, of unknown size."""
     from flockd.ground.calibration.drone_size import Photograph, SizeCandidate
+    from flockd.ground.pictures import PictureDetector
 
     recordings = [path for _, path in distances if path.suffix == RECORDING]
     cameras = None
     if args.config is not None or args.fov is not None or len(recordings) < len(distances):
         cameras = PictureCameras(args)
-    detector = detector_of(perception_of(args, None if cameras is None else cameras.config, drone_size_m=None))
+    detector = PictureDetector(perception_of(args, None if cameras is None else cameras.config, drone_size_m=None))
     with progress("detecting", "pictures") as tell:
         for number, (name, distance_m, image, camera) in enumerate(_taken(args, distances, cameras), start=1):
             found = detector.detect(image, camera).detections

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from flockd.cli.output import PIPED_COLUMNS, complain, progress, say, say_json
 from flockd.cli.parser import Commands, positive_count, positive_number
-from flockd.cli.picture_options import PictureCameras, add_picture_options, detector_of, perception_of
+from flockd.cli.picture_options import PictureCameras, add_picture_options, perception_of
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ class _Detected:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from flockd.ground.pictures import find_pictures, read_labels
+    from flockd.ground.pictures import PictureDetector, find_pictures, read_labels
     from flockd.ground.pictures.copies import Copies
 
     if args.force and args.out is None:
@@ -91,7 +91,7 @@ def _run(args: argparse.Namespace) -> int:
         copies = None
         if args.out is not None:
             copies = stack.enter_context(Copies(args.out, pictures, args.every, overwrite=args.force))
-        detector = detector_of(config)
+        detector = PictureDetector(config)
         detected = list(_detected(args, pictures, labels, detector, cameras, copies))
     result = _result(detected, measure=labels is not None)
     if args.json:

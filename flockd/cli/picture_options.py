@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from flockd.core.config import DroneConfig
     from flockd.core.config.perception import PerceptionConfig
     from flockd.flight.geometry import Camera
-    from flockd.ground.pictures import PictureDetector
 
 MAX_FOV_DEG = 170.0
 
@@ -64,7 +63,6 @@ class PictureCameras:
             raise UsageError("--camera is one of --config's; name the drone's file with --config")
         self.config = loaded(args.config)
         self._file, self._fov = args.config, args.fov
-        self._cameras: dict[tuple[int, int], Camera] = {}
         self._mine = None if self.config is None else self._of_rig(args)
 
     def of(self, name: str, size: tuple[int, int]) -> Camera:
@@ -77,11 +75,9 @@ class PictureCameras:
                     "of that camera, or --fov instead of --config"
                 )
             return self._mine
-        if size not in self._cameras:
-            from flockd.ground.pictures import camera_with_fov
+        from flockd.ground.pictures import camera_with_fov
 
-            self._cameras[size] = camera_with_fov(size, self._fov)
-        return self._cameras[size]
+        return camera_with_fov(size, self._fov)
 
     def _of_rig(self, args: argparse.Namespace) -> Camera:
         from flockd.flight.geometry import build_rig
@@ -99,14 +95,14 @@ class PictureCameras:
 def perception_of(args: argparse.Namespace, drone: DroneConfig | None, **more: Any) -> PerceptionConfig:
     """The settings of a drone or the defaults, with what the options and ``more`` ask for.
 
-    No flow network, as single pictures have no flow. Raises UsageError for values that cannot be.
+    Raises UsageError for values that cannot be.
     """
     from pydantic import ValidationError
 
-    from flockd.core.config.perception import DIS, PerceptionConfig
+    from flockd.core.config.perception import PerceptionConfig
 
     values = {} if drone is None else drone.perception.model_dump()
-    values |= {"flow": DIS, "scale": "network", **more}
+    values |= more
     if args.models is not None:
         values["models_dir"] = str(args.models)
     if args.first_stage is not None:
@@ -122,11 +118,3 @@ def perception_of(args: argparse.Namespace, drone: DroneConfig | None, **more: A
     except ValidationError as error:
         first = error.errors()[0]
         raise UsageError(f"perception.{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
-
-
-def detector_of(config: PerceptionConfig) -> PictureDetector:
-    """With the networks loaded. Raises ModelError."""
-    from flockd.flight.perception import load_networks
-    from flockd.ground.pictures import PictureDetector
-
-    return PictureDetector(load_networks(config), config)

@@ -27,9 +27,7 @@ from rich.table import Table
 
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
-from flockd.flight.geometry import Camera
-from flockd.flight.perception import OnnxNetworks
-from flockd.ground.pictures import Labelled, PictureDetector, PictureFile, camera_with_fov, find_pictures, summary
+from flockd.ground.pictures import Labelled, PictureDetector, PictureFile, find_pictures, summary
 from flockd.ground.pictures.scoring import WIDTH_CLASSES
 from flockd.ground.pictures.single_frame import Box
 from tools.training.skydrones import SPLITS, split_of
@@ -68,12 +66,11 @@ def main() -> None:
         parser.error("give --data, --without-drones or both")
     config = PerceptionConfig(
         depth=arguments.neighbours, segmentation=arguments.neighbours, distance=arguments.distance,
-        verification=arguments.verification, flow="dis", threads=arguments.threads,
+        verification=arguments.verification, models_dir=str(arguments.models), threads=arguments.threads,
     )  # fmt: skip
-    detector = PictureDetector(OnnxNetworks(config, arguments.models), config)
+    detector = PictureDetector(config)
     results: dict[str, dict[str, object]] = {}
     written: dict[str, list[dict[str, object]]] = {}
-    cameras: dict[tuple[int, int], Camera] = {}
     for name, pictures in sets.items():
         begin = time.monotonic()
         measured, proposals = [], 0
@@ -83,10 +80,7 @@ def main() -> None:
             if scale != 1.0:
                 image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
             resized = tuple((scale * a, scale * b, scale * c, scale * d) for a, b, c, d in boxes)
-            size = (image.shape[1], image.shape[0])
-            if size not in cameras:
-                cameras[size] = camera_with_fov(size, arguments.fov)
-            found = detector.detect(image, cameras[size])
+            found = detector.detect(image, fov_deg=arguments.fov)
             measured.append(Labelled(found.detections, resized))
             proposals += found.proposals
         ms = 1e3 * (time.monotonic() - begin) / max(len(pictures), 1)

@@ -38,10 +38,10 @@ class Tracker:
     Every step: `predict`, then `update`, with no measurements too; then `neighbours`. Deterministic.
     """
 
-    def __init__(self, parameters: TrackingParameters) -> None:
-        self.parameters = parameters
+    def __init__(self, parameters: TrackingParameters | None = None) -> None:
+        self.parameters = parameters or TrackingParameters()
         self._tracks: list[_Track] = []
-        self._manoeuvres = Manoeuvres(parameters)
+        self._manoeuvres = Manoeuvres(self.parameters)
         self._time_s = 0.0
         self._created = 0
 

@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
 
-from flockd.core.config.perception import PerceptionConfig
+from flockd.core.config.perception import DIS, PerceptionConfig
 from flockd.core.messages import Detection, FloatArray, Frame, FrameSet, UInt8Array, VehicleState
 from flockd.flight.geometry import Camera, PinholeCamera, Rig, RigCamera, RigidTransform
-from flockd.flight.perception import Networks, Perception
+from flockd.flight.perception import Networks, Perception, load_networks
 from flockd.flight.perception.detection.detector import DetectionTrace
 from flockd.flight.perception.detection.refinement import Candidate
 from flockd.flight.perception.detection.roi import angle_between
@@ -67,19 +68,37 @@ class PictureResult:
 class PictureDetector:
     """Single-frame detection. May be used for pictures of several sizes."""
 
-    def __init__(self, networks: Networks, config: PerceptionConfig) -> None:
-        """``config``: its models are not loaded again; the scale is the networks'."""
-        self._networks, self._config = networks, config.model_copy(update={"scale": "network"})
+    def __init__(self, config: PerceptionConfig | None = None, networks: Networks | None = None) -> None:
+        """``config``: by default flockd's own networks; whatever it says, the scale is the networks', without flow.
+
+        ``networks`` may be shared; None: those that the configuration names. Raises ModelError.
+        """
+        self._config = (config or PerceptionConfig()).model_copy(update={"flow": DIS, "scale": "network"})
+        self._networks = networks or load_networks(self._config)
         self._mounted: RigCamera | None = None
 
-    def detect(self, image: UInt8Array, camera: Camera) -> PictureResult:
-        """Drones in an image (h, w, 3), RGB.
+    def detect(self, image: UInt8Array, camera: Camera | None = None, *, fov_deg: float | None = None) -> PictureResult:
+        """Drones in one picture.
 
         Args:
-            image: RGB.
-            camera: of the picture, of the picture's size or of the size that it is to be resized to.
+            image: (h, w, 3) RGB, 8 bits.
+            camera: of the picture, of the picture's size or of the size that it is to be resized to; or
+            fov_deg: instead of it: field of view across the longer side, of a lens without distortion.
+
+        Raises ValueError for what is no such image, and where not one of ``camera`` and ``fov_deg`` is given.
         """
+        if not isinstance(image, np.ndarray) or image.shape[2:] != (3,) or image.dtype != np.uint8:
+            given = f"{image.dtype} of the shape {image.shape}" if isinstance(image, np.ndarray) else repr(image)[:60]
+            raise ValueError(
+                f"a picture must be an RGB array (height, width, 3) of uint8, not {given}; "
+                "cv2.imread gives None for a file that it cannot read"
+            )
         height, width = image.shape[:2]
+        if (camera is None) == (fov_deg is None):
+            raise ValueError("the picture's camera must be given, or its field of view as fov_deg, and not both")
+        if camera is None:
+            assert fov_deg is not None
+            camera = camera_with_fov((width, height), fov_deg)
         scale = np.array(camera.size) / (width, height)
         if camera.size != (width, height):
             image = np.asarray(cv2.resize(image, camera.size, interpolation=cv2.INTER_AREA), np.uint8)
@@ -127,6 +146,7 @@ class PictureDetector:
         )
 
 
+@lru_cache(maxsize=8)  # one object for pictures of one size, as rays are cached by it
 def camera_with_fov(size: tuple[int, int], fov_deg: float, max_side_px: int = MAX_SIDE_PX) -> PinholeCamera:
     """A camera without distortion, of a picture's size or, for a larger one, of the size to resize it to.
 

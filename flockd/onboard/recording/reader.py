@@ -107,16 +107,16 @@ class Contents:
 class Recording:
     """One drone's recording with all its files, checked as a whole when it is opened."""
 
-    def __init__(self, path: Path, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
+    def __init__(self, path: Path | str, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
         """Opens the file and those that go on where it ends.
 
         Raises RecordingError for what is not a recording of flockd, or too damaged to replay, and OSError.
         `progress` is called with (bytes checked, bytes in all).
         """
-        self.path = path
-        self.contents = _survey(path, progress)
-        migrated = _migrated(path, self.contents.configuration)
-        self.config = _config(path, migrated)
+        self.path = Path(path)
+        self.contents = _survey(self.path, progress)
+        migrated = _migrated(self.path, self.contents.configuration)
+        self.config = _config(self.path, migrated)
         self.migrations: tuple[str, ...] = migrated.notes
         """What was changed in a configuration of an earlier version, each in one sentence."""
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from flockd.cli import main
+from flockd.ground.pictures import PictureDetector, camera_with_fov
 from tests.ground.pictures.photographs import DRONE_SIZE_M, FOCAL_PX, FOV_DEG, LABELS, RENDERED, SIZE, truth
 
 Capture = pytest.CaptureFixture[str]
@@ -67,6 +68,27 @@ def test_a_labelled_folder_is_measured(capsys: Capture) -> None:
             assert one["range_m"] == pytest.approx(distances[name], rel=0.06)
             assert 0 < one["range_sigma_m"] < 0.1 * one["range_m"]
             assert one["size_m"] == pytest.approx(DRONE_SIZE_M, rel=0.06)
+
+
+@pytest.mark.parametrize(
+    ("image", "given"),
+    [
+        (None, "not None; cv2.imread gives None for a file that it cannot read"),
+        (np.zeros((360, 480), np.uint8), r"not uint8 of the shape \(360, 480\)"),
+        (np.zeros((360, 480, 3)), r"not float64 of the shape \(360, 480, 3\)"),
+    ],
+    ids=["not read", "grey", "floats"],
+)
+def test_what_is_no_rgb_image_is_refused(image: Any, given: str) -> None:
+    with pytest.raises(ValueError, match=given):
+        PictureDetector().detect(image, fov_deg=FOV_DEG)
+
+
+def test_a_pictures_camera_is_given_once() -> None:
+    detector, image = PictureDetector(), np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+    for arguments in ({}, {"camera": camera_with_fov(SIZE, FOV_DEG), "fov_deg": FOV_DEG}):
+        with pytest.raises(ValueError, match="and not both"):
+            detector.detect(image, **arguments)  # type: ignore[arg-type]
 
 
 def test_a_known_size_gives_the_range(capsys: Capture) -> None:
