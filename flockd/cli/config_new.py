@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from flockd.cli.output import say
 from flockd.cli.parser import Commands, Parser, add_commands, positive_count, positive_number
 from flockd.core.errors import ConfigError, ExitCode, UsageError
-
-if TYPE_CHECKING:
-    from flockd.core.config.new_files import NewDrone, NewScenario
 
 MISSIONS = ("circle_then_tangent", "hover", "velocity", "waypoints", "follow", "operator")
 OBSTACLES = ("none", "forest", "village")
@@ -35,26 +32,104 @@ _NOTES = """\
 On a terminal it asks for what no option gives, with the default in brackets; with --defaults it asks nothing."""
 
 
+@dataclass(frozen=True)
+class _Question:
+    """One value of the new file: an option, and on a terminal a question for who does not give it."""
+
+    option: str
+    help: str
+    asks: str
+    default: str
+    kind: Callable[[str], Any] = str
+    metavar: str | None = None
+    choices: tuple[str, ...] | None = None
+
+    @property
+    def key(self) -> str:
+        return self.option.replace("-", "_")
+
+    def add(self, parser: Parser) -> None:
+        parser.add_argument(
+            f"--{self.option}", metavar=self.metavar, type=self.kind, choices=self.choices, help=self.help
+        )
+
+    def answer(self, args: argparse.Namespace) -> Any:
+        """The option's value; else what is answered on a terminal, until it is one; else the default."""
+        given = getattr(args, self.key)
+        if given is not None:
+            return given
+        if args.defaults or not sys.stdin.isatty():
+            return self.kind(self.default)
+        asks = f"{self.asks} ({', '.join(self.choices)})" if self.choices else self.asks
+        while True:
+            answer = input(f"{asks} [{self.default}]: ").strip() or self.default
+            try:
+                value = self.kind(answer)
+            except argparse.ArgumentTypeError as error:
+                say(str(error))
+                continue
+            if self.choices is None or value in self.choices:
+                return value
+            say(f"{answer!r} is not one of {', '.join(self.choices)}")
+
+
+def _drone_questions() -> tuple[_Question, ...]:
+    return (
+        _Question("name", "its name in telemetry and recordings", "name of the drone", "drone1", metavar="NAME"),
+        _Question(
+            "cameras", "number of cameras, evenly spaced around the drone", "number of cameras", "4", _camera_count, "N"
+        ),
+        _Question("size", "of an image in pixels", "size of an image", "640x480", image_size, "WxH"),
+        _Question(
+            "field-of-view",
+            "of an image's width, 10 to 190",
+            "field of view in degrees",
+            "120",
+            _field_of_view,
+            "DEG",
+        ),
+        _Question(
+            "source",
+            "USB cameras, others through GStreamer, or frames from another program",
+            "frames from",
+            "v4l2",
+            choices=SOURCES,
+        ),
+        _Question(
+            "autopilot",
+            "serial:///dev/NAME:BAUD or udpin://0.0.0.0:PORT",
+            "address of the autopilot",
+            "serial:///dev/ttyAMA0:921600",
+            metavar="ADDRESS",
+        ),
+        _Question("fleet", "the fleet's name in telemetry", "name of the fleet", "fleet", metavar="NAME"),
+        _Question("mission", "kind of mission", "mission", "hover", choices=MISSIONS),
+    )
+
+
+def _scenario_questions(name: str = "", drone_file: str = "") -> tuple[_Question, ...]:
+    return (
+        _Question("name", "of the flight", "name of the flight", name, metavar="NAME"),
+        _Question("drones", "size of the flock, 1 to 100", "number of drones", "5", _drone_count, "N"),
+        _Question("duration", "seconds to fly", "seconds to fly", "60", positive_number, "S"),
+        _Question("mission", "kind of mission", "mission", MISSIONS[0], choices=MISSIONS),
+        _Question("obstacles", "what the flock flies between", "obstacles", "none", choices=OBSTACLES),
+        _Question(
+            "drone",
+            "the drones' configuration (default: that of the simulated drone that comes with flockd)",
+            "file of the drones",
+            drone_file,
+            metavar="FILE",
+        ),
+    )
+
+
 def _add_drone(commands: Commands) -> None:
     examples = (
         "flockd config new drone my_drone.yaml",
         "flockd config new drone my_drone.yaml --name kite1 --cameras 3 --size 1280x720 --field-of-view 130",
     )
-    parser = commands("drone", "Write the configuration of a real drone.", examples)
-    _add_common(parser)
-    parser.add_argument("--name", metavar="NAME", help="its name in telemetry and recordings")
-    parser.add_argument(
-        "--cameras", metavar="N", type=_camera_count, help="number of cameras, evenly spaced around the drone"
-    )
-    parser.add_argument("--size", metavar="WxH", type=image_size, help="of an image in pixels")
-    parser.add_argument("--field-of-view", metavar="DEG", type=_field_of_view, help="of an image's width, 10 to 190")
-    parser.add_argument(
-        "--source", choices=SOURCES, help="USB cameras, others through GStreamer, or frames from another program"
-    )
-    parser.add_argument("--autopilot", metavar="ADDRESS", help="serial:///dev/NAME:BAUD or udpin://0.0.0.0:PORT")
-    parser.add_argument("--fleet", metavar="NAME", help="the fleet's name in telemetry")
-    parser.add_argument("--mission", choices=MISSIONS, help="kind of mission")
-    parser.set_defaults(run=_new_drone)
+    _add_new(commands("drone", "Write the configuration of a real drone.", examples), _drone_questions(), _new_drone)
 
 
 def _add_scenario(commands: Commands) -> None:
@@ -63,98 +138,40 @@ def _add_scenario(commands: Commands) -> None:
         "flockd config new scenario my_flight.yaml --drones 3 --duration 30 --mission waypoints --defaults",
     )
     parser = commands("scenario", "Write the configuration of a simulated flight.", examples)
-    _add_common(parser)
-    parser.add_argument("--name", metavar="NAME", help="of the flight")
-    parser.add_argument("--drones", metavar="N", type=_drone_count, help="size of the flock, 1 to 100")
-    parser.add_argument("--duration", metavar="S", type=positive_number, help="seconds to fly")
-    parser.add_argument("--mission", choices=MISSIONS, help="kind of mission")
-    parser.add_argument("--obstacles", choices=OBSTACLES, help="what the flock flies between")
-    parser.add_argument(
-        "--drone",
-        metavar="FILE",
-        help="the drones' configuration (default: that of the simulated drone that comes with flockd)",
-    )
-    parser.set_defaults(run=_new_scenario)
+    _add_new(parser, _scenario_questions(), _new_scenario)
 
 
-def _add_common(parser: Parser) -> None:
+def _add_new(parser: Parser, questions: Sequence[_Question], run: Callable[[argparse.Namespace], int]) -> None:
     parser.add_argument("file", metavar="FILE", type=Path, help="to write")
     parser.add_argument("--force", action="store_true", help="overwrite the file if it exists")
     parser.add_argument("--defaults", action="store_true", help="ask nothing; what no option gives has its default")
+    for question in questions:
+        question.add(parser)
+    parser.set_defaults(run=run)
 
 
 def _new_drone(args: argparse.Namespace) -> int:
-    from flockd.core.config.new_files import NewDrone, drone_text
+    from flockd.core.config.new_files import camera_names, new_file, rig_cameras, source_cameras
 
     _refuse_what_is_there(args)
-    default = NewDrone()
-    new: NewDrone = dataclasses.replace(
-        default,
-        name=_asked(args, "name", "name of the drone", default.name, str),
-        cameras=_asked(args, "cameras", "number of cameras", default.cameras, _camera_count),
-        size_px=_asked(
-            args, "size", "size of an image", default.size_px, image_size, "x".join(map(str, default.size_px))
-        ),
-        field_of_view_deg=_asked(
-            args, "field_of_view", "field of view in degrees", default.field_of_view_deg, _field_of_view
-        ),
-        source=_asked(args, "source", _choice("frames from", SOURCES), default.source, _one_of(SOURCES)),
-        autopilot=_asked(args, "autopilot", "address of the autopilot", default.autopilot, str),
-        fleet=_asked(args, "fleet", "name of the fleet", default.fleet, str),
-        mission=_asked(args, "mission", _choice("mission", MISSIONS), default.mission, _one_of(MISSIONS)),
-    )
-    return _write(args.file, drone_text(new))
+    answers = {question.key: question.answer(args) for question in _drone_questions()}
+    names = camera_names(answers["cameras"])
+    rig = rig_cameras(dict.fromkeys(names, answers["size"]), answers["field_of_view"])
+    values = answers | {"rig": rig, "cameras": source_cameras(answers["source"], names)}
+    write_checked(args.file, new_file("drone", values, (answers["source"], answers["mission"])))
+    return ExitCode.DONE
 
 
 def _new_scenario(args: argparse.Namespace) -> int:
-    from flockd.core.config.new_files import NewScenario, scenario_text
+    from flockd.core.config.new_files import new_file, start_positions
     from flockd.core.data import data_path
 
     _refuse_what_is_there(args)
     simulated = _path_from(args.file.resolve().parent, data_path("config") / "simulator.yaml")
-    default = NewScenario(name=args.file.stem, drone_file=simulated)
-    new: NewScenario = dataclasses.replace(
-        default,
-        name=_asked(args, "name", "name of the flight", default.name, str),
-        drones=_asked(args, "drones", "number of drones", default.drones, _drone_count),
-        duration_s=_asked(args, "duration", "seconds to fly", default.duration_s, positive_number),
-        mission=_asked(args, "mission", _choice("mission", MISSIONS), default.mission, _one_of(MISSIONS)),
-        obstacles=_asked(args, "obstacles", _choice("obstacles", OBSTACLES), default.obstacles, _one_of(OBSTACLES)),
-        drone_file=_asked(args, "drone", "file of the drones", default.drone_file, str),
-    )
-    return _write(args.file, scenario_text(new))
-
-
-def _asked(
-    args: argparse.Namespace, option: str, question: str, default: Any, kind: Callable[[str], Any], shown: str = ""
-) -> Any:
-    """The option's value; else what is answered on a terminal, until it is one; else the default."""
-    given = getattr(args, option)
-    if given is not None:
-        return given
-    if args.defaults or not sys.stdin.isatty():
-        return default
-    while True:
-        answer = input(f"{question} [{shown or default}]: ").strip()
-        if not answer:
-            return default
-        try:
-            return kind(answer)
-        except argparse.ArgumentTypeError as error:
-            say(str(error))
-
-
-def _choice(question: str, choices: Sequence[str]) -> str:
-    return f"{question} ({', '.join(choices)})"
-
-
-def _one_of(choices: Sequence[str]) -> Callable[[str], str]:
-    def chosen(text: str) -> str:
-        if text not in choices:
-            raise argparse.ArgumentTypeError(f"{text!r} is not one of {', '.join(choices)}")
-        return text
-
-    return chosen
+    answers = {question.key: question.answer(args) for question in _scenario_questions(args.file.stem, simulated)}
+    values = answers | {"duration": f"{answers['duration']:g}", "vehicles": start_positions(answers["drones"])}
+    write_checked(args.file, new_file("scenario", values, (answers["mission"], answers["obstacles"])))
+    return ExitCode.DONE
 
 
 def _camera_count(text: str) -> int:
@@ -200,11 +217,6 @@ def _refuse_what_is_there(args: argparse.Namespace) -> None:
         raise UsageError(f"{args.file} exists; name another file, or overwrite it with --force")
     if not args.file.parent.is_dir():
         raise UsageError(f"{args.file.parent} is not a folder; make it first")
-
-
-def _write(file: Path, text: str) -> int:
-    write_checked(file, text)
-    return ExitCode.DONE
 
 
 def write_checked(file: Path, text: str) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from flockd.cli import main
 from flockd.core.config import load_drone, load_scenario
+from flockd.core.data import data_path
 
 
 def test_a_scenario_of_each_mission_checks_and_keeps_its_drones_apart(tmp_path: Path) -> None:
@@ -30,6 +31,19 @@ def test_a_drone_has_its_cameras_evenly_around(tmp_path: Path) -> None:
     # 640 px at 45 degrees of an equidistant lens: r = f theta.
     assert drone.rig.cameras[0].intrinsics.fx == pytest.approx(640 / 0.7853982, abs=0.05)
     assert (drone.name, drone.mission.kind) == ("kite", "follow")
+
+
+@pytest.mark.parametrize("shipped", [True, False], ids=["shipped", "new"])
+def test_a_real_drone_hovers_at_a_metre_per_second_at_most_until_its_owner_says_otherwise(
+    shipped: bool, tmp_path: Path
+) -> None:
+    new = tmp_path / "new.yaml"
+    assert main(["config", "new", "drone", str(new), "--defaults"]) == 0
+    drone = load_drone(data_path("config") / "quadrotor.yaml" if shipped else new)
+    assert drone.mission.kind == "hover"
+    assert drone.flocking.max_speed_m_s <= 1.0
+    assert drone.autopilot is not None
+    assert not drone.autopilot.arm_and_take_off
 
 
 @pytest.mark.parametrize("source", ["v4l2", "gstreamer", "shared_memory"])

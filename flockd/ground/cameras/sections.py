@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 
-from flockd.core.config.new_files import rig_lines
+from flockd.core.config.new_files import rig_cameras
 from flockd.ground.cameras.found import FoundCamera, Mode
 
 FIELD_OF_VIEW_DEG = 120.0
@@ -21,8 +21,10 @@ def sections_text(cameras: Mapping[str, tuple[FoundCamera, Mode]]) -> str:
         "# Written by `flockd cameras`: the cameras of this computer, as sections of a drone's configuration.",
         "# Fill in which camera looks where: exchange the names. `flockd cameras --picture FOLDER` shows what each",
         "# sees.",
-        *rig_lines({name: mode.size for name, (_, mode) in cameras.items()}, FIELD_OF_VIEW_DEG),
-        "",
+        "rig:",
+        "  # Fill in: intrinsics and extrinsics, by `flockd calibrate camera` and `flockd calibrate rig`.",
+        "  cameras:",
+        rig_cameras({name: mode.size for name, (_, mode) in cameras.items()}, FIELD_OF_VIEW_DEG),
         "source:",
         f"  kind: {'gstreamer' if as_pipelines else 'v4l2'}",
         "  cameras:",
