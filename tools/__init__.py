@@ -1,1 +1,1 @@
-"""Training, benchmarks and checks of flockd; run from the checkout as `python -m tools.NAME`."""
+"""Training, benchmarks and checks of flockd; run from the checkout as `python -m tools.GROUP.NAME`."""

@@ -1,1 +1,1 @@
-"""The autopilot: one link to it, the stream of setpoints, and a fake for tests and the simulator."""
+"""The autopilot: one link to it, and the stream of setpoints."""
