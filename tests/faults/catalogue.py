@@ -133,6 +133,7 @@ CATALOGUE = (
         10, "event-loop-stuck", "the event loop is stuck", "setpoints stop within 0.5 s; the watchdog is not fed",
         (
             f"{_HERE}computer.py::test_the_event_loop_is_stuck",
+            "tests/cli/test_run.py::test_a_stall_of_the_computer_ends_in_the_autopilots_failsafe_and_is_named",
             "tests/onboard/daemon/test_flight.py::test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe",
         ),
         within_s=0.5,

@@ -15,12 +15,12 @@ from flockd.core.config import DroneConfig
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_telemetry import Mode
 from flockd.sim.autopilot.fake_vehicle import Demand
+from tests.calm import clock, run
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import flying
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, aboard
-from tests.starvation import tell
 
 pytestmark = pytest.mark.slow
 QUIET_S = 1.5
@@ -44,7 +44,7 @@ def test_the_link_is_lost_and_comes_back(tmp_path: Path, record_property: Record
             assert len(process.fake_autopilot.setpoints) == sent
             assert process.state() == "silent"
 
-    tell(story)
+    asyncio.run(story())
 
 
 def test_the_pilot_takes_over(tmp_path: Path, record_property: RecordProperty) -> None:
@@ -62,7 +62,7 @@ def test_the_pilot_takes_over(tmp_path: Path, record_property: RecordProperty) -
             assert process.fake_autopilot.mode == "LOITER"
             assert process.state() == "silent"
 
-    tell(story)
+    asyncio.run(story())
 
 
 class _Refuses(FakeAutopilot):
@@ -73,7 +73,7 @@ class _Refuses(FakeAutopilot):
     def _select(self, mode: Mode) -> bool:
         if mode != "OFFBOARD":
             return super()._select(mode)
-        self.asked_s = min(self.asked_s, time.monotonic())
+        self.asked_s = min(self.asked_s, clock())
         for number in range(2):
             part = REASON[50 * number : 50 * number + 50].encode()
             self._mav.statustext_send(2, part, id=17, chunk_seq=number)
@@ -84,20 +84,20 @@ def test_offboard_is_refused_and_the_whole_reason_reported(tmp_path: Path, recor
     port = free_port()
 
     async def story() -> None:
-        with _Refuses(port, heartbeat_s=HEARTBEAT_S) as autopilot:
+        with _Refuses(port, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
             async with aboard(autopilot, port, tmp_path, arm_and_take_off=True, height_m=HOVER_M) as ship:
                 await until(lambda: ship.state() != "" and math.isfinite(autopilot.asked_s), SECONDS_TO_FAIL)
                 await ship.until_event("the autopilot was asked for offboard, which was ")
                 (refused,) = [event for event in ship.events if "asked for offboard" in event]
                 assert refused.endswith(REASON)
                 await ship.until_state("idle")
-                reacted(record_property, "offboard-refused", time.monotonic() - autopilot.asked_s)
+                reacted(record_property, "offboard-refused", clock() - autopilot.asked_s)
                 assert "offboard_refused" in ship.matters()
                 sent = len(autopilot.setpoints)
                 await asyncio.sleep(QUIET_S)
                 assert len(autopilot.setpoints) == sent
 
-    tell(story)
+    run(story)
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_the_battery_is_low_or_the_position_lost(
             await asyncio.sleep(QUIET_S)
             assert len(process.fake_autopilot.setpoints) == sent
 
-    tell(story)
+    asyncio.run(story())
 
 
 def test_messages_with_absurd_values(tmp_path: Path) -> None:
@@ -158,7 +158,7 @@ def test_messages_with_absurd_values(tmp_path: Path) -> None:
             assert "landed_state = 5" in process.log(), "counted and logged"
             assert "\x1b" not in process.log()
 
-    tell(story)
+    asyncio.run(story())
 
 
 def test_the_ground_is_reached_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
@@ -179,4 +179,4 @@ def test_the_ground_is_reached_in_flight(tmp_path: Path, record_property: Record
             assert process.program.ended is None
             assert "Traceback" not in process.log()
 
-    tell(story)
+    asyncio.run(story())

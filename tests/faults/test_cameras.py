@@ -15,7 +15,6 @@ from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import Process, flying
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import CAMERAS, SECONDS_TO_FAIL
-from tests.starvation import tell
 
 pytestmark = pytest.mark.slow
 NOTICED_S = 0.8
@@ -46,7 +45,7 @@ def test_no_camera_delivers_any_more(tmp_path: Path, record_property: RecordProp
             reacted(record_property, "camera-unplugged", time.monotonic() - fault_s)
             await _is_held_and_stays_so(process, fault_s, repair=process.cameras.silent.clear)
 
-    tell(story)
+    asyncio.run(story())
 
 
 def test_all_cameras_freeze(tmp_path: Path, record_property: RecordProperty) -> None:
@@ -59,7 +58,7 @@ def test_all_cameras_freeze(tmp_path: Path, record_property: RecordProperty) -> 
             await process.until_event("hover: too few cameras deliver images: front frozen, back frozen")
             await _is_held_and_stays_so(process, fault_s, repair=lambda: _good_again(process))
 
-    tell(story)
+    asyncio.run(story())
 
 
 def test_time_stamps_are_repeated_and_run_backwards(tmp_path: Path, record_property: RecordProperty) -> None:
@@ -82,7 +81,7 @@ def test_time_stamps_are_repeated_and_run_backwards(tmp_path: Path, record_prope
             await until(lambda: "frames_dropped" not in process.matters(), SECONDS_TO_FAIL)
             await process.until_state("normal")
 
-    tell(story)
+    asyncio.run(story())
 
 
 def test_one_of_two_cameras_is_gone_and_comes_back(tmp_path: Path, record_property: RecordProperty) -> None:
@@ -100,7 +99,7 @@ def test_one_of_two_cameras_is_gone_and_comes_back(tmp_path: Path, record_proper
             await until(lambda: "camera_lost" not in process.matters(), SECONDS_TO_FAIL)
             await process.until_state("normal")
 
-    tell(story)
+    asyncio.run(story())
 
 
 @pytest.mark.parametrize("ahead_s", [3.0, 86_400.0, -86_400.0, 1e300], ids=["3 s", "a day", "a day ago", "absurd"])
@@ -128,7 +127,7 @@ def test_a_frame_of_another_time_silences_nobody(
             assert process.fake_autopilot.mode == "OFFBOARD"
             await process.until_state("normal")
 
-    tell(story)
+    asyncio.run(story())
 
 
 def test_images_are_damaged(tmp_path: Path, record_property: RecordProperty) -> None:
@@ -149,7 +148,7 @@ def test_images_are_damaged(tmp_path: Path, record_property: RecordProperty) -> 
             await until(lambda: "frames_dropped" not in process.matters(), SECONDS_TO_FAIL)
             await process.until_state("normal")
 
-    tell(story)
+    asyncio.run(story())
 
 
 def test_a_camera_shows_noise(tmp_path: Path, record_property: RecordProperty) -> None:
@@ -173,7 +172,7 @@ def test_a_camera_shows_noise(tmp_path: Path, record_property: RecordProperty) -
             process.cameras.noisy.clear()
             await until(lambda: "camera_lost" not in process.matters(), SECONDS_TO_FAIL)
 
-    tell(story)
+    asyncio.run(story())
 
 
 def _speed_north(process: Process) -> float:

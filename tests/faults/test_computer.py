@@ -19,12 +19,12 @@ from flockd.core.config import DroneConfig
 from flockd.onboard.daemon import DaemonError
 from flockd.onboard.daemon.host_monitors import WallClock
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from tests.calm import clock, run
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import flying
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, Aboard, TinyPerceiver, aboard, config_for, free_endpoint
-from tests.starvation import tell
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
@@ -43,7 +43,7 @@ def _alone(config: DroneConfig, **safety: object) -> DroneConfig:
 @pytest.fixture
 def in_the_air() -> tuple[FakeAutopilot, int]:
     port = free_port()
-    return FakeAutopilot(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S), port
+    return FakeAutopilot(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock), port
 
 
 def test_a_networks_output_is_not_finite(
@@ -57,14 +57,14 @@ def test_a_networks_output_is_not_finite(
                 await _flies(ship)
                 await ship.until_state("normal")
                 ship.perceiver.not_finite = 2
-                fault_s = time.monotonic()
+                fault_s = clock()
                 await ship.until_event("degraded: a network's output is not finite or not plausible")
-                reacted(record_property, "network-not-finite", time.monotonic() - fault_s)
+                reacted(record_property, "network-not-finite", clock() - fault_s)
                 assert autopilot.mode == "OFFBOARD"
                 await until(lambda: ship.heard()["computer"].message["steps_failed"] == 2, SECONDS_TO_FAIL)
                 await ship.until_state("normal")
 
-    tell(story)
+    run(story)
 
 
 def test_a_network_never_returns(
@@ -79,9 +79,9 @@ def test_a_network_never_returns(
                 await _flies(ship)
                 ship.perceiver.ends_when_told = False
                 ship.perceiver.hangs.set()
-                fault_s = time.monotonic()
+                fault_s = clock()
                 await ship.until_event("a step failed: a network call took longer than 0.5 s")
-                reacted(record_property, "network-stuck", time.monotonic() - fault_s)
+                reacted(record_property, "network-stuck", clock() - fault_s)
                 await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
                 assert not autopilot.failsafe
                 fed = ship.service.count("WATCHDOG=1")
@@ -91,7 +91,7 @@ def test_a_network_never_returns(
                 await asyncio.sleep(1.5)
                 assert ship.service.count("WATCHDOG=1") == before, "only a new process can help"
 
-    tell(story)
+    run(story)
 
 
 def _is_not_fed(ship: Aboard) -> bool:
@@ -118,16 +118,16 @@ def test_steps_take_longer_than_they_may(
                     return flow(*arguments)  # type: ignore[arg-type]
 
                 monkeypatch.setattr(TinyPerceiver, "flow", slow)
-                fault_s = time.monotonic()
+                fault_s = clock()
                 await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-                reacted(record_property, "overrun", time.monotonic() - fault_s)
+                reacted(record_property, "overrun", clock() - fault_s)
                 assert not autopilot.failsafe
                 (hover,) = [event for event in ship.events if event.startswith("hover: ")]
                 assert "a step takes " in hover
                 counts = ship.heard()["computer"].message["cameras"]["front"]["counts"]
                 assert counts["superseded"] > 0, "the newest frame wins"
 
-    tell(story)
+    run(story)
 
 
 def test_it_gets_too_hot(
@@ -146,12 +146,12 @@ def test_it_gets_too_hot(
                 await ship.until_event("degraded: the computer is at 88.0 °C")
                 assert autopilot.mode == "OFFBOARD"
                 temperature_c[0] = 97.0
-                fault_s = time.monotonic()
+                fault_s = clock()
                 await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-                reacted(record_property, "overrun", time.monotonic() - fault_s)
+                reacted(record_property, "overrun", clock() - fault_s)
                 assert not autopilot.failsafe
 
-    tell(story)
+    run(story)
 
 
 def test_the_event_loop_is_stuck(
@@ -164,7 +164,7 @@ def test_the_event_loop_is_stuck(
             async with aboard(autopilot, port, tmp_path, change=_alone) as ship:
                 await _flies(ship)
                 ship.service.clear()
-                stuck_s = time.monotonic()
+                stuck_s = clock()
                 time.sleep(2.0)
                 reacted(record_property, "event-loop-stuck", max(0.0, autopilot.setpoints[-1][0] - stuck_s))
                 assert autopilot.failsafe
@@ -174,7 +174,7 @@ def test_the_event_loop_is_stuck(
                 await asyncio.sleep(1.0)
                 assert len(autopilot.setpoints) == sent
 
-    tell(story)
+    run(story)
 
 
 def test_a_task_dies(
@@ -192,15 +192,15 @@ def test_a_task_dies(
                     raise ArithmeticError("for the test")
 
                 monkeypatch.setattr("flockd.onboard.daemon.status_messages._computer_message", dies)
-                fault_s = time.monotonic()
+                fault_s = clock()
                 await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-                reacted(record_property, "task-dies", time.monotonic() - fault_s)
+                reacted(record_property, "task-dies", clock() - fault_s)
                 assert not autopilot.failsafe
                 with pytest.raises(DaemonError, match="telemetry: ArithmeticError") as ended:
                     await ship.ending
                 assert ended.value.exit_code != 0
 
-    tell(story)
+    run(story)
 
 
 def test_the_wall_clock_is_set(
@@ -223,7 +223,7 @@ def test_the_wall_clock_is_set(
                 assert autopilot.mode == "OFFBOARD"
                 assert ship.state() == "normal"
 
-    tell(story)
+    run(story)
 
 
 def test_the_memory_is_used_up_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
@@ -245,7 +245,7 @@ def test_the_memory_is_used_up_in_flight(tmp_path: Path, record_property: Record
             await process.until_state("idle")
             assert len(process.fake_autopilot.setpoints) == sent
 
-    tell(story)
+    asyncio.run(story())
 
 
 def test_the_computer_stalls_for_seconds(tmp_path: Path, record_property: RecordProperty) -> None:
@@ -264,7 +264,7 @@ def test_the_computer_stalls_for_seconds(tmp_path: Path, record_property: Record
             assert len(process.fake_autopilot.setpoints) == sent, "one more, and PX4 would be in offboard again"
             assert any("stall" in event or "stopped" in event or "late" in event for event in process.events)
 
-    tell(story)
+    asyncio.run(story())
 
 
 def test_no_descriptors_are_left_at_the_start(tmp_path: Path) -> None:

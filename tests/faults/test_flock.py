@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -16,12 +17,12 @@ from flockd.core.messages import FrameSet, Neighbour, PilotOutput, VehicleState
 from flockd.flight.pilot import FlockPilot
 from flockd.flight.tracking.tracker import Tracker
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from tests.calm import clock, run
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import flying
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, aboard
-from tests.starvation import tell
 
 pytestmark = pytest.mark.slow
 
@@ -29,7 +30,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture
 def in_the_air() -> Iterator[tuple[FakeAutopilot, int]]:
     port = free_port()
-    with FakeAutopilot(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S) as autopilot:
+    with FakeAutopilot(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
         yield autopilot, port
 
 
@@ -58,12 +59,12 @@ def test_a_neighbour_comes_too_near(
             await ship.is_ready_in_the_air()
             await ship.flies()
             seen.append(_neighbour(0.6, 0.0))
-            fault_s = time.monotonic()
+            fault_s = clock()
             await until(lambda: autopilot.setpoints[-1][1].velocity[0] <= 0.01, SECONDS_TO_FAIL)
-            reacted(record_property, "neighbour-too-near", time.monotonic() - fault_s)
+            reacted(record_property, "neighbour-too-near", clock() - fault_s)
             await until(lambda: "neighbour_close" in ship.matters(), SECONDS_TO_FAIL)
-            near_s = time.monotonic()
-            await until(lambda: time.monotonic() > near_s + 1.0, SECONDS_TO_FAIL)
+            near_s = clock()
+            await until(lambda: clock() > near_s + 1.0, SECONDS_TO_FAIL)
             sent = [setpoint.velocity[0] for at_s, setpoint in list(autopilot.setpoints) if at_s > near_s]
             assert sent
             assert max(sent) <= 0.01
@@ -71,7 +72,7 @@ def test_a_neighbour_comes_too_near(
             await until(lambda: ship.speed() > 0.5, SECONDS_TO_FAIL)
             assert autopilot.mode == "OFFBOARD"
 
-    tell(story)
+    run(story)
 
 
 def test_all_neighbours_are_lost(
@@ -94,17 +95,17 @@ def test_all_neighbours_are_lost(
             await ship.until_state("ready")
             await ship.flies()
             seen.clear()
-            fault_s = time.monotonic()
+            fault_s = clock()
             await until(lambda: "neighbours_lost" in ship.matters(), SECONDS_TO_FAIL)
             assert autopilot.mode == "OFFBOARD"
             velocity = autopilot.setpoints[-1][1].velocity
             np.testing.assert_allclose(velocity, [1.0, 0.0], atol=0.2)
             await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-            reacted(record_property, "alone", time.monotonic() - fault_s)
+            reacted(record_property, "alone", clock() - fault_s)
             assert not autopilot.failsafe
             await ship.until_event("asking: no neighbour seen for ")
 
-    tell(story)
+    run(story)
 
 
 @pytest.mark.parametrize("velocity", [(np.nan, 0.0), (np.inf, 0.0), (1e6, 0.0)], ids=["NaN", "infinite", "too large"])
@@ -129,16 +130,16 @@ def test_a_command_that_cannot_be_flown(
             await ship.is_ready_in_the_air()
             await ship.flies()
             wrong.append(True)
-            fault_s = time.monotonic()
+            fault_s = clock()
             await until(lambda: float(np.linalg.norm(autopilot.setpoints[-1][1].velocity)) < 0.05, SECONDS_TO_FAIL)
-            reacted(record_property, "command-not-finite", time.monotonic() - fault_s)
+            reacted(record_property, "command-not-finite", clock() - fault_s)
             await ship.until_event("degraded: a command was not finite or far too large")
             assert autopilot.refused_setpoints == 0, "it never left"
             wrong.clear()
             await until(lambda: ship.speed() > 0.8, SECONDS_TO_FAIL)
             assert autopilot.mode == "OFFBOARD"
 
-    tell(story)
+    run(story)
 
 
 def test_the_fence_is_left(tmp_path: Path, record_property: RecordProperty) -> None:
@@ -162,7 +163,7 @@ def test_the_fence_is_left(tmp_path: Path, record_property: RecordProperty) -> N
             assert max(late) < 0.05, "nothing outward"
             assert any("outside the fence" in event for event in process.events)
 
-    tell(story)
+    asyncio.run(story())
 
 
 def test_two_drones_at_one_spot_part(
@@ -195,4 +196,4 @@ def test_two_drones_at_one_spot_part(
             await until(lambda: float(autopilot.state.position[1]) < -0.5, SECONDS_TO_FAIL)
             assert abs(float(autopilot.state.position[0])) < 0.5
 
-    tell(story)
+    run(story)

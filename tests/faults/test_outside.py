@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import json
 import subprocess
@@ -19,7 +20,6 @@ from tests.faults.process import Process, flying
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, client, free_endpoint
 from tests.onboard.telemetry.test_malformed import FLIGHT
-from tests.starvation import tell
 
 pytestmark = pytest.mark.slow
 RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
@@ -65,7 +65,7 @@ def test_the_router_of_the_telemetry_goes_and_comes_back(tmp_path: Path) -> None
             await until(lambda: "flockd/v1/test/tiny/flight" in keys, 60.0)
             router.close()
 
-    tell(story)
+    asyncio.run(story())
 
 
 def test_nonsense_on_the_telemetry_bus(tmp_path: Path) -> None:
@@ -85,7 +85,7 @@ def test_nonsense_on_the_telemetry_bus(tmp_path: Path) -> None:
             assert not any("asked for land" in event for event in process.events)
             session.close()  # type: ignore[no-untyped-call]
 
-    tell(story)
+    asyncio.run(story())
 
 
 def test_status_shows_a_peer_that_publishes_nonsense() -> None:

@@ -22,7 +22,6 @@ from tests.faults.process import Process, drone, started
 from tests.onboard.autopilot.conftest import HOVER_M
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL
-from tests.starvation import tell
 
 pytestmark = pytest.mark.slow
 LIE, WORKS = "height: the range contradicts the barometer", "height: the range finder works again"
@@ -97,7 +96,7 @@ def test_the_range_finder_lies(
             limit_m_s = process.config.safety.gate.max_speed_m_s
             assert all(np.linalg.norm(sent.velocity[:2]) <= limit_m_s + 1e-6 for _, sent in autopilot.setpoints)
 
-    tell(story)
+    asyncio.run(story())
 
 
 def test_without_the_barometer_a_lie_is_no_scale_and_ends_in_hold(
@@ -119,4 +118,4 @@ def test_without_the_barometer_a_lie_is_no_scale_and_ends_in_hold(
             await asyncio.sleep(QUIET_S)
             assert len(process.fake_autopilot.setpoints) == sent, "no return by itself"
 
-    tell(story)
+    asyncio.run(story())

@@ -17,7 +17,6 @@ from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import Process, flying
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL
-from tests.starvation import tell
 
 pytestmark = pytest.mark.slow
 MB = 1 << 20
@@ -48,7 +47,7 @@ def test_sigterm_in_flight(tmp_path: Path, record_property: RecordProperty) -> N
             assert recording.contents.finished
             assert len(list(recording.steps())) > 3
 
-    tell(story)
+    asyncio.run(story())
 
 
 def test_it_is_killed_while_it_records(
@@ -65,7 +64,7 @@ def test_it_is_killed_while_it_records(
             reacted(record_property, "killed-while-recording", time.monotonic() - killed_s)
             assert process.fake_autopilot.failsafe, "nobody was there to ask for Hold"
 
-    tell(story)
+    asyncio.run(story())
     whole = tmp_path / "whole.mcap"
     assert main(["record", "recover", str(found[0]), "--out", str(whole)]) == 0, capsys.readouterr()
     recording = Recording(whole)
@@ -89,7 +88,7 @@ def test_the_disk_is_full(tmp_path: Path, record_property: RecordProperty) -> No
             assert process.fake_autopilot.mode == "OFFBOARD"
             assert "file too large" in process.heard()["computer"].message["recording"]
 
-    tell(story)
+    asyncio.run(story())
 
 
 def test_foreign_things_lie_among_the_recordings(tmp_path: Path) -> None:
@@ -109,5 +108,5 @@ def test_foreign_things_lie_among_the_recordings(tmp_path: Path) -> None:
             assert "tiny-fifo.mcap" in log
             assert "tiny-folder.mcap" in log
 
-    tell(story)
+    asyncio.run(story())
     assert (tmp_path / "tiny-damaged.mcap").exists(), "what is not a recording of its own is left alone"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import subprocess
 import sys
@@ -20,7 +21,6 @@ from tests.faults.process import flying
 from tests.onboard.autopilot.conftest import free_port
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, config_for, free_endpoint
-from tests.starvation import tell
 
 pytestmark = pytest.mark.slow
 RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
@@ -146,4 +146,4 @@ def test_a_second_instance_is_started_in_flight(tmp_path: Path, record_property:
             assert process.fake_autopilot.mode == "OFFBOARD"
             assert first.ended is None
 
-    tell(story)
+    asyncio.run(story())

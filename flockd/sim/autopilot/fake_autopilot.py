@@ -16,6 +16,7 @@ import struct
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Self
 
@@ -75,6 +76,7 @@ class FakeAutopilot:
         speed_factor: float = 1.0,
         range_finder: FakeRangeFinder | None = None,
         clock_ahead_s: float = 0.0,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Bind a socket; nothing is sent before `start`.
 
@@ -91,8 +93,9 @@ class FakeAutopilot:
             speed_factor: how fast its time passes.
             range_finder: its own, which faces down; None: it has none.
             clock_ahead_s: what its clock shows when it is made.
+            clock: monotonic seconds, in the place of the computer's.
         """
-        self._speed_factor = speed_factor
+        self._speed_factor, self._real = speed_factor, clock
         self.battery_share = 1.0
         self.estimate_ok = True
         self.failing: set[str] = set()
@@ -112,7 +115,7 @@ class FakeAutopilot:
         }
         """An int is an INT32 parameter, a float a REAL32 one."""
         self.setpoints: deque[tuple[float, Setpoint]] = deque(maxlen=MAX_SETPOINTS_KEPT)
-        """When each came by the kernel's stamp, on the monotonic clock times the speed factor, and what it said."""
+        """When each came by the kernel's stamp, on ``clock`` times the speed factor, and what it said."""
         self.refused_setpoints = 0
 
         self._link = ("127.0.0.1", port)
@@ -135,8 +138,10 @@ class FakeAutopilot:
         self._sticks = -math.inf, np.zeros(2)
         """When a person last moved them, and forward and right from -1 to 1."""
         self.clock_offset_s = clock_ahead_s - self._clock()
-        """Its own clock, of its stamps and of TIMESYNC, less the monotonic clock times the speed factor."""
+        """Its own clock, of its stamps and of TIMESYNC, less ``clock`` times the speed factor."""
         self._streams = TelemetryStreams(self._mav, truth, heartbeat_s, home_deg, -self.clock_offset_s, range_finder)
+        self._heard_s = -math.inf
+        """When no packet waited any more: what is taken later came later, whatever the wall clock says."""
         self._lock = threading.RLock()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fake autopilot", daemon=True)
@@ -205,7 +210,7 @@ class FakeAutopilot:
         )
 
     def _clock(self) -> float:
-        return self._speed_factor * time.monotonic()
+        return self._speed_factor * self._real()
 
     def _run(self) -> None:
         flown_s = self._clock()
@@ -221,15 +226,16 @@ class FakeAutopilot:
     def _receive_until(self, deadline: float) -> None:
         """All that comes by then; when it is late already, all that waits."""
         while True:
-            left_s = max(deadline - self._clock(), 0.0)
-            self._socket.settimeout(left_s / self._speed_factor)
+            asked_s = self._clock()
+            self._socket.settimeout(max(deadline - asked_s, 0.0) / self._speed_factor)
             try:
                 data, ancillary, _, _ = self._socket.recvmsg(4096, 64)
             except (TimeoutError, BlockingIOError):
+                self._heard_s = asked_s
                 return
             if self.silent:
                 continue
-            arrived_s = self._clock() - self._speed_factor * _age(ancillary)
+            arrived_s = max(self._clock() - self._speed_factor * _age(ancillary), self._heard_s)
             with self._lock:
                 for message in self._mav.parse_buffer(data) or ():
                     self._handle(message, arrived_s)

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from tests.calm import clock
 
 HOVER_M = 2.5
 HEARTBEAT_S = 0.25
@@ -27,5 +28,5 @@ def port() -> int:
 
 @pytest.fixture
 def fake_autopilot(port: int) -> Iterator[FakeAutopilot]:
-    with FakeAutopilot(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
+    with FakeAutopilot(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
         yield fake_autopilot

@@ -21,6 +21,7 @@ from flockd.sim.autopilot.fake_autopilot import TICK_S, FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.sim.autopilot.fake_telemetry import TelemetryStreams
 from flockd.sim.autopilot.fake_vehicle import Demand, MotionState
+from tests.calm import clock, run
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, free_port
 from tests.onboard.autopilot.flight import flying, north, until
 
@@ -52,7 +53,7 @@ def test_telemetry_is_what_the_vehicle_does(port: int) -> None:
         return truth
 
     async def story() -> None:
-        link = await AutopilotLink.connect(_parameters(port))
+        link = await AutopilotLink.connect(_parameters(port), clock=clock)
         await until(lambda: link.vehicle_state() is not None and link.status().battery_share is not None)
         await until(lambda: None not in {link.status().estimate_ok, link.status().gps_ok} and link.status().in_air)
         state, status = link.vehicle_state(), link.status()
@@ -76,9 +77,9 @@ def test_telemetry_is_what_the_vehicle_does(port: int) -> None:
         await until(lambda: link.status().heartbeat_age_s > 4 * HEARTBEAT_S)
         await link.close()
 
-    with FakeAutopilot(port, height_m=7.5, motion=still, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
+    with FakeAutopilot(port, height_m=7.5, motion=still, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
         fake_autopilot.battery_share = 0.42
-        asyncio.run(story())
+        run(story)
 
 
 def test_a_landed_state_that_mavlink_does_not_have_is_unknown_and_counted(
@@ -90,7 +91,7 @@ def test_a_landed_state_that_mavlink_does_not_have_is_unknown_and_counted(
         self._mav.extended_sys_state_send(0, 5)
 
     async def story() -> None:
-        link = await AutopilotLink.connect(_parameters(port))
+        link = await AutopilotLink.connect(_parameters(port), clock=clock)
         await until(lambda: link.status().landed_state == "air")
         monkeypatch.setattr(TelemetryStreams, "_send_landed", sends_5)
         await until(lambda: link.status().landed_state == "unknown")
@@ -99,14 +100,14 @@ def test_a_landed_state_that_mavlink_does_not_have_is_unknown_and_counted(
         assert link.status().heartbeat_age_s < 2 * HEARTBEAT_S, "the link still receives"
         await link.close()
 
-    asyncio.run(story())
+    run(story)
 
 
 def test_firmware_and_failsafe_parameters_can_be_read(port: int, fake_autopilot: FakeAutopilot) -> None:
     fake_autopilot.parameters |= {"COM_OF_LOSS_T": 0.75, "COM_OBL_RC_ACT": 4, "COM_LOW_BAT_ACT": -3}
 
     async def story() -> None:
-        link = await AutopilotLink.connect(_parameters(port))
+        link = await AutopilotLink.connect(_parameters(port), clock=clock)
         assert await link.parameter("COM_OF_LOSS_T", float) == 0.75
         assert await link.parameter("COM_OBL_RC_ACT", int) == 4
         assert await link.parameter("COM_LOW_BAT_ACT", int) == -3
@@ -115,12 +116,12 @@ def test_firmware_and_failsafe_parameters_can_be_read(port: int, fake_autopilot:
             await link.parameter("COM_OBL_RC_ACT", float)
         await link.close()
 
-    asyncio.run(story())
+    run(story)
 
 
 def test_offboard_without_setpoints_is_refused_and_the_reason_told(port: int, fake_autopilot: FakeAutopilot) -> None:
     async def story() -> None:
-        link = await AutopilotLink.connect(_parameters(port))
+        link = await AutopilotLink.connect(_parameters(port), clock=clock)
         with pytest.raises(
             AutopilotError, match=r"asked for offboard, which was refused for now: .*no offboard signal"
         ):
@@ -128,7 +129,7 @@ def test_offboard_without_setpoints_is_refused_and_the_reason_told(port: int, fa
         assert fake_autopilot.mode == "LOITER"
         await link.close()
 
-    asyncio.run(story())
+    run(story)
 
 
 def test_the_vehicle_follows_the_velocity_and_holds_its_own_height(port: int, fake_autopilot: FakeAutopilot) -> None:
@@ -148,12 +149,12 @@ def test_the_vehicle_follows_the_velocity_and_holds_its_own_height(port: int, fa
             assert math.atan2(state.R_ned_body[1, 0], state.R_ned_body[0, 0]) == pytest.approx(-0.5, abs=0.05)
             assert fake_autopilot.refused_setpoints == 0
 
-    asyncio.run(story())
+    run(story)
 
 
 def test_a_setpoint_that_is_not_finite_never_leaves(port: int, fake_autopilot: FakeAutopilot) -> None:
     async def story() -> None:
-        link = await AutopilotLink.connect(_parameters(port))
+        link = await AutopilotLink.connect(_parameters(port), clock=clock)
         for broken in (
             Setpoint(0.0, np.array([math.nan, 0.0]), 2.5, 0.0),
             Setpoint(0.0, np.zeros(2), math.inf, 0.0),
@@ -166,7 +167,7 @@ def test_a_setpoint_that_is_not_finite_never_leaves(port: int, fake_autopilot: F
         assert fake_autopilot.refused_setpoints == 0
         await link.close()
 
-    asyncio.run(story())
+    run(story)
 
 
 def test_arming_taking_off_and_landing_from_offboard(port: int) -> None:
@@ -182,8 +183,8 @@ def test_arming_taking_off_and_landing_from_offboard(port: int) -> None:
             await until(lambda: fake_autopilot.mode == "LAND")
             await until(lambda: not flight.streamer.report().streaming)
 
-    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
-        asyncio.run(story())
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
+        run(story)
 
 
 def test_return_flies_home(port: int, fake_autopilot: FakeAutopilot) -> None:
@@ -196,7 +197,7 @@ def test_return_flies_home(port: int, fake_autopilot: FakeAutopilot) -> None:
             await until(lambda: flight.link.status().flight_mode == "land")
             assert abs(fake_autopilot.state.position[0]) < 0.5
 
-    asyncio.run(story())
+    run(story)
 
 
 def test_two_links_on_two_ports_mind_their_own_vehicle(port: int, fake_autopilot: FakeAutopilot) -> None:
@@ -209,8 +210,8 @@ def test_two_links_on_two_ports_mind_their_own_vehicle(port: int, fake_autopilot
             assert (one.link.system_id, two.link.system_id) == (1, 9)
 
     second_port = free_port()
-    with FakeAutopilot(second_port, system_id=9, height_m=4.0, heartbeat_s=HEARTBEAT_S) as second:
-        asyncio.run(story())
+    with FakeAutopilot(second_port, system_id=9, height_m=4.0, heartbeat_s=HEARTBEAT_S, clock=clock) as second:
+        run(story)
 
 
 def test_the_stand_in_runs_as_a_program_too(port: int) -> None:
@@ -225,7 +226,7 @@ def test_the_stand_in_runs_as_a_program_too(port: int) -> None:
     options = ["--port", str(port), "--system-id", "4", "--height", "6"]
     with subprocess.Popen([sys.executable, "-m", "flockd.sim.autopilot.fake_autopilot", *options]) as program:
         try:
-            asyncio.run(story())
+            run(story)
         finally:
             program.kill()
 
@@ -239,14 +240,14 @@ def test_a_stand_in_that_is_late_for_every_tick_still_hears(port: int) -> None:
         return MotionState(np.array([0.0, 0.0, -2.5]), np.zeros(3), np.eye(3))
 
     async def story() -> None:
-        link = await AutopilotLink.connect(_parameters(port))
+        link = await AutopilotLink.connect(_parameters(port), clock=clock)
         assert await link.parameter("COM_OBL_RC_ACT", int) == 5
         link.send_setpoint(north())
         await until(lambda: len(fake_autopilot.setpoints) == 1)
         await link.close()
 
-    with FakeAutopilot(port, height_m=2.5, motion=slow, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
-        asyncio.run(story())
+    with FakeAutopilot(port, height_m=2.5, motion=slow, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
+        run(story)
 
 
 def test_nobody_there_is_told_with_what_to_check(port: int) -> None:
@@ -255,18 +256,21 @@ def test_nobody_there_is_told_with_what_to_check(port: int) -> None:
 
 
 def test_somebody_elses_autopilot_is_not_taken_for_the_own(port: int, fake_autopilot: FakeAutopilot) -> None:
-    with pytest.raises(AutopilotError, match=r"no autopilot with system id 5 .* heard instead: 1"):
-        asyncio.run(AutopilotLink.connect(_parameters(port, system_id=5), timeout_s=0.7))
+    async def story() -> None:
+        with pytest.raises(AutopilotError, match=r"no autopilot with system id 5 .* heard instead: 1"):
+            await AutopilotLink.connect(_parameters(port, system_id=5), timeout_s=0.7, clock=clock)
+
+    run(story)
 
 
 def test_two_programs_cannot_command_one_drone(port: int, fake_autopilot: FakeAutopilot) -> None:
     async def story() -> None:
-        link = await AutopilotLink.connect(_parameters(port))
+        link = await AutopilotLink.connect(_parameters(port), clock=clock)
         with pytest.raises(AutopilotError, match="is another program on it"):
-            await AutopilotLink.connect(_parameters(port))
+            await AutopilotLink.connect(_parameters(port), clock=clock)
         await link.close()
 
-    asyncio.run(story())
+    run(story)
 
 
 def test_the_range_finder_is_heard_along_the_bodys_down_axis_and_falls_silent_with_it(port: int) -> None:
@@ -280,7 +284,7 @@ def test_the_range_finder_is_heard_along_the_bodys_down_axis_and_falls_silent_wi
         return MotionState(place.copy(), np.zeros(3), leaning)
 
     async def story() -> None:
-        link = await AutopilotLink.connect(_parameters(port))
+        link = await AutopilotLink.connect(_parameters(port), clock=clock)
         await until(lambda: (state := link.vehicle_state()) is not None and state.ground_range is not None)
         reading = link.ground_range()
         assert reading is not None
@@ -292,5 +296,5 @@ def test_the_range_finder_is_heard_along_the_bodys_down_axis_and_falls_silent_wi
         await link.close()
 
     finder = FakeRangeFinder(config, level_ground, (0,))
-    with FakeAutopilot(port, height_m=6.0, motion=still, heartbeat_s=HEARTBEAT_S, range_finder=finder):
-        asyncio.run(story())
+    with FakeAutopilot(port, height_m=6.0, motion=still, heartbeat_s=HEARTBEAT_S, range_finder=finder, clock=clock):
+        run(story)

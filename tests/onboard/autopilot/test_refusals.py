@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import struct
 from typing import Any
 
@@ -14,6 +13,7 @@ from flockd.onboard.autopilot.mavlink_messages import ReceivedMessages
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.refusal_reasons import NAMES, REASONS, event_number
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from tests.calm import clock, run
 from tests.onboard.autopilot.flight import flying, until
 
 HOLD, POSITION, LAND, OFFBOARD = (4 << 16 | 3 << 24), 3 << 16, (4 << 16 | 6 << 24), 6 << 16
@@ -238,7 +238,7 @@ REFUSING = (
 
 def test_twelve_refusals_of_the_fake_autopilot_one_by_one_through_mavsdk(port: int) -> None:
     async def story() -> None:
-        link = await AutopilotLink.connect(AutopilotParameters(address=f"udpin://127.0.0.1:{port}"))
+        link = await AutopilotLink.connect(AutopilotParameters(address=f"udpin://127.0.0.1:{port}"), clock=clock)
         await link.ask_for_checks()
         await until(link.knows_checks)
         for name in REFUSING:
@@ -255,8 +255,8 @@ def test_twelve_refusals_of_the_fake_autopilot_one_by_one_through_mavsdk(port: i
         await link.arm()
         await link.close()
 
-    with FakeAutopilot(port) as fake_autopilot:
-        asyncio.run(story())
+    with FakeAutopilot(port, clock=clock) as fake_autopilot:
+        run(story)
 
 
 def test_offboard_that_is_possible_is_not_refused_by_anything(port: int, fake_autopilot: FakeAutopilot) -> None:
@@ -265,5 +265,5 @@ def test_offboard_that_is_possible_is_not_refused_by_anything(port: int, fake_au
             await flight.enter_offboard()
             assert flight.link.refusals() == ()
 
-    asyncio.run(story())
+    run(story)
     assert fake_autopilot.armed

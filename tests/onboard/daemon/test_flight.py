@@ -22,10 +22,10 @@ from flockd.onboard.daemon import DaemonError, Ending
 from flockd.onboard.recording.codec import to_json
 from flockd.onboard.recording.reader import Recording
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from tests.calm import clock, run
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import CAMERAS, PATIENT, SECONDS_TO_FAIL, SPEED_M_S, STEP_S, TinyPerceiver, aboard
-from tests.starvation import tell
 
 ALONE = PATIENT.model_copy(update={"alone_s": None})
 """Flies on without neighbours, however long this computer takes."""
@@ -65,8 +65,8 @@ def test_from_the_ground_into_the_air_and_back_into_the_pilots_hands(tmp_path: P
             assert "not_offboard" in ship.matters()
             assert fake_autopilot.mode == "POSCTL"
 
-    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
-        tell(story)
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
+        run(story)
 
 
 def _tells_what_it_does(heard: object) -> None:
@@ -96,7 +96,7 @@ def test_eyes_that_lie_about_the_own_motion_add_half_a_metre_a_second_at_most_an
             await ship.is_ready_in_the_air()
             await until(lambda: len(fake_autopilot.setpoints) > 5, SECONDS_TO_FAIL)
             fake_autopilot.pilot_selects("OFFBOARD")
-            chosen_s = time.monotonic()
+            chosen_s = clock()
             await until(lambda: ship.heard()["flight"].message["velocity_trim"][0] > 0.49, SECONDS_TO_FAIL)
             off_s = next(at_s for at_s, sent in fake_autopilot.setpoints if np.linalg.norm(sent.velocity) > 0.01)
             assert off_s - chosen_s > 2 * STEP_S - 0.1, "a neighbour counts from its third look on"
@@ -109,13 +109,13 @@ def test_eyes_that_lie_about_the_own_motion_add_half_a_metre_a_second_at_most_an
             np.testing.assert_allclose(np.asarray(sent.velocity)[:2], commanded, atol=0.02)
 
             ship.cameras.silent |= set(CAMERAS)
-            silent_s = time.monotonic()
+            silent_s = clock()
             await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
             last = [sent for at_s, sent in fake_autopilot.setpoints if at_s > silent_s + 1.2]
             assert last, "the hover is sent"
             assert all(np.linalg.norm(sent.velocity) < 0.01 for sent in last)
 
-    tell(story)
+    run(story)
 
 
 def test_one_camera_gone_is_a_slower_flight_and_all_gone_a_hover_and_then_hold(
@@ -129,10 +129,10 @@ def test_one_camera_gone_is_a_slower_flight_and_all_gone_a_hover_and_then_hold(
             await ship.until_event("degraded: a camera is lost: back silent")
             assert fake_autopilot.mode == "OFFBOARD"
             ship.cameras.silent.add("front")
-            silent_s = time.monotonic()
+            silent_s = clock()
             await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
             # Three frame periods of 0.2 s until it is noticed, 1 s of hovering, and some for Hold on a busy computer.
-            assert 1.0 < time.monotonic() - silent_s < 3.0
+            assert 1.0 < clock() - silent_s < 3.0
             assert not fake_autopilot.failsafe, "it was asked for Hold, not left to its failsafe"
             last = [sent for at_s, sent in fake_autopilot.setpoints if at_s > silent_s + 1.2]
             assert last, "the hover is sent"
@@ -142,7 +142,7 @@ def test_one_camera_gone_is_a_slower_flight_and_all_gone_a_hover_and_then_hold(
             await asyncio.sleep(1.0)
             assert ship.state() == "silent", "no re-entry by itself"
 
-    tell(story)
+    run(story)
 
 
 def test_a_noisy_camera_is_lost_and_said_so_until_it_is_good_again(
@@ -166,7 +166,7 @@ def test_a_noisy_camera_is_lost_and_said_so_until_it_is_good_again(
             await ship.until_event("hover: too few cameras deliver images: front noisy, back noisy")
             assert not fake_autopilot.failsafe, "it was asked for Hold, not left to its failsafe"
 
-    tell(story)
+    run(story)
 
 
 def test_a_second_sender_with_the_autopilots_ids_moves_neither_height_band_nor_fence(
@@ -192,7 +192,7 @@ def test_a_second_sender_with_the_autopilots_ids_moves_neither_height_band_nor_f
             assert fake_autopilot.mode == "OFFBOARD"
             assert fake_autopilot.setpoints[-1][1].height_m == pytest.approx(held_m, abs=0.01)
 
-    tell(story)
+    run(story)
 
 
 class _Sender:
@@ -223,7 +223,7 @@ def test_networks_not_finite_or_stuck_degrade_and_sigterm_ends_in_hold(
             assert fake_autopilot.mode == "OFFBOARD"
             assert ship.heard()["computer"].message["recording"].startswith(str(tmp_path))
 
-            asked_s = time.monotonic()
+            asked_s = clock()
             ship.daemon.ask_to_stop()
             await until(lambda: fake_autopilot.mode == "LOITER", 2.0)
             assert not fake_autopilot.failsafe
@@ -231,7 +231,7 @@ def test_networks_not_finite_or_stuck_degrade_and_sigterm_ends_in_hold(
             assert "STOPPING=1" in ship.service
             assert fake_autopilot.setpoints[-1][0] - asked_s < 2.0
 
-    tell(story)
+    run(story)
     (path,) = tmp_path.glob("tiny-*.mcap")
     _replays_to_the_last_bit(Recording(path))
 
@@ -279,7 +279,7 @@ def test_an_operator_sends_it_somewhere_and_the_recording_replays(
             await until(lambda: ship.mission("sentence") == "flies an operator's velocity", SECONDS_TO_FAIL)
             await until(lambda: str(ship.mission("sentence")).startswith("hovers"), SECONDS_TO_FAIL)
 
-    tell(story)
+    run(story)
     told = capsys.readouterr()
     assert "m from home, outside the fence of 100 m" in told.err
     assert "flockd does not fly the drone now" in told.err
@@ -308,7 +308,7 @@ def test_at_its_end_a_mission_hands_over_to_the_autopilot(
             await ship.until_event(f"asking: the mission is over and ends with {end.capitalize()}")
             await ship.until_state("silent", "idle")
 
-    tell(story)
+    run(story)
 
 
 @pytest.mark.parametrize(
@@ -332,7 +332,7 @@ def test_a_dead_task_is_held_by_the_last_resort(
             with pytest.raises(DaemonError, match=rf"a task died \({task}: ArithmeticError\('for the test'\)\)"):
                 await ship.ending
 
-    tell(story)
+    run(story)
 
 
 def test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe(
@@ -343,7 +343,7 @@ def test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe(
             await ship.is_ready_in_the_air()
             await ship.flies()
             ship.service.clear()
-            blocked_s = time.monotonic()
+            blocked_s = clock()
             time.sleep(2.0)
             assert fake_autopilot.setpoints[-1][0] - blocked_s < 0.5
             assert fake_autopilot.mode == "LOITER"
@@ -352,7 +352,7 @@ def test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe(
             await ship.until_state("silent")
             assert len(fake_autopilot.setpoints) == before, "one more, and PX4 would be in offboard again"
 
-    tell(story)
+    run(story)
 
 
 def test_arming_and_taking_off_by_itself_where_configured(tmp_path: Path) -> None:
@@ -367,8 +367,8 @@ def test_arming_and_taking_off_by_itself_where_configured(tmp_path: Path) -> Non
             assert (await ship.ask("ask/land"))["accepted"] is True
             await until(lambda: fake_autopilot.mode == "LAND", SECONDS_TO_FAIL)
 
-    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
-        tell(story)
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
+        run(story)
 
 
 def _wrong() -> DroneConfig:
@@ -382,15 +382,15 @@ def test_what_the_autopilot_refuses_is_in_status_word_for_word_and_once_in_the_l
         async with aboard(fake_autopilot, port, tmp_path) as ship:
             await ship.until_event(sentence)
             await until(lambda: ship.refusals() == {"check_gyro_not_calibrated"}, SECONDS_TO_FAIL)
-            (row,) = status_rows(ship.watcher.drones(), time.monotonic())
+            (row,) = status_rows(ship.watcher.drones(), clock())
             assert sentence in row["matters"]
             fake_autopilot.failing = set()
             await until(lambda: not ship.refusals(), SECONDS_TO_FAIL)
             assert ship.events.count(sentence) == 1
 
-    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
         fake_autopilot.failing = {"check_gyro_not_calibrated"}
-        tell(story)
+        run(story)
 
 
 def test_the_configuration_is_read_again_on_the_ground_only(
@@ -419,20 +419,20 @@ def test_the_configuration_is_read_again_on_the_ground_only(
             ship.daemon.ask_to_reload(lambda: other)
             assert await ship.ending == Ending(other)
 
-    tell(story)
+    run(story)
     (tmp_path / "ground").mkdir()
     second = free_port()
-    with FakeAutopilot(second, heartbeat_s=HEARTBEAT_S) as on_ground:
-        tell(lambda: on_the_ground(on_ground, second))
+    with FakeAutopilot(second, heartbeat_s=HEARTBEAT_S, clock=clock) as on_ground:
+        run(lambda: on_the_ground(on_ground, second))
 
 
 def test_it_can_be_told_to_stop_before_an_autopilot_is_heard(tmp_path: Path, port: int) -> None:
     async def story() -> None:
-        silent = FakeAutopilot(port)  # never started
+        silent = FakeAutopilot(port, clock=clock)  # never started
         async with aboard(silent, port, tmp_path) as ship:
             await asyncio.sleep(0.3)
             ship.daemon.ask_to_stop()
             async with asyncio.timeout(SECONDS_TO_FAIL):
                 assert await ship.ending == Ending(None)
 
-    tell(story)
+    run(story)

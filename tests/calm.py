@@ -1,0 +1,60 @@
+"""Time for tests whose drone flies in this process: real time without the pauses in which the computer ran others.
+
+The daemon, the fake autopilot, the cameras and the test itself read one clock. It advances with real time, but by
+`MOST_S` at most from one reading to the next. So a time-out that the drone keeps is kept however busy the computer is,
+and a bound that a test asserts is the requirement's.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import selectors
+import threading
+import time
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+MOST_S = 0.05
+"""More than between two readings of a computer that is free: the fake autopilot reads every 0.02 s."""
+
+
+class CalmClock:
+    """Monotonic seconds, for any thread."""
+
+    def __init__(self, real: Callable[[], float] = time.monotonic) -> None:
+        self._real = real
+        self._read_s = self._now_s = real()
+        self._lock = threading.Lock()
+
+    def __call__(self) -> float:
+        """Now."""
+        with self._lock:
+            read_s = self._real()
+            self._now_s += min(read_s - self._read_s, MOST_S)
+            self._read_s = read_s
+            return self._now_s
+
+
+clock = CalmClock()
+"""This process's."""
+
+
+class _Loop(asyncio.SelectorEventLoop):
+    def __init__(self) -> None:
+        super().__init__(_Selector())
+
+    def time(self) -> float:
+        return clock()
+
+
+class _Selector(selectors.DefaultSelector):
+    """Returns often enough for the clock to advance while nothing happens."""
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, Any]]:
+        return super().select(MOST_S / 2 if timeout is None else min(timeout, MOST_S / 2))
+
+
+def run(story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """Runs the coroutine on an event loop whose sleeps and time-outs are by `clock`."""
+    with asyncio.Runner(loop_factory=_Loop) as runner:
+        runner.run(story())
