@@ -13,6 +13,9 @@ from flockd.sim import textures
 from flockd.sim.mesh import Mesh
 from flockd.sim.terrain import grid_height
 
+Spot = tuple[float, float, float]
+"""Along a place's heading, across it, and down."""
+
 
 class Scenery:
     """One world's things, in a fixed order of draws. Read its attributes, change none.
@@ -160,6 +163,24 @@ class Scenery:
     def _ground_z(self, place: _Place) -> float:
         return -float(grid_height(self.heights, self.extent, np.array([place.north]), np.array([place.east]))[0])
 
+    def _box(
+        self,
+        place: _Place,
+        at: Spot,
+        half: Spot,
+        texture: int,
+        tint: FloatArray,
+        tile: tuple[float, float] = (2.0, 2.0),
+    ) -> None:
+        """A box with its middle at ``at`` in the place's axes, turned as the place is."""
+        self.mesh.box(place.at(*at), half, place.heading, texture, tint, tile)
+
+    def _blob(
+        self, place: _Place, at: Spot, radii: Spot, rough: float, texture: int, tint: FloatArray, tile: float
+    ) -> None:
+        """A lump with its middle at ``at`` in the place's axes."""
+        self.mesh.blob(place.at(*at), np.array(radii), rough, self.rng, texture, tint, tile)
+
     def _building(self) -> None:
         rng = self.rng
         floors = int(rng.integers(1, 4)) if rng.random() < 0.8 else int(rng.integers(3, 6))
@@ -194,30 +215,18 @@ class Scenery:
                 corners, np.array([(0, 1, 2), (0, 2, 3)]), facade, tint, tile, wall.at(length, out, z - wall_m)
             )
             if side == 0 and rng.random() < 0.7:
-                entrance = wall.at(rng.uniform(-0.6, 0.6) * length, out, z - 1.0)
-                self.mesh.box(entrance, (0.5, 0.04, 1.05), wall.heading, self.planks, paint_colour(rng), (1.0, 2.0))
+                entrance = rng.uniform(-0.6, 0.6) * length, out, z - 1.0
+                self._box(wall, entrance, (0.5, 0.04, 1.05), self.planks, paint_colour(rng), (1.0, 2.0))
         roof_tint = roof_colour(rng)
         roof = int(rng.choice(self.roofs))
         top = z - wall_m
         if rng.random() < 0.35:
-            self.mesh.box(
-                place.at(0, 0, top - 0.12),
-                (a + 0.5 * overhang, b + 0.5 * overhang, 0.13),
-                place.heading,
-                self.walls[0],
-                roof_tint,
-                (3.0, 3.0),
-            )
+            half = (a + 0.5 * overhang, b + 0.5 * overhang, 0.13)
+            self._box(place, (0, 0, top - 0.12), half, self.walls[0], roof_tint, (3.0, 3.0))
             for _ in range(int(rng.integers(0, 4))):
                 x, y = rng.uniform(-0.7, 0.7) * a, rng.uniform(-0.6, 0.6) * b
-                size = rng.uniform(0.3, 0.9, 3)
-                self.mesh.box(
-                    place.at(x, y, top - 0.2 - size[2]),
-                    (size[0], size[1], size[2]),
-                    place.heading,
-                    self.roofs[1],
-                    paint_colour(rng),
-                )
+                half = tuple(rng.uniform(0.3, 0.9, 3))
+                self._box(place, (x, y, top - 0.2 - half[2]), half, self.roofs[1], paint_colour(rng))
             return
         la, lb = a + overhang, b + overhang
         ridge = la if rng.random() < 0.6 else la * rng.uniform(0.0, 0.6)
@@ -238,10 +247,9 @@ class Scenery:
         self.mesh.add(v, np.array([(0, 1, 2), (0, 2, 3)]), self.planks, paint * 0.6, (2.0, 2.0))
         if rng.random() < 0.6:
             wide = rng.uniform(0.2, 0.45)
-            spot = place.at(rng.uniform(-0.5, 0.5) * ridge, rng.uniform(-0.4, 0.4) * b, top - roof_m)
-            self.mesh.box(
-                spot, (wide, wide, rng.uniform(0.7, 1.3)), place.heading, self.walls[0], paint_colour(rng), (1.5, 1.5)
-            )
+            spot = rng.uniform(-0.5, 0.5) * ridge, rng.uniform(-0.4, 0.4) * b, top - roof_m
+            half = wide, wide, rng.uniform(0.7, 1.3)
+            self._box(place, spot, half, self.walls[0], paint_colour(rng), (1.5, 1.5))
 
     def _container(self) -> None:
         rng = self.rng
@@ -249,14 +257,8 @@ class Scenery:
         place = self._place(a, b, 2 * h)
         if place is not None:
             texture = int(rng.choice([*self.walls, *self.roofs]))
-            self.mesh.box(
-                place.at(0, 0, self._ground_z(place) - h + 0.1),
-                (a, b, h + 0.1),
-                place.heading,
-                texture,
-                paint_colour(rng),
-                (2.4, 2.4),
-            )
+            middle = 0, 0, self._ground_z(place) - h + 0.1
+            self._box(place, middle, (a, b, h + 0.1), texture, paint_colour(rng), (2.4, 2.4))
 
     def _fence(self) -> None:
         rng = self.rng
@@ -273,33 +275,17 @@ class Scenery:
             z = self._ground_z(piece)
             half = a / sections
             if style < 0.35:  # wall
-                self.mesh.box(
-                    piece.at(0, 0, z - h + 0.2), (half, 0.12, h + 0.2), place.heading, self.walls[1], tint, (2.0, 2.0)
-                )
+                self._box(piece, (0, 0, z - h + 0.2), (half, 0.12, h + 0.2), self.walls[1], tint)
             elif style < 0.55:  # hedge
-                self.mesh.box(
-                    piece.at(0, 0, z - h + 0.2),
-                    (half, 0.24, h + 0.2),
-                    place.heading,
-                    self.leaves[0],
-                    leaf_colour(rng),
-                    (1.2, 1.2),
-                )
+                inside = 0, 0, z - h + 0.2
+                self._box(piece, inside, (half, 0.24, h + 0.2), self.leaves[0], leaf_colour(rng), (1.2, 1.2))
             else:
-                self.mesh.box(
-                    piece.at(half, 0, z - h + 0.2), (0.06, 0.06, h + 0.25), place.heading, self.planks, tint, (1.0, 1.0)
-                )
+                self._box(piece, (half, 0, z - h + 0.2), (0.06, 0.06, h + 0.25), self.planks, tint, (1.0, 1.0))
                 rails = (0.35, 1.0, 1.65) if style < 0.8 else (0.95,)
                 thick = 0.08 if style < 0.8 else 0.75 * h
                 for level in rails:
-                    self.mesh.box(
-                        piece.at(0, 0, z - level * h - 0.05),
-                        (half, 0.025, thick),
-                        place.heading,
-                        self.planks,
-                        tint,
-                        (1.0, 1.0),
-                    )
+                    rail = 0, 0, z - level * h - 0.05
+                    self._box(piece, rail, (half, 0.025, thick), self.planks, tint, (1.0, 1.0))
 
     def _car(self) -> None:
         rng = self.rng
@@ -309,24 +295,10 @@ class Scenery:
             return
         z = self._ground_z(place)
         paint = paint_colour(rng)
-        smooth = self.facades[0]
-        self.mesh.box(place.at(0, 0, z - 0.58), (length, width, 0.3), place.heading, self.rock, paint, (4.0, 4.0))
-        self.mesh.box(
-            place.at(-0.15 * length, 0, z - 1.14),
-            (0.55 * length, 0.88 * width, 0.26),
-            place.heading,
-            smooth,
-            np.full(3, 0.12),
-            (9.0, 9.0),
-        )
-        self.mesh.box(
-            place.at(-0.15 * length, 0, z - 1.43),
-            (0.5 * length, 0.85 * width, 0.04),
-            place.heading,
-            self.rock,
-            paint,
-            (4.0, 4.0),
-        )
+        cabin, roof = (0.55 * length, 0.88 * width, 0.26), (0.5 * length, 0.85 * width, 0.04)
+        self._box(place, (0, 0, z - 0.58), (length, width, 0.3), self.rock, paint, (4.0, 4.0))
+        self._box(place, (-0.15 * length, 0, z - 1.14), cabin, self.facades[0], np.full(3, 0.12), (9.0, 9.0))
+        self._box(place, (-0.15 * length, 0, z - 1.43), roof, self.rock, paint, (4.0, 4.0))
         for x in (-0.62, 0.62):
             for y in (-1.0, 1.0):
                 hub = place.at(x * length, y * (width - 0.12), z - 0.31)
@@ -344,18 +316,12 @@ class Scenery:
         self.mesh.frustum(place.at(0, 0, z + 0.3), place.at(0, 0, z - h), (r, 0.7 * r), 8, self.rock, tint)
         style = rng.random()
         if style < 0.4:
-            self.mesh.box(place.at(0.25, 0, z - h), (0.35, 0.1, 0.06), place.heading, self.rock, tint)
+            self._box(place, (0.25, 0, z - h), (0.35, 0.1, 0.06), self.rock, tint)
         elif style < 0.75:
-            self.mesh.box(
-                place.at(r, 0, z - h + 0.4),
-                (0.02, 0.35, 0.35),
-                place.heading,
-                self.facades[1],
-                paint_colour(rng),
-                (0.9, 0.9),
-            )
+            sign = r, 0, z - h + 0.4
+            self._box(place, sign, (0.02, 0.35, 0.35), self.facades[1], paint_colour(rng), (0.9, 0.9))
         else:
-            self.mesh.blob(place.at(0, 0, z - h), np.full(3, 0.2), 0.0, rng, self.rock, np.full(3, 0.5), 2.0)
+            self._blob(place, (0, 0, z - h), (0.2, 0.2, 0.2), 0.0, self.rock, np.full(3, 0.5), 2.0)
 
     def _tree(self) -> None:
         rng = self.rng
@@ -371,62 +337,27 @@ class Scenery:
         trunk_tint = np.array([0.22, 0.15, 0.1]) * rng.uniform(0.6, 1.8)
         r = 0.02 * height + 0.06
         bare = style.bare * height
-        mesh.frustum(
-            place.at(0, 0, z + 0.3),
-            place.at(0, 0, z - max(bare + 0.3, 0.75 * height)),
-            (r, 0.5 * r),
-            7,
-            self.bark,
-            trunk_tint,
-        )
+        top = place.at(0, 0, z - max(bare + 0.3, 0.75 * height))
+        mesh.frustum(place.at(0, 0, z + 0.3), top, (r, 0.5 * r), 7, self.bark, trunk_tint)
         if style.shape == "cone":
             layers = style.layers
             for k in range(layers):
                 low = bare + (height - bare) * k / layers * 0.85
                 high = low + (height - low) * (0.75 if k < layers - 1 else 1.0)
-                mesh.frustum(
-                    place.at(0, 0, z - low),
-                    place.at(0, 0, z - high),
-                    (crown * (1 - 0.75 * k / layers), 0.0),
-                    9,
-                    style.texture,
-                    tint * (1 + 0.1 * k),
-                    (1.5, 1.5),
-                )
-        elif style.shape == "column":
-            mesh.blob(
-                place.at(0, 0, z - (bare + height) / 2),
-                np.array([0.45 * crown, 0.45 * crown, (height - bare) / 2]),
-                0.12,
-                rng,
-                style.texture,
-                tint,
-                1.6,
-            )
-        elif style.shape == "round":
-            mesh.blob(
-                place.at(0, 0, z - (bare + height) / 2),
-                np.array([0.9 * crown, 0.9 * crown, (height - bare) / 2]),
-                0.14,
-                rng,
-                style.texture,
-                tint,
-                2.0,
-            )
+                foot, tip = place.at(0, 0, z - low), place.at(0, 0, z - high)
+                radii = (crown * (1 - 0.75 * k / layers), 0.0)
+                mesh.frustum(foot, tip, radii, 9, style.texture, tint * (1 + 0.1 * k), (1.5, 1.5))
+        elif style.shape in ("column", "round"):
+            share, rough, tile = (0.45, 0.12, 1.6) if style.shape == "column" else (0.9, 0.14, 2.0)
+            radius, middle = share * crown, (0, 0, z - (bare + height) / 2)
+            self._blob(place, middle, (radius, radius, (height - bare) / 2), rough, style.texture, tint, tile)
         elif style.shape == "cloud":
             for _ in range(style.layers + 2):
                 x, y = rng.uniform(-0.55, 0.55, 2) * crown
                 size = rng.uniform(0.35, 0.55) * crown
                 up = rng.uniform(bare + 0.5 * size, max(bare + 0.6 * size, height - size))
-                mesh.blob(
-                    place.at(x, y, z - up),
-                    np.array([size, size, 0.8 * size]),
-                    0.16,
-                    rng,
-                    style.texture,
-                    tint * rng.uniform(0.85, 1.15),
-                    1.6,
-                )
+                shade = tint * rng.uniform(0.85, 1.15)
+                self._blob(place, (x, y, z - up), (size, size, 0.8 * size), 0.16, style.texture, shade, 1.6)
         else:  # bare branches
             for _ in range(9):
                 foot = place.at(0, 0, z - rng.uniform(0.35, 0.72) * height)
@@ -439,54 +370,29 @@ class Scenery:
         r = rng.uniform(0.25, 1.1)
         place = self._place(r, r, 1.3 * r, gap=-0.3)
         if place is not None:
-            z = self._ground_z(place)
-            self.mesh.blob(
-                place.at(0, 0, z - 0.5 * r),
-                np.array([0.8 * r, 0.8 * r, 0.7 * r]),
-                0.2,
-                rng,
-                int(rng.choice(self.leaves)),
-                leaf_colour(rng),
-                1.2,
-            )
+            middle, radii = (0, 0, self._ground_z(place) - 0.5 * r), (0.8 * r, 0.8 * r, 0.7 * r)
+            self._blob(place, middle, radii, 0.2, int(rng.choice(self.leaves)), leaf_colour(rng), 1.2)
 
     def _rock(self) -> None:
         rng = self.rng
         r = rng.uniform(0.15, 0.8)
         place = self._place(r, r, r, gap=-0.2)
         if place is not None:
-            z = self._ground_z(place)
-            radii = r * rng.uniform(0.55, 0.8, 3)
-            self.mesh.blob(
-                place.at(0, 0, z - 0.2 * r),
-                radii,
-                0.2,
-                rng,
-                self.rock,
-                np.full(3, rng.uniform(0.15, 0.5)) * rng.uniform(0.85, 1.1, 3),
-                1.5,
-            )
+            radii = tuple(r * rng.uniform(0.55, 0.8, 3))
+            colour = np.full(3, rng.uniform(0.15, 0.5)) * rng.uniform(0.85, 1.1, 3)
+            self._blob(place, (0, 0, self._ground_z(place) - 0.2 * r), radii, 0.2, self.rock, colour, 1.5)
 
     def _pebble(self) -> None:
         """Low things may lie under the path too."""
         rng = self.rng
         place = _Place(rng.uniform(-0.9, 0.9) * self.extent, rng.uniform(-0.9, 0.9) * self.extent, 0.0)
         size = rng.uniform(0.05, 0.2)
-        z = self._ground_z(place)
+        middle = 0, 0, self._ground_z(place)
         if rng.random() < 0.6:
-            self.mesh.blob(
-                place.at(0, 0, z),
-                np.array([size, size, 0.7 * size]),
-                0.2,
-                rng,
-                self.rock,
-                np.full(3, rng.uniform(0.1, 0.6)),
-                0.8,
-            )
+            stone = np.full(3, rng.uniform(0.1, 0.6))
+            self._blob(place, middle, (size, size, 0.7 * size), 0.2, self.rock, stone, 0.8)
         else:
-            self.mesh.blob(
-                place.at(0, 0, z), np.array([size, size, 0.8 * size]), 0.25, rng, self.leaves[1], leaf_colour(rng), 0.8
-            )
+            self._blob(place, middle, (size, size, 0.8 * size), 0.25, self.leaves[1], leaf_colour(rng), 0.8)
 
     def _horizon(self) -> None:
         """Far woods and hills beyond the extent: a ring of lumps, none nearer than 1.3 extents."""
