@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import socket
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from flockd.core.messages import FloatArray
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, Ground
 from flockd.sim.autopilot.fake_vehicle import Demand, MotionState
+from flockd.sim.free_ports import free_port
 from flockd.sim.ground_station import FULL_STICK_M_S, home_deg
 from flockd.sim.leftovers import described, px4_instance, user_of_port
 from flockd.sim.processes import Program, Programs
@@ -94,7 +94,7 @@ class SimulatedAutopilots:
     def __init__(self, scenario: ScenarioConfig, speed_factor: float, ground: Ground) -> None:
         """``ground``: of the world, which range finders measure to."""
         self._scenario, self._speed_factor, self._ground = scenario, speed_factor, ground
-        self.ports = tuple(Ports(_free_port(), _free_port()) for _ in scenario.vehicles)
+        self.ports = tuple(Ports(free_port(), free_port()) for _ in scenario.vehicles)
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -237,9 +237,3 @@ class _Flown:
             heading = np.array([demand.yaw_rad])
             vehicles.step(demand.velocity[None], heading, interval_s, heights=np.array([-demand.down_m]))
         return MotionState(vehicles.position[0], vehicles.velocity[0], vehicles.R_ned_body[0])
-
-
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import socket
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -26,6 +25,7 @@ from flockd.sim.clearances import with_obstacles
 from flockd.sim.daemons import Daemons, fleet_configs
 from flockd.sim.exact_states import HandPilot, exact_states_at
 from flockd.sim.frame_server import FrameServer
+from flockd.sim.free_ports import free_endpoint
 from flockd.sim.ground_station import GroundStation, Mode
 from flockd.sim.processes import Program
 from flockd.sim.swarm import Flight
@@ -86,7 +86,7 @@ def fly_fleet(
             else SimulatedAutopilots(scenario, speed_factor, cameras.ground_height)
         )
         stack.enter_context(autopilots)
-        ports, endpoint = autopilots.ports, _free_endpoint()
+        ports, endpoint = autopilots.ports, free_endpoint()
         configs = fleet_configs(scenario, sitl, ports=ports, endpoint=endpoint, speed_factor=speed_factor)
         names = [None if vehicle.by_hand else f"drone{i + 1}" for i, vehicle in enumerate(scenario.vehicles)]
         assert configs[0].source is not None
@@ -360,12 +360,6 @@ def _kept(folder: Path, logs: Path) -> Iterator[None]:
 
 def _logs_in(folder: Path) -> list[Path]:
     return [*folder.glob("*.log"), *folder.glob("drone*.yaml")]
-
-
-def _free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def _rate(before: tuple[float, float] | None, after: tuple[float, float] | None) -> float | None:

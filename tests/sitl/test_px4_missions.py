@@ -13,7 +13,7 @@ import pytest
 
 from flockd.core.config import load_scenario
 from flockd.core.data import data_path
-from tools.checks.px4_missions import MISSIONS, Mission, kept, main, rows
+from tools.checks.px4_missions import MISSIONS, Mission, main, rows
 
 PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
 
@@ -52,8 +52,8 @@ def test_each_goal_of_a_flight_has_a_row() -> None:
     assert (back.goal, back.arrived, back.time_s, back.error_m) == ("4, 0", True, 7.0, 1.0)
     assert back.farthest_m == pytest.approx(5**0.5, abs=0.01)
     assert back.closest_m == 4.0
-    assert kept(there)
-    assert kept(back)
+    assert there.kept
+    assert back.kept
 
 
 def test_a_flight_that_left_its_mode_or_its_leader_is_not_kept() -> None:
@@ -70,7 +70,7 @@ def test_a_flight_that_left_its_mode_or_its_leader_is_not_kept() -> None:
         log = _log(np.stack([led, behind], axis=1), np.full((31, 2), np.nan), with_modes)
         first, last = rows(MISSIONS[1], scenario, log)
         assert (first.time_s, last.time_s, last.error_m) == (9.0, 14.0, 0.0)
-        assert kept(last) is good
+        assert last.kept is good
 
 
 def test_without_px4_it_says_what_to_do(

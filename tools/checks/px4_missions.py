@@ -13,15 +13,13 @@ flock was not at a goal, or two drones came too close.
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import socket
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
@@ -31,13 +29,13 @@ from flockd.cli.sim_fleet import DEFAULT_SPEED_FACTOR, SITL
 from flockd.core.choices import AutopilotKind
 from flockd.core.config import ScenarioConfig, load_drone, load_scenario
 from flockd.core.data import data_path
-from flockd.core.errors import FlockdError
 from flockd.core.messages import FloatArray
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.flight_folder import save_flight, write_report_files
 from flockd.sim.fleet import fly_fleet
+from flockd.sim.free_ports import free_endpoint
 from flockd.sim.start import with_drones
-from tools.measure.bench_daemon import free_port
+from tools.checks.px4_sitl import run_trials
 
 NEAR_M = 2.0
 """The middle of the flock has to come as near to a goal."""
@@ -87,6 +85,12 @@ class Row:
     modes: str
     """Of each autopilot, in order."""
 
+    @property
+    def kept(self) -> bool:
+        """The flight went as it should, as far as this goal."""
+        steady = all(len(modes.split(" > ")) == 1 for modes in self.modes.split(", "))
+        return self.arrived and steady and self.closest_m > CLOSEST_M and self.farthest_m < FOLLOWS_M
+
 
 class Order:
     """An operator's order, sent once by `flockd fleet goto` while the flight goes on."""
@@ -117,7 +121,7 @@ def fly(
     """One flight, with its report in the new folder ``out``; its goals, in order. Raises FlockdError."""
     scenario = load_scenario(data_path("config") / mission.scenario, {"duration_s": mission.duration_s})
     scenario = with_drones(scenario, mission.drones)
-    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    endpoint = free_endpoint()
     sitl = load_drone(data_path("config") / SITL)
     sitl = sitl.model_copy(update={"telemetry": sitl.telemetry.model_copy(update={"connect": (endpoint,)})})
     order = Order(mission, endpoint)
@@ -182,12 +186,6 @@ def _faults(log: FlightLog) -> list[str]:
     return [f"{drone} did not fly to the end: {why}" for drone, why in fleet.handed_over.items()] + fleet.notes
 
 
-def kept(row: Row) -> bool:
-    """The flight went as it should, as far as this goal."""
-    steady = all(len(modes.split(" > ")) == 1 for modes in row.modes.split(", "))
-    return row.arrived and steady and row.closest_m > CLOSEST_M and row.farthest_m < FOLLOWS_M
-
-
 def _line(row: Row) -> str:
     reached = "never" if row.time_s is None else f"{row.time_s:.1f} s"
     verdict = "arrived" if row.arrived else "NOT ARRIVED"
@@ -200,36 +198,30 @@ def _line(row: Row) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Prints a table, or JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", choices=[mission.name for mission in MISSIONS], help="these flights alone")
     parser.add_argument("--autopilot", choices=get_args(AutopilotKind), default="px4")
     parser.add_argument(
         "--speed-factor", type=float, default=DEFAULT_SPEED_FACTOR, help="how fast simulated time passes (%(default)s)"
     )
     parser.add_argument("--out", type=Path, help="keep logs and reports in this folder")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    args = parser.parse_args(arguments)
+    return run_trials(
+        parser, MISSIONS, _fly_all, line=_line, rows="goals", arguments=arguments,
+        header=f"{'flight':14}{'goal, m':12}{'':13}{'there':9}{'error':>8}{'farthest':>11}{'closest':>11}   modes",
+    )  # fmt: skip
+
+
+def _fly_all(missions: Sequence[Mission], args: argparse.Namespace, told: Callable[[Row], None]) -> list[Row]:
     found: list[Row] = []
     with ExitStack() as stack:
         out = args.out or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="flockd-")))
-        if not args.json:
-            print(f"{'flight':14}{'goal, m':12}{'':13}{'there':9}{'error':>8}{'farthest':>11}{'closest':>11}   modes")
-        try:
-            for mission in MISSIONS:
-                if args.only is not None and mission.name not in args.only:
-                    continue
-                flown = fly(
-                    mission, args.autopilot, args.speed_factor, out / mission.name,
-                    lambda line: print(line, file=sys.stderr),
-                )  # fmt: skip
-                found += flown
-                if not args.json:
-                    print(*map(_line, flown), sep="\n", flush=True)
-        except FlockdError as error:
-            print(error, file=sys.stderr)
-            return int(error.exit_code)
-    if args.json:
-        print(json.dumps({"goals": [{**asdict(row), "kept": kept(row)} for row in found]}, indent=2))
-    return 0 if all(kept(row) for row in found) else 1
+        for mission in missions:
+            flown = fly(
+                mission, args.autopilot, args.speed_factor, out / mission.name,
+                lambda line: print(line, file=sys.stderr),
+            )  # fmt: skip
+            found += flown
+            for row in flown:
+                told(row)
+    return found
 
 
 if __name__ == "__main__":

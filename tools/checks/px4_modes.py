@@ -11,38 +11,34 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import json
 import os
 import signal
-import socket
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 
 from flockd.core.config import DroneConfig, ScenarioConfig, load, load_scenario
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.data import data_path
-from flockd.core.errors import FlockdError, UnavailableError
+from flockd.core.errors import UnavailableError
 from flockd.core.messages import Setpoint
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.sources import clock_at
-from flockd.sim.autopilots import Ports, Px4s, px4_folder
+from flockd.sim.autopilots import Ports, Px4s
 from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.daemons import Daemons, fleet_configs
 from flockd.sim.frame_server import FrameServer
+from flockd.sim.free_ports import free_endpoint
 from flockd.sim.ground_station import GroundStation
 from flockd.sim.processes import Program, Programs
 from flockd.sim.start import with_drones
+from tools.checks.px4_sitl import SitlRun, run_trials
 from tools.checks.soak import small
-from tools.measure.bench_daemon import free_port
 
 HEIGHT_M = 4.0
 SETPOINTS_HZ = 20.0
@@ -151,25 +147,14 @@ class Result:
         return self.ended_in == self.promised
 
 
-class Px4Flight:
-    """One PX4 in offboard flight between ``__enter__`` and ``__exit__``."""
+class Px4Flight(SitlRun):
+    """One PX4 in offboard flight."""
 
     def __init__(self, fault: Fault, speed_factor: float) -> None:
+        super().__init__()
         self._fault, self._speed_factor = fault, speed_factor
         self._clock = clock_at(speed_factor)
-        self._stack = ExitStack()
         self._sticks = False
-
-    def __enter__(self) -> Self:
-        try:
-            self._come_up()
-        except BaseException:
-            self._stack.close()
-            raise
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
 
     def _come_up(self) -> None:
         folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="px4-modes-")))
@@ -206,7 +191,7 @@ class Px4Flight:
         """A whole `flockd run`, with small images of the scenario's world and nobody else in it."""
         sitl = load(data_path("config") / "px4_sitl.yaml")
         assert isinstance(sitl, DroneConfig)
-        endpoint, speed_factor = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", self._speed_factor
+        endpoint, speed_factor = free_endpoint(), self._speed_factor
         scenario = scenario.model_copy(update={"drone": small(scenario.drone)})
         (config,) = fleet_configs(scenario, sitl, ports=[port], endpoint=endpoint, speed_factor=speed_factor)
         config = config.model_copy(update={"safety": config.safety.model_copy(update={"alone_s": None})})
@@ -260,15 +245,6 @@ class Px4Flight:
     def mode(self) -> str:
         """PX4's, now."""
         return self.station.mode(0)
-
-    def shell(self, *command: str) -> None:
-        """Runs a command in PX4's shell. Raises UnavailableError."""
-        program = px4_folder(os.environ) / f"bin/px4-{command[0]}"
-        done = subprocess.run(
-            [program, "--instance", "0", *command[1:]], capture_output=True, text=True, check=False, timeout=60.0
-        )
-        if done.returncode != 0:
-            raise UnavailableError(f"PX4 refused `{' '.join(command)}`: {(done.stdout + done.stderr).strip()}")
 
     def lose_estimates(self) -> None:
         """The estimator has neither position nor height any more. Stopping EKF2 would stop PX4's simulated time."""
@@ -365,22 +341,11 @@ def main() -> int:
     if sys.argv[1:2] == ["--companion"]:
         asyncio.run(_send_setpoints(sys.argv[2], float(sys.argv[3]), float(sys.argv[4])))
     parser = argparse.ArgumentParser(description="Which modes PX4 SITL ends in after faults.")
-    parser.add_argument("--only", nargs="+", choices=[fault.name for fault in FAULTS], help="these faults alone")
     parser.add_argument("--speed-factor", type=float, default=1.0, help="how fast simulated time passes (1)")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    args = parser.parse_args()
-    chosen = [fault for fault in FAULTS if args.only is None or fault.name in args.only]
-    try:
-        px4_folder(os.environ)
-        if not args.json:
-            print(f"{'fault':22}{'promised':13}{'ended in':24}{'':17}modes since the fault; why; drift")
-        results = run(chosen, args.speed_factor, lambda result: None if args.json else print(_line(result), flush=True))
-    except FlockdError as error:
-        print(error, file=sys.stderr)
-        return int(error.exit_code)
-    if args.json:
-        print(json.dumps({"faults": [{**vars(result), "kept": result.kept} for result in results]}, indent=2))
-    return 0 if all(result.kept for result in results) else 1
+    return run_trials(
+        parser, FAULTS, lambda faults, args, told: run(faults, args.speed_factor, told), line=_line, rows="faults",
+        header=f"{'fault':22}{'promised':13}{'ended in':24}{'':17}modes since the fault; why; drift",
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -10,34 +10,31 @@ parameters from the start. Exit code 1: status did not show a reason, or kept it
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import re
-import socket
-import subprocess
 import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from pymavlink import mavutil
 
 from flockd.core.config import DroneConfig, load, load_scenario
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.data import data_path
-from flockd.core.errors import FlockdError, UnavailableError
+from flockd.core.errors import UnavailableError
 from flockd.fleet.fleet_status import status_rows
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.autopilot.refusal_reasons import NOT_STREAMING, REASONS, SEVERAL_SENDERS
-from flockd.sim.autopilots import Px4s, px4_folder
+from flockd.sim.autopilots import Px4s
 from flockd.sim.daemons import Daemons
+from flockd.sim.free_ports import free_endpoint
 from flockd.sim.start import with_drones
-from tools.measure.bench_daemon import free_port
+from tools.checks.px4_sitl import SitlRun, run_trials
 
 FLEET = "reasons"
 START_S, SHOWN_S, GONE_S = 300.0, 60.0, 60.0
@@ -174,27 +171,15 @@ class Result:
         return self.shown_s is not None and self.gone
 
 
-class Bench:
-    """One PX4 and one `flockd run`, between ``__enter__`` and ``__exit__``, and what `flockd status` shows of them."""
+class Bench(SitlRun):
+    """One PX4 and one `flockd run`, and what `flockd status` shows of them."""
 
     def __init__(self, instance: int, parameters: Mapping[str, str], *, well: bool) -> None:
         """``well``: waits at the start until nothing is refused."""
-        self._instance, self._parameters, self._well = instance, parameters, well
-        self._stack = ExitStack()
+        super().__init__(instance)
+        self._parameters, self._well = parameters, well
         self._other: threading.Thread | None = None
         self._other_ends = threading.Event()
-
-    def __enter__(self) -> Self:
-        try:
-            self._come_up()
-        except BaseException:
-            self._stack.close()
-            raise
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.end_other_computer()
-        self._stack.close()
 
     def _come_up(self) -> None:
         folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="px4-reasons-")))
@@ -202,11 +187,12 @@ class Bench:
         px4s = Px4s(scenario, 1.0, os.environ, folder, {"GF_ACTION": "2", **self._parameters}, self._instance)
         self._stack.enter_context(px4s).start()
         self._console = folder / f"px4_{self._instance}.log"
-        endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+        endpoint = free_endpoint()
         config = _config(px4s.ports[0].offboard, endpoint)
         daemons = Daemons([config], folder=folder, recordings=folder, environment=os.environ)
         self._stack.enter_context(daemons).start()
         self._watcher = self._stack.enter_context(FleetWatcher(FLEET, listen=[], connect=[endpoint]))
+        self._stack.callback(self.end_other_computer)
         self.wait_for(lambda: bool(self._flight()), START_S, "the daemon says nothing")
         if self._well:
             self.wait_for(self.ready, START_S, "PX4 did not become ready to be armed")
@@ -242,16 +228,6 @@ class Bench:
     def console_length(self) -> int:
         """Characters so far."""
         return len(self._console.read_text(errors="replace"))
-
-    def shell(self, *command: str) -> None:
-        """Runs a command in PX4's shell. Raises UnavailableError."""
-        program = px4_folder(os.environ) / f"bin/px4-{command[0]}"
-        done = subprocess.run(
-            [program, "--instance", str(self._instance), *command[1:]],
-            capture_output=True, text=True, check=False, timeout=60.0,
-        )  # fmt: skip
-        if done.returncode != 0:
-            raise UnavailableError(f"PX4 refused `{' '.join(command)}`: {(done.stdout + done.stderr).strip()}")
 
     def begin_other_computer(self) -> None:
         """Starts a thread that sends the heartbeats of an onboard computer."""
@@ -324,8 +300,7 @@ def _config(port: int, endpoint: str) -> DroneConfig:
     config = load(data_path("config") / "px4_sitl.yaml")
     assert isinstance(config, DroneConfig)
     assert config.source is not None
-    nowhere = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    frames = config.source.shared_memory.model_copy(update={"connect": (nowhere,)})
+    frames = config.source.shared_memory.model_copy(update={"connect": (free_endpoint(),)})
     return config.model_copy(
         update={
             "autopilot": AutopilotParameters(address=f"udpin://127.0.0.1:{port}"),
@@ -356,24 +331,11 @@ def _row(result: Result) -> str:
 def main() -> int:
     """Prints a table, or JSON."""
     parser = argparse.ArgumentParser(description="Why PX4 SITL refuses, and what `flockd status` shows of it.")
-    parser.add_argument("--only", nargs="+", choices=[one.name for one in PROVOCATIONS], help="these alone")
     parser.add_argument("--instance", type=int, default=0, help="of PX4, 0 to 9 (0)")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    args = parser.parse_args()
-    chosen = [one for one in PROVOCATIONS if args.only is None or one.name in args.only]
-    try:
-        px4_folder(os.environ)
-        if not args.json:
-            print("| reason | provoked by | PX4 says | status shows | after s |\n|---|---|---|---|---|", flush=True)
-        results = run(chosen, args.instance, lambda result: None if args.json else print(_row(result), flush=True))
-    except FlockdError as error:
-        print(error, file=sys.stderr)
-        return int(error.exit_code)
-    if args.json:
-        print(json.dumps({"reasons": [asdict(result) for result in results]}, indent=2))
-    else:
-        print(f"{sum(result.kept for result in results)} of {len(results)} reasons shown, and gone again")
-    return 0 if all(result.kept for result in results) else 1
+    return run_trials(
+        parser, PROVOCATIONS, lambda provocations, args, told: run(provocations, args.instance, told), line=_row,
+        rows="reasons", header="| reason | provoked by | PX4 says | status shows | after s |\n|---|---|---|---|---|",
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -20,7 +20,6 @@ import csv
 import ctypes
 import json
 import os
-import socket
 import sys
 import tempfile
 import time
@@ -42,8 +41,9 @@ from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.daemons import Daemons
 from flockd.sim.frame_server import FrameServer
+from flockd.sim.free_ports import free_endpoint, free_port
 from flockd.sim.ground_station import Poses
-from tools.measure.bench_daemon import at, free_port, of_the_unit
+from tools.measure.bench_daemon import at, of_the_unit
 
 SHRINK = 4
 """Of the simulator's front camera, the only one: 120 x 160 pixels, so that 100,000 steps are hours and not days."""
@@ -218,8 +218,7 @@ def _add(samples: dict[str, array[float]], facts: Mapping[str, float]) -> None:
 
 def soak_daemon(minutes: float) -> dict[str, array[float]]:
     """Samples of each quantity, from the moment in which the daemon is ready and flies."""
-    port = free_port(socket.SOCK_DGRAM)
-    frames_at, telemetry_at = (f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}" for _ in range(2))
+    port, frames_at, telemetry_at = free_port(), free_endpoint(), free_endpoint()
     config = daemon_config(port, frames_at, telemetry_at)
     world = scenario().model_copy(update={"drone": config})
     with tempfile.TemporaryDirectory() as name, FakeAutopilot(port, height_m=HEIGHT_M) as autopilot:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import socket
 import sys
 import tempfile
 import time
@@ -30,6 +29,7 @@ from flockd.onboard.recording.reader import Recording
 from flockd.onboard.sources import FramePublisher
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.daemons import Daemons
+from flockd.sim.free_ports import free_endpoint, free_port
 
 READY_BAR_S = 3.0
 MEMORY_BAR_MB = 350.0
@@ -56,7 +56,7 @@ def main() -> int:
 
 def measure(seconds: float, recording: Path | None) -> dict[str, float]:
     """Every figure by name."""
-    port, endpoint = free_port(socket.SOCK_DGRAM), f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    port, endpoint = free_port(), free_endpoint()
     config = at(port, endpoint)
     with tempfile.TemporaryDirectory() as name, FakeAutopilot(port, height_m=2.5):
         folder = Path(name)
@@ -143,13 +143,6 @@ def status_mb(pid: int) -> dict[str, float]:
     """What Linux says of a process's memory."""
     lines = (line.split() for line in Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines())
     return {words[0].rstrip(":"): int(words[1]) / 1024 for words in lines if words[-1] == "kB"}
-
-
-def free_port(kind: socket.SocketKind) -> int:
-    """One that nobody uses now."""
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import os
 import re
-import socket
 import subprocess
 import sys
 import time
@@ -21,6 +20,8 @@ from pathlib import Path
 
 import numpy as np
 from playwright.sync_api import Browser, Page, ViewportSize, expect, sync_playwright
+
+from flockd.sim.free_ports import free_endpoint
 
 _RUN = "import sys; from flockd.cli import main; sys.exit(main())"
 _ARGUMENTS = ("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking")
@@ -107,13 +108,6 @@ def chromium() -> Iterator[Browser]:
     with sync_playwright() as playwright:
         path = os.environ.get("CHROMIUM", "/usr/bin/chromium")
         yield playwright.chromium.launch(executable_path=path, args=[*_ARGUMENTS])
-
-
-def free_endpoint() -> str:
-    """Of a port that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def _heard_hz(page: Page) -> float:

@@ -32,9 +32,9 @@ from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
+from flockd.sim.free_ports import free_endpoint
 from tests.fleet.foxglove_server.websocket_client import FoxgloveClient
 from tools.docs.foxglove_layout import LAYOUT, layout
-from tools.measure.bench_fleet_page import free_endpoint
 
 FRONT = {"name": "front", "size_px": [640, 480], "intrinsics": {"fx": 300.0, "fy": 300.0, "cx": 320.0, "cy": 240.0}}
 ABOUT = AboutMessage(

@@ -16,7 +16,8 @@ from typing import NamedTuple
 import pytest
 from playwright.sync_api import Page, expect
 
-from tools.measure.bench_fleet_page import NARROW, PATIENCE_MS, chromium, free_endpoint, made_up_drones, served_page
+from flockd.sim.free_ports import free_endpoint
+from tools.measure.bench_fleet_page import NARROW, PATIENCE_MS, chromium, made_up_drones, served_page
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

@@ -11,7 +11,7 @@ from flockd.fleet.page.live_fleet import LiveFleet
 from flockd.fleet.watcher import FleetWatcher, _heard
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
-from tools.measure.bench_fleet_page import free_endpoint
+from flockd.sim.free_ports import free_endpoint
 
 ABOUT = AboutMessage(version="1.2.3", configuration={"safety": {"gate": {"fence_radius_m": 40.0}}}, commands=["hold"])
 

@@ -22,6 +22,7 @@ from flockd.core.messages import Frame, FrameSet
 from flockd.onboard.sources import FramePublisher, shared_memory
 from flockd.onboard.sources.shared_memory import SharedMemorySource
 from flockd.onboard.telemetry import zenoh_session
+from flockd.sim.free_ports import free_endpoint
 from tests.onboard.sources.camera_images import SIZE, scene
 
 CAMERAS = ("front", "back")
@@ -29,9 +30,7 @@ CAMERAS = ("front", "back")
 
 @pytest.fixture
 def endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return free_endpoint()
 
 
 @pytest.fixture

@@ -25,15 +25,14 @@ from flockd.core.messages import (
 )
 from flockd.onboard.telemetry import TOPICS, publish_step
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
+from flockd.sim.free_ports import free_endpoint
 
 Received = queue.Queue[tuple[str, dict[str, object]]]
 
 
 @pytest.fixture
 def endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return free_endpoint()
 
 
 @pytest.fixture
