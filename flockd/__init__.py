@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from flockd.flight.geometry import PinholeCamera, RigidTransform, build_rig, fit_rigid, ransac_rigid
     from flockd.flight.perception import Perception, load_networks
     from flockd.flight.pilot import FlockPilot
+    from flockd.flight.pilot.ground import level_ground
     from flockd.flight.safety import Gate
     from flockd.flight.tracking import Measurement, Tracker, TrackingParameters
     from flockd.ground.pictures import PictureDetector
@@ -42,6 +43,7 @@ __all__ = [
     "VehicleState",
     "build_rig",
     "fit_rigid",
+    "level_ground",
     "load_drone",
     "load_networks",
     "ransac_rigid",
@@ -54,6 +56,7 @@ _HOMES = {
     "flockd.flight.geometry": ("PinholeCamera", "RigidTransform", "build_rig", "fit_rigid", "ransac_rigid"),
     "flockd.flight.perception": ("Perception", "load_networks"),
     "flockd.flight.pilot": ("FlockPilot",),
+    "flockd.flight.pilot.ground": ("level_ground",),
     "flockd.flight.safety": ("Gate",),
     "flockd.flight.tracking": ("Measurement", "Tracker", "TrackingParameters"),
     "flockd.ground.pictures": ("PictureDetector",),

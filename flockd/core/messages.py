@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Annotated
 
 import numpy as np
@@ -32,6 +33,39 @@ class Shape:
 Vector2 = Annotated[FloatArray, Shape((2,))]
 Vector3 = Annotated[FloatArray, Shape((3,))]
 Matrix3 = Annotated[FloatArray, Shape((3, 3))]
+
+
+class ReasonKind(StrEnum):
+    """What of a step a reason explains the lack of."""
+
+    INPUT = "input"
+    """All of it: the frames or the vehicle state cannot be."""
+    HEIGHT = "height"
+    """The height's wanted source."""
+    CAMERA = "camera"
+    """A camera's image, or part of what perception makes of it."""
+    PAIR = "pair"
+    """The pair of frame sets."""
+    PROPOSAL = "proposal"
+    """A region that may show a drone."""
+    EGO_MOTION = "ego_motion"
+    NEIGHBOUR = "neighbour"
+    """A neighbour, or its motion."""
+    RECORDED = "recorded"
+    """Unknown: recordings keep the text alone."""
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why a step lacks something."""
+
+    kind: ReasonKind
+    text: str
+    """One short sentence, the same for each occurrence; for people."""
+
+    def __str__(self) -> str:
+        return self.text
+
 
 UNCLASSED = 255
 """Label of pixels that are not to be used: too near a drone's outline to be sure of, or a drone's that is not detected.
@@ -306,17 +340,17 @@ class PilotOutput:
     """By the label of the detection."""
     neighbours: tuple[Neighbour, ...]
     command: VelocityCommand
-    reasons: tuple[str, ...] = ()
-    """Why something is missing: each is one short sentence."""
+    reasons: tuple[Reason, ...] = ()
+    """Why something is missing; recorded as their texts."""
     counts: Mapping[str, int] = field(default_factory=dict)
-    """Estimates refused in this step, by reason."""
+    """Estimates refused in this step, by the reason's text."""
     stages_ms: Mapping[str, float] = field(default_factory=dict)
     """Time each stage took, as measured by the caller's clock; empty without one."""
     mission: MissionStatus | None = None
     """None for the paper's circle and tangent, which has no goal and no end."""
-    noisy_cameras: tuple[str, ...] | None = None
-    """Whose images were noise, and were not used; None: no camera's."""
+    noisy_cameras: tuple[str, ...] = ()
+    """Whose images were noise, and were not used."""
     ground: GroundEstimate | None = None
-    """What the height gave as the ground; None: level ground below the barometer's height, or no scale at all."""
+    """From the range finder, or the barometer in its place; None: no range finder is wanted, or there is no scale."""
     obstacles: ObstacleRanges | None = None
     """The local map; None where obstacles are not looked for."""

@@ -76,9 +76,8 @@ class TruthPerception:
         if {"depth", "segmentation"} <= self._swap:
             return true
         learned = self._learned.scene(frame, camera, ground)
-        depth = true.depth if "depth" in self._swap else learned.depth
         drones = true if "segmentation" in self._swap else learned
-        return replace(drones, depth=depth, open=None if "depth" in self._swap else learned.open)
+        return replace(drones, depth=true.depth if "depth" in self._swap else learned.depth)
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         """The true range of the drone nearest to each crop's middle, or the learned one."""

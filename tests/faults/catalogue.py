@@ -428,7 +428,7 @@ CATALOGUE = (
         (
             f"{_HERE}range_finder.py::test_the_range_finder_lies",
             f"{_HERE}range_finder.py::test_without_the_barometer_a_lie_is_no_scale_and_ends_in_hold",
-            "tests/flight/perception/depth/test_contradiction.py",
+            "tests/flight/pilot/ground/test_contradiction.py",
         ),
         within_s=3.0,
     ),

@@ -16,6 +16,7 @@ from flockd.core.messages import (
     EgoMotion,
     Float32Array,
     FloatArray,
+    GroundEstimate,
     IntArray,
     ObstacleRanges,
     UInt8Array,
@@ -81,33 +82,39 @@ class ObstacleRanging:
         self._triangulations = {name: _Triangulation(camera) for name, camera in rig.cameras.items()}
         self._bins = 1 + math.ceil(_bin(parameters.range_m))
 
-    def ranges(self, observation: Observation, ego: EgoMotion | None = None) -> ObstacleRanges:
-        """Of one observation, whose depth has its scale, and of the flow since the one before where `ego` is known."""
+    def ranges(
+        self, observation: Observation, ego: EgoMotion | None = None, ground: GroundEstimate | None = None
+    ) -> ObstacleRanges:
+        """Of one observation's depth, and of the flow since the one before where `ego` is known.
+
+        ``ground``: below the drone; None: level, at the autopilot's height.
+        """
         R_ned_body = observation.vehicle.R_ned_body.astype(np.float32)
         parts = [_NOTHING]
         for name, camera in observation.cameras.items():
             origin = R_ned_body @ self._rig.cameras[name].T_body_camera.translation.astype(np.float32)
-            places = (R_ned_body @ self._rays[name]) * camera.depth[_GRID, _GRID].ravel() + origin[:, None]
-            relative = np.full(places.shape[1], self._parameters.range_sigma, np.float32)
-            parts.append(self._about_level(_Points(places, relative, camera.labels[_GRID, _GRID].ravel())))
+            if camera.depth is not None:
+                places = (R_ned_body @ self._rays[name]) * camera.depth[_GRID, _GRID].ravel() + origin[:, None]
+                relative = np.full(places.shape[1], self._parameters.range_sigma, np.float32)
+                parts.append(self._about_level(_Points(places, relative, camera.labels[_GRID, _GRID].ravel())))
             if ego is not None and observation.previous is not None and camera.flow is not None:
                 moved = self._triangulations[name].points(ego, observation.previous, camera)
                 ahead = R_ned_body @ moved.places + origin[:, None]
                 parts.append(self._about_level(_Points(ahead, moved.relative_sigma, moved.labels)))
-        return self._nearest(observation, _Points.concatenate(parts))
+        return self._nearest(observation, _Points.concatenate(parts), ground)
 
     def _about_level(self, points: _Points) -> _Points:
         """Those that are in the drone's band of heights, or show how far it sees."""
         return points.where((np.abs(points.places[2]) <= self._parameters.height_band_m) | _is_level(*points.places))
 
-    def _nearest(self, observation: Observation, points: _Points) -> ObstacleRanges:
+    def _nearest(self, observation: Observation, points: _Points, ground: GroundEstimate | None) -> ObstacleRanges:
         """Of places (3, n) metres NED from the drone."""
         p, labels = self._parameters, points.labels
         north, east, down = points.places
         away_m = np.hypot(north, east)
         sectors = np.round(np.arctan2(east, north) * (SECTORS / (2 * math.pi))).astype(np.int64) % SECTORS
         in_band = np.abs(down) <= p.height_band_m
-        above_ground = down <= _ground_down_m(observation, north, east) - _GROUND_MARGIN_M
+        above_ground = down <= _ground_down_m(observation, ground, north, east) - _GROUND_MARGIN_M
         counts = in_band & above_ground & (labels == 0) & (away_m <= p.range_m)
         range_m, relative = self._agreed(
             sectors[counts], away_m[counts].astype(float), points.relative_sigma[counts].astype(float)
@@ -141,9 +148,10 @@ class ObstacleRanging:
         return mean_m, summed(relative)[first] / in_first
 
 
-def _ground_down_m(observation: Observation, north: Float32Array, east: Float32Array) -> float | Float32Array:
+def _ground_down_m(
+    observation: Observation, ground: GroundEstimate | None, north: Float32Array, east: Float32Array
+) -> float | Float32Array:
     """How far below the drone the ground is under points (n,): level, or the plane that ranges to it tell."""
-    ground = observation.ground
     if ground is None:
         return observation.vehicle.height_m
     return np.asarray(ground.height_m - north * ground.slope[0] - east * ground.slope[1], np.float32)

@@ -12,7 +12,7 @@ from flockd.flight.perception.detection.instances import Instance
 
 @dataclass(frozen=True, eq=False)
 class OpenDepth:
-    """What a network says of depth while its scale is open."""
+    """Depth that a network knows up to its scale."""
 
     inverse: Float32Array
     """(h, w): a factor makes 1/m of it."""
@@ -24,13 +24,11 @@ class OpenDepth:
 class SceneMaps:
     """What the networks say of one image."""
 
-    depth: Float32Array
-    """(h, w) metres along the optical axis; the sky is very far. All NaN while the scale is open."""
+    depth: Float32Array | OpenDepth
+    """(h, w) metres along the optical axis, the sky very far; or what ground of known height gives its scale."""
     labels: UInt8Array
     """(h, w) 0 for background, then one value a drone."""
     instances: tuple[Instance, ...]
-    open: OpenDepth | None = None
-    """What is there instead of metres, for `flockd.flight.perception.depth` to fix."""
     uncertain: BoolArray | None = None
     """(h, w) pixels of the drones that may just as well be background; None: no such."""
     logit: Float32Array | None = None

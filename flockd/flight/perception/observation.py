@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from flockd.core.messages import (
     Detection,
     Float32Array,
-    FloatArray,
-    GroundEstimate,
     ObstacleRanges,
+    Reason,
     UInt8Array,
     VehicleState,
 )
@@ -22,12 +21,12 @@ class CameraObservation:
 
     image: UInt8Array
     """(h, w, 3) RGB."""
-    depth: Float32Array
-    """(h, w) metres, as `Camera.unproject` takes it; drones at their detections' ranges."""
+    depth: Float32Array | None
+    """(h, w) metres, as `Camera.unproject` takes it; drones at their detections' ranges. None: it has no scale."""
     labels: UInt8Array
     """(h, w) 0 background, k the detection with label k, 255 not to be used."""
     flow: Float32Array | None
-    """(h, w, 2) pixels from the image before to this one; None where there is none before."""
+    """(h, w, 2) pixels from the image before to this one; None where there is none before, or the flow failed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +39,10 @@ class Observation:
     detections: tuple[Detection, ...]
     previous: Observation | None
     """What the flow comes from; its own previous one is None. None where the pair starts anew."""
-    reasons: tuple[str, ...] = ()
-    """Why something is missing: each is one short sentence."""
+    reasons: tuple[Reason, ...] = ()
+    """Why something is missing."""
     noisy_cameras: tuple[str, ...] = ()
     """Whose images were noise, and were not used."""
-    ground: GroundEstimate | None = None
-    """See `PilotOutput.ground`."""
-    ground_track: FloatArray | None = None
-    """(k, 3) metres NED from the drone: where the last ranges hit the ground; None: no range finder is used."""
     obstacles: ObstacleRanges | None = None
     """Exact ones, of a simulation; None: they are in the cameras' depth."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -96,10 +95,9 @@ class OnnxNetworks:
         labels = np.asarray(cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
         low = cv2.resize((logit < certain).astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
         peak = self._segmentation.manifest.thresholds.get("proposal_peak_logit", proposal) - proposal
-        scene = SceneMaps(
-            np.full_like(depth, np.nan), labels, instances, uncertain=low & (labels > 0), logit=logit, min_score=peak
+        return SceneMaps(
+            self._depth_of(depth, camera), labels, instances, uncertain=low & (labels > 0), logit=logit, min_score=peak
         )
-        return self._with_depth(scene, depth, camera)
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         """See `Networks`."""
@@ -168,8 +166,8 @@ class OnnxNetworks:
             resized *= np.array([width / maps.shape[2], height / maps.shape[1]], np.float32)[:, None, None]
         return np.asarray(resized, dtype=np.float32)
 
-    def _with_depth(self, scene: SceneMaps, depth: Float32Array, camera: RigCamera) -> SceneMaps:
-        """With metres where the depth network knows them, else with what it leaves open."""
+    def _depth_of(self, depth: Float32Array, camera: RigCamera) -> Float32Array | OpenDepth:
+        """Metres where the depth network knows them, else what it leaves open; from its output, resized."""
         meaning = self._depth.manifest.results["depth"].depth
         is_inverse = meaning.quantity == "inverse_depth"
         if meaning.focal_px:
@@ -178,9 +176,9 @@ class OnnxNetworks:
             depth = depth / longer if is_inverse else depth * longer
         if self._unknown == "nothing":
             metres = 1.0 / np.maximum(depth, 1.0 / _MAX_DEPTH_M) if is_inverse else depth
-            return replace(scene, depth=np.asarray(metres, np.float32))
+            return np.asarray(metres, np.float32)
         inverse = depth if is_inverse else 1.0 / np.maximum(depth, _MIN_DEPTH_M)
-        return replace(scene, open=OpenDepth(np.asarray(inverse, np.float32), shift=self._unknown == "scale_and_shift"))
+        return OpenDepth(np.asarray(inverse, np.float32), shift=self._unknown == "scale_and_shift")
 
     def _what_is_unknown(self, config: PerceptionConfig) -> Unknown:
         """What of the depth is left for the height above ground to fix. Raises ModelError."""

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from flockd.core.config.geometry import GeometryParameters
-from flockd.core.messages import UNCLASSED, EgoMotion, Float32Array, NeighbourMotion
+from flockd.core.messages import UNCLASSED, EgoMotion, Float32Array, NeighbourMotion, Reason, ReasonKind
 from flockd.flight.geometry import (
     PointPairs,
     Rig,
@@ -29,32 +29,34 @@ def ego_motion(rig: Rig, observation: Observation, parameters: GeometryParameter
 
 def background_pairs(rig: Rig, observation: Observation, parameters: GeometryParameters) -> PointPairs:
     """What stands still, seen by the same camera before and now. ``ValueError`` says why there is nothing."""
-    pairs = []
-    for camera, before, after, flow in _seen_twice(rig, observation):
+    pairs, seen = [], list(_seen_twice(rig, observation))
+    for camera, before, after, flow in seen:
+        if before.depth is None or after.depth is None:
+            continue
         lifted = lift_matches(
             camera, grid_pixels(camera.camera.size, parameters.background_stride_px), flow,
             before.depth, after.depth, before.labels, after.labels, max_depth_m=parameters.max_depth_m,
         )  # fmt: skip
         pairs.append(lifted.select(lifted.labels == 0))
     if not pairs:
-        raise ValueError("no camera has both frames")
+        raise ValueError("no depth has a scale" if seen else "no camera has both frames")
     return PointPairs.concatenate(pairs)
 
 
 def neighbour_motions(
     rig: Rig, observation: Observation, ego: EgoMotion, parameters: GeometryParameters
-) -> tuple[dict[int, NeighbourMotion], list[str]]:
+) -> tuple[dict[int, NeighbourMotion], list[Reason]]:
     """The motion of every neighbour seen twice, by its current label (Eq. 22-37), and why some have none."""
     motions: dict[int, NeighbourMotion] = {}
     reasons = []
     for label, pairs in neighbour_pairs(rig, observation, parameters).items():
         if pairs is None or len(pairs) < parameters.min_drone_pairs:
-            reasons.append("neighbour motion: too few point pairs")
+            reasons.append(Reason(ReasonKind.NEIGHBOUR, "neighbour motion: too few point pairs"))
             continue
         try:
             motions[label] = estimate_neighbour_motion(pairs, ego, parameters)
         except ValueError as error:
-            reasons.append(f"neighbour motion: {error}")
+            reasons.append(Reason(ReasonKind.NEIGHBOUR, f"neighbour motion: {error}"))
     return motions, reasons
 
 
@@ -65,6 +67,8 @@ def neighbour_pairs(rig: Rig, observation: Observation, parameters: GeometryPara
     table[list(same.keys())] = list(same.values())
     pairs: dict[int, list[PointPairs]] = {after: [] for after in same.values()}
     for camera, before, after, flow in _seen_twice(rig, observation):
+        if before.depth is None or after.depth is None:
+            continue
         relabelled = table[before.labels]
         for label, found in pairs.items():
             pixels = label_pixels(relabelled, label, parameters.max_drone_pixels)

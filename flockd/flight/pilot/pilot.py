@@ -17,12 +17,15 @@ from flockd.core.messages import (
     EgoMotion,
     FloatArray,
     FrameSet,
+    GroundEstimate,
     MissionOrder,
     MissionStatus,
     Neighbour,
     NeighbourMotion,
     ObstacleRanges,
     PilotOutput,
+    Reason,
+    ReasonKind,
     VehicleState,
     VelocityCommand,
 )
@@ -33,7 +36,7 @@ from flockd.flight.mission.navigator import middle_of
 from flockd.flight.obstacles import Avoidance, LocalMap, ObstacleRanging
 from flockd.flight.perception import Networks, Observation, Perception, load_networks
 from flockd.flight.perception.detection.detector import DetectionTrace
-from flockd.flight.pilot.ground_scale import scaled_by_ground
+from flockd.flight.pilot.ground import GroundFilter, scaled_by_ground
 from flockd.flight.pilot.motions import ego_motion, neighbour_motions
 from flockd.flight.pilot.trim import VelocityTrim
 from flockd.flight.tracking import Blind, Measurement, Prediction, Tracker
@@ -59,14 +62,12 @@ class Observer(Protocol):
         self,
         frames: FrameSet,
         vehicle: VehicleState,
+        ground: GroundEstimate | None,
         predictions: Sequence[Prediction],
         trace: DetectionTrace | None,
         lap: Callable[[str], None],
     ) -> Observation:
         """What the newest frame set shows."""
-
-    def see_slope(self, slope: FloatArray) -> None:
-        """See `Perception.see_slope`."""
 
 
 class FlockPilot:
@@ -89,6 +90,8 @@ class FlockPilot:
         self._perception = observer or Perception(
             self._rig, networks or load_networks(config.perception), config.perception
         )
+        by_height = config.perception.scale == "height"
+        self._ground = GroundFilter(config.perception.height, config.perception.range_finder) if by_height else None
         self._tracker = Tracker(config.tracking)
         self._law = FlockingLaw(config.flocking)
         self._map = LocalMap(config.obstacles) if config.obstacles.enabled else None
@@ -132,10 +135,13 @@ class FlockPilot:
         laps = _Laps(self._stopwatch)
         trace = trace or StepTrace()
         predictions = self._predictions(frames.time_s)
-        observation = self._perception.observe(frames, vehicle, predictions, trace.detection, laps.end)
+        ground, why_no_ground = (None, None) if self._ground is None else self._ground.update(vehicle)
+        observation = self._perception.observe(frames, vehicle, ground, predictions, trace.detection, laps.end)
         trace.observation = observation
+        if self._config.perception.height == "barometer":
+            ground = None  # the height says as much
         ego, why_no_ego = self._ego_motion(observation)
-        ego = self._scaled(observation, ego)
+        ego = self._scaled(observation, ego, ground)
         laps.end("ego_motion")
         motions, why_no_motion = self._neighbour_motions(observation, ego)
         laps.end("neighbour_motion")
@@ -144,12 +150,13 @@ class FlockPilot:
         tracks = self._track(observation, ego, motions, velocity)
         neighbours = self._tracker.neighbours()
         laps.end("tracking")
-        obstacles = self._local_map(observation, ego, velocity)
+        obstacles = self._local_map(observation, ego, ground, velocity)
         laps.end("obstacles")
         command, mission = self._command(observation, neighbours, velocity, obstacles)
         laps.end("flocking")
         self._last_time_s = observation.time_s
-        reasons = (*observation.reasons, *why_no_ego, *why_no_motion)
+        of_height = () if why_no_ground is None else (why_no_ground,)
+        reasons = (*of_height, *observation.reasons, *why_no_ego, *why_no_motion)
         return PilotOutput(
             time_s=observation.time_s,
             ego_motion=ego,
@@ -160,15 +167,15 @@ class FlockPilot:
             neighbours=neighbours,
             command=command,
             reasons=reasons,
-            counts=Counter(reasons),
+            counts=Counter(reason.text for reason in reasons),
             stages_ms=laps.stages_ms,
             mission=mission,
-            noisy_cameras=observation.noisy_cameras or None,
-            ground=observation.ground,
+            noisy_cameras=observation.noisy_cameras,
+            ground=ground,
             obstacles=obstacles,
         )
 
-    def _refused(self, frames: FrameSet, reason: str) -> PilotOutput:
+    def _refused(self, frames: FrameSet, reason: Reason) -> PilotOutput:
         """The output of a step that was not done."""
         last_s = 0.0 if self._last_time_s is None else self._last_time_s
         return PilotOutput(
@@ -181,7 +188,7 @@ class FlockPilot:
             neighbours=self._tracker.neighbours(),
             command=VelocityCommand(np.zeros(2), np.zeros(2), self._yaw_rad),
             reasons=(reason,),
-            counts={reason: 1},
+            counts={reason.text: 1},
         )
 
     def _predictions(self, time_s: float) -> tuple[Prediction, ...]:
@@ -190,27 +197,30 @@ class FlockPilot:
             return ()
         return self._tracker.predictions(time_s - self._last_time_s, self._velocity)
 
-    def _ego_motion(self, observation: Observation) -> tuple[EgoMotion | None, Sequence[str]]:
+    def _ego_motion(self, observation: Observation) -> tuple[EgoMotion | None, Sequence[Reason]]:
         """The own motion in C (the body frame at the previous observation), or why there is none."""
         if observation.previous is None:
             return None, ()
         try:
             ego = ego_motion(self._rig, observation, self._config.geometry)
         except ValueError as error:
-            return None, (f"ego-motion: {error}",)
+            return None, (Reason(ReasonKind.EGO_MOTION, f"ego-motion: {error}"),)
         if not self._is_plausible(_displacement(observation, ego), ego.interval_s):
-            return None, ("ego-motion: no vehicle changes its velocity that fast",)
+            return None, (Reason(ReasonKind.EGO_MOTION, "ego-motion: no vehicle changes its velocity that fast"),)
         return ego, ()
 
-    def _scaled(self, observation: Observation, ego: EgoMotion | None) -> EgoMotion | None:
+    def _scaled(
+        self, observation: Observation, ego: EgoMotion | None, ground: GroundEstimate | None
+    ) -> EgoMotion | None:
         """The own motion with the range finder's scale where the ground shows it, and as it is otherwise."""
-        if ego is None or observation.ground is None:
+        if ego is None or ground is None or self._ground is None:
             return ego
+        track = self._ground.track(observation.vehicle)
         try:
-            scaled, slope = scaled_by_ground(self._rig, observation, ego)
+            scaled, slope = scaled_by_ground(self._rig, observation, ego, ground, track)
         except ValueError:  # at a standstill, or over water and walls: the depth maps' scale stays
             return ego
-        self._perception.see_slope(slope)
+        self._ground.see_slope(slope)
         return scaled
 
     def _is_plausible(self, displacement: FloatArray, interval_s: float) -> bool:
@@ -228,7 +238,7 @@ class FlockPilot:
 
     def _neighbour_motions(
         self, observation: Observation, ego: EgoMotion | None
-    ) -> tuple[Mapping[int, NeighbourMotion], Sequence[str]]:
+    ) -> tuple[Mapping[int, NeighbourMotion], Sequence[Reason]]:
         if ego is None:
             return {}, ()
         return neighbour_motions(self._rig, observation, ego, self._config.geometry)
@@ -256,7 +266,11 @@ class FlockPilot:
         return self._tracker.update(observation.time_s, measurements, velocity, self._blind(observation))
 
     def _local_map(
-        self, observation: Observation, ego: EgoMotion | None, velocity: FloatArray | None
+        self,
+        observation: Observation,
+        ego: EgoMotion | None,
+        ground: GroundEstimate | None,
+        velocity: FloatArray | None,
     ) -> ObstacleRanges | None:
         """The local map at this time; None where obstacles are not looked for."""
         if self._map is None or self._ranging is None:
@@ -266,7 +280,7 @@ class FlockPilot:
             displacement, sigma_m = _displacement(observation, ego)[:2], self._config.geometry.own_displacement_sigma_m
         elif velocity is not None and self._last_time_s is not None:
             displacement, sigma_m = velocity[:2] * (observation.time_s - self._last_time_s), _BY_VELOCITY_SIGMA_M
-        ranges = observation.obstacles or self._ranging.ranges(observation, ego)
+        ranges = observation.obstacles or self._ranging.ranges(observation, ego, ground)
         return self._map.step(observation.time_s, ranges, displacement, sigma_m)
 
     def _blind(self, observation: Observation) -> Blind | None:
@@ -333,23 +347,23 @@ class FlockPilot:
         return heading_rad if self._last_time_s is None else self._yaw_rad
 
 
-def _why_refused(frames: FrameSet, vehicle: VehicleState) -> str | None:
+def _why_refused(frames: FrameSet, vehicle: VehicleState) -> Reason | None:
     """What of a step's input cannot be; None: nothing."""
     R, velocity = vehicle.R_ned_body, vehicle.velocity_ned
     if not (math.isfinite(frames.time_s) and math.isfinite(vehicle.time_s)):
-        return "input refused: a time is not finite"
+        return Reason(ReasonKind.INPUT, "input refused: a time is not finite")
     if not np.allclose(R @ R.T, np.eye(3), atol=_ROTATION_TOLERANCE):  # false for NaN too
-        return "input refused: the attitude is not a rotation"
+        return Reason(ReasonKind.INPUT, "input refused: the attitude is not a rotation")
     if not math.isfinite(vehicle.height_m):
-        return "input refused: the height is not finite"
+        return Reason(ReasonKind.INPUT, "input refused: the height is not finite")
     if velocity is not None and not np.isfinite(velocity).all():
-        return "input refused: the autopilot's velocity is not finite"
+        return Reason(ReasonKind.INPUT, "input refused: the autopilot's velocity is not finite")
     reading = vehicle.ground_range
     if reading is not None and not math.isfinite(reading.time_s):
-        return "input refused: the range finder's time is not finite"
+        return Reason(ReasonKind.INPUT, "input refused: the range finder's time is not finite")
     for place in (vehicle.position, vehicle.home_deg):
         if place is not None and not np.isfinite(place).all():
-            return "input refused: the autopilot's position is not finite"
+            return Reason(ReasonKind.INPUT, "input refused: the autopilot's position is not finite")
     return None
 
 

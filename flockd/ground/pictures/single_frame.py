@@ -107,7 +107,7 @@ class PictureDetector:
         perception = Perception(Rig({"camera": self._mounted}), self._networks, self._config)
         frames = FrameSet(0.0, {"camera": Frame("camera", np.ascontiguousarray(image), 0.0, 0)})
         trace = DetectionTrace()
-        observation = perception.observe(frames, VehicleState(0.0, np.eye(3), _UNKNOWN_HEIGHT_M), trace=trace)
+        observation = perception.observe(frames, VehicleState(0.0, np.eye(3), _UNKNOWN_HEIGHT_M), None, trace=trace)
         if "camera" not in observation.cameras:  # the networks' output was not finite
             return PictureResult((), 0, np.zeros(image.shape[:2], np.uint8))
         seen = observation.cameras["camera"].labels

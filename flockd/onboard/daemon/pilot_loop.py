@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flockd.core.config import DroneConfig
-from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, VehicleState
-from flockd.flight.perception.depth import OF_HEIGHT
+from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, Reason, ReasonKind, VehicleState
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
 from flockd.onboard.daemon.worker import Worker
@@ -154,7 +153,7 @@ class PilotLoop:
     def _count(self, result: StepResult) -> None:
         if result.number > 1:  # the first has nothing to compare with
             self.ego_motion_failures = 0 if result.output.ego_motion is not None else self.ego_motion_failures + 1
-        self.noisy_images.update(result.output.noisy_cameras or ())
+        self.noisy_images.update(result.output.noisy_cameras)
         seen = [result.time_s - neighbour.unseen_s for neighbour in result.output.neighbours if neighbour.confirmed]
         self.neighbour_seen_s = max([self.neighbour_seen_s, *seen])
 
@@ -165,12 +164,12 @@ class HeightReports:
     def __init__(self) -> None:
         self._fault: str | None = None
 
-    def update(self, reasons: Sequence[str]) -> str | None:
+    def update(self, reasons: Sequence[Reason]) -> str | None:
         """The sentence that a step's reasons are worth; None: nothing new."""
-        before, self._fault = self._fault, next((one for one in reasons if one.startswith(OF_HEIGHT)), None)
+        before, self._fault = self._fault, next((one.text for one in reasons if one.kind is ReasonKind.HEIGHT), None)
         if self._fault == before:
             return None
-        return self._fault or f"{OF_HEIGHT}the range finder works again"
+        return self._fault or "height: the range finder works again"
 
 
 def _frame_period_s(config: DroneConfig) -> float:

@@ -61,7 +61,7 @@ class InputCollector:
         pilot_loop, result = self._pilot_loop, self._pilot_loop.newest
         neighbours = result.output.neighbours if result else ()
         ranges = [float(np.linalg.norm(n.position)) for n in neighbours if n.confirmed]
-        noisy = (result.output.noisy_cameras or ()) if result else ()
+        noisy = result.output.noisy_cameras if result else ()
         summary = self._camera_monitor.update(now, self._source.status(), noisy, pilot_loop.noisy_images.total())
         position = position_from_home(status)
         self._had_satellites = self._had_satellites or status.gps_ok is True

@@ -2,7 +2,7 @@
 
 A number is written with as many digits as bring the same number back; one that is not finite is the text `NaN`,
 `Infinity` or `-Infinity`, which JSON's own grammar lacks. A field that is None is left out. An array of the `Shape` in
-its annotation is a flat list of numbers, row by row, as viewers do not take lists of lists.
+its annotation is a flat list of numbers, row by row, as viewers do not take lists of lists. A `Reason` is its text.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import numpy as np
 
-from flockd.core.messages import Shape
+from flockd.core.messages import Reason, ReasonKind, Shape
 
 Json = Any
 """What `json` writes and reads: text, numbers, booleans, lists, and mappings by text."""
@@ -32,6 +32,8 @@ def parsed(data: bytes) -> Json:
 
 def to_json(value: object) -> Json:
     """A message, or any value within one, in JSON's types. Raises TypeError for what has no place in a message."""
+    if isinstance(value, Reason):
+        return value.text
     if dataclasses.is_dataclass(value):
         named = ((field.name, getattr(value, field.name)) for field in dataclasses.fields(value))
         return {name: to_json(inner) for name, inner in named if inner is not None}
@@ -53,6 +55,8 @@ def to_json(value: object) -> Json:
 def from_json(kind: Any, value: Json) -> Any:
     """The message of this type that `to_json` wrote. Raises ValueError for JSON that is not one."""
     origin, parts = get_origin(kind), get_args(kind)
+    if kind is Reason:
+        return Reason(ReasonKind.RECORDED, _expect(str, value))
     if dataclasses.is_dataclass(kind):
         return _dataclass_from(kind, value)
     if origin is Annotated:
@@ -69,6 +73,8 @@ def from_json(kind: Any, value: Json) -> Any:
 def json_schema(kind: Any) -> dict[str, Any]:
     """The JSON schema of a message type, a dataclass or a TypedDict."""
     origin, parts = get_origin(kind), get_args(kind)
+    if kind is Reason:
+        return {"type": "string"}
     if dataclasses.is_dataclass(kind) or is_typeddict(kind):
         named = get_type_hints(kind, include_extras=True)
         needed = [name for name, hint in named.items() if type(None) not in get_args(hint)]

@@ -276,7 +276,7 @@ class Recorder:
             self._parts.write(entry)
         publish_step(_Direct(self._write_message), self._drone, step.vehicle, step.output)
         for reason in step.output.reasons:
-            self._parts.write(_log_entry(step.frames.time_s, "WARNING", reason))
+            self._parts.write(_log_entry(step.frames.time_s, "WARNING", reason.text))
         early, self._early = self._early, []
         for item in early:  # from before there was a time
             self._write_message(item)

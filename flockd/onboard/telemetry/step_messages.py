@@ -102,5 +102,8 @@ def _mission(time_s: float, vehicle: VehicleState, mission: MissionStatus) -> Mi
 
 def _health(output: PilotOutput) -> HealthMessage:
     return HealthMessage(
-        time_s=output.time_s, ok=not output.reasons, reasons=list(output.reasons), refused=dict(output.counts)
+        time_s=output.time_s,
+        ok=not output.reasons,
+        reasons=[reason.text for reason in output.reasons],
+        refused=dict(output.counts),
     )

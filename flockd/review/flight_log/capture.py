@@ -36,7 +36,11 @@ def capture(trace: StepTrace, output: PilotOutput, drone: int, name: str = "") -
             name=name,
             cameras=tuple(cameras),
             images={name: c.image for name, c in cameras.items()},
-            depth={name: np.where(c.depth < _SKY_M, c.depth, np.float32(np.inf)) for name, c in cameras.items()},
+            depth={
+                name: np.where(c.depth < _SKY_M, c.depth, np.float32(np.inf))
+                for name, c in cameras.items()
+                if c.depth is not None
+            },
             labels={name: np.where(c.labels == 255, np.uint8(0), c.labels) for name, c in cameras.items()},
             flow=view.flows,
             track_ids={s.label: t for s, t in zip(output.detections, output.detection_tracks, strict=True)},

@@ -9,7 +9,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flockd.core.config.drone import DroneConfig
-from flockd.core.messages import EgoMotion, Float32Array, Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
+from flockd.core.messages import (
+    EgoMotion,
+    Float32Array,
+    Frame,
+    FrameSet,
+    PilotOutput,
+    ReasonKind,
+    UInt8Array,
+    VehicleState,
+)
 from flockd.flight.geometry import RigCamera, RigidTransform, build_rig, rotation_angle_deg
 from flockd.flight.perception import Crop, Networks, RangeEstimate, SceneMaps
 from flockd.flight.pilot import FlockPilot
@@ -71,7 +80,7 @@ class RecordedDepth:
     def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
         """The learned drones, and the recorded depth."""
         scene = self._learned.scene(frame, camera, ground)
-        return scene if self._depth is None else replace(scene, depth=self._depth, open=None)
+        return scene if self._depth is None else replace(scene, depth=self._depth)
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         """The learned ranges."""
@@ -125,11 +134,11 @@ def _pair(camera: RigCamera, before: Moment, after: Moment, first: PilotOutput, 
 
 
 def _blind(moment: Moment, output: PilotOutput) -> list[str]:
-    return [f"frame {moment.index}: {reason}" for reason in output.reasons if reason.startswith("camera ")]
+    return [f"frame {moment.index}: {reason}" for reason in output.reasons if reason.kind is ReasonKind.CAMERA]
 
 
 def _why(output: PilotOutput) -> list[str]:
-    return [reason for reason in output.reasons if not reason.startswith("camera ")]
+    return [reason.text for reason in output.reasons if reason.kind is not ReasonKind.CAMERA]
 
 
 def _of_camera(ego: EgoMotion, camera: RigCamera) -> RigidTransform:

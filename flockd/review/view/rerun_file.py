@@ -150,7 +150,7 @@ class RerunFile:
         for stage, ms in output.stages_ms.items():
             self._curve(f"stages_ms/{stage}", ms)
         for reason in output.reasons:
-            self._log("log", rr.TextLog(reason, level="WARN"))
+            self._log("log", rr.TextLog(reason.text, level="WARN"))
 
     def _show_command(self, output: PilotOutput, moment: Moment) -> None:
         here = moment.place.position

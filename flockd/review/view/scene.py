@@ -112,7 +112,8 @@ class Scenes:
             return None
         pairs = self._pairs(trace.observation, output.ego_motion, places)
         cameras = trace.observation.cameras
-        return Maps({n: c.labels for n, c in cameras.items()}, {n: c.depth for n, c in cameras.items()}, pairs)
+        depth = {name: camera.depth for name, camera in cameras.items() if camera.depth is not None}
+        return Maps({name: camera.labels for name, camera in cameras.items()}, depth, pairs)
 
     def _pairs(
         self,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from flockd.core.config.avoidance import ObstacleParameters
@@ -31,5 +29,5 @@ def test_a_hillside_ahead_is_ground_and_no_obstacle() -> None:
     level = Observation(0.0, vehicle, cameras, (), None)
     ranging = ObstacleRanging(RIG, ObstacleParameters())
     assert np.isfinite(ranging.ranges(level).range_m[0]), "of level ground below, the hill would stand on it"
-    told = replace(level, ground=GroundEstimate(HEIGHT_M, np.array(SLOPE), "range_finder"))
-    assert not np.isfinite(ranging.ranges(told).range_m).any()
+    told = GroundEstimate(HEIGHT_M, np.array(SLOPE), "range_finder")
+    assert not np.isfinite(ranging.ranges(level, ground=told).range_m).any()

@@ -14,7 +14,7 @@ from flockd.core.errors import ModelError
 from flockd.core.messages import Frame
 from flockd.flight.inference import OnnxModel
 from flockd.flight.inference.fitting import fit
-from flockd.flight.perception import OnnxFlow, OnnxNetworks
+from flockd.flight.perception import OnnxFlow, OnnxNetworks, OpenDepth
 from tests.flight.inference.foreign import SIZE, constant_flow, one_channel_depth
 from tests.flight.perception.cameras import camera_of
 
@@ -47,6 +47,7 @@ def test_an_image_enters_in_the_order_range_and_normalisation_of_the_manifest(
     imagenet = {"mean": [0.485, 0.456, 0.406], "deviation": [0.229, 0.224, 0.225]}
     path = one_channel_depth(tmp_path, channel=channel, output={}, colour=colour, **imagenet)
     seen = perception_with(path, scale="network").scene(front(plain((200, 100, 50))), camera_of(40.0, SIZE), None)
+    assert isinstance(seen.depth, np.ndarray)
     np.testing.assert_allclose(seen.depth, expected, rtol=1e-5)
 
 
@@ -70,6 +71,7 @@ def test_what_lies_right_in_the_image_lies_right_in_the_map_although_its_input_w
     image = plain((0, 0, 0), (64, 64))  # half as wide again is black border in an input of 48 x 32
     image[:, 32:] = 255
     seen = perception_with(path, scale="network").scene(front(image), camera_of(40.0, (64, 64)), None)
+    assert isinstance(seen.depth, np.ndarray)
     assert seen.depth.shape == (64, 64)
     np.testing.assert_allclose(seen.depth[:, :30], 0.0, atol=1e-6)
     np.testing.assert_allclose(seen.depth[:, 34:], 1.0, atol=1e-6)
@@ -78,6 +80,7 @@ def test_what_lies_right_in_the_image_lies_right_in_the_map_although_its_input_w
 def test_inverse_depth_in_a_unit_of_its_own_becomes_metres(tmp_path: Path) -> None:
     path = one_channel_depth(tmp_path, output={"factor": 0.5, "depth": {"quantity": "inverse_depth"}})
     seen = perception_with(path, scale="network").scene(front(plain((51, 0, 0))), camera_of(40.0, SIZE), None)
+    assert isinstance(seen.depth, np.ndarray)
     np.testing.assert_allclose(seen.depth, 10.0, rtol=1e-5)  # 0.2 of brightness is 0.1 1/m
 
 
@@ -85,6 +88,7 @@ def test_depth_for_one_focal_length_is_scaled_to_the_cameras(tmp_path: Path) -> 
     path = one_channel_depth(tmp_path, output={"depth": {"focal_px": 100.0}})
     size = (96, 64)  # enters at half its size, so that 300 px become 150 px
     seen = perception_with(path, scale="network").scene(front(plain((255, 0, 0), size)), camera_of(300.0, size), None)
+    assert isinstance(seen.depth, np.ndarray)
     np.testing.assert_allclose(seen.depth, 1.5, rtol=1e-3)
 
 
@@ -94,16 +98,15 @@ def test_a_relative_network_is_refused_where_nothing_fixes_its_scale(tmp_path: P
     with pytest.raises(ModelError, match=r"perception\.scale: .* has no metric scale .* write height, or choose"):
         perception_with(path, scale="network")
     seen = perception_with(path, scale="height").scene(front(plain((51, 0, 0))), camera_of(40.0, SIZE), None)
-    assert np.isnan(seen.depth).all()
-    assert seen.open is not None
-    assert seen.open.shift
-    np.testing.assert_allclose(seen.open.inverse, 0.2, rtol=1e-5)
+    assert isinstance(seen.depth, OpenDepth)
+    assert seen.depth.shift
+    np.testing.assert_allclose(seen.depth.inverse, 0.2, rtol=1e-5)
 
 
 def test_a_metric_network_leaves_its_scale_to_the_autopilot_where_that_is_asked_for(tmp_path: Path) -> None:
     path = one_channel_depth(tmp_path, output={})
     # it takes no ground as an input, so height has to align what it says
     seen = perception_with(path, scale="height").scene(front(plain((51, 0, 0))), camera_of(40.0, SIZE), None)
-    assert seen.open is not None
-    assert not seen.open.shift
-    np.testing.assert_allclose(seen.open.inverse, 5.0, rtol=1e-5)
+    assert isinstance(seen.depth, OpenDepth)
+    assert not seen.depth.shift
+    np.testing.assert_allclose(seen.depth.inverse, 5.0, rtol=1e-5)

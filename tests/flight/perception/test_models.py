@@ -206,6 +206,8 @@ def test_the_twins_in_8_bits_say_what_the_float_networks_say() -> None:
     ours, theirs = (OnnxNetworks(config, MODELS) for config in (twins, PerceptionConfig.model_validate(roles)))
     camera, frame = camera_of(222.0, (320, 320)), Frame("camera", image, 0.0, 0)
     our, their = (networks.scene(frame, camera, None) for networks in (ours, theirs))
+    assert isinstance(our.depth, np.ndarray)
+    assert isinstance(their.depth, np.ndarray)
     assert np.median(np.abs(our.depth / their.depth - 1)[their.depth < 50]) < 0.03
     both, any_ = ((f(our.labels > 0, their.labels > 0)).sum() for f in (np.logical_and, np.logical_or))
     assert both / any_ > 0.8

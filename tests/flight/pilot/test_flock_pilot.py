@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from flockd.core.messages import Float32Array, Frame, FrameSet
+from flockd.core.messages import Float32Array, Frame, FrameSet, Reason, ReasonKind, UInt8Array
 from flockd.flight.geometry import RigCamera, rotation_angle_deg
-from flockd.flight.perception import SceneMaps
+from flockd.flight.perception import Crop, RangeEstimate, SceneMaps
 from tests.flight.pilot.flyer import STEP_S, Flyer, scenario_with
 
 
@@ -48,7 +49,7 @@ def test_a_repeated_time_stamp_restarts_the_pair_and_says_so(flyer: Flyer) -> No
     flyer.step()
     output = flyer.step()
     assert output.ego_motion is None
-    assert any("time stamps" in reason for reason in output.reasons)
+    assert any(reason.kind is ReasonKind.PAIR for reason in output.reasons)
 
 
 def test_the_others_of_the_rig_fly_on_without_one_camera() -> None:
@@ -99,6 +100,40 @@ def test_an_output_that_is_not_finite_costs_its_frame_only(monkeypatch: pytest.M
     assert output.ego_motion is not None
 
 
+def test_a_flow_that_is_not_finite_costs_its_camera_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+    sound = flyer.truth.flow
+
+    def spoilt(first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
+        if second.camera == "back":
+            raise FloatingPointError("model x: output flow is not finite")
+        return sound(first, second, labels)
+
+    monkeypatch.setattr(flyer.truth, "flow", spoilt)
+    flyer.step()
+    flyer.move()
+    output = flyer.step()
+    assert output.reasons == (Reason(ReasonKind.CAMERA, "camera back: model x: output flow is not finite"),)
+    assert output.ego_motion is not None
+    assert len(output.detections) == 1
+
+
+def test_a_range_that_is_not_finite_costs_its_proposal_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two neighbours, ahead and behind; the network fails on any batch that holds a crop of what is behind."""
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6), (-3.0, 0.0, -3.6)))
+    sound = flyer.truth.ranges
+
+    def spoilt(crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+        if any(crop.T_body_camera.rotation[0, 2] < 0.0 for crop in crops):
+            raise FloatingPointError("model x: output range is not finite")
+        return sound(crops)
+
+    monkeypatch.setattr(flyer.truth, "ranges", spoilt)
+    output = flyer.step()
+    assert output.reasons == (Reason(ReasonKind.PROPOSAL, "proposal: model x: output range is not finite"),)
+    assert [detection.position[0] > 0.0 for detection in output.detections] == [True]
+
+
 @pytest.mark.parametrize("still_there", [True, False])
 def test_a_drone_that_segmentation_misses_is_found_where_it_is_predicted(
     monkeypatch: pytest.MonkeyPatch, still_there: bool
@@ -141,7 +176,7 @@ def test_at_the_ground_or_below_there_is_no_depth_and_the_flight_goes_on_above(h
     flyer.move()
     frames, state = flyer.take_frames()
     output = flyer.pilot.step(frames, replace(state, height_m=height_m))
-    assert sum("is not above the ground" in reason for reason in output.reasons) >= blind
+    assert sum("is not above the ground" in reason.text for reason in output.reasons) >= blind
     assert output.ego_motion is None or blind < len(frames.frames)
     assert np.isfinite(output.command.velocity).all()
     flyer.move()
@@ -170,7 +205,7 @@ def test_input_that_cannot_be_is_refused_and_the_next_step_is_as_if_it_had_not_c
     frames, state = flyer.take_frames()
     spoilt = replace(state, **{name: value for name, value in changes.items() if name != "frames_s"})
     output = flyer.pilot.step(FrameSet(changes.get("frames_s", frames.time_s), frames.frames), spoilt)
-    assert output.reasons == (f"input refused: {reason}",)
+    assert output.reasons == (Reason(ReasonKind.INPUT, f"input refused: {reason}"),)
     np.testing.assert_array_equal(output.command.velocity, [0.0, 0.0])
     assert math.isfinite(output.time_s)
     assert math.isfinite(output.command.yaw_rad)
@@ -200,5 +235,5 @@ def test_an_impossible_ego_motion_is_refused_but_not_for_ever() -> None:
         flyer.vehicles.position = flyer.vehicles.position + np.array([4.0, 0.0, 0.0])
         output = flyer.step()
         known.append(output.ego_motion is not None)
-        assert (output.ego_motion is not None) != any("that fast" in reason for reason in output.reasons)
+        assert (output.ego_motion is not None) != any("that fast" in reason.text for reason in output.reasons)
     assert known == [False, False, True, True]

@@ -62,12 +62,12 @@ def test_a_noisy_camera_is_flown_without_from_its_first_noisy_image_until_it_is_
 
     for number, (found, reference) in enumerate(outputs):
         refused = NOISE_BEGINS <= number <= NOISE_ENDS
-        assert found.noisy_cameras == ((CAMERA,) if refused else None)
-        assert (f"camera {CAMERA}: its image is noise" in found.reasons) == refused
+        assert found.noisy_cameras == ((CAMERA,) if refused else ())
+        assert (f"camera {CAMERA}: its image is noise" in found.counts) == refused
         assert confirmed(found) == confirmed(reference)
         assert np.linalg.norm(found.command.velocity - reference.command.velocity) < 0.1
     assert confirmed(outputs[-1][0]) == 1, "the neighbour that the others see"
-    assert not any(CAMERA in reason for reason in outputs[-1][0].reasons), "it is flown on with"
+    assert not any(CAMERA in reason.text for reason in outputs[-1][0].reasons), "it is flown on with"
 
 
 def blocks(image: UInt8Array, number: int, rng: np.random.Generator) -> UInt8Array:
@@ -105,4 +105,4 @@ def test_a_camera_whose_images_do_not_follow_from_each_other_does_not_steer(reco
             assert confirmed(found) == confirmed(wanted[number])
             assert np.linalg.norm(found.command.velocity - wanted[number].command.velocity) < 0.1
         assert found.noisy_cameras == (CAMERA,)
-        assert f"camera {CAMERA}: its image does not follow from the one before" in found.reasons
+        assert f"camera {CAMERA}: its image does not follow from the one before" in found.counts

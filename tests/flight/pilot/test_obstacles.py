@@ -11,7 +11,7 @@ import pytest
 
 from flockd.core.config import DroneConfig, load_scenario
 from flockd.core.data import data_path
-from flockd.core.messages import SECTORS, FloatArray, FrameSet, ObstacleRanges, PilotOutput, VehicleState
+from flockd.core.messages import SECTORS, FrameSet, ObstacleRanges, PilotOutput, VehicleState
 from flockd.flight.perception import Observation
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.recording.codec import from_json, parsed, to_json
@@ -28,13 +28,16 @@ class Observer:
         self.sees = sees
 
     def observe(
-        self, frames: FrameSet, vehicle: VehicleState, predictions: Any, trace: Any, lap: Callable[[str], None]
+        self,
+        frames: FrameSet,
+        vehicle: VehicleState,
+        ground: Any,
+        predictions: Any,
+        trace: Any,
+        lap: Callable[[str], None],
     ) -> Observation:
         ranges = true_ranges(WALL, frames.time_s, np.array([0.0, 0.0, -4.0])) if self.sees else None
         return Observation(frames.time_s, vehicle, {}, (), None, obstacles=ranges)
-
-    def see_slope(self, slope: FloatArray) -> None:
-        raise AssertionError("exact ranges need no slope")
 
 
 def drone(*, enabled: bool) -> DroneConfig:

@@ -20,7 +20,7 @@ from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.config.source import SourceParameters
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
-from flockd.core.messages import Frame, RangeReading, VehicleState
+from flockd.core.messages import Frame, RangeReading, Reason, ReasonKind, VehicleState
 from flockd.flight.inference import OnnxModel
 from flockd.onboard.daemon.host_monitors import LoopLag, WallClock, hottest_zone_c
 from flockd.onboard.daemon.lock import only_instance
@@ -286,8 +286,11 @@ def test_a_range_finder_that_fails_is_an_event_and_so_is_its_return() -> None:
     from flockd.onboard.daemon.pilot_loop import HeightReports
 
     reports = HeightReports()
-    weak = "height: the range finder's signal is too weak; the barometer's is used"
-    old = "height: the range is too old; the barometer's is used"
-    steps = ((), ("camera left: no frame", weak), (weak,), (old,), ("camera left: no frame",), ())
+    weak, old = (
+        Reason(ReasonKind.HEIGHT, f"height: the range{fault}; the barometer's is used")
+        for fault in (" finder's signal is too weak", " is too old")
+    )
+    left = Reason(ReasonKind.CAMERA, "camera left: no frame")
+    steps: tuple[tuple[Reason, ...], ...] = ((), (left, weak), (weak,), (old,), (left,), ())
     found = [reports.update(reasons) for reasons in steps]
-    assert found == [None, weak, None, old, "height: the range finder works again", None]
+    assert found == [None, weak.text, None, old.text, "height: the range finder works again", None]

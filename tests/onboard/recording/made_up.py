@@ -22,6 +22,8 @@ from flockd.core.messages import (
     Neighbour,
     PilotOutput,
     RangeReading,
+    Reason,
+    ReasonKind,
     VehicleState,
     VelocityCommand,
 )
@@ -72,6 +74,8 @@ class MadeUpPilot:
 def filled(kind: Any, number: float) -> Any:
     """A message of this type with something in every field, whatever fields it has."""
     origin, parts = get_origin(kind), get_args(kind)
+    if kind is Reason:
+        return Reason(ReasonKind.RECORDED, "front")
     if is_dataclass(kind) and isinstance(kind, type):
         return kind(
             **{field: filled(hint, number) for field, hint in get_type_hints(kind, include_extras=True).items()}

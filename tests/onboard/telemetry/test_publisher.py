@@ -20,6 +20,8 @@ from flockd.core.messages import (
     Neighbour,
     ObstacleRanges,
     PilotOutput,
+    Reason,
+    ReasonKind,
     VehicleState,
     VelocityCommand,
 )
@@ -82,7 +84,8 @@ def _output(velocity: np.ndarray | None) -> PilotOutput:
     return PilotOutput(
         time_s=12.5, ego_motion=None, velocity=velocity, detections=(), detection_tracks=(), neighbour_motions={},
         neighbours=(neighbour,), command=command,
-        reasons=("no ego-motion: 12 pairs are too few",), counts={"ego": 1}, stages_ms={"flow": 14.0},
+        reasons=(Reason(ReasonKind.EGO_MOTION, "no ego-motion: 12 pairs are too few"),),
+        counts={"ego": 1}, stages_ms={"flow": 14.0},
         mission=MissionStatus("waypoints", np.array([1.0, 0.0]), "9 m to the goal", goal=np.array([9.0, 2.0])),
         obstacles=ObstacleRanges(12.5, np.full(SECTORS, np.inf), np.zeros(SECTORS), np.full(SECTORS, 4.0)),
     )  # fmt: skip

@@ -15,6 +15,7 @@ from flockd.core.messages import UNCLASSED, Detection, Frame, FrameSet, VehicleS
 from flockd.flight.geometry import Rig
 from flockd.flight.perception import DisFlow, Networks, Perception
 from flockd.flight.perception.detection.detector import DetectionTrace
+from flockd.flight.pilot.ground import level_ground
 from flockd.sim.drone_models import FAMILIES, drone_model
 from tools.training.dataset import HEIGHT, R_BODY_CAMERA, WIDTH, PairSet, rig_camera
 from tools.training.scenes import outline_of
@@ -102,8 +103,11 @@ def look_at_pairs(pairs: PairSet, networks: Networks, indices: Iterable[int]) ->
             measured_m = height + HEIGHT_SIGMAS_M.get(given or "", 0.0) * wrong
             vehicle = VehicleState(0.0, R_ned_camera @ R_BODY_CAMERA.T, measured_m)
             trace = DetectionTrace()
-            view = Perception(rig, networks, PerceptionConfig(scale=scale)).observe(frames, vehicle, trace=trace)
-            off = _depth_errors(view.cameras["camera"].depth[1::2, 1::2], depth, ids)
+            perception = Perception(rig, networks, PerceptionConfig(scale=scale))
+            view = perception.observe(frames, vehicle, level_ground(vehicle), trace=trace)
+            metres = view.cameras["camera"].depth
+            assert metres is not None
+            off = _depth_errors(metres[1::2, 1::2], depth, ids)
             found.depth[given].append(float(off.mean()) if off.size else 0.0)
             found.depth_pixels[given].append(off[::16])
         labels = view.cameras["camera"].labels

@@ -6,7 +6,7 @@ from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from flockd.core.config.perception import DetectionParameters
-from flockd.core.messages import Detection, UInt8Array, VehicleState
+from flockd.core.messages import Detection, Float32Array, Reason, UInt8Array, VehicleState
 from flockd.flight.geometry import Rig
 from flockd.flight.perception.detection.from_depth import candidates_from_depth
 from flockd.flight.perception.detection.instances import Instance
@@ -22,6 +22,17 @@ from flockd.flight.perception.detection.refinement import Candidate, Cascade
 from flockd.flight.perception.interface import Networks
 from flockd.flight.perception.maps import KnownSize, SceneMaps
 from flockd.flight.tracking import Prediction
+
+
+@dataclass(frozen=True, eq=False)
+class Detected:
+    """The drones in view."""
+
+    detections: tuple[Detection, ...]
+    masks: Mapping[str, UInt8Array]
+    """(h, w) labels of the detections, by camera."""
+    reasons: tuple[Reason, ...] = ()
+    """Why proposals were dropped."""
 
 
 @dataclass
@@ -47,37 +58,44 @@ class Detector:
         self,
         images: Mapping[str, UInt8Array],
         scenes: Mapping[str, SceneMaps],
+        depths: Mapping[str, Float32Array],
         vehicle: VehicleState,
         predictions: Sequence[Prediction],
         trace: DetectionTrace,
-    ) -> tuple[tuple[Detection, ...], dict[str, UInt8Array]]:
-        """The drones in view, and each camera's mask (h, w) of their labels.
+    ) -> Detected:
+        """The drones in view, and their masks.
 
         Args:
             images: (h, w, 3) by camera.
-            scenes: what the first stage says of each, with depth in metres.
+            scenes: what the first stage says of each.
+            depths: (h, w) metres, of the cameras that have them.
             vehicle: for the attitude.
             predictions: of tracks, where the second stage searches too.
             trace: filled.
         """
         if not images:
-            return (), {}
+            return Detected((), {})
         rig = Rig({name: self._rig.cameras[name] for name in images})
         if self._refining is None:
-            trace.candidates += candidates_from_depth(rig, scenes, self._parameters)
+            trace.candidates += candidates_from_depth(rig, scenes, depths, self._parameters)
             return self._masked(suppress(trace.candidates, self._parameters), images, scenes, ())
         rules, cascade = self._refining
         proposals = propose_instances(rig, scenes, rules, self._parameters)
-        candidates, rejected = cascade.refine(rig, images, proposals)
-        predicted = propose_predictions(rig, vehicle, predictions, [c.bearing for c in candidates], rules)
-        candidates += cascade.refine(rig, images, predicted)[0]
-        none = {proposal.instance for proposal in rejected if proposal.instance}
+        first = cascade.refine(rig, images, proposals)
+        predicted, unpredicted = propose_predictions(
+            rig, vehicle, predictions, [c.bearing for c in first.candidates], rules
+        )
+        second = cascade.refine(rig, images, predicted)
+        candidates = [*first.candidates, *second.candidates]
+        none = {proposal.instance for proposal in first.rejected if proposal.instance}
         masks = {n: m.by_networks() for n, m in self._masks(separate(candidates), scenes, none).items()}
         residuals = propose_residuals(rig, scenes, masks, rules, self._parameters)
-        candidates += cascade.refine(rig, images, residuals)[0]
+        third = cascade.refine(rig, images, residuals)
+        candidates += third.candidates
         trace.proposals += [*proposals, *predicted, *residuals]
         trace.candidates += candidates
-        return self._masked(suppress(candidates, self._parameters), images, scenes, none)
+        reasons = (*first.reasons, *unpredicted, *second.reasons, *third.reasons)
+        return self._masked(suppress(candidates, self._parameters), images, scenes, none, reasons)
 
     def _masked(
         self,
@@ -85,10 +103,12 @@ class Detector:
         images: Mapping[str, UInt8Array],
         scenes: Mapping[str, SceneMaps],
         rejected: Container[Instance],
-    ) -> tuple[tuple[Detection, ...], dict[str, UInt8Array]]:
+        reasons: tuple[Reason, ...] = (),
+    ) -> Detected:
         masks = self._masks(found, scenes, rejected)
         weight = self._parameters.colour_weight
-        return found.detections, {name: mask.by_colours(images[name], weight) for name, mask in masks.items()}
+        by_colours = {name: mask.by_colours(images[name], weight) for name, mask in masks.items()}
+        return Detected(found.detections, by_colours, reasons)
 
     def _masks(
         self, found: Suppressed, scenes: Mapping[str, SceneMaps], rejected: Container[Instance]

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from flockd.core.config.perception import DetectionParameters
+from flockd.core.messages import Float32Array
 from flockd.flight.geometry import Rig, RigCamera, log_polar
 from flockd.flight.perception.detection.instances import Instance
 from flockd.flight.perception.detection.proposals import Proposal
@@ -22,21 +23,22 @@ _MIN_ANGLE = 1e-3
 
 
 def candidates_from_depth(
-    rig: Rig, scenes: Mapping[str, SceneMaps], parameters: DetectionParameters
+    rig: Rig, scenes: Mapping[str, SceneMaps], depths: Mapping[str, Float32Array], parameters: DetectionParameters
 ) -> list[Candidate]:
-    """One an instance of the first stage: the centre of the bounding box of its points."""
+    """One an instance of the first stage: the centre of the bounding box of its points. None without depth."""
     found = []
-    for name, scene in scenes.items():
-        found += [_candidate(rig.cameras[name], scene, instance, parameters) for instance in scene.instances]
+    for name, depth in depths.items():
+        camera, scene = rig.cameras[name], scenes[name]
+        found += [_candidate(camera, scene, depth, instance, parameters) for instance in scene.instances]
     return [one for one in found if one is not None]
 
 
 def _candidate(
-    camera: RigCamera, scene: SceneMaps, instance: Instance, parameters: DetectionParameters
+    camera: RigCamera, scene: SceneMaps, depth: Float32Array, instance: Instance, parameters: DetectionParameters
 ) -> Candidate | None:
     rows, columns = np.nonzero(scene.labels == instance.label)
     pixels = np.asarray(np.stack([columns, rows], 1) + 0.5, np.float64)
-    points = camera.camera.unproject(pixels, np.asarray(scene.depth[rows, columns], np.float64))
+    points = camera.camera.unproject(pixels, np.asarray(depth[rows, columns], np.float64))
     distance = np.linalg.norm(points, axis=1)
     kept = np.abs(distance - np.median(distance)) < _MAX_RADIUS_M
     if not kept.any():

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from flockd.core.config.perception import DetectionParameters
-from flockd.core.messages import UNCLASSED, BoolArray, FloatArray, UInt8Array, VehicleState
+from flockd.core.messages import UNCLASSED, BoolArray, FloatArray, Reason, ReasonKind, UInt8Array, VehicleState
 from flockd.flight.geometry import Rig, log_polar
 from flockd.flight.perception.detection.instances import Instance
 from flockd.flight.perception.detection.roi import CropRules, Roi, angle_between, roi_of_instance
@@ -74,8 +74,8 @@ def propose_predictions(
     predictions: Iterable[Prediction],
     detected: Sequence[FloatArray],
     rules: CropRules,
-) -> list[Proposal]:
-    """Where a track is predicted and nothing was found.
+) -> tuple[list[Proposal], list[Reason]]:
+    """Where a track is predicted and nothing was found, and why a prediction is none.
 
     Args:
         rig: the cameras that have an image.
@@ -84,11 +84,15 @@ def propose_predictions(
         detected: bearings (3,), in the body, of what was found already.
         rules: for the crops.
     """
-    proposals = []
+    proposals, reasons = [], []
     for prediction in predictions:
         R_body_ned = vehicle.R_ned_body.T
         place = R_body_ned @ prediction.position
-        bearing, log_range = log_polar(place)
+        try:
+            bearing, log_range = log_polar(place)
+        except ValueError as error:
+            reasons.append(Reason(ReasonKind.PROPOSAL, f"proposal of a track: {error}"))
+            continue
         range_m = math.exp(log_range)
         covariance = R_body_ned @ prediction.covariance @ R_body_ned.T / range_m**2
         roi = Roi(bearing, rules.half_angle(prediction.size_m, range_m))
@@ -96,7 +100,7 @@ def propose_predictions(
         found = any(angle_between(roi.direction, bearing) < roi.half_angle for bearing in detected)
         if cameras and not found:
             proposals.append(Proposal(cameras, roi, predicted=Predicted(bearing, log_range, covariance)))
-    return proposals
+    return proposals, reasons
 
 
 def propose_residuals(

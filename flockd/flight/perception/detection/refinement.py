@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from flockd.core.config.perception import DetectionParameters
-from flockd.core.messages import FloatArray, UInt8Array
+from flockd.core.messages import FloatArray, Reason, ReasonKind, UInt8Array
 from flockd.flight.geometry import Rig, VirtualCrop, log_polar, log_polar_covariance, log_polar_residual
 from flockd.flight.perception.detection.masks import CropMask
 from flockd.flight.perception.detection.proposals import Proposal
-from flockd.flight.perception.detection.roi import Roi, take_crops
+from flockd.flight.perception.detection.roi import Roi, take_crop
 from flockd.flight.perception.detection.second_stage import SecondStage
 from flockd.flight.perception.maps import Crop, KnownSize, RangeEstimate
 
@@ -50,6 +50,16 @@ class Candidate:
         return log_polar_covariance(self.bearing, self.log_range_sigma, self.bearing_sigma_rad)
 
 
+class Refined(NamedTuple):
+    """What became of proposals."""
+
+    candidates: list[Candidate]
+    rejected: list[Proposal]
+    """Those that surely are no drones."""
+    reasons: list[Reason]
+    """Why others were dropped."""
+
+
 class RangeNetwork(Protocol):
     """Of `flockd.flight.perception.interface.Networks`, what refinement needs."""
 
@@ -68,6 +78,17 @@ class _Stage:
     """The least that an earlier crop gave, but for the first, which may be far from what suits the drone."""
 
 
+@dataclass(frozen=True, eq=False)
+class _LastStage(_Stage):
+    """The mirror image of the last crop."""
+
+    candidate: Candidate = field(kw_only=True)
+    """As the crop itself shows it."""
+
+
+_S = TypeVar("_S", bound=_Stage)
+
+
 class Cascade:
     """Refines proposals with the network of the second stage."""
 
@@ -82,10 +103,8 @@ class Cascade:
         self._network, self._crop_size, self._known_size = network, second_stage.crop_size, known_size
         self._rules, self._thresholds, self._parameters = second_stage.rules, second_stage.thresholds, parameters
 
-    def refine(
-        self, rig: Rig, images: Mapping[str, UInt8Array], proposals: Sequence[Proposal]
-    ) -> tuple[list[Candidate], list[Proposal]]:
-        """The drones among the proposals, and the proposals that surely are none.
+    def refine(self, rig: Rig, images: Mapping[str, UInt8Array], proposals: Sequence[Proposal]) -> Refined:
+        """The drones among the proposals, the proposals that surely are none, and why others were dropped.
 
         At least two crops each, the further ones cut to the drone's size with it in the middle, then one of its mirror
         image. Where two cameras share the drone, the crops show it whole.
@@ -97,12 +116,15 @@ class Cascade:
         """
         settled: list[tuple[_Stage, Candidate]] = []
         rejected: list[Proposal] = []
+        reasons: list[Reason] = []
         stages = [_Stage(proposal, proposal.roi) for proposal in proposals]
         for number in range(1, self._rules.max_crops + 1):
             if not stages:
                 break
             further = []
-            for stage, candidate in zip(stages, self._candidates(rig, images, stages), strict=True):
+            judged, dropped = self._candidates(rig, images, stages)
+            reasons += dropped
+            for stage, candidate in judged:
                 probability = min(stage.drone_probability, candidate.drone_probability)
                 if probability <= self._thresholds.another_crop:
                     rejected.append(stage.proposal)
@@ -117,22 +139,50 @@ class Cascade:
                     settled.append((following, candidate))
             stages = further
         candidates = []
-        for candidate in self._with_mirrored(rig, images, settled):
+        together, dropped = self._with_mirrored(rig, images, settled)
+        reasons += dropped
+        for candidate in together:
             if candidate.drone_probability <= self._thresholds.another_crop:
                 rejected.append(candidate.proposal)
             elif candidate.drone_probability > self._needed(candidate.proposal) and self._is_as_predicted(candidate):
                 candidates.append(candidate)
-        return candidates, rejected
+        return Refined(candidates, rejected, reasons)
 
-    def _candidates(self, rig: Rig, images: Mapping[str, UInt8Array], stages: Sequence[_Stage]) -> list[Candidate]:
-        """What the network says of each crop, in the body."""
-        if not stages:
-            return []
-        crops, views = take_crops(rig, images, [stage.roi for stage in stages], self._crop_size)
-        return [
-            self._candidate(stage, view, estimate)
-            for stage, view, estimate in zip(stages, views, self._network.ranges(crops), strict=True)
-        ]
+    def _candidates(
+        self, rig: Rig, images: Mapping[str, UInt8Array], stages: Sequence[_S]
+    ) -> tuple[list[tuple[_S, Candidate]], list[Reason]]:
+        """What the network says of each crop, in the body, and why some crops were dropped."""
+        cut: list[tuple[_S, Crop, VirtualCrop]] = []
+        reasons = []
+        for stage in stages:
+            try:
+                cut.append((stage, *take_crop(rig, images, stage.roi, self._crop_size)))
+            except ValueError as error:
+                reasons.append(_dropped(error))
+        ranged, unranged = self._ranges(cut)
+        candidates = []
+        for stage, view, estimate in ranged:
+            try:
+                candidates.append((stage, self._candidate(stage, view, estimate)))
+            except ValueError as error:
+                reasons.append(_dropped(error))
+        return candidates, [*reasons, *unranged]
+
+    def _ranges(
+        self, cut: Sequence[tuple[_S, Crop, VirtualCrop]]
+    ) -> tuple[list[tuple[_S, VirtualCrop, RangeEstimate]], list[Reason]]:
+        """One estimate a crop. Where the network fails on several, each half is tried by itself: one crop is lost."""
+        if not cut:
+            return [], []
+        try:
+            estimates = self._network.ranges([crop for _, crop, _ in cut])
+        except (FloatingPointError, ValueError) as error:
+            if len(cut) == 1:
+                return [], [_dropped(error)]
+            half = len(cut) // 2
+            (first, of_first), (second, of_second) = self._ranges(cut[:half]), self._ranges(cut[half:])
+            return [*first, *second], [*of_first, *of_second]
+        return [(stage, view, one) for (stage, _, view), one in zip(cut, estimates, strict=True)], []
 
     def _candidate(self, stage: _Stage, view: VirtualCrop, estimate: RangeEstimate) -> Candidate:
         """The camera sits beside the body's origin, so that bearing and range change a little."""
@@ -151,14 +201,17 @@ class Cascade:
 
     def _with_mirrored(
         self, rig: Rig, images: Mapping[str, UInt8Array], settled: Sequence[tuple[_Stage, Candidate]]
-    ) -> list[Candidate]:
+    ) -> tuple[list[Candidate], list[Reason]]:
         """Each candidate together with what the mirror image of its crop says; without those that it contradicts."""
         stages = []
-        for stage, _ in settled:
+        for stage, candidate in settled:
             half_angle = self._rules.mirror_scale * stage.roi.half_angle
-            stages.append(replace(stage, roi=replace(stage.roi, half_angle=half_angle, mirrored=True)))
+            mirrored = replace(stage.roi, half_angle=half_angle, mirrored=True)
+            stages.append(_LastStage(stage.proposal, mirrored, stage.drone_probability, candidate=candidate))
+        judged, reasons = self._candidates(rig, images, stages)
         together = []
-        for (stage, candidate), other in zip(settled, self._candidates(rig, images, stages), strict=True):
+        for stage, other in judged:
+            candidate = stage.candidate
             if self._is_in_range(other) and min(candidate.log_range_sigma, other.log_range_sigma) > 0:
                 both = mean_candidate(candidate, other)
                 sigma = self._thresholds.mean_sigma * both.log_range_sigma
@@ -169,7 +222,7 @@ class Cascade:
                         drone_probability=min(stage.drone_probability, both.drone_probability),
                     )
                 )
-        return together
+        return together, reasons
 
     def _next_roi(self, rig: Rig, stage: _Stage, candidate: Candidate) -> Roi:
         """With the drone in its middle, or where the proposal was if no camera sees that direction."""
@@ -217,3 +270,7 @@ def mean_candidate(one: Candidate, other: Candidate) -> Candidate:
         drone_probability=min(one.drone_probability, other.drone_probability),
         masks=one.masks + other.masks,
     )
+
+
+def _dropped(error: Exception) -> Reason:
+    return Reason(ReasonKind.PROPOSAL, f"proposal: {error}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,17 +84,11 @@ def roi_of_instance(camera: RigCamera, instance: Instance, rules: CropRules) -> 
     return Roi(camera.T_body_camera.rotation @ centre, half_angle)
 
 
-def take_crops(
-    rig: Rig, images: Mapping[str, UInt8Array], rois: Sequence[Roi], size_px: int
-) -> tuple[list[Crop], list[VirtualCrop]]:
-    """One crop a region, drawn from whichever cameras of the rig see there, and the virtual cameras."""
-    crops, views = [], []
-    for roi in rois:
-        view = virtual_crop(rig, roi.direction, roi.half_angle, size_px)
-        image, _ = view.sample(images, range_m=roi.range_m)
-        crops.append(Crop(image, view.camera, view.T_body_virtual, roi.mirrored))
-        views.append(view)
-    return crops, views
+def take_crop(rig: Rig, images: Mapping[str, UInt8Array], roi: Roi, size_px: int) -> tuple[Crop, VirtualCrop]:
+    """The crop of a region, drawn from whichever cameras of the rig see there, and the virtual camera."""
+    view = virtual_crop(rig, roi.direction, roi.half_angle, size_px)
+    image, _ = view.sample(images, range_m=roi.range_m)
+    return Crop(image, view.camera, view.T_body_virtual, roi.mirrored), view
 
 
 def angle_between(a: FloatArray, b: FloatArray) -> float:

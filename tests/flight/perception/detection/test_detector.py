@@ -38,8 +38,8 @@ class Scene:
         images = {self.camera: self.frames.frames[self.camera].image if image is None else image}
         detector = Detector(self._flyer.cameras.rig, self._flyer.truth, PARAMETERS)
         scenes = {self.camera: self.maps}
-        detections, masks = detector.detect(images, scenes, self.vehicle, (), DetectionTrace())
-        return detections, masks[self.camera]
+        found = detector.detect(images, scenes, {}, self.vehicle, (), DetectionTrace())
+        return found.detections, found.masks[self.camera]
 
 
 @pytest.mark.parametrize(("probability", "certain", "uncertain"), [(0.05, 0, 0), (0.35, 255, 255), (0.9, 1, 255)])

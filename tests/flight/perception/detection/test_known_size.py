@@ -36,11 +36,11 @@ def test_a_flights_detections_are_ranged_by_it() -> None:
     """With exact networks, which know the drone's true size: a size said wrong by a factor moves the drone by it."""
     flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
     frames, vehicle = flyer.take_frames()
-    (true,) = flyer.perception().observe(frames, vehicle).detections
+    (true,) = flyer.perception().observe(frames, vehicle, None).detections
     for factor in (0.8, 1.0, 1.25):
         said = {"scale": "network", "drone_size_m": factor * true.size_m, "drone_size_sigma_m": 0.1 * true.size_m}
         config = flyer.scenario.drone.perception.model_copy(update=said)
-        (known,) = Perception(flyer.cameras.rig, flyer.truth, config).observe(frames, vehicle).detections
+        (known,) = Perception(flyer.cameras.rig, flyer.truth, config).observe(frames, vehicle, None).detections
         assert known.range_m == pytest.approx(factor * true.range_m, rel=0.01)
         assert known.size_m == pytest.approx(factor * true.size_m)
         wanted = 0.98 * math.hypot(true.range_sigma_m / true.range_m / 0.98, 0.1 / factor)

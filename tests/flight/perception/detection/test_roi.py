@@ -9,7 +9,7 @@ import pytest
 
 from flockd.flight.geometry import Rig
 from flockd.flight.perception import Instance
-from flockd.flight.perception.detection.roi import Roi, angle_between, roi_of_instance, take_crops
+from flockd.flight.perception.detection.roi import Roi, angle_between, roi_of_instance, take_crop
 from tests.flight.perception.cameras import camera_of
 from tests.flight.perception.shipped import SECOND_STAGE
 
@@ -47,7 +47,7 @@ def test_a_crop_shows_what_lies_in_its_direction() -> None:
     image = np.zeros((480, 640, 3), np.uint8)
     image[230:250, 470:490] = 255  # 160 px right of the centre: half a focal length
     direction = np.array([0.5, 0.0, 1.0]) / math.hypot(0.5, 1.0)
-    (crop,), (view,) = take_crops(Rig({"front": CAMERA}), {"front": image}, [Roi(direction, 0.1)], 96)
+    crop, view = take_crop(Rig({"front": CAMERA}), {"front": image}, Roi(direction, 0.1), 96)
     assert crop.image.shape == (96, 96, 3)
     assert angle_between(view.T_body_virtual.rotation[:, 2], direction) < 1e-9
     assert crop.image[48, 48].min() == 255

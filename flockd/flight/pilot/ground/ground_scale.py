@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flockd.core.messages import EgoMotion, Float32Array, FloatArray
+from flockd.core.messages import EgoMotion, Float32Array, FloatArray, GroundEstimate
 from flockd.flight.geometry import (
     GroundSamples,
     Rig,
@@ -35,13 +35,21 @@ MAX_CORRECTION = 1.4
 """Factor, or one over it: what would be more is a false plane."""
 
 
-def scaled_by_ground(rig: Rig, observation: Observation, ego: EgoMotion) -> tuple[EgoMotion, FloatArray]:
+def scaled_by_ground(
+    rig: Rig, observation: Observation, ego: EgoMotion, ground: GroundEstimate, track: FloatArray
+) -> tuple[EgoMotion, FloatArray]:
     """The motion with the scale of the range finder's height, and the ground's slope (2,), north and east.
+
+    Args:
+        rig: the drone's cameras.
+        observation: of the motion's end, with the one before.
+        ego: in the depth maps' scale.
+        ground: below the drone at the motion's end.
+        track: (k, 3) metres NED from the drone, where the last ranges hit the ground.
 
     Raises ValueError with the reason where the ground does not tell.
     """
-    ground = observation.ground
-    if ground is None or ground.source != "range_finder":
+    if ground.source != "range_finder":
         raise ValueError("no range to the ground")
     samples = [
         _samples(rig.cameras[name], observation, camera, flow, ego)
@@ -53,10 +61,8 @@ def scaled_by_ground(rig: Rig, observation: Observation, ego: EgoMotion) -> tupl
     seen = GroundSamples.concatenate(samples)
     plane = fit_ground(seen, ground.height_m, ground.slope)
     factor = ground.height_m / plane.height
-    track = observation.ground_track
-    if track is not None:
-        with suppress(ValueError):  # before it has flown far enough, the plane alone tells
-            factor = scale_on_track(seen, track, plane.slope, factor)
+    with suppress(ValueError):  # before it has flown far enough, the plane alone tells
+        factor = scale_on_track(seen, track, plane.slope, factor)
     if not abs(math.log(factor)) < math.log(MAX_CORRECTION):
         raise ValueError("the ground that is seen does not fit the range")
     return replace(ego, translation=ego.translation * factor), plane.slope

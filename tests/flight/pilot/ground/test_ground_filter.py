@@ -10,8 +10,8 @@ import pytest
 
 from flockd.core.choices import HeightSource
 from flockd.core.config.perception import RangeFinderParameters
-from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, VehicleState
-from flockd.flight.perception.depth import GroundBelow, NoGround
+from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, Reason, ReasonKind, VehicleState
+from flockd.flight.pilot.ground import GroundFilter
 from flockd.sim.vehicles import euler_rotation
 
 STEP_S = 0.5
@@ -36,11 +36,11 @@ def state(
     return VehicleState(time_s, R, height_m, np.zeros(3), np.array([north_m, 0.0]), ground_range=reading)
 
 
-def follower(source: HeightSource = "best") -> GroundBelow:
-    return GroundBelow(source, RangeFinderParameters())
+def follower(source: HeightSource = "best") -> GroundFilter:
+    return GroundFilter(source, RangeFinderParameters())
 
 
-def known(found: tuple[GroundEstimate | NoGround, str | None]) -> GroundEstimate:
+def known(found: tuple[GroundEstimate | None, Reason | None]) -> GroundEstimate:
     assert isinstance(found[0], GroundEstimate)
     return found[0]
 
@@ -101,10 +101,11 @@ FAULTS: dict[str, Callable[[float], VehicleState]] = {
 def test_without_a_good_range_the_barometer_serves_or_there_is_no_scale(fault: str) -> None:
     found, why = follower("best").update(FAULTS[fault](0.0))
     assert isinstance(found, GroundEstimate)
-    assert (found.source, found.height_m, why) == ("barometer", 4.0, f"height: {fault}; the barometer's is used")
+    assert (found.source, found.height_m) == ("barometer", 4.0)
+    assert why == Reason(ReasonKind.HEIGHT, f"height: {fault}; the barometer's is used")
     assert follower("range_finder").update(FAULTS[fault](0.0)) == (
-        NoGround(f"height: {fault}; there is no scale"),
         None,
+        Reason(ReasonKind.HEIGHT, f"height: {fault}; there is no scale"),
     )
     level, nothing = follower("barometer").update(FAULTS[fault](0.0))
     assert isinstance(level, GroundEstimate)

@@ -13,7 +13,8 @@ from flockd.core.data import data_path
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, Frame, FrameSet, UInt8Array, VehicleState
 from flockd.flight.geometry import Rig, RigCamera, build_rig, ground_inverse_depth
 from flockd.flight.perception import Instance, OnnxNetworks, OpenDepth, Perception, SceneMaps
-from flockd.flight.perception.depth import fix_by_height
+from flockd.flight.perception.metric_depth import metric_depth
+from flockd.flight.pilot.ground import level_ground
 from tests.flight.inference.foreign import SIZE, one_channel_depth
 
 WIDTH, HEIGHT = 160, 120
@@ -35,10 +36,9 @@ def opened(depth: FloatArray, *, shift: bool, labels: UInt8Array | None = None) 
     inverse = (1.0 / depth - (SHIFT if shift else 0.0)) / FACTOR
     nothing: tuple[Instance, ...] = ()
     return SceneMaps(
-        np.full(depth.shape, np.nan, np.float32),
+        OpenDepth(inverse.astype(np.float32), shift=shift),
         np.zeros(depth.shape, np.uint8) if labels is None else labels,
         nothing,
-        OpenDepth(inverse.astype(np.float32), shift=shift),
     )
 
 
@@ -55,11 +55,10 @@ def depth_of_ground(height_m: float, seed: int = 0) -> tuple[FloatArray, Float32
 @pytest.mark.parametrize("shift", [False, True])
 def test_height_finds_the_ground_under_what_stands_on_it(shift: bool) -> None:
     scene, ground, bare = depth_of_ground(3.0)
-    fixed = fix_by_height(opened(scene, shift=shift), ground)
-    assert fixed.open is None
-    np.testing.assert_allclose(fixed.depth[bare], scene[bare], rtol=0.02)
+    fixed = metric_depth(opened(scene, shift=shift), ground)
+    np.testing.assert_allclose(fixed[bare], scene[bare], rtol=0.02)
     near = scene < 20.0
-    np.testing.assert_allclose(fixed.depth[near], scene[near], rtol=0.02)
+    np.testing.assert_allclose(fixed[near], scene[near], rtol=0.02)
 
 
 def test_drones_before_the_ground_do_not_count() -> None:
@@ -68,18 +67,18 @@ def test_drones_before_the_ground_do_not_count() -> None:
     labels[HEIGHT // 2 :, : WIDTH // 3] = 1
     seen = scene.copy()
     seen[labels > 0] *= 0.2
-    fixed = fix_by_height(opened(seen, shift=True, labels=labels), ground)
-    np.testing.assert_allclose(fixed.depth[bare & (labels == 0)], scene[bare & (labels == 0)], rtol=0.02)
+    fixed = metric_depth(opened(seen, shift=True, labels=labels), ground)
+    np.testing.assert_allclose(fixed[bare & (labels == 0)], scene[bare & (labels == 0)], rtol=0.02)
 
 
 def test_without_ground_in_view_height_says_nothing() -> None:
     wall = np.random.default_rng(0).uniform(1.0, 30.0, (HEIGHT, WIDTH))
     ground = np.zeros((HEIGHT // 2, WIDTH // 2), np.float32)
     with pytest.raises(ValueError, match="too little flat ground is in view to fix the scale of depth"):
-        fix_by_height(opened(wall, shift=True), ground)
+        metric_depth(opened(wall, shift=True), ground)
     _, level, _ = depth_of_ground(3.0)
     with pytest.raises(ValueError, match="too little flat ground"):
-        fix_by_height(opened(wall, shift=True), level)  # nothing in this picture looks like ground
+        metric_depth(opened(wall, shift=True), level)  # nothing in this picture looks like ground
 
 
 def test_a_foreign_relative_network_sees_metres_by_height(tmp_path: Path) -> None:
@@ -92,7 +91,11 @@ def test_a_foreign_relative_network_sees_metres_by_height(tmp_path: Path) -> Non
     path = one_channel_depth(tmp_path, output={"depth": {"quantity": "inverse_depth", "unknown": "scale_and_shift"}})
     config = PerceptionConfig(flow="dis", depth=str(path), distance="none", scale="height")
     perception = Perception(rig, OnnxNetworks(config, data_path("models")), config)
-    observation = perception.observe(FrameSet(0.0, {"front": Frame("front", image, 0.0, 0)}), vehicle)
+    observation = perception.observe(
+        FrameSet(0.0, {"front": Frame("front", image, 0.0, 0)}), vehicle, level_ground(vehicle)
+    )
     assert observation.reasons == ()
     rows = slice(SIZE[1] * 3 // 4, None)
-    np.testing.assert_allclose(observation.cameras["front"].depth[rows], 1.0 / inverse[rows], rtol=0.05)
+    depth = observation.cameras["front"].depth
+    assert depth is not None
+    np.testing.assert_allclose(depth[rows], 1.0 / inverse[rows], rtol=0.05)

@@ -12,22 +12,22 @@ from scipy.interpolate import RegularGridInterpolator
 from flockd.core.choices import HeightSource
 from flockd.core.config.perception import RangeFinderParameters
 from flockd.core.config.scenario import RangeFinderConfig
-from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, VehicleState
-from flockd.flight.perception.depth import GroundBelow, NoGround
+from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, Reason, ReasonKind, VehicleState
+from flockd.flight.pilot.ground import GroundFilter
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.sim.hills import hills
 from flockd.sim.vehicles import euler_rotation
 
 STEP_S = 0.5
-LIE = "height: the range contradicts the barometer; the barometer's is used"
-Told = tuple[GroundEstimate | NoGround, str | None]
+LIE = Reason(ReasonKind.HEIGHT, "height: the range contradicts the barometer; the barometer's is used")
+Told = tuple[GroundEstimate | None, Reason | None]
 
 
 class Drone:
     """One that flies over level ground with a sensor that says what a story wants."""
 
     def __init__(self, source: HeightSource = "best", height_m: float = 4.0, **parameters: float) -> None:
-        self.below = GroundBelow(source, RangeFinderParameters.model_validate(parameters))
+        self.below = GroundFilter(source, RangeFinderParameters.model_validate(parameters))
         self.time_s, self.height_m, self.north_m, self.east_m = 0.0, height_m, 0.0, 0.0
 
     def step(
@@ -80,8 +80,8 @@ def test_alone_it_gives_no_scale() -> None:
     drone = Drone("range_finder")
     drone.hovers(3.0)
     assert drone.hovers(2.0, 0.3)[-1] == (
-        NoGround("height: the range contradicts the barometer; there is no scale"),
         None,
+        Reason(ReasonKind.HEIGHT, "height: the range contradicts the barometer; there is no scale"),
     )
 
 
@@ -161,7 +161,7 @@ def test_hills_of_fifteen_per_cent_never_contradict_the_barometer(seed: int) -> 
     rng = np.random.default_rng([seed, 1])
     ground = _over_hills(seed)
     sensor = FakeRangeFinder(RangeFinderConfig(dropouts_per_min=0.0), ground, (seed,))
-    below, heading = GroundBelow("best", RangeFinderParameters()), float(rng.uniform(0.0, 2 * math.pi))
+    below, heading = GroundFilter("best", RangeFinderParameters()), float(rng.uniform(0.0, 2 * math.pi))
     velocity = np.array([math.cos(heading), math.sin(heading), 0.0])
     told, rises_m = set(), []
     for k in range(300):

@@ -9,17 +9,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 
 from flockd.core.choices import HeightSource
 from flockd.core.config.perception import RangeFinderParameters
-from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, VehicleState
-from flockd.flight.perception.depth.contradiction import ContradictionMonitor, GroundPoint
+from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, Reason, ReasonKind, VehicleState
+from flockd.flight.pilot.ground.contradiction import ContradictionMonitor, GroundPoint
 
-OF_HEIGHT = "height: "
-"""How reasons begin that tell of the height's source."""
 HEIGHT_NOISE_M = 0.03
 """Standard deviation of the autopilot's height from one reading to the next; what changes slowly does not matter."""
 FIRST_SLOPE = 0.1
@@ -38,14 +35,7 @@ BELIEVED_AFTER = 2
 """Readings in a row that the expected ground does not explain: then the ground is as they say."""
 
 
-@dataclass(frozen=True)
-class NoGround:
-    """Why there is no ground to fix the scale by: one short sentence, the same for each occurrence."""
-
-    reason: str
-
-
-class GroundBelow:
+class GroundFilter:
     """Follows the ground below one drone. Call `update` once for each step."""
 
     def __init__(self, source: HeightSource, parameters: RangeFinderParameters) -> None:
@@ -67,18 +57,18 @@ class GroundBelow:
         places = np.array(self._track).reshape(-1, 3)
         return np.column_stack([places[:, :2] - self._flown, vehicle.height_m - places[:, 2]])
 
-    def update(self, vehicle: VehicleState) -> tuple[GroundEstimate | NoGround, str | None]:
-        """The ground at a step, and why its source is not the one that was wanted; None: it is."""
+    def update(self, vehicle: VehicleState) -> tuple[GroundEstimate | None, Reason | None]:
+        """The ground at a step, and why its source is not the one that was wanted."""
         if self._source == "barometer":
-            return _level(vehicle), None
+            return level_ground(vehicle), None
         fault = self._follow(vehicle)
         age_s = vehicle.time_s - self._measured_s
         if self._state is not None and (fault is None or age_s <= self._parameters.bridge_s):
             height_m = vehicle.height_m - float(self._state[0])
             return GroundEstimate(height_m, self._state[1:].copy(), "range_finder"), None
         if self._source == "best":
-            return _level(vehicle), f"{OF_HEIGHT}{fault}; the barometer's is used"
-        return NoGround(f"{OF_HEIGHT}{fault}; there is no scale"), None
+            return level_ground(vehicle), Reason(ReasonKind.HEIGHT, f"height: {fault}; the barometer's is used")
+        return None, Reason(ReasonKind.HEIGHT, f"height: {fault}; there is no scale")
 
     def see_slope(self, slope: FloatArray) -> None:
         """Takes the slope (2,) that the images of the newest step show."""
@@ -170,7 +160,8 @@ def reading_fault(reading: RangeReading | None, now_s: float, parameters: RangeF
     return None
 
 
-def _level(vehicle: VehicleState) -> GroundEstimate:
+def level_ground(vehicle: VehicleState) -> GroundEstimate:
+    """Level, as far below as the autopilot's height says."""
     return GroundEstimate(vehicle.height_m, np.zeros(2), "barometer")
 
 

@@ -1,0 +1,51 @@
+"""The metric scale of depth that a network leaves open, from flat ground as far below as the height says."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flockd.core.messages import Float32Array
+from flockd.flight.geometry.robust.line import ransac_line
+from flockd.flight.perception.maps import OpenDepth, SceneMaps
+
+_MAX_GROUND_M = 40.0
+"""Flat ground beyond is a few rows under the horizon: a degree of attitude moves it by half."""
+_TOLERANCE = 0.1
+"""A pixel agrees with a scale when its inverse depth is off by less than this share."""
+_MIN_SHARE = 0.25
+"""Of the pixels that have to agree: on a plain with trees and houses about half is ground."""
+_MIN_PIXELS = 100
+_MAX_DEPTH_M = 1e3
+"""Farther is as far: the sky's inverse depth is about 0, or less."""
+
+
+def metric_depth(maps: SceneMaps, ground: Float32Array | None) -> Float32Array:
+    """(h, w) metres: the network's own, or with the scale that flat ground gives.
+
+    That scale, ``inverse depth = factor * open + shift``, is the one that brings most of the image's lower part onto
+    the ground, by RANSAC: what stands on the ground does not count.
+
+    Args:
+        maps: what the networks say of the image.
+        ground: (h/stride, w/stride) inverse depth of flat ground, 1/m, 0 where there is none; None: nothing is known of
+            the ground.
+
+    Raises ValueError where too little of the image is ground.
+    """
+    if not isinstance(maps.depth, OpenDepth):
+        return maps.depth
+    if ground is None:
+        raise ValueError("the network gives its depth no scale")
+    (height, width), stride = ground.shape, maps.labels.shape[0] // ground.shape[0]
+    blocks = (height, stride, width, stride)
+    level = (ground > 1.0 / _MAX_GROUND_M) & (maps.labels.reshape(blocks).max(axis=(1, 3)) == 0)
+    open_, target = maps.depth.inverse.reshape(blocks).mean(axis=(1, 3))[level], ground[level]
+    finite = np.isfinite(open_) & np.isfinite(target)
+    x, y = open_[finite].astype(np.float64), target[finite].astype(np.float64)
+    scale = ransac_line(
+        x, y, _TOLERANCE * np.abs(y), intercept=maps.depth.shift, min_inliers=_MIN_PIXELS, min_inlier_ratio=_MIN_SHARE
+    )
+    if scale is None:
+        raise ValueError("too little flat ground is in view to fix the scale of depth")
+    inverse = np.float32(scale.slope) * maps.depth.inverse + np.float32(scale.intercept)
+    return np.asarray(1.0 / np.maximum(inverse, np.float32(1.0 / _MAX_DEPTH_M)), np.float32)
