@@ -79,8 +79,6 @@ def _info(args: argparse.Namespace) -> int:
         say(f"{name:12}{facts[name]}")
     for name, sha256 in facts["models"].items():
         say(f"{'model':12}{name} {sha256[:12]}")
-    for note in facts["migrations"]:
-        say(f"{'migration':12}{note}")
     for gap in facts["gaps"]:
         say(f"{'gap':12}steps {gap['first_step']} to {gap['last_step']} are missing")
     for damage in facts["damages"]:

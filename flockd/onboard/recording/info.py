@@ -20,7 +20,6 @@ def recording_info(recording: Recording) -> dict[str, Any]:
         "duration_s": recording.duration_s,
         "lost": contents.lost,
         "models": dict(contents.models),
-        "migrations": list(recording.migrations),
         "gaps": [{"first_step": first, "last_step": last} for first, last in contents.gaps],
         "damages": [
             {"file": str(path), "byte": damage.offset, "reason": damage.reason} for path, damage in contents.damages

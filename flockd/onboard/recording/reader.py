@@ -20,7 +20,7 @@ from flockd.core.messages import Frame, FrameSet, MissionOrder, UInt8Array, Vehi
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.codec import from_json, parsed
 from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, Note, Record, RecordingError, read_records
-from flockd.onboard.recording.migration import Migrated, migrate_configuration, migrate_output
+from flockd.onboard.recording.migration import migrate_configuration, migrate_output
 from flockd.onboard.recording.streams import (
     CONFIGURATION,
     END_NOTE,
@@ -115,10 +115,7 @@ class Recording:
         """
         self.path = Path(path)
         self.contents = _survey(self.path, progress)
-        migrated = _migrated(self.path, self.contents.configuration)
-        self.config = _config(self.path, migrated)
-        self.migrations: tuple[str, ...] = migrated.notes
-        """What was changed in a configuration of an earlier version, each in one sentence."""
+        self.config = _config(self.path, self.contents)
 
     @property
     def drone(self) -> str:
@@ -289,23 +286,21 @@ def _time_of(path: Path, data: bytes) -> float:
     return time_s
 
 
-def _migrated(path: Path, text: bytes) -> Migrated:
+def _config(path: Path, contents: Contents) -> DroneConfig:
     try:
-        return migrate_configuration(parsed(text))
+        document = migrate_configuration(parsed(contents.configuration))
     except ValueError as error:
         raise RecordingError(f"{path}: the configuration in it is not JSON ({error}); use another copy") from error
-
-
-def _config(path: Path, migrated: Migrated) -> DroneConfig:
     try:
         # Strict checks allow in JSON what they refuse in Python values, such as a list for a tuple.
-        return DroneConfig.model_validate_json(json.dumps(migrated.document))
+        return DroneConfig.model_validate_json(json.dumps(document))
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "the whole"
+        version = contents.flight.get("version", "of unknown version")
         raise RecordingError(
             f"{path}: the configuration in it is not one of this flockd ({key}: {first['msg']}); "
-            "use the flockd that wrote it"
+            f"use the flockd that wrote it, {version}"
         ) from error
 
 

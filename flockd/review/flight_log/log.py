@@ -66,8 +66,8 @@ class FlightLog:
     """(K, 6) each confirmed track at each step: step, observer, track, and metres north, east and down of it."""
 
     goal: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-    """(S, 2) m north and east: where most drones that have a goal want to go, to the millimetre; NaN without
-    one; (0, 2) in logs from before there were goals."""
+    """(S, 2) m north and east: where most drones that have a goal want to go, to the millimetre; NaN, or
+    (0, 2), without one."""
     obstacles: FloatArray = field(default_factory=lambda: np.zeros((0, 7)))
     """(K, 7) each solid from above: metres north and east of its middle, half its length and width, the heading of its
     length (rad), and its lowest and highest height above z = 0. A round one has its radius as half length, and half

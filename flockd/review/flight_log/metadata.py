@@ -116,8 +116,7 @@ class FlightMetadata(BaseModel):
     """Of flockd."""
     interrupted: bool = False
     """It was ended before its time; `duration_s` is what was flown."""
-    mission: MissionMetadata | None = None
-    """None in logs from before there were missions."""
+    mission: MissionMetadata
     drone_radius_m: float | None = None
     """Of the sphere that holds a drone; None where there is nothing to collide with."""
     clock_at_start_s: float | None = None

@@ -25,9 +25,6 @@ def replay_warnings(recording: Recording, config: DroneConfig, start_s: float) -
     ``start_s`` is on the recording's clock. Raises ModelError.
     """
     contents = recording.contents
-    if recording.migrations and config is recording.config:
-        changed = "; ".join(recording.migrations)
-        yield f"{recording.path}: was recorded by version {contents.flight.get('version')}: {changed}"
     first_step = next(number for number, time_s in contents.steps if time_s >= start_s)
     if first_step > 0:
         yield f"the replay begins with step {first_step}: the pilot has no tracks and no flight time from before it"

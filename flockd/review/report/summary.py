@@ -113,9 +113,9 @@ def mission_figures(log: FlightLog) -> Json:
     first time that it was there, once that goal was the one to fly to.
     """
     mission = log.metadata.mission
-    figures: Json = {"kind": None if mission is None else mission.kind, "arrived": None, "time_s": None}
+    figures: Json = {"kind": mission.kind, "arrived": None, "time_s": None}
     goals = np.flatnonzero(np.isfinite(log.goal).all(axis=1))
-    if mission is None or not len(goals) or not log.has_truth:
+    if not len(goals) or not log.has_truth:
         return {**figures, "final_error_m": None}
     last = log.goal[goals[-1]]
     away_m = np.linalg.norm(log.position[..., :2].mean(axis=1) - last, axis=1)

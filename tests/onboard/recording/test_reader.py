@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import struct
 import subprocess
 import sys
@@ -22,7 +23,7 @@ from flockd.onboard.recording import RecordingError
 from flockd.onboard.recording.codec import to_json
 from flockd.onboard.recording.editing import cut, recover
 from flockd.onboard.recording.export import export_images, export_tables
-from flockd.onboard.recording.mcap_file import Damage, Entry, McapFile, Note, read_records
+from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, McapFile, Note, read_records
 from flockd.onboard.recording.reader import Recording, is_image
 from tests.onboard.recording.made_up import record
 
@@ -61,6 +62,25 @@ def test_what_is_no_recording_is_refused_in_one_sentence(tmp_path: Path, whole: 
     content = whole.read_bytes()
     path.write_bytes(content.replace(b"\x01\x00\x00\x001", b"\x01\x00\x00\x002", 1))
     assert refusal(path) == "is of format '2', and this flockd reads '1'; use the flockd that wrote it"
+
+
+def test_a_configuration_of_another_version_is_refused_with_the_version_that_reads_it(
+    tmp_path: Path, whole: Path
+) -> None:
+    path = tmp_path / "later.mcap"
+    with McapFile(path) as file:
+        for entry in read_records(whole):
+            assert not isinstance(entry, Damage)
+            if isinstance(entry, Inclosure):
+                data = {**json.loads(entry.data), "colour": "red"}
+                entry = replace(entry, data=json.dumps(data).encode())  # noqa: PLW2901
+            if isinstance(entry, Note) and "version" in entry.facts:
+                entry = replace(entry, facts={**entry.facts, "version": "9.1"})  # noqa: PLW2901
+            file.write(entry)
+    assert re.fullmatch(
+        r"the configuration in it is not one of this flockd \(colour: .*\); use the flockd that wrote it, 9\.1",
+        refusal(path),
+    )
 
 
 def test_a_file_cut_off_anywhere_is_refused_or_played_as_far_as_it_goes(tmp_path: Path, whole: Path) -> None:

@@ -14,7 +14,7 @@ from flockd.onboard.recording.reader import Recording
 from flockd.review.flight_log.autopilot_log import AutopilotLog
 from flockd.review.flight_log.from_recordings import autopilot_clock
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.flight_log.metadata import FlightMetadata
+from flockd.review.flight_log.metadata import FlightMetadata, MissionMetadata
 from flockd.review.flight_log.ulog import autopilot_log, drone_of, read_ulog
 from flockd.review.report.autopilot_figure import autopilot_texts
 from flockd.review.report.flight_folder import save_flight
@@ -37,6 +37,7 @@ def _commanded(time_s: float) -> tuple[float, float]:
 def _log() -> FlightLog:
     times_s = np.asarray(STEP_S * np.arange(STEPS), np.float64)
     metadata = FlightMetadata(
+        mission=MissionMetadata(kind="hover", reached_m=1.0),
         scenario="kestrel", perception="learned", flow="dis", scale="height", drones=1, duration_s=30.0, step_s=STEP_S,
         circle_until_s=0.0, desired_distance_m=3.5, observation_distance_m=10.0, separation_distance_m=2.0,
         names=["kestrel"], recorded=["kestrel"], clock_at_start_s=CLOCK_AT_START_S,

@@ -20,7 +20,7 @@ from scipy.spatial import Delaunay
 
 from flockd.review.flight_log.key_frames import KeyFrame, load_key_frames, save_key_frames
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.flight_log.metadata import FlightMetadata
+from flockd.review.flight_log.metadata import FlightMetadata, MissionMetadata
 from flockd.review.report.curves import error_curves, flight_curves
 from flockd.review.report.filmstrip import filmstrip_figure
 from flockd.review.report.obstacle_figures import obstacle_figure
@@ -81,6 +81,7 @@ def _flight(*, drones: int = 5, duration_s: float = 110.0, perception: str = "le
         stages_ms={} if perception == "truth" else {"flow": np.array([40.0, 60.0]), "ego_motion": np.array([5.0])},
         metadata=FlightMetadata(
             scenario="polygon",
+            mission=MissionMetadata(kind="circle_then_tangent", reached_m=1.0),
             perception=perception,
             flow="flow",
             scale="height",

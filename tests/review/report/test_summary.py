@@ -91,6 +91,7 @@ def _hand_made() -> FlightLog:
         stages_ms={"flow": np.arange(1.0, 102.0), "never run": np.empty(0)},
         metadata=FlightMetadata(
             scenario="side_by_side",
+            mission=MissionMetadata(kind="circle_then_tangent", reached_m=1.0),
             perception="learned",
             flow="dis",
             scale="height",
@@ -320,7 +321,7 @@ def test_a_mission_has_arrived_where_the_middle_is_at_the_last_goal() -> None:
     over = summarise(landed)["mission"]
     assert over == {"kind": "waypoints", "arrived": True, "time_s": 11.0, "final_error_m": pytest.approx(0.5, abs=0.01)}
     nowhere = summarise(_hand_made())["mission"]
-    assert nowhere == {"kind": None, "arrived": None, "time_s": None, "final_error_m": None}
+    assert nowhere == {"kind": "circle_then_tangent", "arrived": None, "time_s": None, "final_error_m": None}
 
 
 def test_a_contact_with_an_obstacle_counts_once_however_long_it_lasts() -> None:

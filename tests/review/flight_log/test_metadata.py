@@ -1,0 +1,43 @@
+"""Metadata of flights as JSON."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flockd.core.config import load_scenario
+from flockd.core.data import data_path
+from flockd.review.flight_log.metadata import FleetMetadata, FlightMetadata, Percentiles
+
+
+def test_metadata_of_a_fleet_comes_back(tmp_path: Path) -> None:
+    fleet = FleetMetadata(
+        speed_factor=0.5, cores={"daemons": 1.5}, frame_sets=4, frame_sets_looked_at={"drone1": 3},
+        longest_step_s=1.0, motions_over_more_than_one_frame_set=1,
+        frames_late_s=Percentiles(p50=0.1, p95=float("nan")),
+        autopilot_clock_rates=[0.5], order_last_20s=1.0, union_last_20s=1.0, handed_over={"drone1": "it landed"},
+        exit_codes={"drone1": 0}, notes=["a note"],
+    )  # fmt: skip
+    drone = load_scenario(data_path("config") / "paper_flight.yaml").drone
+    metadata = FlightMetadata.of_configuration(
+        drone, scenario="two", perception="learned", drones=2, duration_s=2.0, seed=None, wall_s=3.0, fleet=fleet
+    )
+    written = metadata.model_dump_json(exclude_unset=True)
+    assert json.loads(written)["seed"] is None
+    assert "recorded" not in json.loads(written)
+    again = FlightMetadata.model_validate_json(written)
+    assert again.fleet is not None
+    assert np.isnan(again.fleet.frames_late_s.p95)
+    assert again.fleet.handed_over == {"drone1": "it landed"}
+    assert again.separation_distance_m == drone.flocking.separation_distance_m
+
+
+def test_facts_that_no_flight_has_are_refused() -> None:
+    drone = load_scenario(data_path("config") / "paper_flight.yaml").drone
+    with pytest.raises(ValueError, match="duratoin_s"):
+        FlightMetadata.of_configuration(
+            drone, scenario="two", perception="learned", drones=2, duration_s=2.0, duratoin_s=2.0
+        )
