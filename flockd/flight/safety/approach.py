@@ -11,6 +11,8 @@ from flockd.core.messages import FloatArray
 
 SAME_SPOT_M = 0.1
 """A neighbour whose level range is smaller is above or below, in no direction: cameras do not measure one that well."""
+NOTHING_NEAR = np.empty((0, 2)), np.empty(0)
+"""No direction, and no limit."""
 
 
 def towards_neighbours(
@@ -29,10 +31,13 @@ def towards_neighbours(
     ranges = np.hypot(offsets[:, 0], offsets[:, 1])
     about_m = max(separation_m, p.vertical_separation_m)
     meets = (ranges >= SAME_SPOT_M) & (ranges < math.inf) & (np.abs(offsets[:, 2]) < about_m)
-    offsets, ranges = offsets[meets], ranges[meets]
+    if not meets.any():
+        return NOTHING_NEAR
+    offsets, ranges, velocities = offsets[meets], ranges[meets], velocities[meets]
     towards = offsets[:, :2] / ranges[:, None]
-    velocities = np.nan_to_num(velocities[meets], posinf=0.0, neginf=0.0)
-    comes = -np.clip(np.sum(velocities * towards, axis=1), -p.max_speed_m_s, p.max_speed_m_s)
+    velocities = np.where(np.isfinite(velocities), velocities, 0.0)
+    goes = (velocities * towards).sum(axis=1)
+    comes = -np.minimum(np.maximum(goes, -p.max_speed_m_s), p.max_speed_m_s)
     left_m = ranges - separation_m
     lag = p.braking_m_s2 * p.reaction_s
     square = lag**2 + 2 * p.braking_m_s2 * (left_m - comes * p.reaction_s) - comes * np.abs(comes)
@@ -49,6 +54,8 @@ def towards_obstacles(
 
     `points` (m, 2) metres north and east from the drone; those that are not finite, or at no distance, are left out.
     """
+    if not len(points):
+        return NOTHING_NEAR
     ranges = np.hypot(points[:, 0], points[:, 1])
     somewhere = (ranges > 0) & (ranges < math.inf)
     points, ranges = points[somewhere], ranges[somewhere]

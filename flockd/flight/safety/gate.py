@@ -141,7 +141,7 @@ class Gate:
                     objections.append(Objection.SLOWED)
         velocity = self._within_acceleration(target, now_s, around)
         velocity = self._within_space(velocity, permission.action, around, objections)
-        if not np.isfinite([*velocity, wanted.height_m, yaw_rad]).all():
+        if not all(map(math.isfinite, (*velocity, wanted.height_m, yaw_rad))):
             objections.append(Objection.SETPOINT_NOT_FINITE)
             return None
         height_m = self._within_climb(now_s, permission.action, wanted, around, objections)
@@ -163,7 +163,7 @@ class Gate:
         refusals = (
             (
                 Objection.COMMAND_NOT_FINITE,
-                not (np.isfinite(command.velocity).all() and math.isfinite(command.yaw_rad)),
+                not all(map(math.isfinite, (*command.velocity, command.yaw_rad))),
             ),
             (Objection.COMMAND_TOO_LARGE, math.hypot(*command.velocity) > self._parameters.max_speed_m_s),
             (Objection.POSITION_UNKNOWN, is_fenced(self._parameters) and not np.isfinite(around.position).all()),
@@ -199,7 +199,8 @@ class Gate:
         """The velocity without what leads out of the fence, too fast towards a neighbour, or too near an obstacle."""
         p = self._parameters
         separation_m = p.min_separation_m if action is Action.FLY else p.degraded_separation_m
-        outward = _units(offsets_outside(p, around.position))
+        outward = offsets_outside(p, around.position)
+        outward = _units(outward) if len(outward) else outward
         to_neighbours = towards_neighbours(p, around.neighbours, around.neighbour_velocities, separation_m)
         to_obstacles = towards_obstacles(around.obstacles, p.obstacle_clearance_m, p.braking_m_s2, p.reaction_s)
         limits = {
@@ -207,9 +208,10 @@ class Gate:
             Objection.SEPARATION: to_neighbours,
             Objection.OBSTACLE: to_obstacles,
         }
-        for objection, (directions, most_m_s) in limits.items():
-            if (directions @ velocity > most_m_s).any():
-                objections.append(objection)
+        over = [name for name, (directions, most_m_s) in limits.items() if (directions @ velocity > most_m_s).any()]
+        if not over:
+            return velocity
+        objections.extend(over)
         every_direction, every_limit = zip(*limits.values(), strict=True)
         return nearest_within(velocity, np.concatenate(every_direction), np.concatenate(every_limit))
 
@@ -247,6 +249,8 @@ class Gate:
         p, offsets = self._parameters, around.neighbours
         own_m = around.height_m if math.isfinite(around.height_m) else start_m
         near = np.hypot(offsets[:, 0], offsets[:, 1]) < _COLUMN * p.degraded_separation_m
+        if not near.any():
+            return -math.inf, math.inf
         up = -offsets[near, 2]
         room_up = np.maximum(up[up > 0] - p.vertical_separation_m, 0.0).min(initial=math.inf)
         room_down = np.maximum(-up[up < 0] - p.vertical_separation_m, 0.0).min(initial=math.inf)

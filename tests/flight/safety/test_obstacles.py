@@ -131,6 +131,11 @@ def test_a_velocity_that_is_not_finite_does_not_raise() -> None:
     np.testing.assert_array_equal(nearest_within(np.array([np.nan, 0.0]), np.array([[1.0, 0.0]]), np.zeros(1)), [0, 0])
 
 
+def test_a_velocity_within_its_limits_is_itself() -> None:
+    directions, limits = np.array([[1.0, 0.0], [0.0, -1.0], [-1.0, 0.0]]), np.array([0.5, 0.0, 0.0])
+    np.testing.assert_array_equal(nearest_within(np.array([0.3, 0.7]), directions, limits), [0.3, 0.7])
+
+
 def test_a_gap_between_two_walls_is_flown_through_in_its_middle() -> None:
     points = [(0.1 * k, side) for k in range(-20, 21) for side in (-0.9, 0.9)]
     np.testing.assert_allclose(velocity_of(flown([1.0, 0.0], among(*points))), [1.0, 0.0])
