@@ -62,6 +62,11 @@ EQUIVALENT: dict[str, str] = {
     "gate.py Gate._within_space: every_direction, every_limit = zip(*limits.values(), strict=(False))": (
         "each of them is a pair"
     ),
+    "gate.py Gate._within_space: outward = (_units(outward))": "of none there are none; it only saves time",
+    "gate.py Gate._within_space: if False:": "the velocity nearest to one within all limits is itself",
+    "gate.py Gate._between_neighbours: if False:": "the room beside nobody is infinite; it only saves time",
+    "approach.py towards_neighbours: if False:": "of none there are no limits; it only saves time",
+    "approach.py towards_obstacles: if False:": "of none there are no limits; it only saves time",
     "half_planes.py nearest_within: if ((over < 0)).all():": (
         "with a limit just reached, its foot is the velocity itself"
     ),

@@ -12,20 +12,16 @@ import numpy as np
 
 from flockd.core.config.perceived import PerceivedErrors
 from flockd.core.config.scenario import ScenarioConfig
-from flockd.core.messages import SECTORS, FloatArray, IntArray
-from flockd.flight.obstacles.local_map import DIRECTIONS
-from flockd.sim.control_level import flock_figures, gate_limits, law_sums, motion, perceived_sums, ways_around
+from flockd.core.messages import FloatArray, IntArray
+from flockd.sim.control_level import flock_figures, law_sums, motion, perceived_sums
 from flockd.sim.control_level.cells import CELLS_A_DRONE, sort_flights
+from flockd.sim.control_level.flight_code import FlightCode, Seen
 from flockd.sim.control_level.flock_figures import FlightFigures
 from flockd.sim.control_level.many_missions import ManyMissions
-from flockd.sim.control_level.many_obstacles import FIGURES, ManyObstacles, Run
-from flockd.sim.control_level.ways_around import Rules
+from flockd.sim.control_level.many_obstacles import FIGURES, ManyObstacles
 
 Figures = dict[str, float | int | bool | None]
 _Errors = tuple[FloatArray, FloatArray, IntArray]
-_NO_ERRORS: _Errors = (np.empty((0, 9)), np.empty(12), np.empty(0, np.int64))
-_SETPOINT_RATE_HZ = 20.0
-"""Of a drone without an autopilot's section, as by default in one."""
 _LEAST_DRONES = 250
 """Of a thread: fewer are computed sooner than handed over."""
 
@@ -48,9 +44,8 @@ def fly_flocks(
             obstacles and the errors of perception. Rig and sensors do not count.
         errors: of what the drones perceive of each other; None: they are given exact states. Ranges to obstacles are
             exact in any case.
-        gated: whether each drone's safety gate limits how fast it flies towards neighbours and obstacles
-            (`gate_limits`).
-        threads: to compute in.
+        gated: whether each drone flies through its safety gate (`flockd.flight.safety.Gate`), on what it perceives.
+        threads: to compute in what is not the flight code of single drones, its gate and its avoidance.
         progress: called with (flights done, flights in all).
 
     Raises UsageError for what cannot be flown without images, and for obstacles that do not fit into their world.
@@ -87,15 +82,12 @@ class FlockFlights:
         if errors is not None:
             tables = perceived_sums.by_distance(errors), perceived_sums.constants(errors, drone.step_s)
             self._errors = (*tables, np.array(seeds, dtype=np.int64))
-        rate_hz = _SETPOINT_RATE_HZ if drone.autopilot is None else drone.autopilot.setpoint_rate_hz
-        self._ticks = max(round(drone.step_s * rate_hz), 1) if gated else 1
-        gate = drone.safety.gate
-        self._gate = gate_limits.gate_figures(gate, gate.min_separation_m) if gated else None
-        self._gate_obstacles = gate_limits.obstacle_figures(drone.obstacles, gate.obstacle_clearance_m)
+        self._gated = gated
         self._obstacles = None if scenario.world.obstacles is None else ManyObstacles(scenarios)
         self._avoids = self._obstacles is not None and drone.obstacles.enabled
-        self._rules, self._last_rad = Rules.of(drone), np.full(f * n, np.nan)
-        self._substeps = motion.Substeps.of(vehicle, drone.step_s / self._ticks)
+        self._code = FlightCode(drone, vehicle, f * n) if gated or self._avoids else None
+        of_step = motion.Substeps.of(vehicle, drone.step_s)
+        self._substeps = self._code.substeps if gated and self._code is not None else of_step
         self._gusts = [motion.Gusts(vehicle, n, seed) for seed in seeds] if vehicle.gust_m_s else []
         self._figures = FlightFigures(f, n, self._times, drone.step_s, vehicle.radius_m)
         self._arrival_s, self._away_m = np.full(f, np.nan), np.full(f, np.nan)
@@ -108,7 +100,7 @@ class FlockFlights:
         self.commands = np.zeros((2, f, n))
         """Velocities that drones were asked to fly with in the last step, m/s."""
         self._middles, self._own = (np.zeros((2, f, n)) for _ in range(2))
-        self._sent = np.full((2, f, n), np.nan)
+        self._room = perceived_sums.Room.of(n)
         self._level, self._straight, self._unsafe = (np.empty((f, n)) for _ in range(3))
 
     def step(self, step: int, pool: ThreadPoolExecutor | None, threads: int) -> None:
@@ -121,7 +113,7 @@ class FlockFlights:
         self._note_goal(step)
         gusts = self._next_gusts()
         climbs = bool(np.isfinite(height_m).any())
-        states, flat = self.states.reshape(6, -1), height_m.reshape(-1)
+        states, heights = self.states.reshape(6, -1), height_m.reshape(-1)
         own = states[3:5] if self._errors is None else self._own.reshape(2, -1)
         commands = self.commands.reshape(2, -1)
 
@@ -132,58 +124,53 @@ class FlockFlights:
                 self._drone.step_s, p.max_acceleration_m_s2, p.max_speed_m_s, commands,
             )  # fmt: skip
 
-        def climb(a: int, b: int) -> None:
-            if climbs:
-                motion.climb(a, b, states, flat, self._substeps._replace(times=self._ticks * self._substeps.times))
-
         def fly(a: int, b: int) -> None:
             motion.fly(a, b, states, commands, gusts, self._substeps)
-            climb(a, b)
+            if climbs:
+                motion.climb(a, b, states, heights, self._substeps)
 
         _run(pool, drones, ask)
-        if self._avoids:
-            self._fly_around(step, desired, own, lambda work: _run(pool, drones, work))
-        if self._gate is None:
+        if self._code is not None:
+            self._fly_by_code(self._code, step, desired.reshape(2, -1), own.copy(), heights, gusts)
+        if not self._gated:
             _run(pool, drones, fly)
-        else:
-            self._fly_gated(step, gusts, pool, drones)
-            _run(pool, drones, climb)
 
-    def _fly_around(self, step: int, desired: FloatArray, own: FloatArray, run: Run) -> None:
-        """Turns the commands of a step aside from obstacles."""
-        assert self._obstacles is not None
-        cells = self._by_slot, self._grids, self._starts, self._order
-        self._obstacles.look(self.states.reshape(6, -1), run)
-        to_obstacles = self._obstacles.ranges, self._obstacles.first
-        errors = self._errors or _NO_ERRORS
-
-        def around(a: int, b: int) -> None:
-            ways_around.fly_around(
-                a, b, *cells, self.sums.reshape(2, -1), desired.reshape(2, -1), own, *to_obstacles, self._rules, errors,
-                step, self._last_rad, self.commands.reshape(2, -1),
-            )  # fmt: skip
-
-        run(around)
-
-    def _fly_gated(
-        self, step: int, gusts: FloatArray, pool: ThreadPoolExecutor | None, drones: list[tuple[int, int]]
+    def _fly_by_code(
+        self, code: FlightCode, step: int, desired: FloatArray, own: FloatArray, heights: FloatArray, gusts: FloatArray
     ) -> None:
-        """Towards the commands of a step, as far as the gates let each drone."""
-        cells = self._by_slot, self._grids, self._starts, self._order
-        fastest = np.hypot(self.states[3], self.states[4]).max(axis=1)
-        errors = self._errors or _NO_ERRORS
-        tick_s = self._drone.step_s / self._ticks
-        ranges = np.empty((0, SECTORS)) if self._obstacles is None or not self._avoids else self._obstacles.ranges
-        obstacles = self._gate_obstacles, DIRECTIONS, ranges
+        """Lets each drone's own code turn its command aside from obstacles, and its gate, if any, fly it."""
+        f, n = self._shape
+        states, commands = self.states.reshape(6, -1), self.commands.reshape(2, -1)
+        began = self.states.copy()
+        time_s = float(self._times[step])
+        for i in range(f * n):
+            flight, slot = divmod(i, n)
+            drone = flight * n + int(self._order[flight, slot])
+            ranges = None
+            if self._obstacles is not None and self._avoids:
+                ranges = self._obstacles.look(flight, time_s, began[:3, flight, drone - flight * n])
+            if ranges is None and not self._gated:
+                continue
+            seen = self._seen(step, flight, slot, began)
+            if ranges is not None:
+                commands[:, drone] = code.around(drone, own[:, drone], seen, desired[:, drone], ranges)
+            if self._gated:
+                code.fly_gated(drone, time_s, states, commands, heights, gusts, seen, ranges)
 
-        def fly(a: int, b: int) -> None:
-            gate_limits.fly_gated(
-                a, b, *cells, self.states.reshape(6, -1), self.commands.reshape(2, -1), self._sent.reshape(2, -1),
-                fastest, self._gate, self._ticks, tick_s, gusts, self._substeps, errors, step,
-                obstacles,
-            )  # fmt: skip
-
-        _run(pool, drones, fly)
+    def _seen(self, step: int, flight: int, slot: int, states: FloatArray) -> Seen:
+        """What the drone of a slot knows of the others, of the flights' `states` as the step begins."""
+        drone = int(self._order[flight, slot])
+        if self._errors is None:
+            others = np.delete(states[:, flight].T, drone, axis=0)
+            return Seen(others[:, :3] - states[:3, flight, drone], others[:, 3:])
+        cells = self._by_slot, self._grids[flight], self._starts[flight], self._order
+        table, figures, seeds = self._errors
+        reach = perceived_sums.farthest(figures, self._law)
+        count = perceived_sums.perceive(
+            flight, slot, *cells, table, figures, seeds[flight], step, reach, *self._room
+        )  # fmt: skip
+        known = self._room.seen[:count]
+        return Seen(known[:, [0, 1, 4]], np.column_stack([known[:, 2:4], known[:, 5]]))
 
     def perceive(self, step: int, pool: ThreadPoolExecutor | None = None, threads: int = 1) -> None:
         """What each drone sees of the others now, and what the law makes of it: `sums`."""
@@ -217,8 +204,7 @@ class FlockFlights:
         _run(pool, parts, lambda a, b: flock_figures.nearest_distances(a, b, *cells, self._order, *found))
         self._figures.add(step, *found)
         if self._obstacles is not None:
-            flat, ends = self.states.reshape(6, -1), step == self.steps - 1
-            self._obstacles.measure(flat, lambda work: _run(pool, parts, work), ends=ends)
+            self._obstacles.measure(self.states, ends=step == self.steps - 1)
         if self._figures.needs_union(step):
             unions, reach = np.empty(f), self._drone.flocking.observation_distance_m
             parts = _parts(f, threads, least=max(_LEAST_DRONES // n, 1))
@@ -229,8 +215,7 @@ class FlockFlights:
         """(substeps, 2, flights * n) m/s^2."""
         if not self._gusts:
             return np.empty((0, 2, 0))
-        substeps = self._substeps._replace(times=self._ticks * self._substeps.times)
-        return np.concatenate([gusts.step(substeps) for gusts in self._gusts], axis=2)
+        return np.concatenate([gusts.step(self._substeps) for gusts in self._gusts], axis=2)
 
     def _note_goal(self, step: int) -> None:
         """When each flock's true middle first was at the last goal, once that was the one to fly to."""

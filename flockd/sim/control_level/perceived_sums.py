@@ -8,13 +8,13 @@ it, and only those near are looked at. Compiled.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numba import njit
 
 from flockd.core.config.perceived import PerceivedErrors, Spread
-from flockd.core.messages import FloatArray
+from flockd.core.messages import FloatArray, IntArray
 from flockd.flight.flocking.law import SAME_SPOT_M
 from flockd.sim.control_level.cells import row_of, slice_of_row
 from flockd.sim.control_level.law_sums import (
@@ -42,6 +42,21 @@ MOST_FALSE = 4
 """False neighbours of a drone at one time, at most."""
 _ENLARGE = 0.8
 """The k nearest are known once the k-th is nearer than this times how far was looked."""
+
+
+class Room(NamedTuple):
+    """What `perceive` fills, for flights of n drones."""
+
+    slots: IntArray
+    ranges: FloatArray
+    rays: FloatArray
+    seen: FloatArray
+    z: FloatArray
+
+    @classmethod
+    def of(cls, n: int) -> Self:
+        """With room for all others and the false ones."""
+        return cls(np.empty(n, np.int64), np.empty(n), np.empty((n, 4)), np.empty((n + MOST_FALSE, 6)), np.empty(2))
 
 
 def by_distance(errors: PerceivedErrors) -> FloatArray:
@@ -206,6 +221,7 @@ def perceived_sums(
         while True:
             count = perceive(f, slot, by_slot, grids[f], starts[f], order, table, figures, seeds[f], step, reach,
                               slots, ranges, rays, seen, z)  # fmt: skip
+            _part(seen, count)
             kept = 0
             for k in range(count):
                 level = seen[k, 0] ** 2 + seen[k, 1] ** 2
@@ -234,6 +250,14 @@ def perceived_sums(
         out[1, f, drone] = sums[1] - ve
         middles[0, f, drone] = middle_n / (count + 1)
         middles[1, f, drone] = middle_e / (count + 1)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _part(seen: Any, count: int) -> None:
+    """As `flockd.flight.flocking.level_offsets`."""
+    for k in range(count):
+        if seen[k, 0] ** 2 + seen[k, 1] ** 2 < SAME_SPOT_M * SAME_SPOT_M:
+            seen[k, 0], seen[k, 1] = 0.0, -SAME_SPOT_M if seen[k, 4] > 0.0 else SAME_SPOT_M
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -274,8 +298,6 @@ def perceive(
             longer * (dx * math.cos(turn) - dy * math.sin(turn)),
             longer * (dx * math.sin(turn) + dy * math.cos(turn)),
         )
-        if px * px + py * py < SAME_SPOT_M * SAME_SPOT_M:  # as `flockd.flight.flocking.level_offsets`
-            px, py = 0.0, -SAME_SPOT_M if dz > 0.0 else SAME_SPOT_M
         _slow_normals(seed, pair, 3, step, figures[STRETCH], z)
         seen[count, 0], seen[count, 1] = px, py
         seen[count, 2] = by_slot[3, f, j] + _error(table, d, VELOCITY, z[0])

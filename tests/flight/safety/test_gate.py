@@ -365,6 +365,11 @@ def test_the_height_is_brought_into_the_band() -> None:
         assert verdict.objections == (() if asked_m == sent_m else (Objection.HEIGHT,))
 
 
+def test_below_home_and_alone_a_drone_stays_as_low_as_it_is() -> None:
+    valley = GateParameters(min_height_m=-50.0)
+    assert sent(Stream(valley).step(STILL, around=replace(HOME, height_m=-20.0), height_m=-20.0)).height_m == -20.0
+
+
 def test_the_height_changes_at_the_limit_and_not_at_all_while_the_drone_stands_still() -> None:
     stream = Stream(GateParameters(max_climb_m_s=1.0))
     climbed = [sent(stream.step(STILL, height_m=9.0)).height_m for _ in range(41)]

@@ -14,12 +14,10 @@ from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.data import data_path
 from flockd.core.messages import FloatArray, VelocityCommand
 from flockd.flight.obstacles import nearest_points
-from flockd.flight.safety import half_planes
 from flockd.flight.safety.gate import Gate, Objection, Permission, Surroundings, Wanted
 from flockd.flight.safety.policy import Action
 from flockd.sim.control_level import fly_flocks
 from flockd.sim.control_level.flock_flights import FlockFlights
-from flockd.sim.control_level.gate_limits import nearest_within
 from flockd.sim.exact_states import ExactFlock
 from flockd.sim.start import scattered, with_drones
 from flockd.sim.vehicles import Vehicles
@@ -97,18 +95,6 @@ def test_each_drone_flies_as_its_gate_says(keys: dict[str, Any]) -> None:
     for step in range(flights.steps):
         np.testing.assert_allclose(flights.states[:2, 0].T, expected[step], atol=1e-9)
         flights.step(step, None, 1)
-
-
-def test_the_velocity_within_half_planes_is_the_gates() -> None:
-    random = np.random.default_rng(0)
-    for count in (1, 2, 3, 8, 30):
-        for _ in range(40):
-            angles, most = random.uniform(0, 2 * np.pi, count), random.uniform(-0.3, 1.5, count).clip(0)
-            directions = np.column_stack([np.cos(angles), np.sin(angles)])
-            velocity = random.normal(size=2)
-            expected = half_planes.nearest_within(velocity, directions, most)
-            found = nearest_within(velocity[0], velocity[1], np.column_stack([directions, most]), count)
-            np.testing.assert_allclose(found, expected, atol=1e-8)
 
 
 def test_drones_that_fly_at_each_other_stop_in_time() -> None:

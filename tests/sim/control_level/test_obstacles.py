@@ -12,40 +12,14 @@ from flockd.core.config.loader import load_perceived_errors
 from flockd.core.config.perceived import PerceivedErrors
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.data import data_path
-from flockd.core.messages import SECTORS
 from flockd.review.report.summary import obstacle_figures
-from flockd.sim.clearances import clearances
 from flockd.sim.control_level import fly_flocks
 from flockd.sim.control_level.flock_flights import FlockFlights
-from flockd.sim.control_level.solid_distances import sector_ranges, solid_rows, way_clearances
 from flockd.sim.exact_states import ExactFlock
 from flockd.sim.start import scattered, with_drones
 from flockd.sim.swarm import fly
-from flockd.sim.worlds.obstacles import (
-    HEIGHT_BAND_M,
-    POINTS_A_STEP,
-    RANGE_LIMIT_M,
-    Box,
-    Capsule,
-    Frustum,
-    Obstacles,
-    true_ranges,
-)
 
 STEP_S = 0.5
-SOLIDS = Obstacles(
-    (
-        Frustum(6.0, 1.0, 0.4, 0.2, -0.6, 9.0),
-        Frustum(-3.0, 4.0, 0.9, 0.0, 0.3, 5.0),
-        Box(2.0, -7.0, 3.0, 0.2, 0.7, -0.6, 4.4),
-        Box(-9.0, -2.0, 2.0, 4.0, -2.4, -0.6, 7.0),
-        Capsule(0.0, 9.0, 7.0, 8.0, 3.0, 3.0, 0.012),  # a wire
-        Capsule(-6.0, 9.0, 4.0, -6.0, 9.0, 6.0, 1.2),
-        Capsule(9.0, 9.0, 5.0, 9.0, 9.0, 5.0, 0.8),  # a ball
-        Capsule(-2.0, -12.0, 4.5, 5.0, -14.0, 4.5, 0.5),
-    )
-)
-FIRST = np.array([0, len(SOLIDS.solids)])
 
 
 def _scenario(kind: str, drones: int, **overrides: Any) -> ScenarioConfig:
@@ -75,28 +49,6 @@ def _faultless() -> PerceivedErrors:
         "false_neighbours": {"at_once": 0.0, "lifetime_s": 1.0, "distances_m": (1.0, 2.0, 3.0)},
     }
     return PerceivedErrors.model_validate(values)
-
-
-def _states(count: int, seed: int) -> np.ndarray:
-    """(6, count) m and m/s NED, all over the solids and up to their tops."""
-    random = np.random.default_rng(seed)
-    places = np.vstack([random.uniform(-14.0, 14.0, (2, count)), random.uniform(-8.0, -0.5, (1, count))])
-    return np.vstack([places, random.normal(0.0, 1.0, (3, count))])
-
-
-def test_ranges_and_clearances_are_those_of_the_solids() -> None:
-    before, now = _states(150, seed=0), _states(150, seed=1)
-    now[:3] = before[:3] + 0.5 * now[3:]
-    rows, ranges, clearance = solid_rows(SOLIDS), np.empty((150, SECTORS)), np.empty(150)
-    sector_ranges(0, 150, 150, before, rows, FIRST, np.array(HEIGHT_BAND_M), RANGE_LIMIT_M, ranges)
-    way_clearances(0, 150, 150, before, now, STEP_S, POINTS_A_STEP, rows, FIRST, clearance)
-    expected = np.array([true_ranges(SOLIDS, 0.0, place).range_m for place in before[:3].T])
-    np.testing.assert_allclose(ranges, expected, atol=1e-9)
-    assert (expected == 0.0).any() and np.isinf(expected).any()
-    position, velocity = (np.stack([before[rows].T, now[rows].T]) for rows in (slice(3), slice(3, 6)))
-    on_the_way = clearances(SOLIDS, np.array([0.0, STEP_S]), position, velocity)[0]
-    np.testing.assert_allclose(clearance, on_the_way, atol=1e-9)
-    assert on_the_way.min() < 0.0
 
 
 @pytest.mark.parametrize(
