@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -53,13 +52,11 @@ def endless(folder: Path) -> Path:
 
 def test_an_endless_network_is_refused_in_one_sentence(tmp_path: Path) -> None:
     path = endless(tmp_path)
-    began_s = time.monotonic()
     with pytest.raises(
         ModelError,
         match=rf"^{path}:4: file: endless\.onnx did not finish the golden input in time \(more than 0\.3",
     ):
         OnnxModel(path, threads=1, deadline=within(0.3))
-    assert time.monotonic() - began_s < 5.0
 
 
 def test_work_that_ends_in_time_is_not_stopped_and_passes_its_errors_on() -> None:
@@ -78,12 +75,11 @@ def test_work_that_takes_too_long_is_stopped_and_left_if_it_does_not_obey(obeys:
     asked, free = threading.Event(), threading.Event()
 
     def work() -> None:
-        (asked if obeys else free).wait(30.0)
+        (asked if obeys else free).wait()
 
     stop: Callable[[], None] = asked.set
-    began_s = time.monotonic()
     with pytest.raises(TimeoutError, match=r"more than 0\.1 s"):
         within(0.1)(work, stop)
-    free.set()
     assert asked.is_set()
-    assert time.monotonic() - began_s < 3.0
+    assert not free.is_set(), "nobody waits for it"
+    free.set()

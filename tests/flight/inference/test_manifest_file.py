@@ -16,15 +16,16 @@ from flockd.flight.inference import load_manifest, read_manifest
 from tests.flight.inference.foreign import one_channel_depth
 
 LIMIT_S = 2.0
+"""Of the processor's time: what waits or reads for ever never ends, whatever else runs."""
 
 
 @contextmanager
 def refused(complaint: str) -> Iterator[None]:
     """In one sentence that matches, within the limit."""
-    began_s = time.monotonic()
+    began_s = time.process_time()
     with pytest.raises(ModelError, match=complaint) as error:
         yield
-    assert time.monotonic() - began_s < LIMIT_S
+    assert time.process_time() - began_s < LIMIT_S
     assert "\n" not in str(error.value)
 
 

@@ -219,19 +219,24 @@ def test_the_thread_keeps_its_rate_and_ends_when_the_gate_breaks() -> None:
         return setpoint
 
     streamer = SetpointStreamer(lambda _: sent.append(time.monotonic()), lambda: HOVERING, gate, AutopilotParameters())
-    streamer.start()
-    streamer.begin()
-    until_s = time.monotonic() + 1.0
-    while time.monotonic() < until_s:
+
+    def offer() -> None:
         streamer.offer(Setpoint(time.monotonic(), np.zeros(2), 2.5, 0.0))
         streamer.beat()
-        time.sleep(0.02)
-    assert 10 <= len(sent) <= 22
+        time.sleep(0.01)
+
+    streamer.start()
+    streamer.begin()
+    while len(sent) < 20:
+        offer()
+    passed_s = sent[-1] - sent[0]
+    assert passed_s > 18 / 20.0, "never faster than 20 Hz, but for one that was late"
+    assert len(sent) - 1 + streamer.report().missed >= round(20.0 * passed_s) - 1, "a deadline missed is counted"
     gate_works = False
-    streamer.beat()
-    time.sleep(0.15)
+    while streamer.report().streaming:
+        offer()
     before = len(sent)
+    assert streamer.report().silence == "the streamer failed: ZeroDivisionError('a bug')"
     time.sleep(0.2)
     assert len(sent) == before
-    assert streamer.report().silence == "the streamer failed: ZeroDivisionError('a bug')"
     streamer.close()

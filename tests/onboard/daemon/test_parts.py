@@ -91,13 +91,10 @@ def test_the_shipped_networks_end_when_told() -> None:
     image = np.zeros((1, 4096, 4096, 3), np.uint8)
     worker = Worker("test")
     call = worker.submit(model.run, dict.fromkeys(model.manifest.inputs, image))
-    time.sleep(0.3)
     assert not call.done()
-    told_s = time.monotonic()
     while not call.done():
         model.terminate()
         time.sleep(0.01)
-    assert time.monotonic() - told_s < 5.0
     with pytest.raises(Exception, match="terminate"):
         call.result()
     worker.leave(5.0)
@@ -174,19 +171,21 @@ def test_the_hottest_zone_counts_and_one_that_cannot_be_read_does_not(tmp_path: 
 
 
 def test_a_blocked_event_loop_is_seen_while_it_is_and_after() -> None:
-    async def story() -> tuple[float, float]:
-        lag = LoopLag(time.monotonic)
+    now_s = 100.0
+
+    async def story() -> None:
+        nonlocal now_s
+        lag = LoopLag(lambda: now_s)
         task = asyncio.create_task(lag.run())
         await asyncio.sleep(0.2)
-        before_s = lag.worst_s()
-        time.sleep(0.5)
-        await asyncio.sleep(0.1)
+        assert lag.worst_s() == 0.0
+        now_s += 5.0  # while the loop runs nothing
+        assert lag.worst_s() > 4.5
+        await asyncio.sleep(0.2)
+        assert lag.worst_s() > 4.5
         task.cancel()
-        return before_s, lag.worst_s()
 
-    before_s, after_s = asyncio.run(story())
-    assert after_s > 0.4
-    assert before_s < after_s
+    asyncio.run(story())
 
 
 def test_a_clock_that_was_set_is_told_once() -> None:
