@@ -247,6 +247,7 @@ for _, _, (reading, writing) in children:
 """
 
 
+@pytest.mark.slow
 def test_a_kill_at_any_moment_loses_half_a_second_at_most(tmp_path: Path) -> None:
     flown = subprocess.run(
         [sys.executable, "-c", FLYING, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, check=True

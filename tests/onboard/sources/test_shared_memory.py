@@ -39,7 +39,7 @@ def source(endpoint: str) -> Iterator[SharedMemorySource]:
     lens = IntrinsicsConfig(fx=300.0, fy=300.0, cx=320.0, cy=240.0)
     rig = RigConfig(cameras=tuple(CameraConfig(name=name, size_px=SIZE, intrinsics=lens) for name in CAMERAS))
     parameters = SourceParameters(
-        kind="shared_memory", shared_memory=SharedMemoryParameters(drone="3", connect=(endpoint,))
+        kind="shared_memory", set_wait_s=5.0, shared_memory=SharedMemoryParameters(drone="3", connect=(endpoint,))
     )
     source = SharedMemorySource(DroneConfig(rig=rig, source=parameters), parameters)
     source.start()
@@ -89,13 +89,13 @@ def test_frames_arrive_byte_for_byte_in_one_process(endpoint: str, source: Share
         _assert_same(frames, frames.frames["front"].sequence)
         for later in range(number, number + 10):
             time_s = _send(publisher, later)
-            received = source.newest(5.0)
+            received = source.newest(60.0)
             assert received is not None
             assert received.time_s == time_s
             _assert_same(received, later)
         status = source.status()["front"]
         assert status.fault is None
-        assert status.age_s < 5.0
+        assert 0.0 < status.age_s < 60.0
         if _shared_memory_works():
             assert publisher.notes() == source.notes() == (), "it went through shared memory"
 
@@ -117,7 +117,7 @@ with FramePublisher(listen=[{endpoint!r}]) as publisher:
 """
     with subprocess.Popen([sys.executable, "-c", simulator]) as process:
         try:
-            received = [source.newest(20.0) for _ in range(20)]
+            received = [source.newest(60.0) for _ in range(20)]
         finally:
             process.kill()
     whole = [frames for frames in received if frames is not None and len(frames.frames) == 2]
@@ -203,7 +203,7 @@ def test_messages_that_are_no_frames_are_counted_and_ignored(endpoint: str, sour
         assert status.counts["malformed"] == 3
         stranger.put(b"too short", attachment=header.pack(b"rgb8", 640, 480, number, time.monotonic()))
         publisher.publish("3", Frame("back", scene(), time.monotonic(), number))
-        frames = source.newest(5.0)
+        frames = source.newest(60.0)
         assert frames is not None
         assert frames.frames.keys() == {"back"}
 
@@ -224,7 +224,7 @@ def test_stamps_of_another_clock_are_dropped_and_good_frames_go_on_at_once(
             assert (status.fault is not None) == (bad == 2), "one bad frame is no lost camera"
         assert status.fault == "front: a time stamp is not of this computer's clock; correct the program"
         _send(publisher, number + 1)
-        received = source.newest(5.0)
+        received = source.newest(60.0)
         assert received is not None
         _assert_same(received, number + 1)
         assert source.status()["front"].fault is None

@@ -20,6 +20,7 @@ from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
 
 EXAMPLE = (data_path("config") / "zenoh_tls.json5").read_text(encoding="utf-8")
+SECONDS_TO_FAIL = 60.0
 ABOUT = AboutMessage(version="1.2.3", configuration={"name": "d"}, commands=["hold"])
 KEY = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"]
 DRONE, WATCHER, OPERATOR = "drone", "watcher", "operator"
@@ -53,20 +54,22 @@ def settings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def _may(endpoint: str, drone: ZenohTelemetry, settings: Path | None) -> tuple[bool, list[object]]:
     """Whether somebody hears the drone, and what it answers to a question and a command."""
     with FleetWatcher("f", listen=[], connect=[endpoint], settings=settings) as watcher:
-        until_s = time.monotonic() + (2.0 if settings is None else 15.0)
+        until_s = time.monotonic() + (2.0 if settings is None else SECONDS_TO_FAIL)
         while time.monotonic() < until_s and not (watcher.drones() and watcher.drones()[0].topics):
             drone.publish("d", "events", {"time_s": 0.0, "event": "hello"})
             time.sleep(0.05)
         hears = [(watched.drone, watched.alive, set(watched.topics)) for watched in watcher.drones()]
     session = open_session("a test", [], [endpoint], settings=settings)
-    time.sleep(0.5)
-    answers = [answer for what in ("about", "ask/hold") for answer in _answers(session, f"flockd/v1/f/d/{what}")]
+    while not (about := _answers(session, "about", 1.0)) and time.monotonic() < until_s:
+        time.sleep(0.05)
+    # Who may not command gets no answer, however long he waits.
+    answers = about + _answers(session, "ask/hold", SECONDS_TO_FAIL if settings and settings.stem == OPERATOR else 1.0)
     close_session(session)
     return hears == [("d", True, {"events"})], answers
 
 
-def _answers(session: zenoh.Session, key: str) -> list[object]:
-    samples = [reply.ok for reply in session.get(key, timeout=1.0)]
+def _answers(session: zenoh.Session, what: str, timeout_s: float) -> list[object]:
+    samples = [reply.ok for reply in session.get(f"flockd/v1/f/d/{what}", timeout=timeout_s)]
     return [json.loads(sample.payload.to_bytes()) for sample in samples if sample is not None]
 
 
@@ -103,7 +106,7 @@ def test_what_is_no_message_is_counted_and_not_taken() -> None:
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     with FleetWatcher(None, listen=[endpoint], connect=[]) as watcher:
         session = open_session("a test", [], [endpoint])
-        until_s = time.monotonic() + 15.0
+        until_s = time.monotonic() + SECONDS_TO_FAIL
         while watcher.malformed < 3 and time.monotonic() < until_s:
             for payload in (b"\xff\x00", b"[]", b'{"time_s": 0.0}'):
                 session.put("flockd/v1/f/d/flight", payload)
