@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.geometry.rigid_fit import fit_rotation
@@ -22,29 +23,23 @@ MIN_TURNS = 30
 _AXES = ("rolled", "pitched", "yawed")
 
 
-@dataclass(frozen=True)
-class AlignmentParameters:
-    """How turns are compared, and what is believed."""
-
-    scan_step_s: float = 0.01
-    """Between offsets that are tried as starts."""
-    max_rounds: int = 8
-    weight_tolerance: float = 1e-3
-    """Fits with new weights end where no weight changes by more."""
-    chain_s: float = 0.4
-    """Turns are compared over about this long."""
-    inlier_weight: float = 0.2
-    """Weight above which a turn counts as one that fits."""
-    difference_step_s: float = 1e-3
-    """Of the derivative by the offset."""
-    max_sigma_deg: float = 0.5
-    max_sigma_s: float = 0.01
-    """What is more uncertain than this is not known."""
-    max_residual: float = 0.3
-    """Share of the turns themselves: more left over than this, and both have nothing to do with each other."""
-
-
-DEFAULTS = AlignmentParameters()
+_SCAN_STEP_S = 0.01
+"""Between offsets that are tried as starts."""
+_MAX_ROUNDS = 8
+_WEIGHT_TOLERANCE = 1e-3
+"""Fits with new weights end where no weight changes by more."""
+_CHAIN_S = 0.4
+"""Turns are compared over about this long."""
+_INLIER_WEIGHT = 0.2
+"""Weight above which a turn counts as one that fits."""
+_DIFFERENCE_STEP_S = 1e-3
+"""Of the derivative by the offset."""
+_MAX_SIGMA_DEG, _MAX_SIGMA_S = 0.5, 0.01
+"""What is more uncertain than this is not known."""
+_MAX_RESIDUAL = 0.3
+"""Share of the turns themselves: more left over than this, and both have nothing to do with each other."""
+_MAX_GAP = 3.0
+"""Attitudes farther apart than this times their median are not interpolated between."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,37 +48,19 @@ class Attitudes:
 
     times_s: FloatArray
     rotations: FloatArray
-    max_gap: float = 3.0
-    """Attitudes farther apart than this times their median are not interpolated between."""
 
     @cached_property
-    def _bends(self) -> FloatArray:
-        """(n, 3, 3) second derivatives at the times, of natural cubic splines through each entry of the matrices."""
-        steps = np.diff(self.times_s)
-        slopes = np.diff(self.rotations, axis=0) / steps[:, None, None]
-        # Tridiagonal: forward, then back.
-        pivots, right = 2.0 * (steps[:-1] + steps[1:]), 6.0 * np.diff(slopes, axis=0)
-        for k in range(1, len(pivots)):
-            factor = steps[k] / pivots[k - 1]
-            pivots[k] -= factor * steps[k]
-            right[k] -= factor * right[k - 1]
-        bends = np.zeros_like(self.rotations)
-        for k in range(len(pivots) - 1, -1, -1):
-            bends[k + 1] = (right[k] - steps[k + 1] * bends[k + 2]) / pivots[k]
-        return bends
+    def _spline(self) -> CubicSpline:
+        """Natural cubic splines through each entry of the matrices."""
+        return CubicSpline(self.times_s, self.rotations, bc_type="natural")
 
     def at(self, times_s: FloatArray) -> tuple[FloatArray, BoolArray]:
         """(m, 3, 3) attitudes at these times (m,), and a mask (m,) of those that lie between two near ones."""
         steps = np.diff(self.times_s)
         index = np.clip(np.searchsorted(self.times_s, times_s, side="right") - 1, 0, len(steps) - 1)
-        span = steps[index]
-        b = ((times_s - self.times_s[index]) / span)[:, None, None]
-        a, square = 1.0 - b, (span**2 / 6.0)[:, None, None]
-        near = a * self.rotations[index] + b * self.rotations[index + 1]
-        near += square * ((a**3 - a) * self._bends[index] + (b**3 - b) * self._bends[index + 1])
-        u, _, vt = np.linalg.svd(near)
+        u, _, vt = np.linalg.svd(self._spline(times_s))
         inside = (times_s >= self.times_s[0]) & (times_s <= self.times_s[-1])
-        inside &= span <= self.max_gap * float(np.median(steps))
+        inside &= steps[index] <= _MAX_GAP * float(np.median(steps))
         return u @ vt, inside
 
 
@@ -102,30 +79,25 @@ class Alignment:
     turns: int
 
 
-def align(
-    turns: Sequence[CameraTurn], attitudes: Attitudes, max_offset_s: float, parameters: AlignmentParameters = DEFAULTS
-) -> Alignment:
+def align(turns: Sequence[CameraTurn], attitudes: Attitudes, max_offset_s: float) -> Alignment:
     """The rotation and the offset for which the camera's turns are the vehicle's.
 
     Raises CalibrationError where there are too few turns, where both contradict each other, and where the vehicle
     turned too little, or about one axis only, to tell.
     """
     each = _Turns.of(turns, attitudes, max_offset_s)
-    offset_s, weights = each.scan(max_offset_s, parameters)
+    offset_s, weights = each.scan(max_offset_s)
     start = _State(fit_rotation(each.camera, each.vehicle(offset_s), weights), offset_s)
-    solution, weights = _fit(each, start, weights, parameters)
-    chains = _chained(
-        [turn for turn, weight in zip(each.turns, weights, strict=True) if weight > parameters.inlier_weight],
-        parameters.chain_s,
-    )
+    solution, weights = _fit(each, start, weights)
+    chains = _chained([turn for turn, weight in zip(each.turns, weights, strict=True) if weight > _INLIER_WEIGHT])
     problem = _Turns.of(chains, attitudes, max_offset_s)
-    solution, weights = _fit(problem, solution.state, np.ones(len(problem.turns)), parameters)
+    solution, weights = _fit(problem, solution.state, np.ones(len(problem.turns)))
     state = solution.state
     left = problem.residuals(state)
-    good = weights > parameters.inlier_weight
+    good = weights > _INLIER_WEIGHT
     rms = float(np.sqrt((left[good] ** 2).sum(axis=1).mean()))
     size = float(np.sqrt((problem.vehicle(state.offset_s)[good] ** 2).sum(axis=1).mean()))
-    if rms > parameters.max_residual * size:
+    if rms > _MAX_RESIDUAL * size:
         raise CalibrationError(
             f"the camera's turns and the vehicle's have nothing to do with each other: {math.degrees(rms):.2f} of "
             f"{math.degrees(size):.2f} degrees are left over; turn the drone faster, before something that stands still"
@@ -142,28 +114,26 @@ def align(
         rms_deg=math.degrees(rms),
         turns=int(good.sum()),
     )
-    _check_known(found, problem, abs(state.offset_s) >= max_offset_s, parameters)
+    _check_known(found, problem, abs(state.offset_s) >= max_offset_s)
     return found
 
 
-def _fit(
-    turns: _Turns, start: _State, weights: FloatArray, parameters: AlignmentParameters
-) -> tuple[Solution[_State], FloatArray]:
+def _fit(turns: _Turns, start: _State, weights: FloatArray) -> tuple[Solution[_State], FloatArray]:
     """From a start and weights (n,): the last fit, and the weights of what it leaves over."""
     return reweighted(
         lambda weights, before: LevenbergMarquardt().minimise(
-            _Alignment(turns, weights, parameters.difference_step_s), before.state if before else start
+            _Alignment(turns, weights), before.state if before else start
         ),
         lambda solution: np.linalg.norm(turns.residuals(solution.state), axis=1),
         _tukey,
         weights,
-        rounds=parameters.max_rounds,
-        settled=parameters.weight_tolerance,
+        rounds=_MAX_ROUNDS,
+        settled=_WEIGHT_TOLERANCE,
     )
 
 
-def _chained(turns: Sequence[CameraTurn], chain_s: float) -> list[CameraTurn]:
-    """From each turn on, as many as take nearest to ``chain_s`` together, as one.
+def _chained(turns: Sequence[CameraTurn]) -> list[CameraTurn]:
+    """From each turn on, as many as take nearest to `_CHAIN_S` together, as one.
 
     The noise of a short turn is as large as that of a long one; and where attitudes are interpolated it is smaller,
     which would draw short turns there, whatever the offset.
@@ -172,15 +142,15 @@ def _chained(turns: Sequence[CameraTurn], chain_s: float) -> list[CameraTurn]:
     for first, turn in enumerate(turns):
         rotation, end_s = turn.rotation, turn.end_s
         for after in turns[first + 1 :]:
-            if after.start_s != end_s or end_s - turn.start_s > chain_s - 0.5 * (after.end_s - after.start_s):
+            if after.start_s != end_s or end_s - turn.start_s > _CHAIN_S - 0.5 * (after.end_s - after.start_s):
                 break
             rotation, end_s = rotation @ after.rotation, after.end_s
         found.append(CameraTurn(turn.start_s, end_s, rotation))
     return found
 
 
-def _check_known(found: Alignment, problem: _Turns, at_limit: bool, parameters: AlignmentParameters) -> None:
-    if not found.sigma_deg < parameters.max_sigma_deg:
+def _check_known(found: Alignment, problem: _Turns, at_limit: bool) -> None:
+    if not found.sigma_deg < _MAX_SIGMA_DEG:
         spread = np.abs(problem.vehicle(found.time_offset_s)).mean(axis=0)
         most = _AXES[int(np.argmax(spread))]
         others = " and ".join(axis.removesuffix("ed") for axis in _AXES if axis != most)
@@ -188,7 +158,7 @@ def _check_known(found: Alignment, problem: _Turns, at_limit: bool, parameters: 
             f"the camera's turn in the body is known to {found.sigma_deg:.1f} degrees only, as the drone mostly {most};"
             f" {others} it as much, and for longer"
         )
-    if not found.sigma_s < parameters.max_sigma_s or at_limit:
+    if not found.sigma_s < _MAX_SIGMA_S or at_limit:
         raise CalibrationError(
             f"the time offset is known to {1000 * found.sigma_s:.0f} ms only, as the drone turned too evenly or the "
             "offset is larger than --max-offset; turn it back and forth, or raise --max-offset"
@@ -234,10 +204,10 @@ class _Turns:
         second, _ = self.attitudes.at(self.ends_s + offset_s)
         return _logs(np.swapaxes(first, 1, 2) @ second)
 
-    def scan(self, max_offset_s: float, parameters: AlignmentParameters) -> tuple[float, FloatArray]:
+    def scan(self, max_offset_s: float) -> tuple[float, FloatArray]:
         """The offset that leaves least, whatever the rotation, and the weights (n,) of the turns there."""
         best = (math.inf, 0.0, np.ones(len(self.camera)))
-        for offset_s in np.arange(-max_offset_s, max_offset_s + parameters.scan_step_s / 2, parameters.scan_step_s):
+        for offset_s in np.arange(-max_offset_s, max_offset_s + _SCAN_STEP_S / 2, _SCAN_STEP_S):
             vehicle = self.vehicle(float(offset_s))
             _, left, weights = robust_rotation(self.camera, vehicle, _tukey, rounds=3)
             cost = float(np.median(left))
@@ -256,7 +226,6 @@ class _Alignment(Problem[_State]):
 
     turns: _Turns
     weights: FloatArray
-    difference_step_s: float
 
     def linearise(self, state: _State) -> NormalEquations:
         turned = self.turns.camera @ state.rotation.T
@@ -265,9 +234,8 @@ class _Alignment(Problem[_State]):
         jacobian[:, 0, 1], jacobian[:, 0, 2] = -z, y
         jacobian[:, 1, 0], jacobian[:, 1, 2] = z, -x
         jacobian[:, 2, 0], jacobian[:, 2, 1] = -y, x
-        step_s = self.difference_step_s
-        later, sooner = (self.turns.vehicle(state.offset_s + sign * step_s) for sign in (1.0, -1.0))
-        jacobian[:, :, 3] = (later - sooner) / (2 * step_s)
+        later, sooner = (self.turns.vehicle(state.offset_s + sign * _DIFFERENCE_STEP_S) for sign in (1.0, -1.0))
+        jacobian[:, :, 3] = (later - sooner) / (2 * _DIFFERENCE_STEP_S)
         residuals = self.turns.residuals(state).ravel()
         return NormalEquations.of(residuals, jacobian.reshape(-1, 4), np.repeat(self.weights, 3))
 

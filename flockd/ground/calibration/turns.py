@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import cv2
@@ -18,37 +18,28 @@ from flockd.flight.geometry.robust.reweighting import robust_rotation
 from flockd.flight.geometry.robust.solver import GaussNewton, NormalEquations, Problem
 from flockd.flight.geometry.rotations import rotation_from_vector
 
-
-@dataclass(frozen=True)
-class TurnParameters:
-    """How points are followed from one image to the next, and what turns are believed."""
-
-    max_points: int = 400
-    quality: float = 0.01
-    """Of a point, as a share of the best one's (Shi & Tomasi 1994)."""
-    min_distance: float = 1 / 60
-    """Of two points, in widths of the image."""
-    window_px: int = 21
-    pyramid_levels: int = 4
-    forward_backward_px: float = 0.5
-    """A point is kept that, followed back, ends nearer than this to where it began (Kalal et al. 2010)."""
-    min_points: int = 40
-    max_interval_s: float = 1.5
-    """Images farther apart are not compared."""
-    rotation_rounds: int = 6
-    pure_rotation_px: float = 0.35
-    """Where a turn alone leaves no more than this, by the median, the camera's own shift does not show."""
-    five_point_min_cosine: float = 0.3
-    """From the optical axis, of the points that five-point solutions are made from."""
-    five_point_tolerance: float = 0.003
-    """Radians."""
-    optimizer: GaussNewton = field(default=GaussNewton(max_steps=12, tolerance=1e-8))
-    """Tolerance in radians."""
-    max_residual_px: float = 2.0
-    """A turn that leaves more than this, by the median, is none."""
-
-
-DEFAULTS = TurnParameters()
+_MAX_POINTS = 400
+_QUALITY = 0.01
+"""Of a point, as a share of the best one's (Shi & Tomasi 1994)."""
+_MIN_DISTANCE = 1 / 60
+"""Of two points, in widths of the image."""
+_WINDOW_PX, _PYRAMID_LEVELS = 21, 4
+_FORWARD_BACKWARD_PX = 0.5
+"""A point is kept that, followed back, ends nearer than this to where it began (Kalal et al. 2010)."""
+_MIN_POINTS = 40
+_MAX_INTERVAL_S = 1.5
+"""Images farther apart are not compared."""
+_ROTATION_ROUNDS = 6
+_PURE_ROTATION_PX = 0.35
+"""Where a turn alone leaves no more than this, by the median, the camera's own shift does not show."""
+_FIVE_POINT_MIN_COSINE = 0.3
+"""From the optical axis, of the points that five-point solutions are made from."""
+_FIVE_POINT_TOLERANCE = 0.003
+"""Radians."""
+_OPTIMIZER = GaussNewton(max_steps=12, tolerance=1e-8)
+"""Tolerance in radians."""
+_MAX_RESIDUAL_PX = 2.0
+"""A turn that leaves more than this, by the median, is none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +66,9 @@ class CameraTurn:
 class Follower:
     """Takes one camera's images one after the other, and keeps how it turned meanwhile."""
 
-    def __init__(self, camera: Camera, R_body_camera: FloatArray, parameters: TurnParameters = DEFAULTS) -> None:
+    def __init__(self, camera: Camera, R_body_camera: FloatArray) -> None:
         """``R_body_camera`` (3, 3): about how it is mounted, as a first guess after a large turn."""
-        self._camera, self._R_body_camera, self._parameters = camera, R_body_camera, parameters
+        self._camera, self._R_body_camera = camera, R_body_camera
         self._before: tuple[float, UInt8Array, FloatArray] | None = None
         self.turns: list[CameraTurn] = []
         self.lost: Counter[str] = Counter()
@@ -86,97 +77,82 @@ class Follower:
     def add(self, time_s: float, grey: UInt8Array, R_ned_body: FloatArray) -> None:
         """The next (h, w) image, and about the attitude (3, 3) it was taken in."""
         before, self._before = self._before, (time_s, grey, R_ned_body)
-        if before is None or not 0.0 < time_s - before[0] < self._parameters.max_interval_s:
+        if before is None or not 0.0 < time_s - before[0] < _MAX_INTERVAL_S:
             return
         expected = self._R_body_camera.T @ before[2].T @ R_ned_body @ self._R_body_camera
-        found = turn_between(self._camera, before[1], grey, (np.eye(3), expected), self._parameters)
+        found = turn_between(self._camera, before[1], grey, (np.eye(3), expected))
         if isinstance(found, str):
             self.lost[found] += 1
         else:
             self.turns.append(CameraTurn(before[0], time_s, found.rotation))
 
 
-def turn_between(
-    camera: Camera,
-    first: UInt8Array,
-    second: UInt8Array,
-    guesses: Sequence[FloatArray],
-    parameters: TurnParameters = DEFAULTS,
-) -> Turn | str:
+def turn_between(camera: Camera, first: UInt8Array, second: UInt8Array, guesses: Sequence[FloatArray]) -> Turn | str:
     """The turn from one (h, w) grey image to the next, or the reason why there is none.
 
     ``guesses`` (3, 3) are rough turns to start from; the best is taken.
     """
-    corners = cv2.goodFeaturesToTrack(
-        first, parameters.max_points, parameters.quality, parameters.min_distance * camera.size[0]
-    )
-    if corners is None or len(corners) < parameters.min_points:
+    corners = cv2.goodFeaturesToTrack(first, _MAX_POINTS, _QUALITY, _MIN_DISTANCE * camera.size[0])
+    if corners is None or len(corners) < _MIN_POINTS:
         return "too few details in the image"
     start = np.asarray(corners, np.float32).reshape(-1, 2)
     best: tuple[Float32Array, BoolArray] | None = None
     for guess in guesses:
-        found = _followed(camera, first, second, start, guess, parameters)
+        found = _followed(camera, first, second, start, guess)
         if best is None or found[1].sum() > best[1].sum():
             best = found
-    if best is None or best[1].sum() < parameters.min_points:
+    if best is None or best[1].sum() < _MIN_POINTS:
         return "the image could not be followed"
     end, kept = best
     # OpenCV has pixel centres at whole numbers.
     before, after = (camera.rays(points[kept].astype(np.float64) + 0.5) for points in (start, end))
     imaged = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
-    return _turn(before[imaged], after[imaged], camera.focal_px, parameters)
+    return _turn(before[imaged], after[imaged], camera.focal_px)
 
 
 def _followed(
-    camera: Camera,
-    first: UInt8Array,
-    second: UInt8Array,
-    start: Float32Array,
-    guess: FloatArray,
-    parameters: TurnParameters,
+    camera: Camera, first: UInt8Array, second: UInt8Array, start: Float32Array, guess: FloatArray
 ) -> tuple[Float32Array, BoolArray]:
     expected = camera.project(camera.rays(start.astype(np.float64) + 0.5) @ guess) - 0.5
     lost = ~(np.isfinite(expected).all(axis=1) & camera.in_image(expected))
     expected[lost] = start[lost]
     follow = partial(
         cv2.calcOpticalFlowPyrLK,
-        winSize=(parameters.window_px, parameters.window_px),
-        maxLevel=parameters.pyramid_levels,
+        winSize=(_WINDOW_PX, _WINDOW_PX),
+        maxLevel=_PYRAMID_LEVELS,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
     end, there, _ = follow(first, second, start, expected.astype(np.float32))
     back, again, _ = follow(second, first, end, start.copy())
     kept = (there.ravel() == 1) & (again.ravel() == 1) & ~lost
-    kept &= np.linalg.norm(np.asarray(back) - start, axis=1) < parameters.forward_backward_px
+    kept &= np.linalg.norm(np.asarray(back) - start, axis=1) < _FORWARD_BACKWARD_PX
     return np.asarray(end, np.float32), np.asarray(kept, np.bool_)
 
 
-def _turn(before: FloatArray, after: FloatArray, focal_px: float, parameters: TurnParameters) -> Turn | str:
-    rotation, left, _ = robust_rotation(after, before, _cauchy, rounds=parameters.rotation_rounds)
-    if np.median(left) * focal_px > parameters.pure_rotation_px:
-        starts = [rotation, *_essential_turn(before, after, rotation, parameters)]
+def _turn(before: FloatArray, after: FloatArray, focal_px: float) -> Turn | str:
+    rotation, left, _ = robust_rotation(after, before, _cauchy, rounds=_ROTATION_ROUNDS)
+    if np.median(left) * focal_px > _PURE_ROTATION_PX:
+        starts = [rotation, *_essential_turn(before, after, rotation)]
         rotation, left = min(
-            (_turn_beside_a_shift(before, after, start, parameters.optimizer) for start in starts),
+            (_turn_beside_a_shift(before, after, start) for start in starts),
             key=lambda found: float(np.median(found[1])),
         )
     residual_px = float(np.median(left)) * focal_px
-    if not residual_px < parameters.max_residual_px:
+    if not residual_px < _MAX_RESIDUAL_PX:
         return "what is seen does not move as one"
     return Turn(rotation, residual_px, len(before))
 
 
-def _essential_turn(
-    before: FloatArray, after: FloatArray, near: FloatArray, parameters: TurnParameters
-) -> list[FloatArray]:
+def _essential_turn(before: FloatArray, after: FloatArray, near: FloatArray) -> list[FloatArray]:
     """Where to begin when the shift is large: from five points at a time; of its two rotations the one like ``near``.
 
     None where too little is seen within a pinhole's reach.
     """
-    ahead = np.minimum(before[:, 2], after[:, 2]) > parameters.five_point_min_cosine
-    if ahead.sum() < parameters.min_points:
+    ahead = np.minimum(before[:, 2], after[:, 2]) > _FIVE_POINT_MIN_COSINE
+    if ahead.sum() < _MIN_POINTS:
         return []
     first, second = (rays[ahead, :2] / rays[ahead, 2:] for rays in (after, before))
-    essential = cv2.findEssentialMat(first, second, np.eye(3), cv2.RANSAC, 0.999, parameters.five_point_tolerance)[0]
+    essential = cv2.findEssentialMat(first, second, np.eye(3), cv2.RANSAC, 0.999, _FIVE_POINT_TOLERANCE)[0]
     if essential is None or essential.shape != (3, 3):
         return []
     rotations = [np.asarray(one, np.float64) for one in cv2.decomposeEssentialMat(essential)[:2]]
@@ -249,12 +225,10 @@ class _TurnBesideAShift(Problem[_Epipolar]):
         return float(np.linalg.norm(step[:3]))
 
 
-def _turn_beside_a_shift(
-    before: FloatArray, after: FloatArray, start: FloatArray, optimizer: GaussNewton
-) -> tuple[FloatArray, FloatArray]:
+def _turn_beside_a_shift(before: FloatArray, after: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The rotation for which both directions and one shift lie in a plane, at whatever distance each point is."""
     state = _Epipolar(before, after, start, np.ones(len(before)))
-    found = optimizer.minimise(_TurnBesideAShift(), state).state
+    found = _OPTIMIZER.minimise(_TurnBesideAShift(), state).state
     return found.rotation, np.abs(found.residuals)
 
 
