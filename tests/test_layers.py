@@ -110,6 +110,22 @@ def test_the_pure_line_knows_no_clock_no_thread_and_no_network() -> None:
         assert "getenv" not in path.read_text(encoding="utf-8"), path
 
 
+def test_only_the_gate_makes_a_setpoint() -> None:
+    """What is asked for and what is allowed are two types; a name is followed under an import's other name too."""
+    for path in MODULES:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        names = {"Setpoint"} | {
+            alias.asname
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom)
+            for alias in node.names
+            if alias.name == "Setpoint" and alias.asname
+        }
+        called = [node.func for node in ast.walk(tree) if isinstance(node, ast.Call)]
+        makes = any(ast.unparse(function).rpartition(".")[2] in names for function in called)
+        assert makes == (_place(path) == ("flight", "safety", "gate")), path
+
+
 def test_only_inference_runs_networks() -> None:
     for path in set(MODULES) - set(_of("flight/inference")):
         assert not _libraries(path) & NETWORK_LIBRARIES, path

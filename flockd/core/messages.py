@@ -296,15 +296,18 @@ class Neighbour:
 
 
 @dataclass(frozen=True, eq=False)
-class VelocityCommand:
-    """What the flock law, which is level, and the mission's height ask of the autopilot."""
+class Wanted:
+    """What the pilot asks for: the flock law's velocity, which is level, and the mission's height and heading.
+
+    Only the gate turns it into what is allowed, a `Setpoint`.
+    """
 
     velocity: Vector2
     """(2,) m/s, north and east: the law's after limits, and the trim."""
     acceleration: Vector2
     """(2,) m/s^2, north and east: u of Eq. 38 after limits."""
-    yaw_rad: float
-    """Heading, clockwise from north."""
+    yaw_rad: float | None
+    """Heading, clockwise from north; None: as it is, while no good attitude is known."""
     trim: Vector2 | None = None
     """(2,) m/s, north and east: what of the velocity corrects the autopilot's own estimate; None: nothing."""
     height_m: float | None = None
@@ -313,7 +316,7 @@ class VelocityCommand:
 
 @dataclass(frozen=True, eq=False)
 class Setpoint:
-    """What the autopilot is asked to do now: fly this horizontal velocity, hold this height, face this way."""
+    """What the gate allows: fly this horizontal velocity, hold this height, face this way. Nothing else makes one."""
 
     time_s: float
     """When it was decided."""
@@ -339,7 +342,7 @@ class PilotOutput:
     neighbour_motions: Mapping[int, NeighbourMotion]
     """By the label of the detection."""
     neighbours: tuple[Neighbour, ...]
-    command: VelocityCommand
+    command: Wanted
     reasons: tuple[Reason, ...] = ()
     """Why something is missing; recorded as their texts."""
     counts: Mapping[str, int] = field(default_factory=dict)

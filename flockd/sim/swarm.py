@@ -226,7 +226,7 @@ class _VisionPilots:
         for i, stepped in self._stepped.items():
             output, command = stepped.output, stepped.output.command
             commands.velocity[i], commands.acceleration[i] = command.velocity, command.acceleration
-            commands.yaw_rad[i] = command.yaw_rad
+            commands.yaw_rad[i] = self._yaw_rad if command.yaw_rad is None else command.yaw_rad
             commands.height_m[i] = np.nan if command.height_m is None else command.height_m
             missions[i] = output.mission
             commands.desired[i] = desired_of(self._scenario.drone_of(i).mission, time_s, output.mission)

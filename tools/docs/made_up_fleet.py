@@ -29,7 +29,7 @@ from flockd.core.messages import (
     ObstacleRanges,
     PilotOutput,
     VehicleState,
-    VelocityCommand,
+    Wanted,
 )
 from flockd.onboard.daemon.operator_commands import OperatorRequests, command_handler
 from flockd.onboard.telemetry import publish_step
@@ -156,7 +156,7 @@ class MadeUpDrone:
             for i in near
             if i != self._number - 1
         )
-        command = VelocityCommand(velocity, np.zeros(2), yaw)
+        command = Wanted(velocity, np.zeros(2), yaw)
         mission = MissionStatus("circle_then_tangent", velocity, "circles", goal=np.zeros(2))
         output = PilotOutput(
             time_s, None, moving, (), (), {}, neighbours, command, mission=mission, obstacles=_obstacles(time_s, place)

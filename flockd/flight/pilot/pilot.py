@@ -27,7 +27,7 @@ from flockd.core.messages import (
     Reason,
     ReasonKind,
     VehicleState,
-    VelocityCommand,
+    Wanted,
 )
 from flockd.flight.flocking import FlockingLaw, level_offsets
 from flockd.flight.geometry import build_rig
@@ -106,7 +106,8 @@ class FlockPilot:
         self._first_time_s: float | None = None
         self._last_time_s: float | None = None
         self._velocity: FloatArray | None = None
-        self._yaw_rad = 0.0
+        self._yaw_rad: float | None = None
+        """The heading asked for last; before the first, that of the first good attitude."""
         self._refused_in_a_row = 0
         self._order: MissionOrder | None = None
 
@@ -126,9 +127,11 @@ class FlockPilot:
             order: an operator's to the mission, in the first step after it came.
 
         Input that cannot be is refused with a reason: the command is standstill, and nothing of it is remembered but
-        the order.
+        the order, and the heading where there was none before.
         """
         self._order = self._order if order is None else order
+        if self._yaw_rad is None and _is_rotation(vehicle.R_ned_body):
+            self._yaw_rad = math.atan2(vehicle.R_ned_body[1, 0], vehicle.R_ned_body[0, 0])
         refusal = _why_refused(frames, vehicle)
         if refusal is not None:
             return self._refused(frames, refusal)
@@ -186,7 +189,7 @@ class FlockPilot:
             detection_tracks=(),
             neighbour_motions={},
             neighbours=self._tracker.neighbours(),
-            command=VelocityCommand(np.zeros(2), np.zeros(2), self._yaw_rad),
+            command=Wanted(np.zeros(2), np.zeros(2), self._yaw_rad),
             reasons=(reason,),
             counts={reason.text: 1},
         )
@@ -305,7 +308,7 @@ class FlockPilot:
         neighbours: Sequence[Neighbour],
         velocity: FloatArray | None,
         obstacles: ObstacleRanges | None,
-    ) -> tuple[VelocityCommand, MissionStatus | None]:
+    ) -> tuple[Wanted, MissionStatus | None]:
         if self._first_time_s is None:
             self._first_time_s = observation.time_s
         seen = [n for n in neighbours if n.confirmed]
@@ -330,29 +333,20 @@ class FlockPilot:
             )
         else:
             command, acceleration = self._avoidance.command(self._law, own, places, velocities, desired, obstacles)
-        self._yaw_rad = self._heading(vehicle, guidance.course_rad)
+        if self._config.yaw == "course" and guidance.course_rad is not None:
+            self._yaw_rad = guidance.course_rad
         trim = self._trim.velocity
-        return VelocityCommand(
+        return Wanted(
             command + trim, acceleration, self._yaw_rad, trim if trim.any() else None, guidance.height_m
         ), self._navigator.status(guidance)
-
-    def _heading(self, vehicle: VehicleState, course_rad: float | None) -> float:
-        """The mission's course; without one the heading that the drone was asked for last, or has."""
-        R = vehicle.R_ned_body
-        heading_rad = math.atan2(R[1, 0], R[0, 0])
-        if self._config.yaw == "hold":
-            return heading_rad
-        if course_rad is not None:
-            return course_rad
-        return heading_rad if self._last_time_s is None else self._yaw_rad
 
 
 def _why_refused(frames: FrameSet, vehicle: VehicleState) -> Reason | None:
     """What of a step's input cannot be; None: nothing."""
-    R, velocity = vehicle.R_ned_body, vehicle.velocity_ned
+    velocity = vehicle.velocity_ned
     if not (math.isfinite(frames.time_s) and math.isfinite(vehicle.time_s)):
         return Reason(ReasonKind.INPUT, "input refused: a time is not finite")
-    if not np.allclose(R @ R.T, np.eye(3), atol=_ROTATION_TOLERANCE):  # false for NaN too
+    if not _is_rotation(vehicle.R_ned_body):
         return Reason(ReasonKind.INPUT, "input refused: the attitude is not a rotation")
     if not math.isfinite(vehicle.height_m):
         return Reason(ReasonKind.INPUT, "input refused: the height is not finite")
@@ -365,6 +359,10 @@ def _why_refused(frames: FrameSet, vehicle: VehicleState) -> Reason | None:
         if place is not None and not np.isfinite(place).all():
             return Reason(ReasonKind.INPUT, "input refused: the autopilot's position is not finite")
     return None
+
+
+def _is_rotation(R: FloatArray) -> bool:
+    return np.allclose(R @ R.T, np.eye(3), atol=_ROTATION_TOLERANCE)  # false for NaN too
 
 
 def _displacement(observation: Observation, ego: EgoMotion) -> FloatArray:

@@ -9,9 +9,9 @@ from flockd.flight.safety.gate import (
     Gate,
     Objection,
     Permission,
+    Request,
     Surroundings,
     Verdict,
-    Wanted,
 )
 from flockd.flight.safety.policy import Action, Reaction
 from flockd.flight.safety.supervisor import Decision, Reason, State, Supervisor
@@ -30,12 +30,12 @@ __all__ = [
     "Permission",
     "Reaction",
     "Reason",
+    "Request",
     "SafetyParameters",
     "State",
     "Supervisor",
     "Surroundings",
     "Verdict",
-    "Wanted",
     "outside_fence",
     "outside_heights",
 ]

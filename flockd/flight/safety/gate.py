@@ -13,7 +13,7 @@ from enum import StrEnum
 import numpy as np
 
 from flockd.core.config.safety import GateParameters
-from flockd.core.messages import FloatArray, Setpoint, VelocityCommand
+from flockd.core.messages import FloatArray, Setpoint, Wanted
 from flockd.flight.safety.approach import towards_neighbours, towards_obstacles
 from flockd.flight.safety.fence import is_fenced, offsets_outside
 from flockd.flight.safety.half_planes import nearest_within
@@ -26,18 +26,6 @@ class Permission:
 
     action: Action
     time_s: float
-
-
-@dataclass(frozen=True, eq=False)
-class Wanted:
-    """What the pilot's code asks for."""
-
-    command: VelocityCommand | None
-    """None before the first."""
-    time_s: float
-    """When the command was made."""
-    height_m: float
-    """To hold."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +45,19 @@ class Surroundings:
     """Of the drone, as in `VehicleState`; NaN: not known."""
     obstacles: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     """(m, 2) metres, north and east, relative to the drone: points of obstacles, each the nearest that it may be."""
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """All that the gate judges, as of one tick of the control loop."""
+
+    permission: Permission
+    wanted: Wanted
+    wanted_s: float
+    """When `wanted` was made, on the permission's clock."""
+    height_m: float
+    """To hold where `wanted` names no height."""
+    around: Surroundings
 
 
 class Objection(StrEnum):
@@ -111,16 +112,15 @@ class Gate:
         self.counts: Counter[Objection] = Counter()
         """Objections since the start."""
 
-    def step(self, now_s: float, permission: Permission, wanted: Wanted, around: Surroundings) -> Verdict:
+    def step(self, now_s: float, request: Request) -> Verdict:
         """What may be sent at `now_s`, on the clock of the other times; never raises, whatever the numbers are."""
         objections: list[Objection] = []
-        self._last = self._setpoint(now_s, permission, wanted, around, objections)
+        self._last = self._setpoint(now_s, request, objections)
         self.counts.update(objections)
         return Verdict(self._last, tuple(objections))
 
-    def _setpoint(
-        self, now_s: float, permission: Permission, wanted: Wanted, around: Surroundings, objections: list[Objection]
-    ) -> Setpoint | None:
+    def _setpoint(self, now_s: float, request: Request, objections: list[Objection]) -> Setpoint | None:
+        permission, wanted, around = request.permission, request.wanted, request.around
         if permission.action not in _MOVES | _STANDS_STILL:
             objections.append(Objection.NOT_ALLOWED)
             return None
@@ -130,21 +130,22 @@ class Gate:
         yaw_rad = self._last.yaw_rad if self._last is not None else around.yaw_rad
         target = np.zeros(2)
         if permission.action in _MOVES:
-            if wanted.command is None or not abs(now_s - wanted.time_s) <= self._parameters.command_timeout_s:
+            if not abs(now_s - request.wanted_s) <= self._parameters.command_timeout_s:
                 objections.append(Objection.COMMAND_STALE)
                 return None
-            if math.isfinite(wanted.command.yaw_rad):
-                yaw_rad = wanted.command.yaw_rad
-            if self._accepts(wanted.command, around, objections):
-                target = self._slowed(wanted.command.velocity, now_s - wanted.time_s, permission.action)
-                if (target != wanted.command.velocity).any():
+            if wanted.yaw_rad is not None and math.isfinite(wanted.yaw_rad):
+                yaw_rad = wanted.yaw_rad
+            if self._accepts(wanted, around, objections):
+                target = self._slowed(wanted.velocity, now_s - request.wanted_s, permission.action)
+                if (target != wanted.velocity).any():
                     objections.append(Objection.SLOWED)
         velocity = self._within_acceleration(target, now_s, around)
         velocity = self._within_space(velocity, permission.action, around, objections)
-        if not all(map(math.isfinite, (*velocity, wanted.height_m, yaw_rad))):
+        wanted_m = request.height_m if wanted.height_m is None else wanted.height_m
+        if not all(map(math.isfinite, (*velocity, wanted_m, yaw_rad))):
             objections.append(Objection.SETPOINT_NOT_FINITE)
             return None
-        height_m = self._within_climb(now_s, permission.action, wanted, around, objections)
+        height_m = self._within_climb(now_s, wanted_m, request, objections)
         return Setpoint(now_s, velocity, self._within_heights(height_m, objections), yaw_rad)
 
     def _slowed(self, velocity: FloatArray, age_s: float, action: Action) -> FloatArray:
@@ -158,14 +159,12 @@ class Gate:
         p = self._parameters
         return min((p.command_timeout_s - age_s) / (p.command_timeout_s - p.command_fresh_s), 1.0)
 
-    def _accepts(self, command: VelocityCommand, around: Surroundings, objections: list[Objection]) -> bool:
-        """Whether the command may move the drone at all."""
+    def _accepts(self, wanted: Wanted, around: Surroundings, objections: list[Objection]) -> bool:
+        """Whether what is wanted may move the drone at all."""
+        numbers = (*wanted.velocity, 0.0 if wanted.yaw_rad is None else wanted.yaw_rad)
         refusals = (
-            (
-                Objection.COMMAND_NOT_FINITE,
-                not all(map(math.isfinite, (*command.velocity, command.yaw_rad))),
-            ),
-            (Objection.COMMAND_TOO_LARGE, math.hypot(*command.velocity) > self._parameters.max_speed_m_s),
+            (Objection.COMMAND_NOT_FINITE, not all(map(math.isfinite, numbers))),
+            (Objection.COMMAND_TOO_LARGE, math.hypot(*wanted.velocity) > self._parameters.max_speed_m_s),
             (Objection.POSITION_UNKNOWN, is_fenced(self._parameters) and not np.isfinite(around.position).all()),
             (
                 Objection.NEIGHBOUR_UNKNOWN,
@@ -215,25 +214,24 @@ class Gate:
         every_direction, every_limit = zip(*limits.values(), strict=True)
         return nearest_within(velocity, np.concatenate(every_direction), np.concatenate(every_limit))
 
-    def _within_climb(
-        self, now_s: float, action: Action, wanted: Wanted, around: Surroundings, objections: list[Objection]
-    ) -> float:
+    def _within_climb(self, now_s: float, wanted_m: float, request: Request, objections: list[Objection]) -> float:
         """The height nearest to the one to hold that may be asked for now.
 
         It changes no faster than the limit, as much slower as the velocity of an old command, and not at all where the
         drone is to stand still in flight. It leads no nearer to a neighbour that is near above or below.
         """
+        action, around = request.permission.action, request.around
         if action is Action.OFFER:  # on the ground, or flown by the pilot: as high as the control loop says
-            return wanted.height_m
+            return wanted_m
         last = self._recent(now_s)
         if last is not None:
             start_m, elapsed_s = last.height_m, max(now_s - last.time_s, 0.0)
         else:
-            start_m, elapsed_s = (around.height_m if math.isfinite(around.height_m) else wanted.height_m), 0.0
+            start_m, elapsed_s = (around.height_m if math.isfinite(around.height_m) else wanted_m), 0.0
         most_m = 0.0
         if action in _MOVES:
-            most_m = self._parameters.max_climb_m_s * elapsed_s * self._share(now_s - wanted.time_s)
-        height_m = start_m + min(max(wanted.height_m - start_m, -most_m), most_m)
+            most_m = self._parameters.max_climb_m_s * elapsed_s * self._share(now_s - request.wanted_s)
+        height_m = start_m + min(max(wanted_m - start_m, -most_m), most_m)
         lowest_m, highest_m = self._between_neighbours(start_m, around)
         between_m = min(max(height_m, lowest_m), highest_m)
         if between_m != height_m:

@@ -15,11 +15,12 @@ from dataclasses import dataclass, field
 
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.messages import Setpoint
+from flockd.flight.safety import Request, Verdict
 from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus
 
 Send = Callable[[Setpoint], None]
-Gate = Callable[[Setpoint], Setpoint | None]
-"""What may be sent in a setpoint's place; None: nothing."""
+Gate = Callable[[float, Request], Verdict]
+"""See `flockd.flight.safety.Gate.step`: it judges each request on the streamer's thread, just before it is sent."""
 
 CLOSE_TIMEOUT_S = 1.0
 """A cable that takes no more bytes may hold the thread for ever; it ends with the process."""
@@ -43,9 +44,9 @@ class StreamReport:
 
 
 class SetpointStreamer:
-    """Sends the newest setpoint at a fixed rate for as long as all of this holds.
+    """Sends what the gate makes of the newest request at a fixed rate for as long as all of this holds.
 
-    It was begun; the control loop beats; the setpoint is fresh and the gate lets it pass; the autopilot is heard, not
+    It was begun; the control loop beats; the request is fresh and the gate lets it pass; the autopilot is heard, not
     in its failsafe, and has not left offboard. What ends a stream for good (the pilot's mode change, a lost link, a gap
     in offboard flight, a fault of the gate) is final until `begin`. Every method may be called from any thread and
     returns at once.
@@ -60,13 +61,13 @@ class SetpointStreamer:
         *,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`status` is asked before each setpoint; `clock` is the one that setpoints are dated by."""
+        """`status` is asked before each setpoint; `clock` is the one that requests are dated by."""
         self._send = send
         self._status = status
         self._gate = gate
         self._parameters = parameters
         self._clock = clock
-        self._setpoint: Setpoint | None = None
+        self._request: Request | None = None
         self._beat_s = float("-inf")
         self._stream = _Stream(begun_s=clock(), ended="not begun")
         self._silence: str | None = "not begun"
@@ -89,17 +90,17 @@ class SetpointStreamer:
             self._thread.join(CLOSE_TIMEOUT_S)
 
     def begin(self) -> None:
-        """Streams from now on, with setpoints given from now on."""
-        self._setpoint = None
+        """Streams from now on, with requests given from now on."""
+        self._request = None
         self._stream = _Stream(begun_s=self._clock())
 
     def end(self, reason: str) -> None:
         """Silence until `begin`; `reason` is reported unless the stream had ended before."""
         self._stream.end(reason)
 
-    def offer(self, setpoint: Setpoint) -> None:
-        """The setpoint to send from now on, until a newer one is offered or it is too old."""
-        self._setpoint = setpoint
+    def offer(self, request: Request) -> None:
+        """What to ask the gate for from now on, until a newer request is offered or this one is too old."""
+        self._request = request
 
     def beat(self) -> None:
         """The control loop runs. To be called by the control loop itself, several times in `max_control_age_s`."""
@@ -144,18 +145,18 @@ class SetpointStreamer:
         return stream.ended
 
     def _send_one(self, stream: _Stream) -> str | None:
-        """Sends the newest setpoint; why not, where it cannot be sent."""
-        setpoint = self._setpoint
+        """Sends what the gate makes of the newest request; why not, where nothing can be sent."""
+        request = self._request
         now = self._clock()
         if now - self._beat_s > self._parameters.max_control_age_s:
             return "the control loop is late"
-        if setpoint is None:
+        if request is None:
             return "no setpoint yet"
-        if not 0.0 <= now - setpoint.time_s <= self._parameters.max_setpoint_age_s:
+        if not 0.0 <= now - request.permission.time_s <= self._parameters.max_setpoint_age_s:
             return "the setpoint is not fresh"
         if now - stream.last_sent_s > self._parameters.max_gap_s and stream.offboard:
             return "the thread was stopped"  # between two deadlines: SIGSTOP, or a machine that slept
-        allowed = self._gate(setpoint)
+        allowed = self._gate(now, request).setpoint
         if allowed is None:
             return "the gate refused"
         if stream.ended is not None:

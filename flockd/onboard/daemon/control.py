@@ -10,16 +10,25 @@ from dataclasses import replace
 import numpy as np
 
 from flockd.core.config import DroneConfig
-from flockd.core.messages import FloatArray, Setpoint, VehicleState
+from flockd.core.messages import VehicleState, Wanted
 from flockd.flight.obstacles import nearest_points
-from flockd.flight.safety import Action, Decision, Event, MissionEnd, Permission, State, Supervisor, Surroundings
+from flockd.flight.safety import (
+    Action,
+    Decision,
+    Event,
+    MissionEnd,
+    Permission,
+    Request,
+    State,
+    Supervisor,
+    Surroundings,
+)
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
 from flockd.onboard.daemon.autopilot_requests import AutopilotRequests, Takeover
 from flockd.onboard.daemon.operator_commands import OperatorRequests
 from flockd.onboard.daemon.pilot_loop import PilotLoop
-from flockd.onboard.daemon.stream_gate import Clearance, StreamGate
 from flockd.onboard.daemon.supervisor_inputs import InputCollector, position_from_home
 from flockd.onboard.daemon.vehicle_history import VehicleHistory
 
@@ -36,7 +45,6 @@ class Control:
         config: DroneConfig,
         link: AutopilotLink,
         streamer: SetpointStreamer,
-        stream_gate: StreamGate,
         pilot_loop: PilotLoop,
         input_collector: InputCollector,
         requests: AutopilotRequests,
@@ -49,7 +57,7 @@ class Control:
         assert config.autopilot is not None
         self._autopilot = config.autopilot
         self._sigmas = config.obstacles.sigmas
-        self._link, self._streamer, self._stream_gate, self._pilot_loop = link, streamer, stream_gate, pilot_loop
+        self._link, self._streamer, self._pilot_loop = link, streamer, pilot_loop
         self._input_collector, self._requests, self._history = input_collector, requests, history
         self._operator, self._on_tick, self._clock = operator, on_tick, clock
         self._supervisor = Supervisor(config.safety)
@@ -57,6 +65,8 @@ class Control:
         self._height_m = math.nan
         self._yaw_rad = math.nan
         self._flight = 0
+        self._request: Request | None = None
+        """The last one offered; None in silence."""
         self.decision = Decision(State.IDLE, Action.SILENCE, ())
 
     async def run(self) -> None:
@@ -83,9 +93,8 @@ class Control:
 
     def stand_still(self) -> None:
         """For when no tick follows: the streamer sends standstill until it notices that the control loop is late."""
-        if self._stream_gate.clearance is not None:
-            permission = Permission(Action.ASK_HOLD, self._clock())
-            self._stream_gate.clearance = replace(self._stream_gate.clearance, permission=permission)
+        if self._request is not None:
+            self._streamer.offer(replace(self._request, permission=Permission(Action.ASK_HOLD, self._clock())))
 
     def _mission_over(self) -> MissionEnd | None:
         """What the mission of this flight asks of the autopilot; None while nothing flies, as its mission is past."""
@@ -106,31 +115,29 @@ class Control:
             self._yaw_rad = _yaw(vehicle)
 
     def _stream(self, now: float, status: AutopilotStatus, vehicle: VehicleState | None, before: Decision) -> None:
-        """Offers a setpoint, with the clearance for the gate, or ends the stream."""
+        """Offers what the pilot wants, with the permission for it, or ends the stream."""
         action = self.decision.action
         if action is Action.SILENCE:
-            self._stream_gate.clearance = None
+            self._request = None
             self._streamer.end(self.decision.reasons[0].sentence if self.decision.reasons else action)
             return
         if before.action is Action.SILENCE:
             self._streamer.begin()
-        velocity, height_m, yaw_rad, made_s = self._command(now)
+        wanted, wanted_s = self._wanted(now)
         around = self._around(now, status, vehicle)
-        self._stream_gate.clearance = Clearance(Permission(action, now), around, made_s)
-        self._streamer.offer(Setpoint(now, velocity, height_m, yaw_rad))
+        self._request = Request(Permission(action, now), wanted, wanted_s, self._height_m, around)
+        self._streamer.offer(self._request)
         self._streamer.beat()
 
-    def _command(self, now: float) -> tuple[FloatArray, float, float, float]:
-        """Velocity, height, heading, and when they were computed; standstill during a flight's first steps.
+    def _wanted(self, now: float) -> tuple[Wanted, float]:
+        """What the pilot wants, and when it was made; standstill during a flight's first steps.
 
         Before those it knows neither its ego-motion nor its neighbours.
         """
         result = self._pilot_loop.newest
         if result is None or result.flight != self._flight or result.number < self._first_steps:
-            return np.zeros(2), self._height_m, self._yaw_rad, now
-        command = result.output.command
-        height_m = self._height_m if command.height_m is None else command.height_m
-        return command.velocity, height_m, command.yaw_rad, result.time_s
+            return Wanted(np.zeros(2), np.zeros(2), self._yaw_rad), now
+        return result.output.command, result.time_s
 
     def _around(self, now: float, status: AutopilotStatus, vehicle: VehicleState | None) -> Surroundings:
         known = vehicle is not None and vehicle.velocity_ned is not None

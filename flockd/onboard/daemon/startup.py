@@ -24,7 +24,6 @@ from flockd.onboard.daemon.mission_orders import MissionOrders
 from flockd.onboard.daemon.operator_commands import OperatorRequests, command_handler
 from flockd.onboard.daemon.pilot_loop import PilotLoop
 from flockd.onboard.daemon.refusal_watch import RefusalWatch
-from flockd.onboard.daemon.stream_gate import StreamGate
 from flockd.onboard.daemon.supervisor_inputs import InputCollector
 from flockd.onboard.daemon.take_off import TakeOff
 from flockd.onboard.daemon.vehicle_history import VehicleHistory
@@ -74,8 +73,7 @@ async def open_components(
     )
     stack.push_async_callback(_close_async, link.close)
     gate = Gate(config.safety.gate)
-    stream_gate = StreamGate(gate, clock)
-    streamer = SetpointStreamer(link.send_setpoint, link.status, stream_gate, config.autopilot, clock=clock)
+    streamer = SetpointStreamer(link.send_setpoint, link.status, gate.step, config.autopilot, clock=clock)
     streamer.start()
     stack.callback(streamer.close)
     history, lag, thermometer = VehicleHistory(), LoopLag(clock), Thermometer()
@@ -85,7 +83,7 @@ async def open_components(
     collector = InputCollector(config, source, pilot_loop, networks, gate, lag, thermometer, dead_tasks, clock)
     requests = AutopilotRequests(link, sinks.event)
     control = Control(
-        config, link, streamer, stream_gate, pilot_loop, collector, requests, history, operator, on_tick, clock
+        config, link, streamer, pilot_loop, collector, requests, history, operator, on_tick, clock
     )  # fmt: skip
     take_off = TakeOff(link, streamer, operator, lambda: control.decision, sinks.event)
     missions = MissionOrders(config, pilot_loop, link.vehicle_state, lambda: control.decision.state)

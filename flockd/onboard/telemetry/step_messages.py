@@ -84,7 +84,7 @@ def _command(output: PilotOutput) -> CommandMessage:
         time_s=output.time_s,
         velocity_ne=output.command.velocity.tolist(),
         acceleration_ne=output.command.acceleration.tolist(),
-        yaw_deg=math.degrees(output.command.yaw_rad),
+        yaw_deg=None if output.command.yaw_rad is None else math.degrees(output.command.yaw_rad),
     )
 
 

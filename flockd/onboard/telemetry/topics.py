@@ -90,7 +90,7 @@ class CommandMessage(TypedDict):
     """m/s, north and east, after limits."""
     acceleration_ne: list[float]
     """m/s^2, north and east, after limits."""
-    yaw_deg: float
+    yaw_deg: float | None
 
 
 class MissionMessage(TypedDict):

@@ -23,7 +23,7 @@ from typing import Any, Self
 import numpy as np
 from pymavlink.dialects.v20 import development as mavlink
 
-from flockd.core.messages import FloatArray, Setpoint
+from flockd.core.messages import FloatArray
 from flockd.onboard.autopilot.refusal_reasons import CHECKS_FAIL, NO_SETPOINTS
 from flockd.sim.autopilot.fake_checks import FakeChecks
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
@@ -114,7 +114,7 @@ class FakeAutopilot:
             "MAN_DEADZONE": 0.1,
         }
         """An int is an INT32 parameter, a float a REAL32 one."""
-        self.setpoints: deque[tuple[float, Setpoint]] = deque(maxlen=MAX_SETPOINTS_KEPT)
+        self.setpoints: deque[tuple[float, Demand]] = deque(maxlen=MAX_SETPOINTS_KEPT)
         """When each came by the kernel's stamp, on ``clock`` times the speed factor, and what it said."""
         self.refused_setpoints = 0
 
@@ -308,8 +308,7 @@ class FakeAutopilot:
     def _demand(self) -> Demand:
         match self._mode:
             case "OFFBOARD" if self.setpoints:
-                setpoint = self.setpoints[-1][1]
-                return Demand(setpoint.velocity, -setpoint.height_m, setpoint.yaw_rad)
+                return self.setpoints[-1][1]
             case "POSCTL":
                 return Demand(self._by_hand(), self._hold_down_m, self._hold_yaw_rad)
             case "TAKEOFF":
@@ -364,8 +363,8 @@ class FakeAutopilot:
         if message.type_mask != TYPE_MASK or message.coordinate_frame != 1 or not np.isfinite(numbers).all():
             self.refused_setpoints += 1
             return
-        velocity = np.array([message.vx, message.vy])
-        self.setpoints.append((arrived_s, Setpoint(arrived_s, velocity, height_m=-message.z, yaw_rad=message.yaw)))
+        demand = Demand(np.array([message.vx, message.vy]), down_m=message.z, yaw_rad=message.yaw)
+        self.setpoints.append((arrived_s, demand))
 
     def _obey(self, command: int, message: Any) -> int:
         done: bool

@@ -8,10 +8,10 @@ import numpy as np
 
 from flockd.core.config.drone import DroneConfig
 from flockd.core.config.scenario import VehicleConfig
-from flockd.core.messages import FloatArray, ObstacleRanges, VelocityCommand
+from flockd.core.messages import FloatArray, ObstacleRanges, Wanted
 from flockd.flight.flocking import FlockingLaw
 from flockd.flight.obstacles import Avoidance, nearest_points
-from flockd.flight.safety import Action, Gate, Permission, Surroundings, Wanted
+from flockd.flight.safety import Action, Gate, Permission, Request, Surroundings
 from flockd.sim.control_level import motion
 
 _SETPOINT_RATE_HZ = 20.0
@@ -60,8 +60,9 @@ class FlightCode:
         as high as now; `gusts` as of `motion.fly`. Neighbours go on as they flew when they were `seen`.
         """
         points = np.empty((0, 2)) if ranges is None else nearest_points(ranges, self._drone.obstacles.sigmas)
-        command, holds = VelocityCommand(commands[:, i].copy(), np.zeros(2), 0.0), np.isnan(heights[i])
-        wanted = Wanted(command, begin_s, float(-states[2, i] if holds else heights[i]))
+        wanted = Wanted(commands[:, i].copy(), np.zeros(2), 0.0)
+        holds = bool(np.isnan(heights[i]))
+        height_m = float(-states[2, i] if holds else heights[i])
         for tick in range(self._ticks):
             age_s = tick * self._tick_s
             own = states[3:, i].copy()
@@ -75,7 +76,8 @@ class FlightCode:
                 obstacles=points - age_s * own[:2],
             )
             now_s = begin_s + age_s
-            setpoint = self._gates[i].step(now_s, Permission(Action.FLY, now_s), wanted, around).setpoint
+            request = Request(Permission(Action.FLY, now_s), wanted, begin_s, height_m, around)
+            setpoint = self._gates[i].step(now_s, request).setpoint
             assert setpoint is not None, "all that it is told is finite and of now"
             self._sent[:, i] = setpoint.velocity
             of_tick = gusts[tick * self._substeps.times : (tick + 1) * self._substeps.times]

@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockd.core.messages import Float32Array, Frame, FrameSet, Reason, ReasonKind, UInt8Array
+from flockd.core.config.mission import MissionParameters
+from flockd.core.messages import Float32Array, FloatArray, Frame, FrameSet, Reason, ReasonKind, UInt8Array
 from flockd.flight.geometry import RigCamera, rotation_angle_deg
 from flockd.flight.perception import Crop, RangeEstimate, SceneMaps
+from flockd.flight.pilot import FlockPilot
 from tests.flight.pilot.flyer import STEP_S, Flyer, scenario_with
 
 
@@ -165,6 +167,7 @@ def test_blind_cameras_still_give_a_finite_command() -> None:
     assert output.ego_motion is None
     assert len(output.reasons) == 4
     assert np.isfinite(output.command.velocity).all()
+    assert output.command.yaw_rad is not None
     assert math.isfinite(output.command.yaw_rad)
 
 
@@ -183,6 +186,39 @@ def test_at_the_ground_or_below_there_is_no_depth_and_the_flight_goes_on_above(h
     flyer.step()
     flyer.move()
     assert flyer.step().ego_motion is not None
+
+
+def facing(yaw_rad: float) -> FloatArray:
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def blown_about(yaw: str, *headings_rad: float, height_m: float = 4.0) -> list[float | None]:
+    """The headings that are asked for while the wind turns a drone without cameras."""
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0)))
+    config = flyer.scenario.drone
+    pilot = FlockPilot(config.model_copy(update={"yaw": yaw, "mission": MissionParameters(kind="hover")}), flyer.truth)
+    _, state = flyer.take_frames()
+    state = replace(state, height_m=height_m)
+    return [
+        pilot.step(FrameSet(float(i), {}), replace(state, R_ned_body=facing(heading_rad))).command.yaw_rad
+        for i, heading_rad in enumerate(headings_rad)
+    ]
+
+
+@pytest.mark.parametrize("yaw", ["hold", "course"])
+def test_a_heading_to_hold_is_the_first_one_whatever_the_wind_makes_of_it(yaw: str) -> None:
+    """With `course`, where the mission has none."""
+    assert blown_about(yaw, 1.0, 1.2, 0.7, -3.0) == pytest.approx([1.0] * 4)
+
+
+@pytest.mark.parametrize("yaw", ["hold", "course"])
+def test_refused_before_its_first_good_step_it_holds_the_heading_that_it_has_then(yaw: str) -> None:
+    assert blown_about(yaw, 2.0, 2.1, height_m=math.nan) == pytest.approx([2.0] * 2)
+
+
+def test_before_any_good_attitude_no_heading_is_asked_for() -> None:
+    assert blown_about("course", math.nan, 2.0, 2.5) == [None, pytest.approx(2.0), pytest.approx(2.0)]
 
 
 @pytest.mark.parametrize(
@@ -208,6 +244,7 @@ def test_input_that_cannot_be_is_refused_and_the_next_step_is_as_if_it_had_not_c
     assert output.reasons == (Reason(ReasonKind.INPUT, f"input refused: {reason}"),)
     np.testing.assert_array_equal(output.command.velocity, [0.0, 0.0])
     assert math.isfinite(output.time_s)
+    assert output.command.yaw_rad is not None
     assert math.isfinite(output.command.yaw_rad)
     flyer.move()
     after = flyer.step()

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from flockd.core.messages import FloatArray, Setpoint, VelocityCommand
-from flockd.flight.safety import Action, Gate, GateParameters, Objection, Permission, Surroundings, Verdict, Wanted
+from flockd.core.messages import FloatArray, Setpoint, Wanted
+from flockd.flight.safety import Action, Gate, GateParameters, Objection, Permission, Request, Surroundings, Verdict
 
 STILL = np.zeros(2)
 NOBODY = np.empty((0, 3))
@@ -26,12 +26,14 @@ HOME = Surroundings(
 )
 
 
-def wanted(velocity: ArrayLike, *, time_s: float = 0.0, height_m: float = 5.0, yaw_rad: float = 1.0) -> Wanted:
-    command = VelocityCommand(np.asarray(velocity, dtype=float), np.zeros(2), yaw_rad)
-    return Wanted(command, time_s, height_m)
+def wanted(velocity: ArrayLike, *, time_s: float = 0.0, height_m: float = 5.0, yaw_rad: float = 1.0) -> Request:
+    """A request without permission, far from everybody."""
+    want = Wanted(np.asarray(velocity, dtype=float), np.zeros(2), yaw_rad)
+    return Request(Permission(Action.SILENCE, 0.0), want, time_s, height_m, HOME)
 
 
-NO_COMMAND = Wanted(None, 0.0, height_m=5.0)
+def judge(gate: Gate, now_s: float, permission: Permission, want: Request, around: Surroundings = HOME) -> Verdict:
+    return gate.step(now_s, replace(want, permission=permission, around=around))
 
 
 class Stream:
@@ -46,7 +48,7 @@ class Stream:
     ) -> Verdict:
         self.now_s += 0.05
         permission = Permission(action, self.now_s)
-        return self.gate.step(self.now_s, permission, wanted(velocity, time_s=self.now_s, height_m=height_m), around)
+        return judge(self.gate, self.now_s, permission, wanted(velocity, time_s=self.now_s, height_m=height_m), around)
 
     def second(self, velocity: ArrayLike, action: Action = Action.FLY, around: Surroundings = HOME) -> Verdict:
         """The second of two steps: the first one begins at the drone's own velocity."""
@@ -66,6 +68,21 @@ def near(*neighbours: ArrayLike) -> Surroundings:
     )
 
 
+def test_a_heading_and_a_height_that_are_not_asked_for_stay() -> None:
+    """The heading is the drone's own before a first one was sent; the height is the one that the flight began at."""
+    gate = Gate(DRAG_FREE)
+    free = replace(wanted([0.0, 0.0], height_m=6.0), wanted=Wanted(STILL, STILL, None))
+    turned = replace(wanted([0.0, 0.0], height_m=6.0), wanted=Wanted(STILL, STILL, 2.0, height_m=5.5))
+    around, flown = replace(HOME, height_m=6.0), []
+    for tick, want in enumerate((free, turned, turned, free, free)):
+        now_s = tick / 4
+        verdict = judge(gate, now_s, Permission(Action.FLY, now_s), replace(want, wanted_s=now_s), around)
+        assert verdict.objections == ()
+        flown.append((sent(verdict).yaw_rad, sent(verdict).height_m))
+    # 1.5 m/s of climb are 0.375 m in a quarter of a second.
+    assert flown == [(0.5, 6.0), (2.0, 5.625), (2.0, 5.5), (2.0, 5.875), (2.0, 6.0)]
+
+
 # Silence.
 
 
@@ -78,7 +95,7 @@ def test_a_command_within_all_limits_passes_as_it_is() -> None:
 
 
 def test_it_is_silent_until_allowed() -> None:
-    verdict = Gate(DRAG_FREE).step(0.0, Permission(Action.SILENCE, 0.0), wanted([1.0, 0.0]), HOME)
+    verdict = judge(Gate(DRAG_FREE), 0.0, Permission(Action.SILENCE, 0.0), wanted([1.0, 0.0]), HOME)
     assert verdict == Verdict(None, (Objection.NOT_ALLOWED,))
 
 
@@ -87,10 +104,9 @@ def test_all_other_actions_send_standstill_whatever_the_command(action: Action) 
     for want in (
         wanted([1.0, 1.0]),
         wanted([math.nan, 99.0], yaw_rad=math.nan),
-        NO_COMMAND,
         wanted([1, 1], time_s=-99),
     ):
-        verdict = Gate(DRAG_FREE).step(0.0, Permission(action, 0.0), want, HOME)
+        verdict = judge(Gate(DRAG_FREE), 0.0, Permission(action, 0.0), want, HOME)
         np.testing.assert_array_equal(sent(verdict).velocity, STILL)
         assert sent(verdict).yaw_rad == 0.5  # as the drone looks
         assert verdict.objections == ()
@@ -102,7 +118,7 @@ def test_all_other_actions_send_standstill_whatever_the_command(action: Action) 
 )
 def test_a_permission_is_good_for_so_long(action: Action, age_s: float, good: bool) -> None:
     gate = Gate(GateParameters(permission_timeout_s=0.25))
-    verdict = gate.step(8.0, Permission(action, 8.0 - age_s), wanted([1.0, 0.0], time_s=8.0), HOME)
+    verdict = judge(gate, 8.0, Permission(action, 8.0 - age_s), wanted([1.0, 0.0], time_s=8.0), HOME)
     assert (verdict.setpoint is not None) == good
     assert verdict.objections == (() if good else (Objection.PERMISSION_STALE,))
 
@@ -112,7 +128,7 @@ def test_a_permission_is_good_for_so_long(action: Action, age_s: float, good: bo
     ("age_s", "good"), [(1.5, True), (1.51, False), (-1.5, True), (-1.51, False), (math.nan, False)]
 )
 def test_a_command_is_good_for_so_long(action: Action, age_s: float, good: bool) -> None:
-    verdict = Gate(DRAG_FREE).step(8.0, Permission(action, 8.0), wanted([1.0, 0.0], time_s=8.0 - age_s), HOME)
+    verdict = judge(Gate(DRAG_FREE), 8.0, Permission(action, 8.0), wanted([1.0, 0.0], time_s=8.0 - age_s), HOME)
     assert (verdict.setpoint is not None) == good
     assert (verdict.objections == (Objection.COMMAND_STALE,)) is not good
 
@@ -126,17 +142,12 @@ def test_after_the_pilots_last_output_the_drone_slows_down_and_stands_still_befo
     for tick in range(0, 70):
         now_s = tick / 20
         command = wanted([speed_m_s, 0.0], time_s=min(now_s, 1.0))
-        setpoint = gate.step(now_s, Permission(Action.FLY, now_s), command, HOME).setpoint
+        setpoint = judge(gate, now_s, Permission(Action.FLY, now_s), command, HOME).setpoint
         speeds[now_s] = None if setpoint is None else float(setpoint.velocity[0])
     assert speeds[1.9] == pytest.approx(speed_m_s)  # a pilot whose steps take 0.4 s is not slowed down
     assert speeds[2.2] == pytest.approx(speed_m_s / 2)  # half of the way from 0.9 s to 1.5 s
     assert speeds[2.5] == pytest.approx(0.0, abs=1e-9)
     assert speeds[2.55] is None
-
-
-def test_before_the_first_command_there_is_none_to_fly() -> None:
-    verdict = Gate(DRAG_FREE).step(0.0, Permission(Action.FLY, 0.0), NO_COMMAND, HOME)
-    assert verdict == Verdict(None, (Objection.COMMAND_STALE,))
 
 
 def test_a_daemon_that_stalls_is_silenced_in_time_for_the_half_second() -> None:
@@ -146,7 +157,7 @@ def test_a_daemon_that_stalls_is_silenced_in_time_for_the_half_second() -> None:
     heard_s = [
         now_s
         for now_s in np.arange(0.05, 2.0, 0.05)
-        if stream.gate.step(now_s, last, wanted([1.0, 0.0], time_s=0.05), HOME).setpoint is not None
+        if judge(stream.gate, now_s, last, wanted([1.0, 0.0], time_s=0.05), HOME).setpoint is not None
     ]
     assert max(heard_s) - last.time_s < 0.5
 
@@ -168,7 +179,7 @@ def test_a_yaw_that_is_not_finite_is_refused_and_the_last_one_kept() -> None:
     stream = Stream()
     stream.second([0.5, 0.0])
     want = wanted([0.5, 0.0], time_s=0.1, yaw_rad=math.nan)
-    verdict = stream.gate.step(0.15, Permission(Action.FLY, 0.15), want, HOME)
+    verdict = judge(stream.gate, 0.15, Permission(Action.FLY, 0.15), want, HOME)
     np.testing.assert_allclose(sent(verdict).velocity, STILL, atol=1e-12)
     assert sent(verdict).yaw_rad == 1.0
     assert verdict.objections == (Objection.COMMAND_NOT_FINITE,)
@@ -246,7 +257,7 @@ def test_without_a_fence_the_position_does_not_matter() -> None:
 def test_an_old_command_is_reported_as_slowed_once() -> None:
     gate = Gate(DRAG_FREE)
     for action in (Action.FLY, Action.FLY_DEGRADED):
-        verdict = gate.step(8.0, Permission(action, 8.0), wanted([3.0, 0.0], time_s=6.8), HOME)
+        verdict = judge(gate, 8.0, Permission(action, 8.0), wanted([3.0, 0.0], time_s=6.8), HOME)
         assert verdict.objections == (Objection.SLOWED,)
 
 
@@ -321,7 +332,7 @@ def test_twice_at_one_instant_nothing_changes_nor_when_the_clock_is_read_late() 
     gate = Gate(GateParameters())
     for now_s in (0.0, 0.05, 0.05, 0.04):
         velocity = sent(
-            gate.step(now_s, Permission(Action.FLY, now_s), wanted([1.0, 0.0], time_s=now_s), HOME)
+            judge(gate, now_s, Permission(Action.FLY, now_s), wanted([1.0, 0.0], time_s=now_s), HOME)
         ).velocity
     np.testing.assert_allclose(velocity, [0.25, 0.0])  # 5 m/s^2 for 0.05 s
 
@@ -386,7 +397,7 @@ def test_an_old_command_climbs_ever_slower() -> None:
     heights = []
     for step in range(31):
         now_s = 0.05 * step
-        verdict = gate.step(now_s, Permission(Action.FLY, now_s), wanted(STILL, time_s=0.0, height_m=9.0), HOME)
+        verdict = judge(gate, now_s, Permission(Action.FLY, now_s), wanted(STILL, time_s=0.0, height_m=9.0), HOME)
         heights.append(sent(verdict).height_m)
     climbs = np.diff(heights) / 0.05
     np.testing.assert_allclose(climbs[:18], 1.0)
@@ -627,11 +638,11 @@ def test_whatever_is_asked_for_what_is_sent_is_safe(seed: int, odd: float) -> No
             neighbour_velocities=np.array([_vector(rng, 2, 1.0, odd) for _ in range(number)]).reshape(-1, 2),
             height_m=10.0 + _number(rng, 3.0, odd),
         )
-        verdict = gate.step(now_s, permission, want, around)
+        verdict = judge(gate, now_s, permission, want, around)
         setpoint = verdict.setpoint
         fresh = now_s - permission.time_s <= 0.3 and action is not Action.SILENCE
         if action in (Action.FLY, Action.FLY_DEGRADED):
-            fresh &= now_s - want.time_s <= 1.5
+            fresh &= now_s - want.wanted_s <= 1.5
         if setpoint is None:
             assert odd or not fresh
         else:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from flockd.core.messages import FloatArray, VelocityCommand
-from flockd.flight.safety import Action, Gate, GateParameters, Objection, Permission, Surroundings, Verdict, Wanted
+from flockd.core.messages import FloatArray, Wanted
+from flockd.flight.safety import Action, Gate, GateParameters, Objection, Permission, Request, Surroundings, Verdict
 from flockd.flight.safety.approach import SAME_SPOT_M, stopping_speed, towards_neighbours, towards_obstacles
 from flockd.flight.safety.gate import _units
 from flockd.flight.safety.half_planes import nearest_within
@@ -36,8 +36,8 @@ def flown(velocity: ArrayLike, around: Surroundings, action: Action = Action.FLY
     """The second of two steps: the first one begins at the drone's own velocity."""
     gate = Gate(PARAMETERS)
     for now_s in (0.05, 0.1):
-        command = VelocityCommand(np.array(velocity, dtype=float), np.zeros(2), 0.0)
-        verdict = gate.step(now_s, Permission(action, now_s), Wanted(command, now_s, 5.0), around)
+        wanted = Wanted(np.array(velocity, dtype=float), np.zeros(2), 0.0)
+        verdict = gate.step(now_s, Request(Permission(action, now_s), wanted, now_s, 5.0, around))
     return verdict
 
 

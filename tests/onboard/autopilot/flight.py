@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from flockd.core.config.autopilot import AutopilotParameters
-from flockd.core.messages import Setpoint
+from flockd.core.messages import Setpoint, Wanted
+from flockd.flight.safety import Action, Permission, Request, Surroundings, Verdict
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
 from flockd.onboard.daemon import clock_at, event_loop_at
@@ -25,12 +26,18 @@ from tests import calm
 CONTROL_S = 0.05
 
 
-def north(speed_m_s: float = 1.0, height_m: float = 2.5, clock: Callable[[], float] = calm.clock) -> Setpoint:
-    return Setpoint(clock(), np.array([speed_m_s, 0.0]), height_m, yaw_rad=0.0)
+NOWHERE = Surroundings(np.zeros(2), np.zeros(2), 0.0, np.empty((0, 3)), np.empty((0, 2)), 2.5)
+NORTH = Wanted(np.array([1.0, 0.0]), np.zeros(2), 0.0, height_m=2.5)
 
 
-def let_pass(setpoint: Setpoint) -> Setpoint | None:
-    return setpoint
+def request_of(wanted: Wanted, now_s: float) -> Request:
+    return Request(Permission(Action.FLY, now_s), wanted, now_s, 0.0, NOWHERE)
+
+
+def let_pass(now_s: float, request: Request) -> Verdict:
+    """A gate that allows all."""
+    wanted = request.wanted
+    return Verdict(Setpoint(now_s, wanted.velocity, wanted.height_m or 0.0, wanted.yaw_rad or 0.0), ())
 
 
 async def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> float:
@@ -57,9 +64,7 @@ class Flight:
 
 
 @asynccontextmanager
-async def flying(
-    port: int, setpoint: Callable[[], Setpoint] = north, clock: Callable[[], float] = calm.clock
-) -> AsyncIterator[Flight]:
+async def flying(port: int, wanted: Wanted = NORTH, clock: Callable[[], float] = calm.clock) -> AsyncIterator[Flight]:
     parameters = AutopilotParameters(address=f"udpin://127.0.0.1:{port}")
     link = await AutopilotLink.connect(parameters, clock=clock)
     streamer = SetpointStreamer(link.send_setpoint, link.status, let_pass, parameters, clock=clock)
@@ -67,7 +72,7 @@ async def flying(
 
     async def control() -> None:
         while True:
-            streamer.offer(setpoint())
+            streamer.offer(request_of(wanted, clock()))
             streamer.beat()
             await asyncio.sleep(CONTROL_S)
 
@@ -82,7 +87,7 @@ async def flying(
 
 async def main(port: int, speed_factor: float) -> None:
     clock = clock_at(speed_factor)
-    async with flying(port, functools.partial(north, clock=clock), clock) as flight:
+    async with flying(port, clock=clock) as flight:
         await flight.enter_offboard()
         print("offboard", flush=True)  # noqa: T201
         await asyncio.sleep(3600)

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.scenario import RangeFinderConfig
-from flockd.core.messages import Setpoint
+from flockd.core.messages import Setpoint, Wanted
 from flockd.onboard.autopilot.autopilot_status import AutopilotError, Firmware
 from flockd.onboard.autopilot.mavsdk_link import SETPOINT_TYPE_MASK, AutopilotLink
 from flockd.sim.autopilot.fake_autopilot import TICK_S, FakeAutopilot
@@ -23,7 +23,7 @@ from flockd.sim.autopilot.fake_telemetry import TelemetryStreams
 from flockd.sim.autopilot.fake_vehicle import Demand, MotionState
 from tests.calm import clock, run
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, free_port
-from tests.onboard.autopilot.flight import flying, north, until
+from tests.onboard.autopilot.flight import flying, until
 
 
 def _parameters(port: int, system_id: int | None = None) -> AutopilotParameters:
@@ -133,11 +133,10 @@ def test_offboard_without_setpoints_is_refused_and_the_reason_told(port: int, fa
 
 
 def test_the_vehicle_follows_the_velocity_and_holds_its_own_height(port: int, fake_autopilot: FakeAutopilot) -> None:
-    def setpoint() -> Setpoint:
-        return Setpoint(north().time_s, np.array([0.6, -0.8]), height_m=3.0, yaw_rad=-0.5)
+    wanted = Wanted(np.array([0.6, -0.8]), np.zeros(2), yaw_rad=-0.5, height_m=3.0)
 
     async def story() -> None:
-        async with flying(port, setpoint) as flight:
+        async with flying(port, wanted) as flight:
             await flight.enter_offboard()
             assert fake_autopilot.mode == "OFFBOARD"
             await asyncio.sleep(1.5)
@@ -202,7 +201,8 @@ def test_return_flies_home(port: int, fake_autopilot: FakeAutopilot) -> None:
 
 def test_two_links_on_two_ports_mind_their_own_vehicle(port: int, fake_autopilot: FakeAutopilot) -> None:
     async def story() -> None:
-        async with flying(port) as one, flying(second_port, lambda: north(-0.5, height_m=4.0)) as two:
+        south = Wanted(np.array([-0.5, 0.0]), np.zeros(2), 0.0, height_m=4.0)
+        async with flying(port) as one, flying(second_port, south) as two:
             await asyncio.gather(one.enter_offboard(), two.enter_offboard())
             await asyncio.sleep(1.5)
             assert fake_autopilot.state.velocity[0] == pytest.approx(1.0, abs=0.15)
@@ -242,7 +242,7 @@ def test_a_stand_in_that_is_late_for_every_tick_still_hears(port: int) -> None:
     async def story() -> None:
         link = await AutopilotLink.connect(_parameters(port), clock=clock)
         assert await link.parameter("COM_OBL_RC_ACT", int) == 5
-        link.send_setpoint(north())
+        link.send_setpoint(Setpoint(0.0, np.zeros(2), 2.5, 0.0))
         await until(lambda: len(fake_autopilot.setpoints) == 1)
         await link.close()
 

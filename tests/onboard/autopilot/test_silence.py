@@ -12,8 +12,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from flockd.core.messages import Setpoint
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from tests.calm import clock, run
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
@@ -92,7 +94,7 @@ def test_the_stand_in_itself_would_return_to_offboard(port: int, fake_autopilot:
             await flight.enter_offboard()
             flight.streamer.end("for the test")
             await until(lambda: fake_autopilot.failsafe)
-            flight.link.send_setpoint((fake_autopilot.setpoints[-1])[1])
+            flight.link.send_setpoint(Setpoint(0.0, np.array([1.0, 0.0]), 2.5, 0.0))
             await until(lambda: fake_autopilot.mode == "OFFBOARD", 1.0)
 
     run(story)

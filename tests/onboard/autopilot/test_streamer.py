@@ -11,8 +11,10 @@ import pytest
 
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.messages import Setpoint
+from flockd.flight.safety import Request, Verdict
 from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus
 from flockd.onboard.autopilot.streamer import SetpointStreamer
+from tests.onboard.autopilot.flight import NORTH, let_pass, request_of
 
 PERIOD_S = 0.05
 
@@ -45,8 +47,8 @@ class Story:
             self._send, lambda: self.status, self._gate, AutopilotParameters(), clock=lambda: self.now
         )
 
-    def _gate(self, setpoint: Setpoint) -> Setpoint | None:
-        return setpoint if isinstance(self.gate_says, str) else self.gate_says
+    def _gate(self, now_s: float, request: Request) -> Verdict:
+        return let_pass(now_s, request) if isinstance(self.gate_says, str) else Verdict(self.gate_says, ())
 
     def _send(self, setpoint: Setpoint) -> None:
         if not self.cable_is_in:
@@ -59,7 +61,7 @@ class Story:
         for _ in range(round(duration_s / PERIOD_S)):
             self.now += PERIOD_S
             if deciding:
-                self.streamer.offer(Setpoint(self.now, np.array([1.0, 0.0]), 2.5, 0.0))
+                self.streamer.offer(request_of(NORTH, self.now))
             if beating:
                 self.streamer.beat()
             self.streamer.step()
@@ -115,7 +117,7 @@ def test_a_beating_loop_that_decides_nothing_any_more_is_silence_too(in_offboard
 def test_a_setpoint_from_the_future_or_with_no_date_is_not_sent(story: Story) -> None:
     story.streamer.begin()
     for date in (story.now + 60.0, math.nan):
-        story.streamer.offer(Setpoint(date, np.zeros(2), 2.5, 0.0))
+        story.streamer.offer(request_of(NORTH, date))
         assert story.go_on(0.5, deciding=False) == 0
         assert story.silence == "the setpoint is not fresh"
 
@@ -213,15 +215,15 @@ def test_the_thread_keeps_its_rate_and_ends_when_the_gate_breaks() -> None:
     sent: list[float] = []
     gate_works = True
 
-    def gate(setpoint: Setpoint) -> Setpoint | None:
+    def gate(now_s: float, request: Request) -> Verdict:
         if not gate_works:
             raise ZeroDivisionError("a bug")
-        return setpoint
+        return let_pass(now_s, request)
 
     streamer = SetpointStreamer(lambda _: sent.append(time.monotonic()), lambda: HOVERING, gate, AutopilotParameters())
 
     def offer() -> None:
-        streamer.offer(Setpoint(time.monotonic(), np.zeros(2), 2.5, 0.0))
+        streamer.offer(request_of(NORTH, time.monotonic()))
         streamer.beat()
         time.sleep(0.01)
 

@@ -25,7 +25,7 @@ from flockd.core.messages import (
     Reason,
     ReasonKind,
     VehicleState,
-    VelocityCommand,
+    Wanted,
 )
 from flockd.onboard.recording import Recorder
 
@@ -67,7 +67,7 @@ class MadeUpPilot:
             ego_motion=replace(filled(EgoMotion, m), translation=np.array([m, 1e-310, -0.0])),
             velocity=np.array([m, 1 / 3, math.nan]),
             neighbours=(replace(filled(Neighbour, m), velocity_sigma_m_s=math.inf),),
-            command=VelocityCommand(np.array([m, -m]), np.array([0.1 * m, 0.2]), m),
+            command=Wanted(np.array([m, -m]), np.array([0.1 * m, 0.2]), m),
         )
 
 

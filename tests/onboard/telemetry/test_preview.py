@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
-from flockd.core.messages import Detection, Frame, FrameSet, PilotOutput, UInt8Array, VelocityCommand
+from flockd.core.messages import Detection, Frame, FrameSet, PilotOutput, UInt8Array, Wanted
 from flockd.flight.geometry import build_rig
 from flockd.onboard.telemetry.preview import EVERY_S, FRESH_S, Previews
 
@@ -28,7 +28,7 @@ def output(*bearings: tuple[float, float, float]) -> PilotOutput:
         Detection(np.array(bearing), math.log(4.0), np.eye(3), 0.9, 0.5, ("front",), label)
         for label, bearing in enumerate(bearings, 1)
     )
-    command = VelocityCommand(np.zeros(2), np.zeros(2), 0.0)
+    command = Wanted(np.zeros(2), np.zeros(2), 0.0)
     return PilotOutput(0.0, None, None, found, (), {}, (), command)
 
 

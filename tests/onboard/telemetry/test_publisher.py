@@ -23,7 +23,7 @@ from flockd.core.messages import (
     Reason,
     ReasonKind,
     VehicleState,
-    VelocityCommand,
+    Wanted,
 )
 from flockd.onboard.telemetry import TOPICS, publish_step
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
@@ -80,7 +80,7 @@ def _output(velocity: np.ndarray | None) -> PilotOutput:
         track=3, position=np.array([1.0, -2.5, 0.5]), velocity=np.array([1.0, 0.0, 0.0]), position_sigma_m=0.1,
         velocity_sigma_m_s=math.inf, age_s=2.0, unseen_s=0.5, hits=4, confirmed=True,
     )  # fmt: skip
-    command = VelocityCommand(velocity=np.array([0.9, 0.1]), acceleration=np.array([0.2, -0.2]), yaw_rad=math.pi / 2)
+    command = Wanted(velocity=np.array([0.9, 0.1]), acceleration=np.array([0.2, -0.2]), yaw_rad=math.pi / 2)
     return PilotOutput(
         time_s=12.5, ego_motion=None, velocity=velocity, detections=(), detection_tracks=(), neighbour_motions={},
         neighbours=(neighbour,), command=command,

@@ -22,7 +22,7 @@ from flockd.core.messages import (
     Neighbour,
     PilotOutput,
     VehicleState,
-    VelocityCommand,
+    Wanted,
 )
 from flockd.flight.geometry import log_polar, log_polar_covariance
 from flockd.flight.perception import CameraObservation, Observation
@@ -90,7 +90,7 @@ def output_of(drone: int, step: int, time_s: float) -> PilotOutput:
         detection_tracks=(7,),
         neighbour_motions={},
         neighbours=tuple(neighbours),
-        command=VelocityCommand(np.array([1.0, 0.1]), np.array([0.0, 0.2]), 0.0),
+        command=Wanted(np.array([1.0, 0.1]), np.array([0.0, 0.2]), 0.0),
         stages_ms={"scene": 10.0 + step},
     )
 

@@ -12,9 +12,9 @@ from flockd.core.config import load_scenario
 from flockd.core.config.loader import load_perceived_errors
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.data import data_path
-from flockd.core.messages import FloatArray, VelocityCommand
+from flockd.core.messages import FloatArray, Wanted
 from flockd.flight.obstacles import nearest_points
-from flockd.flight.safety.gate import Gate, Objection, Permission, Surroundings, Wanted
+from flockd.flight.safety.gate import Gate, Objection, Permission, Request, Surroundings
 from flockd.flight.safety.policy import Action
 from flockd.sim.control_level import fly_flocks
 from flockd.sim.control_level.flock_flights import FlockFlights
@@ -52,10 +52,11 @@ def _flown_by_gates(scenario: ScenarioConfig) -> tuple[FloatArray, Counter[Objec
                 others = np.arange(n) != i
                 own, seen = vehicles.velocity[i], commands.obstacles[i]
                 points = np.empty((0, 2)) if seen is None else nearest_points(seen, drone.obstacles.sigmas)
-                setpoint = gate.step(
-                    now_s,
+                request = Request(
                     Permission(Action.FLY, now_s),
-                    Wanted(VelocityCommand(commands.velocity[i], np.zeros(2), 0.0), begin_s, 4.0),
+                    Wanted(commands.velocity[i], np.zeros(2), 0.0),
+                    begin_s,
+                    4.0,
                     Surroundings(
                         vehicles.position[i, :2],
                         own[:2],
@@ -65,7 +66,8 @@ def _flown_by_gates(scenario: ScenarioConfig) -> tuple[FloatArray, Counter[Objec
                         4.0,
                         points - age_s * own[:2],
                     ),
-                ).setpoint
+                )
+                setpoint = gate.step(now_s, request).setpoint
                 assert setpoint is not None
                 setpoints[i] = setpoint.velocity
             vehicles.step(setpoints, np.zeros(n), TICK_S)

@@ -13,7 +13,7 @@ import numpy as np
 
 from flockd.core.config import DroneConfig, load_drone
 from flockd.core.config.safety import GateParameters, SafetyParameters
-from flockd.core.messages import Frame, FrameSet, PilotOutput, VehicleState, VelocityCommand
+from flockd.core.messages import Frame, FrameSet, PilotOutput, VehicleState, Wanted
 from flockd.flight.perception import load_networks
 from flockd.flight.pilot import FlockPilot
 from flockd.flight.safety import (
@@ -23,11 +23,11 @@ from flockd.flight.safety import (
     Gate,
     Inputs,
     Permission,
+    Request,
     State,
     Supervisor,
     Surroundings,
     Verdict,
-    Wanted,
 )
 from tools.checks.fuzzing.mutation import any_float
 from tools.checks.fuzzing.target import CORPUS, Check, Target
@@ -119,7 +119,8 @@ def _vehicle(random: Random, time_s: float) -> VehicleState:
 
 def _assert_within_limits(output: PilotOutput, config: DroneConfig) -> None:
     command = output.command
-    assert np.isfinite([*command.velocity, *command.acceleration, command.yaw_rad]).all(), "a command is not finite"
+    numbers = [*command.velocity, *command.acceleration, command.yaw_rad or 0.0]
+    assert np.isfinite(numbers).all(), "a command is not finite"
     trim = 0.0 if config.autopilot is None else config.autopilot.max_velocity_trim_m_s
     limit_m_s = config.flocking.max_speed_m_s + trim
     assert math.hypot(*command.velocity) <= limit_m_s + ROUNDING, f"{command.velocity} is over {limit_m_s} m/s"
@@ -137,9 +138,9 @@ def _through_gate(random: Random, gate: Gate, p: GateParameters, output: PilotOu
         any_float(random),
     )
     last = gate._last
-    wanted = Wanted(output.command, now_s, any_float(random))
     action = random.choice((Action.FLY, Action.FLY_DEGRADED))
-    assert_safe(gate.step(now_s, Permission(action, now_s), wanted, around), p, action, around, last)
+    request = Request(Permission(action, now_s), output.command, now_s, any_float(random), around)
+    assert_safe(gate.step(now_s, request), p, action, around, last)
 
 
 def assert_safe(verdict: Verdict, p: GateParameters, action: Action, around: Surroundings, last: Any) -> None:
@@ -178,16 +179,16 @@ def _gate(folder: Path) -> Check:
         gate, now_s = Gate(p), random.choice((0.0, 1e3, 1e9))
         for _ in range(random.randrange(1, 8)):
             now_s += random.choice((0.0, 0.05, 0.05, 0.05, 0.5, -0.1))
-            command = None
-            if random.random() < 0.95:
-                two = [np.array([any_float(random), any_float(random)]) for _ in range(2)]
-                command = VelocityCommand(two[0], two[1], any_float(random))
+            two = [np.array([any_float(random), any_float(random)]) for _ in range(2)]
+            yaw_rad, height_m = (None if random.random() < 0.2 else any_float(random) for _ in range(2))
+            wanted = Wanted(two[0], two[1], yaw_rad, height_m=height_m)
             around = _surroundings(random)
             action = random.choice(list(Action))
-            wanted = Wanted(command, now_s - random.choice((0.0, 0.1, 1.0, 1.2, any_float(random))), any_float(random))
+            wanted_s = now_s - random.choice((0.0, 0.1, 1.0, 1.2, any_float(random)))
             permission = Permission(action, now_s - random.choice((0.0, 0.0, 0.0, any_float(random))))
             last = gate._last
-            assert_safe(gate.step(now_s, permission, wanted, around), p, action, around, last)
+            request = Request(permission, wanted, wanted_s, any_float(random), around)
+            assert_safe(gate.step(now_s, request), p, action, around, last)
 
     return check
 
