@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,31 +15,23 @@ from flockd.flight.geometry.robust.solver import GaussNewton, NormalEquations, P
 from flockd.flight.geometry.rotations import rotation_from_vector
 from flockd.flight.geometry.transform import RigidTransform
 
-
-@dataclass(frozen=True)
-class RefinementParameters:
-    """How the ego-motion is refined."""
-
-    max_pairs: int = 2500
-    """Drawn of more: each costs two residuals a step."""
-    flow_sigma_px: float = 0.3
-    depth_sigma: float = 0.05
-    """Relative error of depth. Only its ratio to the flow's error matters: their common size is found from the
-    residuals."""
-    cauchy_sigmas: float = 1.2
-    """Cauchy's scale in standard deviations. Half of the 2.385 that Gaussian errors ask for: the depth of a whole
-    object is wrong together, and the stricter scale halved the error where that is 15 %, for 5 % where all errors are
-    Gaussian."""
-    unseen_px: float = 1e3
-    """Residual of a point that a motion moves out of the lens's reach."""
-    rough: GaussNewton = field(default=GaussNewton(max_steps=3, tolerance=0.0, max_condition=1e12))
-    """While the motion is still rough, so are the size of the residuals and the direction of the parallax: they are
-    found anew at each step."""
-    fine: GaussNewton = field(default=GaussNewton(max_steps=17, tolerance=1e-4, min_steps=2, max_condition=1e12))
-    """Then they stay; until a step is under so many radians and metres."""
-
-
-DEFAULTS = RefinementParameters()
+_MAX_PAIRS = 2500
+"""Drawn of more: each costs two residuals a step."""
+_FLOW_SIGMA_PX = 0.3
+_DEPTH_SIGMA = 0.05
+"""Relative error of depth. Only its ratio to the flow's error matters: their common size is found from the
+residuals."""
+_CAUCHY_SIGMAS = 1.2
+"""Cauchy's scale in standard deviations. Half of the 2.385 that Gaussian errors ask for: the depth of a whole
+object is wrong together, and the stricter scale halved the error where that is 15 %, for 5 % where all errors are
+Gaussian."""
+_UNSEEN_PX = 1e3
+"""Residual of a point that a motion moves out of the lens's reach."""
+_ROUGH_SOLVER = GaussNewton(max_steps=3, tolerance=0.0, max_condition=1e12)
+"""While the motion is still rough, so are the size of the residuals and the direction of the parallax: they are
+found anew at each step."""
+_FINE_SOLVER = GaussNewton(max_steps=17, tolerance=1e-4, min_steps=2, max_condition=1e12)
+"""Then they stay; until a step is under so many radians and metres."""
 
 
 def refine_ego_motion(
@@ -49,7 +41,6 @@ def refine_ego_motion(
     *,
     agreeing: BoolArray | None = None,
     seed: int = 0,
-    parameters: RefinementParameters = DEFAULTS,
 ) -> RigidTransform | None:
     """The motion near ``initial`` (F to C) that best reprojects the pairs, or None where there is no better one.
 
@@ -67,8 +58,8 @@ def refine_ego_motion(
     if strangers:
         raise ValueError(f"pairs of camera {sorted(strangers)[0]!r}, which is not in the rig")
     agreeing = np.ones(len(pairs), np.bool_) if agreeing is None else agreeing
-    if len(pairs) > parameters.max_pairs:
-        drawn = np.sort(np.random.default_rng(seed).choice(len(pairs), parameters.max_pairs, replace=False))
+    if len(pairs) > _MAX_PAIRS:
+        drawn = np.sort(np.random.default_rng(seed).choice(len(pairs), _MAX_PAIRS, replace=False))
         pairs, agreeing = pairs.select(drawn), agreeing[drawn]
     mine = {name: pairs.camera_names == name for name in rig.cameras}
     views = [_View(rig.cameras[name], pairs.select(which)) for name, which in mine.items() if which.any()]
@@ -76,12 +67,12 @@ def refine_ego_motion(
     typical = np.concatenate([np.tile(agreeing[which], 2) for which in mine.values()])
     if not typical.any():
         return None
-    start = _Reprojection(views, initial, parameters.unseen_px)
-    rough = parameters.rough.minimise(_Refinement(parameters, typical), start)
+    start = _Reprojection(views, initial)
+    rough = _ROUGH_SOLVER.minimise(_Refinement(typical), start)
     if not rough.equations.solvable:
         return None
-    weighting = _Weighting.learned(rough.state, typical, parameters)
-    fine = parameters.fine.minimise(_Refinement(parameters, typical, weighting), rough.state)
+    weighting = _Weighting.learned(rough.state, typical)
+    fine = _FINE_SOLVER.minimise(_Refinement(typical, weighting), rough.state)
     if not fine.converged:
         return None
     before, after = (weighting.loss(state) for state in (start, fine.state))
@@ -119,14 +110,13 @@ class _Reprojection:
 
     views: list[_View]
     motion: RigidTransform
-    unseen_px: float
 
     @cached_property
     def linearised(self) -> _Linearisation:
         parts = [part for view in self.views for part in self._both_ways(view)]
         residuals, jacobians, parallaxes = (np.concatenate(part) for part in zip(*parts, strict=True))
         unseen = ~np.isfinite(residuals[:, 0])
-        residuals[unseen], jacobians[unseen], parallaxes[unseen] = self.unseen_px, 0.0, 0.0
+        residuals[unseen], jacobians[unseen], parallaxes[unseen] = _UNSEEN_PX, 0.0, 0.0
         return _Linearisation(residuals, jacobians, parallaxes)
 
     def _both_ways(self, view: _View) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
@@ -158,18 +148,18 @@ class _Weighting:
     """of whitened residuals"""
 
     @classmethod
-    def learned(cls, state: _Reprojection, typical: BoolArray, parameters: RefinementParameters) -> _Weighting:
+    def learned(cls, state: _Reprojection, typical: BoolArray) -> _Weighting:
         """From the parallax of all residuals, and the size of the ``typical`` (m,) ones."""
-        parallaxes, flow_px = state.linearised.parallaxes, parameters.flow_sigma_px
+        parallaxes, flow_px = state.linearised.parallaxes, _FLOW_SIGMA_PX
         length = np.linalg.norm(parallaxes, axis=1)
         direction = parallaxes / np.maximum(length, 1e-12)[:, None]
-        discount = 1.0 - flow_px / np.hypot(flow_px, parameters.depth_sigma * length)
+        discount = 1.0 - flow_px / np.hypot(flow_px, _DEPTH_SIGMA * length)
         along = direction[:, :, None] * direction[:, None, :]
         whitening = (np.eye(2) - discount[:, None, None] * along) / flow_px
         size = np.linalg.norm(_times(whitening[typical], state.linearised.residuals[typical]), axis=1)
         # Outliers under a half do not move the median, which for a Rayleigh distribution is sqrt(2 ln 2) sigma.
         sigma = max(float(np.median(size)) / np.sqrt(2.0 * np.log(2.0)), 1e-3)
-        return cls(whitening, Cauchy(parameters.cauchy_sigmas * sigma))
+        return cls(whitening, Cauchy(_CAUCHY_SIGMAS * sigma))
 
     def whitened(self, state: _Reprojection) -> FloatArray:
         """(m, 2)"""
@@ -184,13 +174,12 @@ class _Weighting:
 class _Refinement(Problem[_Reprojection]):
     """Six parameters: rotation vector and translation that the motion is multiplied by from the left."""
 
-    parameters: RefinementParameters
     typical: BoolArray
     weighting: _Weighting | None = None
     """None: learned anew at each state."""
 
     def linearise(self, state: _Reprojection) -> NormalEquations:
-        weighting = self.weighting or _Weighting.learned(state, self.typical, self.parameters)
+        weighting = self.weighting or _Weighting.learned(state, self.typical)
         white = weighting.whitened(state)
         weights = weighting.kernel.weight((white**2).sum(axis=1))
         J = weighting.whitening @ state.linearised.jacobians
@@ -198,7 +187,7 @@ class _Refinement(Problem[_Reprojection]):
 
     def move(self, state: _Reprojection, step: FloatArray) -> _Reprojection:
         increment = RigidTransform(rotation_from_vector(step[:3]), step[3:])
-        return _Reprojection(state.views, increment @ state.motion, state.unseen_px)
+        return _Reprojection(state.views, increment @ state.motion)
 
 
 def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -12,35 +11,27 @@ from numpy.typing import NDArray
 from flockd.core.messages import UNCLASSED, BoolArray, Float32Array, UInt8Array
 from flockd.flight.perception.flow.images import gradients, grey
 
-
-@dataclass(frozen=True)
-class BackgroundFlowParameters:
-    """What counts as texture, and how far flow spreads from it."""
-
-    cell_px: int = 4
-    """Of the map that all of this works on."""
-    window_cells: int = 5
-    """Over which texture is measured."""
-    pyramid_levels: int = 4
-    """Halvings of the map over which flow spreads."""
-    surroundings_weight: float = 0.1
-    """What is around weighs like texture of this much, (grey levels a cell)^2."""
-    noise: float = 0.3
-    """Grey levels by which the images may differ along the flow before it counts for less."""
-    min_weight: float = 1e-4
-    half_texture: float = 1.0
-    """With this much texture a cell keeps half of its own flow."""
-    drone_margin_px: int = 20
-    """So near to a drone no flow is used: it mixes with the drone's own."""
-    homography_stride_cells: int = 8
-    homography_min_texture: float = 0.5
-    homography_min_cells: int = 30
-    homography_tolerance_cells: float = 1.0
-    homography_max_error: float = 0.25
-    """A homography is no use that is off by more than this share of the image's width at the median."""
-
-
-DEFAULTS = BackgroundFlowParameters()
+_CELL_PX = 4
+"""Of the map that all of this works on."""
+_WINDOW_CELLS = 5
+"""Over which texture is measured."""
+_PYRAMID_LEVELS = 4
+"""Halvings of the map over which flow spreads."""
+_SURROUNDINGS_WEIGHT = 0.1
+"""What is around weighs like texture of this much, (grey levels a cell)^2."""
+_NOISE_LEVELS = 0.3
+"""Grey levels by which the images may differ along the flow before it counts for less."""
+_MIN_WEIGHT = 1e-4
+_HALF_TEXTURE = 1.0
+"""With this much texture a cell keeps half of its own flow."""
+_DRONE_MARGIN_PX = 20
+"""So near to a drone no flow is used: it mixes with the drone's own."""
+_HOMOGRAPHY_STRIDE_CELLS = 8
+_HOMOGRAPHY_MIN_TEXTURE = 0.5
+_HOMOGRAPHY_MIN_CELLS = 30
+_HOMOGRAPHY_TOLERANCE_CELLS = 1.0
+_HOMOGRAPHY_MAX_ERROR = 0.25
+"""A homography is no use that is off by more than this share of the image's width at the median."""
 
 
 def background_flow(
@@ -48,7 +39,6 @@ def background_flow(
     first: UInt8Array,
     second: UInt8Array,
     labels: UInt8Array,
-    parameters: BackgroundFlowParameters = DEFAULTS,
 ) -> Float32Array:
     """The flow with that of the background inpainted where the images do not show it: in the sky, beside drones.
 
@@ -60,24 +50,23 @@ def background_flow(
         first: (h, w, 3) RGB.
         second: (h, w, 3) RGB.
         labels: (h, w) of the first image: 0 the background, 255 not to be used, else one value a drone.
-        parameters: what counts as texture.
     """
     height, width = labels.shape
-    cell = parameters.cell_px
+    cell = _CELL_PX
     size = (width // cell, height // cell)
     before, after = _small_grey(first, size), _small_grey(second, size)
     coarse = np.asarray(cv2.resize(flow, size, interpolation=cv2.INTER_AREA) / cell, np.float32)
-    reach = 2 * (parameters.drone_margin_px // cell) + 1
+    reach = 2 * (_DRONE_MARGIN_PX // cell) + 1
     drone_pixels = ((labels > 0) & (labels != UNCLASSED)).astype(np.uint8)
     drones = cv2.resize(drone_pixels, size, interpolation=cv2.INTER_NEAREST)
     free = cv2.dilate(drones, np.ones((reach, reach), np.uint8)) == 0
-    window = (parameters.window_cells, parameters.window_cells)
+    window = (_WINDOW_CELLS, _WINDOW_CELLS)
     texture = _texture(before, window)
     difference = _difference(before, after, coarse, window)
-    weight = texture * free / (1.0 + (difference / parameters.noise) ** 2) + np.float32(parameters.min_weight)
-    plane = _homography_flow(coarse, (texture > parameters.homography_min_texture) & free, parameters)
-    change = _spread(coarse - plane, weight, parameters) + plane - coarse
-    unknown = np.where(free, 1.0 / (1.0 + (texture / parameters.half_texture) ** 2), 1.0).astype(np.float32)
+    weight = texture * free / (1.0 + (difference / _NOISE_LEVELS) ** 2) + np.float32(_MIN_WEIGHT)
+    plane = _homography_flow(coarse, (texture > _HOMOGRAPHY_MIN_TEXTURE) & free)
+    change = _spread(coarse - plane, weight) + plane - coarse
+    unknown = np.where(free, 1.0 / (1.0 + (texture / _HALF_TEXTURE) ** 2), 1.0).astype(np.float32)
     change *= unknown[..., None]
     full = cv2.resize(cell * change, (width, height), interpolation=cv2.INTER_LINEAR)
     if drones.any():
@@ -105,36 +94,36 @@ def _difference(before: Float32Array, after: Float32Array, flow: Float32Array, w
     return np.asarray(cv2.blur(np.abs(before - warped), window), np.float32)
 
 
-def _homography_flow(flow: Float32Array, sure: BoolArray, parameters: BackgroundFlowParameters) -> Float32Array:
+def _homography_flow(flow: Float32Array, sure: BoolArray) -> Float32Array:
     """The flow of the homography that most of what is sure follows; none where there is no such."""
     none = np.zeros_like(flow)
     height, width = sure.shape
-    stride = parameters.homography_stride_cells
+    stride = _HOMOGRAPHY_STRIDE_CELLS
     step = np.s_[stride // 2 :: stride]
     rows, columns = (axis[step, step][sure[step, step]] for axis in np.mgrid[:height, :width])
-    if len(rows) < parameters.homography_min_cells:
+    if len(rows) < _HOMOGRAPHY_MIN_CELLS:
         return none
     start = np.stack([columns, rows], 1).astype(np.float64)
     end = start + flow[rows, columns]
-    found, _ = cv2.findHomography(start, end, cv2.USAC_MAGSAC, parameters.homography_tolerance_cells)
+    found, _ = cv2.findHomography(start, end, cv2.USAC_MAGSAC, _HOMOGRAPHY_TOLERANCE_CELLS)
     if found is None:
         return none
     v, u = np.mgrid[:height, :width].astype(np.float64)
     cells = np.stack([u, v], 2)
     along = (cv2.perspectiveTransform(cells, np.asarray(found, np.float64)) - cells).astype(np.float32)
     off = np.linalg.norm(along - flow, axis=2)
-    allowed = parameters.homography_max_error * width
+    allowed = _HOMOGRAPHY_MAX_ERROR * width
     usable = np.isfinite(along).all() and np.median(off) < allowed and off.max() < width
     return along if usable else none
 
 
-def _spread(values: Float32Array, weight: Float32Array, parameters: BackgroundFlowParameters) -> Float32Array:
+def _spread(values: Float32Array, weight: Float32Array) -> Float32Array:
     """(h, w, 2) each cell's own by its weight, what is around by a fixed one."""
     levels: list[tuple[NDArray[Any], NDArray[Any]]] = [(values * weight[..., None], weight)]
-    for _ in range(parameters.pyramid_levels):
+    for _ in range(_PYRAMID_LEVELS):
         levels.append((cv2.pyrDown(levels[-1][0]), cv2.pyrDown(levels[-1][1])))
     around = levels[-1][0] / levels[-1][1][..., None]
-    share = parameters.surroundings_weight
+    share = _SURROUNDINGS_WEIGHT
     for sums, weights in levels[-2::-1]:
         wider = cv2.pyrUp(around, dstsize=(weights.shape[1], weights.shape[0]))
         around = (sums + share * wider) / (weights + share)[..., None]

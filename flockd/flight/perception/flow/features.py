@@ -2,87 +2,73 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from flockd.core.messages import Float32Array, FloatArray, UInt8Array
 
-
-@dataclass(frozen=True)
-class FeatureFlowParameters:
-    """Features, matches, and what is made of them."""
-
-    max_features: int = 2000
-    min_contrast: int = 5
-    """Grey levels, of FAST; a blurred image has no strong corners. OpenCV's default is 20."""
-    bucket_px: int = 32
-    max_features_per_bucket: int = 25
-    """Else all features are in one plant."""
-    max_matches: int = 1000
-    min_matches: int = 20
-    neighbours: int = 12
-    """Matches around, which one is compared with and which are interpolated between."""
-    neighbour_tolerance_px: float = 6.0
-    neighbour_tolerance: float = 0.2
-    """A match stays that differs from the median of those around it by less than the first, and this share of it."""
-    homography_tolerance_px: float = 8.0
-    grid_px: int = 16
-    reach_px: float = 100.0
-    """Farther from all matches than this, the homography counts for more than they do."""
+_MAX_FEATURES = 2000
+_MIN_CONTRAST = 5
+"""Grey levels, of FAST; a blurred image has no strong corners. OpenCV's default is 20."""
+_BUCKET_PX = 32
+_MAX_FEATURES_PER_BUCKET = 25
+"""Else all features are in one plant."""
+_MAX_MATCHES = 1000
+_MIN_MATCHES = 20
+_NEIGHBOURS = 12
+"""Matches around, which one is compared with and which are interpolated between."""
+_NEIGHBOUR_TOLERANCE_PX = 6.0
+_NEIGHBOUR_TOLERANCE = 0.2
+"""A match stays that differs from the median of those around it by less than the first, and this share of it."""
+_HOMOGRAPHY_TOLERANCE_PX = 8.0
+_GRID_PX = 16
+_REACH_PX = 100.0
+"""Farther from all matches than this, the homography counts for more than they do."""
 
 
-DEFAULTS = FeatureFlowParameters()
-
-
-def feature_flow(
-    first: UInt8Array, second: UInt8Array, parameters: FeatureFlowParameters = DEFAULTS
-) -> Float32Array | None:
+def feature_flow(first: UInt8Array, second: UInt8Array) -> Float32Array | None:
     """(h, w, 2) pixels from grey ``first`` (h, w) to grey ``second``; None where too few features agree.
 
     ORB features (Rublee et al. 2011) that are each other's best match and move like those around them. Between them
     goes the homography that most follow, and what they differ from it nearby.
     """
-    start, moved = _consistent(*_matches(first, second, parameters), parameters)
-    if len(start) < parameters.min_matches:
+    start, moved = _consistent(*_matches(first, second))
+    if len(start) < _MIN_MATCHES:
         return None
-    found, _ = cv2.findHomography(start, start + moved, cv2.USAC_MAGSAC, parameters.homography_tolerance_px)
+    found, _ = cv2.findHomography(start, start + moved, cv2.USAC_MAGSAC, _HOMOGRAPHY_TOLERANCE_PX)
     if found is None:
         return None
     homography = np.asarray(found, np.float64)
     height, width = first.shape
-    u, v = np.meshgrid(_cell_centres(width, parameters.grid_px), _cell_centres(height, parameters.grid_px))
-    coarse = _interpolated(np.stack([u.ravel(), v.ravel()], 1), start, moved, homography, parameters)
+    u, v = np.meshgrid(_cell_centres(width, _GRID_PX), _cell_centres(height, _GRID_PX))
+    coarse = _interpolated(np.stack([u.ravel(), v.ravel()], 1), start, moved, homography)
     if not np.isfinite(coarse).all():  # a plane seen edge-on
         return None
     grid = np.asarray(coarse.reshape(*u.shape, 2), np.float32)
     return np.asarray(cv2.resize(grid, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def _matches(first: UInt8Array, second: UInt8Array, parameters: FeatureFlowParameters) -> tuple[FloatArray, FloatArray]:
+def _matches(first: UInt8Array, second: UInt8Array) -> tuple[FloatArray, FloatArray]:
     """(n, 2) pixels in the first image, and how far each is from its match in the second."""
-    (before, descriptors_before), (after, descriptors_after) = (
-        _features(image, parameters) for image in (first, second)
-    )
+    (before, descriptors_before), (after, descriptors_after) = (_features(image) for image in (first, second))
     if not len(before) or not len(after):
         return np.empty((0, 2)), np.empty((0, 2))
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(descriptors_before, descriptors_after)
-    pairs = sorted(pairs, key=lambda pair: pair.distance)[: parameters.max_matches]
+    pairs = sorted(pairs, key=lambda pair: pair.distance)[:_MAX_MATCHES]
     start = before[[pair.queryIdx for pair in pairs]]
     return start, after[[pair.trainIdx for pair in pairs]] - start
 
 
-def _features(image: UInt8Array, parameters: FeatureFlowParameters) -> tuple[FloatArray, UInt8Array]:
+def _features(image: UInt8Array) -> tuple[FloatArray, UInt8Array]:
     """(n, 2) pixels and (n, 32) descriptors, spread over the image."""
-    orb = cv2.ORB.create(parameters.max_features, fastThreshold=parameters.min_contrast)
+    orb = cv2.ORB.create(_MAX_FEATURES, fastThreshold=_MIN_CONTRAST)
     counts: dict[tuple[int, int], int] = {}
     kept = []
     for feature in sorted(orb.detect(image, None), key=lambda feature: -feature.response):
-        bucket = int(feature.pt[0]) // parameters.bucket_px, int(feature.pt[1]) // parameters.bucket_px
+        bucket = int(feature.pt[0]) // _BUCKET_PX, int(feature.pt[1]) // _BUCKET_PX
         counts[bucket] = counts.get(bucket, 0) + 1
-        if counts[bucket] <= parameters.max_features_per_bucket:
+        if counts[bucket] <= _MAX_FEATURES_PER_BUCKET:
             kept.append(feature)
     features, descriptors = orb.compute(image, kept)
     if descriptors is None:
@@ -90,18 +76,16 @@ def _features(image: UInt8Array, parameters: FeatureFlowParameters) -> tuple[Flo
     return np.array([feature.pt for feature in features], np.float64), np.asarray(descriptors, np.uint8)
 
 
-def _consistent(
-    start: FloatArray, moved: FloatArray, parameters: FeatureFlowParameters
-) -> tuple[FloatArray, FloatArray]:
+def _consistent(start: FloatArray, moved: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The matches that move like those around them, of which those around must themselves agree."""
-    tolerance_px = parameters.neighbour_tolerance_px
+    tolerance_px = _NEIGHBOUR_TOLERANCE_PX
     for _ in range(2):  # the first time false matches still spoil the medians
-        if len(start) < parameters.min_matches:
+        if len(start) < _MIN_MATCHES:
             break
-        nearest, _ = _nearest(start, start, parameters.neighbours + 1)
+        nearest, _ = _nearest(start, start, _NEIGHBOURS + 1)
         around = moved[nearest]
         median = np.median(around, axis=1)
-        allowed = parameters.neighbour_tolerance * np.abs(median).sum(1)
+        allowed = _NEIGHBOUR_TOLERANCE * np.abs(median).sum(1)
         spread = np.median(np.abs(around - median[:, None]).sum(2), axis=1)
         agrees = np.abs(moved - median).sum(1) < tolerance_px + allowed
         agrees &= spread < 2 * tolerance_px + allowed
@@ -114,15 +98,14 @@ def _interpolated(
     start: FloatArray,
     moved: FloatArray,
     homography: FloatArray,
-    parameters: FeatureFlowParameters,
 ) -> FloatArray:
     """(n, 2) how far pixels (n, 2) move: a homography's flow, and by inverse distance what matches differ from it."""
     off_homography = moved - _homography_flow(homography, start)
-    nearest, distance2 = _nearest(pixels, start, parameters.neighbours)
-    weight = 1.0 / (distance2 + 0.01 * parameters.reach_px**2)
+    nearest, distance2 = _nearest(pixels, start, _NEIGHBOURS)
+    weight = 1.0 / (distance2 + 0.01 * _REACH_PX**2)
     flow = _homography_flow(homography, pixels)
     differs = (weight[..., None] * off_homography[nearest]).sum(1)
-    flow += differs / (weight.sum(1, keepdims=True) + 1.0 / parameters.reach_px**2)
+    flow += differs / (weight.sum(1, keepdims=True) + 1.0 / _REACH_PX**2)
     return flow
 
 

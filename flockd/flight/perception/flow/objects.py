@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -27,54 +27,45 @@ class AlignmentStage:
     """Tolerance in pixels."""
 
 
-@dataclass(frozen=True)
-class ObjectFlowParameters:
-    """How a drone is searched for and aligned, and what is believed."""
-
-    min_pixels: int = 12
-    """Of a drone, for its motion to be found at all."""
-    max_pixels: int = 600
-    """Drawn of more."""
-    certain_correlation: float = 0.85
-    """Of a drone's colours before and after: from here on no other start is tried."""
-    min_correlation: float = 0.5
-    """Below this, no motion is believed."""
-    visible_exponent: float = 0.3
-    """Correlation is less, by this power of the share of the drone that is in both images, where it leaves them."""
-    search_radius_px: int = 80
-    """From where its surroundings went."""
-    surroundings_px: int = 16
-    """As far around the drone the flow of its surroundings is measured."""
-    max_matches: int = 3
-    """Places with the drone's colours that are tried as starts."""
-    affine: AlignmentStage = field(default=AlignmentStage(2.0, 3, GaussNewton(max_steps=12, tolerance=0.1)))
-    higher_orders: tuple[AlignmentStage, ...] = field(
-        default=(
-            AlignmentStage(1.0, 6, GaussNewton(max_steps=10, tolerance=0.1)),
-            AlignmentStage(0.6, 10, GaussNewton(max_steps=12, tolerance=0.1)),
-        )
-    )
-    term_damping: float = 0.005
-    """Of all terms but the shift, in units of the shift's own curvature."""
-    contrast_damping: float = 0.01
-    """Of the change of contrast, a pixel."""
-    max_step_px: float = 3.0
-    """Farther the linearised image is not the image."""
-    window_margin_px: int = 24
-    """Around where the drone is thought to be in the second image."""
-    cauchy_deviations: float = 3.0
-    """Cauchy's scale in median absolute deviations: 2.0 standard deviations, where 2.4 are efficient."""
-    min_cauchy_levels: float = 4.0
-    """The least that scale is, grey levels: rounding and noise."""
-    max_residual_px: float = 3.0
-    """What single pixels may move apart from the whole drone."""
-    residual_smoothness: float = 5.0
-    """Brox et al.'s alpha: weight of neighbours moving alike, where that of the grey levels is 5."""
-    residual_gradients: float = 20.0
-    """Their gamma: weight of the image's gradients being kept."""
-
-
-DEFAULTS = ObjectFlowParameters()
+_MIN_PIXELS = 12
+"""Of a drone, for its motion to be found at all."""
+_MAX_PIXELS = 600
+"""Drawn of more."""
+_CERTAIN_CORRELATION = 0.85
+"""Of a drone's colours before and after: from here on no other start is tried."""
+_MIN_CORRELATION = 0.5
+"""Below this, no motion is believed."""
+_VISIBLE_EXPONENT = 0.3
+"""Correlation is less, by this power of the share of the drone that is in both images, where it leaves them."""
+_SEARCH_RADIUS_PX = 80
+"""From where its surroundings went."""
+_SURROUNDINGS_PX = 16
+"""As far around the drone the flow of its surroundings is measured."""
+_MAX_MATCHES = 3
+"""Places with the drone's colours that are tried as starts."""
+_AFFINE_STAGE = AlignmentStage(2.0, 3, GaussNewton(max_steps=12, tolerance=0.1))
+_HIGHER_ORDER_STAGES = (
+    AlignmentStage(1.0, 6, GaussNewton(max_steps=10, tolerance=0.1)),
+    AlignmentStage(0.6, 10, GaussNewton(max_steps=12, tolerance=0.1)),
+)
+_TERM_DAMPING = 0.005
+"""Of all terms but the shift, in units of the shift's own curvature."""
+_CONTRAST_DAMPING = 0.01
+"""Of the change of contrast, a pixel."""
+_MAX_STEP_PX = 3.0
+"""Farther the linearised image is not the image."""
+_WINDOW_MARGIN_PX = 24
+"""Around where the drone is thought to be in the second image."""
+_CAUCHY_DEVIATIONS = 3.0
+"""Cauchy's scale in median absolute deviations: 2.0 standard deviations, where 2.4 are efficient."""
+_MIN_CAUCHY_LEVELS = 4.0
+"""The least that scale is, grey levels: rounding and noise."""
+_MAX_RESIDUAL_PX = 3.0
+"""What single pixels may move apart from the whole drone."""
+_RESIDUAL_SMOOTHNESS = 5.0
+"""Brox et al.'s alpha: weight of neighbours moving alike, where that of the grey levels is 5."""
+_RESIDUAL_GRADIENTS = 20.0
+"""Their gamma: weight of the image's gradients being kept."""
 
 
 def object_flow(
@@ -82,7 +73,6 @@ def object_flow(
     first: UInt8Array,
     second: UInt8Array,
     labels: UInt8Array,
-    parameters: ObjectFlowParameters = DEFAULTS,
 ) -> Float32Array:
     """The flow with that of each drone found by itself, wherever that can be.
 
@@ -95,18 +85,17 @@ def object_flow(
         first: (h, w, 3) RGB.
         second: (h, w, 3) RGB.
         labels: (h, w) of the first image: one value a drone, 0 and 255 no drone.
-        parameters: how a drone is searched for and aligned.
     """
     areas = cv2.calcHist([labels], [0], None, [256], [0.0, 256.0]).ravel()  # its shape depends on OpenCV
     areas[[0, UNCLASSED]] = 0
-    large = np.flatnonzero(areas >= parameters.min_pixels)
+    large = np.flatnonzero(areas >= _MIN_PIXELS)
     found = flow.copy() if len(large) else flow
     for label in large:
         region = _Region(*np.nonzero(labels == label))
-        motion = _motion(region, flow, first, second, labels, parameters)
+        motion = _motion(region, flow, first, second, labels)
         if motion is not None:
             whole = motion.at(region.rows.astype(np.float64), region.columns.astype(np.float64))
-            residual = _residual_flow(region, first, second, motion, parameters)
+            residual = _residual_flow(region, first, second, motion)
             found[region.rows, region.columns] = whole + residual
     return found
 
@@ -131,31 +120,30 @@ def _motion(
     first: UInt8Array,
     second: UInt8Array,
     labels: UInt8Array,
-    parameters: ObjectFlowParameters,
 ) -> _Motion | None:
     """One drone's motion, from where the flow says that it is or else from the best other start; None: not found."""
     flow_shift = np.median(flow[region.rows, region.columns], axis=0).astype(np.float64)
-    template = _Template(region, first, parameters)
+    template = _Template(region, first)
     best = _cubic(template, second, _affine(template, second, flow_shift))
-    if best is None or best.correlation < parameters.certain_correlation:
-        box = region.box(parameters.surroundings_px, labels.shape)
+    if best is None or best.correlation < _CERTAIN_CORRELATION:
+        box = region.box(_SURROUNDINGS_PX, labels.shape)
         around = flow[box][labels[box] == 0]
         beside = np.median(around, axis=0).astype(np.float64) if len(around) else flow_shift
-        starts = [beside, *_template_matches(region, first, second, beside, parameters)]
+        starts = [beside, *_template_matches(region, first, second, beside)]
         aligned = [motion for start in starts if (motion := _affine(template, second, start))]
         most_alike = max(aligned, key=lambda motion: motion.correlation, default=None)
         other = _cubic(template, second, most_alike)
         if other and (best is None or other.correlation > best.correlation):
             best = other
-    return best if best and best.correlation >= parameters.min_correlation else None
+    return best if best and best.correlation >= _MIN_CORRELATION else None
 
 
 class _Template:
     """Some of a drone's pixels in the first image."""
 
-    def __init__(self, region: _Region, first: UInt8Array, parameters: ObjectFlowParameters) -> None:
-        chosen = np.linspace(0, len(region.rows) - 1, min(len(region.rows), parameters.max_pixels)).astype(np.int64)
-        self.region, self.parameters = region, parameters
+    def __init__(self, region: _Region, first: UInt8Array) -> None:
+        chosen = np.linspace(0, len(region.rows) - 1, min(len(region.rows), _MAX_PIXELS)).astype(np.int64)
+        self.region = region
         self.rows, self.columns = region.rows[chosen].astype(np.float64), region.columns[chosen].astype(np.float64)
         self.middle = np.array([self.columns.mean(), self.rows.mean()])
         apart = np.hypot(self.columns - self.middle[0], self.rows - self.middle[1])
@@ -166,7 +154,7 @@ class _Template:
         grey_levels = grey(first[box]).astype(np.float32)
         self.layers = {}
         """For each stage's smoothing, (n, 3): grey level, and how it changes to the right and down."""
-        for stage in (parameters.affine, *parameters.higher_orders):
+        for stage in (_AFFINE_STAGE, *_HIGHER_ORDER_STAGES):
             layers = _with_gradients(smoothed(grey_levels, stage.sigma_px))
             self.layers[stage.sigma_px] = np.stack([layer[at] for layer in layers], 1).astype(np.float64)
 
@@ -201,12 +189,12 @@ class _Motion:
 def _affine(template: _Template, second: UInt8Array, start: FloatArray) -> _Motion | None:
     """The best affine motion near a shift (2,); None where it leads out of the image."""
     motion = _Motion(template.middle, template.size_px, start[None])
-    return _aligned(template, second, motion, (template.parameters.affine,))
+    return _aligned(template, second, motion, (_AFFINE_STAGE,))
 
 
 def _cubic(template: _Template, second: UInt8Array, motion: _Motion | None) -> _Motion | None:
     """The best motion of third order near an affine one."""
-    return _aligned(template, second, motion, template.parameters.higher_orders) if motion else None
+    return _aligned(template, second, motion, _HIGHER_ORDER_STAGES) if motion else None
 
 
 def _aligned(
@@ -224,7 +212,7 @@ def _aligned(
     u, v = template.moved(motion.at(template.rows, template.columns))
     visible = window.inside(u, v)
     correlation = _correlation(template.colours[visible], window.sample(window.colours, u, v)[visible])
-    share = float(visible.mean()) ** template.parameters.visible_exponent
+    share = float(visible.mean()) ** _VISIBLE_EXPONENT
     return replace(motion, correlation=correlation * share)
 
 
@@ -235,7 +223,7 @@ class _Window:
         height, width = second.shape[:2]
         region = template.region
         extent = max(np.ptp(region.rows), np.ptp(region.columns))
-        margin = template.parameters.window_margin_px + int(extent) // 4
+        margin = _WINDOW_MARGIN_PX + int(extent) // 4
         u, v = round(float(start[0])), round(float(start[1]))
         self.left = int(np.clip(region.columns.min() + u - margin, 0, width - 2))
         self.top = int(np.clip(region.rows.min() + v - margin, 0, height - 2))
@@ -270,7 +258,6 @@ class _Alignment(Problem[FloatArray]):
 
     def __init__(self, template: _Template, window: _Window, basis: FloatArray, stage: AlignmentStage) -> None:
         self._template, self._window, self._basis = template, window, basis
-        self._parameters = template.parameters
         self._before, self._after = template.layers[stage.sigma_px], window.layers(stage.sigma_px)
         self._terms = basis.shape[1]
         self._jacobian = np.ones((len(basis), 2 * self._terms + 2))
@@ -279,13 +266,13 @@ class _Alignment(Problem[FloatArray]):
     def linearise(self, state: FloatArray) -> NormalEquations:
         u, v = self._template.moved(self._basis @ state)
         visible = self._window.inside(u, v)
-        if np.count_nonzero(visible) < self._parameters.min_pixels:
+        if np.count_nonzero(visible) < _MIN_PIXELS:
             return NormalEquations.unsolvable(self._jacobian.shape[1])
         there = self._window.sample(self._after, u, v)
         residuals = self._before[:, 0] - there[:, 0]
         residuals -= _median(residuals[visible])
         deviation = _median(np.abs(residuals[visible]))
-        scale = max(self._parameters.min_cauchy_levels, self._parameters.cauchy_deviations * deviation)
+        scale = max(_MIN_CAUCHY_LEVELS, _CAUCHY_DEVIATIONS * deviation)
         weights = visible * Cauchy(scale).weight(residuals**2)
         # Gradients of both images: converges from farther (Benhimane & Malis 2004).
         slope = (self._before[:, 1:] + there[:, 1:]) / -2
@@ -300,7 +287,7 @@ class _Alignment(Problem[FloatArray]):
 
     def limited(self, step: FloatArray) -> FloatArray:
         shift = max(abs(float(step[0])), abs(float(step[self._terms])))
-        return step * min(1.0, self._parameters.max_step_px / max(shift, 1e-9))
+        return step * min(1.0, _MAX_STEP_PX / max(shift, 1e-9))
 
     def step_size(self, step: FloatArray) -> float:
         """Pixels."""
@@ -310,17 +297,15 @@ class _Alignment(Problem[FloatArray]):
         damping = np.full(len(hessian), 1e-6 + 1e-10 * float(hessian.trace()))  # stripes show motion one way only
         of_shift = (hessian[0, 0] + hessian[self._terms, self._terms]) / 2
         for start in (0, self._terms):
-            damping[start + 1 : start + self._terms] += self._parameters.term_damping * of_shift
-        damping[-1] = self._parameters.contrast_damping * len(self._basis)
+            damping[start + 1 : start + self._terms] += _TERM_DAMPING * of_shift
+        damping[-1] = _CONTRAST_DAMPING * len(self._basis)
         return damping
 
 
-def _template_matches(
-    region: _Region, first: UInt8Array, second: UInt8Array, beside: FloatArray, parameters: ObjectFlowParameters
-) -> list[FloatArray]:
+def _template_matches(region: _Region, first: UInt8Array, second: UInt8Array, beside: FloatArray) -> list[FloatArray]:
     """Shifts to where something of a drone's colours is, the highest correlation first."""
     box = region.box(2, first.shape)
-    coarse = 4 if max(box[0].stop - box[0].start, box[1].stop - box[1].start) > parameters.search_radius_px else 2
+    coarse = 4 if max(box[0].stop - box[0].start, box[1].stop - box[1].start) > _SEARCH_RADIUS_PX else 2
     rows, columns = region.rows // coarse, region.columns // coarse
     images = [cv2.resize(i, None, fx=1 / coarse, fy=1 / coarse, interpolation=cv2.INTER_AREA) for i in (first, second)]
     top, left = int(rows.min()), int(columns.min())
@@ -329,7 +314,7 @@ def _template_matches(
         return []
     mask = np.zeros((bottom - top, right - left, 3), np.uint8)
     mask[np.minimum(rows - top, bottom - top - 1), np.minimum(columns - left, right - left - 1)] = 1
-    reach, (u, v) = parameters.search_radius_px // coarse, np.round(beside / coarse).astype(int)
+    reach, (u, v) = _SEARCH_RADIUS_PX // coarse, np.round(beside / coarse).astype(int)
     height, width = images[1].shape[:2]
     beyond = (bottom - top) // 2, (right - left) // 2  # half of it may have left the image
     low = max(top + v - reach, -beyond[0]), max(left + u - reach, -beyond[1])
@@ -339,7 +324,7 @@ def _template_matches(
         return []
     correlation = cv2.matchTemplate(searched, images[0][top:bottom, left:right], cv2.TM_CCOEFF_NORMED, mask=mask)
     apart = max(2, min(mask.shape[:2]) // 3)
-    peaks = _peaks(np.asarray(correlation, np.float32), apart, parameters.max_matches)
+    peaks = _peaks(np.asarray(correlation, np.float32), apart, _MAX_MATCHES)
     return [coarse * np.array([low[1] + column - left, low[0] + row - top], np.float64) for row, column in peaks]
 
 
@@ -366,9 +351,7 @@ def _peaks(correlation: Float32Array, apart: int, count: int) -> list[tuple[int,
     return peaks
 
 
-def _residual_flow(
-    region: _Region, first: UInt8Array, second: UInt8Array, motion: _Motion, parameters: ObjectFlowParameters
-) -> FloatArray:
+def _residual_flow(region: _Region, first: UInt8Array, second: UInt8Array, motion: _Motion) -> FloatArray:
     """(n, 2) what each of its pixels moves apart from the whole drone, px."""
     box = region.box(8, first.shape)
     before, after = grey(first[box]), _warped_grey(box, second, motion)
@@ -378,12 +361,12 @@ def _residual_flow(
     contrast = float(np.clip(covariance / max(float(inside_after.var()), 1.0), 0.5, 2.0))
     matched = np.clip(inside_before.mean() + contrast * (after - inside_after.mean()), 0, 255).astype(np.uint8)
     refinement = cv2.VariationalRefinement.create()
-    refinement.setAlpha(parameters.residual_smoothness)
-    refinement.setGamma(parameters.residual_gradients)
+    refinement.setAlpha(_RESIDUAL_SMOOTHNESS)
+    refinement.setGamma(_RESIDUAL_GRADIENTS)
     refinement.setSorIterations(20)
     residual = refinement.calc(before, matched, np.zeros((*before.shape, 2), np.float32))[rows, columns]
     length = np.linalg.norm(residual, axis=1, keepdims=True)
-    limit = np.minimum(1.0, parameters.max_residual_px / np.maximum(length, 1e-6))
+    limit = np.minimum(1.0, _MAX_RESIDUAL_PX / np.maximum(length, 1e-6))
     return np.asarray(residual * limit, np.float64)
 
 
