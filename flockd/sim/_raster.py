@@ -275,6 +275,14 @@ def _encode(tone: Any, value: float) -> Any:
 
 
 @njit(cache=True, error_model="numpy")
+def _put(rgb: Any, y: int, x: int, tone: Any, red: float, green: float, blue: float) -> None:
+    """Linear light into a pixel of the image."""
+    rgb[y, x, 0] = _encode(tone, red)
+    rgb[y, x, 1] = _encode(tone, green)
+    rgb[y, x, 2] = _encode(tone, blue)
+
+
+@njit(cache=True, error_model="numpy")
 def _sky(sky: Any, bits: int, x: float, y: float, z: float) -> Any:
     """Spread sky colour of a direction, NED: an octahedral map of the upper half."""
     z = max(0.0, -z)
@@ -343,9 +351,7 @@ def shade_scene(
             if t < 0:
                 depth[y, x] = np.inf
                 packed = _sky(sky, sky_bits, rn, re, rd)
-                rgb[y, x, 0] = _encode(tone, 4.0 * _byte(packed, 0))
-                rgb[y, x, 1] = _encode(tone, 4.0 * _byte(packed, 32))
-                rgb[y, x, 2] = _encode(tone, 4.0 * _byte(packed, 16))
+                _put(rgb, y, x, tone, 4.0 * _byte(packed, 0), 4.0 * _byte(packed, 32), 4.0 * _byte(packed, 16))
                 continue
             z = 1.0 / (planes[t, 9] * u + planes[t, 10] * v + planes[t, 11])
             depth[y, x] = z
@@ -369,18 +375,10 @@ def shade_scene(
                     gu = 1.0 - abs(1.0 - (gu - 2.0 * math.floor(gu * 0.5)))
                     gv = 1.0 - abs(1.0 - (gv - 2.0 * math.floor(gv * 0.5)))
                 packed = sample(ground, 0, ground_bits, gv, gu, footprint + ground_level)
-                gi = ground_kind[
-                    min(ground_size - 1, int(gu * ground_size)), min(ground_size - 1, int(gv * ground_size))
-                ]
-                tile = ground_detail[gi, 1]
-                fine = sample(
-                    texels,
-                    int(ground_detail[gi, 0]) * texture_area,
-                    texture_bits,
-                    e * tile,
-                    n * tile,
-                    footprint + ground_detail[gi, 2],
-                )
+                row = min(ground_size - 1, int(gu * ground_size))
+                detail = ground_detail[ground_kind[row, min(ground_size - 1, int(gv * ground_size))]]
+                base = int(detail[0]) * texture_area
+                fine = sample(texels, base, texture_bits, e * detail[1], n * detail[1], footprint + detail[2])
                 cosine = -sun[2] if beyond else _byte(packed, 48)
                 red, green, blue = _light(light, -1.0, cosine * free)
                 red *= 2.0 * _byte(packed, 0) * _byte(fine, 0)
@@ -398,9 +396,10 @@ def shade_scene(
                 green *= 2.0 * tint[t, 1] * _byte(fine, 32)
                 blue *= 2.0 * tint[t, 2] * _byte(fine, 16)
             clear = math.exp(-fog * z * length)
-            rgb[y, x, 0] = _encode(tone, red * clear + light[4, 0] * (1.0 - clear))
-            rgb[y, x, 1] = _encode(tone, green * clear + light[4, 1] * (1.0 - clear))
-            rgb[y, x, 2] = _encode(tone, blue * clear + light[4, 2] * (1.0 - clear))
+            red = red * clear + light[4, 0] * (1.0 - clear)
+            green = green * clear + light[4, 1] * (1.0 - clear)
+            blue = blue * clear + light[4, 2] * (1.0 - clear)
+            _put(rgb, y, x, tone, red, green, blue)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -480,9 +479,7 @@ def smooth_edges(hit: Any, texture: Any, planes: Any, linear: Any, tone: Any, sh
                 red += 0.25 * linear[sharp[j, i, 0]]
                 green += 0.25 * linear[sharp[j, i, 1]]
                 blue += 0.25 * linear[sharp[j, i, 2]]
-            rgb[y, x, 0] = _encode(tone, red)
-            rgb[y, x, 1] = _encode(tone, green)
-            rgb[y, x, 2] = _encode(tone, blue)
+            _put(rgb, y, x, tone, red, green, blue)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -570,14 +567,8 @@ def shade_drone(
                         facing = max(0.05, -(rn * nn + re * ne + rd * nd) / away)
                         # Tiles per metre are the same both ways on a drone.
                         tile = abs(uv[t, 0, 0]) + abs(uv[t, 0, 1]) + abs(uv[t, 0, 2])
-                        fine = sample(
-                            texels,
-                            texture[t] * texture_area,
-                            texture_bits,
-                            tu,
-                            tv,
-                            math.log2(z / focal / math.sqrt(facing) * texture_size * tile),
-                        )
+                        fineness = math.log2(z / focal / math.sqrt(facing) * texture_size * tile)
+                        fine = sample(texels, texture[t] * texture_area, texture_bits, tu, tv, fineness)
                         cosine = nn * sun[0] + ne * sun[1] + nd * sun[2]
                         if cosine > 0.0:
                             cosine *= sun_reaches(
@@ -595,9 +586,10 @@ def shade_drone(
                 continue
             share = 1.0 / (s * s)
             rest = 1.0 - covered * share
-            rgb[y, x, 0] = _encode(tone, linear[rgb[y, x, 0]] * rest + sum_red * share)
-            rgb[y, x, 1] = _encode(tone, linear[rgb[y, x, 1]] * rest + sum_green * share)
-            rgb[y, x, 2] = _encode(tone, linear[rgb[y, x, 2]] * rest + sum_blue * share)
+            red = linear[rgb[y, x, 0]] * rest + sum_red * share
+            green = linear[rgb[y, x, 1]] * rest + sum_green * share
+            blue = linear[rgb[y, x, 2]] * rest + sum_blue * share
+            _put(rgb, y, x, tone, red, green, blue)
             middle_y = row * s + s // 2
             middle_x = column * s + s // 2
             t = hit[middle_y, middle_x]
@@ -655,6 +647,14 @@ def _noise(maps: Any, k: int, u: float, v: float) -> float:
     above = maps[k, y0, x0] * (1.0 - wx) + maps[k, y0, x1] * wx
     below = maps[k, y1, x0] * (1.0 - wx) + maps[k, y1, x1] * wx
     return float(above * (1.0 - wy) + below * wy)
+
+
+@njit(cache=True, error_model="numpy")
+def _between(grid: Any, i: int, j: int, a: float, b: float) -> float:
+    """Bilinear value of a grid, shares ``a`` and ``b`` of a cell beyond node (i, j)."""
+    low = grid[i, j] * (1.0 - a) + grid[i + 1, j] * a
+    high = grid[i, j + 1] * (1.0 - a) + grid[i + 1, j + 1] * a
+    return float(low * (1.0 - b) + high * b)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -753,15 +753,9 @@ def compose_ground(
             cj = min(cells - 1, int(fe))
             a = fn - ci
             b = fe - cj
-            height = (heights[ci, cj] * (1.0 - a) + heights[ci + 1, cj] * a) * (1.0 - b) + (
-                heights[ci, cj + 1] * (1.0 - a) + heights[ci + 1, cj + 1] * a
-            ) * b
-            slope_n = (slopes[0, ci, cj] * (1.0 - a) + slopes[0, ci + 1, cj] * a) * (1.0 - b) + (
-                slopes[0, ci, cj + 1] * (1.0 - a) + slopes[0, ci + 1, cj + 1] * a
-            ) * b
-            slope_e = (slopes[1, ci, cj] * (1.0 - a) + slopes[1, ci + 1, cj] * a) * (1.0 - b) + (
-                slopes[1, ci, cj + 1] * (1.0 - a) + slopes[1, ci + 1, cj + 1] * a
-            ) * b
+            height = _between(heights, ci, cj, a, b)
+            slope_n = _between(slopes[0], ci, cj, a, b)
+            slope_e = _between(slopes[1], ci, cj, a, b)
             lit = 0.0
             for k in range(5):
                 dx = 0.06 * ((k & 1) * 2 - 1) if k < 4 else 0.0

@@ -79,16 +79,10 @@ def run_trials(
     rows: str,
     arguments: Sequence[str] | None = None,
 ) -> int:
-    """Parses the command line, tries what it names, and prints a table or JSON; the exit code.
+    """Tries what the command line names, all by default, and prints a table or JSON; the exit code.
 
-    Args:
-        parser: with the options of this check; `--only` and `--json` are added.
-        trials: all that can be named.
-        run: tries some of them, and calls its last argument with each row as it comes.
-        header: of the table.
-        line: a row of the table.
-        rows: the name of the rows in JSON.
-        arguments: instead of the command line's.
+    ``run`` tries some of the trials, and calls its last argument with each row as it comes. In JSON, ``rows`` is the
+    name of them all. ``arguments``: instead of the command line's.
     """
     parser.add_argument("--only", nargs="+", choices=[trial.name for trial in trials], help="these alone")
     parser.add_argument("--json", action="store_true", help="print JSON")

@@ -34,7 +34,6 @@ def neighbours_sample(
     rng: np.random.Generator,
     *,
     crop_px: int | None = None,
-    augment: bool = True,
     behind: NDArray[np.uint8] | None = None,
 ) -> Sample:
     """Image, geometry planes and targets for ``NeighboursNet``; ``crop_px``: of a square, mostly around a drone.
@@ -46,7 +45,7 @@ def neighbours_sample(
     image, depth, ids = pairs["image"][index][k], pairs["depth"][index][k], pairs["ids"][index][k]
     focal = float(pairs["focal"][index])
     prior = np.zeros((HEIGHT // 2, WIDTH // 2), np.float32)
-    with_height = rng.random() < 0.7 if augment else True
+    with_height = rng.random() < 0.7
     if with_height:
         wobble = rng.normal(0, 0.005, 3)
         tilt = np.array([[1, -wobble[2], wobble[1]], [wobble[2], 1, -wobble[0]], [-wobble[1], wobble[0], 1]])
@@ -64,13 +63,12 @@ def neighbours_sample(
         share = cv2.resize((ids > 0).astype(np.float32), None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)[:, :, None]
         image = np.round(share * repainted(image, rng) + (1 - share) * behind).astype(np.uint8)
         depth = np.where(ids > 0, depth, np.float32(np.nan))
-    if augment:
-        image = as_filmed(image, rng)
-        if rng.random() < 0.5:
-            image, depth, ids = image[:, ::-1], depth[:, ::-1], ids[:, ::-1]
-            geometry, offset = geometry[:, :, ::-1].copy(), offset[:, :, ::-1].copy()
-            geometry[0] *= -1
-            offset[0] *= -1
+    image = as_filmed(image, rng)
+    if rng.random() < 0.5:
+        image, depth, ids = image[:, ::-1], depth[:, ::-1], ids[:, ::-1]
+        geometry, offset = geometry[:, :, ::-1].copy(), offset[:, :, ::-1].copy()
+        geometry[0] *= -1
+        offset[0] *= -1
     return {
         "image": np.ascontiguousarray(image),
         "geometry": np.ascontiguousarray(geometry),
@@ -193,27 +191,24 @@ def sample_without_drone(crop: VirtualCrop, image: NDArray[Any]) -> Sample:
     }
 
 
-def flow_sample(
-    pairs: PairSet, index: int, rng: np.random.Generator, size: tuple[int, int], *, augment: bool = True
-) -> Sample:
+def flow_sample(pairs: PairSet, index: int, rng: np.random.Generator, size: tuple[int, int]) -> Sample:
     """Two quarter-size images and the flow between them, cropped to ``size`` (height, width).
 
-    Augmented, half of the second images are the first one warped: larger motions and turns than drones make in a step.
+    Half of the second images are the first one warped: larger motions and turns than drones make in a step.
     """
     first, second = (_quarter(image) for image in pairs["image"][index])
     ids = _pairwise(pairs["ids"][index][0]).max((-3, -1))
-    if augment and rng.random() < 0.5:
+    if rng.random() < 0.5:
         second, flow, valid = warped(first, second, rng)
     else:
         flow = _pairwise(pairs["flow"][index].astype(np.float32)).mean((-3, -1)) / 4.0
         valid = np.asarray(_pairwise(pairs["flow_valid"][index]).all((-3, -1)))
-    if augment:
-        first, second = motion_blur(photometric([first, second], rng), rng)
-        if rng.random() < 0.5:
-            first, second, valid, ids = first[:, ::-1], second[:, ::-1], valid[:, ::-1], ids[:, ::-1]
-            flow = flow[:, :, ::-1] * np.array([-1, 1], np.float32)[:, None, None]
-    top = int(rng.integers(first.shape[0] - size[0] + 1)) if augment else 0
-    left = int(rng.integers(first.shape[1] - size[1] + 1)) if augment else 0
+    first, second = motion_blur(photometric([first, second], rng), rng)
+    if rng.random() < 0.5:
+        first, second, valid, ids = first[:, ::-1], second[:, ::-1], valid[:, ::-1], ids[:, ::-1]
+        flow = flow[:, :, ::-1] * np.array([-1, 1], np.float32)[:, None, None]
+    top = int(rng.integers(first.shape[0] - size[0] + 1))
+    left = int(rng.integers(first.shape[1] - size[1] + 1))
     window = np.s_[top : top + size[0], left : left + size[1]]
     return {
         "first": np.ascontiguousarray(first[window]),
