@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 def run(tool: str, *options: str | Path) -> str:
-    command = [sys.executable, "-m", f"tools.{tool}", *map(str, options)]
+    command = [sys.executable, "-m", f"tools.training.{tool}", *map(str, options)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr
     return done.stdout
