@@ -54,6 +54,31 @@ class _Selector(selectors.DefaultSelector):
         return super().select(MOST_S / 2 if timeout is None else min(timeout, MOST_S / 2))
 
 
+class _SteppedLoop(asyncio.SelectorEventLoop):
+    def __init__(self) -> None:
+        self._selector_now = _SteppedSelector()
+        super().__init__(self._selector_now)
+
+    def time(self) -> float:
+        return self._selector_now.now_s
+
+
+class _SteppedSelector(selectors.DefaultSelector):
+    now_s = 0.0
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, Any]]:
+        ready = super().select(0.0)
+        if not ready and timeout is not None:
+            self.now_s += timeout
+        return ready
+
+
+def run_stepped(story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """Runs a coroutine that waits for nothing outside of it: each sleep and time-out passes at once."""
+    with asyncio.Runner(loop_factory=_SteppedLoop) as runner:
+        runner.run(story())
+
+
 def run(story: Callable[[], Coroutine[Any, Any, None]]) -> None:
     """Runs the coroutine on an event loop whose sleeps and time-outs are by `clock`."""
     with asyncio.Runner(loop_factory=_Loop) as runner:

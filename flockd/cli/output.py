@@ -52,9 +52,9 @@ def say_json(value: object) -> None:
 
 
 @contextmanager
-def progress(label: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+def progress(label: str, unit: str, clock: Callable[[], float] = monotonic) -> Iterator[Callable[[int, int], None]]:
     """Gives a function that tells how many of how many are done: a bar on a terminal, else a line now and then."""
-    with Phases() as phases:
+    with Phases(clock=clock) as phases:
         yield phases.of(label, unit)
 
 
@@ -64,8 +64,8 @@ class Phases:
     ``quiet``: nothing. ``verbose``: also a line for each phase that is done, with the time it took.
     """
 
-    def __init__(self, *, quiet: bool = False, verbose: bool = False) -> None:
-        self._quiet, self._verbose = quiet, verbose
+    def __init__(self, *, quiet: bool = False, verbose: bool = False, clock: Callable[[], float] = monotonic) -> None:
+        self._quiet, self._verbose, self._clock = quiet, verbose, clock
         self._bar: Progress | None = None
         self._label = ""
         self._task: TaskID | None = None
@@ -109,13 +109,13 @@ class Phases:
         if label != self._label:
             self._end_phase()
             self._label = label
-            self._began_s = self._told_s = monotonic()
+            self._began_s = self._told_s = self._clock()
             if self._bar is not None:
                 self._task = self._bar.add_task(label, total=total, unit=unit)
         if self._bar is not None and self._task is not None:
             self._bar.update(self._task, completed=done, total=total)
             return
-        now_s = monotonic()
+        now_s = self._clock()
         if now_s - self._told_s >= PLAIN_LINE_EVERY_S:
             self._told_s = now_s
             left = _duration((now_s - self._began_s) * (total - done) / done) if done else "unknown"
@@ -127,7 +127,7 @@ class Phases:
         if self._bar is not None and self._task is not None:
             self._bar.remove_task(self._task)
         if self._verbose:
-            complain(f"{self._label}: done in {_duration(monotonic() - self._began_s)}")
+            complain(f"{self._label}: done in {_duration(self._clock() - self._began_s)}")
         self._label, self._task = "", None
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import sys
+import time
+from collections.abc import Callable
 
 import pytest
 
@@ -15,33 +17,27 @@ class _Terminal(io.StringIO):
         return True
 
 
-def _count_to_three() -> None:
-    with output.progress("flying", "steps") as tell:
+def _count_to_three(clock: Callable[[], float] = time.monotonic) -> None:
+    with output.progress("flying", "steps", clock) as tell:
         for done in (1, 2, 3):
             tell(done, 3)
 
 
-def test_without_a_terminal_there_is_a_plain_line_now_and_then(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_terminal_there_is_a_plain_line_now_and_then(capsys: pytest.CaptureFixture[str]) -> None:
     _count_to_three()
     assert capsys.readouterr() == ("", ""), "quick work is not worth a line"
     seconds = iter((0.0, 4.0, 12.0, 13.0))  # as the first count begins the phase, then at each count
-    monkeypatch.setattr(output, "monotonic", lambda: next(seconds))
-    _count_to_three()
+    _count_to_three(lambda: next(seconds))
     assert capsys.readouterr() == ("", "flying: 2 of 3 steps, 6 s left\n"), "12 s for two, so 6 s for the third"
 
 
-def test_quiet_is_quiet_and_verbose_says_how_long_a_phase_took(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_quiet_is_quiet_and_verbose_says_how_long_a_phase_took(capsys: pytest.CaptureFixture[str]) -> None:
     seconds = iter((0.0, 20.0, 90.0, 90.0, 91.0, 93.0))
-    monkeypatch.setattr(output, "monotonic", lambda: next(seconds))
-    with output.Phases(quiet=True) as phases:
+    with output.Phases(quiet=True, clock=lambda: next(seconds)) as phases:
         phases.of("flying", "steps")(1, 3)
         phases.say("taking off")
     assert capsys.readouterr() == ("", "")
-    with output.Phases(verbose=True) as phases:
+    with output.Phases(verbose=True, clock=lambda: next(seconds)) as phases:
         phases.of("loading", "parts")(1, 2)
         phases.of("flying", "steps")(1, 3)
     assert capsys.readouterr().err == (

@@ -24,7 +24,7 @@ from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import flying
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
 from tests.onboard.autopilot.flight import until
-from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, Aboard, TinyPerceiver, aboard, config_for, free_endpoint
+from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, Aboard, aboard, config_for, free_endpoint
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
@@ -101,7 +101,6 @@ def _is_not_fed(ship: Aboard) -> bool:
 
 def test_steps_take_longer_than_they_may(
     tmp_path: Path, in_the_air: tuple[FakeAutopilot, int], record_property: RecordProperty,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """Frames are not queued: each step takes the newest; the drone hovers and asks for Hold."""
     autopilot, port = in_the_air
@@ -111,13 +110,7 @@ def test_steps_take_longer_than_they_may(
         with autopilot:
             async with aboard(autopilot, port, tmp_path, change=change) as ship:
                 await _flies(ship)
-                flow = TinyPerceiver.flow
-
-                def slow(*arguments: object) -> object:
-                    time.sleep(0.15)
-                    return flow(*arguments)  # type: ignore[arg-type]
-
-                monkeypatch.setattr(TinyPerceiver, "flow", slow)
+                ship.perceiver.slow_s = 0.15
                 fault_s = clock()
                 await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
                 reacted(record_property, "overrun", clock() - fault_s)

@@ -103,11 +103,11 @@ def _dependencies(itself: str, locked: Sequence[Pin], networks: Sequence[Json]) 
         yield {"ref": _purl(pin), "dependsOn": [_purl(other) for other in locked if other.name in needed]}
 
 
-def main() -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", metavar="FILE", type=Path, default=DEFAULT, help=f"default: {DEFAULT}")
-    out: Path = parser.parse_args().out
+    out: Path = parser.parse_args(arguments).out
     try:
         bill = document()
     except PackageNotFoundError as error:

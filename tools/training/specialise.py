@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -26,7 +27,7 @@ from tools.training.specialising.from_mesh import claim_mesh, specialise_range
 from tools.training.specialising.from_pictures import claim_pictures, read_pictures, specialise_verification
 
 
-def main() -> None:
+def main(command_line: Sequence[str] | None = None) -> None:
     """From a mesh or pictures to networks that a configuration can name."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     source = parser.add_mutually_exclusive_group(required=True)
@@ -47,7 +48,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=os.cpu_count(), help="that render")
     parser.add_argument("--threads", type=int, default=os.cpu_count(), help="that train")
     parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(command_line)
     if arguments.mesh and arguments.size_m is None:
         parser.error("--mesh needs --size-m, the drone's size: a mesh's unit and a range are nothing without it")
     if arguments.pictures and arguments.labels is None:

@@ -27,17 +27,17 @@ OLDEST_TRIED = (1, 14)
 LONGEST_LOSS_S = 1.0
 
 
-def check_autopilot(config: DroneConfig) -> Iterator[Finding]:
-    """All of it, over a link of its own."""
+def check_autopilot(config: DroneConfig, heard_s: float = HEARD_S) -> Iterator[Finding]:
+    """All of it, over a link of its own, to an autopilot that is heard within ``heard_s``."""
     if config.autopilot is None:
         measured = "the configuration has no `autopilot`: this drone can be simulated but not flown"
         yield warned("autopilot", measured, "add `autopilot` with the `address` of the autopilot")
         return
-    yield from asyncio.run(_ask(config, config.autopilot))
+    yield from asyncio.run(_ask(config, config.autopilot, heard_s))
 
 
-async def _ask(config: DroneConfig, parameters: AutopilotParameters) -> list[Finding]:
-    link = await AutopilotLink.connect(parameters, timeout_s=HEARD_S)
+async def _ask(config: DroneConfig, parameters: AutopilotParameters, heard_s: float) -> list[Finding]:
+    link = await AutopilotLink.connect(parameters, timeout_s=heard_s)
     try:
         heard = link.status()
         firmware = await _firmware(link)

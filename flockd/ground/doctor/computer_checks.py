@@ -33,9 +33,9 @@ SAMPLE_S = 0.02
 DRIFT = 0.05
 
 
-def check_disk(config: DroneConfig, folder: Path | None) -> Iterator[Finding]:
-    """Whether recordings fit; ``folder`` as for `flockd run --record`, None for the service's where there is one."""
-    folder = folder or (STATE_FOLDER if STATE_FOLDER.is_dir() else None)
+def check_disk(config: DroneConfig, folder: Path | None, state_folder: Path = STATE_FOLDER) -> Iterator[Finding]:
+    """Whether recordings fit; ``folder`` as for `flockd run --record`; None: the ``state_folder`` of a service."""
+    folder = folder or (state_folder if state_folder.is_dir() else None)
     if folder is None:
         measured = "no folder for recordings was named, so none was checked"
         yield warned(

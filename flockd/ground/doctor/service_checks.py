@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from flockd.core.data import data_path
@@ -44,9 +44,9 @@ def _unseen(lock: str) -> Finding:
     return warned("instance", f"{lock} belongs to another user, so who holds it cannot be seen", fix)
 
 
-def check_unit(unit: Path | None) -> Iterator[Finding]:
-    """The security score of ``unit``; None: of the installed one, else of the one that comes with flockd."""
-    chosen, whose = (unit, "") if unit is not None else _find_unit()
+def check_unit(unit: Path | None, folders: Sequence[Path] = UNIT_FOLDERS) -> Iterator[Finding]:
+    """The security score of ``unit``; None: of the one installed in ``folders``, else of the one that flockd brings."""
+    chosen, whose = (unit, "") if unit is not None else _find_unit(folders)
     if shutil.which("systemd-analyze") is None:
         measured = f"{chosen} was not checked, as systemd-analyze is not installed"
         yield warned("unit", measured, "examine where flockd is to run as a service")
@@ -70,8 +70,8 @@ def judge_exposure(score: float, unit: Path, whose: str) -> Finding:
     return warned("unit", f"{measured}, more than {BAR:g}", fix) if score > BAR else passed("unit", measured)
 
 
-def _find_unit() -> tuple[Path, str]:
-    for folder in UNIT_FOLDERS:
+def _find_unit(folders: Sequence[Path]) -> tuple[Path, str]:
+    for folder in folders:
         if (folder / UNIT).is_file():
             return folder / UNIT, ""
     return data_path("systemd") / UNIT, " (not installed)"

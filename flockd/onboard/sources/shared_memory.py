@@ -30,7 +30,7 @@ _HEADER = struct.Struct("<4sHHQd")
 _MAGIC = b"rgb8"
 MAX_AGE_S = 5.0
 """Of a frame on arrival: a simulator stamps before it draws, and may draw for long."""
-_POOL_BYTES = 16 << 20
+POOL_BYTES = 16 << 20
 """For one drone, in whose memory it counts: four sets of four 640x480 cameras."""
 
 
@@ -40,7 +40,9 @@ class FramePublisher(SessionOwner):
     Nothing waits for a reader: a frame that nobody can take in time is dropped on the way.
     """
 
-    def __init__(self, *, listen: Sequence[str] = (DEFAULT_ENDPOINT,)) -> None:
+    def __init__(self, *, listen: Sequence[str] = (DEFAULT_ENDPOINT,), pool_bytes: int = POOL_BYTES) -> None:
+        """``pool_bytes``: of shared memory for each drone."""
+        self._pool_bytes = pool_bytes
         self._session, note = _open(listen=listen, connect=())
         self._notes = [note] if note else []
         self._shares = note is None
@@ -73,7 +75,7 @@ class FramePublisher(SessionOwner):
 
     def _pool(self) -> shm.ShmProvider | None:
         try:
-            return shm.ShmProvider.default_backend(_POOL_BYTES)
+            return shm.ShmProvider.default_backend(self._pool_bytes)
         except zenoh.ZError as error:
             self._note(_without_shared_memory(str(error).split(" at ")[0]))
             return None

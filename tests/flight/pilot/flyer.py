@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, cast
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from flockd.core.choices import ROLES
 from flockd.core.config import ScenarioConfig, load_scenario
 from flockd.core.data import data_path
 from flockd.core.messages import Float32Array, Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
-from flockd.flight.geometry import RigCamera
+from flockd.flight.geometry import Rig, RigCamera
 from flockd.flight.perception import Crop, Perception, RangeEstimate, SceneMaps
 from flockd.flight.pilot import FlockPilot
 from flockd.sim.camera_simulator import CameraSimulator
@@ -48,13 +49,35 @@ def scenario_with(*places: tuple[float, float, float]) -> ScenarioConfig:
     return scenario.model_copy(update={"vehicles": drones})
 
 
+class SpoilableTruth(TruthPerception):
+    """The truth, where a test puts nothing else in the place of a role."""
+
+    def __init__(self, rig: Rig) -> None:
+        super().__init__(NoNetworks(), frozenset(ROLES), rig)
+        self.instead: dict[str, Callable[..., Any]] = {}
+        """By role (``flow``, ``scene``, ``ranges``)."""
+
+    def sound(self, role: str) -> Callable[..., Any]:
+        """The truth's own."""
+        return cast("Callable[..., Any]", getattr(super(), role))
+
+    def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
+        return cast("Float32Array", self.instead.get("flow", super().flow)(first, second, labels))
+
+    def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
+        return cast("SceneMaps", self.instead.get("scene", super().scene)(frame, camera, ground))
+
+    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+        return cast("tuple[RangeEstimate, ...]", self.instead.get("ranges", super().ranges)(crops))
+
+
 class Flyer:
     """Drone 0 of a scenario with true networks, while the others fly straight on."""
 
     def __init__(self, scenario: ScenarioConfig) -> None:
         self.scenario = scenario
         self.cameras = CameraSimulator(scenario)
-        self.truth = TruthPerception(NoNetworks(), frozenset(ROLES), self.cameras.rig)
+        self.truth = SpoilableTruth(self.cameras.rig)
         self.pilot = FlockPilot(scenario.drone, self.truth)
         self.vehicles = Vehicles(scenario.vehicles, scenario.vehicle)
         self.time_s = 100.0

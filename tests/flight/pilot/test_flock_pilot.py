@@ -85,16 +85,17 @@ def test_a_neighbour_before_a_camera_that_is_gone_is_as_probable_as_before(gone:
     assert (left < 0.95) is less_probable
 
 
-def test_an_output_that_is_not_finite_costs_its_frame_only(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_output_that_is_not_finite_costs_its_frame_only() -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
-    sound = flyer.truth.scene
+    sound = flyer.truth.sound("scene")
 
     def spoilt(frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
         if frame.camera == "back":
             raise FloatingPointError("model x: output depth is not finite")
-        return sound(frame, camera, ground)
+        result: SceneMaps = sound(frame, camera, ground)
+        return result
 
-    monkeypatch.setattr(flyer.truth, "scene", spoilt)
+    flyer.truth.instead["scene"] = spoilt
     flyer.step()
     flyer.move()
     output = flyer.step()
@@ -102,16 +103,17 @@ def test_an_output_that_is_not_finite_costs_its_frame_only(monkeypatch: pytest.M
     assert output.ego_motion is not None
 
 
-def test_a_flow_that_is_not_finite_costs_its_camera_only(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flow_that_is_not_finite_costs_its_camera_only() -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
-    sound = flyer.truth.flow
+    sound = flyer.truth.sound("flow")
 
     def spoilt(first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
         if second.camera == "back":
             raise FloatingPointError("model x: output flow is not finite")
-        return sound(first, second, labels)
+        result: Float32Array = sound(first, second, labels)
+        return result
 
-    monkeypatch.setattr(flyer.truth, "flow", spoilt)
+    flyer.truth.instead["flow"] = spoilt
     flyer.step()
     flyer.move()
     output = flyer.step()
@@ -120,37 +122,36 @@ def test_a_flow_that_is_not_finite_costs_its_camera_only(monkeypatch: pytest.Mon
     assert len(output.detections) == 1
 
 
-def test_a_range_that_is_not_finite_costs_its_proposal_only(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_range_that_is_not_finite_costs_its_proposal_only() -> None:
     """Two neighbours, ahead and behind; the network fails on any batch that holds a crop of what is behind."""
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6), (-3.0, 0.0, -3.6)))
-    sound = flyer.truth.ranges
+    sound = flyer.truth.sound("ranges")
 
     def spoilt(crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         if any(crop.T_body_camera.rotation[0, 2] < 0.0 for crop in crops):
             raise FloatingPointError("model x: output range is not finite")
-        return sound(crops)
+        result: tuple[RangeEstimate, ...] = sound(crops)
+        return result
 
-    monkeypatch.setattr(flyer.truth, "ranges", spoilt)
+    flyer.truth.instead["ranges"] = spoilt
     output = flyer.step()
     assert output.reasons == (Reason(ReasonKind.PROPOSAL, "proposal: model x: output range is not finite"),)
     assert [detection.position[0] > 0.0 for detection in output.detections] == [True]
 
 
 @pytest.mark.parametrize("still_there", [True, False])
-def test_a_drone_that_segmentation_misses_is_found_where_it_is_predicted(
-    monkeypatch: pytest.MonkeyPatch, still_there: bool
-) -> None:
+def test_a_drone_that_segmentation_misses_is_found_where_it_is_predicted(still_there: bool) -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
     for _ in range(3):
         flyer.step()
         flyer.move()
-    sound = flyer.truth.scene
+    sound = flyer.truth.sound("scene")
 
     def blind(frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
         scene = sound(frame, camera, ground)
         return SceneMaps(scene.depth, np.zeros_like(scene.labels), ())
 
-    monkeypatch.setattr(flyer.truth, "scene", blind)
+    flyer.truth.instead["scene"] = blind
     if not still_there:
         flyer.vehicles.position[1] += [0.0, 40.0, 0.0]
     output = flyer.step()

@@ -11,7 +11,7 @@ from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.safety import GateParameters, SafetyParameters
 from flockd.core.config.scenario import RangeFinderConfig
 from flockd.core.data import data_path
-from flockd.ground.doctor import Check, Finding, Level, autopilot_checks, run_checks
+from flockd.ground.doctor import Check, Finding, Level, run_checks
 from flockd.ground.doctor.autopilot_checks import (
     JUDGES,
     check_autopilot,
@@ -44,8 +44,8 @@ def _config(port: int) -> DroneConfig:
     return quadrotor.model_copy(update={"autopilot": AutopilotParameters(address=f"udpin://127.0.0.1:{port}")})
 
 
-def _examined(port: int) -> dict[str, Finding]:
-    check = Check("autopilot", lambda: check_autopilot(_config(port)), limit_s=60.0)
+def _examined(port: int, heard_s: float = 60.0) -> dict[str, Finding]:
+    check = Check("autopilot", lambda: check_autopilot(_config(port), heard_s), limit_s=60.0)
     return {finding.about: finding for finding in run_checks([check], lambda done, total: None)["autopilot"]}
 
 
@@ -126,10 +126,9 @@ def test_a_clock_is_good_as_its_round_trips(error_s: float, level: Level, words:
     assert judge_clock(None).level is Level.WARNING
 
 
-def test_nobody_there_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(autopilot_checks, "HEARD_S", 0.3)
+def test_nobody_there_is_a_failure() -> None:
     port = free_port()
-    (finding,) = _examined(port).values()
+    (finding,) = _examined(port, 0.3).values()
     assert (finding.level, finding.about) == (Level.FAILURE, "autopilot")
     assert finding.measured == f"no autopilot was heard at udpin://127.0.0.1:{port} within 0.3 s"
     assert finding.fix.startswith("check autopilot.address")

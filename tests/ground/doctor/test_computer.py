@@ -10,7 +10,7 @@ import pytest
 from flockd.core.config import DroneConfig, load_drone
 from flockd.core.config.recording import RecordingConfig
 from flockd.core.data import data_path
-from flockd.ground.doctor import Finding, Level, computer_checks
+from flockd.ground.doctor import Finding, Level
 from flockd.ground.doctor.computer_checks import (
     check_clock,
     check_disk,
@@ -38,12 +38,10 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     assert finding.measured == f"{tmp_path / 'none'} cannot be written (No such file or directory)"
 
 
-def test_without_a_folder_none_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(computer_checks, "STATE_FOLDER", tmp_path / "none")
-    (finding,) = check_disk(QUADROTOR, None)
+def test_without_a_folder_none_is_checked(tmp_path: Path) -> None:
+    (finding,) = check_disk(QUADROTOR, None, tmp_path / "none")
     assert finding.level is Level.WARNING
-    monkeypatch.setattr(computer_checks, "STATE_FOLDER", tmp_path)
-    assert str(tmp_path) in next(iter(check_disk(QUADROTOR, None))).measured
+    assert str(tmp_path) in next(iter(check_disk(QUADROTOR, None, tmp_path))).measured
 
 
 @pytest.mark.parametrize(

@@ -111,13 +111,12 @@ def test_the_lock_of_the_service_cannot_be_seen_by_who_may_not_write_there(
 
 
 @needs_systemd
-def test_the_unit_that_comes_with_flockd_and_one_that_is_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service_checks, "UNIT_FOLDERS", (tmp_path,))
-    (finding,) = check_unit(None)
+def test_the_unit_that_comes_with_flockd_and_one_that_is_open(tmp_path: Path) -> None:
+    (finding,) = check_unit(None, (tmp_path,))
     assert finding.level is Level.PASS, finding
     assert "flockd.service (not installed) exposes 1." in finding.measured
     (tmp_path / "flockd.service").write_text("[Service]\nExecStart=/bin/true\n", encoding="utf-8")
-    (finding,) = check_unit(None)
+    (finding,) = check_unit(None, (tmp_path,))
     assert finding.level is Level.FAILURE
     assert finding.measured.startswith(f"{tmp_path / 'flockd.service'} exposes 9.")
     broken = tmp_path / "broken.service"

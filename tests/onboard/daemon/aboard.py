@@ -62,6 +62,8 @@ class TinyPerceiver:
         """So many of the next flows are not finite."""
         self.hangs = threading.Event()
         """Set: does not answer."""
+        self.slow_s = 0.0
+        """Each flow takes this much longer."""
         self.ends_when_told = True
         self.told_to_end = 0
 
@@ -74,6 +76,7 @@ class TinyPerceiver:
         if self.not_finite > 0:
             self.not_finite -= 1
             raise FloatingPointError("model tiny: output flow is not finite")
+        time.sleep(self.slow_s)
         while self.hangs.is_set():
             time.sleep(0.01)
         return np.zeros((*first.image.shape[:2], 2), np.float32)

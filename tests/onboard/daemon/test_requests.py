@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 from typing import Any, cast
 
-import pytest
-
-from flockd.onboard.daemon import autopilot_requests
 from flockd.onboard.daemon.autopilot_requests import AutopilotRequests
+from tests.calm import run_stepped
+
+SILENT = "has not responded yet"
 
 
 class _Dead:
@@ -24,26 +24,23 @@ class _Dead:
     return_home = land = hold
 
 
-def test_a_dead_autopilot_is_asked_again_and_again_but_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(autopilot_requests, "REPLY_S", 0.01)
-    monkeypatch.setattr(autopilot_requests, "RETRY_S", 0.01)
+def test_a_dead_autopilot_is_asked_again_and_again_but_reported_once() -> None:
+    """Once in 1.3 s: a second for its answer, and 0.3 s until the next request."""
     events: list[str] = []
     dead = _Dead()
     requests = AutopilotRequests(cast("Any", dead), events.append)
 
-    async def ask(times: int) -> None:
+    async def story() -> None:
         task = asyncio.create_task(requests.run())
-        until = dead.asked + times
-        while dead.asked < until:
-            await asyncio.sleep(0.005)
+        requests.takeover = "hold"
+        await asyncio.sleep(8.0)
+        assert dead.asked == 7
+        assert events == [f"the autopilot was asked for hold and {SILENT}"]
+        requests.takeover = "land"
+        await asyncio.sleep(8.0)
+        assert events[1:] == [f"the autopilot was asked for land and {SILENT}"]
+        await asyncio.sleep(30.0)
+        assert events[2:] == events[1:2], "now and then the same is said again"
         task.cancel()
 
-    requests.takeover = "hold"
-    asyncio.run(ask(5))
-    assert events == ["the autopilot was asked for hold and has not responded yet"]
-    requests.takeover = "land"
-    asyncio.run(ask(3))
-    assert events[1:] == ["the autopilot was asked for land and has not responded yet"]
-    monkeypatch.setattr(autopilot_requests, "SAME_AGAIN_S", 0.0)
-    asyncio.run(ask(3))
-    assert len(events) >= 4, "now and then the same is said again"
+    run_stepped(story)

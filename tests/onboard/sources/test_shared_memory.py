@@ -19,7 +19,7 @@ from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.config.source import SharedMemoryParameters, SourceParameters
 from flockd.core.errors import UnavailableError
 from flockd.core.messages import Frame, FrameSet
-from flockd.onboard.sources import FramePublisher, shared_memory
+from flockd.onboard.sources import FramePublisher
 from flockd.onboard.sources.shared_memory import SharedMemorySource
 from flockd.onboard.telemetry import zenoh_session
 from flockd.sim.free_ports import free_endpoint
@@ -163,10 +163,9 @@ def test_without_shared_memory_the_same_bytes_come_through_the_socket_with_a_not
 
 
 def test_a_pool_that_is_full_sends_through_the_socket_and_says_so_once(
-    endpoint: str, source: SharedMemorySource, monkeypatch: pytest.MonkeyPatch
+    endpoint: str, source: SharedMemorySource
 ) -> None:
-    monkeypatch.setattr(shared_memory, "_POOL_BYTES", 1 << 16)
-    with FramePublisher(listen=[endpoint]) as publisher:
+    with FramePublisher(listen=[endpoint], pool_bytes=1 << 16) as publisher:
         frames, _ = _first(publisher, source)
         _assert_same(frames, frames.frames["front"].sequence)
         assert len(publisher.notes()) == 1

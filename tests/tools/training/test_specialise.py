@@ -86,7 +86,7 @@ def test_photographs_become_a_verification_network(tmp_path: Path) -> None:
 
 
 def test_too_few_photographs_and_anothers_folder_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     coco = json.loads(LABELS.read_text(encoding="utf-8"))
     coco["annotations"] = coco["annotations"][:3]
@@ -103,9 +103,8 @@ def test_too_few_photographs_and_anothers_folder_are_refused(
         (("--mesh", mesh, "--size-m", "0.2"), "--size-m 0.2 m fits none"),
         (("--mesh", mesh, "--size-m", "0.78"), "holds the work on another drone or size; name another folder"),
     ):
-        monkeypatch.setattr(sys, "argv", ["specialise", *map(str, options), "--out", str(tmp_path / "taken")])
         with pytest.raises(SystemExit) as refused:
-            main()
+            main([*map(str, options), "--out", str(tmp_path / "taken")])
         assert refused.value.code == 2
         assert said in capsys.readouterr().err
     assert list(work.iterdir()) == [work / "drone.json"], "nothing was begun"

@@ -14,9 +14,8 @@ from flockd.flight.perception import Crop, Instance, RangeEstimate, SceneMaps
 from flockd.flight.perception.detection.detector import DetectionTrace, Detector
 from flockd.flight.perception.detection.masks import DroneLogits, DroneMasks, first_stage_labels, without_borders
 from flockd.flight.perception.detection.proposals import largest_blobs, propose_residuals
-from flockd.sim.truth_perception import TruthPerception
 from tests.flight.perception.shipped import SECOND_STAGE
-from tests.flight.pilot.flyer import Flyer, scenario_with
+from tests.flight.pilot.flyer import Flyer, SpoilableTruth, scenario_with
 
 PARAMETERS = DetectionParameters()
 COLOUR_WEIGHT = PARAMETERS.colour_weight
@@ -43,14 +42,12 @@ class Scene:
 
 
 @pytest.mark.parametrize(("probability", "certain", "uncertain"), [(0.05, 0, 0), (0.35, 255, 255), (0.9, 1, 255)])
-def test_what_is_no_drone_belongs_to_the_background_again(
-    monkeypatch: pytest.MonkeyPatch, probability: float, certain: int, uncertain: int
-) -> None:
+def test_what_is_no_drone_belongs_to_the_background_again(probability: float, certain: int, uncertain: int) -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -4.0)))
     scene = Scene(flyer)
-    estimates = flyer.truth.ranges
-    monkeypatch.setattr(
-        flyer.truth, "ranges", lambda crops: tuple(replace(e, drone_probability=probability) for e in estimates(crops))
+    estimates = flyer.truth.sound("ranges")
+    flyer.truth.instead["ranges"] = lambda crops: tuple(
+        replace(e, drone_probability=probability) for e in estimates(crops)
     )
     drone = scene.maps.labels > 0
     upper = drone & (np.cumsum(drone.any(axis=1)) < np.ptp(np.flatnonzero(drone.any(axis=1))) / 2)[:, None]
@@ -60,9 +57,9 @@ def test_what_is_no_drone_belongs_to_the_background_again(
     assert set(labels[upper]) == {uncertain}
 
 
-def with_discs(truth: TruthPerception, height: float) -> Callable[[Sequence[Crop]], tuple[RangeEstimate, ...]]:
+def with_discs(truth: SpoilableTruth, height: float) -> Callable[[Sequence[Crop]], tuple[RangeEstimate, ...]]:
     """The second stage, with masks: a disc somewhat wider than the drone, so high inside and so deep outside."""
-    estimates = truth.ranges
+    estimates = truth.sound("ranges")
 
     def ranges(crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         v, u = np.mgrid[0:96, 0:96] + 0.5
@@ -76,10 +73,10 @@ def with_discs(truth: TruthPerception, height: float) -> Callable[[Sequence[Crop
     return ranges
 
 
-def test_two_drones_that_the_first_stage_takes_for_one_are_two(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_drones_that_the_first_stage_takes_for_one_are_two() -> None:
     """The far one's pixels count for the near one's, until the second stage says which of them are the near one's."""
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0), (6.0, -0.6, -4.0)))
-    monkeypatch.setattr(flyer.truth, "ranges", with_discs(flyer.truth, 9.0))
+    flyer.truth.instead["ranges"] = with_discs(flyer.truth, 9.0)
     scene = Scene(flyer)
     near, far = scene.maps.instances
     true = scene.maps.labels
@@ -93,9 +90,9 @@ def test_two_drones_that_the_first_stage_takes_for_one_are_two(monkeypatch: pyte
     assert {*seen[true == near.label]} & {*seen[true == far.label]} <= {0, 255}
 
 
-def test_masks_are_drawn_as_colours_say(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_masks_are_drawn_as_colours_say() -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.3, -4.0)))
-    monkeypatch.setattr(flyer.truth, "ranges", with_discs(flyer.truth, 3.0))
+    flyer.truth.instead["ranges"] = with_discs(flyer.truth, 3.0)
     scene = Scene(flyer)
     scene.maps = replace(scene.maps, logit=np.zeros(scene.maps.labels[1::2, 1::2].shape, np.float32))
 

@@ -25,12 +25,10 @@ from tests.flight.pilot.flyer import Flyer, scenario_with
         ((1.6, 1.3, 1.6, 1.0), 4),
     ],
 )
-def test_a_proposal_is_cropped_again_until_the_crop_suits_the_drone(
-    monkeypatch: pytest.MonkeyPatch, wrong_by: tuple[float, ...], wanted: int
-) -> None:
+def test_a_proposal_is_cropped_again_until_the_crop_suits_the_drone(wrong_by: tuple[float, ...], wanted: int) -> None:
     """What a badly cut crop says of the range cuts the next one; the last estimate counts."""
     flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.3, -4.5)))
-    estimates = flyer.truth.ranges
+    estimates = flyer.truth.sound("ranges")
     asked: list[int] = []
 
     def ranges(crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
@@ -38,16 +36,16 @@ def test_a_proposal_is_cropped_again_until_the_crop_suits_the_drone(
         factor = wrong_by[min(len(asked), len(wrong_by)) - 1]
         return tuple(replace(one, log_range=math.log(factor) + one.log_range) for one in estimates(crops))
 
-    monkeypatch.setattr(flyer.truth, "ranges", ranges)
+    flyer.truth.instead["ranges"] = ranges
     (detection,) = flyer.step().detections
     assert asked == [1] * (wanted + 1)
     assert np.linalg.norm(detection.position) == pytest.approx(math.hypot(3.0, 0.3), rel=0.01)
 
 
-def test_the_mirrored_crop_is_weighted_by_its_variance(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_mirrored_crop_is_weighted_by_its_variance() -> None:
     """Of a drone 3 m away: the last crop says 3 m, its mirror image 6."""
     flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
-    estimates = flyer.truth.ranges
+    estimates = flyer.truth.sound("ranges")
     mirrors: list[bool] = []
 
     def ranges(crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
@@ -57,7 +55,7 @@ def test_the_mirrored_crop_is_weighted_by_its_variance(monkeypatch: pytest.Monke
             given[0] = replace(given[0], log_range=math.log(6.0), log_range_sigma=0.1, drone_probability=0.85)
         return tuple(given)
 
-    monkeypatch.setattr(flyer.truth, "ranges", ranges)
+    flyer.truth.instead["ranges"] = ranges
     (detection,) = flyer.step().detections
     assert mirrors == [False, False, True]
     assert np.linalg.norm(detection.position) == pytest.approx(3.0 * 2 ** (1 / 5), rel=0.005)  # 1 of 1 + 4
@@ -74,27 +72,21 @@ def test_the_mirrored_crop_is_weighted_by_its_variance(monkeypatch: pytest.Monke
         ((0.9, 0.9, 0.75), 0),
     ],
 )
-def test_a_low_probability_of_the_first_crop_does_not_outlive_the_next(
-    monkeypatch: pytest.MonkeyPatch, given: tuple[float, ...], found: int
-) -> None:
+def test_a_low_probability_of_the_first_crop_does_not_outlive_the_next(given: tuple[float, ...], found: int) -> None:
     """Only a very low one rejects at once; the first crop was not cut to this drone."""
     flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
-    estimates, probabilities = flyer.truth.ranges, list(given)
-    monkeypatch.setattr(
-        flyer.truth,
-        "ranges",
-        lambda crops: tuple(replace(one, drone_probability=probabilities.pop(0)) for one in estimates(crops)),
+    estimates, probabilities = flyer.truth.sound("ranges"), list(given)
+    flyer.truth.instead["ranges"] = lambda crops: tuple(
+        replace(one, drone_probability=probabilities.pop(0)) for one in estimates(crops)
     )
     assert len(flyer.step().detections) == found
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")
 @pytest.mark.parametrize("wrong", [{"log_range": math.inf}, {"log_range": math.nan}, {"log_range_sigma": 0.0}])
-def test_nonsense_for_the_mirrored_crop_gives_no_detection(
-    monkeypatch: pytest.MonkeyPatch, wrong: dict[str, Any]
-) -> None:
+def test_nonsense_for_the_mirrored_crop_gives_no_detection(wrong: dict[str, Any]) -> None:
     flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
-    estimates = flyer.truth.ranges
+    estimates = flyer.truth.sound("ranges")
 
     def ranges(crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         return tuple(
@@ -102,5 +94,5 @@ def test_nonsense_for_the_mirrored_crop_gives_no_detection(
             for crop, estimate in zip(crops, estimates(crops), strict=True)
         )
 
-    monkeypatch.setattr(flyer.truth, "ranges", ranges)
+    flyer.truth.instead["ranges"] = ranges
     assert not flyer.step().detections
