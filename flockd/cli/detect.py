@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -12,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.output import PIPED_COLUMNS, complain, progress, say, say_json
+from flockd.cli.output import complain, progress, say, say_json, tables_console
 from flockd.cli.parser import Commands, positive_count, positive_number
 from flockd.cli.picture_options import PictureCameras, add_picture_options, perception_of
 from flockd.core.errors import ExitCode, UsageError
@@ -169,10 +168,9 @@ def _result(detected: Sequence[_Detected], *, measure: bool) -> dict[str, Any]:
 
 
 def _say(detected: Sequence[_Detected], result: Mapping[str, Any]) -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console(markup=False, highlight=False, width=None if sys.stdout.isatty() else PIPED_COLUMNS)
+    console = tables_console()
     table = Table("picture", "box, px", "probability", "range, m", "size, m", box=None, pad_edge=False)
     for one in detected:
         for found in one.detections:

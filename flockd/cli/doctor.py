@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.output import progress, say, say_json
+from flockd.cli.output import progress, say, say_json, tables_console
 from flockd.cli.parser import Commands, positive_number
 from flockd.core.errors import ExitCode, UsageError
 from flockd.core.printable import printable
@@ -91,7 +91,6 @@ def _as_json(drone: str, found: Mapping[str, Sequence[Finding]]) -> dict[str, ob
 
 def _print(drone: str, found: Mapping[str, Sequence[Finding]]) -> None:
     """The worst first, each with its fix below."""
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -105,7 +104,7 @@ def _print(drone: str, found: Mapping[str, Sequence[Finding]]) -> None:
         if finding.fix:
             told.append(f"\nfix: {printable(finding.fix)}", style="italic")
         table.add_row(Text(finding.level, STYLES[finding.level]), finding.about, told)
-    Console(markup=False, highlight=False).print(table)
+    tables_console().print(table)
     counts = {level: sum(finding.level == level for finding in findings) for level in STYLES}
     say(
         f"\n{drone}: {_plural(counts['FAILURE'], 'failure')}, {_plural(counts['WARNING'], 'warning')}, "

@@ -7,13 +7,12 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli import fleet_page
+from flockd.cli.endpoint_options import add_endpoint_options, endpoints
 from flockd.cli.output import complain, say, say_json
 from flockd.cli.parser import Commands, Parser, add_commands, positive_number
-from flockd.cli.status import ENDPOINT
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
@@ -109,12 +108,7 @@ def _add_drones(parser: Parser) -> None:
 
 
 def _add_connection(parser: Parser) -> None:
-    parser.add_argument("--fleet", metavar="NAME", help="only drones of this one; by default every fleet that is heard")
-    parser.add_argument(
-        "--connect", metavar="ENDPOINT", action="append", help=f"of a drone or a router; by default {ENDPOINT}"
-    )
-    parser.add_argument("--listen", metavar="ENDPOINT", action="append", help="where drones connect to")
-    parser.add_argument("--zenoh-config", metavar="FILE", type=Path, help="zenoh's own settings, as for TLS")
+    add_endpoint_options(parser)
     parser.add_argument("--json", action="store_true", help="print the replies as JSON, by drone")
 
 
@@ -154,9 +148,7 @@ def _ask(args: argparse.Namespace, command: str, order: MissionOrder | None, rep
     """Asks all, again and again for ``repeat_s``; says what each answered, later only what has changed."""
     from flockd.fleet.operator_client import FleetOperator
 
-    connect, listen = args.connect or [], args.listen or []
-    if not connect and not listen:
-        connect = [ENDPOINT]
+    listen, connect = endpoints(args)
     with FleetOperator(args.fleet, listen=listen, connect=connect, settings=args.zenoh_config) as operator:
         drones = _drones(operator, args.drones, ", ".join([*listen, *connect]))
         began_s = time.monotonic()

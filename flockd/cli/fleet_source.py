@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import ipaddress
+import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.output import complain, progress
+from flockd.cli.endpoint_options import ENDPOINT, add_endpoint_options, endpoints
+from flockd.cli.output import complain, progress, say
 from flockd.cli.parser import Parser
-from flockd.cli.status import ENDPOINT
 from flockd.core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -21,17 +22,17 @@ HERE = "127.0.0.1"
 """Where they serve unless told otherwise: for this computer alone."""
 
 
-def add_source_options(parser: Parser) -> None:
-    """Telemetry, or recordings."""
+def add_server_options(parser: Parser, port: int) -> None:
+    """Where it serves, and where its data come from: telemetry, or recordings."""
+    parser.add_argument("--port", metavar="N", type=port_number, default=port, help=f"(default: {port}; 0: any)")
+    parser.add_argument(
+        "--listen", metavar="ADDRESS", type=ip_address, default=HERE, dest="server_address",
+        help=f"of the server, such as 0.0.0.0 for other computers too (default: {HERE})",
+    )  # fmt: skip
     parser.add_argument(
         "--recordings", metavar="FOLDER", type=Path, help="show the recordings in it on one time line, not telemetry"
     )
-    parser.add_argument("--fleet", metavar="NAME", help="only this one; by default every fleet that publishes")
-    parser.add_argument(
-        "--connect", metavar="ENDPOINT", action="append", help=f"of a drone or a router; by default {ENDPOINT}"
-    )
-    parser.add_argument("--drones-at", metavar="ENDPOINT", action="append", help="where drones connect to")
-    parser.add_argument("--zenoh-config", metavar="FILE", type=Path, help="zenoh's own settings, as for TLS")
+    add_endpoint_options(parser, "--drones-at")
 
 
 def open_source(args: argparse.Namespace, stack: ExitStack) -> FleetSource:
@@ -47,35 +48,30 @@ def open_source(args: argparse.Namespace, stack: ExitStack) -> FleetSource:
             )
         with progress("reading", "MB") as tell_progress:
             return RecordedFleet(args.recordings, lambda done, total: tell_progress(done >> 20, total >> 20))
-    connect, listen = args.connect or [], args.drones_at or []
-    if not connect and not listen:
-        connect = [ENDPOINT]
+    listen, connect = endpoints(args)
     watcher = FleetWatcher(args.fleet, listen=listen, connect=connect, settings=args.zenoh_config)
     return stack.enter_context(LiveFleet(stack.enter_context(watcher)))
 
 
-def places(args: argparse.Namespace) -> list[str]:
-    """What stands on the terminal about where drones are looked for; nothing where the options say it."""
-    if args.recordings is not None or args.connect or args.drones_at:
-        return []
-    return [
-        f"it looks for drones at {ENDPOINT}; for those that connect to this computer, as those of "
-        f"`flockd sim --autopilot` do, start it with --drones-at {ENDPOINT}"
-    ]
+def announce(args: argparse.Namespace, sentence: str, warning: str) -> None:
+    """Says where it is served, once it is.
 
-
-def in_a_link(address: str) -> str:
-    """An IP address as it stands there; for all addresses of this computer, the one at which it reaches itself."""
-    where = ipaddress.ip_address(address)
-    return HERE if where.is_unspecified else f"[{address}]" if where.version == 6 else address
-
-
-def for_others(address: str, warning: str) -> list[str]:
-    """What stands on the terminal where other computers reach this address, too; `warning`: who may do what then."""
-    if ipaddress.ip_address(address).is_loopback:
-        return []
-    complain(f"{warning}; it travels unencrypted, so use a network that you trust")
-    return [f"on other computers: the same with this computer's address in the place of {in_a_link(address)}"]
+    ``sentence`` has a place `{host}`; ``warning`` says what those who reach it may do, where other computers can.
+    """
+    where = ipaddress.ip_address(args.server_address)
+    # For all addresses of this computer, the one at which it reaches itself.
+    host = HERE if where.is_unspecified else f"[{where}]" if where.version == 6 else str(where)
+    say(sentence.format(host=host))
+    if not where.is_loopback:
+        complain(f"{warning}; it travels unencrypted, so use a network that you trust")
+        say(f"on other computers: the same with this computer's address in the place of {host}")
+    if args.recordings is None and not args.connect and not args.drones_at:
+        say(
+            f"it looks for drones at {ENDPOINT}; for those that connect to this computer, as those of "
+            f"`flockd sim --autopilot` do, start it with --drones-at {ENDPOINT}"
+        )
+    say("Ctrl-C ends it")
+    sys.stdout.flush()  # whoever reads a pipe needs the address now
 
 
 def port_number(text: str) -> int:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.output import Phases, say, say_json
+from flockd.cli.output import Phases, say, say_json, tables_console
 from flockd.core.errors import ExitCode
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ def show_summary(directory: Path, summary: Mapping[str, Any], *, as_json: bool) 
     if as_json:
         say_json(summary)
         return ExitCode.DONE
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(box=None, show_header=False, pad_edge=False)
@@ -42,7 +41,7 @@ def show_summary(directory: Path, summary: Mapping[str, Any], *, as_json: bool) 
     table.add_column(justify="right")
     for name, value in _key_figures(summary).items():
         table.add_row(name, value)
-    Console(markup=False, highlight=False).print(table)
+    tables_console().print(table)
     say(f"report: {directory / REPORT_NAME}")
     return ExitCode.DONE
 

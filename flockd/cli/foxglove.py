@@ -3,20 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from contextlib import ExitStack, suppress
 
-from flockd.cli.fleet_source import (
-    HERE,
-    add_source_options,
-    for_others,
-    in_a_link,
-    ip_address,
-    open_source,
-    places,
-    port_number,
-)
-from flockd.cli.output import say
+from flockd.cli.fleet_source import add_server_options, announce, open_source
 from flockd.cli.parser import Commands
 from flockd.core.errors import ExitCode
 
@@ -35,12 +24,7 @@ def add(commands: Commands) -> None:
         "flockd foxglove --recordings out/paper-flight-learned-seed1/recordings",
     )
     parser = commands("foxglove", "Serve the fleet to Foxglove's app: live, or from recordings.", examples, _NOTES)
-    parser.add_argument("--port", metavar="N", type=port_number, default=PORT, help=f"(default: {PORT}; 0: any)")
-    parser.add_argument(
-        "--listen", metavar="ADDRESS", type=ip_address, default=HERE, dest="server_address",
-        help=f"of the server, such as 0.0.0.0 for other computers too (default: {HERE})",
-    )  # fmt: skip
-    add_source_options(parser)
+    add_server_options(parser, PORT)
     parser.set_defaults(run=_run)
 
 
@@ -51,14 +35,10 @@ def _run(args: argparse.Namespace) -> int:
     with ExitStack() as stack, suppress(KeyboardInterrupt):
         source = open_source(args, stack)
         server = stack.enter_context(FoxgloveServer(source, args.server_address, args.port))
-        for line in [*_told(args.server_address, server.port), *places(args), "Ctrl-C ends it"]:
-            say(line)
-        sys.stdout.flush()  # whoever reads a pipe needs the address now
+        announce(
+            args,
+            f"Foxglove finds the fleet at ws://{{host}}:{server.port}",
+            "whoever reaches this address sees the fleet",
+        )
         server.wait()
     return ExitCode.DONE
-
-
-def _told(address: str, port: int) -> list[str]:
-    """What stands on the terminal once the app can connect."""
-    warning = "whoever reaches this address sees the fleet"
-    return [f"Foxglove finds the fleet at ws://{in_a_link(address)}:{port}", *for_others(address, warning)]

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.output import progress, say, say_json
+from flockd.cli.output import progress, say, say_json, tables_console
 from flockd.cli.parser import Commands, Parser, add_commands, positive_count
 from flockd.core.choices import PROVIDERS, Provider
 from flockd.core.errors import ExitCode, ModelError, UnavailableError
@@ -90,7 +90,6 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _list(args: argparse.Namespace) -> int:
-    from rich.console import Console
     from rich.table import Table
 
     from flockd.flight.inference import load_manifest
@@ -104,7 +103,7 @@ def _list(args: argparse.Namespace) -> int:
     for model, file in models:
         size_mb = f"{file.stat().st_size / 1e6:.1f}"
         table.add_row(model.name, ", ".join(model.roles), size_mb, model.sha256[:12], model.licence, model.description)
-    Console(markup=False, highlight=False).print(table)
+    tables_console().print(table)
     return ExitCode.DONE
 
 
@@ -143,7 +142,6 @@ class _Timing:
 
 
 def _bench(args: argparse.Namespace) -> int:
-    from rich.console import Console
     from rich.table import Table
 
     timings = []
@@ -160,7 +158,7 @@ def _bench(args: argparse.Namespace) -> int:
         for t in timings:
             cells = [f"{t.median_ms:.1f}", f"{t.least_ms:.1f}", t.input] if t.fault is None else ["-", "-", t.fault]
             table.add_row(t.model, t.provider, str(t.threads), *cells)
-        Console(markup=False, highlight=False).print(table)
+        tables_console().print(table)
     return ExitCode.CHECK_FAILED if any(timing.fault for timing in timings) else ExitCode.DONE
 
 

@@ -30,6 +30,11 @@ PIPED_COLUMNS = 1000
 """Width of tables that are not on a terminal, which has none: no column is cut."""
 
 
+def tables_console() -> Console:
+    """Where tables are printed. Not on a terminal there is no width to fit; rich would assume 80 columns and cut."""
+    return Console(markup=False, highlight=False, width=None if sys.stdout.isatty() else PIPED_COLUMNS)
+
+
 def say(text: str) -> None:
     """Writes lines on stdout; what would steer a terminal is escaped, as in all that these functions write."""
     sys.stdout.write(f"{printable(text)}\n")

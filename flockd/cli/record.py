@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.output import cell, say, say_json
+from flockd.cli.output import cell, say, say_json, tables_console
 from flockd.cli.parser import Commands, Parser, add_commands
 from flockd.cli.recording_options import add_stretch, opened, refuse_existing, stretch
 from flockd.core.errors import ExitCode, UsageError
@@ -72,7 +72,6 @@ def _info(args: argparse.Namespace) -> int:
     if args.json:
         say_json(facts)
         return ExitCode.DONE
-    from rich.console import Console
     from rich.table import Table
 
     for name in ("drone", "began", "version", "steps", "duration_s", "bytes", "images", "finished", "lost"):
@@ -87,7 +86,7 @@ def _info(args: argparse.Namespace) -> int:
     for stream in facts["streams"]:
         rate = "" if stream["rate_hz"] is None else f"{stream['rate_hz']:.2f} Hz"
         table.add_row(cell(stream["topic"]), cell(stream["schema"]), f"{stream['messages']}", rate)
-    Console(markup=False, highlight=False).print(table)
+    tables_console().print(table)
     return ExitCode.DONE
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
 
 from flockd.cli.flight_summary import show_summary
-from flockd.cli.output import PIPED_COLUMNS, complain, progress, say_json
+from flockd.cli.output import complain, progress, say_json, tables_console
 from flockd.cli.parser import Commands
 from flockd.cli.recording_options import opened
 from flockd.core.errors import ExitCode, UsageError
@@ -169,14 +168,12 @@ def _compare(args: argparse.Namespace) -> int:
     if args.json:
         say_json({"flights": [str(flight) for flight in flights], "rows": [asdict(row) for row in rows]})
         return ExitCode.DONE
-    from rich.console import Console
     from rich.table import Table
 
     table = Table("", *(str(flight) for flight in flights), "difference", box=None, pad_edge=False)
     for row in rows:
         table.add_row(row.name, *row.cells)
-    # Not on a terminal there is no width to fit.
-    Console(markup=False, highlight=False, width=None if sys.stdout.isatty() else PIPED_COLUMNS).print(table)
+    tables_console().print(table)
     return ExitCode.DONE
 
 

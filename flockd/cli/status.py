@@ -7,10 +7,10 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.output import PIPED_COLUMNS, cell, say_json
+from flockd.cli.endpoint_options import add_endpoint_options, endpoints
+from flockd.cli.output import cell, say_json, tables_console
 from flockd.cli.parser import Commands, positive_number
 from flockd.core.errors import ExitCode, UnavailableError
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
     from flockd.fleet.watcher import Watched
 
-ENDPOINT = "tcp/127.0.0.1:7447"
 LISTEN_S = 3.0
 REFRESH_S = 0.5
 MAX_SHOWN = 1e6
@@ -35,12 +34,7 @@ def add(commands: Commands) -> None:
         "flockd status --json --seconds 2",
     )
     parser = commands("status", "Show how each drone of a fleet is doing, the worst first.", examples)
-    parser.add_argument("--fleet", metavar="NAME", help="only this one; by default every fleet that publishes")
-    parser.add_argument(
-        "--connect", metavar="ENDPOINT", action="append", help=f"of a drone or a router; by default {ENDPOINT}"
-    )
-    parser.add_argument("--listen", metavar="ENDPOINT", action="append", help="where drones connect to")
-    parser.add_argument("--zenoh-config", metavar="FILE", type=Path, help="zenoh's own settings, as for TLS")
+    add_endpoint_options(parser)
     parser.add_argument(
         "--seconds", metavar="S", type=positive_number, help="listen this long and print once, also on a terminal"
     )
@@ -52,9 +46,7 @@ def _run(args: argparse.Namespace) -> int:
     from flockd.fleet.fleet_status import status_rows
     from flockd.fleet.watcher import FleetWatcher
 
-    connect, listen = args.connect or [], args.listen or []
-    if not connect and not listen:
-        connect = [ENDPOINT]
+    listen, connect = endpoints(args)
     once = args.json or args.seconds is not None or not sys.stdout.isatty()
     with FleetWatcher(args.fleet, listen=listen, connect=connect, settings=args.zenoh_config) as watcher:
         if not once:
@@ -65,7 +57,7 @@ def _run(args: argparse.Namespace) -> int:
     if args.json:
         say_json(rows)
     elif rows:
-        _console().print(_table(rows))
+        tables_console().print(_table(rows))
     if not rows:
         places = ", ".join([*listen, *connect])
         raise UnavailableError(
@@ -120,17 +112,9 @@ def _show_live(drones: Callable[[], Iterable[Watched]]) -> int:
 
     from flockd.fleet.fleet_status import status_rows
 
-    with suppress(KeyboardInterrupt), Live(console=_console(), auto_refresh=False) as live:
+    with suppress(KeyboardInterrupt), Live(console=tables_console(), auto_refresh=False) as live:
         while True:
             rows = status_rows(drones(), time.monotonic())
             live.update(_table(rows) if rows else "no drone was heard yet", refresh=True)
             time.sleep(REFRESH_S)
     return ExitCode.DONE
-
-
-def _console() -> Any:
-    from rich.console import Console
-
-    # Not on a terminal there is no width to fit: rich would assume 80 columns and cut what does not fit.
-    width = None if sys.stdout.isatty() else PIPED_COLUMNS
-    return Console(markup=False, highlight=False, width=width)

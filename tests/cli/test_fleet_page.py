@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import shutil
 import socket
+from argparse import Namespace
 from pathlib import Path
 
 import pytest
 
 from flockd.cli import main
-from flockd.cli.fleet_page import _told
+from flockd.cli.fleet_source import announce
 
 RECORDING = Path(__file__).parents[1] / "review" / "replay" / "crossing.mcap"
 
@@ -49,14 +50,17 @@ def test_a_taken_port_is_reported_in_one_sentence(tmp_path: Path, capsys: pytest
 @pytest.mark.parametrize(
     ("address", "shown", "warns"),
     [
-        ("127.0.0.1", "http://127.0.0.1:80/?key=k", False),
-        ("::1", "http://[::1]:80/?key=k", False),
-        ("0.0.0.0", "http://127.0.0.1:80/?key=k", True),
-        ("10.0.0.7", "http://10.0.0.7:80/?key=k", True),
+        ("127.0.0.1", "127.0.0.1", False),
+        ("::1", "[::1]", False),
+        ("0.0.0.0", "127.0.0.1", True),
+        ("10.0.0.7", "10.0.0.7", True),
     ],
 )
 def test_an_address_that_others_reach_comes_with_a_warning(
     address: str, shown: str, warns: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert _told(address, 80, "k")[0] == f"the fleet page is at {shown}"
-    assert ("travels unencrypted" in capsys.readouterr().err) == warns
+    args = Namespace(server_address=address, recordings=None, connect=["tcp/127.0.0.1:1"], drones_at=None)
+    announce(args, "at http://{host}:80/?key=k", "whoever reaches it sees all")
+    out, err = capsys.readouterr()
+    assert out.splitlines()[0] == f"at http://{shown}:80/?key=k"
+    assert ("travels unencrypted" in err) == ("on other computers" in out) == warns

@@ -8,7 +8,6 @@ import sys
 import pytest
 
 from flockd.cli import main
-from flockd.cli.foxglove import _told
 
 
 def test_without_its_extra_it_says_what_to_install(
@@ -38,18 +37,3 @@ def test_a_taken_port_is_reported_in_one_sentence() -> None:
             FoxgloveServer(Nothing(), "127.0.0.1", port)  # type: ignore[arg-type]
     assert str(refused.value).startswith(f"the server cannot use 127.0.0.1 port {port} (Address already in use")
     assert str(refused.value).endswith("); name others")
-
-
-@pytest.mark.parametrize(
-    ("address", "shown", "warns"),
-    [
-        ("127.0.0.1", "ws://127.0.0.1:80", False),
-        ("::1", "ws://[::1]:80", False),
-        ("0.0.0.0", "ws://127.0.0.1:80", True),
-    ],
-)
-def test_an_address_that_others_reach_comes_with_a_warning(
-    address: str, shown: str, warns: bool, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert _told(address, 80)[0].endswith(f" {shown}")
-    assert ("sees the fleet" in capsys.readouterr().err) == warns

@@ -130,9 +130,10 @@ def test_newest_messages_are_sent_again_while_the_simulation_computes() -> None:
 
 
 def test_a_table_is_printed_for_people(capsys: pytest.CaptureFixture[str]) -> None:
-    from flockd.cli.status import _console, _table
+    from flockd.cli.output import tables_console
+    from flockd.cli.status import _table
 
-    _console().print(_table(status_rows([_drone("a", "normal"), _drone("b", "x", alive=False)], NOW_S)))
+    tables_console().print(_table(status_rows([_drone("a", "normal"), _drone("b", "x", alive=False)], NOW_S)))
     heading, first, second = (line.split() for line in capsys.readouterr().out.splitlines())
     assert heading[:5] == ["drone", "state", "mode", "height", "battery"]
     assert first[:2] == ["meadow/b", "gone"]
@@ -140,11 +141,12 @@ def test_a_table_is_printed_for_people(capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_a_piped_table_is_not_cut_at_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
-    from flockd.cli.status import _console, _table
+    from flockd.cli.output import tables_console
+    from flockd.cli.status import _table
 
     sentence = "no heartbeat from the autopilot for 12.5 s, and more words than a line of 80 columns has room for"
     drone = _drone("a", "degraded", reasons=[{"event": "link_lost", "sentence": sentence}])
-    _console().print(_table(status_rows([drone], NOW_S)))
+    tables_console().print(_table(status_rows([drone], NOW_S)))
     _, row = capsys.readouterr().out.splitlines()
     assert row.rstrip().endswith(sentence)
     assert row == row.rstrip(), "no padding to the width of a terminal that is not there"
