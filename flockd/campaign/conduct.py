@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from flockd.campaign.engines import Engine
+from flockd.campaign.engine import Engine
 from flockd.campaign.flight_kinds import FLIGHT_KINDS, Task
 from flockd.campaign.flight_plan import Plan, Run
 from flockd.campaign.folder import CampaignFolder

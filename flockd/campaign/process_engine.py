@@ -13,7 +13,7 @@ from typing import Self
 import cv2
 from joblib.externals.loky import ProcessPoolExecutor
 
-from flockd.campaign.engines import MAX_TRIES, ONE_THREAD, Flown, ended
+from flockd.campaign.engine import MAX_TRIES, ONE_THREAD, Flown, ended
 from flockd.campaign.flight_kinds import Task, fly_task
 from flockd.campaign.flight_plan import Run
 from flockd.core.side_process import with_package

@@ -10,7 +10,7 @@ from typing import Any, Self
 import ray
 from ray.exceptions import RayError
 
-from flockd.campaign.engines import MAX_TRIES, ONE_THREAD, Flown, ended
+from flockd.campaign.engine import MAX_TRIES, ONE_THREAD, Flown, ended
 from flockd.campaign.flight_kinds import Task, fly_task
 from flockd.core.errors import UnavailableError
 from flockd.core.side_process import with_package

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any, Literal
 
 import numpy as np
@@ -18,14 +17,13 @@ from flockd.campaign.results import Results
 from flockd.core.config import ScenarioConfig
 from flockd.core.config.campaign import DRONES, Figure
 from flockd.core.errors import UsageError
-from flockd.core.messages import BoolArray, FloatArray
+from flockd.core.messages import FloatArray
 
 LEVEL = 0.05
 """Of all figures together: so often one at most is called different where none is."""
-_EXACT_UP_TO = 13
-"""Of so many pairs all signs are tried."""
-_DRAWS = 10_000
+_DRAWS = 9_999
 _NUMBERS_AT_ONCE = 500_000
+"""Of all permutations, so that they need little memory."""
 
 
 @dataclass(frozen=True)
@@ -112,38 +110,25 @@ def _verdict(first: Results, second: Results, figure: Figure, cells: list[tuple[
 
 def paired_p(differences: FloatArray) -> float:
     """By flipping signs: of (n,) differences, how often their mean is as far from zero if each could be either way."""
-    n = len(differences)
-    if n <= _EXACT_UP_TO:
-        signs = np.array(list(product((1.0, -1.0), repeat=n)))
-        return float(np.mean(_as_far(signs @ differences, differences.sum())))
-    rng = np.random.default_rng(0)
-    far = sum(
-        int(_as_far(rng.choice((1.0, -1.0), (draws, n)) @ differences, differences.sum()).sum()) for draws in _blocks(n)
-    )
-    return (far + 1) / (_DRAWS + 1)
+    return _p((differences,), "samples", lambda change, axis: change.mean(axis=axis))
 
 
 def unpaired_p(first: FloatArray, second: FloatArray) -> float:
     """By exchanging values: how often two sets drawn from all of them have means as far apart."""
-    rng = np.random.default_rng(0)
-    together, n = np.concatenate([first, second]), len(first)
-    far = 0
-    for draws in _blocks(len(together)):
-        mixed = rng.permuted(np.tile(together, (draws, 1)), axis=1)
-        apart = mixed[:, n:].mean(axis=1) - mixed[:, :n].mean(axis=1)
-        far += int(_as_far(apart, second.mean() - first.mean()).sum())
-    return (far + 1) / (_DRAWS + 1)
+    return _p((first, second), "independent", lambda a, b, axis: b.mean(axis=axis) - a.mean(axis=axis))
 
 
-def _blocks(length: int) -> list[int]:
-    """Of all draws, so many at once that they need little memory."""
-    block = max(_NUMBERS_AT_ONCE // length, 1)
-    return [min(block, _DRAWS - begin) for begin in range(0, _DRAWS, block)]
+def _p(
+    samples: tuple[FloatArray, ...], kind: Literal["samples", "independent"], statistic: Callable[..., FloatArray]
+) -> float:
+    """Of all permutations, or of `_DRAWS` of them where there are more."""
+    from scipy.stats import permutation_test  # noqa: PLC0415 - heavy
 
-
-def _as_far(found: FloatArray, seen: float) -> BoolArray:
-    """Whether each is; sums of the same numbers in another order differ by rounding."""
-    return np.asarray(np.abs(found) >= abs(seen) * (1 - 1e-9))
+    at_once = max(_NUMBERS_AT_ONCE // sum(map(len, samples)), 1)
+    found = permutation_test(
+        samples, statistic, permutation_type=kind, n_resamples=_DRAWS, batch=at_once, rng=0, vectorized=True
+    )
+    return float(found.pvalue)
 
 
 def _of_two(first: FloatArray, second: FloatArray) -> Interval:

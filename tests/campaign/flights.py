@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flockd.campaign.conduct import Conducted, conduct
-from flockd.campaign.engines import Flown
+from flockd.campaign.engine import Flown
 from flockd.campaign.figures import Figures
 from flockd.campaign.flight_kinds import Task, fly_task
 from flockd.campaign.flight_plan import Plan

@@ -86,4 +86,4 @@ def test_paired_differences_that_all_go_one_way() -> None:
 
 def test_two_sets_without_pairs() -> None:
     """Of 20 ways to draw 3 of 6, two have means as far apart: p = 0.1."""
-    assert unpaired_p(np.array([1.0, 2.0, 3.0]), np.array([11.0, 12.0, 13.0])) == pytest.approx(0.1, abs=0.01)
+    assert unpaired_p(np.array([1.0, 2.0, 3.0]), np.array([11.0, 12.0, 13.0])) == 0.1
