@@ -12,13 +12,12 @@ from flockd.cli.calibrate_options import (
     add_shared,
     board_of,
     ended_by_ctrl_c,
-    pair,
     refuse_overwriting,
     source_name,
 )
 from flockd.cli.config import loaded
 from flockd.cli.output import complain, progress, say, say_json
-from flockd.cli.parser import Commands, positive_count, positive_number
+from flockd.cli.parser import Commands, positive_count, positive_number, size
 from flockd.cli.recording_options import opened
 from flockd.core.choices import LENS_MODELS, PixelFormat
 from flockd.core.errors import ExitCode, UsageError
@@ -58,7 +57,7 @@ def add(commands: Commands) -> None:
         "--serial", metavar="TEXT", help="the camera's serial number, where the device does not give it"
     )
     parser.add_argument("--picture", metavar="FILE", type=Path, help="draw the coverage and the residuals (.png)")
-    parser.add_argument("--size", metavar="WxH", type=pair, default=(640, 480), help="of a /dev/video (640x480)")
+    parser.add_argument("--size", metavar="WxH", type=size, default=(640, 480), help="of a /dev/video (640x480)")
     parser.add_argument(
         "--pixel-format", choices=get_args(PixelFormat), default="mjpeg", help="of a /dev/video (mjpeg)"
     )

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.parser import Parser, positive_count, positive_number
+from flockd.cli.parser import Parser, positive_count, positive_number, size
 from flockd.core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -28,18 +27,10 @@ def add_shared(parser: Parser, help_of_config: str) -> None:
     parser.add_argument("--seconds", metavar="S", type=positive_number, default=SECONDS, help="of a live camera (120)")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
     board = parser.add_argument_group("the board", "as it was printed; measure it, printers shrink")
-    board.add_argument("--squares", metavar="CxR", type=pair, default=(7, 5), help="columns x rows (7x5)")
+    board.add_argument("--squares", metavar="CxR", type=size, default=(7, 5), help="columns x rows (7x5)")
     board.add_argument("--square-mm", metavar="MM", type=positive_number, default=36.0, help="of a square's side (36)")
     board.add_argument("--marker-mm", metavar="MM", type=positive_number, help="of a marker's side (0.75 of a square)")
     board.add_argument("--dictionary", metavar="NAME", default="4x4_50", help="of the markers (4x4_50)")
-
-
-def pair(text: str) -> tuple[int, int]:
-    """An option's value as two whole numbers, as in 7x5."""
-    match = re.fullmatch("([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", text)
-    if match is None:
-        raise argparse.ArgumentTypeError(f"{text!r} is not two numbers such as 7x5")
-    return int(match[1]), int(match[2])
 
 
 def board_of(args: argparse.Namespace) -> BoardSpec:

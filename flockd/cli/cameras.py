@@ -8,9 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.config_new import image_size
 from flockd.cli.output import cell, complain, say, say_json
-from flockd.cli.parser import Commands, positive_number
+from flockd.cli.parser import Commands, positive_number, size
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
@@ -39,9 +38,7 @@ def add(commands: Commands) -> None:
         "--seconds", metavar="S", type=positive_number, default=SECONDS, help=f"measure this long ({SECONDS:g})"
     )
     parser.add_argument("--picture", metavar="FOLDER", type=Path, help="save an image of each camera; measures too")
-    parser.add_argument(
-        "--size", metavar="WxH", type=image_size, default=(640, 480), help="of an image, the nearest to this"
-    )
+    parser.add_argument("--size", metavar="WxH", type=size, default=(640, 480), help="of an image, the nearest to this")
     parser.add_argument("--write", metavar="FILE", type=Path, help="write the sections `rig` and `source` for them")
     parser.add_argument("--names", metavar="NAME", nargs="+", help="of the cameras in the rig, in the listed order")
     parser.add_argument("--force", action="store_true", help="overwrite the file if it exists")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from flockd.cli.output import say
-from flockd.cli.parser import Commands, Parser, add_commands, positive_count, positive_number
+from flockd.cli.parser import Commands, Parser, add_commands, positive_count, positive_number, size
 from flockd.core.errors import ConfigError, ExitCode, UsageError
 
 MISSIONS = ("circle_then_tangent", "hover", "velocity", "waypoints", "follow", "operator")
@@ -79,7 +79,7 @@ def _drone_questions() -> tuple[_Question, ...]:
         _Question(
             "cameras", "number of cameras, evenly spaced around the drone", "number of cameras", "4", _camera_count, "N"
         ),
-        _Question("size", "of an image in pixels", "size of an image", "640x480", image_size, "WxH"),
+        _Question("size", "of an image in pixels", "size of an image", "640x480", size, "WxH"),
         _Question(
             "field-of-view",
             "of an image's width, 10 to 190",
@@ -188,15 +188,6 @@ def _drone_count(text: str) -> int:
     if count > MAX_DRONES:
         raise argparse.ArgumentTypeError(f"{text!r} is more than {MAX_DRONES} drones")
     return count
-
-
-def image_size(text: str) -> tuple[int, int]:
-    """An option's value as width and height."""
-    width, _, height = text.partition("x")
-    try:
-        return positive_count(width), positive_count(height)
-    except argparse.ArgumentTypeError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a size such as 640x480") from error
 
 
 def _field_of_view(text: str) -> float:

@@ -111,5 +111,13 @@ def seed(text: str) -> int:
     return int(text)
 
 
+def size(text: str) -> tuple[int, int]:
+    """An option's value as two whole numbers above 0, as in 640x480."""
+    match = re.fullmatch("([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", text)
+    if match is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is not two numbers such as 640x480")
+    return int(match[1]), int(match[2])
+
+
 def _is_whole(text: str) -> bool:
     return re.fullmatch("[0-9]{1,18}", text) is not None

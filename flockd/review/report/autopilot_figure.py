@@ -21,10 +21,10 @@ MOST_ROWS = 60
 """Of the table: a log that warns without end does not fill the page."""
 
 
-def autopilot_figure(log: FlightLog, *, narrow: bool, autopilot: AutopilotLog) -> Figure:
+def autopilot_figure(log: FlightLog, autopilot: AutopilotLog) -> Figure:
     """Velocity north and east and height, and the flight modes below, over the flight's time."""
     with rc_context(STYLE):
-        figure = Figure(figsize=(3.9 if narrow else 11.0, 7.2), layout="constrained")
+        figure = Figure(figsize=(11.0, 7.2), layout="constrained")
         panels = figure.subplots(4, 1, sharex=True, height_ratios=(3, 3, 3, 1))
         command = log.command_velocity[:, autopilot.drone]
         for axis, name in enumerate(("north", "east")):
@@ -39,24 +39,24 @@ def autopilot_figure(log: FlightLog, *, narrow: bool, autopilot: AutopilotLog) -
         setpoint = autopilot.setpoint_height_m
         height.plot(autopilot.setpoint_time_s, setpoint, color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
         height.set_ylabel("height, m")
-        _mode_band(modes, autopilot, narrow=narrow)
+        _mode_band(modes, autopilot)
         modes.set_xlabel("time, s")
         for axes in panels:
             for span in autopilot.failsafes:
                 axes.axvspan(span.begin_s, span.end_s, color=FAILSAFE, alpha=0.18, linewidth=0)
         figure.align_ylabels(panels)
-        figure.legend(handles=_handles(autopilot), loc="outside upper left", ncols=2 if narrow else 4)
+        figure.legend(handles=_handles(autopilot), loc="outside upper left", ncols=4)
     return figure
 
 
-def _mode_band(axes: Axes, autopilot: AutopilotLog, *, narrow: bool) -> None:
+def _mode_band(axes: Axes, autopilot: AutopilotLog) -> None:
     """A bar for each mode, with its name where there is room."""
     begin_s, end_s = autopilot.flown_time_s[[0, -1]]
     for span in autopilot.modes:
         width_s = span.end_s - span.begin_s
         colour = MODE_COLOURS.get(span.what, MUTED)
         axes.barh(0.0, width_s, left=span.begin_s, color=colour, alpha=0.55, edgecolor="none")
-        if width_s > (0.12 if narrow else 0.05) * (end_s - begin_s):
+        if width_s > 0.05 * (end_s - begin_s):
             axes.text(span.begin_s + 0.5 * width_s, 0.0, span.what, ha="center", va="center", fontsize=8)
     axes.set_yticks([])
     axes.set_ylabel("mode")

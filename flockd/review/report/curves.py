@@ -23,14 +23,11 @@ from flockd.review.report.paper_results import TABLE_2
 from flockd.review.report.style import BAND, FEW, INK, MUTED, STYLE, colour_of, drone_name
 from flockd.review.report.summary import estimation_errors, objective_sums
 
-NARROW_IN = 3.9
-"""Width of a figure for a phone: one column of panels."""
 
-
-def flight_curves(log: FlightLog, *, narrow: bool = False) -> Figure:
+def flight_curves(log: FlightLog) -> Figure:
     """Airspeed, course, heights, distances, and the sums of obj1 and obj2, the flight beside its exact-state companion.
 
-    One drone has no distances and no shape. ``narrow``: below each other.
+    One drone has no distances and no shape.
     """
     flights = [(_flight_title(log), log.position, log.velocity)]
     exact = log.companion
@@ -39,25 +36,16 @@ def flight_curves(log: FlightLog, *, narrow: bool = False) -> Figure:
     drones = log.position.shape[1]
     labels = [label for label in _CURVES if drones > 1 or label not in _CURVES_OF_PAIRS]
     with rc_context(STYLE):
-        rows: Any
-        if narrow:
-            figure = Figure(figsize=(NARROW_IN, 1.7 * len(labels) * len(flights)), layout="constrained")
-            rows = figure.subplots(len(labels) * len(flights), 1, sharex=True).reshape(len(flights), len(labels)).T
-            for row in rows:
-                for other in row[1:]:
-                    other.sharey(row[0])
-        else:
-            figure = Figure(figsize=(11.0, 2.1 * len(labels)), layout="constrained")
-            rows = figure.subplots(len(labels), len(flights), sharex=True, sharey="row", squeeze=False)
+        figure = Figure(figsize=(11.0, 2.1 * len(labels)), layout="constrained")
+        rows = figure.subplots(len(labels), len(flights), sharex=True, sharey="row", squeeze=False)
         for column, (title, position, velocity) in enumerate(flights):
             _flight_column(dict(zip(labels, rows[:, column], strict=True)), log, position, velocity)
             rows[0, column].set_title(title)
             rows[-1, column].set_xlabel("time, s")
-        for column in range(len(flights) if narrow else 1):
-            for axes, label in zip(rows[:, column], labels, strict=True):
-                axes.set_ylabel(label)
+        for axes, label in zip(rows[:, 0], labels, strict=True):
+            axes.set_ylabel(label)
         figure.align_ylabels(rows[:, 0])
-        _legend(figure, log, Line2D([], [], label="desired", **_DESIRED), narrow=narrow)
+        _legend(figure, log, Line2D([], [], label="desired", **_DESIRED))
     return figure
 
 
@@ -149,14 +137,14 @@ def _flock_handles(drones: int) -> list[Line2D | Patch]:
     ]
 
 
-def _legend(figure: Figure, log: FlightLog, *more: Line2D, narrow: bool = False) -> None:
+def _legend(figure: Figure, log: FlightLog, *more: Line2D) -> None:
     handles = [*_flock_handles(log.position.shape[1]), *more]
     if _circle_ends(log):
         handles.append(Line2D([], [], color=MUTED, linewidth=0.8, label="circle ends"))
     figure.legend(
         handles=handles,
         loc="outside upper left",
-        ncols=3 if narrow else len(handles),
+        ncols=len(handles),
         handlelength=1.8,
         columnspacing=1.4,
     )
@@ -165,7 +153,7 @@ def _legend(figure: Figure, log: FlightLog, *more: Line2D, narrow: bool = False)
 # ---------------------------------------------------------------------------------------------------- without truth
 
 
-def account_curves(log: FlightLog, *, narrow: bool = False) -> Figure:
+def account_curves(log: FlightLog) -> Figure:
     """Estimates and commands of one recorded drone: speed, course, and the distances of the neighbours it tracked."""
     time_s = log.time_s
     own, command = log.own_velocity_estimate[:, 0, :2], log.command_velocity[:, 0]
@@ -175,7 +163,7 @@ def account_curves(log: FlightLog, *, narrow: bool = False) -> Figure:
         (log.desired, {"label": "desired", **_DESIRED}),
     )
     with rc_context(STYLE):
-        figure = Figure(figsize=(NARROW_IN if narrow else 11.0, 6.3), layout="constrained")
+        figure = Figure(figsize=(11.0, 6.3), layout="constrained")
         speed, course, distance = figure.subplots(3, 1, sharex=True)
         for velocity, style in drawn:
             speed.plot(time_s, np.linalg.norm(velocity, axis=1), **style)
@@ -188,7 +176,7 @@ def account_curves(log: FlightLog, *, narrow: bool = False) -> Figure:
             axes.set_ylim(bottom=0)
         figure.align_ylabels([speed, course, distance])
         handles, labels = speed.get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper left", ncols=2 if narrow else len(handles))
+        figure.legend(handles, labels, loc="outside upper left", ncols=len(handles))
     return figure
 
 
@@ -221,15 +209,15 @@ def _tracked_lines(axes: Axes, log: FlightLog) -> None:
 # -------------------------------------------------------------------------------------------------- errors of Fig. 5
 
 
-def error_curves(log: FlightLog, *, narrow: bool = False) -> Figure | None:
+def error_curves(log: FlightLog) -> Figure | None:
     """Errors of the estimated own motion and of the distance to the tracked neighbours; None without any estimate."""
     errors = estimation_errors(log)
     if not log.metadata.by_sight or not any(np.isfinite(values).any() for values in errors.values()):
         return None
     drones = log.position.shape[1]
     with rc_context(STYLE):
-        figure = Figure(figsize=(NARROW_IN, 11.0) if narrow else (11.0, 6.6), layout="constrained")
-        panels = figure.subplots(6, 1, sharex=True)[:, None] if narrow else figure.subplots(2, 3, sharex=True)
+        figure = Figure(figsize=(11.0, 6.6), layout="constrained")
+        panels = figure.subplots(2, 3, sharex=True)
         for axes, (column, title) in zip(panels.flat, _ERROR_TITLES.items(), strict=True):
             values = errors[column]
             axes.set_title(title)
@@ -246,7 +234,7 @@ def error_curves(log: FlightLog, *, narrow: bool = False) -> Figure | None:
             _mark_circle(axes, log)
         for axes in panels[-1]:
             axes.set_xlabel("time, s")
-        _legend(figure, log, Line2D([], [], label="the paper’s maximum", **_REFERENCE), narrow=narrow)
+        _legend(figure, log, Line2D([], [], label="the paper’s maximum", **_REFERENCE))
     return figure
 
 

@@ -15,7 +15,6 @@ from matplotlib.transforms import Affine2D
 
 from flockd.core.messages import BoolArray
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.report.curves import NARROW_IN
 from flockd.review.report.style import BAND, FEW, GRID, INK, PAPER, STYLE, colour_of, drone_name
 
 IN_THE_WAY: Final = "#8a7355"
@@ -45,22 +44,18 @@ def in_the_way(log: FlightLog) -> BoolArray:
     return np.asarray((log.obstacles[:, 5] <= high) & (log.obstacles[:, 6] >= low))
 
 
-def obstacle_figure(log: FlightLog, *, narrow: bool = False) -> Figure | None:
+def obstacle_figure(log: FlightLog) -> Figure | None:
     """Each drone's clearance over time and, of the drone that came nearest, its map of the obstacles just then.
 
-    ``narrow``: below each other. None of a flight without obstacles.
+    None of a flight without obstacles.
     """
     radius_m = log.metadata.drone_radius_m
     if not len(log.clearance) or radius_m is None:
         return None
     step, drone = np.unravel_index(int(np.argmin(log.clearance)), log.clearance.shape)
     with rc_context(STYLE):
-        if narrow:
-            figure = Figure(figsize=(NARROW_IN, 6.4), layout="constrained")
-            curves, local = figure.subplots(2, 1, height_ratios=(1.0, 1.6))
-        else:
-            figure = Figure(figsize=(11.0, 4.4), layout="constrained")
-            curves, local = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
+        figure = Figure(figsize=(11.0, 4.4), layout="constrained")
+        curves, local = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
         _clearance_curves(curves, log, radius_m)
         _local_map(local, log, int(step), int(drone), radius_m)
     return figure

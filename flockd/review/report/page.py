@@ -55,7 +55,6 @@ def write_report(
     for old in folder.glob("*.png"):
         old.unlink()
     drawings = _DRAWINGS_OF_TRUTH if log.has_truth else _DRAWINGS_OF_ACCOUNT
-    shapes = [(name, narrow) for name in drawings for narrow in (False, True)]
     # As files only the first drone's: 1.4 MB each.
     files = [folder / f"filmstrip_{number}.png" for number in range(1, len(frames) + 1)]
     strips = [
@@ -66,12 +65,10 @@ def write_report(
         helpers = [
             stack.enter_context(SideProcess("drew figures", _Drawings, log, folder)) for _ in range(1, processes)
         ]
-        drawn = shared([*shapes, *strips], draw, helpers, progress)
+        drawn = shared([*((name, None) for name in drawings), *strips], draw, helpers, progress)
     embedded: dict[str, Markup | None] = {"trajectories": None, "obstacles": None, "errors": None, "autopilot": None}
-    for (name, _), element in zip(shapes, drawn, strict=False):
-        if element is not None:
-            embedded[name] = Markup("\n").join(part for part in (embedded.get(name), element) if part)
-    plates = drawn[len(shapes) :]
+    embedded |= zip(drawings, drawn, strict=False)
+    plates = drawn[len(drawings) :]
     beside = directory / "autopilot.npz"
     autopilot = AutopilotLog.load(beside) if beside.is_file() else None
     if autopilot is not None:
@@ -125,12 +122,11 @@ def _flight_data(log: FlightLog) -> str:
     return json.dumps(data, separators=(",", ":"))
 
 
-def _of_autopilot(log: FlightLog, autopilot: AutopilotLog, folder: Path) -> Markup:
-    """The figure of the autopilot's own log, for a wide window and for a narrow one."""
+def _of_autopilot(log: FlightLog, autopilot: AutopilotLog, folder: Path) -> Markup | None:
+    """The figure of the autopilot's own log."""
     draw = functools.partial(autopilot_figure, autopilot=autopilot)
     file, what = folder / "autopilot.png", "Velocities, height and flight modes as the autopilot logged them"
-    shapes = [_embed(log, draw, file, what, narrow=narrow) for narrow in (False, True)]
-    return Markup("\n").join(shape for shape in shapes if shape)
+    return _embed(log, draw, file, what)
 
 
 _MAX_SVG_BYTES = 700_000
@@ -144,33 +140,28 @@ class _Drawings:
         """PNG files go to the folder."""
         self._log, self._folder = log, folder
 
-    def __call__(self, what: str | KeyFrame, how: bool | Path | None) -> Markup | dict[str, Any] | None:
-        """A figure by its name, for a narrow window or a wide one, or a key frame's plate with a file or without."""
+    def __call__(self, what: str | KeyFrame, file: Path | None) -> Markup | dict[str, Any] | None:
+        """A figure by its name, or a key frame's plate with a file or without."""
         if isinstance(what, KeyFrame):
-            assert not isinstance(how, bool)
-            return _plate(what, how)
+            return _plate(what, file)
         drawings = _DRAWINGS_OF_TRUTH if self._log.has_truth else _DRAWINGS_OF_ACCOUNT
-        draw, file, description = drawings[what]
-        return _embed(self._log, draw, self._folder / f"{file}.png", description, narrow=bool(how))
+        draw, name, description = drawings[what]
+        return _embed(self._log, draw, self._folder / f"{name}.png", description)
 
 
-def _embed(log: FlightLog, draw: _Draw, path: Path, description: str, *, narrow: bool) -> Markup | None:
-    """A drawing for a wide or for a narrow window, or a PNG if that is less; the wide one also as a PNG file."""
-    figure = draw(log, narrow=narrow)
+def _embed(log: FlightLog, draw: _Draw, path: Path, description: str) -> Markup | None:
+    """A drawing as SVG, or as PNG if that is less; also as a PNG file."""
+    figure = draw(log)
     if figure is None:
         return None
-    kind = "narrow" if narrow else "wide"
-    element = inline_svg(figure, f"{path.stem}-{kind}", description)
+    element = inline_svg(figure, path.stem, description)
     figure.set_layout_engine("none")  # everything has its place now, and finding it again takes as long as drawing
-    large = len(element) > _MAX_SVG_BYTES
-    if large or not narrow:
-        image = io.BytesIO()
-        figure.savefig(image, format="png")
-        if not narrow:
-            path.write_bytes(image.getvalue())
-        if large:
-            element = f'<img src="{_data_url("image/png", image.getvalue())}" alt="{description}">'
-    return Markup(f'<div class="{kind}">{element}</div>')  # drawn here, from numbers
+    image = io.BytesIO()
+    figure.savefig(image, format="png")
+    path.write_bytes(image.getvalue())
+    if len(element) > _MAX_SVG_BYTES:
+        element = f'<img src="{_data_url("image/png", image.getvalue())}" alt="{description}">'
+    return Markup(f'<div class="drawing">{element}</div>')  # drawn here, from numbers
 
 
 def _plate(frame: KeyFrame, file: Path | None) -> dict[str, Any]:

@@ -14,31 +14,22 @@ from matplotlib.ticker import MaxNLocator
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.flocking.metrics import pair_distances
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.report.curves import NARROW_IN
 from flockd.review.report.obstacle_figures import IN_THE_WAY, LEGEND, add_obstacles
 from flockd.review.report.style import FEW, INK, MUTED, NAMED, ON_COLOUR, PAPER, STYLE, colour_of, drone_name
 from flockd.review.report.summary import SAME_GOAL_M
 
 
-def trajectories(log: FlightLog, *, narrow: bool = False) -> Figure:
-    """All true paths seen from above, north up, with the formation at the start and at the end.
-
-    ``narrow``: below each other.
-    """
+def trajectories(log: FlightLog) -> Figure:
+    """All true paths seen from above, north up, with the formation at the start and at the end."""
     drones = log.position.shape[1]
     exact = log.companion
     with rc_context(STYLE):
-        if narrow:
-            figure = Figure(figsize=(NARROW_IN, 12.0 if drones > 1 else 4.5), layout="constrained")
-            panels = list(figure.subplots(3 if drones > 1 else 1, 1, squeeze=False)[:, 0])
-        else:
-            figure = Figure(figsize=(11.0, 7.4), layout="constrained")
-            mosaic = figure.subplot_mosaic(
-                [["paths", "start"], ["paths", "end"]] if drones > 1 else [["paths"]],
-                width_ratios=(1.9, 1.0) if drones > 1 else (1.0,),
-            )
-            panels = list(mosaic.values())
-        paths, *formations = panels
+        figure = Figure(figsize=(11.0, 7.4), layout="constrained")
+        mosaic = figure.subplot_mosaic(
+            [["paths", "start"], ["paths", "end"]] if drones > 1 else [["paths"]],
+            width_ratios=(1.9, 1.0) if drones > 1 else (1.0,),
+        )
+        paths, *formations = mosaic.values()
         if exact:
             for number in range(drones):
                 _plan(paths, exact[0][:, number], **_COMPANION)

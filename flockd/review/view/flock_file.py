@@ -15,9 +15,8 @@ from flockd.core.messages import FloatArray, PilotOutput
 from flockd.onboard.recording.codec import from_json
 from flockd.onboard.recording.reader import RecordedStep
 from flockd.onboard.recording.truth import Truth
-from flockd.review.view.rerun_file import colour_of, jpeg
+from flockd.review.view.rerun_file import RerunWriter, colour_of, jpeg
 
-_TIMELINE = "time"
 _DRONE_RADIUS_M = 0.3
 _NEIGHBOUR_RADIUS_M = 0.12
 
@@ -31,22 +30,16 @@ class FlockFile:
 
     def __init__(self, path: Path, name: str, cameras: Mapping[str, Sequence[str]]) -> None:
         """``cameras``: the names of each recorded drone's cameras, by the drone's name."""
-        path.open("wb").close()  # Rerun's own writer reports a failure only in its log
         self._tracks: dict[str, list[list[float]]] = {}
         self._shown: set[int] = set()
-        self._recording = rr.RecordingStream("flockd", recording_id=f"flockd-{name}")
-        self._recording.save(path, default_blueprint=_blueprint(cameras))
-        self._recording.send_recording_name(name)
-        self._recording.set_log_time_enabled(False)  # when the file was written is of no interest
-        self._recording.set_log_tick_enabled(False)
-        self._log("world", rr.ViewCoordinates.FRD, static=True)  # as north, east and down lie to each other
+        self._file = RerunWriter(path, name, _blueprint(cameras))
+        self._log = self._file.log
 
     def show(self, drone: str, step: RecordedStep) -> None:
         """Adds one step of one drone; steps of one drone in order, drones one after the other."""
         if step.truth is None:
             return
-        self._recording.set_time(_TIMELINE, duration=step.frames.time_s)
-        self._recording.set_time("step", sequence=step.number)
+        self._file.at(step.frames.time_s, step.number)
         if step.number not in self._shown:
             self._shown.add(step.number)
             self._show_flock(step.truth)
@@ -58,11 +51,9 @@ class FlockFile:
 
     def close(self) -> None:
         """Ends the file."""
-        self._recording.reset_time()
         for number, (drone, track) in enumerate(self._tracks.items()):
             self._log(f"world/path/{drone}", rr.LineStrips3D([track], colors=[colour_of(number)]), static=True)
-        self._recording.flush()
-        self._recording.disconnect()
+        self._file.close()
 
     def _show_flock(self, truth: Truth) -> None:
         places: dict[str, FloatArray] = {drone.name: drone.position for drone in truth.drones}
@@ -91,9 +82,6 @@ class FlockFile:
         self._log(f"world/neighbours/{drone}", balls)
         lines = rr.LineStrips3D([[here, place] for place in places], colors=[colour] * len(places), radii=0.01)
         self._log(f"world/neighbours/{drone}/lines", lines)
-
-    def _log(self, entity: str, what: Any, *, static: bool = False) -> None:
-        self._recording.log(entity, what, static=static)
 
 
 def _blueprint(cameras: Mapping[str, Sequence[str]]) -> Any:

@@ -43,26 +43,49 @@ _DRONES = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 1
 _DRONE_RADIUS_M = 0.3
 
 
+class RerunWriter:
+    """One `.rrd` file, in metres north, east and down. Raises OSError where that cannot be."""
+
+    def __init__(self, path: Path, name: str, blueprint: Any) -> None:
+        path.open("wb").close()  # Rerun's own writer reports a failure only in its log
+        self.recording = rr.RecordingStream("flockd", recording_id=f"flockd-{name}")
+        self.recording.save(path, default_blueprint=blueprint)
+        self.recording.send_recording_name(name)
+        self.recording.set_log_time_enabled(False)  # when the file was written is of no interest
+        self.recording.set_log_tick_enabled(False)
+        self.log("world", rr.ViewCoordinates.FRD, static=True)  # as north, east and down lie to each other
+
+    def at(self, time_s: float, step: int | None = None) -> None:
+        """What follows is of this time; ``step``: its number, or None for what is of no step."""
+        self.recording.reset_time()
+        self.recording.set_time(_TIMELINE, duration=time_s)
+        if step is not None:
+            self.recording.set_time("step", sequence=step)
+
+    def log(self, entity: str, what: Any, *, static: bool = False) -> None:
+        """Adds something."""
+        self.recording.log(entity, what, static=static)
+
+    def close(self) -> None:
+        """Ends the file."""
+        self.recording.flush()
+        self.recording.disconnect()
+
+
 class RerunFile:
-    """Writes one `.rrd` file. Raises OSError where that cannot be."""
+    """Writes one `.rrd` file of one drone. Raises OSError where that cannot be."""
 
     def __init__(self, path: Path, drone: str, rig: Rig) -> None:
-        path.open("wb").close()  # Rerun's own writer reports a failure only in its log
         self._rig = rig
         self._track: list[list[float]] = []
-        self._recording = rr.RecordingStream("flockd", recording_id=f"flockd-{drone}")
-        self._recording.save(path, default_blueprint=_blueprint(rig))
-        self._recording.send_recording_name(drone)
-        self._recording.set_log_time_enabled(False)  # when the file was written is of no interest
-        self._recording.set_log_tick_enabled(False)
-        self._log("world", rr.ViewCoordinates.FRD, static=True)  # as north, east and down lie to each other
+        self._file = RerunWriter(path, drone, _blueprint(rig))
+        self._log = self._file.log
         for camera in rig.cameras.values():
             self._mount(camera)
 
     def show(self, moment: Moment) -> None:
         """Adds one step."""
-        self._recording.set_time(_TIMELINE, duration=moment.time_s)
-        self._recording.set_time("step", sequence=moment.number)
+        self._file.at(moment.time_s, moment.number)
         place = moment.place
         self._track.append(place.position.tolist())
         self._log(_HERE, rr.Transform3D(translation=place.position))
@@ -83,17 +106,13 @@ class RerunFile:
 
     def say(self, time_s: float, text: str) -> None:
         """Adds a text event."""
-        self._recording.reset_time()
-        self._recording.set_time(_TIMELINE, duration=time_s)
+        self._file.at(time_s)
         self._log("log", rr.TextLog(text, level="INFO"))
-        self._recording.reset_time()
 
     def close(self) -> None:
         """Ends the file."""
-        self._recording.reset_time()
         self._log("world/path", rr.LineStrips3D([self._track], colors=[_OWN]), static=True)
-        self._recording.flush()
-        self._recording.disconnect()
+        self._file.close()
 
     def _mount(self, camera: RigCamera) -> None:
         """Where a camera sits; a wide-angle one has no image plane in 3D, and lens distortion is left as it is."""
@@ -171,9 +190,6 @@ class RerunFile:
 
     def _curve(self, name: str, value: float) -> None:
         self._log(f"curves/{name}", rr.Scalars(value))
-
-    def _log(self, entity: str, what: Any, *, static: bool = False) -> None:
-        rr.log(entity, what, static=static, recording=self._recording)
 
 
 def open_viewer(path: Path) -> int:

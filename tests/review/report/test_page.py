@@ -246,13 +246,6 @@ def test_the_page_speaks_of_the_flight_it_shows(tmp_path: Path) -> None:
     assert "The paper’s are of 5 drones, this flight is of 3." in text
 
 
-def test_figures_have_a_form_for_narrow_windows(five: Path) -> None:
-    html = (five / "report.html").read_text(encoding="utf-8")
-    for name in ("wide", "narrow"):
-        assert len(re.findall(rf'<div class="{name}"><(?:svg|img)', html)) == 3, "paths, curves and errors"
-    assert len({axes.get_position().x1 for axes in flight_curves(_flight(), narrow=True).axes}) == 1, "one column"
-
-
 def test_the_headline_tells_what_happened(five_page: _Page) -> None:
     text = five_page.text
     assert "Five drones flew 110 s by sight and stayed one flock" in text
