@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 UInt8Array = NDArray[np.uint8]
-UInt16Array = NDArray[np.uint16]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 

@@ -24,10 +24,6 @@ _UNITS = {
     "_s": "seconds",
     "_m": "metres",
 }
-_MOVED = {
-    "desired": "is called `mission` now; write `mission:` with `kind: circle_then_tangent` and the same keys below it",
-}
-"""Keys of earlier versions, and what to write instead."""
 _LIMITS = {
     "greater_than": ("gt", "greater than"),
     "greater_than_equal": ("ge", "at least"),
@@ -128,8 +124,6 @@ def _unknown_key(key: str, known: Sequence[str]) -> str:
         return f"is not a key; put a space after the colon: `{word}: {rest}`"
     if key == "<<":
         return "merge keys are not supported; write the values out"
-    if key in _MOVED and "mission" in known:
-        return _MOVED[key]
     close = difflib.get_close_matches(key.lower().replace("-", "_"), known, n=1)
     if close:
         return f"is not a known key; did you mean `{close[0]}`?"

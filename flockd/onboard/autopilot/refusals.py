@@ -55,8 +55,6 @@ REMEMBERED_S = 15.0
 """For how long a request that was refused is told."""
 MOST_TOLD = 5
 """Reasons at once; further ones are counted."""
-HIGHEST_TOLD_SEVERITY = 4
-"""A STATUSTEXT up to this MAV_SEVERITY, a warning, may be a reason."""
 STICKS = "check_modes_manual_control"
 MANUAL_MODES = frozenset({"manual", "altitude", "position"})
 

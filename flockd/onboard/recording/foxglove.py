@@ -6,11 +6,9 @@ and each camera's frame carries the camera's name and is RDF.
 
 from __future__ import annotations
 
-import math
 from functools import cache
 from typing import Any, Literal
 
-import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
@@ -19,15 +17,14 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import DecodeError
+from scipy.spatial.transform import Rotation
 
 from flockd.core.choices import ImageFormat
 from flockd.core.config.rig import CameraConfig, RigConfig
 from flockd.core.messages import FloatArray
 from flockd.onboard.recording.mcap_file import RecordingError, Stream
 
-Quaternion = tuple[float, float, float, float]
-"""w, x, y, z"""
-_FRD_RDF: Quaternion = (0.5, 0.5, 0.5, 0.5)
+_FRD_RDF = Rotation.from_quat((0.5, 0.5, 0.5, 0.5))
 """From a camera's axes (right, down, forward) to those of a body that faces along it."""
 _CENTRE_PX = 0.5
 """Pixel centres lie at whole numbers in Foxglove, as in OpenCV, and half a pixel farther here."""
@@ -72,7 +69,7 @@ def calibration(time_ns: int, camera: CameraConfig) -> bytes:
 def transforms(time_ns: int, position: FloatArray, R_ned_body: FloatArray, rig: RigConfig) -> bytes:
     """FrameTransforms of the body in `local` and of each camera in the body."""
     message = FrameTransforms()
-    _add(message, time_ns, ("local", "body"), position.tolist(), quaternion(R_ned_body))
+    _add(message, time_ns, ("local", "body"), position.tolist(), Rotation.from_matrix(R_ned_body))
     for camera in rig.cameras:
         _add(message, time_ns, ("body", camera.name), camera.extrinsics.position_m, _mounting(camera))
     return bytes(message.SerializeToString())
@@ -83,7 +80,7 @@ def odometry(time_ns: int, position: FloatArray, R_ned_body: FloatArray, velocit
     message = Odometry(frame_id="local", body_frame_id="body")
     message.timestamp.FromNanoseconds(time_ns)
     _set_vector(message.pose.position, position.tolist())
-    _set_quaternion(message.pose.orientation, quaternion(R_ned_body))
+    _set_rotation(message.pose.orientation, Rotation.from_matrix(R_ned_body))
     _set_vector(message.linear_velocity, (R_ned_body.T @ velocity_ned).tolist())
     return bytes(message.SerializeToString())
 
@@ -93,22 +90,6 @@ def log(time_ns: int, level: Literal["INFO", "WARNING"], text: str) -> bytes:
     message = Log(level=Log.Level.Value(level), message=text, name="flockd")
     message.timestamp.FromNanoseconds(time_ns)
     return bytes(message.SerializeToString())
-
-
-def quaternion(rotation: FloatArray) -> Quaternion:
-    """w, x, y, z of a (3, 3) rotation: the eigenvector of Bar-Itzhack's matrix (2000), w not negative."""
-    R = np.asarray(rotation)
-    K = np.array(
-        [
-            [R[0, 0] - R[1, 1] - R[2, 2], 0.0, 0.0, 0.0],
-            [R[1, 0] + R[0, 1], R[1, 1] - R[0, 0] - R[2, 2], 0.0, 0.0],
-            [R[2, 0] + R[0, 2], R[2, 1] + R[1, 2], R[2, 2] - R[0, 0] - R[1, 1], 0.0],
-            [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], R[0, 0] + R[1, 1] + R[2, 2]],
-        ]
-    )
-    x, y, z, w = np.linalg.eigh(K, UPLO="L")[1][:, -1]
-    sign = 1.0 if w >= 0 else -1.0
-    return float(sign * w), float(sign * x), float(sign * y), float(sign * z)
 
 
 def _descriptor_set(file: Any) -> bytes:
@@ -127,45 +108,27 @@ def _descriptor_set(file: Any) -> bytes:
     return bytes(descriptors.SerializeToString(deterministic=True))
 
 
-def _mounting(camera: CameraConfig) -> Quaternion:
+def _mounting(camera: CameraConfig) -> Rotation:
     """From the camera's axes to the body's: yaw, then pitch, then roll of a camera that faces forward."""
     extrinsics = camera.extrinsics
-    turn = _times(
-        _times(_about(2, extrinsics.yaw_deg), _about(1, extrinsics.pitch_deg)), _about(0, extrinsics.roll_deg)
-    )
-    return _times(turn, _FRD_RDF)
+    angles = (extrinsics.yaw_deg, extrinsics.pitch_deg, extrinsics.roll_deg)
+    return Rotation.from_euler("ZYX", angles, degrees=True) * _FRD_RDF
 
 
-def _about(axis: int, angle_deg: float) -> Quaternion:
-    half = math.radians(angle_deg) / 2
-    parts = [0.0, 0.0, 0.0]
-    parts[axis] = math.sin(half)
-    return math.cos(half), parts[0], parts[1], parts[2]
-
-
-def _times(a: Quaternion, b: Quaternion) -> Quaternion:
-    return (
-        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-    )
-
-
-def _add(message: Any, time_ns: int, frames: tuple[str, str], place: Any, turn: Quaternion) -> None:
+def _add(message: Any, time_ns: int, frames: tuple[str, str], place: Any, turn: Rotation) -> None:
     transform: FrameTransform = message.transforms.add()
     transform.timestamp.FromNanoseconds(time_ns)
     transform.parent_frame_id, transform.child_frame_id = frames
     _set_vector(transform.translation, place)
-    _set_quaternion(transform.rotation, turn)
+    _set_rotation(transform.rotation, turn)
 
 
 def _set_vector(target: Any, values: Any) -> None:
     target.x, target.y, target.z = values
 
 
-def _set_quaternion(target: Any, values: Quaternion) -> None:
-    target.w, target.x, target.y, target.z = values
+def _set_rotation(target: Any, rotation: Rotation) -> None:
+    target.x, target.y, target.z, target.w = rotation.as_quat(canonical=True).tolist()
 
 
 def _stream(topic: str, message: Any) -> Stream:

@@ -139,11 +139,6 @@ def test_words_that_old_yaml_takes_for_truth_values_stay_words(tmp_path: Path) -
             "perception.threads: 99999999999999999999 is too large; write a number up to 9223372036854775807",
         ),
         ("flocking: {weight: [1]}", "flocking.weight: a list is not a section; write a section with kind, nearest"),
-        (
-            "desired: {speed_m_s: 1.0}",
-            "desired: is called `mission` now; write `mission:` with `kind: circle_then_tangent` and the same keys "
-            "below it",
-        ),
         ("yaw: !!str hold", "yaw: the tag `tag:yaml.org,2002:str` is not supported; delete it"),
         ("yaw: &way hold", "yaw: the anchor `&way` is not supported; delete it"),
         ("<<: {yaw: hold}", "<<: merge keys are not supported; write the values out"),
