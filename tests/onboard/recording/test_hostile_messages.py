@@ -14,9 +14,9 @@ from flockd.onboard.recording import RecordingError, foxglove
 from flockd.onboard.recording.codec import from_json, parsed
 from flockd.onboard.recording.editing import recover
 from flockd.onboard.recording.export import export_images, export_tables
-from flockd.onboard.recording.mcap_file import Damage, Entry, McapFile, read_records
+from flockd.onboard.recording.mcap_file import Entry, Record
 from flockd.onboard.recording.reader import Recording
-from tests.onboard.recording.made_up import record
+from tests.onboard.recording.made_up import record, rewritten
 
 STEPS = 3
 DEEP = b"[" * 100_000
@@ -31,12 +31,12 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def changed(whole: Path, path: Path, topic: str, change: Callable[[Entry], Entry], step: int = 1) -> Path:
     """A copy with one message changed, all checksums right."""
-    with McapFile(path) as file:
-        for found in read_records(whole):
-            assert not isinstance(found, Damage)
-            hit = isinstance(found, Entry) and found.stream.topic == topic and found.sequence == step
-            file.write(change(found) if hit else found)  # type: ignore[arg-type]
-    return path
+
+    def in_its_step(found: Record) -> Record:
+        hit = isinstance(found, Entry) and found.stream.topic == topic and found.sequence == step
+        return change(found) if hit else found  # type: ignore[arg-type]
+
+    return rewritten(whole, path, in_its_step)
 
 
 @pytest.mark.parametrize("topic", ["/vehicle", "/output"])

@@ -23,9 +23,9 @@ from flockd.onboard.recording import RecordingError
 from flockd.onboard.recording.codec import to_json
 from flockd.onboard.recording.editing import cut, recover
 from flockd.onboard.recording.export import export_images, export_tables
-from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, McapFile, Note, read_records
+from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, McapFile, Note, Record, read_records
 from flockd.onboard.recording.reader import Recording, is_image
-from tests.onboard.recording.made_up import record
+from tests.onboard.recording.made_up import record, rewritten
 
 ROOT = Path(__file__).parents[3]
 
@@ -67,19 +67,16 @@ def test_what_is_no_recording_is_refused_in_one_sentence(tmp_path: Path, whole: 
 def test_a_configuration_of_another_version_is_refused_with_the_version_that_reads_it(
     tmp_path: Path, whole: Path
 ) -> None:
-    path = tmp_path / "later.mcap"
-    with McapFile(path) as file:
-        for entry in read_records(whole):
-            assert not isinstance(entry, Damage)
-            if isinstance(entry, Inclosure):
-                data = {**json.loads(entry.data), "colour": "red"}
-                entry = replace(entry, data=json.dumps(data).encode())  # noqa: PLW2901
-            if isinstance(entry, Note) and "version" in entry.facts:
-                entry = replace(entry, facts={**entry.facts, "version": "9.1"})  # noqa: PLW2901
-            file.write(entry)
+    def later(entry: Record) -> Record:
+        if isinstance(entry, Inclosure):
+            return replace(entry, data=json.dumps({**json.loads(entry.data), "colour": "red"}).encode())
+        if isinstance(entry, Note) and "version" in entry.facts:
+            return replace(entry, facts={**entry.facts, "version": "9.1"})
+        return entry
+
     assert re.fullmatch(
         r"the configuration in it is not one of this flockd \(colour: .*\); use the flockd that wrote it, 9\.1",
-        refusal(path),
+        refusal(rewritten(whole, tmp_path / "later.mcap", later)),
     )
 
 
@@ -168,29 +165,25 @@ def test_a_hostile_chunk_is_damage_and_takes_little_memory(
 
 def test_an_image_that_claims_to_be_huge_is_not_decoded(tmp_path: Path, whole: Path) -> None:
     """A PNG's width and height are bytes 16 to 24; zlib packs an all-black image of 60000x60000 into some megabytes."""
-    path = tmp_path / "x.mcap"
-    with McapFile(path) as file:
-        for entry in read_records(whole):
-            if isinstance(entry, Entry) and is_image(entry.stream.topic):
-                at = entry.data.index(b"IHDR") + 4
-                huge = entry.data[:at] + struct.pack(">II", 60000, 60000) + entry.data[at + 8 :]
-                entry = replace(entry, data=huge)  # noqa: PLW2901 - the rest of the loop is the same
-            if not isinstance(entry, Damage):
-                file.write(entry)
+
+    def huge(entry: Record) -> Record:
+        if not (isinstance(entry, Entry) and is_image(entry.stream.topic)):
+            return entry
+        at = entry.data.index(b"IHDR") + 4
+        return replace(entry, data=entry.data[:at] + struct.pack(">II", 60000, 60000) + entry.data[at + 8 :])
+
     with pytest.raises(RecordingError, match="claims 60000x60000 pixels"):
-        list(Recording(path).steps())
+        list(Recording(rewritten(whole, tmp_path / "x.mcap", huge)).steps())
 
 
 @pytest.mark.parametrize("number", ["NaN", "-1", "1e9", "9" * 5000, ""])
 def test_a_number_of_lost_steps_that_is_none_is_refused(tmp_path: Path, whole: Path, number: str) -> None:
-    path = tmp_path / "x.mcap"
-    with McapFile(path) as file:
-        for entry in read_records(whole):
-            if isinstance(entry, Note) and "lost" in entry.facts:
-                entry = replace(entry, facts={**entry.facts, "lost": number})  # noqa: PLW2901
-            if not isinstance(entry, Damage):
-                file.write(entry)
-    assert "which is no number" in refusal(path)
+    def miscounted(entry: Record) -> Record:
+        if isinstance(entry, Note) and "lost" in entry.facts:
+            return replace(entry, facts={**entry.facts, "lost": number})
+        return entry
+
+    assert "which is no number" in refusal(rewritten(whole, tmp_path / "x.mcap", miscounted))
 
 
 def test_a_step_without_its_vehicle_is_the_last_of_a_killed_one_or_an_error(tmp_path: Path, whole: Path) -> None:
