@@ -84,16 +84,6 @@ EQUIVALENT: dict[str, str] = {
     "half_planes.py : _PARALLEL = (0.0)": "lines that are all but parallel cross far away, or as near as a foot",
     "half_planes.py _crossings: cross = (np.abs(determinants) >= _PARALLEL)": "the same, at just this angle",
     "half_planes.py _crossings: i, j = np.triu_indices(len(directions), (0))": "a line is parallel to itself",
-    "fence.py _inside: ends = np.roll(corners, (1), axis=0)": "the same outline, the other way round",
-    "fence.py _inside: return bool(np.sum((east >= e1 + (e2 - e1) * (north - n1) / (n2 - n1))) % 2)": (
-        "the same ray, to the west; a closed outline is crossed an even number of times in all"
-    ),
-    "fence.py _inside: return bool(np.sum((east <= e1 + (e2 - e1) * (north - n1) / (n2 - n1))) % 2)": (
-        "differs on the outline itself, which is neither inside nor outside"
-    ),
-    "fence.py _inside: return (np.sum(east < e1 + (e2 - e1) * (north - n1) / (n2 - n1)) % 2)": (
-        "1 for True and 0 for False, of which only the truth is asked"
-    ),
     "fence.py _nearest_on_outline: sides = np.roll(corners, (1), axis=0) - corners": (
         "the same outline, the other way round"
     ),

@@ -6,6 +6,7 @@ gives one.
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -75,7 +76,7 @@ class DroneConfig(Section):
     def _the_gate_lets_the_trim_through(self) -> Self:
         gate_m_s, law_m_s = self.safety.gate.max_speed_m_s, self.flocking.max_speed_m_s
         trim_m_s = 0.0 if self.autopilot is None else self.autopilot.max_velocity_trim_m_s
-        if law_m_s + trim_m_s > gate_m_s:
+        if law_m_s + trim_m_s > gate_m_s and not math.isclose(law_m_s + trim_m_s, gate_m_s):
             raise ValueError(
                 f"flocking.max_speed_m_s {law_m_s:g} and autopilot.max_velocity_trim_m_s {trim_m_s:g} are above "
                 f"safety.gate.max_speed_m_s, which would refuse them; write {gate_m_s - law_m_s:g} or less for the trim"

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
 from flockd.core.config.base import Distance, NonNegative, Section, Speed, refuse
 from flockd.core.config.safety import GateParameters
+from flockd.core.polygon import is_inside
 
 MissionKind = Literal["circle_then_tangent", "hover", "velocity", "waypoints", "follow", "operator"]
 AtEnd = Literal["hold", "land", "return"]
@@ -167,14 +168,6 @@ def fault_of_place(gate: GateParameters, north_m: float, east_m: float) -> str |
     away_m = math.hypot(north_m, east_m)
     if gate.fence_radius_m is not None and away_m > gate.fence_radius_m:
         return f"is {away_m:.1f} m from home, outside the fence of {gate.fence_radius_m:g} m; write a nearer place"
-    if gate.fence_corners_m and not _inside(gate.fence_corners_m, north_m, east_m):
+    if gate.fence_corners_m and not is_inside(gate.fence_corners_m, north_m, east_m):
         return "is outside safety.gate.fence_corners_m; write a place within"
     return None
-
-
-def _inside(corners: Sequence[tuple[float, float]], north_m: float, east_m: float) -> bool:
-    """Whether a ray to the east crosses a polygon's outline an odd number of times."""
-    crossed = 0
-    for (n1, e1), (n2, e2) in zip(corners, (*corners[1:], corners[0]), strict=True):
-        crossed += (n1 > north_m) != (n2 > north_m) and east_m < e1 + (e2 - e1) * (north_m - n1) / (n2 - n1)
-    return crossed % 2 == 1

@@ -6,12 +6,11 @@ Everything here is horizontal: north and east.
 from __future__ import annotations
 
 from flockd.core.config.flocking import FlockingParameters, WeightParameters
-from flockd.flight.flocking.law import FlockingLaw, level_offsets, limit_norm
+from flockd.flight.flocking.law import FlockingLaw, level_offsets
 
 __all__ = [
     "FlockingLaw",
     "FlockingParameters",
     "WeightParameters",
     "level_offsets",
-    "limit_norm",
 ]

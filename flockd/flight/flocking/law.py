@@ -9,12 +9,10 @@ from numpy.typing import ArrayLike
 
 from flockd.core.config.flocking import FlockingParameters, WeightParameters
 from flockd.core.messages import BoolArray, FloatArray
+from flockd.flight.geometry.level import SAME_SPOT_M, limit_norm
 
 _MIN_DISTANCE_M = 1e-3
 """Nearer than this counts as this far: Eq. 39 and 41 have a pole at zero distance."""
-
-SAME_SPOT_M = 0.1
-"""Neighbours at a smaller level range are above or below: their direction is not measured that well."""
 
 
 class FlockingLaw:
@@ -97,12 +95,6 @@ def influence_weights(parameters: WeightParameters, distances: FloatArray, obser
     if parameters.kind == "nearest":
         weights[np.argsort(distances, kind="stable")[parameters.nearest :]] = 0.0
     return weights
-
-
-def limit_norm(vector: FloatArray, maximum: float) -> FloatArray:
-    """The vector itself if it is no longer than `maximum`, else the one of that length in its direction."""
-    norm = float(np.linalg.norm(vector))
-    return vector if norm <= maximum else vector * (maximum / norm)
 
 
 def _finite(values: ArrayLike, shape: tuple[int, int] | tuple[int], name: str) -> FloatArray:

@@ -30,6 +30,8 @@ class Navigator:
         self._parameters = parameters
         self._mission = _mission(parameters, gate)
         self._began_s = 0.0
+        self._height_m = parameters.height_m
+        """The mission's or an order's last, without offset: what stays where no other is asked for."""
         self._course_rad: float | None = None
         self._turned_s = 0.0
 
@@ -43,12 +45,12 @@ class Navigator:
 
         Its height has the offset of the configuration, its course turns no faster than `MAX_TURN_RAD_S`.
         """
-        if moment.order is not None and self._parameters.kind != "operator":
+        if moment.order is not None and self._configured.kind != "operator":
             self._replace(moment.order, moment.time_s)
         guidance = self._mission.step(replace(moment, time_s=moment.time_s - self._began_s))
-        height_m = self._parameters.height_m if guidance.height_m is None else guidance.height_m
-        if height_m is not None:
-            height_m += self._parameters.height_offset_m
+        if guidance.height_m is not None:
+            self._height_m = guidance.height_m
+        height_m = None if self._height_m is None else self._height_m + self._configured.height_offset_m
         course_rad = guidance.course_rad if self.is_paper else self._turned(guidance.course_rad, moment.time_s)
         self._course_rad, self._turned_s = course_rad, moment.time_s
         return replace(guidance, height_m=height_m, course_rad=course_rad)
@@ -89,9 +91,7 @@ class Navigator:
 
 def ordered_mission(configured: MissionParameters, order: MissionOrder) -> MissionParameters:
     """The mission that an order puts in place of the configured one; see `Navigator`."""
-    kept = configured.model_dump(
-        include={"speed_m_s", "reached_m", "timeout_s", "height_offset_m", "height_m", "origin_m"}
-    )
+    kept = configured.model_dump(include={"speed_m_s", "reached_m", "timeout_s", "origin_m"})
     if order.velocity is not None:
         return MissionParameters(kind="operator", **kept)
     place = {}

@@ -45,7 +45,7 @@ class Waypoints:
             return self._stands("waits for the autopilot's position")
         goal = self._goal(moment)
         while goal is not None and not self._arrived and self._is_reached(moment.time_s, math.dist(here, goal)):
-            self._height_m, self._approach = self._height(self._next), None
+            self._height_m, self._approach = self._height, None
             if self._next + 1 < len(self._parameters.waypoints):
                 self._next += 1
                 goal = self._goal(moment)
@@ -55,6 +55,7 @@ class Waypoints:
             return self._stands("waits for home in degrees, which the autopilot has not sent")
         if outside_fence(self._gate, goal):
             return self._stands(f"{self._name} is outside the fence")
+        self._height_m = self._height
         return self._towards(goal, here)
 
     def _is_reached(self, time_s: float, away_m: float) -> bool:
@@ -75,7 +76,7 @@ class Waypoints:
             velocity=np.zeros(2) if takeover else velocity,
             sentence=sentence,
             course_rad=None if last and left_m < 2 * p.reached_m else course_of(velocity),
-            height_m=self._height(self._next),
+            height_m=self._height_m,
             goal=goal,
             arrived=self._arrived,
             takeover=takeover,
@@ -94,9 +95,10 @@ class Waypoints:
     def _goal(self, moment: Moment) -> FloatArray | None:
         return place_of_waypoint(self._parameters.waypoints[self._next], self._origin, moment.home_deg)
 
-    def _height(self, number: int) -> float | None:
-        """That of a waypoint, or of the one before it."""
-        height_m = self._parameters.waypoints[number].height_m
+    @property
+    def _height(self) -> float | None:
+        """That of the waypoint that is flown to, or of the one before it."""
+        height_m = self._parameters.waypoints[self._next].height_m
         return self._height_m if height_m is None else height_m
 
     def _stands(self, why: str) -> Guidance:

@@ -9,7 +9,8 @@ import numpy as np
 from flockd.core.config.avoidance import ObstacleParameters
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray, ObstacleRanges
-from flockd.flight.flocking import FlockingLaw, level_offsets, limit_norm
+from flockd.flight.flocking import FlockingLaw, level_offsets
+from flockd.flight.geometry.level import limit_norm
 from flockd.flight.obstacles.local_map import nearest_points
 from flockd.flight.obstacles.steering import Steering
 from flockd.flight.safety.approach import stopping_speed, towards_neighbours, towards_obstacles

@@ -101,7 +101,7 @@ class FlockPilot:
         limit_m_s, memory = 0.0, 0.0
         if config.autopilot is not None and config.own_velocity == "vision":
             limit_m_s, memory = config.autopilot.max_velocity_trim_m_s, config.autopilot.velocity_trim_memory
-        self._trim = VelocityTrim(limit_m_s, memory)
+        self._trim = VelocityTrim(limit_m_s, memory, config.safety.gate.max_speed_m_s)
         self._stopwatch = stopwatch
         self._first_time_s: float | None = None
         self._last_time_s: float | None = None
@@ -337,7 +337,7 @@ class FlockPilot:
             self._yaw_rad = guidance.course_rad
         trim = self._trim.velocity
         return Wanted(
-            command + trim, acceleration, self._yaw_rad, trim if trim.any() else None, guidance.height_m
+            self._trim.corrected(command), acceleration, self._yaw_rad, trim if trim.any() else None, guidance.height_m
         ), self._navigator.status(guidance)
 
 

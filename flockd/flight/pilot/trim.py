@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from flockd.core.messages import EgoMotion, FloatArray, VehicleState
-from flockd.flight.flocking import limit_norm
+from flockd.flight.geometry.level import limit_norm
 
 
 class VelocityTrim:
@@ -17,16 +17,23 @@ class VelocityTrim:
     with v - b, and so do neighbours with other b: a flock with equal commands drifts together. So b is added.
     """
 
-    def __init__(self, limit_m_s: float, memory: float) -> None:
-        """``limit_m_s``: its largest norm; 0: no trim. ``memory``: share of the last trim that each step keeps."""
-        self._limit_m_s, self._memory = limit_m_s, memory
+    def __init__(self, limit_m_s: float, memory: float, gate_m_s: float) -> None:
+        """``limit_m_s``: its largest norm; 0: no trim. ``memory``: share of the last trim that each step keeps.
+
+        ``gate_m_s``: what the gate lets through.
+        """
+        self._limit_m_s, self._memory, self._gate_m_s = limit_m_s, memory, gate_m_s
         self._before: VehicleState | None = None
         self._mean = np.zeros(2)
 
     @property
     def velocity(self) -> FloatArray:
-        """(2,) m/s, north and east, to be added to the pilot's command."""
+        """(2,) m/s, north and east, of the setpoints' correction."""
         return limit_norm(self._mean, self._limit_m_s)
+
+    def corrected(self, velocity: FloatArray) -> FloatArray:
+        """The law's velocity (2,) m/s with the trim: not even by rounding more than the gate lets through."""
+        return limit_norm(velocity + self.velocity, self._gate_m_s)
 
     def update(self, vehicle: VehicleState, ego: EgoMotion | None) -> None:
         """With the vehicle's state and the ego-motion of each step.

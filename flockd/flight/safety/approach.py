@@ -8,9 +8,8 @@ import numpy as np
 
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray
+from flockd.flight.geometry.level import SAME_SPOT_M
 
-SAME_SPOT_M = 0.1
-"""A neighbour whose level range is smaller is above or below, in no direction: cameras do not measure one that well."""
 NOTHING_NEAR = np.empty((0, 2)), np.empty(0)
 """No direction, and no limit."""
 

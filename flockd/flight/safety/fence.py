@@ -8,6 +8,7 @@ import numpy as np
 
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray
+from flockd.core.polygon import is_inside
 
 
 def outside_fence(parameters: GateParameters, position: FloatArray) -> bool:
@@ -34,18 +35,9 @@ def offsets_outside(p: GateParameters, position: FloatArray) -> FloatArray:
     distance = math.hypot(*position)
     if p.fence_radius_m is not None and distance > p.fence_radius_m:
         offsets.append(position * (1 - p.fence_radius_m / distance))
-    if p.fence_corners_m and not _inside(position, np.array(p.fence_corners_m)):
+    if p.fence_corners_m and not is_inside(p.fence_corners_m, *position.tolist()):
         offsets.append(position - _nearest_on_outline(position, np.array(p.fence_corners_m)))
     return np.reshape(offsets, (len(offsets), 2))
-
-
-def _inside(point: FloatArray, corners: FloatArray) -> bool:
-    """Whether a point is in a polygon: a ray from it to the east crosses the outline an odd number of times."""
-    north, east = point
-    ends = np.roll(corners, -1, axis=0)
-    spans = (corners[:, 0] > north) != (ends[:, 0] > north)
-    (n1, e1), (n2, e2) = corners[spans].T, ends[spans].T
-    return bool(np.sum(east < e1 + (e2 - e1) * (north - n1) / (n2 - n1)) % 2)
 
 
 def _nearest_on_outline(point: FloatArray, corners: FloatArray) -> FloatArray:

@@ -14,6 +14,7 @@ import numpy as np
 
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray, Setpoint, Wanted
+from flockd.flight.geometry.level import limit_norm
 from flockd.flight.safety.approach import towards_neighbours, towards_obstacles
 from flockd.flight.safety.fence import is_fenced, offsets_outside
 from flockd.flight.safety.half_planes import nearest_within
@@ -152,7 +153,7 @@ class Gate:
         """A command's velocity: slower once a newer command is missed, nothing when it is too old, slow if degraded."""
         p = self._parameters
         limit_m_s = p.degraded_speed_m_s if action is Action.FLY_DEGRADED else p.max_speed_m_s
-        return _limited(self._share(age_s) * velocity, limit_m_s)
+        return limit_norm(self._share(age_s) * velocity, limit_m_s)
 
     def _share(self, age_s: float) -> float:
         """How much of a command is flown at its age: all while it is fresh, nothing at the time-out."""
@@ -182,10 +183,10 @@ class Gate:
         if last is not None:
             start, elapsed_s = last.velocity, max(now_s - last.time_s, 0.0)
         elif np.isfinite(around.velocity).all():
-            start, elapsed_s = _limited(around.velocity, p.max_speed_m_s), 0.0
+            start, elapsed_s = limit_norm(around.velocity, p.max_speed_m_s), 0.0
         else:
             start, elapsed_s = np.zeros(2), 0.0
-        return start + _limited(target - start, p.max_acceleration_m_s2 * elapsed_s)
+        return start + limit_norm(target - start, p.max_acceleration_m_s2 * elapsed_s)
 
     def _recent(self, now_s: float) -> Setpoint | None:
         """The last setpoint; None where that is too long ago to go on from it."""
@@ -268,9 +269,3 @@ def _units(vectors: FloatArray) -> FloatArray:
     lengths = np.hypot(vectors[:, 0], vectors[:, 1])
     units: FloatArray = vectors[lengths > 0] / lengths[lengths > 0, None]
     return units
-
-
-def _limited(vector: FloatArray, limit: float) -> FloatArray:
-    """The vector itself if it is no longer than `limit`, else the one of that length in its direction."""
-    length = math.hypot(*vector)
-    return vector if length <= limit else vector * (limit / length)

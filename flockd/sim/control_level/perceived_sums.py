@@ -15,7 +15,7 @@ from numba import njit
 
 from flockd.core.config.perceived import PerceivedErrors, Spread
 from flockd.core.messages import FloatArray, IntArray
-from flockd.flight.flocking.law import SAME_SPOT_M
+from flockd.flight.geometry.level import SAME_SPOT_M
 from flockd.sim.control_level.cells import row_of, slice_of_row
 from flockd.sim.control_level.law_sums import (
     ALIGNMENT,

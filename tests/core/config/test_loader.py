@@ -467,3 +467,14 @@ def test_the_configuration_knows_how_many_families_the_simulator_has() -> None:
     from flockd.sim.drone_models import FAMILIES
 
     assert DRONE_FAMILIES == FAMILIES
+
+
+def test_the_trim_that_an_error_recommends_is_taken_though_rounding_adds_up(tmp_path: Path) -> None:
+    """0.2 + 0.1 is above 0.3 in binary."""
+    limits = "flocking: {max_speed_m_s: 0.2}\nmission: {speed_m_s: 0.2}\n"
+    limits += "safety: {gate: {max_speed_m_s: 0.3, degraded_speed_m_s: 0.3}}\n"
+    (problem,) = _drone_problems(tmp_path, f"{DRONE}{limits}autopilot: {{max_velocity_trim_m_s: 0.2}}\n")
+    assert "write 0.1 or less for the trim" in problem
+    path = tmp_path / "drone.yaml"
+    path.write_text(f"{DRONE}{limits}autopilot: {{max_velocity_trim_m_s: 0.1}}\n", encoding="utf-8")
+    assert load_drone(path).autopilot is not None

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flockd.flight.flocking import FlockingLaw, FlockingParameters, WeightParameters, level_offsets, limit_norm
+from flockd.flight.flocking import FlockingLaw, FlockingParameters, WeightParameters, level_offsets
 from flockd.flight.flocking.metrics import min_distance, obj1, obj2, pair_distances
+from flockd.flight.geometry.level import limit_norm
 from flockd.flight.mission import MissionParameters
 from flockd.flight.mission.circle_then_tangent import course, desired_velocity
 

@@ -188,6 +188,53 @@ def test_a_goal_takes_the_place_of_any_other_mission_for_good() -> None:
     np.testing.assert_allclose(point.position, [0.0, 20.0], atol=1.0)
 
 
+def test_a_goal_ordered_after_a_velocity_is_for_good_too() -> None:
+    point = Point(mission(kind="hover"))
+    point.step(MissionOrder(velocity=np.array([0.0, 0.5])))
+    point.fly(4.0)
+    point.step(MissionOrder(place=np.array([20.0, 0.0])))
+    assert point.fly(60.0).arrived
+    np.testing.assert_allclose(point.position, [20.0, 0.0], atol=0.1)
+
+
+PLACE, VELOCITY = MissionOrder(place=np.array([40.0, 0.0])), MissionOrder(velocity=np.array([0.5, 0.0]))
+
+
+@pytest.mark.parametrize("kind", ["circle_then_tangent", "operator"])
+@pytest.mark.parametrize("first", [PLACE, VELOCITY], ids=["goal", "velocity"])
+@pytest.mark.parametrize("second", [PLACE, VELOCITY], ids=["then goal", "then velocity"])
+def test_an_order_without_a_height_keeps_the_last_one_ordered(
+    kind: str, first: MissionOrder, second: MissionOrder
+) -> None:
+    """And so it does when the order has lapsed; the drone's offset counts once."""
+    point = Point(mission(kind=kind, height_m=4.0, height_offset_m=1.0))
+    assert point.step().height_m == 5.0
+    assert point.step(replace(first, height_m=8.0)).height_m == 9.0
+    assert point.step(second).height_m == 9.0
+    assert {point.step().height_m for _ in range(10)} == {9.0}
+
+
+@pytest.mark.parametrize("loses", ["position", "fence"])
+def test_a_drone_that_stops_on_its_way_stays_at_the_height_of_that_way(loses: str) -> None:
+    """At 4 m it reached its first waypoint; at 8 m, on its way to the next, the autopilot's position is lost.
+
+    Or the next one but one, in degrees, turns out to be outside the fence.
+    """
+    waypoints: tuple[dict[str, float], ...] = (
+        {"north_m": 2.0, "east_m": 0.0, "height_m": 4.0},
+        {"north_m": 9.0, "east_m": 0.0, "height_m": 8.0},
+        {"latitude_deg": 48.0, "longitude_deg": 8.5},
+    )
+    navigator = Navigator(mission(kind="waypoints", waypoints=waypoints), GATE)
+    home_deg = np.array([47.4, 8.5])
+    assert navigator.step(Moment(0.0, np.array([0.0, 0.0]), home_deg=home_deg)).height_m == 4.0
+    assert navigator.step(Moment(0.5, np.array([2.0, 0.0]), home_deg=home_deg)).height_m == 8.0
+    stopped = Moment(1.0, None) if loses == "position" else Moment(1.0, np.array([9.0, 0.0]), home_deg=home_deg)
+    guidance = navigator.step(stopped)
+    np.testing.assert_array_equal(guidance.velocity, ORIGIN)
+    assert guidance.height_m == 8.0
+
+
 @pytest.mark.parametrize(
     ("message", "command", "refusal"),
     [

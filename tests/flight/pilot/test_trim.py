@@ -7,10 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from flockd.core.messages import EgoMotion, FloatArray, VehicleState
+from flockd.core.messages import EgoMotion, FloatArray, VehicleState, Wanted
+from flockd.flight.flocking import FlockingLaw, FlockingParameters
 from flockd.flight.pilot.trim import VelocityTrim
+from flockd.flight.safety import Action, Gate, GateParameters, Permission, Request, Surroundings
 
 STEP_S = 0.5
+GATE_M_S = 4.0
 YAW_RAD = 0.7
 R_NED_BODY = np.array(
     [[math.cos(YAW_RAD), -math.sin(YAW_RAD), 0], [math.sin(YAW_RAD), math.cos(YAW_RAD), 0], [0, 0, 1]]
@@ -31,7 +34,7 @@ def ego(moved_with: FloatArray | None) -> EgoMotion | None:
 def test_a_drone_flies_as_commanded_although_its_autopilot_errs() -> None:
     """The autopilot makes its own estimate what it is told; the truth is less by what it errs."""
     wanted, errs = np.array([1.0, 0.3]), np.array([0.2, -0.15, 0.05])
-    trim = VelocityTrim(0.5, 0.7)
+    trim = VelocityTrim(0.5, 0.7, GATE_M_S)
     moved = np.full(3, np.nan)
     for step in range(20):
         moved = np.array([*(wanted + trim.velocity), 0.0]) - errs
@@ -40,7 +43,7 @@ def test_a_drone_flies_as_commanded_although_its_autopilot_errs() -> None:
 
 
 def test_an_autopilot_that_is_right_is_left_alone() -> None:
-    trim = VelocityTrim(0.5, 0.7)
+    trim = VelocityTrim(0.5, 0.7, GATE_M_S)
     for step in range(10):
         speeding_up = np.array([0.2 * step, -0.1 * step, 0.0])
         mean = speeding_up - np.array([0.1, -0.05, 0.0])
@@ -50,7 +53,7 @@ def test_an_autopilot_that_is_right_is_left_alone() -> None:
 
 @pytest.mark.parametrize("limit_m_s", [0.0, 0.3])
 def test_no_trim_is_larger_than_allowed_and_a_wild_measurement_is_soon_forgotten(limit_m_s: float) -> None:
-    trim, still = VelocityTrim(limit_m_s, 0.7), np.zeros(3)
+    trim, still = VelocityTrim(limit_m_s, 0.7, GATE_M_S), np.zeros(3)
     trim.update(vehicle(0, still), ego(None))
     for step in range(1, 10):
         trim.update(vehicle(step, still), ego(np.array([-9.0, 12.0, 0.0])))
@@ -61,7 +64,7 @@ def test_no_trim_is_larger_than_allowed_and_a_wild_measurement_is_soon_forgotten
 
 
 def test_what_cannot_be_compared_leaves_the_trim_as_it_is() -> None:
-    trim, drift = VelocityTrim(0.5, 0.7), np.array([0.2, 0.0, 0.0])
+    trim, drift = VelocityTrim(0.5, 0.7, GATE_M_S), np.array([0.2, 0.0, 0.0])
     for step in range(30):
         trim.update(vehicle(step, np.zeros(3)), ego(-drift if step else None))
     before = trim.velocity
@@ -75,3 +78,19 @@ def test_what_cannot_be_compared_leaves_the_trim_as_it_is() -> None:
         trim.update(vehicle(41, np.full(3, unheard_of)), ego(away))
         trim.update(vehicle(42, np.zeros(3)), ego(away))
     assert trim.velocity == pytest.approx(before)
+
+
+def test_a_law_and_a_trim_at_their_limits_pass_the_gate_though_rounding_adds_up() -> None:
+    """3.5 and 0.5 m/s in one direction, where the gate refuses more than 4 m/s: 2,000 directions."""
+    around = Surroundings(np.zeros(2), np.zeros(2), 0.0, np.empty((0, 3)), np.empty((0, 2)), 5.0)
+    gate = Gate(GateParameters(max_speed_m_s=GATE_M_S))
+    for angle in np.random.default_rng(1).uniform(0, 2 * math.pi, 2000):
+        direction = np.array([math.cos(angle), math.sin(angle)])
+        trim = VelocityTrim(0.5, 0.0, GATE_M_S)
+        trim.update(vehicle(0, np.array([*direction, 0.0])), ego(None))
+        trim.update(vehicle(1, np.array([*direction, 0.0])), ego(np.zeros(3)))
+        law, _ = FlockingLaw(FlockingParameters(max_speed_m_s=3.5)).limited(9.0 * direction, np.zeros(2), 0.5)
+        wanted = Wanted(trim.corrected(law), np.zeros(2), 0.0)
+        assert math.hypot(*wanted.velocity) == pytest.approx(4.0)
+        gate.step(0.0, Request(Permission(Action.FLY, 0.0), wanted, 0.0, 5.0, around))
+    assert gate.counts == {}

@@ -10,8 +10,9 @@ import pytest
 from numpy.typing import ArrayLike
 
 from flockd.core.messages import FloatArray, Wanted
+from flockd.flight.geometry.level import SAME_SPOT_M
 from flockd.flight.safety import Action, Gate, GateParameters, Objection, Permission, Request, Surroundings, Verdict
-from flockd.flight.safety.approach import SAME_SPOT_M, stopping_speed, towards_neighbours, towards_obstacles
+from flockd.flight.safety.approach import stopping_speed, towards_neighbours, towards_obstacles
 from flockd.flight.safety.gate import _units
 from flockd.flight.safety.half_planes import nearest_within
 
