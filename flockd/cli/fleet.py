@@ -17,11 +17,12 @@ from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
     from flockd.core.messages import MissionOrder
-    from flockd.fleet.operator_client import FleetOperator
+    from flockd.fleet.watcher import FleetWatcher
 
 ALL = "all"
 REPEAT_S = 1.0
 """Half of the time for which an operator's velocity holds."""
+FIND_S, AGAIN_S = 3.0, 0.1
 NO_ANSWER = "did not answer; this computer may not command it, or it is one of the simulator's own pilots"
 PLAIN = {
     "hold": "Make the drones' autopilots hold position: the drones stop, and flockd hands over.",
@@ -146,18 +147,18 @@ def _velocity(args: argparse.Namespace) -> int:
 
 def _ask(args: argparse.Namespace, command: str, order: MissionOrder | None, repeat_s: float = 0.0) -> int:
     """Asks all, again and again for ``repeat_s``; says what each answered, later only what has changed."""
-    from flockd.fleet.operator_client import FleetOperator
+    from flockd.fleet.watcher import FleetWatcher
 
     listen, connect = endpoints(args)
-    with FleetOperator(args.fleet, listen=listen, connect=connect, settings=args.zenoh_config) as operator:
-        drones = _drones(operator, args.drones, ", ".join([*listen, *connect]))
+    with FleetWatcher(args.fleet, listen=listen, connect=connect, settings=args.zenoh_config) as watcher:
+        drones = _drones(watcher, args.drones, ", ".join([*listen, *connect]))
         began_s = time.monotonic()
-        answers = _answers(operator, drones, command, order)
+        answers = _answers(watcher, drones, command, order)
         _show(answers, as_json=args.json)
         with suppress(KeyboardInterrupt):
             while time.monotonic() + REPEAT_S <= began_s + repeat_s:
                 time.sleep(REPEAT_S)
-                before, answers = answers, _answers(operator, drones, command, order)
+                before, answers = answers, _answers(watcher, drones, command, order)
                 _show(
                     {drone: answer for drone, answer in answers.items() if answer != before[drone]}, as_json=args.json
                 )
@@ -165,24 +166,30 @@ def _ask(args: argparse.Namespace, command: str, order: MissionOrder | None, rep
     return ExitCode.CHECK_FAILED if refused else ExitCode.DONE
 
 
-def _drones(operator: FleetOperator, wanted: str, places: str) -> tuple[str, ...]:
-    names = None if wanted == ALL else wanted.split(",")
-    found = operator.drones(names)
-    missing = [name for name in names or () if name not in {key.split("/")[1] for key in found}]
-    if missing or not found:
+def _drones(watcher: FleetWatcher, wanted: str, places: str) -> tuple[str, ...]:
+    """The keys `fleet/drone` of drones that are alive: as soon as all named ones are found; of all, after a while."""
+    names = [] if wanted == ALL else wanted.split(",")
+    until_s = time.monotonic() + FIND_S
+    while True:
+        alive = [one for one in watcher.drones() if one.alive and (wanted == ALL or one.drone in names)]
+        missing = [name for name in names if name not in {one.drone for one in alive}]
+        if time.monotonic() >= until_s or (names and not missing):
+            break
+        time.sleep(AGAIN_S)
+    if missing or not alive:
         who = f"{' and '.join(missing)} {'was' if len(missing) == 1 else 'were'} not" if missing else "no drone was"
         raise UnavailableError(f"{who} found at {places}; no request was sent; check `flockd status`")
-    return found
+    return tuple(sorted(f"{one.fleet}/{one.drone}" for one in alive))
 
 
 def _answers(
-    operator: FleetOperator, drones: tuple[str, ...], command: str, order: MissionOrder | None
+    watcher: FleetWatcher, drones: tuple[str, ...], command: str, order: MissionOrder | None
 ) -> dict[str, dict[str, object]]:
     from flockd.onboard.telemetry.order_messages import order_message
 
     answers: dict[str, dict[str, object]] = {}
     for drone in drones:
-        answer = operator.ask(drone, command, None if order is None else order_message(order))
+        answer = watcher.queries.ask(drone, command, None if order is None else order_message(order))
         answers[drone] = {"accepted": False, "sentence": NO_ANSWER} if answer is None else {**answer}
     return answers
 

@@ -21,7 +21,7 @@ class _Silence:
     def __exit__(self, *_: object) -> None:
         pass
 
-    def drones(self, wanted: object) -> tuple[str, ...]:
+    def drones(self) -> tuple[str, ...]:
         return ()
 
 
@@ -32,7 +32,8 @@ class _Silence:
 def test_a_drone_that_is_not_heard_gets_no_request(
     drones: str, told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("flockd.fleet.operator_client.FleetOperator", _Silence)
+    monkeypatch.setattr("flockd.fleet.watcher.FleetWatcher", _Silence)
+    monkeypatch.setattr("flockd.cli.fleet.FIND_S", 0.0)
     assert main(["fleet", "hold", drones, "--connect", "tcp/127.0.0.1:1"]) == 69
     sentence = f"{told} found at tcp/127.0.0.1:1; no request was sent; check `flockd status`\n"
     assert capsys.readouterr().err == sentence
