@@ -12,8 +12,8 @@ from tests.faults.catalogue import CATALOGUE
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "safety.md").read_text(encoding="utf-8")
-FAULTS = 47
-"""Rows of the list of faults that flockd has to survive."""
+FAULTS = (*range(1, 48), 60)
+"""Rows of the list of faults that flockd has to survive; others of the list are not asked for yet."""
 OPEN = "not shown yet"
 
 
@@ -41,8 +41,8 @@ def test_each_row_is_shown_by_tests_that_exist(row: list[str]) -> None:
 
 
 def test_every_fault_of_the_list_is_named_once() -> None:
-    assert [row[0] for row in rows("Faults")] == [str(number) for number in range(1, FAULTS + 1)]
-    assert {fault.row for fault in CATALOGUE} <= set(range(1, FAULTS + 1))
+    assert [row[0] for row in rows("Faults")] == [str(number) for number in FAULTS]
+    assert {fault.row for fault in CATALOGUE} <= set(FAULTS)
 
 
 def test_requirements_are_numbered_and_only_they_are_open_that_say_so() -> None:

@@ -97,10 +97,13 @@ CATALOGUE = (
         within_s=2.0,
     ),
     Fault(
-        6, "network-not-finite", "a network's output is not finite", "its step is discarded and counted; degraded",
+        6, "network-not-finite", "a network's output is not finite",
+        "the camera or the proposal is left out of the step, and counted; degraded",
         (
             "tests/onboard/daemon/test_flight.py::test_networks_not_finite_or_stuck_degrade_and_sigterm_ends_in_hold",
             "tests/flight/pilot/test_flock_pilot.py::test_an_output_that_is_not_finite_costs_its_frame_only",
+            "tests/flight/pilot/test_flock_pilot.py::test_a_flow_that_is_not_finite_costs_its_camera_only",
+            "tests/flight/pilot/test_flock_pilot.py::test_a_range_that_is_not_finite_costs_its_proposal_only",
             f"{_HERE}computer.py::test_a_networks_output_is_not_finite",
         ),
         within_s=2.0,
@@ -431,6 +434,14 @@ CATALOGUE = (
             "tests/flight/pilot/ground/test_contradiction.py",
         ),
         within_s=3.0,
+    ),
+    Fault(
+        60, "step-exception", "an exception that nobody expected in the pilot's step",
+        "caught at the step's border; one step lost with its reason; three in a row: Hold",
+        (
+            f"{_HERE}computer.py::test_a_step_ends_in_an_error_that_nobody_expects",
+        ),
+        within_s=5.0,
     ),
 )
 # fmt: on

@@ -15,13 +15,13 @@ from tests.faults.catalogue import CATALOGUE, REACTION, Fault, fault_named, reac
 from tools.checks.faults import outcome
 
 ROOT = Path(__file__).parents[2]
-ROWS = 47
+ROWS = (*range(1, 48), 60)
 FAULT = fault_named("sigterm")
 
 
 def test_every_row_has_one_name_and_a_story() -> None:
-    assert [fault.row for fault in CATALOGUE] == list(range(1, ROWS + 1))
-    assert len({fault.name for fault in CATALOGUE}) == ROWS
+    assert [fault.row for fault in CATALOGUE] == list(ROWS)
+    assert len({fault.name for fault in CATALOGUE}) == len(ROWS)
     assert all(fault.stories for fault in CATALOGUE)
 
 

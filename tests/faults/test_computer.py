@@ -61,8 +61,39 @@ def test_a_networks_output_is_not_finite(
                 await ship.until_event("degraded: a network's output is not finite or not plausible")
                 reacted(record_property, "network-not-finite", clock() - fault_s)
                 assert autopilot.mode == "OFFBOARD"
-                await until(lambda: ship.heard()["computer"].message["steps_failed"] == 2, SECONDS_TO_FAIL)
                 await ship.until_state("normal")
+                assert ship.heard()["computer"].message["steps_failed"] == 0, "one camera's flow was left out"
+
+    run(story)
+
+
+def test_a_step_ends_in_an_error_that_nobody_expects(
+    tmp_path: Path, in_the_air: tuple[FakeAutopilot, int], record_property: RecordProperty
+) -> None:
+    """One such step is lost, and the flight goes on; three in a row end in Hold."""
+    autopilot, port = in_the_air
+
+    async def story() -> None:
+        with autopilot:
+            async with aboard(autopilot, port, tmp_path, change=_alone) as ship:
+                await _flies(ship)
+                await ship.until_state("normal")
+                ship.perceiver.unexpected = 1
+                await ship.until_event("a step failed: KeyError: 'for the test'")
+                await until(lambda: ship.heard()["computer"].message["steps_failed"] == 1, SECONDS_TO_FAIL)
+                await ship.until_state("normal")
+                assert autopilot.mode == "OFFBOARD"
+
+                ship.perceiver.unexpected = 3
+                fault_s = clock()
+                await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+                reacted(record_property, "step-exception", clock() - fault_s)
+                assert not autopilot.failsafe
+                with pytest.raises(
+                    DaemonError,
+                    match=r"StepsFailedError.*3 steps in a row failed",
+                ):
+                    await ship.ending
 
     run(story)
 

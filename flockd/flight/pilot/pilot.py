@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -42,7 +42,9 @@ from flockd.flight.pilot.trim import VelocityTrim
 from flockd.flight.tracking import Blind, Measurement, Prediction, Tracker
 
 _ROTATION_TOLERANCE = 1e-3
-"""Of an attitude's R R^T from the identity: MAVLink sends quaternions in single precision, which are 1e-6 off."""
+"""Of an attitude's R R^T from the identity: what is farther off is no attitude, and not only rounded."""
+_ROUNDING = 1e-6
+"""The same: what is farther off is replaced by the nearest rotation, as measurements and transforms ask for one."""
 _BY_VELOCITY_SIGMA_M = 0.1
 """Of where the drone went in a step, each axis, by its velocity alone."""
 
@@ -135,6 +137,7 @@ class FlockPilot:
         refusal = _why_refused(frames, vehicle)
         if refusal is not None:
             return self._refused(frames, refusal)
+        vehicle = _with_rotation(vehicle)
         laps = _Laps(self._stopwatch)
         trace = trace or StepTrace()
         predictions = self._predictions(frames.time_s)
@@ -150,7 +153,8 @@ class FlockPilot:
         laps.end("neighbour_motion")
         self._trim.update(vehicle, ego)
         velocity = self._own_velocity(observation, ego)
-        tracks = self._track(observation, ego, motions, velocity)
+        detections, measurements, why_no_measurement = self._measurements(observation, motions)
+        tracks = self._track(observation, ego, measurements, velocity)
         neighbours = self._tracker.neighbours()
         laps.end("tracking")
         obstacles = self._local_map(observation, ego, ground, velocity)
@@ -159,12 +163,12 @@ class FlockPilot:
         laps.end("flocking")
         self._last_time_s = observation.time_s
         of_height = () if why_no_ground is None else (why_no_ground,)
-        reasons = (*of_height, *observation.reasons, *why_no_ego, *why_no_motion)
+        reasons = (*of_height, *observation.reasons, *why_no_ego, *why_no_motion, *why_no_measurement)
         return PilotOutput(
             time_s=observation.time_s,
             ego_motion=ego,
             velocity=velocity,
-            detections=observation.detections,
+            detections=detections,
             detection_tracks=tracks,
             neighbour_motions=motions,
             neighbours=neighbours,
@@ -252,20 +256,32 @@ class FlockPilot:
             self._velocity = _displacement(observation, ego) / ego.interval_s  # Eq. 21
         return observation.vehicle.velocity_ned if self._config.own_velocity == "autopilot" else self._velocity
 
+    def _measurements(
+        self, observation: Observation, motions: Mapping[int, NeighbourMotion]
+    ) -> tuple[tuple[Detection, ...], list[Measurement], list[Reason]]:
+        """The detections that the tracker takes, what it takes, and why it takes others not."""
+        caution = self._config.geometry.neighbour_velocity_caution
+        taken, measurements, reasons = [], [], []
+        for detection in observation.detections:
+            try:
+                measurements.append(_measurement(observation, detection, motions.get(detection.label), caution))
+                taken.append(detection)
+            except ValueError as error:
+                reasons.append(Reason(ReasonKind.NEIGHBOUR, f"neighbour: {error}"))
+        return tuple(taken), measurements, reasons
+
     def _track(
         self,
         observation: Observation,
         ego: EgoMotion | None,
-        motions: Mapping[int, NeighbourMotion],
+        measurements: Sequence[Measurement],
         velocity: FloatArray | None,
     ) -> tuple[int, ...]:
-        """The track of each detection."""
+        """The track of each measurement."""
         if observation.previous is not None:
             displacement = None if ego is None else _displacement(observation, ego)
             sigma_m = self._config.geometry.own_displacement_sigma_m
             self._tracker.predict(observation.interval_s, displacement, sigma_m)
-        caution = self._config.geometry.neighbour_velocity_caution
-        measurements = [_measurement(observation, d, motions.get(d.label), caution) for d in observation.detections]
         return self._tracker.update(observation.time_s, measurements, velocity, self._blind(observation))
 
     def _local_map(
@@ -361,8 +377,21 @@ def _why_refused(frames: FrameSet, vehicle: VehicleState) -> Reason | None:
     return None
 
 
-def _is_rotation(R: FloatArray) -> bool:
-    return np.allclose(R @ R.T, np.eye(3), atol=_ROTATION_TOLERANCE)  # false for NaN too
+def _is_rotation(matrix: FloatArray) -> bool:
+    return bool(_off_rotation(matrix) <= _ROTATION_TOLERANCE and np.linalg.det(matrix) > 0.0)  # false for NaN too
+
+
+def _off_rotation(matrix: FloatArray) -> float:
+    """How far a (3, 3) matrix times its transpose is from the identity."""
+    return float(np.abs(matrix @ matrix.T - np.eye(3)).max())
+
+
+def _with_rotation(vehicle: VehicleState) -> VehicleState:
+    """With a rotation for its attitude: the nearest one where it was rounded more than a step can take."""
+    if _off_rotation(vehicle.R_ned_body) <= _ROUNDING:
+        return vehicle
+    u, _, vt = np.linalg.svd(vehicle.R_ned_body)
+    return replace(vehicle, R_ned_body=u @ vt)
 
 
 def _displacement(observation: Observation, ego: EgoMotion) -> FloatArray:

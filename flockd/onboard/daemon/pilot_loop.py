@@ -15,7 +15,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.messages import FrameSet, MissionOrder, PilotOutput, Reason, ReasonKind, VehicleState
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
-from flockd.onboard.daemon.worker import Worker
+from flockd.onboard.daemon.worker import BusyError, LateError, Worker
 from flockd.onboard.sources import FrameSource
 
 FRAME_WAIT_S = 0.1
@@ -25,6 +25,8 @@ STEP_DEADLINE_S = 30.0
 """Of a whole step, whose networks have deadlines of their own; the drone has been handed over long before."""
 LEAVE_S = 0.7
 STEPS_REMEMBERED = 20
+MAX_UNEXPECTED = 3
+"""Steps in a row that end in an error that nobody expects; then the loop ends, and the drone holds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +39,10 @@ class StepResult:
     """The number of the flight whose pilot computed it."""
     number: int
     """Of the step, from 1 for the first of its pilot."""
+
+
+class StepsFailedError(Exception):
+    """Too many steps in a row ended in an error that nobody expects."""
 
 
 OnStep = Callable[[FrameSet, VehicleState, PilotOutput, MissionOrder | None], None]
@@ -63,6 +69,8 @@ class PilotLoop:
         self._pilot: FlockPilot | None = None
         self._flight = 0
         self._failure: str | None = None
+        self._unexpected = 0
+        """Errors in a row that nobody expects."""
         self._height_reports = HeightReports()
         self._took_s: deque[float] = deque(maxlen=STEPS_REMEMBERED)
         self.frames: FrameSet | None = None
@@ -72,7 +80,7 @@ class PilotLoop:
         """The frames of the newest result, and its output."""
         self.steps = 0
         self.failed = 0
-        """Steps without a result, because a network failed or was late."""
+        """Steps without a result, because a network was late or an error came that nobody expects."""
         self.ego_motion_failures = 0
         """In a row."""
         self.noisy_images: Counter[str] = Counter()
@@ -91,7 +99,11 @@ class PilotLoop:
         return float(np.percentile(self._took_s, 95)) / self._config.step_s if self._took_s else 0.0
 
     async def run(self) -> None:
-        """Steps until cancelled. Raises LateError when decoding or a step hangs."""
+        """Steps until cancelled.
+
+        Raises LateError when decoding or a step hangs, and StepsFailedError when some steps in a row had no result for
+        an error that nobody expects; one such step is counted, and the next comes as if it had not been.
+        """
         due_s, frame_period_s = self._clock(), _frame_period_s(self._config)
         while True:
             frames = await self._decoding.do(FRAME_DEADLINE_S, self._source.newest, FRAME_WAIT_S)
@@ -120,8 +132,13 @@ class PilotLoop:
             if pilot is None:
                 pilot = await self._geometry.do(STEP_DEADLINE_S, self._new_pilot)
             output = await self._geometry.do(STEP_DEADLINE_S, pilot.step, frames, vehicle, None, order)
-        except (FloatingPointError, NetworkStuckError) as error:
+        except (LateError, BusyError):
+            raise
+        except NetworkStuckError as error:
             self._note_failure(str(error))
+            return
+        except Exception as error:  # noqa: BLE001 - the step's border: one is lost, and the loop goes on
+            self._note_unexpected(error)
             return
         finally:
             self._took_s.append(self._clock() - taken_s)
@@ -129,7 +146,7 @@ class PilotLoop:
             return  # a flight began meanwhile; this result is the old pilot's
         if self.order is order:
             self.order = None  # a step that fails is not recorded, so that the next takes the order again
-        self._failure = None
+        self._failure, self._unexpected = None, 0
         number = 1 if self._pilot is None or self.newest is None else self.newest.number + 1
         self._pilot = pilot
         self.newest = StepResult(taken_s, output, flight, number)
@@ -149,6 +166,14 @@ class PilotLoop:
         if why != self._failure:
             self._log_event(f"a step failed: {why}")
         self._failure = why
+
+    def _note_unexpected(self, error: Exception) -> None:
+        """Counts a step that an unexpected error ended. Raises StepsFailedError for the last of some in a row."""
+        why = f"{type(error).__name__}: {error}"
+        self._note_failure(why)
+        self._unexpected += 1
+        if self._unexpected >= MAX_UNEXPECTED:
+            raise StepsFailedError(f"{self._unexpected} steps in a row failed; the last with {why}") from error
 
     def _count(self, result: StepResult) -> None:
         if result.number > 1:  # the first has nothing to compare with

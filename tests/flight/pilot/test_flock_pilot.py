@@ -11,9 +11,19 @@ import numpy as np
 import pytest
 
 from flockd.core.config.mission import MissionParameters
-from flockd.core.messages import Float32Array, FloatArray, Frame, FrameSet, Reason, ReasonKind, UInt8Array
+from flockd.core.messages import (
+    Detection,
+    Float32Array,
+    FloatArray,
+    Frame,
+    FrameSet,
+    Reason,
+    ReasonKind,
+    UInt8Array,
+    VehicleState,
+)
 from flockd.flight.geometry import RigCamera, rotation_angle_deg
-from flockd.flight.perception import Crop, RangeEstimate, SceneMaps
+from flockd.flight.perception import Crop, Observation, RangeEstimate, SceneMaps
 from flockd.flight.pilot import FlockPilot
 from tests.flight.pilot.flyer import STEP_S, Flyer, scenario_with
 
@@ -230,6 +240,7 @@ def test_before_any_good_attitude_no_heading_is_asked_for() -> None:
         ({"time_s": math.nan}, "a time is not finite"),
         ({"R_ned_body": np.full((3, 3), math.nan)}, "the attitude is not a rotation"),
         ({"R_ned_body": 2.0 * np.eye(3)}, "the attitude is not a rotation"),
+        ({"R_ned_body": np.diag([1.0, 1.0, -1.0])}, "the attitude is not a rotation"),
         ({"height_m": -math.inf}, "the height is not finite"),
         ({"velocity_ned": np.array([0.0, math.nan, 0.0])}, "the autopilot's velocity is not finite"),
     ],
@@ -252,6 +263,39 @@ def test_input_that_cannot_be_is_refused_and_the_next_step_is_as_if_it_had_not_c
     assert after.reasons == ()
     assert after.ego_motion is not None
     assert after.ego_motion.interval_s == pytest.approx(STEP_S)
+
+
+@pytest.mark.parametrize("off", [1e-7, 3e-5, 4e-4])
+def test_an_attitude_that_is_rounded_is_flown_with(off: float) -> None:
+    """A share by which its axes are too long; 5e-4 is refused, as R R^T is then off by 1e-3."""
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -3.6)))
+    for _ in range(2):
+        flyer.move()
+        frames, state = flyer.take_frames()
+        output = flyer.pilot.step(frames, replace(state, R_ned_body=(1.0 + off) * state.R_ned_body))
+    assert output.reasons == ()
+    assert output.ego_motion is not None
+    (neighbour,) = output.neighbours
+    true = flyer.vehicles.position[1] - flyer.vehicles.position[0]
+    assert np.allclose(neighbour.position, true, atol=0.02)
+
+
+def test_a_detection_that_the_tracker_refuses_costs_that_neighbour_only() -> None:
+    """Of two neighbours, one's probability came out above 1."""
+    covariance = np.diag([1e-2, 1e-4, 1e-4])
+    sound = Detection(np.array([1.0, 0.0, 0.0]), math.log(3.0), covariance, 0.9, 0.4, ("front",), 1)
+    spoilt = replace(sound, bearing=np.array([0.0, 1.0, 0.0]), drone_probability=1.5, label=2)
+
+    class Observer:
+        def observe(self, frames: FrameSet, vehicle: VehicleState, *_: object) -> Observation:
+            return Observation(frames.time_s, vehicle, {}, (spoilt, sound), None)
+
+    networks: Any = object()  # never asked for anything
+    pilot = FlockPilot(scenario_with((0.0, 0.0, -4.0)).drone, networks, observer=Observer())
+    output = pilot.step(FrameSet(0.0, {}), VehicleState(0.0, np.eye(3), 4.0))
+    assert [reason.kind for reason in output.reasons] == [ReasonKind.NEIGHBOUR]
+    assert output.detections == (sound,)
+    assert output.detection_tracks == tuple(neighbour.track for neighbour in output.neighbours)
 
 
 def test_a_time_before_the_first_step_is_no_error() -> None:

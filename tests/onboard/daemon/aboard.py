@@ -60,6 +60,8 @@ class TinyPerceiver:
     def __init__(self) -> None:
         self.not_finite = 0
         """So many of the next flows are not finite."""
+        self.unexpected = 0
+        """So many of the next flows end in an error that nobody expects."""
         self.hangs = threading.Event()
         """Set: does not answer."""
         self.slow_s = 0.0
@@ -77,6 +79,9 @@ class TinyPerceiver:
             self.not_finite -= 1
             raise FloatingPointError("model tiny: output flow is not finite")
         time.sleep(self.slow_s)
+        if self.unexpected > 0:
+            self.unexpected -= 1
+            raise KeyError("for the test")
         while self.hangs.is_set():
             time.sleep(0.01)
         return np.zeros((*first.image.shape[:2], 2), np.float32)
