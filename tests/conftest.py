@@ -39,7 +39,7 @@ def _fail_unless_permitted(report: pytest.TestReport | pytest.CollectReport) -> 
 
 
 def _reason(report: pytest.TestReport | pytest.CollectReport) -> str:
-    """Of a skip; pytest keeps it as (file, line, "Skipped: reason")."""
+    """The reason of a skip; pytest keeps it as (file, line, "Skipped: reason")."""
     return report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
 
 

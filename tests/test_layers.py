@@ -36,7 +36,7 @@ IMPURE_MODULES = {
 NETWORK_LIBRARIES = {"onnxruntime"}
 """Only inference runs networks."""
 SIMULATOR_LIBRARIES = {"numba", "matplotlib", "jinja2", "markupsafe"}
-"""Of the extra `sim`: only the simulator, flights at control level, campaigns and reports may need them."""
+"""Libraries of the extra `sim`: only the simulator, campaigns and reports may need them."""
 TOOL_LIBRARIES = {"torch", "onnx", "trimesh", "embreex", "pytest"}
 """For training and tests: nothing in the package may need them."""
 

@@ -12,7 +12,7 @@ from flockd.sim.world import World
 
 generate_anew = World.generate
 KEPT = 3
-"""Of 80 MB each."""
+"""How many are kept, of 80 MB each."""
 
 
 @pytest.fixture(scope="session", autouse=True)

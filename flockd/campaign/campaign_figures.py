@@ -20,9 +20,9 @@ from flockd.core.config.campaign import Figure as FigureName
 from flockd.review.report.style import BAND, DRONE_COLOURS, INK, MUTED, STYLE
 
 BINS: Final = 8
-"""Of what each flight draws: flights with neighbouring values are taken together."""
+"""How many bins a drawn parameter's flights are put into: flights with neighbouring values are taken together."""
 MOST_PAIRS: Final = 6
-"""Of parameters that get heat maps."""
+"""The most pairs of parameters that get heat maps."""
 _DECADES: Final = 30.0
 """A parameter whose largest value is so many times its smallest gets a logarithmic axis."""
 _COLUMNS: Final = 3
@@ -183,7 +183,7 @@ def _band(axes: Axes, points: Points, colour: str, label: str | None, *, is_shar
 
 
 def _spread_out(axes: Axes, values: Sequence[Any]) -> None:
-    """Of numbers over decades the logarithm is drawn, with a tick at every value that has room."""
+    """Sets a logarithmic axis for numbers over decades, with a tick at every value that has room."""
     if not all(isinstance(value, int | float) and not isinstance(value, bool) and value > 0 for value in values):
         return
     if max(values) < _DECADES * min(values):

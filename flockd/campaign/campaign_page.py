@@ -27,14 +27,14 @@ from flockd.review.report.figure_files import inline_svg
 from flockd.review.report.templates import page_template
 
 MOST_ROWS = 200
-"""Of a table; the Parquet files have all."""
+"""The most rows of a table; the Parquet files have all."""
 NEAREST = 5
 """Flights with the smallest distances are named."""
 
 
 @dataclass(frozen=True)
 class TableCell:
-    """Of a table's row."""
+    """One cell of a table's row."""
 
     text: str = ""
     kind: str = ""

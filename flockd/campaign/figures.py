@@ -27,7 +27,7 @@ class Measure:
     of: Callable[[FlightLog, dict[str, Any]], Any]
     """From a flight's log and its summary."""
     is_share: bool = False
-    """Of one flight it is 0 or 1, so that its mean is a share of flights."""
+    """The figure is 0 or 1 for one flight, so that its mean is a share of flights."""
 
 
 def _in(*keys: str) -> Callable[[FlightLog, dict[str, Any]], Any]:

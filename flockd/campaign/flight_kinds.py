@@ -138,7 +138,7 @@ def _failed(run: Run, error: Exception, began: str, wall_s: float) -> FlownRun:
 
 
 def _sha256(scenario: ScenarioConfig) -> str:
-    """Of all values of a scenario, those that no file gives too."""
+    """The hash of all values of a scenario, those that no file gives too."""
     return hashlib.sha256(scenario.model_dump_json().encode()).hexdigest()
 
 

@@ -62,7 +62,7 @@ class ControlLevel:
     """What only flights at control level have."""
 
     errors: PerceivedErrors | None = None
-    """Of perception; None: exact states."""
+    """Perception's errors; None: exact states."""
     gated: bool = False
     """Whether safety gates limit how fast drones fly towards neighbours and obstacles."""
 
@@ -75,11 +75,11 @@ class Plan:
     base: Mapping[str, Any]
     """The scenario's own values, its drone's within."""
     errors: PerceivedErrors | None = None
-    """Of perception, at control level."""
+    """Perception's errors, at control level."""
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Of a campaign's file.
+        """The plan that a campaign's file describes.
 
         Raises ConfigError with everything wrong with it, its scenario and each cell, and ModelError for networks that
         are not there.
@@ -104,7 +104,7 @@ class Plan:
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Of `to_json`. Raises ValueError."""
+        """The plan that `to_json` wrote. Raises ValueError."""
         values = _with_tuples(json.loads(text))
         errors = values["errors"] and PerceivedErrors.model_validate(values["errors"])
         return cls(CampaignConfig.model_validate(values["campaign"]), values["scenario"], errors)
@@ -121,7 +121,7 @@ class Plan:
 
     @property
     def sha256(self) -> str:
-        """Of `to_json`."""
+        """The hash of what `to_json` writes."""
         return hashlib.sha256(self.to_json().encode()).hexdigest()
 
     @cached_property
@@ -150,7 +150,7 @@ class Plan:
         return len(self.cells) * self.config.seeds
 
     def parameters(self, cell: Cell, number: int) -> Values:
-        """Of one flight: its cell's, and what it drew."""
+        """The values that one flight flies with: its cell's, and what it drew."""
         seed = self.config.seed + number
         return {**cell.parameters, **{key: _draw(variation, key, seed) for key, variation in self.drawn.items()}}
 
@@ -170,7 +170,7 @@ class Plan:
 
 
 def values_of(variation: Variation) -> tuple[Any, ...]:
-    """Of a key of the grid."""
+    """The values that one key of the grid takes."""
     if variation.values is not None:
         return variation.values
     low, high, steps = variation.low, variation.high, variation.steps

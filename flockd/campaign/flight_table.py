@@ -76,7 +76,7 @@ class FlightTable:
         return whole.select(self._of_timings)
 
     def joined(self, flights: pa.Table, timings: pa.Table) -> pa.Table:
-        """Of both files, whose rows are in the same order, the whole table."""
+        """The whole table from both files, whose rows are in the same order."""
         return pa.table({**_columns(timings), **_columns(flights)}).select(self.schema.names).cast(self.schema)
 
     def _row(self, flown: FlownRun) -> dict[str, Any]:

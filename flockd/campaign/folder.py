@@ -94,7 +94,7 @@ class CampaignFolder:
             yield Run(row["cell"], row["number"]), row[figure] if figure else None
 
     def _whole(self) -> pa.Table:
-        """Of both files together. Between writing one and the other, the rows of the shorter one."""
+        """Both files joined. Between writing one and the other: the rows of the shorter one."""
         flights, timings = self.path / FLIGHTS_NAME, self.path / TIMINGS_NAME
         if not flights.is_file():
             return self._table.schema.empty_table()

@@ -19,7 +19,7 @@ class Interval(NamedTuple):
 
     @property
     def half_width(self) -> float:
-        """Of the wider side."""
+        """Half the width of the wider side."""
         return max(self.high - self.mean, self.mean - self.low)
 
 

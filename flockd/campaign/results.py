@@ -22,12 +22,12 @@ from flockd.core.errors import UsageError
 
 Row = Mapping[str, Any]
 Seeds = dict[int, float]
-"""Of one or several cells, by number of the seed."""
+"""A figure's value for each seed number, from one or several cells."""
 
 
 @dataclass(frozen=True)
 class Results:
-    """Of a campaign that is over or not."""
+    """The results of a campaign, finished or not."""
 
     path: Path
     plan: Plan
@@ -38,7 +38,7 @@ class Results:
 
     @classmethod
     def load(cls, path: Path) -> Results:
-        """Of a campaign's folder. Raises UsageError where nothing is in it."""
+        """The results in a campaign's folder. Raises UsageError where nothing is in it."""
         plan = load_plan(path)
         if not (path / FLIGHTS_NAME).is_file():
             raise UsageError(f"{path}: no flight is finished; run `flockd campaign` first")
@@ -65,7 +65,7 @@ class Results:
         return (*grid, *self.plan.drawn)
 
     def values_of(self, parameter: str) -> tuple[Any, ...]:
-        """Of a parameter of the grid, in its order."""
+        """The values of a parameter of the grid, in its order."""
         return tuple(dict.fromkeys(_hashable(cell.parameters[parameter]) for cell in self.plan.cells))
 
     def cells_with(self, wanted: Mapping[str, Any]) -> tuple[int, ...]:
@@ -77,7 +77,7 @@ class Results:
         )
 
     def by_seed(self, figure: Figure, cells: Iterable[int]) -> Seeds:
-        """Of each seed that all these cells flew, the mean of the figure over the cells; of failed flights nothing."""
+        """For each seed that all these cells flew, the figure's mean over the cells; failed flights are left out."""
         wanted = tuple(cells)
         found: defaultdict[int, list[float]] = defaultdict(list)
         for row in (row for cell in wanted for row in self._by_cell.get(cell, ())):

@@ -18,9 +18,9 @@ class Schedule:
         self._seeds, self._stop = plan.config.seeds, plan.config.stop
         self._batch = self._seeds if self._stop is None else self._stop.batch
         self._values: dict[int, dict[int, float | None]] = {cell.number: {} for cell in plan.cells}
-        """Of each cell, by number of the seed, what the stop rule is about."""
+        """What the stop rule is about, for each cell by number of the seed."""
         self._until = dict.fromkeys(self._values, min(self._batch, self._seeds))
-        """Of each cell, so many seeds are to be flown."""
+        """How many seeds of each cell are to be flown."""
         self._open = set(self._values)
         """Cells that may need more."""
         self._waiting: deque[tuple[int, int, int]] = deque()

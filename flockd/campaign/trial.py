@@ -11,21 +11,21 @@ from flockd.campaign.flight_kinds import FLIGHT_KINDS
 from flockd.campaign.flight_plan import Plan, Run
 
 SHORT_STEPS = 3
-"""Of the first trial flight of a cell. The second one is longer: the difference is what its steps take, the rest what a
-flight takes before its first."""
+"""Steps of a cell's first trial flight. The second one is longer: the difference is what its steps take, the rest what
+a flight takes before its first."""
 LONG_S = 0.5
 """The second flight is twice as long until it takes so much more time than the first, or is a whole flight."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Of a campaign."""
+    """What a campaign will take."""
 
     cells: int
     flights: int
     """At most."""
     core_hours: float
-    """Of one processor core, at most."""
+    """Hours of one processor core, at most."""
     flight_s: float
     """Mean processor time of a flight."""
 

@@ -20,10 +20,10 @@ from flockd.core.errors import UsageError
 from flockd.core.messages import FloatArray
 
 LEVEL = 0.05
-"""Of all figures together: so often one at most is called different where none is."""
+"""Significance level for all figures together: at most this often, one is called different where none is."""
 _DRAWS = 9_999
 _NUMBERS_AT_ONCE = 500_000
-"""Of all permutations, so that they need little memory."""
+"""How many permutations are drawn at once, so that they need little memory."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Verdict:
 
     @property
     def says(self) -> Literal["better", "worse", "no difference shown"]:
-        """Of the second campaign."""
+        """The verdict on the second campaign."""
         if self.p > LEVEL:
             return "no difference shown"
         return "better" if (self.difference.mean > 0) == (MEASURES[self.figure].better == "higher") else "worse"
@@ -51,7 +51,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Of two campaigns."""
+    """Two campaigns compared."""
 
     first: Results
     second: Results
@@ -121,7 +121,7 @@ def unpaired_p(first: FloatArray, second: FloatArray) -> float:
 def _p(
     samples: tuple[FloatArray, ...], kind: Literal["samples", "independent"], statistic: Callable[..., FloatArray]
 ) -> float:
-    """Of all permutations, or of `_DRAWS` of them where there are more."""
+    """The p value of all permutations, or of `_DRAWS` of them where there are more."""
     from scipy.stats import permutation_test  # noqa: PLC0415 - heavy
 
     at_once = max(_NUMBERS_AT_ONCE // sum(map(len, samples)), 1)

@@ -124,7 +124,7 @@ def _print_board(args: argparse.Namespace, board: BoardSpec) -> int:
 
 
 def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, ImageStream]:
-    """Of the one camera that is meant, and its name."""
+    """The images of the one camera that is meant, and its name."""
     from flockd.ground.calibration import image_sources
     from flockd.ground.datasets.video import SUFFIXES
 

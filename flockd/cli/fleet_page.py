@@ -20,7 +20,7 @@ PORT = 8470
 
 
 def add_options(parser: Parser) -> None:
-    """Of the page, and where its data come from."""
+    """Adds the page's options, and those that say where its data come from."""
     add_server_options(parser, PORT)
     parser.add_argument("--watch-only", action="store_true", help="the page passes no command on")
     parser.set_defaults(run=_run)

@@ -75,14 +75,14 @@ def announce(args: argparse.Namespace, sentence: str, warning: str) -> None:
 
 
 def port_number(text: str) -> int:
-    """Of an option."""
+    """The port number that an option names."""
     if not (text.isascii() and text.isdecimal() and int(text) < 1 << 16):
         raise argparse.ArgumentTypeError(f"{text!r} is not a port, a whole number from 0 to 65535")
     return int(text)
 
 
 def ip_address(text: str) -> str:
-    """Of an option, at which something is served."""
+    """The IP address that an option names, at which something is served."""
     try:
         return str(ipaddress.ip_address(text))
     except ValueError as error:

@@ -66,7 +66,7 @@ def _key_figures(summary: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _mission(mission: Mapping[str, Any]) -> str:
-    """Of a mission with a goal: whether the flock's middle arrived."""
+    """Whether the flock's middle arrived, for a mission with a goal."""
     if mission["arrived"] is None:
         return ""
     when = f"first there after {mission['time_s']:g} s" if mission["time_s"] is not None else "never there"
@@ -74,7 +74,7 @@ def _mission(mission: Mapping[str, Any]) -> str:
 
 
 def _obstacles(obstacles: Mapping[str, Any]) -> str:
-    """Of a flight among obstacles: how often and how nearly drones hit them."""
+    """How often and how nearly drones hit obstacles."""
     if obstacles["collisions"] is None:
         return ""
     return f"{obstacles['collisions']} collisions, {obstacles['min_clearance_m']:.2f} m at the nearest"

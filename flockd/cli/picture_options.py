@@ -66,7 +66,8 @@ class PictureCameras:
         self._mine = None if self.config is None else self._of_rig(args)
 
     def of(self, name: str, size: tuple[int, int]) -> Camera:
-        """Of a picture of this width and height. Raises UsageError where it is not of --config's camera."""
+        """The camera for a picture of this width and height. Raises UsageError where --config's camera has another
+        size."""
         if self._mine is not None:
             if self._mine.size != size:
                 wanted = " x ".join(map(str, self._mine.size))

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from flockd.review.flight_log.log import FlightLog
 
 SUFFIX = ".report"
-"""Of the folder beside a recording that its report goes to."""
+"""Ending of the folder beside a recording that its report goes to."""
 
 
 def add(commands: Commands) -> None:

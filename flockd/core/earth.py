@@ -9,7 +9,7 @@ SQUARED_ECCENTRICITY = 6.694379990e-3
 
 
 def metres_a_degree(latitude_deg: float) -> tuple[float, float]:
-    """Of latitude and of longitude."""
+    """Metres in a degree of latitude and of longitude."""
     latitude = math.radians(latitude_deg)
     flattened = 1.0 - SQUARED_ECCENTRICITY * math.sin(latitude) ** 2
     north = math.radians(EQUATOR_M * (1.0 - SQUARED_ECCENTRICITY) / flattened**1.5)

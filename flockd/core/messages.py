@@ -24,7 +24,7 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Shape:
-    """Of an array in a message, in its annotation: recordings are checked against it."""
+    """Shape of an array in a message, in its annotation: recordings are checked against it."""
 
     sizes: tuple[int, ...]
 
@@ -105,7 +105,7 @@ class RangeReading:
     max_m: float | None = None
     """Farther than this, likewise."""
     quality: float | None = None
-    """Of the signal, 0 (none) to 1; None: the sensor does not say."""
+    """Quality of the signal, 0 (none) to 1; None: the sensor does not say."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +132,7 @@ class GroundEstimate:
     """The ground below the drone, as a plane: what fixed the metric scale of depth."""
 
     height_m: float
-    """Of the body's origin above the ground straight below."""
+    """Height of the body's origin above the ground straight below."""
     slope: Vector2
     """(2,) rise of the ground for each metre to the north and to the east."""
     source: str
@@ -227,7 +227,7 @@ class Detection:
     """(3, 3) in body axes, of what `flockd.flight.geometry.log_polar_residual` measures: along the bearing the
     variance of the log range, across it that of the angle, rad^2."""
     drone_probability: float
-    """Of being a drone at all."""
+    """Probability that it is a drone at all."""
     size_m: float
     """About the drone's own size, constant over time: its range times its angular size."""
     cameras: tuple[str, ...]
@@ -291,7 +291,7 @@ class Neighbour:
     hits: int
     confirmed: bool
     existence_probability: float = 1.0
-    """Of being a drone that is still there; 1 in recordings from before it was estimated."""
+    """Probability that it is a drone and still there; 1 in recordings from before it was estimated."""
 
 
 @dataclass(frozen=True, eq=False)

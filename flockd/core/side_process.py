@@ -69,7 +69,7 @@ class SideProcess:
 
     @property
     def pid(self) -> int:
-        """Of the process."""
+        """The process's number."""
         return self._process.pid
 
     def wait_until_ready(self) -> None:

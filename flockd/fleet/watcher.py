@@ -19,13 +19,13 @@ from flockd.onboard.telemetry.topics import PREFIX, TOPICS, checked_name, is_nam
 from flockd.onboard.telemetry.zenoh_session import SessionOwner, open_session
 
 MAX_BYTES = 1 << 20
-"""Of a message; one with every field at its longest has a hundredth of it."""
+"""The largest message; one with every field at its longest has a hundredth of it."""
 MAX_DRONES = 1000
-"""Of a bus on which somebody invents drones, so many are remembered."""
+"""The most drones that are remembered, on a bus on which somebody invents drones."""
 MAX_EVENTS = 500
 """So many of the newest are remembered."""
 _PERIOD_SHARE = 0.2
-"""Of the newest period in the mean."""
+"""Weight of the newest period in the mean."""
 _SLOWEST = 10.0
 """The smallest speed factor that a daemon's configuration allows is 0.1."""
 

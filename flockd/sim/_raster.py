@@ -1,7 +1,7 @@
 """The renderer's inner loops, compiled: set up triangles, fill a depth buffer, shade what is seen.
 
 No fastmath: a shared edge must give the same crossing from both of its triangles (no holes). Each runs on the thread
-that calls it and releases the GIL, so that several images are drawn side by side: compiled for parallel rows, they took
+that calls it and releases the GIL, so that several images are drawn side by side. Compiled for parallel rows, they took
 three times as long to compile, and half as much processor time again to run.
 """
 # Compiled loops are long: a call for each few lines would cost more than it explains.

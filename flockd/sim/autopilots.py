@@ -27,7 +27,7 @@ from flockd.sim.vehicles import Vehicles
 PX4_FOLDER = "FLOCKD_PX4"
 """The environment variable that names PX4's SITL build folder."""
 OFFBOARD_PORT, TRUTH_PORT = 14540, 19410
-"""Of PX4's instance 0."""
+"""Ports of PX4's instance 0."""
 MAX_INSTANCES = 10
 """PX4 sends all further ones to one port."""
 PARAMETERS = {
@@ -46,14 +46,14 @@ PARAMETERS = {
     "COM_OBL_RC_ACT": "5",
     "SDLOG_BACKEND": "0",
 }
-"""Of all instances."""
+"""Parameters of all instances."""
 BY_HAND = {
     "COM_RC_IN_MODE": "1",  # sticks come over MAVLink
     "MPC_VEL_MANUAL": f"{FULL_STICK_M_S:g}",
     "MAN_DEADZONE": "0",  # a person who leads slowly hardly moves a stick
     "MPC_HOLD_DZ": "0",  # the same before PX4 1.18
 }
-"""Of an instance that a person flies in Position mode, too."""
+"""Parameters of an instance that a person flies in Position mode, too."""
 
 
 @dataclass(frozen=True)

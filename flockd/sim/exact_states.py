@@ -66,7 +66,7 @@ class ExactFlock:
         self._avoidances = [Avoidance(drone.obstacles, drone.safety.gate, drone.step_s) for _ in self._pilots]
 
     def step(self, time_s: float, positions: FloatArray, velocities: FloatArray) -> Commands:
-        """Of drones at (n, 3) m and (n, 3) m/s in NED; called in order of time."""
+        """The commands for drones at (n, 3) m and (n, 3) m/s in NED; called in order of time."""
         seen = [true_ranges(self._obstacles, time_s, place) if self._obstacles.solids else None for place in positions]
         found = [self._of(i, time_s, positions, velocities, ranges) for i, ranges in enumerate(seen)]
         velocity, acceleration, yaw_rad, height_m, missions, desired = zip(*found, strict=True)

@@ -43,7 +43,7 @@ _NEUTRAL_THROTTLE = 500
 MAX_FORWARD_S = 0.2
 """A pose is extrapolated by no more than this."""
 FURTHER_MODES = {10 << 16: "TERMINATION"}
-"""Of PX4's modes by number, those that pymavlink has no name for."""
+"""Those of PX4's modes, by number, that pymavlink has no name for."""
 _RECEIVED = {
     name: int(getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
     for name in (
@@ -142,7 +142,7 @@ class GroundStation:
             self._command(vehicle, mavlink.MAV_CMD_REQUEST_MESSAGE, _RECEIVED["AUTOPILOT_VERSION"])
 
     def poses(self) -> Poses:
-        """Of all as of now, extrapolated from the last messages."""
+        """Poses of all as of now, extrapolated from the last messages."""
         now = self._clock()
         with self._lock:
             received = [vehicle.pose for vehicle in self._vehicles]
@@ -170,7 +170,7 @@ class GroundStation:
         return self._vehicles[number].text
 
     def version(self, number: int) -> str | None:
-        """Of its firmware, as in `1.18.0`; None while it is not known."""
+        """Version of its firmware, such as `1.18.0`; None while it is not known."""
         return self._vehicles[number].version
 
     def uptime_s(self, number: int) -> tuple[float, float] | None:

@@ -17,7 +17,7 @@ LEVEL_M, FULL_M = 6.0, 30.0
 BORDER_M = 40.0
 """Over which the hills fade to level ground at the border."""
 DRAWS = 60
-"""Of which the one with the highest hills is taken: about one in ten is as steep everywhere as it may be."""
+"""How many are drawn, of which the highest hills are taken: about one in ten is as steep everywhere as it may be."""
 
 
 def hills(rng: Generator, extent: float, hills_m: float, slope: float) -> FloatArray:

@@ -15,11 +15,11 @@ from flockd.sim.worlds.obstacle_worlds import LOWEST_CROWN_M
 from flockd.sim.worlds.obstacles import Box, Capsule, Frustum, Material, Obstacles
 
 _LOOKS = 3
-"""Of each material: the trees of one wood are of a few kinds, the houses of one village too."""
+"""Looks of each material: the trees of one wood are of a few kinds, the houses of one village too."""
 _HOUSE_M = 2.0
 """A box that is wider than this on both sides is a house, and has windows."""
 _SWELL = 1.04
-"""Of a crown's corners, so that its faces lie about as far out as the sphere that they stand for."""
+"""Factor on a crown's corners, so that its faces lie about as far out as the sphere that they stand for."""
 
 
 class _Look(NamedTuple):

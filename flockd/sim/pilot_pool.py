@@ -68,7 +68,7 @@ class PilotPool:
     def step(
         self, drone: int, frames: FrameSet, vehicle: VehicleState, truth: RenderTruth, *, pictured: bool
     ) -> Future[Stepped]:
-        """Of a drone's pilot, see `Pilots`; it is there once the drone's process has come to it."""
+        """Steps a drone's pilot, see `Pilots`; the result is there once the drone's process has come to it."""
         place = self.drones.index(drone) % len(self._shares)
         pilots: Callable[..., Stepped] = self._here or self._processes[place].ask
         order = (drone, frames, vehicle, truth if self._swap else None, pictured)

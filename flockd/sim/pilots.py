@@ -34,7 +34,7 @@ class Pilots:
     """Pilots that share their networks and nothing else."""
 
     def __init__(self, scenario: ScenarioConfig, drones: Sequence[int], swap: Swap | None) -> None:
-        """Of ``drones``, counted from 0. Raises ModelError."""
+        """Pilots of ``drones``, counted from 0. Raises ModelError."""
         learned = load_networks(scenario.drone.perception)
         self._truths = {} if swap is None else {i: swap(learned) for i in drones}
         self._pilots = {

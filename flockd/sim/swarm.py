@@ -33,7 +33,7 @@ from flockd.sim.pilots import Stepped
 from flockd.sim.vehicles import SimulatedAutopilot, Vehicles
 
 _KEY_FRAME_DRONES = 8
-"""Of more, only the first ones' are kept."""
+"""Key frames are kept of the first drones only, this many."""
 _LEAST_STEPS = 2
 """A flight interrupted before has nothing to report."""
 
@@ -146,7 +146,7 @@ class _ExactStatePilots:
     def step(
         self, step: int, time_s: float, vehicles: Vehicles, builder: FlightLogBuilder, *, pictured: bool
     ) -> Commands:
-        """Of all drones; there are no images."""
+        """Commands for all drones; there are no images."""
         positions, velocities = vehicles.position, vehicles.velocity
         commands = self._flock.step(time_s, positions, velocities)
         for i in (i for i, by_hand in enumerate(self._by_hand) if not by_hand):
@@ -194,7 +194,7 @@ class _VisionPilots:
     def step(
         self, step: int, time_s: float, vehicles: Vehicles, builder: FlightLogBuilder, *, pictured: bool
     ) -> Commands:
-        """Of all drones. Each steps as soon as its images are drawn."""
+        """Commands for all drones. Each steps as soon as its images are drawn."""
         steps = {}
         render_ms = {}
         for i in self._drones:
@@ -219,7 +219,7 @@ class _VisionPilots:
         return self._commands(time_s, vehicles)
 
     def _commands(self, time_s: float, vehicles: Vehicles) -> Commands:
-        """Of the pilots, and of the people who fly drones by hand."""
+        """Commands of the pilots, and of the people who fly drones by hand."""
         count = len(self._scenario.vehicles)
         commands = Commands.of(count)
         missions: list[MissionStatus | None] = [None] * count

@@ -25,7 +25,7 @@ class RenderTruth:
     views: Mapping[str, View]
     R_ned_cameras: Mapping[str, FloatArray]
     positions: Mapping[str, FloatArray]
-    """Of the optical centres, NED."""
+    """Positions of the optical centres, NED."""
     R_ned_body: FloatArray
     position: FloatArray
     drone_rotations: FloatArray

@@ -30,10 +30,10 @@ REFERENCE_DEG = (1.0, 1.0)
 class Vehicles:
     """All vehicles of a flight.
 
-    Horizontal velocity follows a setpoint as a first-order lag of limited acceleration; height is held, or changed as
-    by a critically damped controller of limited climb, down to the ground at z = 0; the attitude is the one whose
-    thrust gives the horizontal acceleration. The arrays are replaced by `step`, never changed in place:
-    `position` (n, 3) m and `velocity` (n, 3) m/s in NED, `R_ned_body` (n, 3, 3).
+    Horizontal velocity follows a setpoint as a first-order lag of limited acceleration. Height is held, or changed as
+    by a critically damped controller of limited climb, down to the ground at z = 0. The attitude is the one whose
+    thrust gives the horizontal acceleration. The arrays are replaced by `step`, never changed in place: `position` (n,
+    3) m and `velocity` (n, 3) m/s in NED, `R_ned_body` (n, 3, 3).
     """
 
     def __init__(self, starts: Sequence[StartConfig], config: VehicleConfig, *, yaw_rad: float = 0.0, seed: int = 0):

@@ -89,7 +89,7 @@ def workers_of(parent: int) -> set[int]:
 
 @pytest.mark.slow
 def test_a_flight_that_ends_its_process_is_a_row(tmp_path: Path) -> None:
-    """Of one that always does; the others, which were lost with it, are flown."""
+    """One flight always ends its process; the others, which were lost with it, are flown."""
     plan = few(tmp_path)
     with ENGINES["processes"](2, None) as engine:
         submit = engine._executor.submit  # type: ignore[attr-defined]

@@ -162,7 +162,7 @@ def test_figures_stand_under_the_case_and_the_value_that_were_flown(tmp_path: Pa
 
 @pytest.mark.usefixtures("made_up_flights")
 def test_two_campaigns_are_compared_by_pairs(tmp_path: Path) -> None:
-    """Of 12 seeds one fails; in the other 11 all figures are 0.1 larger: of 2^11 ways to give signs 2 are as far."""
+    """One of 12 seeds fails; in the other 11 all figures are 0.1 larger: of 2^11 ways to give signs 2 are as far."""
     text = "vary: {drone.flocking.separation: {values: [5, 10]}}\nmeasure: [min_distance_m, collisions]\n"
     head = HEAD.replace("seeds: 6", "seeds: 12")
     for name, more in (("old", ""), ("same", "seed: 0\n"), ("new", "fixed: {drone.flocking.cohesion: 0.2}\n")):

@@ -43,7 +43,7 @@ def stopping(folder: Path) -> Plan:
 
 
 def value_of(run: Run) -> float | None:
-    """Of cell 0 nearly always the same, of cell 1 in the first seeds different, of cell 2 seldom any."""
+    """In cell 0 nearly always the same, in cell 1 different in the first seeds, in cell 2 seldom any."""
     if run.cell == 0:
         return 0.01 * run.number
     return (3.0 if run.number == 2 else 1.0) if run.cell == 1 else (None if run.number else 1.0)
@@ -51,7 +51,7 @@ def value_of(run: Run) -> float | None:
 
 @pytest.mark.parametrize("order", range(5))
 def test_how_many_seeds_a_cell_flies_does_not_depend_on_which_is_done_first(order: int, tmp_path: Path) -> None:
-    """Of 1, 1, 3, 1 the mean is known to 1.59, of these and four times 1 to 0.59, and of two more to 0.45."""
+    """The mean of 1, 1, 3, 1 is known to 1.59, of these and four times 1 to 0.59, and of two more to 0.45."""
     schedule, draw = Schedule(stopping(tmp_path)), random.Random(order)
     flying: list[Run] = []
     flown: list[Run] = []
@@ -77,7 +77,7 @@ def test_what_is_done_is_not_flown_again(tmp_path: Path) -> None:
 
 
 def test_paired_differences_that_all_go_one_way() -> None:
-    """Of 2^5 ways to give signs, two have a sum as far from zero: p = 1/16."""
+    """Two of 2^5 ways to give signs have a sum as far from zero: p = 1/16."""
     assert paired_p(np.array([0.3, 0.1, 0.2, 0.5, 0.4])) == 2 / 32
     assert paired_p(np.array([1.0, -1.0, 1.0, -1.0])) == 1.0
     assert paired_p(np.full(30, 0.2)) < 1e-3
@@ -85,5 +85,5 @@ def test_paired_differences_that_all_go_one_way() -> None:
 
 
 def test_two_sets_without_pairs() -> None:
-    """Of 20 ways to draw 3 of 6, two have means as far apart: p = 0.1."""
+    """Two of 20 ways to draw 3 of 6 have means as far apart: p = 0.1."""
     assert unpaired_p(np.array([1.0, 2.0, 3.0]), np.array([11.0, 12.0, 13.0])) == 0.1

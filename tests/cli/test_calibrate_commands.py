@@ -39,7 +39,7 @@ def pictures() -> list[UInt8Array]:
 
 @pytest.fixture
 def folder(tmp_path: Path, pictures: list[UInt8Array]) -> Path:
-    """Of pictures, two of which are of no use."""
+    """A folder of pictures, two of which are of no use."""
     path = tmp_path / "pictures"
     path.mkdir()
     for number, image in enumerate(pictures):

@@ -73,7 +73,7 @@ def test_help_shows_examples_of_the_command(command: list[str], capsys: pytest.C
 
 
 def test_help_needs_nothing_but_python() -> None:
-    """Of what is installed, nothing but rich is loaded before a command runs."""
+    """Only rich is loaded of what is installed before a command runs."""
     heavy = {"numpy", "pydantic", "yaml", "cv2", "onnxruntime", "zenoh", "numba", "matplotlib", "jinja2"}
     code = f"import sys, flockd.cli; print(*{heavy!r} & set(sys.modules))"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.slow
 RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
 ROOT = Path(__file__).parents[2]
 MEMORY_BYTES = 3 << 30
-"""Of address space; libraries take most of it."""
+"""Address space; libraries take most of it."""
 
 
 def _flockd(*arguments: str) -> subprocess.CompletedProcess[str]:

@@ -88,5 +88,5 @@ def test_a_flight_ends_in_one_sentence_when_a_process_of_its_pilots_is_killed() 
 
 
 def _children() -> set[str]:
-    """Of this process, started on its main thread, which is where a flight starts its own."""
+    """Children of this process, started on its main thread, which is where a flight starts its own."""
     return set(Path(f"/proc/self/task/{os.getpid()}/children").read_text(encoding="ascii").split())

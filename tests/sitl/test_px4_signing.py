@@ -22,7 +22,7 @@ PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 name
 SPEED_FACTOR, START_S, TIMES, PAUSE_S = 0.5, 120.0, 5, 0.5
 KEY, NO_KEY = bytes(range(1, 33)), bytes(32)
 EPOCH_2015_S, TICKS_A_S = 1420070400, 1e5
-"""Of MAVLink's signature time stamps."""
+"""Epoch and ticks of MAVLink's signature time stamps."""
 LATER = 10**8
 
 

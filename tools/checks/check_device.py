@@ -55,7 +55,7 @@ COMPILE = "import flockd.sim.autopilot.fake_autopilot"
 """What it needs of a dozen MAVLink dialects, and no more."""
 ARCH, DEBIAN = "amd64", "debian12"
 VERSIONS = ("1", "2")
-"""Of the package, before and after it is upgraded."""
+"""Versions of the package, before and after it is upgraded."""
 SYSTEM_PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 IMAGE_MB, MEMORY_MB = 4096, 2048
 PATIENCE_S = 3600.0

@@ -4,10 +4,10 @@
     python -m tools.checks.px4_missions --only led_by_hand --speed-factor 0.1 --out out/px4_missions
     python -m tools.checks.px4_missions --autopilot standin --json
 
-Flights: `waypoints`, after which `flockd fleet goto` sends all drones somewhere else; `led_by_hand`: a person flies
-one drone in Position mode with MAVLink's MANUAL_CONTROL, and no flockd runs for it; `one_knows`: one drone has a
-waypoint, the others follow what they see. Exit code 1: a drone left the mode that it was to fly in, the middle of the
-flock was not at a goal, or two drones came too close.
+Flights: `waypoints`, after which `flockd fleet goto` sends all drones somewhere else. `led_by_hand`: a person flies one
+drone in Position mode with MAVLink's MANUAL_CONTROL, and no flockd runs for it. `one_knows`: one drone has a waypoint,
+the others follow what they see. Exit code 1: a drone left the mode that it was to fly in, the middle of the flock was
+not at a goal, or two drones came too close.
 """
 
 from __future__ import annotations
@@ -77,13 +77,13 @@ class Row:
     time_s: float | None
     """From the beginning of the flight to when it was there first."""
     error_m: float
-    """Of the flock's middle, or of the drone flown by hand: the nearest that it came; to the last goal, at the end."""
+    """How near the flock's middle, or the drone flown by hand, came: to the last goal, at the end."""
     farthest_m: float
     """From there to the farthest drone, at the end of the way there."""
     closest_m: float
     """The closest two drones of the whole flight."""
     modes: str
-    """Of each autopilot, in order."""
+    """Modes of each autopilot, in order."""
 
     @property
     def kept(self) -> bool:
@@ -159,7 +159,7 @@ def rows(mission: Mission, scenario: ScenarioConfig, log: FlightLog) -> list[Row
 
 
 def _rows(led: FloatArray, plan: FloatArray, goals: FloatArray, times: FloatArray, common: dict[str, Any]) -> list[Row]:
-    """Of `led` (S, 2) m, which flies to the goals (n, 2) m in order, and of all drones at `plan` (S, N, 2) m."""
+    """The rows for `led` (S, 2) m, which flies to the goals (n, 2) m in order, and all drones at `plan` (S, N, 2) m."""
     found, since = [], 0
     for number, goal in enumerate(goals):
         away_m = np.linalg.norm(led[since:] - goal, axis=1)

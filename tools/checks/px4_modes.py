@@ -44,7 +44,7 @@ HEIGHT_M = 4.0
 SETPOINTS_HZ = 20.0
 FRAMES_HZ = 2.0
 SHELL_PORT = 14580
-"""Of this computer, where PX4's instance 0 listens to its companion computer."""
+"""Port of this computer, where PX4's instance 0 listens to its companion computer."""
 START_S = 120.0
 """Real seconds for PX4 and for the link to come up."""
 REQUEST_S, SETTLE_S, WATCH_S, STAY_S = 60.0, 5.0, 30.0, 3.0
@@ -52,7 +52,7 @@ REQUEST_S, SETTLE_S, WATCH_S, STAY_S = 60.0, 5.0, 30.0, 3.0
 mode; and for which it has to stay in it."""
 POLL_S = 0.05
 STICK = 700
-"""Of 1000: how far a pilot pushes the stick, within 0.3 s."""
+"""How far a pilot pushes the stick, of 1000, within 0.3 s."""
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ python -m tools.checks.soak --steps 5000 --json
 python -m tools.checks.soak --daemon --samples soak.csv # each sample too, to draw the curve
 
 Prints for memory, file descriptors, threads, latency and what waits or is lost: how much it grew in the first tenth of
-the run, which is the warm-up; the mean of the next and of the last tenth; and the slope over the rest with its 95 %
-confidence interval. The slope is a straight line through the means of 20
-stretches of the run after the warm-up, so that neighbouring samples, which are alike, do not count as independent.
-Exit code 1 if something grows by more than its allowance, all of the interval above it.
+the run, which is the warm-up. Then the mean of the next and of the last tenth, and the slope over the rest with its 95
+% confidence interval. The slope is a straight line through the means of 20 stretches of the run after the warm-up, so
+that neighbouring samples, which are alike, do not count as independent. Exit code 1 if something grows by more than its
+allowance, all of the interval above it.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ from flockd.sim.ground_station import Poses
 from tools.measure.bench_daemon import at, of_the_unit
 
 SHRINK = 4
-"""Of the simulator's front camera, the only one: 120 x 160 pixels, so that 100,000 steps are hours and not days."""
+"""Factor on the simulator's front camera, the only one: 120 x 160 pixels, so that 100,000 steps are hours and not
+days."""
 ROUND_STEPS = 40
 """After so many steps the drone is where it began: the same images again."""
 SWING_M, HEIGHT_M = 2.0, 4.0
@@ -87,12 +88,12 @@ class Slope:
     """Over the run without its first tenth, in the quantity's unit."""
     low: float
     high: float
-    """Of the 95 % confidence interval of the slope."""
+    """Upper end of the 95 % confidence interval of the slope."""
     grows: bool
 
 
 def slope_of(name: str, values: Sequence[float]) -> Slope:
-    """Of samples evenly spread over a run; at least 40."""
+    """The slope of samples evenly spread over a run; at least 40."""
     samples = np.asarray(values, float)
     tenth = max(len(samples) // 10, 1)
     means = np.array([stretch.mean() for stretch in np.array_split(samples[tenth:], STRETCHES)])

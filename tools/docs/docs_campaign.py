@@ -32,7 +32,7 @@ from flockd.sim.control_level.flock_flights import FlockFlights
 DPI = 110
 QUALITY = 85
 REACH_M = 42.0
-"""Of `--places`, from the flock's middle."""
+"""Reach of `--places`, from the flock's middle."""
 
 
 def main() -> None:

@@ -41,14 +41,14 @@ from flockd.review.report.style import GRID, INK, MUTED, PAPER, STYLE, colour_of
 FRAME_MS = 50
 SIZE_IN, DPI = (7.6, 3.23), 100
 DEPTH_SHARE = 0.5
-"""Of a length on the ground away from the viewer, how much is drawn upwards."""
+"""How much of a length on the ground away from the viewer is drawn upwards."""
 TRAIL_STEPS = 24
 ARM_M = 0.8
-"""Of a drone as drawn, larger than it is."""
+"""Arm of a drone as drawn, larger than it is."""
 COLOURS = 48
 CLIP_SCALE = 0.75
 WORLD_ROWS = slice(80, 480)
-"""Of the images of a world, without much sky and ground."""
+"""Rows of the images of a world, without much sky and ground."""
 
 
 def main() -> None:

@@ -26,7 +26,7 @@ from flockd.onboard.telemetry import topics
 FOLDER = Path(__file__).parents[2] / "docs" / "reference"
 NOTICE = "<!-- Written by tools/docs/docs_reference.py; do not edit. -->"
 SCENARIO_KEY = "drone"
-"""Of a scenario: the path of a drone's file, which has its own part of the page."""
+"""A scenario's key: the path of a drone's file, which has its own part of the page."""
 
 
 def main() -> int:

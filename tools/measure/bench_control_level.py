@@ -104,7 +104,7 @@ def fly(case: Case) -> float:
 
 
 def peak_mb(_: int) -> float:
-    """Of this process so far."""
+    """Peak memory of this process so far."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 

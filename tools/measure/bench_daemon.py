@@ -2,10 +2,10 @@
 
 python -m tools.measure.bench_daemon [--seconds 20] [--recording DRONE.mcap] [--json]
 
-A real `flockd run` with the configuration of PX4 SITL, beside a fake autopilot in Hold: images of 640x480 from
-shared memory (a recording's, or plain ones without drones), 2 sets a second, and a recording; in the environment that
-systemd's unit gives it. Memory is what Linux calls resident; pages shared with who sends the images are counted apart.
-Exit code 1: ready after more than 3 s, or more than 350 MB.
+A real `flockd run` with the configuration of PX4 SITL, beside a fake autopilot in Hold. Images of 640x480 come from
+shared memory (a recording's, or plain ones without drones), 2 sets a second, and it records. Its environment is the one
+that systemd's unit gives it. Memory is what Linux calls resident; pages shared with who sends the images are counted
+apart. Exit code 1: ready after more than 3 s, or more than 350 MB.
 """
 
 from __future__ import annotations

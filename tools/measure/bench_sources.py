@@ -62,7 +62,7 @@ def main() -> None:
 
 
 def measure_camera(device: CameraDevice) -> dict[str, float]:
-    """Of the images of one camera, after the first ones, which waited for the start."""
+    """Figures of the images of one camera, after the first ones, which waited for the start."""
     watched, ages_ms, began_s = Watched(), [], 0.0
     last: CapturedBuffer | None = None
     for number in range(WARM_UP + IMAGES):
@@ -85,7 +85,7 @@ def measure_camera(device: CameraDevice) -> dict[str, float]:
 
 
 def _processor_s() -> float:
-    """Of this process and of those it started that still run."""
+    """Processor time of this process and of those it started that still run."""
     ticks = 0.0
     for task in Path("/proc/self/task").iterdir():
         for pid in (task / "children").read_text(encoding="ascii").split():

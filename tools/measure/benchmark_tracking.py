@@ -29,7 +29,7 @@ LOG_RANGE_SIGMA = 0.025
 """As the detections say it; in truth one in ten errs by 0.08, the others by 0.02."""
 CLUTTER_PER_FRAME_SET = 0.3
 RANGES_M = (0.5, 20.0)
-"""Of clutter."""
+"""Ranges of clutter."""
 OWN_DISPLACEMENT_SIGMA_M = 0.02
 MATCH_M = 1.0
 """A confirmed track farther from every neighbour is false."""

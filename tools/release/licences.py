@@ -51,7 +51,7 @@ _CLASSIFIER = re.compile(r"License ::(?: OSI Approved ::)? (.+)")
 
 @dataclass(frozen=True)
 class Licence:
-    """Of one installed package."""
+    """Licence of one installed package."""
 
     package: str
     version: str

@@ -50,9 +50,9 @@ class CameraEffects:
 def drawn_effects(scale: float, rng: np.random.Generator) -> CameraEffects:
     """Any camera that flies or films; a quarter have almost nothing wrong with them.
 
-    Width of edges (contrast over the steepest gradient, camera pixels, 10 / 50 / 90 % of the drones of 20-30 px):
-    skydrones' training clips 1.8 / 2.1 / 2.2, renderings merely shrunk 1.5 / 2.0 / 2.7, through these cameras
-    1.7 / 2.4 / 3.4: the clips' sharpness is among them, and so are worse lenses.
+    Width of edges (contrast over the steepest gradient, camera pixels, 10 / 50 / 90 % of the drones of 20-30 px).
+    Skydrones' training clips 1.8 / 2.1 / 2.2, renderings merely shrunk 1.5 / 2.0 / 2.7, through these cameras 1.7 / 2.4
+    / 3.4. The clips' sharpness is among them, and so are worse lenses.
     """
     is_good = rng.random() < 0.25
     exposure = float(np.exp(rng.normal(0, 0.2)))
@@ -105,7 +105,7 @@ def through_camera(sharp: Image, effects: CameraEffects, rng: np.random.Generato
 
 
 def smear_kernel(length_px: float, angle: float) -> NDArray[np.float32]:
-    """Of a point that moves evenly along a line; sums to 1."""
+    """Kernel of a point that moves evenly along a line; sums to 1."""
     reach = math.ceil(length_px / 2) + 1
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1), np.float32)
     for share in (np.arange(16 * reach) + 0.5) / (16 * reach) - 0.5:

@@ -16,7 +16,7 @@ _LOOK_EVERY = 200
 _AIMED_SHARE = 0.6
 """At least so many of the drones are in the middle and fill their crop: the last crop of a drone is what counts."""
 _NONE_SHARE = 0.08
-"""Of what is drawn: what is no drone, however many families there are."""
+"""Share of what is drawn that is no drone, however many families there are."""
 _AIMED_OFF_PX, _AIMED_PX = 4.0, (60.0, 84.0)
 
 

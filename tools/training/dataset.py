@@ -17,7 +17,7 @@ HEIGHT, WIDTH = 640, 480
 MAX_DRONES = 6
 FOCAL_PX = 222.0
 R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""Of a camera that looks forward: optical RDF to body FRD."""
+"""Rotation of a camera that looks forward: optical RDF to body FRD."""
 
 ARRAYS: dict[str, tuple[tuple[int, ...], Any]] = {
     "image": ((2, HEIGHT, WIDTH, 3), np.uint8),

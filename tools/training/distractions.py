@@ -28,7 +28,7 @@ class Distraction:
     turn: Array
     """(3,) roll, pitch and yaw rate, rad/s."""
     beat: tuple[float, float, float]
-    """Of the wings: amplitude and phase, rad, and rad/s."""
+    """Beat of the wings: amplitude and phase, rad, and rad/s."""
 
     def at(self, time_s: float) -> Placed:
         """As it is after some time."""

@@ -32,7 +32,7 @@ class Plan:
     hubs: Array
     """(n, 3) where the arms end."""
     radius: float
-    """Of the propellers."""
+    """Radius of the propellers."""
     is_coaxial: bool
     """A second rotor hangs under each arm."""
     has_booms: bool

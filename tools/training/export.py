@@ -47,7 +47,7 @@ COLUMNS = {
     ),
     "drone": ("drone_logit",),
 }
-"""Of an output (n, k), in the order in which the network writes them."""
+"""Columns of an output (n, k), in the order in which the network writes them."""
 NETWORKS: dict[str, dict[str, Any]] = {
     "neighbours": {
         "net": NeighboursNet,

@@ -32,7 +32,7 @@ LEAST_SEEN = 10
 SETTLED_S = 3.0
 MAX_LAG_S = 60.0
 LEAST_RATIO = 2.91
-"""Of a 95th percentile to its median; about that of normal errors."""
+"""Least ratio of a 95th percentile to its median; about that of normal errors."""
 HIDDEN_EDGES = (0.02, 0.2, 0.4, 0.6, 0.8, 1.01)
 DRONE_RADIUS_M, ELEVATION_DEG = 0.35, 45.0
 HIDDEN_LIMIT = 0.5

@@ -20,7 +20,7 @@ Out = TypeVar("Out")
 MAX_DEPTH_M = 80.0
 """What the depth output says of the sky."""
 PLANE_STEPS = torch.tensor([64.0, 64.0, 32.0])[:, None, None]
-"""Of the geometry's planes, in a network that runs, a step of 8-bit numbers is one over this."""
+"""Steps of the geometry's planes: in a network that runs, a step of 8-bit numbers is one over this."""
 OFFSET_SCALE_PX = 16.0
 """Centre offsets leave the network in units of this many pixels of the half-size map."""
 
@@ -121,9 +121,9 @@ class NeighboursNet(nn.Module):
     """U-Net at a quarter of the image's size, with a thin branch at half: a far drone's arms are a pixel wide.
 
     Inputs: image (n, h, w, 3) uint8; geometry (n, 3, h/2, w/2): tangents of the pixel's ray right and down of the
-    optical axis, and the inverse depth in 1/m of flat ground as attitude and height say (0: unknown or sky).
-    Outputs, at half size: depth (n, 1, ., .) metres; drone (n, 1, ., .) probability logit; offset (n, 2, ., .) from
-    the pixel to its drone's centre, half-size pixels.
+    optical axis. The third plane is the inverse depth in 1/m of flat ground as attitude and height say (0: unknown or
+    sky). Outputs, at half size: depth (n, 1, ., .) metres; drone (n, 1, ., .) probability logit; offset (n, 2, ., .)
+    from the pixel to its drone's centre, half-size pixels.
     """
 
     widths = (32, 56, 96, 128)
@@ -281,7 +281,8 @@ class VerificationNet(nn.Module):
 
 
 def _moments(where: Tensor) -> tuple[Tensor, Tensor]:
-    """Of maps (n, k, h, w) of logits: their middles (n, k, 2) in crop pixels, and all their moments (n, 6 k)."""
+    """Moments of maps (n, k, h, w) of logits: their middles (n, k, 2) in crop pixels, and all their moments (n, 6
+    k)."""
     n, k, h, w = where.shape
     flat = where.flatten(2)
     v, u = torch.meshgrid(torch.arange(h).float() + 0.5 - h / 2, torch.arange(w).float() + 0.5 - w / 2, indexing="ij")

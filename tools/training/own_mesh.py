@@ -32,7 +32,7 @@ WIDTHS = (0.6, 1.05)
 """A mesh is as wide as this share of the drone's size from tip to tip: its propellers may stand across the arms, or be
 missing."""
 FLAT = 0.7
-"""Of a mesh that stands upright, no level side is less than this share of its height."""
+"""A mesh stands upright where no level side is less than this share of its height."""
 MOST_BYTES = 500 << 20
 MOST_TRIANGLES_READ, MOST_TRIANGLES = 4_000_000, 40_000
 CELLS = (320, 160, 80)
@@ -104,7 +104,7 @@ def _parts(model: DroneModel) -> Array:
 
 
 _SHARES = (0.35, 0.35, 0.1, 0.1, 0.1)
-"""Of body, frame, metal, front and rear colours."""
+"""Shares of body, frame, metal, front and rear colours."""
 
 
 def _loaded(path: Path) -> list[tuple[Any, Array]]:

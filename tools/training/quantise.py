@@ -204,7 +204,7 @@ def _crops(manifest: Manifest, folder: Path, count: int) -> Iterator[Feeds]:
 
 
 def _differences(file: Path, twin: Path, feeds: Sequence[Feeds]) -> dict[str, float]:
-    """Of each output, in its standard deviations."""
+    """Differences of each output, in its standard deviations."""
     ours, theirs = (ort.InferenceSession(str(one), providers=["CPUExecutionProvider"]) for one in (twin, file))
     names = [output.name for output in theirs.get_outputs()]
     pairs = [(ours.run(names, feed), theirs.run(names, feed)) for feed in feeds]

@@ -17,7 +17,7 @@ PATCH_REACH = 1.75
 _CROP_SHARE = (0.45, 1.65)
 """Half of a crop around a proposal, of half the pipeline's first one: the network's own size leads there."""
 _SHIFT = 0.25
-"""Of half the crop's width: how far a crop is aimed beside its proposal."""
+"""How far a crop is aimed beside its proposal, in half the crop's width."""
 _DRONE_FILL = (0.45, 0.95)
 """Share of the crop's width that a real drone's box fills."""
 
@@ -47,7 +47,7 @@ class RealPatches:
 
     @property
     def count(self) -> int:
-        """Of all sources."""
+        """Number of patches of all sources."""
         return sum(map(len, self._patches))
 
     def draw(self, rng: np.random.Generator) -> tuple[Image, float, NDArray[np.float32]]:

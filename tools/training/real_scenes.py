@@ -28,7 +28,7 @@ _SCALES = (0.4, 1.5)
 """A picture is resized by, unless it would not fill the sample then."""
 _DRONE_SCALES = (0.5, 1.3)
 _LEAST_WIDTH_PX = 7.0
-"""Of a drone's box: what is smaller is not made smaller still."""
+"""Least width of a drone's box: what is smaller is not made smaller still."""
 _SURE_SHARE = 0.35
 """Half axes of the ellipse that is surely drone, as a share of the box."""
 _MARGIN_PX = 3.0
@@ -48,7 +48,7 @@ class RealScenes:
 
     @classmethod
     def of(cls, without: Path | None, labels: Path | None) -> RealScenes:
-        """Of a folder, and of a COCO file beside its pictures. Raises UsageError and DatasetError."""
+        """The scenes of a folder, and of a COCO file beside its pictures. Raises UsageError and DatasetError."""
         pictures = find_pictures([without]) if without else []
         boxes = read_labels(labels, find_pictures([labels.parent])) if labels else {}
         free = [*pictures, *(picture for picture, one in boxes.items() if not one.boxes)]
@@ -62,13 +62,13 @@ class RealScenes:
         return image
 
     def sample_without(self, size: tuple[int, int], rng: np.random.Generator) -> Sample:
-        """Of a picture without drones."""
+        """A sample from a picture without drones."""
         image = as_filmed(self.background(size, rng), rng)
         shape = (size[1] // 2, size[0] // 2)
         return _sample(image, np.zeros(shape, np.float32), np.zeros((2, *shape), np.float32), rng)
 
     def sample_with(self, size: tuple[int, int], rng: np.random.Generator) -> Sample:
-        """Of a picture with labelled drones."""
+        """A sample from a picture with labelled drones."""
         picture, boxes = self.labelled[int(rng.integers(len(self.labelled)))]
         image = _read(picture)
         left, top, right, bottom = boxes[int(rng.integers(len(boxes)))]

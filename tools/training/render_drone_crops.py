@@ -37,7 +37,7 @@ MOST_DRONES = 3
 MIN_PIXELS = 8
 """That much of it must be seen: a drone six pixels wide is still to be told from a bird."""
 HIDDEN_SHARE = 0.02
-"""Of its outline: a drone of which something hides less is whole."""
+"""Hidden share of its outline below which a drone is whole."""
 WITH_DISTRACTORS, DISTRACTOR_ALONE = 0.3, 0.1
 """Shares of the scenes: a bird or the like before or behind the drone, and in its place, where half are too far."""
 
@@ -56,7 +56,7 @@ class CropJob:
 
     file: Path
     seed: int
-    """Of the world."""
+    """Seed of the world."""
     scenes: int
     draw_models: DrawModels
     measures: bool = False

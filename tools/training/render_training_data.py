@@ -31,7 +31,7 @@ from tools.training.scenes import attitude, drawn_attitude
 
 Array = NDArray[Any]
 SHAPES_A_WORLD = 24
-"""Of the generator, where it is drawn from."""
+"""Shapes of the generator in a world, where drones are drawn from it."""
 NEAREST_M = 1.2
 """To an obstacle: a camera moves by up to a metre within a pair."""
 WITH_DISTRACTORS = 1 / 3
@@ -69,13 +69,13 @@ class PairJob:
 
     folder: Path
     seed: int
-    """Of the world."""
+    """Seed of the world."""
     pairs: int
     families: range
     shapes_share: float = 0.0
-    """Of the drones, how many are of the generator's shapes instead."""
+    """Share of the drones that are of the generator's shapes instead."""
     obstacles_share: float = 0.0
-    """Of worlds: how likely this one has a forest or a village."""
+    """How likely a world has a forest or a village."""
 
 
 def render_pairs(jobs: Sequence[PairJob], processes: int | None) -> Iterator[tuple[int, int]]:

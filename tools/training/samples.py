@@ -138,7 +138,7 @@ def sample_of(drone: DroneInView, crop: VirtualCrop, image: NDArray[Any], mine: 
 
 
 def four_motors(hubs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of a drone's motors (n, 3) the four that spread about as far one way as another, and then farthest."""
+    """Those four of a drone's motors (n, 3) that spread about as far one way as another, and then farthest."""
     if len(hubs) == 4:
         return hubs
 

@@ -18,7 +18,7 @@ from tools.training.samples import Sample, flow_sample, neighbours_sample, no_dr
 
 Batch = dict[str, Tensor]
 NO_NAME = -1
-"""Of a shape that is no family of its own in the training's hint."""
+"""The name of a shape that is no family of its own in the training's hint."""
 
 
 class Task:
@@ -188,7 +188,7 @@ class DistanceTask(Task):
 
 
 def _mask_loss(logits: Tensor, mask: Tensor, drone: Tensor) -> tuple[Tensor, float]:
-    """Of (n, ., .) masks, ``drone`` (n,) being 0 where there is none; and the mean IoU of the others."""
+    """Loss of (n, ., .) masks, ``drone`` (n,) being 0 where there is none; and the mean IoU of the others."""
     bce = F.binary_cross_entropy_with_logits(logits, mask)
     probability = torch.sigmoid(logits)
     both, either = (probability * mask).sum((1, 2)), (probability + mask).sum((1, 2))

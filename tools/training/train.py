@@ -183,7 +183,7 @@ def is_faster_in_16_bits(device: torch.device) -> bool:
 
 
 def _recent_mean(mean: Tensor, new: Tensor, count: Tensor) -> Tensor:
-    """Of floating-point weights; counters are taken as they are."""
+    """Running mean of floating-point weights; counters are taken as they are."""
     if not mean.is_floating_point():
         return new
     share = max(1e-3, 1.0 / (1.0 + 0.1 * float(count)))

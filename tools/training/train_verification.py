@@ -34,11 +34,11 @@ MIX = {"rendered": 30, "composite": 16, "real drone": 10, "cut out": 6, "negativ
 """Samples of a batch."""
 KINDS = tuple(MIX)
 SOFTENED_SHARE = 0.5
-"""Of the rendered ones."""
+"""Share of the rendered crops that is softened."""
 PLACES_SHARE = 0.15
-"""Of the negatives: cut anywhere, not where the first stage proposed a drone."""
+"""Share of the negatives that is cut anywhere, not where the first stage proposed a drone."""
 NOISE_SHARE = 0.05
-"""Of the negatives: what a failing sensor delivers."""
+"""Share of the negatives that is what a failing sensor delivers."""
 NEGATIVE_WEIGHTS = {"skyothers": 130.0, "rendered": 80.0}
 """What flies besides drones, and what the first stage proposes in the worlds of the test flights, are drawn more often
 than the number of their patches says."""
@@ -46,7 +46,7 @@ HARD_PROBABILITY, HARD_SHARE, HARD_ONES, FEWEST_HARD = 0.3, 0.35, 4000, 200
 """A negative of more than this probability is remembered, the last so many are, and drawn so often."""
 
 NO_PLACE = np.array([-1, -1])
-"""Of a sample that is no negative patch."""
+"""The place of a sample that is no negative patch."""
 
 
 class VerificationTask(Task):

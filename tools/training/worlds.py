@@ -20,7 +20,7 @@ FAMILIES = range(12)
 UNSEEN_FAMILIES = range(12, 14)
 SHAPES = range(400)
 SHAPES_SHARE = 1 / 2
-"""Of the drones of training worlds, and of the drones that a training draws."""
+"""Share of the generator's shapes among the drones of training worlds, and among those that a training draws."""
 
 
 def drawn_obstacles(seed: int, share: float) -> ObstaclesConfig | None:

@@ -13,7 +13,7 @@ _Seconds = Annotated[float, Field(gt=0, le=60)]
 
 
 class ObstacleParameters(Section):
-    """Of the local map and of the avoidance; braking and reaction are those of `safety.gate`."""
+    """Parameters for the local map and for avoidance; braking and reaction are those of `safety.gate`."""
 
     enabled: bool = False
     """Whether obstacles are looked for and avoided. Without it trees and walls are seen, but not flown around."""

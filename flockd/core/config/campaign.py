@@ -43,7 +43,7 @@ Figure = Literal[
 DRONES = "drones"
 """Instead of a key: the size of the flock."""
 MAX_CONTROL_DRONES = 10_000
-"""Of a flight at control level."""
+"""The most drones in a flight at control level."""
 MAX_VALUES = 1000
 MAX_SEEDS = 1_000_000
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=60)]
@@ -96,7 +96,8 @@ class StopRule(Section):
     figure: Figure
     """The one that has to be known."""
     half_width: Positive
-    """Of the confidence interval of its mean, in the figure's unit; of `arrived`, of the share of flights."""
+    """Half width of the confidence interval of its mean, in the figure's unit; for `arrived`, of the share of
+    flights."""
     confidence: Annotated[float, Field(ge=0.5, le=0.999)] = 0.95
     batch: Annotated[int, Field(ge=2, le=10_000)] = 10
     """Seeds are flown in batches of so many. The rule is asked after each whole batch, about all seeds up to there:

@@ -28,7 +28,7 @@ class GeometryParameters(Section):
     own_displacement_sigma_m: Positive = 0.02
     """Standard deviation of the own motion over one step, each axis, for tracking."""
     max_drone_pixels: Annotated[int, Field(ge=1)] = 300
-    """Of a neighbour's mask, spread evenly, that are matched for its motion."""
+    """How many pixels of a neighbour's mask, spread evenly, are matched for its motion."""
     min_drone_pairs: Annotated[int, Field(ge=3)] = 12
     """With fewer point pairs a neighbour's motion is not estimated."""
     neighbour_velocity_caution: Positive = 2.0

@@ -57,16 +57,16 @@ class MissionParameters(Section):
 
     kind: MissionKind = "circle_then_tangent"
     """The paper's circle and its tangent (Eq. 43); `hover` at a standstill; a constant `velocity`; `waypoints` one
-    after the other; `follow` the others without a goal of its own (W_i = 0 of Eq. 42); `operator`: what an operator
+    after the other. `follow`: the others, without a goal of its own (W_i = 0 of Eq. 42). `operator`: what an operator
     sends over telemetry, as `telemetry.commands` allows."""
     speed_m_s: Speed = 1.0
     """Desired speed: V of Eq. 43, and on the way to goals."""
     radius_m: Distance = 10.0
-    """Of `circle_then_tangent`."""
+    """For `circle_then_tangent`."""
     circle_until_s: NonNegative = 66.0
-    """Of `circle_then_tangent`: from then on straight."""
+    """For `circle_then_tangent`: from then on straight."""
     velocity_m_s: tuple[float, float] | None = None
-    """Of `velocity`: north and east."""
+    """For `velocity`: north and east."""
     waypoints: Annotated[tuple[WaypointParameters, ...], Field(max_length=1000)] = ()
     at_end: AtEnd = "hold"
     """After the last of the `waypoints`: hold the flock there, or have the autopilot land, or return home."""

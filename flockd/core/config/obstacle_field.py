@@ -32,9 +32,9 @@ class ObstaclesConfig(Section):
     extent_m: Annotated[float, Field(ge=15, le=75)] = 60.0
     """They stand within this distance of the origin, north and east."""
     trees_per_hectare: Annotated[float, Field(ge=50, le=400)] = 100.0
-    """Of `forest`: 100 are an old beech wood, 400 a dense plantation."""
+    """For `forest`: 100 are an old beech wood, 400 a dense plantation."""
     houses_per_hectare: Annotated[float, Field(ge=2, le=16)] = 8.0
-    """Of `village`."""
+    """For `village`."""
     min_gap_m: Annotated[float, Field(ge=1, le=6)] = 2.0
     """Between two trees, houses or walls, measured from the circles around them."""
     free_start_m: NonNegative = 4.0

@@ -33,11 +33,11 @@ class AtDistance(Section):
 
     distance_m: Distance
     missed: Share
-    """Of the steps, those without a confirmed track of a neighbour that nothing hides."""
+    """Share of the steps without a confirmed track of a neighbour that nothing hides."""
     range_bias: Annotated[float, Field(ge=-0.5, le=0.5)]
     """Logarithm of estimated over true range, median."""
     range_error: Spread
-    """Of that logarithm from its median."""
+    """Spread of that logarithm about its median."""
     bearing_error_deg: Spread
     """In the plane."""
     velocity_error_m_s: Spread
@@ -52,7 +52,7 @@ class FalseNeighbours(Section):
     at_once: NonNegative
     """How many a drone has, mean."""
     lifetime_s: Duration
-    """Of each, mean."""
+    """Mean lifetime of each."""
     distances_m: tuple[NonNegative, NonNegative, NonNegative]
     """Tenth, fiftieth and ninetieth percentile of how far away they are."""
 
@@ -73,13 +73,13 @@ class PerceivedErrors(Section):
     hidden_limit: Share
     """A neighbour of which nearer drones hide more than this share is not perceived."""
     drone_radius_m: Distance
-    """Of the disc that a drone hides."""
+    """Radius of the disc that a drone hides."""
     error_time_s: Duration
     """Time constant of errors of range, bearing and velocity."""
     missed_time_s: Duration
     """The same, of what is missed."""
     own_velocity_error_m_s: Spread
-    """Of a drone's estimate of its own velocity, each axis."""
+    """Error of a drone's estimate of its own velocity, each axis."""
     own_velocity_time_s: Duration
     false_neighbours: FalseNeighbours
 

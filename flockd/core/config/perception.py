@@ -13,7 +13,7 @@ DIS, NO_MODEL = "dis", "none"
 """What stands where else a model's name does: OpenCV's DIS flow, and no second stage."""
 
 MIN_DRONE_SIZE_M, MAX_DRONE_SIZE_M = 0.05, 5.0
-"""Of a drone from tip to tip: less is a toy's that the networks do not find, more is an aircraft."""
+"""Limits of a drone's size from tip to tip: less is a toy that the networks do not find, more is an aircraft."""
 MAX_SIZE_SIGMA = 0.3
 """Standard deviation of a known size as a share of it: with more, the networks' own judgement is better."""
 
@@ -52,7 +52,7 @@ class DetectionParameters(Section):
     mask_border_px: Annotated[int, Field(ge=0)] = 5
     """Background so near to a mask is not used: masks and depth maps are least certain there."""
     colour_weight: NonNegative = 4.0
-    """Of a pixel's colour against the networks' logits, in a mask. 0: masks are the networks' alone."""
+    """Weight of a pixel's colour against the networks' logits, in a mask. 0: masks are the networks' alone."""
     depth_map_sigma: Positive = 0.08
     """Standard deviation of a drone's log range where the depth map alone gives it (`perception.distance: none`)."""
 

@@ -19,7 +19,7 @@ class MeasurementConfig(Section):
     source: str
     """What it was measured from."""
     views: Annotated[int, Field(ge=1)]
-    """Of a board, or pairs of images of what lay about."""
+    """Number of views of a board, or of pairs of images of what lay about."""
     residual_px: NonNegative | None = None
     """Root mean square of what the fit left over."""
     residual_deg: NonNegative | None = None

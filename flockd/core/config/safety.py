@@ -32,7 +32,7 @@ class GateParameters(Section):
     degraded_separation_m: Annotated[float, Field(ge=0, le=1000)] = 1.5
     """Instead, while the drone is degraded."""
     vertical_separation_m: Annotated[float, Field(ge=0, le=1000)] = 3.0
-    """A neighbour that is above or below by less than this counts as one at the drone's height, and no change of height
+    """A neighbour that is above or below by less than this counts as one at the drone's height. No change of height
     leads nearer to one whose level distance is within one and a half times `degraded_separation_m`: the lower flies in
     the other's downwash."""
     max_climb_m_s: Annotated[float, Field(gt=0, le=20)] = 1.5
@@ -79,7 +79,7 @@ class SafetyParameters(Section):
     max_lost_cameras: Annotated[int, Field(ge=0)] = 1
     """Fly on with the others, degraded, while no more than this many are lost; at least one has to see."""
     max_dropped_share: Share = 0.2
-    """Of the frames of late; above it, degraded."""
+    """Limit of the share of dropped frames of late; above it, degraded."""
     estimate_timeout_s: Annotated[float, Field(gt=0, le=60)] = 1.5
     """Hover when the pilot's newest output is older than this; leave it three of its steps."""
     degraded_ego_motion_failures: Annotated[int, Field(ge=1)] = 2
@@ -91,11 +91,11 @@ class SafetyParameters(Section):
     max_load: Positive = 2.0
     """The same, to hover."""
     degraded_temperature_c: float = 85.0
-    """Of the hottest thermal zone, to be degraded."""
+    """Temperature of the hottest thermal zone from which the drone is degraded."""
     max_temperature_c: float = 95.0
     """The same, to hover."""
     max_loop_lag_s: Annotated[float, Field(gt=0, le=10)] = 0.2
-    """Of the event loop; above it, degraded."""
+    """Lag of the event loop; above it, degraded."""
     heartbeat_timeout_s: Annotated[float, Field(gt=0, le=10)] = 2.0
     """The link to the autopilot counts as lost, and flockd falls silent for good."""
     neighbours_timeout_s: Annotated[float, Field(gt=0, le=60)] = 2.0

@@ -22,7 +22,7 @@ _LOWEST_M = 0.5
 """A drone that begins lower touches the uneven ground."""
 _HIGHEST_M = 1000.0
 MIN_START_DISTANCE_M = 0.7
-"""Of two drones at the start, about the size of one: nearer, they touch."""
+"""Smallest distance of two drones at the start, about the size of one: nearer, they touch."""
 
 
 class StartConfig(Section):
@@ -52,7 +52,7 @@ class VehicleConfig(Section):
     """Standard deviation of the velocity that gusts add, each axis, to that of a drone whose setpoint stays the same.
     The flocking law begins its setpoint at the own velocity: there drones are carried farther."""
     radius_m: Annotated[float, Field(gt=0, le=5)] = 0.35
-    """Of the sphere around its centre that holds the whole drone: nearer to an obstacle it collides."""
+    """Radius of the sphere around its centre that holds the whole drone: nearer to an obstacle it collides."""
 
 
 class RangeFinderConfig(Section):

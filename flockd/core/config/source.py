@@ -25,14 +25,14 @@ class CameraDeviceParameters(Section):
     name: Annotated[str, Field(pattern=r"^[a-z0-9_-]+$")]
     """The camera's name in the rig."""
     device: Annotated[str, Field(pattern=r"^/dev/")] = ""
-    """Of kind `v4l2`: its path, best one of /dev/v4l/by-path."""
+    """For kind `v4l2`: its path, best one of /dev/v4l/by-path."""
     pipeline: Annotated[str, Field(min_length=1)] = ""
-    """Of kind `gstreamer`: elements as `gst-launch-1.0` takes them, without a sink."""
+    """For kind `gstreamer`: elements as `gst-launch-1.0` takes them, without a sink."""
     pixel_format: PixelFormat = "mjpeg"
-    """Of kind `v4l2`; a pipeline says it itself."""
+    """For kind `v4l2`; a pipeline says it itself."""
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 30.0
     controls: tuple[ControlParameters, ...] = ()
-    """Of kind `v4l2`: set in this order whenever the camera is opened; what is not named here stays as it was."""
+    """For kind `v4l2`: set in this order whenever the camera is opened; what is not named here stays as it was."""
 
     @property
     def place(self) -> str:
@@ -60,9 +60,9 @@ class SourceParameters(Section):
     kind: Literal["v4l2", "gstreamer", "shared_memory"]
     """Cameras of the kernel, those behind a GStreamer pipeline each, or another program's frames."""
     cameras: tuple[CameraDeviceParameters, ...] = ()
-    """Of kind `v4l2` and `gstreamer`: one for each camera of the rig."""
+    """For kinds `v4l2` and `gstreamer`: one for each camera of the rig."""
     shared_memory: SharedMemoryParameters = SharedMemoryParameters()
-    """Of kind `shared_memory`."""
+    """For kind `shared_memory`."""
     set_tolerance_s: Annotated[float, Field(gt=0, le=60)] = 0.02
     """How far the time stamp of a frame may be from that of its set; half a frame period or more."""
     set_wait_s: Annotated[float, Field(gt=0, le=60)] = 0.1

@@ -31,8 +31,8 @@ class TrackingParameters(Section):
     model 82 % are nearer, of measured velocities 90 % (chi-square with 4 and 3 degrees of freedom)."""
 
     size_correlation: Probability = 0.3
-    """Of the errors of a detection's log range and log size, which are taken to be equally large: a range is the size,
-    which the appearance tells, over the apparent size. Measured as 0.2 with drones of families that the shipped
+    """Correlation of the errors of a detection's log range and log size, taken to be equally large: a range is the
+    size, which the appearance tells, over the apparent size. Measured as 0.2 with drones of families that the shipped
     networks know and 0.9 with others; taken low, so that ranges count as uncertain as the networks say they are."""
     size_drift: Positive = 0.05
     """How far the log size of one drone drifts, as the network sees it in changing views: standard deviation after one

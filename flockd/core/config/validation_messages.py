@@ -224,7 +224,7 @@ def _resolved(root: Schema, schema: Schema) -> Schema:
 
 
 def _with_parts(root: Schema, schema: Schema) -> Schema:
-    """Of an optional section or list, the branch that is not null."""
+    """The branch that is not null, for the schema of an optional section or list."""
     branches = [_resolved(root, branch) for branch in schema.get("anyOf", ())]
     return next((branch for branch in branches if branch.get("type") in {"object", "array"}), schema)
 

@@ -16,10 +16,10 @@ Row = dict[str, Any]
 HISTORY_COLUMNS = (
     "time", "north", "east", "height", "speed", "battery", "load", "temperature", "rate", "delay", "clock",
 )  # fmt: skip
-"""Of a drone's history: seconds, metres from the map's origin, metres, m/s, shares, degrees Celsius, steps a second,
-milliseconds, seconds."""
+"""Columns of a drone's history: seconds, metres from the map's origin, metres, m/s, shares, degrees Celsius, steps a
+second, milliseconds, seconds."""
 MAX_CORNERS = 200
-"""Of a fence that is drawn."""
+"""The most corners of a fence that is drawn."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Known:
 
     about: AboutMessage | None = None
     delay_s: float | None = None
-    """Of the link, there and back."""
+    """Round-trip delay of the link."""
     clock_s: float | None = None
     """The drone's wall clock less this computer's."""
 

@@ -18,7 +18,7 @@ class FleetSource(Protocol):
 
     @property
     def span_s(self) -> tuple[float, float] | None:
-        """Of recordings, their time line from begin to end; None: live."""
+        """Begin and end of the recordings' time line; None: live."""
 
     def now_s(self) -> float:
         """Now on the time line of a live fleet; the end of a recorded one."""
@@ -39,7 +39,7 @@ class FleetSource(Protocol):
         """What happened up to a time, the newest last."""
 
     def history(self) -> Mapping[str, list[list[float | None]]]:
-        """Of each drone, by its key: rows of `HISTORY_COLUMNS` in order of time."""
+        """For each drone, by its key: rows of `HISTORY_COLUMNS` in order of time."""
 
     def ask(self, drone: str, command: str, order: Mapping[str, object] | None) -> AnswerMessage:
         """A drone's answer to a command. Waits; called on a thread of its own."""

@@ -73,7 +73,7 @@ class LiveFleet:
             return dict(self._known)
 
     def rows(self, time_s: float) -> dict[str, Row]:
-        """Of all that were ever heard."""
+        """Rows of all drones that were ever heard."""
         return drone_rows(self.drones(time_s), self.known(), time_s)
 
     def events(self, time_s: float) -> list[Event]:
@@ -81,7 +81,7 @@ class LiveFleet:
         return [(event.time_s, f"{event.fleet}/{event.drone}", event.sentence) for event in self._watcher.events()]
 
     def history(self) -> Mapping[str, list[list[float | None]]]:
-        """Of the last five minutes."""
+        """The history of the last five minutes."""
         with self._lock:
             return {key: list(rows) for key, rows in self._history.items()}
 

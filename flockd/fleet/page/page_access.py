@@ -18,7 +18,7 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
-"""Of every reply: nothing comes from elsewhere, and nobody else may embed or read it."""
+"""Headers of every reply: nothing comes from elsewhere, and nobody else may embed or read it."""
 MAX_SESSIONS = 1000
 
 

@@ -188,7 +188,7 @@ class _Feed:
             reading.cancel()
 
     async def follow(self) -> None:
-        """Of recordings: sends what was at each time that the page asks for."""
+        """Sends what the recordings hold at each time that the page asks for."""
         async for message in self._socket:
             asked = _object(message.data if message.type == WSMsgType.TEXT else "")
             at = asked.get("at")

@@ -58,7 +58,7 @@ class _Story:
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """Of its steps, on the time line."""
+        """Begin and end of its steps, on the time line."""
         return self.times["state"][0] + self.offset_s, self.times["state"][-1] + self.offset_s
 
     def at(self, time_s: float) -> Watched:
@@ -137,7 +137,7 @@ class RecordedFleet:
         return self._events[: bisect_right(self._events, time_s, key=lambda event: event[0])]
 
     def history(self) -> Mapping[str, list[list[float | None]]]:
-        """Of all."""
+        """The history of all drones."""
         return self._history
 
     @functools.cached_property
@@ -156,7 +156,7 @@ class RecordedFleet:
         return AnswerMessage(accepted=False, sentence="this is a recording, which takes no commands")
 
     def image(self, drone: str, camera: str, time_s: float) -> bytes | None:
-        """Of the second before."""
+        """The newest picture of the second before."""
         story = self._stories.get(drone)
         return None if story is None else story.pictures.at(camera, time_s - story.offset_s)
 

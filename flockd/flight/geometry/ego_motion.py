@@ -22,10 +22,10 @@ class EgoMotionAcceptance:
     explained_px: float = 3.0
     """A match is explained that is so near to where the motion moves it."""
     min_explained: float = 0.08
-    """Of all matches. On real images true motions explain 15 % and more; those that Algorithm 1 finds in nothing but
-    false matches, because within metres there are always some that agree, under 6 %."""
+    """Least share of all matches. On real images true motions explain 15 % and more; those that Algorithm 1 finds in
+    nothing but false matches, because within metres there are always some that agree, under 6 %."""
     min_kept: float = 0.9
-    """Of the explained matches: a refinement that loses more has followed the false ones."""
+    """Least share of the explained matches: a refinement that loses more has followed the false ones."""
 
 
 ACCEPTANCE = EgoMotionAcceptance()

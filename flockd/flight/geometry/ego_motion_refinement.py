@@ -46,7 +46,7 @@ def refine_ego_motion(
 
     Both ways over all cameras: the point lifted at t must fall on its pixel at t+1 and the point lifted at t+1 on its
     pixel at t. Gauss-Newton on the six parameters with Cauchy weights. A residual along the point's parallax is
-    discounted by what the depth's own error makes of it, across it only the flow's error counts: far points fix the
+    discounted by what the depth's own error makes of it. Across it only the flow's error counts. So far points fix the
     rotation, near ones with sound depth the translation's length, and all of them its direction. How large a residual
     may be is learned from the pairs that ``agreeing`` (n,) marks, those that agree with ``initial`` in space: of all
     pairs, more than half may be false matches.

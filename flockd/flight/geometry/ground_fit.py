@@ -19,7 +19,7 @@ REACH = 3.0
 """How far from the point below the drone the ground is used, in heights."""
 MIN_POINTS = 60
 MIN_AGREEING = 0.4
-"""Of the points: with fewer, what is there is no plane."""
+"""Least share of the points: with fewer, what is there is no plane."""
 ROUNDS = 8
 MEDIAN_DEVIATIONS = 6.0
 """Beyond so many of the residuals' median size a point counts nothing."""
@@ -56,7 +56,7 @@ class FittedGround:
     """A plane under the drone."""
 
     height: float
-    """Of the body's origin above it, straight down, in the samples' unit."""
+    """Height of the body's origin above it, straight down, in the samples' unit."""
     slope: FloatArray
     """(2,) rise for each metre to the north and to the east."""
 

@@ -10,7 +10,7 @@ from flockd.core.messages import FloatArray
 
 _EYE = np.eye(3)
 _TOLERANCE = 1e-6 + 1e-5 * _EYE
-"""Of a rotation times its transpose."""
+"""How far a rotation times its transpose may be from the identity."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from flockd.flight.inference.manifest_file import ManifestFile
 from flockd.flight.inference.weights import fault_of_weights
 
 _GOLDEN_TOLERANCE = 0.02
-"""Of mean and deviation: providers round differently."""
+"""Largest difference of mean and deviation: providers round differently."""
 
 Deadline = Callable[[Callable[[], None], Callable[[], None]], None]
 """Runs the first; where that takes too long, calls the second, which ends it, and raises TimeoutError.

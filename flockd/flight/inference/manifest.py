@@ -99,9 +99,9 @@ class OutputSpec(TensorSpec):
     gives: str | None = None
     """What it is used as; by default what the output's name says."""
     layout: Literal["nhwc", "nchw"] = "nchw"
-    """Of a map with 4 axes; with 3 it is (n, h, w)."""
+    """Layout of a map with 4 axes; with 3 it is (n, h, w)."""
     columns: tuple[Annotated[str, Field(min_length=1)], ...] = ()
-    """Of an output (n, k): the name of each of its k numbers, in their order."""
+    """Names of the k numbers of an output (n, k), in their order."""
     factor: float = 1.0
     """Makes pixels of the input (flow), pixels of the map (offset), metres or 1/m (depth) of what comes out."""
     depth: DepthMeaning = DepthMeaning()

@@ -114,7 +114,7 @@ def models_folder(config: PerceptionConfig) -> Path:
 
 
 def manifest_path(folder: Path, name: str) -> Path:
-    """Of a model by its name in a folder, or of one that is named by its manifest's path."""
+    """The path of the manifest of a model named in a folder, or named by its manifest's path."""
     return Path(name) if name.endswith(".yaml") else folder / f"{name}.yaml"
 
 

@@ -28,7 +28,7 @@ _STRIDE_PX = 4
 """Between pixels that are taken: a trunk of 0.2 m at 10 m is 4 px wide at 222 px a radian."""
 _NEAREST_M = 0.3
 _RATIO = 1.1
-"""Of a range to that of the bin before it."""
+"""Ratio of a range to that of the bin before it."""
 _GROUND_MARGIN_M = 0.7
 """What is no higher than this above the ground counts as ground."""
 _HORIZON = 0.1
@@ -36,7 +36,7 @@ _HORIZON = 0.1
 
 
 _GRID = slice(_STRIDE_PX // 2, None, _STRIDE_PX)
-"""Of `grid_pixels`."""
+"""Rows or columns that `grid_pixels` takes."""
 _STEEPEST = 0.25
 """Sine of the elevation up to which pixels are triangulated: the band of heights from 3 m on, and its middle nearer."""
 _MIN_BASELINE_M = 0.05
@@ -85,7 +85,7 @@ class ObstacleRanging:
     def ranges(
         self, observation: Observation, ego: EgoMotion | None = None, ground: GroundEstimate | None = None
     ) -> ObstacleRanges:
-        """Of one observation's depth, and of the flow since the one before where `ego` is known.
+        """Ranges from one observation's depth, and of the flow since the one before where `ego` is known.
 
         ``ground``: below the drone; None: level, at the autopilot's height.
         """
@@ -108,7 +108,7 @@ class ObstacleRanging:
         return points.where((np.abs(points.places[2]) <= self._parameters.height_band_m) | _is_level(*points.places))
 
     def _nearest(self, observation: Observation, points: _Points, ground: GroundEstimate | None) -> ObstacleRanges:
-        """Of places (3, n) metres NED from the drone."""
+        """The nearest obstacle in each sector, from places (3, n) metres NED from the drone."""
         p, labels = self._parameters, points.labels
         north, east, down = points.places
         away_m = np.hypot(north, east)
@@ -188,7 +188,7 @@ def _medians(sectors: IntArray, values: Float32Array) -> FloatArray:
 
 
 class _Triangulation:
-    """Of one camera: places of what stood still between two of its images."""
+    """Triangulation for one camera: places of what stood still between two of its images."""
 
     def __init__(self, camera: RigCamera) -> None:
         self._camera = camera

@@ -1,8 +1,8 @@
 """Which way around obstacles: the direction nearest to the wanted one that is free for some seconds.
 
-After Ulrich and Borenstein 1998, "VFH+: reliable obstacle avoidance for fast mobile robots": directions in which
-an obstacle, enlarged by the clearance, is met too soon are closed; of the others the cheapest is taken, and the one
-taken last is cheaper than it would be otherwise.
+After Ulrich and Borenstein 1998, "VFH+: reliable obstacle avoidance for fast mobile robots". Directions in which an
+obstacle, enlarged by the clearance, is met too soon are closed. Of the others the cheapest is taken, and the one taken
+last is cheaper than it would be otherwise.
 """
 
 from __future__ import annotations

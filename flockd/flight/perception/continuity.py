@@ -1,8 +1,8 @@
 """Whether an image follows from the one before it: what is damaged in blocks, or covered by soft noise, does not.
 
 A scene is explained by its last image, moved along the optical flow, whatever its texture is. Noise and damage come
-anew with each image. How much is left unexplained also depends on how the drone moves, but it moves all of its cameras:
-an image counts as broken by comparison with the other cameras' of the same moment, and only while the drone turns
+anew with each image. How much is left unexplained also depends on how the drone moves, but it moves all of its cameras.
+So an image counts as broken by comparison with the other cameras' of the same moment, and only while the drone turns
 slowly. A rig of one camera has none to compare with, and is not judged.
 """
 
@@ -18,7 +18,8 @@ from flockd.core.config.perception import NoiseParameters
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, UInt8Array
 
 _LONGER_SIDE_PX = 96
-"""Of the small images that are compared: noise of single pixels averages out, and DIS takes a millisecond."""
+"""Longer side of the small images that are compared: noise of single pixels averages out, and DIS takes a
+millisecond."""
 _PATCH_PX = 8
 _WINDOW_PX = 15
 """Over which the images are compared, so that a damaged block has contrast in any window that it is in."""
@@ -31,7 +32,7 @@ _MIN_CORRELATION = 0.7
 _FIT_ROUNDS, _FIT_STRIDE = 3, 4
 _GAINS = (0.5, 2.0)
 _MAX_TURN = np.deg2rad(10.0)
-"""Of the drone between two images: beyond it the flow is lost, in one camera before the others."""
+"""Largest turn of the drone between two images: beyond it the flow is lost, in one camera before the others."""
 _FORGOTTEN_S = 2.0
 """After so long without an image, a camera may see something else entirely."""
 

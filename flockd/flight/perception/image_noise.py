@@ -1,8 +1,8 @@
 """Whether an image is noise, as of interference: the networks find drones in it that are not there.
 
-White noise is as strong at each scale, while scenes lose their contrast from scale to scale: the power spectrum of
-photographs falls with the square of the frequency (Field 1987, Ruderman and Bialek 1994), so that the diagonal details
-of an orthonormal Haar transform are about half as strong at the finest scale as at the next. The strength of the finest
+White noise is as strong at each scale, while scenes lose their contrast from scale to scale. The power spectrum of
+photographs falls with the square of the frequency (Field 1987, Ruderman and Bialek 1994). So the diagonal details of an
+orthonormal Haar transform are about half as strong at the finest scale as at the next. The strength of the finest
 details alone (Donoho and Johnstone 1994, Immerkaer 1996) would not do: grass and leaves have as much of them as noise.
 
 Noise that was filtered, as by a camera's own electronics, has the spectrum of gravel. It is told by how it comes: from
@@ -24,7 +24,7 @@ from flockd.core.messages import BoolArray, Float32Array, UInt8Array
 _BLOCK = 16
 """Details on one side of a block at the finest scale: two image pixels each."""
 _SIGMA_PER_MEAN = float(np.sqrt(np.pi / 2))
-"""Of normal numbers: the standard deviation over the mean magnitude."""
+"""Standard deviation over the mean magnitude, for normal numbers."""
 _REMEMBERED = 5
 """Images of a camera that are its history."""
 _FORGOTTEN_S = 2.0
@@ -41,7 +41,7 @@ class NoiseShares(NamedTuple):
 
 
 def noise_shares(image: UInt8Array, parameters: NoiseParameters) -> NoiseShares:
-    """Of an RGB image (h, w, 3); 0 for one that is too small to say."""
+    """Shares of noise in an RGB image (h, w, 3); 0 for one that is too small to say."""
     height, width = (length // (2 * _BLOCK) * 2 * _BLOCK for length in image.shape[:2])
     if not (height and width):
         return NoiseShares(0.0, 0.0)
@@ -96,12 +96,12 @@ class NoiseMonitor:
 
 @dataclass
 class _History:
-    """Of one camera."""
+    """History of one camera."""
 
     used: deque[NoiseShares] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
     """Its last images that were."""
     time_s: float = -np.inf
-    """Of its last image."""
+    """Time of its last image."""
     clean_needed: int = 0
 
 

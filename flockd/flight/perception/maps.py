@@ -51,7 +51,7 @@ class Crop:
 
 @dataclass(frozen=True)
 class KnownSize:
-    """Of every drone of the fleet, from tip to tip, and its standard deviation."""
+    """Size of every drone of the fleet, from tip to tip, and its standard deviation."""
 
     size_m: float
     sigma_m: float
@@ -70,7 +70,7 @@ class RangeEstimate:
     size_m: float
     """The drone's size from tip to tip; errs like the range does, but is the same in every crop of one drone."""
     drone_probability: float = 1.0
-    """Of there being a drone at all."""
+    """Probability that there is a drone at all."""
     mask: Float32Array | None = None
     """(size, size) logit of each pixel of the crop being that drone's; None: the model does not say."""
 

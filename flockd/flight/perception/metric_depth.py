@@ -13,7 +13,7 @@ _MAX_GROUND_M = 40.0
 _TOLERANCE = 0.1
 """A pixel agrees with a scale when its inverse depth is off by less than this share."""
 _MIN_SHARE = 0.25
-"""Of the pixels that have to agree: on a plain with trees and houses about half is ground."""
+"""Least share of the pixels that has to agree: on a plain with trees and houses about half is ground."""
 _MIN_PIXELS = 100
 _MAX_DEPTH_M = 1e3
 """Farther is as far: the sky's inverse depth is about 0, or less."""

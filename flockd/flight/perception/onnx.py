@@ -32,7 +32,7 @@ CROPS_PER_RUN = 24
 _MIN_DEPTH_M, _MAX_DEPTH_M = 1e-3, 1e3
 """Where a reciprocal of depth is taken: nearer than the lens, and where flow and height measure nothing any more."""
 _MIN_RAY_Z = 0.1
-"""Of a unit ray, for its tangents to stay finite: 84 degrees off the optical axis."""
+"""Least z of a unit ray, for its tangents to stay finite: 84 degrees off the optical axis."""
 
 
 def load_networks(config: PerceptionConfig, deadline: Deadline = no_deadline) -> OnnxNetworks:
@@ -255,7 +255,7 @@ def _in_batches(model: OnnxModel, images: Sequence[UInt8Array]) -> dict[str, Flo
 
 
 def _no_range(drone_probability: float, size: int) -> RangeEstimate:
-    """Of a crop that shows no drone."""
+    """The estimate for a crop that shows no drone."""
     middle = np.full(2, size / 2)
     return RangeEstimate(math.nan, math.nan, middle, math.nan, drone_probability=drone_probability)
 
@@ -265,7 +265,7 @@ def _probability(logit: FloatArray) -> FloatArray:
 
 
 def _estimate(columns: Mapping[str, float], drone_logit: float, crop: Crop, mask: Float32Array | None) -> RangeEstimate:
-    """Of one crop's output, with a mirror image's turned back."""
+    """The estimate from one crop's output, with a mirror image's turned back."""
     size = crop.camera.size[0]
     right = columns["right_px"]
     if crop.mirrored:

@@ -23,7 +23,7 @@ class Threshold:
 
 @dataclass(frozen=True)
 class Requirements:
-    """Of one role."""
+    """Requirements of one role."""
 
     inputs: tuple[str, ...]
     """What its inputs carry."""
@@ -31,7 +31,7 @@ class Requirements:
     """What its outputs give."""
     optional_inputs: tuple[str, ...] = ()
     columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """Of an output (n, k): the columns it has to have, in any order."""
+    """For an output (n, k): the columns it has to have, in any order."""
     thresholds: Mapping[str, Threshold] = field(default_factory=dict)
     crop: bool = False
     """Whether the manifest has to say how crops are cut."""

@@ -42,11 +42,11 @@ from flockd.flight.pilot.trim import VelocityTrim
 from flockd.flight.tracking import Blind, Measurement, Prediction, Tracker
 
 _ROTATION_TOLERANCE = 1e-3
-"""Of an attitude's R R^T from the identity: what is farther off is no attitude, and not only rounded."""
+"""How far an attitude's R R^T may be from the identity: beyond it is no attitude, and not only rounded."""
 _ROUNDING = 1e-6
 """The same: what is farther off is replaced by the nearest rotation, as measurements and transforms ask for one."""
 _BY_VELOCITY_SIGMA_M = 0.1
-"""Of where the drone went in a step, each axis, by its velocity alone."""
+"""Standard deviation of where the drone went in a step, each axis, by its velocity alone."""
 
 
 @dataclass
@@ -199,7 +199,7 @@ class FlockPilot:
         )
 
     def _predictions(self, time_s: float) -> tuple[Prediction, ...]:
-        """Of the tracks, at the frames' time; none where time does not go on."""
+        """Predictions of the tracks at the frames' time; none where time does not go on."""
         if self._last_time_s is None or time_s <= self._last_time_s:
             return ()
         return self._tracker.predictions(time_s - self._last_time_s, self._velocity)
@@ -422,7 +422,7 @@ class _Laps:
         self.stages_ms: dict[str, float] = {}
 
     def end(self, stage: str) -> None:
-        """Of a stage."""
+        """Takes the time of a stage that ends now."""
         if self._watch:
             now = self._watch()
             self.stages_ms[stage] = 1e3 * (now - self._last)

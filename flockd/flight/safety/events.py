@@ -18,7 +18,7 @@ class CameraHealth:
     """How one camera is doing."""
 
     age_s: float
-    """Of its newest usable frame; infinite before the first."""
+    """Age of its newest usable frame; infinite before the first."""
     period_s: float
     """How far apart its frames should be."""
     unplugged: bool
@@ -43,9 +43,9 @@ class Inputs:
     cameras: Mapping[str, CameraHealth]
     """Every camera of the rig, by name."""
     dropped_share: float
-    """Of the frames of the last seconds: corrupt, truncated, stamped out of order, or noise."""
+    """Share of the frames of the last seconds that were corrupt, truncated, stamped out of order, or noise."""
     estimate_age_s: float
-    """Of the pilot's newest output; infinite before the first."""
+    """Age of the pilot's newest output; infinite before the first."""
     ego_motion_failures: int
     """Steps in a row in which the pilot found no motion of its own."""
     network_faults: int
@@ -55,7 +55,7 @@ class Inputs:
     load: float
     """How long the steps take (95th percentile, slowest stage) over how long they may."""
     temperature_c: float | None
-    """Of the hottest thermal zone; None on a computer that has none."""
+    """Temperature of the hottest thermal zone; None on a computer that has none."""
     loop_lag_s: float
     """How late the event loop runs."""
     dead_tasks: tuple[str, ...]
@@ -71,7 +71,7 @@ class Inputs:
     outside_heights: bool
     """As of `outside_heights`."""
     heartbeat_age_s: float
-    """Of the autopilot's newest heartbeat; infinite before the first."""
+    """Age of the autopilot's newest heartbeat; infinite before the first."""
     flight_mode: str | None
     """The autopilot's; `OFFBOARD` or any other word. None: not known yet, as for the next two."""
     armed: bool | None

@@ -43,7 +43,7 @@ class Surroundings:
     neighbour_velocities: FloatArray
     """(n, 2) m/s over ground, north and east."""
     height_m: float
-    """Of the drone, as in `VehicleState`; NaN: not known."""
+    """Height of the drone, as in `VehicleState`; NaN: not known."""
     obstacles: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     """(m, 2) metres, north and east, relative to the drone: points of obstacles, each the nearest that it may be."""
 
@@ -92,7 +92,7 @@ _COLUMN = 1.5
 """A neighbour is above or below where its level range is less than this many times the degraded separation: downwash
 widens on its way down, and neither drone stays exactly where it is."""
 _HEIGHT_NOISE_M = 0.3
-"""Of a height over a few seconds: a difference this small between asked and own height is no climb."""
+"""Noise of a height over a few seconds: a difference this small between asked and own height is no climb."""
 
 _MOVES = frozenset({Action.FLY, Action.FLY_DEGRADED})
 _STANDS_STILL = frozenset({Action.OFFER, Action.HOVER, Action.ASK_HOLD, Action.ASK_RETURN, Action.ASK_LAND})

@@ -13,7 +13,7 @@ from flockd.flight.geometry import log_polar_residual
 from flockd.flight.tracking.measurement import Measurement
 
 _LINEARISATIONS = 3
-"""Of the iterated update (B. Bell, F. Cathey, IEEE Transactions on Automatic Control 38(2), 1993)."""
+"""Linearisations of the iterated update (B. Bell, F. Cathey, IEEE Transactions on Automatic Control 38(2), 1993)."""
 MIN_RANGE_M = 0.01
 """A predicted position nearer than this, inside the drone itself, has no bearing."""
 
@@ -70,7 +70,7 @@ class Innovation:
 
     @property
     def log_determinant(self) -> float:
-        """Of the covariance."""
+        """Logarithm of the covariance's determinant."""
         return float(np.linalg.slogdet(self.covariance).logabsdet)
 
     @property
@@ -120,7 +120,7 @@ def predict(
 
 
 def innovation(state: State, measurement: Measurement, parameters: TrackingParameters) -> Innovation:
-    """Of a measurement against the predicted state."""
+    """The innovation of a measurement against the predicted state."""
     residual, derivative = _linearised(state.mean, measurement)
     return Innovation(residual, derivative @ state.covariance @ derivative.T + _noise(measurement, parameters))
 

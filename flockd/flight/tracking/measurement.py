@@ -29,7 +29,7 @@ class Measurement:
     size_m: float
     """As of `Detection.size_m`."""
     drone_probability: float = 1.0
-    """Of being a drone at all, 0 to 1."""
+    """Probability that it is a drone at all, 0 to 1."""
     velocity: FloatArray | None = None
     """(3,) m/s over ground, where one was estimated (Eq. 36)."""
     velocity_sigma_m_s: float = 1.0

@@ -16,7 +16,7 @@ from flockd.flight.tracking.manoeuvres import Manoeuvres
 from flockd.flight.tracking.measurement import Measurement
 
 Blind = Callable[[FloatArray], BoolArray]
-"""Of positions (n, 3), metres NED from the own drone: which (n,) no camera could show at this time."""
+"""Tells which (n,) of the positions (n, 3), metres NED from the own drone, no camera could show at this time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,11 +189,11 @@ class _Track:
     existence: float
     """Probability of being anything that persists."""
     drone_probability: float
-    """Of being a drone if it exists."""
+    """Probability that it is a drone if it exists."""
     first_seen_s: float
     last_seen_s: float
     hits: int = 1
     agreed: int = 1
-    """Of the hits, those within `confirm_sigma`."""
+    """How many of the hits were within `confirm_sigma`."""
     confirmed: bool = False
     was_confirmed: bool = False

@@ -33,7 +33,7 @@ _CHAIN_S = 0.4
 _INLIER_WEIGHT = 0.2
 """Weight above which a turn counts as one that fits."""
 _DIFFERENCE_STEP_S = 1e-3
-"""Of the derivative by the offset."""
+"""Step of the derivative by the offset."""
 _MAX_SIGMA_DEG, _MAX_SIGMA_S = 0.5, 0.01
 """What is more uncertain than this is not known."""
 _MAX_RESIDUAL = 0.3
@@ -75,7 +75,7 @@ class Alignment:
     """Added to an image's time, the autopilot's time of the same moment."""
     sigma_s: float
     rms_deg: float
-    """Of what is left over of the turns, without outliers."""
+    """Root mean square of the turns' residuals, without outliers."""
     turns: int
 
 
@@ -182,7 +182,7 @@ class _Turns:
 
     @classmethod
     def of(cls, turns: Sequence[CameraTurn], attitudes: Attitudes, max_offset_s: float) -> _Turns:
-        """Of those turns that attitudes are known for, whatever the offset."""
+        """The turns for which attitudes are known, whatever the offset."""
         starts, ends = (np.array([getattr(turn, name) for turn in turns]) for name in ("start_s", "end_s"))
         known = np.ones(len(turns), np.bool_)
         if min(len(attitudes.times_s), len(turns)) >= MIN_TURNS:

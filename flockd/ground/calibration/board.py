@@ -19,7 +19,7 @@ MIN_CORNERS = 8
 _CENTRE_PX = 0.5
 """OpenCV has pixel centres at whole numbers."""
 _MAX_STEPS, _PRECISION_PX = 50, 0.002
-"""Of the search for a corner's exact place."""
+"""Limits of the search for a corner's exact place."""
 _WINDOW, _WINDOWS_PX = 0.13, (2, 12)
 """Half the side of the window around a corner: in squares, so that no marker is in it, and its limits."""
 

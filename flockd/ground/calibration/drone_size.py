@@ -24,7 +24,7 @@ VIEW_SIGMA = 0.04
 """Standard deviation of the log apparent size from one view to another, beside what the network says of its own error:
 on rendered drones of families that the network never saw, its median absolute value is 4 %."""
 TAPE_SIGMA_M = 0.02
-"""Of a distance by a tape, from the lens to the drone's middle."""
+"""Standard deviation of a distance by a tape, from the lens to the drone's middle."""
 MAX_SIGMA = 0.05
 """Standard deviation of the result as a share of it: with more, too little is known to fly with."""
 NAMED = 3

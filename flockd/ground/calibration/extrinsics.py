@@ -42,7 +42,7 @@ class Mounting:
     sigma_deg: float
     """Standard deviation of its turn about the worst of the body's axes: what noise alone leaves open."""
     sigma_m: float
-    """Of its place along the worst of the body's axes."""
+    """Standard deviation of its place along the worst of the body's axes."""
     rms_px: float
     boards: int
     """Boards that it saw together with another camera."""

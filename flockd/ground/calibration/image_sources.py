@@ -33,7 +33,7 @@ class ImageSet:
     images: Mapping[str, UInt8Array]
     """(h, w, 3) RGB by camera."""
     times_s: Mapping[str, float] = field(default_factory=dict)
-    """Of each camera's frame, where it is known."""
+    """Time of each camera's frame, where it is known."""
     vehicle: VehicleState | None = None
 
 

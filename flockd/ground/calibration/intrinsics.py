@@ -129,7 +129,7 @@ def calibrate(views: Sequence[View], size: tuple[int, int], model: LensModel) ->
 
 
 def simplest_that_fits(lenses: Sequence[Lens]) -> Lens:
-    """Of lenses fitted to the same views, simplest first: the first that none fits clearly better than.
+    """The first of some lenses, simplest first, that none fits clearly better than. All are fitted to the same views.
 
     Noise alone leaves one model a little less residual than another, and an absurd distortion can imitate a plain lens.
     """

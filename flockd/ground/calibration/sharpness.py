@@ -39,7 +39,7 @@ def edge_width_px(grey: UInt8Array, seen: BoardDetection, spec: BoardSpec) -> fl
 
 
 def _width(grey: UInt8Array, first: FloatArray, second: FloatArray) -> float:
-    """Of the edge between two neighbouring corners."""
+    """Width of the edge between two neighbouring corners."""
     along = second - first
     square = float(np.linalg.norm(along))
     if square < _SMALLEST_SQUARE_PX:

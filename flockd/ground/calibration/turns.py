@@ -20,9 +20,9 @@ from flockd.flight.geometry.rotations import rotation_from_vector
 
 _MAX_POINTS = 400
 _QUALITY = 0.01
-"""Of a point, as a share of the best one's (Shi & Tomasi 1994)."""
+"""Least quality of a point, as a share of the best one's (Shi & Tomasi 1994)."""
 _MIN_DISTANCE = 1 / 60
-"""Of two points, in widths of the image."""
+"""Least distance of two points, in widths of the image."""
 _WINDOW_PX, _PYRAMID_LEVELS = 21, 4
 _FORWARD_BACKWARD_PX = 0.5
 """A point is kept that, followed back, ends nearer than this to where it began (Kalal et al. 2010)."""

@@ -33,7 +33,7 @@ class View:
     """One image of the board."""
 
     name: str
-    """Of the file, or the frame's number or time."""
+    """Name of the file, or the frame's number or time."""
     seen: BoardDetection
     edge_px: float
     """See `sharpness.edge_width_px`."""
@@ -46,7 +46,7 @@ class Refused:
     name: str
     why: Refusal
     edge_px: float | None = None
-    """Of a blurred one."""
+    """Width of a blurred edge."""
 
 
 class Collector:

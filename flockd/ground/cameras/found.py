@@ -11,7 +11,7 @@ from flockd.core.config.source import CameraDeviceParameters
 USUAL_SIZE, USUAL_RATE_HZ = (640, 480), 30.0
 """What is chosen where a camera offers it."""
 _PREFERENCE = ("mjpeg", "NV12", "I420", "yuyv")
-"""Of formats, first those that take the least of a bus."""
+"""Formats in order of preference, first those that take the least of a bus."""
 
 
 @dataclass(frozen=True)

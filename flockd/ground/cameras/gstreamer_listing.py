@@ -10,7 +10,7 @@ from flockd.onboard.sources.gstreamer_formats import FORMATS
 
 MONITOR = ("gst-device-monitor-1.0", "Video/Source")
 _OTHERS = ("v4l2src", "pipewiresrc", "ximagesrc")
-"""Of elements: what flockd finds by itself, and what is a view of it or no camera."""
+"""Elements that are left out: what flockd finds by itself, and what is a view of it or no camera."""
 _LAUNCH = re.compile(r"^\s*gst-launch-1\.0 (\S.*?)(?: ! \.\.\.)?\s*$", re.MULTILINE)
 _NAME = re.compile(r"^\s*name\s*: (.*)$", re.MULTILINE)
 _CAPS = re.compile(r"(image/jpeg|video/x-raw),([^;\n]*)")
@@ -32,7 +32,7 @@ def cameras_of_monitor(text: str) -> list[FoundCamera]:
 
 
 _ANY = (Mode("NV12", (640, 480), (30.0,)),)
-"""Of an element that does not say what it offers."""
+"""Modes assumed for an element that does not say what it offers."""
 
 
 def _modes(text: str) -> Iterator[Mode]:

@@ -34,7 +34,7 @@ class Measured:
     edge_px: float
     """See ``edge_width_px``; NaN without an image."""
     mean_grey: float
-    """Of 255; NaN without an image."""
+    """Mean grey, 0 to 255; NaN without an image."""
     black_share: float
     white_share: float
 

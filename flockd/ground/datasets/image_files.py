@@ -16,7 +16,7 @@ SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", "
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
 _JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 MAX_FILE_BYTES = 1 << 29
-"""Of an image with the most pixels that are read, and a depth of 16 bits, uncompressed, and some."""
+"""Largest file: an image with the most pixels that are read and a depth of 16 bits, uncompressed, and some more."""
 _CHUNK_FRAME = 12
 """Bytes of a PNG chunk beside its data: length, name and checksum."""
 
@@ -63,7 +63,7 @@ def _decoded(path: Path, flags: int) -> cv2.typing.MatLike:
 
 
 def _read(path: Path) -> bytes:
-    """Of an ordinary file: a pipe or a device may never end."""
+    """The bytes of an ordinary file: a pipe or a device may never end."""
     if path.exists() and not path.is_file():
         raise DatasetError(f"{path}: is not an ordinary file; restore it, or leave its frame out")
     if path.exists() and path.stat().st_size > MAX_FILE_BYTES:

@@ -14,13 +14,13 @@ from flockd.ground.doctor.lens_checks import coverage, lens_problems, width_deg
 from flockd.onboard.sources.v4l2_kernel import Kernel, LinuxKernel
 
 SLOW, TOO_SLOW = 0.95, 0.8
-"""Of the configured rate. Cheap cameras halve theirs by themselves in dim light."""
+"""Shares of the configured rate. Cheap cameras halve theirs by themselves in dim light."""
 UNEVEN, TOO_UNEVEN = 0.2, 0.5
-"""Of a frame period, the 95th percentile of how far a frame is from its beat. By half a period sets fall apart."""
+"""Shares of a frame period: 95th percentile of how far a frame is from its beat. By half a period sets fall apart."""
 FIX_RATE = "try another cable and port, fewer cameras on one USB bus, or a shorter exposure that is set by hand"
 FIX_PIPELINE = "try the pipeline with `gst-launch-1.0`, and ask it for a rate and size that it can keep"
 DARK, BRIGHT = 12.0, 243.0
-"""Of 0-255, the mean grey of an image in which little can be seen."""
+"""Mean grey, 0 to 255, of an image in which little can be seen."""
 
 
 def check_cameras(config: DroneConfig, seconds: float, kernel: Kernel | None = None) -> Iterator[Finding]:

@@ -14,7 +14,7 @@ from flockd.ground.doctor.finding import Finding, failed, passed, warned
 # A calibration made at another size of image has its principal point far from the middle: half the width off for twice
 # the size. Real lenses sit within some percent of it.
 ODD_CENTRE, WRONG_CENTRE = 0.08, 0.2
-"""Of the width or height, between the principal point and the middle."""
+"""Shares of the width or height, between the principal point and the middle."""
 ODD_PIXELS, WRONG_PIXELS = 0.03, 0.15
 """How much fx and fy differ: pixels are square, unless images were squeezed from another aspect."""
 NARROW_DEG, MOST_PINHOLE_DEG, MOST_WIDE_DEG = 40.0, 130.0, 220.0

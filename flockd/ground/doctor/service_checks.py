@@ -17,7 +17,7 @@ from flockd.onboard.daemon import only_instance, service_lock
 UNIT_FOLDERS = (Path("/etc/systemd/system"), Path("/usr/lib/systemd/system"), Path("/lib/systemd/system"))
 UNIT = "flockd.service"
 BAR, MUCH = 1.5, 5.0
-"""Of 10. systemd itself calls 5 and more at best medium."""
+"""Exposure scores, from 0 to 10. systemd itself calls 5 and more at best medium."""
 
 
 def check_instance(drone: str, environment: Mapping[str, str]) -> Iterator[Finding]:

@@ -101,7 +101,7 @@ def average_precision(judged: Sequence[tuple[float, bool]], boxes: int) -> float
 
 
 def summary(pictures: Sequence[Labelled], min_probability: float = 0.0) -> dict[str, Any]:
-    """Of one set of labelled pictures, counting detections that are at least so probable.
+    """The summary of one set of labelled pictures, counting detections that are at least so probable.
 
     ``boxes``; ``by_width``: by the box's width in pixels the boxes, those ``found`` (a detection's centre lies in the
     box) and those ``found_iou30``; ``ap50``; ``false_per_500_images``: detections that found no box.

@@ -21,7 +21,7 @@ from flockd.flight.perception.detection.roi import angle_between
 MAX_SIDE_PX = 1280
 """Larger pictures are resized to this before the networks: they were trained on cameras of 640 pixels."""
 _R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""Of a camera that faces forward: optical right-down-forward axes to the body's forward-right-down."""
+"""Rotation of a camera that faces forward: optical right-down-forward axes to the body's forward-right-down."""
 _MAX_INSTANCE = 2.0
 """An instance's longer side over the drone's apparent size, for it to be of this drone alone: masks of soft pictures
 lack thin arms and propellers, which the first stage has, but it may take several drones for one."""

@@ -31,7 +31,7 @@ class ClockEstimate:
     """The autopilot's clock as of one time of this computer's."""
 
     time_s: float
-    """Of the newest round trip, on this computer's clock."""
+    """Time of the newest round trip, on this computer's clock."""
     offset_s: float
     """The autopilot's clock less this computer's, then."""
     error_s: float

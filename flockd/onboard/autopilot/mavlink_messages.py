@@ -65,19 +65,19 @@ ENUMERATIONS: Mapping[tuple[str, str], int] = {
 RANGES: Mapping[tuple[str, str], range] = {("SYS_STATUS", "battery_remaining"): range(-1, 101)}
 """What other fields may be, likewise; -1 is MAVLink's own word for unknown."""
 FACES_DOWN = 25
-"""Of MAV_SENSOR_ORIENTATION: MAV_SENSOR_ROTATION_PITCH_270."""
+"""MAV_SENSOR_ROTATION_PITCH_270 of MAV_SENSOR_ORIENTATION."""
 FULL_SIGNAL, NO_SIGNAL = 100, 1
-"""Of DISTANCE_SENSOR's `signal_quality`, in percent; 0 is for sensors that do not say."""
+"""Values of DISTANCE_SENSOR's `signal_quality`, in percent; 0 is for sensors that do not say."""
 RANGE_LOST_S = 0.5
 """A range finder that is silent for so long gives way to the autopilot's own distance to bottom."""
 QUATERNION_TOLERANCE = 0.1
-"""Of its norm from 1; one that is farther off is no attitude."""
+"""How far a quaternion's norm may be from 1; one that is farther off is no attitude."""
 HOME_TOLERANCE_M = 0.5
 """A home that moves less in flight is not reported: estimators drift."""
 STAMPED = frozenset({"ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "DISTANCE_SENSOR"})
 """Messages whose `time_boot_ms` says when they were true."""
 MOST_ERROR_S = 0.005
-"""Of a clock whose stamps are better than times of arrival."""
+"""Largest error of a clock whose stamps are better than times of arrival."""
 LONGEST_DELAY_S = 1.0
 """A stamp that is older at its arrival is not believed."""
 MAV_SEVERITY_WARNING = 4

@@ -41,14 +41,14 @@ DENIALS = frozenset(
 )
 MODE_DENIED = event_number("commander_modeswitch_not_avail")
 OFFBOARD_MAIN_MODE = 6
-"""Of PX4's custom mode."""
+"""Main mode in PX4's custom mode."""
 ALL_MODES = 0xFFFFFFFF
 ERROR, WARNING = 3, 4
-"""Of PX4's log levels, which are worse the smaller."""
+"""PX4's log levels, which are worse the smaller."""
 MOST_CHECKS = 300
 """That a report may name as failed: PX4 has fewer."""
 PREARM_CHECK = 1 << 28
-"""Of MAV_SYS_STATUS_SENSOR."""
+"""Bit of MAV_SYS_STATUS_SENSOR."""
 QUIET_ERRORS = frozenset({"check_system_safety_button", "check_modes_mission"})
 """PX4 sends them as information, and refuses to arm all the same."""
 REMEMBERED_S = 15.0
@@ -81,7 +81,7 @@ class FailedCheck(NamedTuple):
     """A check of PX4 that fails."""
 
     number: int
-    """Of the event."""
+    """The event's number."""
     modes: int
     """Bits of the modes that it concerns."""
     level: int
@@ -206,7 +206,7 @@ def _of_report(report: CheckReport, status: AutopilotStatus, *, streams: bool, a
 
 
 def _blocking(report: CheckReport, state: int, status: AutopilotStatus) -> list[FailedCheck]:
-    """Of the checks that fail in a mode those that keep it from being armed; PX4 does not say which do."""
+    """The failed checks of a mode that keep it from being armed; PX4 does not say which do."""
     failed = [check for check in report.failed if check.modes >> state & 1]
     certain = [
         check

@@ -87,7 +87,7 @@ class WallClock:
 
 
 def hottest_zone_c(folder: Path) -> float | None:
-    """Of all zones that can be read; a zone that is switched off cannot."""
+    """Temperature of the hottest zone that can be read; a zone that is switched off cannot."""
     readings = []
     for zone in folder.glob("thermal_zone*/temp"):
         try:

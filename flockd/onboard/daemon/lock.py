@@ -12,7 +12,7 @@ from pathlib import Path
 from flockd.core.errors import UnavailableError
 
 SERVICE_FOLDER = Path("/run/flockd")
-"""Of the systemd unit; a process started by hand checks there too."""
+"""Runtime folder of the systemd unit; a process started by hand checks there too."""
 
 
 @contextmanager

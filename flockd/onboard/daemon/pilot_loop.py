@@ -22,7 +22,7 @@ FRAME_WAIT_S = 0.1
 FRAME_DEADLINE_S = 5.0
 """To decode one set."""
 STEP_DEADLINE_S = 30.0
-"""Of a whole step, whose networks have deadlines of their own; the drone has been handed over long before."""
+"""Deadline of a whole step, whose networks have deadlines of their own; the drone has been handed over long before."""
 LEAVE_S = 0.7
 STEPS_REMEMBERED = 20
 MAX_UNEXPECTED = 3
@@ -38,7 +38,7 @@ class StepResult:
     flight: int
     """The number of the flight whose pilot computed it."""
     number: int
-    """Of the step, from 1 for the first of its pilot."""
+    """Number of the step, from 1 for the first of its pilot."""
 
 
 class StepsFailedError(Exception):
@@ -198,7 +198,7 @@ class HeightReports:
 
 
 def _frame_period_s(config: DroneConfig) -> float:
-    """Of the slowest camera."""
+    """Frame period of the slowest camera."""
     assert config.source is not None
     rates_hz = [camera.rate_hz for camera in config.source.cameras] or [config.source.shared_memory.rate_hz]
     return 1.0 / min(rates_hz)

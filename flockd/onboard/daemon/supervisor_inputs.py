@@ -175,7 +175,7 @@ class _Tally(NamedTuple):
     """When they came."""
     decoded: int
     useless: int
-    """Of the decoded: they show nothing, or noise."""
+    """How many of the decoded show nothing, or noise."""
 
     @classmethod
     def of(cls, status: Mapping[str, CameraStatus], noisy_images: int) -> Self:

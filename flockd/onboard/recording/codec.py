@@ -94,7 +94,7 @@ def json_schema(kind: Any) -> dict[str, Any]:
 
 
 def _shape(kind: Any) -> tuple[int, ...]:
-    """Of an annotated array. Raises TypeError where none is declared."""
+    """The shape of an annotated array. Raises TypeError where none is declared."""
     for part in get_args(kind)[1:]:
         if isinstance(part, Shape):
             return part.sizes

@@ -45,7 +45,7 @@ class FieldDifference:
 
     steps: set[int] = field(default_factory=set)
     largest: float | None = 0.0
-    """Of the numbers; None where something else than a number differs."""
+    """Largest difference of the numbers; None where something else than a number differs."""
 
 
 @dataclass

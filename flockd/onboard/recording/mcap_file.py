@@ -32,7 +32,8 @@ SYNC_EVERY_S = 1.0
 _MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")
 MAX_RECORD_BYTES = 256 << 20
-"""Of a record in the file, and of a chunk uncompressed: what takes more is damaged. The largest holds one image."""
+"""Limit of a record in the file, and of a chunk uncompressed: what takes more is damaged. The largest holds one
+image."""
 # RuntimeError and EOFError: lz4; ValueError: a wrong checksum, text that is not UTF-8; OverflowError: sizes over 2^63
 _BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError, RuntimeError, EOFError, MemoryError)
 

@@ -54,7 +54,7 @@ class RecordedStep:
     """A `PilotOutput` as JSON, every number exact; None where the recording ends before it. Of an earlier version: as
     `migrate_output` converts it."""
     truth: Truth | None
-    """Of a simulated flight."""
+    """The truth of a simulated flight."""
     order: MissionOrder | None = None
     """An operator's that the step took."""
 

@@ -345,7 +345,7 @@ class _Parts:
 
     @property
     def path(self) -> Path:
-        """Of the file that is being written."""
+        """Path of the file that is being written."""
         return part_path(self._first, self._number)
 
     def begin(self) -> None:

@@ -14,7 +14,7 @@ from flockd.onboard.recording.truth import Truth
 from flockd.onboard.telemetry import TOPICS
 
 FORMAT = "1"
-"""Of this layout; a reader refuses others."""
+"""Version of this layout; a reader refuses others."""
 FLIGHT_NOTE = "flockd"
 MODELS_NOTE = "models"
 END_NOTE = "end"
@@ -52,16 +52,16 @@ def _json_stream(topic: str, kind: Any) -> Stream:
 FRAMES = _json_stream("/frames", StepFrames)
 VEHICLE = _json_stream("/vehicle", VehicleState)
 ORDER = _json_stream("/order", MissionOrder)
-"""Of steps in which the pilot took an operator's order."""
+"""Orders of the steps in which the pilot took an operator's."""
 OUTPUT = _json_stream("/output", PilotOutput)
 TRUTH = _json_stream("/truth", Truth)
-"""Of simulated flights."""
+"""Only in recordings of simulated flights."""
 TABLE = {key: _json_stream(f"/{key}", topic.type) for key, topic in TOPICS.items() if topic.recorded}
 """The telemetry that the table of topics marks as recorded."""
 
 
 def part_path(first: Path, number: int) -> Path:
-    """Of a recording's files, the one with this number; the first is number 0."""
+    """Path of the recording's file with this number; the first is number 0."""
     return first.with_name(f"{first.stem}.{number}{first.suffix}") if number else first
 
 

@@ -38,7 +38,7 @@ class CameraDevice(Protocol):
         """The next image; None if there is none within the time."""
 
     def image_format(self) -> ImageFormat:
-        """Of the image that `read` gave last."""
+        """Format of the image that `read` gave last."""
 
     def __enter__(self) -> Self: ...
 

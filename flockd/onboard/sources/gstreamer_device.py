@@ -27,7 +27,7 @@ PACKAGES = "libgstreamer1.0-0, gstreamer1.0-plugins-base and the plugins that it
 _PIPE_BYTES = 1 << 20
 """What an ordinary user may have; fewer system calls an image than with the usual 64 kB."""
 _MOST_BYTES = 1 << 28
-"""Of one image: the largest that a rig may have is less."""
+"""The most bytes of one image: the largest that a rig may have is less."""
 _END_S = 1.5
 
 

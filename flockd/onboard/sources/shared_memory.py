@@ -29,7 +29,7 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7448"
 _HEADER = struct.Struct("<4sHHQd")
 _MAGIC = b"rgb8"
 MAX_AGE_S = 5.0
-"""Of a frame on arrival: a simulator stamps before it draws, and may draw for long."""
+"""Largest age of a frame on arrival: a simulator stamps before it draws, and may draw for long."""
 POOL_BYTES = 16 << 20
 """For one drone, in whose memory it counts: four sets of four 640x480 cameras."""
 

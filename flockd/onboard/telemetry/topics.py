@@ -3,11 +3,11 @@
 A key is `flockd/v1/<fleet>/<drone>/<topic>`; a message is a JSON object in UTF-8. Every number is finite or null.
 Vectors are lists: NED is north, east, down. Times are seconds on the drone's monotonic clock.
 
-`state` to `timings` follow from each step of the pilot; `flight` to `clock` come from the daemon, at all times.
-Beside the topics, a drone's daemon has a liveliness token `.../alive`, replies to a query for `.../about` with an
-`AboutMessage`, one for `.../time` with a `TimeMessage`, one for `.../ask/hold`, `land`, `resume`, `goto` or
-`velocity` with an `AnswerMessage`, and one for `.../image/<camera>` with a small JPEG of what that camera sees. A query
-for `goto` or `velocity` carries an `OrderMessage`.
+`state` to `timings` follow from each step of the pilot; `flight` to `clock` come from the daemon, at all times. Beside
+the topics, a drone's daemon has a liveliness token `.../alive`. It replies to a query for `.../about` with an
+`AboutMessage`, and for `.../time` with a `TimeMessage`. It replies to one for `.../ask/hold`, `land`, `resume`, `goto`
+or `velocity` with an `AnswerMessage`, and one for `.../image/<camera>` with a small JPEG of what that camera sees. A
+query for `goto` or `velocity` carries an `OrderMessage`.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ class FlightMessage(TypedDict):
     armed: bool | None
     in_air: bool | None
     heartbeat_age_s: float | None
-    """Of the autopilot; null before the first."""
+    """Age of the autopilot's newest heartbeat; null before the first."""
     battery_share: float | None
     """0 to 1."""
     height_m: float | None

@@ -21,7 +21,7 @@ _BY_STEP = (
 
 
 class FlightLogBuilder:
-    """Of a flight of ``drones`` drones whose steps begin at ``times`` (S,) s; NaN where nothing is added."""
+    """Builds the log of ``drones`` drones whose steps begin at ``times`` (S,) s; NaN where nothing is added."""
 
     def __init__(self, times: FloatArray, drones: int) -> None:
         steps, n, nan = len(times), drones, np.nan

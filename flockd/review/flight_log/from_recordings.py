@@ -26,7 +26,7 @@ from flockd.review.flight_log.metadata import FlightMetadata
 Progress = Callable[[int, int], None]
 
 CLOCK_TOPIC = "/clock"
-"""Of recordings, with the autopilot's clock."""
+"""Topic of recordings with the autopilot's clock."""
 
 
 def recordings_in(folder: Path) -> tuple[Path, ...]:

@@ -40,7 +40,7 @@ class KeyFrame:
     shrink: int = 1
     """How many camera pixels, each way, one pixel of these images stands for."""
     name: str = ""
-    """Of the drone, where it has another than its number."""
+    """The drone's name, where it is another than its number."""
 
     @property
     def title(self) -> str:

@@ -17,7 +17,7 @@ _FROZEN = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="constants")
 
 
 class Percentiles(BaseModel):
-    """Of a set of durations."""
+    """Percentiles of a set of durations."""
 
     model_config = _FROZEN
 
@@ -54,7 +54,7 @@ class FleetMetadata(BaseModel):
     modes: dict[str, list[str]] = {}
     """The flight modes of each autopilot, in order, by the drone's name."""
     exit_codes: dict[str, int]
-    """Of the daemons, by the drone's name."""
+    """Exit codes of the daemons, by the drone's name."""
     notes: list[str]
 
 
@@ -64,13 +64,13 @@ class MissionMetadata(BaseModel):
     model_config = _FROZEN
 
     kind: str
-    """Of the missions, by name, each once."""
+    """Kinds of the missions, by name, each once."""
     reached_m: float
     """How near to a goal the flock's middle has to come."""
 
     @classmethod
     def of(cls, scenario: ScenarioConfig) -> Self:
-        """Of all vehicles of a scenario."""
+        """The missions of all vehicles of a scenario."""
         vehicles = range(len(scenario.vehicles))
         kinds = [
             f"{scenario.drone_of(i).mission.kind}{' by hand' if scenario.vehicles[i].by_hand else ''}" for i in vehicles
@@ -100,31 +100,32 @@ class FlightMetadata(BaseModel):
     observation_distance_m: float
     separation_distance_m: float
     seed: int | None = None
-    """Of the scenario; None where a recording does not hold it."""
+    """Seed of the scenario; None where a recording does not hold it."""
     wall_s: float | None = None
     """How long the simulation took; None of a recording."""
     autopilot: str | None = None
     """What real daemons flew; None where there were no daemons."""
     fleet: FleetMetadata | None = None
     names: list[str] | None = None
-    """Of all drones, in the log's order; None where they are drone1, drone2, ..."""
+    """Names of all drones, in the log's order; None where they are drone1, drone2, ..."""
     recorded: list[str] | None = None
     """Drones whose recordings the log was made of; None of a log that a simulator wrote."""
     began: str | None = None
     """Wall time, ISO 8601, at which the flight, or its first recording, was begun."""
     version: str | None = None
-    """Of flockd."""
+    """Version of flockd."""
     interrupted: bool = False
     """It was ended before its time; `duration_s` is what was flown."""
     mission: MissionMetadata
     drone_radius_m: float | None = None
-    """Of the sphere that holds a drone; None where there is nothing to collide with."""
+    """Radius of the sphere that holds a drone; None where there is nothing to collide with."""
     clock_at_start_s: float | None = None
     """Time of the recordings' clock at the log's 0 s."""
 
     @classmethod
     def of_configuration(cls, config: DroneConfig, **facts: Any) -> Self:
-        """Of a flight with this configuration of its drones. ``facts`` are all other fields, and override its own.
+        """Metadata of a flight with this configuration of its drones. ``facts`` are all other fields, and override its
+        own.
 
         Raises ValueError (pydantic's ValidationError) for facts that are missing, unknown or of another type.
         """

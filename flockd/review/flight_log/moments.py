@@ -94,7 +94,7 @@ def _ring(detection: Detection) -> FloatArray:
 
 
 def _masks(frame: KeyFrame) -> dict[str, list[Outline]]:
-    """Of a key frame's masks the boxes."""
+    """The boxes of a key frame's masks."""
     found: dict[str, list[Outline]] = {}
     for camera, labels in frame.labels.items():
         for label in (int(one) for one in np.unique(labels) if one):

@@ -45,12 +45,12 @@ MODES = {
 }
 """PX4's navigation states, in flockd's words where it has them."""
 WARNING = 4
-"""Of syslog's levels, as messages of the log have them."""
+"""Syslog's level, as messages of the log have it."""
 BEFORE_S, AFTER_S = 10.0, 20.0
-"""Of the log, around the flight."""
+"""How much of the log is shown before and after the flight."""
 GRID_S = 0.05
 LEAST_SHARE = 0.6
-"""Of the commands' squares, which the log's setpoints explain at least where they are laid on each other."""
+"""Least share of the commands' squares that the log's setpoints explain where they are laid on each other."""
 LEAST_MOTION_M_S = 0.1
 NEARLY = 0.9
 FRESH_S = 0.5
@@ -79,7 +79,7 @@ def read_ulog(path: Path) -> ULog:
 
 
 def system_id(ulog: ULog) -> int | None:
-    """Of the autopilot that wrote it; None where it does not say."""
+    """System id of the autopilot that wrote it; None where it does not say."""
     number = ulog.initial_parameters.get("MAV_SYS_ID")
     return None if number is None else int(number)
 

@@ -31,7 +31,7 @@ class Replay:
     outputs: dict[int, Mapping[str, Any]] = field(default_factory=dict)
     recorded: dict[int, Mapping[str, Any]] = field(default_factory=dict)
     times_s: list[float] = field(default_factory=list)
-    """Of each step's frames."""
+    """Time of each step's frames."""
     reading_s: float = 0.0
     computing_s: float = 0.0
     stages_ms: dict[str, list[float]] = field(default_factory=dict)

@@ -16,9 +16,9 @@ from flockd.review.report.style import DRONE_COLOURS, INK, MUTED, STYLE, drone_n
 
 FLOWN, COMMANDED, FAILSAFE = DRONE_COLOURS[0], DRONE_COLOURS[1], "#c0392b"
 MODE_COLOURS: Final = {"offboard": DRONE_COLOURS[2]}
-"""Of modes that stand out; all others are grey."""
+"""Colours of modes that stand out; all others are grey."""
 MOST_ROWS = 60
-"""Of the table: a log that warns without end does not fill the page."""
+"""The most rows of the table: a log that warns without end does not fill the page."""
 
 
 def autopilot_figure(log: FlightLog, autopilot: AutopilotLog) -> Figure:

@@ -32,7 +32,7 @@ class Row:
     name: str
     unit: str
     digits: int | None
-    """Of a number; None of a word."""
+    """Decimal digits of a number; None for a word."""
     first: Any
     second: Any
     difference: float | None

@@ -96,7 +96,7 @@ class _Cell:
 
     @property
     def border(self) -> Rectangle:
-        """Of the image."""
+        """Border of the image."""
         size = self.scale * self.shape[1], self.scale * self.shape[0]
         return Rectangle((self.left, self.top), *size, transform=self.axes.transData)
 

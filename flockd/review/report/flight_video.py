@@ -23,7 +23,7 @@ CODECS = {".webm": "VP90", ".mp4": "vp09"}
 """VP9 in both: free of royalties, in OpenCV's own build, and shown by every browser."""
 _PLATE, _PANEL, _INK, _MUTED = "#14181f", "#1c222b", "#e8ecf1", "#98a3b0"
 _HEAD_PX, _GAP_PX, _MAP_PX = 36, 6, 640
-"""Of the line above, between the parts, and each side of the map."""
+"""Heights of the line above and of the gaps between the parts, and each side of the map."""
 _TRAIL_S = 20.0
 _LEAST_REACH_M = 6.0
 _FONT = cv2.FONT_HERSHEY_SIMPLEX

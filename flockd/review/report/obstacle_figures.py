@@ -18,7 +18,7 @@ from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.style import BAND, FEW, GRID, INK, PAPER, STYLE, colour_of, drone_name
 
 IN_THE_WAY: Final = "#8a7355"
-"""Of obstacles at the heights that were flown; the others are pale."""
+"""Colour of obstacles at the heights that were flown; the others are pale."""
 _FREE: Final = "#cfe6f5"
 LEGEND: Final[dict[str, Any]] = {
     "loc": "upper right", "frameon": True, "facecolor": PAPER, "edgecolor": "none", "framealpha": 0.85,

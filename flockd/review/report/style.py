@@ -23,7 +23,7 @@ PAPER: Final = "#ffffff"
 DRONE_COLOURS: Final = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#a39400", "#808890")
 
 BAND: Final = DRONE_COLOURS[0]
-"""Of the band that many drones fill."""
+"""Colour of the band that many drones fill."""
 
 ON_COLOUR: Final = "#fffffe"
 """White in either scheme, so not the paper's."""

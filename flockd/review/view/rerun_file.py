@@ -242,7 +242,7 @@ def _blueprint(rig: Rig) -> Any:
 
 
 def colour_of(number: int) -> tuple[int, int, int]:
-    """Of a drone or a track, by its number."""
+    """The colour of a drone or a track, by its number."""
     return _DRONES[number % len(_DRONES)]
 
 

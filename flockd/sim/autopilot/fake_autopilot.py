@@ -1,7 +1,7 @@
 """A fake autopilot for tests, and for the simulator where there is no PX4. It is not PX4 and flies nothing real.
 
-It speaks real MAVLink over UDP and keeps PX4's rules where flockd depends on them: who may enter offboard, when it is
-lost and what follows, that PX4 returns to offboard by itself when setpoints come back, that the heartbeat comes once a
+It speaks real MAVLink over UDP and keeps PX4's rules where flockd depends on them. These are: who may enter offboard,
+when it is lost and what follows; PX4 returns to offboard by itself when setpoints come back; the heartbeat comes once a
 second only. Where PX4 does more (climbing before a return, position control in Hold, estimators) it does not try.
 
     python -m flockd.sim.autopilot.fake_autopilot --port 14540 --height 2.5
@@ -52,7 +52,7 @@ OFFBOARD_LOSS_MODES: dict[int, Mode] = {0: "RTL", 3: "RTL", 4: "LAND", 5: "LOITE
 HOME_DEG = (47.3977, 8.5456)
 MAX_SETPOINTS_KEPT = 100_000
 SO_TIMESTAMPNS = 35
-"""Of Linux: the kernel says when each packet came, however long this thread waited for a turn."""
+"""Linux's socket option: the kernel says when each packet came, however long this thread waited for a turn."""
 
 
 class FakeAutopilot:

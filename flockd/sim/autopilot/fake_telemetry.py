@@ -26,7 +26,7 @@ TRUTH_S = 0.04
 ON_GROUND_M = 0.05
 UNKNOWN_COVARIANCE = 255
 FULL_SIGNAL, NO_SIGNAL = 100, 1
-"""Of DISTANCE_SENSOR's `signal_quality`, whose 0 is for sensors that do not say."""
+"""Values of DISTANCE_SENSOR's `signal_quality`, whose 0 is for sensors that do not say."""
 ALL_ESTIMATED = 1 | 2 | 4 | 8 | 16 | 32
 
 

@@ -68,13 +68,13 @@ def _sort(x: Any, y: Any, grid: Any, starts: Any, order: Any) -> None:
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def row_of(x: float, grid: Any) -> int:
-    """Of a place to the north; the nearest row's where it is beyond them."""
+    """Row of a place to the north; the nearest row where it is beyond them."""
     return int(min(max(math.floor((x - grid[0]) / grid[2]), 0), grid[3] - 1))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def column_of(y: float, grid: Any) -> int:
-    """Of a place to the east; the nearest column's where it is beyond them."""
+    """Column of a place to the east; the nearest column where it is beyond them."""
     return int(min(max(math.floor((y - grid[1]) / grid[2]), 0), grid[4] - 1))
 
 

@@ -15,7 +15,7 @@ from flockd.flight.safety import Action, Gate, Permission, Request, Surroundings
 from flockd.sim.control_level import motion
 
 _SETPOINT_RATE_HZ = 20.0
-"""Of a drone without an autopilot's section, as by default in one."""
+"""Rate for a drone without an autopilot's section, as by default in one."""
 
 
 class Seen(NamedTuple):
@@ -28,7 +28,7 @@ class Seen(NamedTuple):
 
 
 class FlightCode:
-    """Of `drones` drones of one configuration, whatever flight they are in."""
+    """The code of `drones` drones of one configuration, whatever flight they are in."""
 
     def __init__(self, drone: DroneConfig, vehicle: VehicleConfig, drones: int) -> None:
         self._drone, self._law = drone, FlockingLaw(drone.flocking)
@@ -40,7 +40,7 @@ class FlightCode:
         self._tick_s = step_s / self._ticks
         self._substeps = motion.Substeps.of(vehicle, self._tick_s)
         self.substeps = self._substeps._replace(times=self._ticks * self._substeps.times)
-        """Of a step with gates: the same number in each of its setpoints."""
+        """Flies a step with gates: the same number in each of its setpoints."""
         self._sent, self._height_m = np.zeros((2, drones)), np.zeros(drones)
 
     def around(

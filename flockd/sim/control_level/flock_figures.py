@@ -21,7 +21,7 @@ SAFE_M = 1.0
 def nearest_distances(
     begin: int, end: int, by_slot: Any, grids: Any, starts: Any, order: Any, level: Any, straight: Any, unsafe: Any
 ) -> None:
-    """Of the drones `begin` to before `end`, counted slot by slot through all flights.
+    """Figures of the drones `begin` to before `end`, counted slot by slot through all flights.
 
     Fills `level` and `straight` (flights, n) with the distance to the nearest other drone in the plane and in space, m,
     infinite for one that is alone, and `unsafe` (flights, n) with how many are nearer than `SAFE_M`.

@@ -23,7 +23,7 @@ from flockd.sim.control_level.many_obstacles import FIGURES, ManyObstacles
 Figures = dict[str, float | int | bool | None]
 _Errors = tuple[FloatArray, FloatArray, IntArray]
 _LEAST_DRONES = 250
-"""Of a thread: fewer are computed sooner than handed over."""
+"""Least drones of a thread: fewer are computed sooner than handed over."""
 
 
 def fly_flocks(
@@ -227,7 +227,7 @@ class FlockFlights:
             self._arrival_s[there] = self._times[step]
 
     def figures(self) -> list[Figures]:
-        """Of each flight."""
+        """The figures of each flight."""
         flights, obstacles = range(self._shape[0]), self._obstacles
         of_obstacles = [dict.fromkeys(FIGURES) if obstacles is None else obstacles.of_flight(k) for k in flights]
         return [{**self._figures.of_flight(k), **self._of_goal(k), **of_obstacles[k]} for k in flights]

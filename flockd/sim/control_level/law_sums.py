@@ -94,7 +94,8 @@ def _uniform_slice(a: int, b: int, here: Any, x: Any, y: Any, vx: Any, vy: Any, 
 def uniform_sums(
     begin: int, end: int, by_slot: Any, grids: Any, starts: Any, order: Any, law: Any, out: Any, middles: Any
 ) -> None:
-    """Of the drones `begin` to before `end`, counted slot by slot through all flights; weight 1 on all who are seen.
+    """Sums for the drones `begin` to before `end`, counted slot by slot through all flights; weight 1 on all who are
+    seen.
 
     `out` (2, flights, n) m/s^2 is u of Eq. 38 without u_vf, `middles` (2, flights, n) m the way from each drone to the
     middle of it and of those it sees.

@@ -34,7 +34,7 @@ class Substeps(NamedTuple):
 
     @classmethod
     def of(cls, vehicle: VehicleConfig, step_s: float) -> Substeps:
-        """Of a vehicle that gets a setpoint every `step_s`."""
+        """The substeps of a vehicle that gets a setpoint every `step_s`."""
         count = math.ceil(step_s / MAX_SUBSTEP_S - 1e-9)
         dt_s = step_s / count
         answer_per_s = -math.expm1(-dt_s / vehicle.velocity_time_constant_s) / dt_s

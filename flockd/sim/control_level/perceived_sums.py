@@ -150,7 +150,7 @@ def _column(table: Any, d: float, column: int) -> float:
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _error(table: Any, d: float, column: int, z: float) -> float:
-    """Of a normal number."""
+    """The error that belongs to a normal number."""
     return _column(table, d, column) * z + _column(table, d, column + 1) * z * z * z
 
 

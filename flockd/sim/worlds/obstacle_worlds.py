@@ -17,7 +17,7 @@ from flockd.sim.worlds.obstacles import Box, Capsule, Frustum, Material, Obstacl
 DEPTH_M = 0.6
 """How far everything reaches below z = 0, where the ground may lie lower."""
 LOWEST_CROWN_M = 6.0
-"""Of a forest's old trees."""
+"""Lowest crown of a forest's old trees."""
 _TREE_TRIES = 400
 _YOUNG = 0.12
 """Share of a forest's trees that have branches down to the ground."""

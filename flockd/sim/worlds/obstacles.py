@@ -18,9 +18,9 @@ from flockd.sim.worlds.solid_distances import BOX, CAPSULE, FRUSTUM, OWN, level_
 RANGE_LIMIT_M = 20.0
 """How far `true_ranges` reaches."""
 HEIGHT_BAND_M = (-0.75, 0.75)
-"""Of `true_ranges`: from below to above the drone's centre, up positive."""
+"""Heights that `true_ranges` looks at, from below to above the drone's centre, up positive."""
 EXACT_SIGMA_M = 0.01
-"""Of `true_ranges`: a standard deviation that is not 0."""
+"""Standard deviation that `true_ranges` gives, which is not 0."""
 POINTS_A_STEP = 10
 """At which a clearance is taken on the way from one step to the next: 8 cm apart at 1.5 m/s and a step of 0.5 s."""
 Material = Literal["bark", "leaves", "needles", "plaster", "bricks", "stone", "roof", "wood", "metal"]

@@ -54,7 +54,7 @@ def level_ranges(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _radius_at(own: Any, height: float) -> float:
-    """Of a frustum."""
+    """Radius of a frustum at a height."""
     return float(own[2] + (height - own[4]) / (own[5] - own[4]) * (own[3] - own[2]))
 
 
@@ -62,7 +62,7 @@ def _radius_at(own: Any, height: float) -> float:
 def _capsule_ranges(
     own: Any, x: float, y: float, low: float, high: float, looks: Any, half_width: float, out: Any
 ) -> None:
-    """Of the part of a capsule between two heights: discs at its ends, and the rectangle between them.
+    """Ranges to the part of a capsule between two heights: discs at its ends, and the rectangle between them.
 
     Exact for upright and level ones; of a sloping one the axis is cut where it leaves the heights by the radius.
     """

@@ -69,7 +69,7 @@ RANGES = [4.0 if sector == 18 else None for sector in range(72)]
 PLACE = [20.0, 10.0, 5.0]
 """East, north, up."""
 PICTURE = bytes(cv2.imencode(".jpg", np.full((240, 320, 3), 90, np.uint8))[1])
-"""Of half the camera's size."""
+"""A picture of half the camera's size."""
 CAMERA = "/drone1/camera/front"
 FLOWN = Path(__file__).parents[2] / "review" / "replay" / "crossing.mcap"
 

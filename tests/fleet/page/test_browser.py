@@ -55,7 +55,7 @@ def flock() -> Iterator[Flock]:
 
 
 def card(page: Page, drone: str) -> str:
-    """Of one drone."""
+    """The card of one drone."""
     return f"article[data-key='made-up/{drone}']"
 
 

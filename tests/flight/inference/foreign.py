@@ -20,14 +20,14 @@ SIZE = (48, 32)
 
 
 def image_input(**changes: Any) -> dict[str, Any]:
-    """Of a network that takes what torch users feed: NCHW, 0 to 1."""
+    """The image input of a network that takes what torch users feed: NCHW, 0 to 1."""
     width, height = SIZE
     plain = {"shape": [1, 3, height, width], "dtype": "float32", "layout": "nchw", "white": 1.0}
     return {**plain, "meaning": "image", "unit": "0-1", **changes}
 
 
 def map_output(shape: Sequence[int | str], **changes: Any) -> dict[str, Any]:
-    """Of any map."""
+    """The output that is a map."""
     return {"shape": list(shape), "dtype": "float32", "meaning": "map", "unit": "1", **changes}
 
 

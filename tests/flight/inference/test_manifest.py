@@ -194,7 +194,7 @@ def test_a_batch_of_crops_enters_at_the_models_own_size(tmp_path: Path) -> None:
 
 
 def planes_document(tmp_path: Path) -> dict[str, Any]:
-    """Of a network with an image of free size and two planes beside it."""
+    """The manifest of a network with an image of free size and two planes beside it."""
     document: dict[str, Any] = yaml.safe_load(one_channel_depth(tmp_path, output={}).read_text())
     document["inputs"] = {
         "image": image_input(shape=[1, 3, "h", "w"]),

@@ -16,7 +16,7 @@ from flockd.flight.inference import load_manifest, read_manifest
 from tests.flight.inference.foreign import one_channel_depth
 
 LIMIT_S = 2.0
-"""Of the processor's time: what waits or reads for ever never ends, whatever else runs."""
+"""Limit of the processor's time: what waits or reads for ever never ends, whatever else runs."""
 
 
 @contextmanager

@@ -281,7 +281,7 @@ def test_an_attitude_that_is_rounded_is_flown_with(off: float) -> None:
 
 
 def test_a_detection_that_the_tracker_refuses_costs_that_neighbour_only() -> None:
-    """Of two neighbours, one's probability came out above 1."""
+    """Two neighbours: one's probability came out above 1."""
     covariance = np.diag([1e-2, 1e-4, 1e-4])
     sound = Detection(np.array([1.0, 0.0, 0.0]), math.log(3.0), covariance, 0.9, 0.4, ("front",), 1)
     spoilt = replace(sound, bearing=np.array([0.0, 1.0, 0.0]), drone_probability=1.5, label=2)

@@ -18,7 +18,7 @@ from flockd.flight.safety import (
 )
 
 STEP_S = 1 / 16
-"""Of the supervisor. A power of two, so that the clock adds up without rounding."""
+"""Step of the supervisor. A power of two, so that the clock adds up without rounding."""
 
 SEES = CameraHealth(age_s=0.02, period_s=0.033, unplugged=False, frozen=False, noisy=False)
 UNPLUGGED = replace(SEES, unplugged=True)

@@ -85,7 +85,7 @@ def _texture(spec: BoardSpec) -> UInt8Array:
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Of one frame in another: p_other = R p + t."""
+    """The place of one frame in another: p_other = R p + t."""
 
     R: FloatArray
     t: FloatArray

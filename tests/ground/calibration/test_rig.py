@@ -117,7 +117,7 @@ RATE_HZ, OFFSET_S = 20.0, 0.0437
 
 
 def attitude(time_s: FloatArray | float, axes: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Rotation:
-    """Of a drone that somebody turns about in their hands, on the autopilot's clock."""
+    """The attitude of a drone that somebody turns about in their hands, on the autopilot's clock."""
     t = np.asarray(time_s)
     roll, pitch, yaw = 0.5 * np.sin(2.1 * t), 0.4 * np.sin(1.3 * t + 1.0), 0.8 * np.sin(0.9 * t) + 0.2 * np.sin(3.7 * t)
     return Rotation.from_euler("ZYX", np.stack([axes[2] * yaw, axes[1] * pitch, axes[0] * roll], axis=-1))

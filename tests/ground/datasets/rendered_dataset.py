@@ -24,7 +24,7 @@ PERIOD_S = 0.1
 START_S = 1403636579.75
 MATRIX = np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
 OTHERS_MATRIX = MATRIX - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
-"""Of the same camera for whoever counts pixel centres from 0."""
+"""The matrix of the same camera for whoever counts pixel centres from 0."""
 R_FRD_RDF = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 

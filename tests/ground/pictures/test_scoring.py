@@ -35,7 +35,7 @@ def test_boxes_fall_into_classes_by_their_width() -> None:
 
 @pytest.mark.parametrize(("right", "iou"), [(0.0, 1.0), (10.0, 100 / 300), (5.0, 150 / 250), (20.0, 0.0), (-30.0, 0.0)])
 def test_intersection_over_union(right: float, iou: float) -> None:
-    """Of boxes 20 x 10 that are moved against each other."""
+    """Boxes 20 x 10 are moved against each other."""
     assert intersection_over_union(BOX, moved(right)) == pytest.approx(iou)
 
 
@@ -53,7 +53,7 @@ def test_of_two_boxes_a_detection_takes_the_one_that_it_fits_best() -> None:
 
 
 def test_average_precision_by_hand() -> None:
-    """Of three boxes: hit, miss, hit. Precision 1 at recall 1/3, 2/3 at 2/3: area 1/3 + 2/9. The third is not found."""
+    """Three boxes: hit, miss, hit. Precision 1 at recall 1/3, 2/3 at 2/3: area 1/3 + 2/9. The third is not found."""
     judged = [(0.7, True), (0.9, True), (0.8, False)]
     assert average_precision(judged, 3) == pytest.approx(1 / 3 + 2 / 9)
     assert average_precision([], 3) == 0.0
@@ -64,7 +64,7 @@ def test_average_precision_by_hand() -> None:
 
 
 def test_a_summary_of_pictures_with_and_without_drones() -> None:
-    """Of boxes 20 px wide: hit well; hit with IoU 1/3, beside a false one; not found; and a false one where none is."""
+    """Boxes 20 px wide: hit well; hit with IoU 1/3, beside a false one; not found; and a false one where none is."""
     ghost = (200.0, 200.0, 230.0, 220.0)
     pictures = [
         Labelled((found(BOX, 0.99),), (BOX,)),

@@ -26,7 +26,7 @@ FAILSAFE_WITHIN_S = 2.5
 """COM_OF_LOSS_T is 1 s; the rest is the silence before it, and some."""
 SECONDS_TO_FAIL = 60.0
 SPEED_FACTOR = 0.25
-"""Of stories with a process of their own: a computer that is busy for a second has not stopped its setpoints."""
+"""For stories with a process of their own: a computer that is busy for a second has not stopped its setpoints."""
 
 
 @contextmanager

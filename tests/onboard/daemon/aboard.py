@@ -46,7 +46,7 @@ STEP_S = 0.25
 SPEED_M_S = 1.0
 COMMANDS: tuple[OperatorCommand, ...] = ("resume", "land", "goto", "velocity")
 SECONDS_TO_FAIL = 60.0
-"""Of the event loop's clock. Nothing is promised within it: it ends a story that hangs."""
+"""Limit on the event loop's clock. Nothing is promised within it: it ends a story that hangs."""
 PATIENT = SafetyParameters(degraded_load=50.0, max_load=100.0, max_loop_lag_s=2.0, recovery_s=0.5)
 """These stories are not about how fast the computer is that tells them."""
 
@@ -198,7 +198,7 @@ class Watched:
         return "" if flight is None else str(flight.message["state"])
 
     def mission(self, key: str) -> object:
-        """Of the newest message on its mission; None before the first."""
+        """A key of the newest message on its mission; None before the first."""
         heard = self.heard().get("mission")
         return None if heard is None else heard.message[key]
 

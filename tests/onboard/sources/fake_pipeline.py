@@ -3,10 +3,10 @@
 fake_pipeline.py "WORD..." CAPS
 
 `caps:WxH` and `caps:text` say what the images are; `N` sends N different images of 64x48 in RGB, 20 ms apart, `same:N`
-N equal ones, `short` one that lacks a byte, `flagged` one the driver calls damaged, `old` one of an hour ago, `untimed`
-one without a time; `stall` waits until the other side goes, `fail:text` and `end` say so, `print` prints a line,
-`crash` ends by a signal, `once:FILE` skips the word after it if FILE exists, and makes it. Underscores in texts are
-spaces.
+N equal ones. `short` sends one that lacks a byte, `flagged` one the driver calls damaged, `old` one of an hour ago,
+`untimed` one without a time. `stall` waits until the other side goes, `fail:text` and `end` say so, `print` prints a
+line, `crash` ends by a signal, `once:FILE` skips the word after it if FILE exists, and makes it. Underscores in texts
+are spaces.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def images(count: int, *, same: bool = False) -> None:
 
 
 def say_caps(text: str) -> None:
-    """Of RGB where only a size is given."""
+    """Says the caps: RGB where only a size is given."""
     width, _, height = text.partition("x")
     raw = f"video/x-raw, format=(string)RGB, width=(int){width}, height=(int){height}, framerate=(fraction)50/1"
     send(b"caps", (raw if width.isdigit() else text.replace("_", " ")).encode())

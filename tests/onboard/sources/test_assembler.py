@@ -37,7 +37,7 @@ class Stage:
         return self.assembler.take(self.now_s)
 
     def stamps(self) -> dict[str, float] | None:
-        """Of the next set, by camera."""
+        """Time stamps of the next set, by camera."""
         taken = self.take()
         return None if taken is None else {name: frame.time_s for name, frame in taken.frames.items()}
 

@@ -22,7 +22,7 @@ from tests.review.report.test_page import _flight, _moment, _report
 
 VOID = frozenset({"meta", "img", "br", "link", "input", "hr"})
 SIDE_M = 2.1 * 3**0.5
-"""Of a triangle whose corners are 2.1 m from its middle."""
+"""Side of a triangle whose corners are 2.1 m from its middle."""
 
 
 class _Tree(HTMLParser):

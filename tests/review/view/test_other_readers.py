@@ -146,7 +146,7 @@ def rerun_says(*arguments: str, home: Path) -> str:
 
 
 def test_reruns_own_check_finds_nothing(files: list[Path], tmp_path: Path) -> None:
-    """Of flights whose cameras' clocks ran: one of the recorded faults is a time that goes back."""
+    """The cameras' clocks ran in these flights: one of the recorded faults is a time that goes back."""
     for path in (path for path in files if path.name != "faults.mcap"):
         rows = [line.split() for line in rerun_says("check", "--full", str(path), home=tmp_path).splitlines()]
         streams = [row for row in rows if any(cell.startswith("/") for cell in row[3:4])]

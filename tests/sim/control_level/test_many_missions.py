@@ -12,7 +12,7 @@ from flockd.sim.control_level.many_missions import HOME_DEG, ManyMissions
 
 
 def test_waypoints_count_as_reached_for_the_same_drones_at_the_same_time() -> None:
-    """Of middles that come near, turn away and stand still, each drone's own `Navigator` makes the same."""
+    """Each drone's own `Navigator` makes the same of middles that come near, turn away and stand still."""
     scenario = load_scenario(data_path("config") / "square.yaml")
     flights, drones, rng = 3, len(scenario.vehicles), np.random.default_rng(4)
     many = ManyMissions(scenario, flights)

@@ -36,7 +36,7 @@ def _scenario(kind: str, drones: int, **overrides: Any) -> ScenarioConfig:
 
 
 def _faultless() -> PerceivedErrors:
-    """Of perception that measures and misses nothing wrongly."""
+    """Errors of perception that measures and misses nothing wrongly."""
     errors = load_perceived_errors(data_path("config") / "perceived" / "shipped_networks.yaml")
     exact = {"median": 0.0, "p95": 0.0}
     entry = dict.fromkeys(("range_error", "bearing_error_deg", "velocity_error_m_s"), exact)

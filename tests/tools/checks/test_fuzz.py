@@ -27,7 +27,7 @@ INPUTS = {
     "gate": 150,
     "supervisor": 250,
 }
-"""Of each target: about half a second of computing."""
+"""Inputs for each target: about half a second of computing."""
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numbers near the largest overflow, which is what is tried

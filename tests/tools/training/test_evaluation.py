@@ -30,7 +30,8 @@ def test_one_detection_is_not_two_drones_and_none_is_found_in_another_direction(
 
 
 def test_a_drone_is_proposed_where_the_second_stage_was_asked_about_its_direction() -> None:
-    """Of two drones 10 m ahead and 2 m apart, without a detection, only the one is that a proposal points to."""
+    """Two drones are 10 m ahead and 2 m apart, without a detection: only the one is proposed that a proposal points
+    to."""
     depth, ids = np.full((HEIGHT // 2, WIDTH // 2), 80.0, np.float32), np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8)
     pairs = PairSet(
         {

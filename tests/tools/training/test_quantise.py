@@ -18,7 +18,7 @@ SCALE, ZERO = np.array(1.0, np.float32), np.array(128, np.uint8)
 
 
 def model_of(nodes: list[onnx.NodeProto], output: str, shape: list[int]) -> onnx.ModelProto:
-    """Of an 8-bit image (1, 3, 4, 4) and planes (1, 1, 4, 4)."""
+    """A model of an 8-bit image (1, 3, 4, 4) and planes (1, 1, 4, 4)."""
     inputs = [
         helper.make_tensor_value_info("image", TensorProto.UINT8, [1, 3, 4, 4]),
         helper.make_tensor_value_info("planes", TensorProto.FLOAT, [1, 1, 4, 4]),

@@ -17,11 +17,12 @@ from flockd.onboard.sources.v4l2_device import control_name
 from flockd.onboard.sources.v4l2_kernel import VIDIOC_QUERYCTRL, VIDIOC_S_CTRL, Control, QueryControl
 
 WEBCAM = "/dev/video10"
-"""Of vivid: shows its own pattern, in sizes and rates as USB cameras have them, and breaks in every way it can."""
+"""A camera of vivid: shows its own pattern, in sizes and rates as USB cameras have them, and breaks in every way it
+can."""
 CABLE_OUT, CABLE = "/dev/video11", "/dev/video12"
-"""Of vivid: an HDMI output, and the camera at the other end of its cable."""
+"""An HDMI output of vivid, and the camera at the other end of its cable."""
 LOOPBACK = "/dev/video20"
-"""Of v4l2loopback: a camera of Motion-JPEG."""
+"""A camera of v4l2loopback with Motion-JPEG."""
 _NEXT = 0x80000000  # V4L2_CTRL_FLAG_NEXT_CTRL
 _WHITE = 6
 """A test pattern in which the networks see nothing: in the coloured bars they see drones."""

@@ -19,7 +19,7 @@ class Finding:
     measured: str
     wanted: str
     row: int | None = None
-    """Of the catalogue of faults (`tests/faults/catalogue.py`), where it is one of those."""
+    """Row of the catalogue of faults (`tests/faults/catalogue.py`), where it is one of those."""
 
 
 Check = Callable[[], Iterator[Finding]]

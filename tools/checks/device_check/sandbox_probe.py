@@ -21,7 +21,7 @@ DONE = "done"
 CODE = b"\xb8\x2a\x00\x00\x00\xc3"
 """x86: return 42."""
 FOREIGN_ADDRESS = "203.0.113.1"
-"""Of no private network; the check gives it to this machine itself."""
+"""An address in no private network; the check gives it to this machine itself."""
 _FAILED = ctypes.c_void_p(-1).value
 _READ, _WRITE, _EXECUTE = 1, 2, 4
 _SHM_EXECUTE = 0o100000

@@ -33,7 +33,7 @@ from tools.checks.fuzzing.mutation import any_float
 from tools.checks.fuzzing.target import CORPUS, Check, Target
 
 STEPS = 4
-"""Of one pilot: the second pairs frames, the others have tracks."""
+"""Steps of one pilot: the second pairs frames, the others have tracks."""
 ROUNDING = 1e-6
 
 # ---------------------------------------------------------------------------------------------------- network outputs
@@ -95,7 +95,7 @@ def _shape(spec: tuple[int | str, ...], batch: int, height: int, width: int) -> 
 
 
 def _numbers(random: Random, shape: tuple[int, ...]) -> Any:
-    """Of one kind all over, or with a few that are not."""
+    """Numbers of one kind all over, or with a few that are not."""
     rng = np.random.default_rng(random.getrandbits(32))
     scale = random.choice((0.0, 1e-6, 1.0, 1.0, 10.0, 10.0, 100.0, 1e6, 1e30))
     values = rng.normal(random.choice((0.0, 1.0, -5.0, 5.0)), scale, shape) if scale else np.zeros(shape)

@@ -27,7 +27,7 @@ class Target:
 
     name: str
     share: int
-    """Of all inputs, relative to the other targets: those that take long get few."""
+    """Share of all inputs, relative to the other targets: those that take long get few."""
     prepare: Callable[[Path], Check]
     """Called once with an empty folder."""
 

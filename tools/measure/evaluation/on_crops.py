@@ -34,7 +34,8 @@ class HeldOut:
 
     @classmethod
     def of(cls, folder: Path, none: Array, size_m: float) -> HeldOut:
-        """Of the files of ``render_drone_crops`` in ``folder``: whole drones, aimed at as the cascade's last crop is.
+        """Held-out crops from the files of ``render_drone_crops`` in ``folder``: whole drones, aimed at as the
+        cascade's last crop is.
 
         ``none``: crops without a drone, besides these files' own.
         """

@@ -40,7 +40,7 @@ class Drone:
     whole: bool
     found: bool
     error: float
-    """Of its range, relative; 0 where it was not found."""
+    """Relative error of its range; 0 where it was not found."""
     sigma: float
     """What was said of that error's standard deviation."""
     proposed: bool = True
@@ -175,7 +175,7 @@ def compare_drones(
 
 
 def _pairings(detections: tuple[Detection, ...], places: list[Array], sizes_m: list[float]) -> dict[int, Detection]:
-    """Of each drone that was found the detection: first those that lie nearest to each other."""
+    """The detection of each drone that was found: first those that lie nearest to each other."""
     away = sorted(
         (_angle(detection.position, place) / (size_m / 2 / float(np.linalg.norm(place))), drone, number)
         for number, detection in enumerate(detections)

@@ -43,7 +43,7 @@ from tools.training.train import start, train
 RATE = 4e-4
 """Learning rate to begin with: less than of a network that knows nothing yet."""
 PAINTS = 12
-"""Of the drone in one world."""
+"""Paints of the drone in one world."""
 SCENES, HELD_OUT_SCENES, PAIRS = 300, 150, 20
 """In one world: drones to learn from, drones to measure on, and images to find what is no drone in."""
 NONE_IN_POOL = 3000

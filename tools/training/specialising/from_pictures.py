@@ -52,7 +52,7 @@ SCENES = 300
 PLACES = 6
 """Cut from every photograph, anywhere but at the drone."""
 CROPS_EACH = 8
-"""Of every held-out patch."""
+"""Crops of every held-out patch."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class LabelledPictures:
     training: tuple[tuple[PictureFile, tuple[Box, ...]], ...]
     held_out: tuple[tuple[PictureFile, tuple[Box, ...]], ...]
     sha256: str
-    """Of the label file."""
+    """Hash of the label file."""
 
 
 def read_pictures(arguments: argparse.Namespace) -> LabelledPictures:

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 LEAST_TRAINING = 0.3
-"""Of the minutes, however long rendering took."""
+"""Least share of the minutes for training, however long rendering took."""
 MEASURING = 0.05
-"""Of the minutes, kept for export and measurement."""
+"""Share of the minutes that is kept for export and measurement."""
 
 
 def claim(out: Path, network: str, drone: Mapping[str, object]) -> None:

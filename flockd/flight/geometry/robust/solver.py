@@ -40,7 +40,7 @@ class NormalEquations:
 
     @classmethod
     def unsolvable(cls, parameters: int) -> NormalEquations:
-        """Of a state that is no solution."""
+        """The equations for a state that is no solution."""
         return cls(math.inf, np.zeros(parameters), np.eye(parameters))
 
     @property
@@ -114,7 +114,7 @@ class GaussNewton:
     min_steps: int = 1
     """Before this many it has not."""
     max_condition: float = math.inf
-    """Of a hessian: beyond, some parameter is not known at all."""
+    """Largest condition number of a hessian: beyond, some parameter is not known at all."""
 
     def minimise(self, problem: Problem[State], state: State) -> Solution[State]:
         """Goes downhill from ``state``."""
@@ -156,7 +156,7 @@ class LevenbergMarquardt:
     min_damping: float = 1e-12
     max_damping: float = 1e9
     relative_gain: float = 1e-10
-    """Of the cost: a step that gains less has converged."""
+    """Relative decrease of the cost: a step that gains less has converged."""
 
     def minimise(self, problem: Problem[State], state: State) -> Solution[State]:
         """Goes downhill from ``state``."""

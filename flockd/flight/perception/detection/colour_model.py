@@ -39,7 +39,7 @@ def reweight_by_colour(logit: Float32Array, image: UInt8Array, weight: float) ->
 
 
 def _frequency(colour: NDArray[np.int64], weight: FloatArray) -> FloatArray:
-    """Of each pixel's colour among all of them, up to a factor that is the same whatever the weights."""
+    """How frequent each pixel's colour is among all, up to a factor that is the same whatever the weights."""
     counts = np.bincount(colour, weight, _LEVELS**3).astype(np.float64)
     for _ in range(3):
         counts = (_SHADES @ counts.reshape(_LEVELS, -1)).T.ravel()  # each colour's turn, and back in order after three

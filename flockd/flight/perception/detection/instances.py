@@ -105,7 +105,7 @@ def _vote_peaks(votes: FloatArray, shape: tuple[int, int]) -> FloatArray:
     kept = np.empty((0, 2))
     reach = np.empty(0)
     for place in places[order]:
-        # A side lobe of a big drone's votes is weaker and close by; another drone stands on its own feet.
+        # A side lobe of a big drone's votes is weaker and close by; another drone's votes are as strong as this one's.
         if (np.hypot(*(place - kept).T) < reach).any():
             continue
         if len(kept) == _MAX_INSTANCES:

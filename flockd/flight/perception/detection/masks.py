@@ -40,7 +40,7 @@ class DroneLogits:
     box: tuple[slice, slice]
     """The part of the image that it covers."""
     logit: Float32Array
-    """Of each of its pixels being this drone's."""
+    """Logit of each of its pixels showing this drone."""
 
 
 @dataclass(frozen=True, eq=False)

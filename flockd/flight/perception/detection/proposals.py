@@ -40,13 +40,13 @@ class Proposal:
     """Those that show it."""
     roi: Roi
     instance: Instance | None = None
-    """Of the first stage; None where it comes from a prediction."""
+    """What the first stage proposed; None where the proposal comes from a prediction."""
     predicted: Predicted | None = None
     """Where it comes from a track; None elsewhere."""
 
     @property
     def area_px(self) -> float:
-        """Of its pixels in the first stage."""
+        """Area of its pixels in the first stage."""
         return self.instance.area_px if self.instance else 0.0
 
 

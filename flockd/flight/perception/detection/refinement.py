@@ -27,7 +27,7 @@ class Candidate:
     bearing: FloatArray
     """(3,) unit vector."""
     log_range: float
-    """Of metres."""
+    """Natural logarithm of the range in metres."""
     log_range_sigma: float
     bearing_sigma_rad: float
     size_m: float
@@ -61,7 +61,7 @@ class Refined(NamedTuple):
 
 
 class RangeNetwork(Protocol):
-    """Of `flockd.flight.perception.interface.Networks`, what refinement needs."""
+    """The part of `flockd.flight.perception.interface.Networks` that refinement needs."""
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         """Range and centre of the drone in the middle of each crop."""

@@ -34,7 +34,7 @@ class CropRules:
     max_resize: float
     """A further crop is at most this many times as wide as the last one, and at least as much narrower."""
     max_crops: int
-    """Of one proposal, before the mirrored one."""
+    """The most crops of one proposal, before the mirrored one."""
 
     def half_angle(self, size_m: float, range_m: float, before: float | None = None) -> float:
         """Half the angle, rad, of a crop that suits a drone of known size and range, not far from what it was."""
@@ -57,7 +57,7 @@ class Roi:
     half_angle: float
     """rad, from its centre to its borders."""
     range_m: float | None = None
-    """Of what it should show, for the parallax between cameras; None: not known yet."""
+    """Range of what it should show, for the parallax between cameras; None: not known yet."""
     mirrored: bool = False
 
     def resembles(self, other: Roi, shift: float, resize: float) -> bool:

@@ -37,7 +37,8 @@ class SecondStage:
 
     @classmethod
     def of(cls, manifest: Manifest, verification: Manifest | None = None) -> SecondStage:
-        """Of a distance network, and of the verification network whose probability counts instead of its own.
+        """The second stage from a distance network, and the verification network whose probability counts instead of
+        its own.
 
         Raises ModelError where a manifest does not say how crops are cut or outputs are judged, or where the two take
         crops of different sizes.

@@ -12,7 +12,7 @@ from flockd.core.messages import UNCLASSED, BoolArray, Float32Array, UInt8Array
 from flockd.flight.perception.flow.images import gradients, grey
 
 _CELL_PX = 4
-"""Of the map that all of this works on."""
+"""Cell size of the map that all of this works on."""
 _WINDOW_CELLS = 5
 """Over which texture is measured."""
 _PYRAMID_LEVELS = 4

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from flockd.core.messages import Float32Array, UInt8Array
 
 _SHORTER_SIDE_PX = 45
-"""Of the small images that are compared: at this size a motion of half the image is some 20 pixels, and the blur of a
-fast turn one or two."""
+"""Shorter side of the small images that are compared: at this size a motion of half the image is some 20 pixels, and
+the blur of a fast turn one or two."""
 _MIN_OVERLAP = 0.3
 """Share of an image: less than this in common correlates by chance."""
 

@@ -110,7 +110,7 @@ def _interpolated(
 
 
 def _cell_centres(length: int, cell_px: int) -> FloatArray:
-    """Of cells of about this size that together are so long."""
+    """Centres of cells of about this size that together are so long."""
     count = max(1, round(length / cell_px))
     return np.asarray((np.arange(count) + 0.5) * (length / count), np.float64)
 

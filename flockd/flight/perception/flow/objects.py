@@ -20,19 +20,19 @@ class AlignmentStage:
     """One fit of a drone's motion, of coarse ones and finer ones."""
 
     sigma_px: float
-    """Of the Gaussian that both images are smoothed with."""
+    """Standard deviation of the Gaussian that both images are smoothed with."""
     terms: int
-    """Of the polynomial: 3 are affine, 6 of second, 10 of third order."""
+    """Terms of the polynomial: 3 are affine, 6 of second, 10 of third order."""
     optimizer: GaussNewton
     """Tolerance in pixels."""
 
 
 _MIN_PIXELS = 12
-"""Of a drone, for its motion to be found at all."""
+"""Least pixels of a drone, for its motion to be found at all."""
 _MAX_PIXELS = 600
 """Drawn of more."""
 _CERTAIN_CORRELATION = 0.85
-"""Of a drone's colours before and after: from here on no other start is tried."""
+"""Correlation of a drone's colours before and after: from here on no other start is tried."""
 _MIN_CORRELATION = 0.5
 """Below this, no motion is believed."""
 _VISIBLE_EXPONENT = 0.3
@@ -49,9 +49,9 @@ _HIGHER_ORDER_STAGES = (
     AlignmentStage(0.6, 10, GaussNewton(max_steps=12, tolerance=0.1)),
 )
 _TERM_DAMPING = 0.005
-"""Of all terms but the shift, in units of the shift's own curvature."""
+"""Damping of all terms but the shift, in units of the shift's own curvature."""
 _CONTRAST_DAMPING = 0.01
-"""Of the change of contrast, a pixel."""
+"""Damping of the change of contrast, a pixel."""
 _MAX_STEP_PX = 3.0
 """Farther the linearised image is not the image."""
 _WINDOW_MARGIN_PX = 24
@@ -165,7 +165,7 @@ class _Template:
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """Of a whole drone, as polynomials of a pixel's place."""
+    """Motion of a whole drone, as polynomials of a pixel's place."""
 
     middle: FloatArray
     """(2,) of the drone, u and v."""
@@ -173,7 +173,7 @@ class _Motion:
     terms: FloatArray
     """(1, 3, 6 or 10, 2) what each term adds right and down."""
     correlation: float = 0.0
-    """Of the drone's colours before and after."""
+    """Correlation of the drone's colours before and after."""
 
     def at(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
         """(n, 2) pixels right and down."""
@@ -394,7 +394,7 @@ def _median(values: FloatArray) -> float:
 
 
 def _correlation(a: FloatArray, b: FloatArray) -> float:
-    """Of (n, 3) colours, each channel about its own mean."""
+    """Correlation of (n, 3) colours, each channel about its own mean."""
     a, b = a - a.mean(0), b - b.mean(0)
     size = math.sqrt(float((a * a).sum() * (b * b).sum()))
     return float((a * b).sum()) / size if size > 0 else -1.0

@@ -39,7 +39,7 @@ class GroundPoint:
 
 
 class ContradictionMonitor:
-    """Of one range finder. Call `update` once for each reading."""
+    """Monitors one range finder. Call `update` once for each reading."""
 
     def __init__(self, parameters: RangeFinderParameters) -> None:
         self._parameters = parameters

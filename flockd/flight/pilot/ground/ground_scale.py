@@ -1,9 +1,9 @@
 """The own motion's metric scale from the height above the ground that the motion itself shows.
 
 Two images and the motion between them give the depth of matched points in units of that motion, and so the ground's
-plane: its slope, and the drone's height above it. Where a range finder says how high that is, the unit is known.
-Ground is not plane, and a bump of 0.2 m straight below would be 4 % at 5 m: so, once the drone has flown far enough,
-the places that the last ranges hit are compared with the same places in the images.
+plane: its slope, and the drone's height above it. Where a range finder says how high that is, the unit is known. Ground
+is not plane, and a bump of 0.2 m straight below would be 4 % at 5 m. So, once the drone has flown far enough, the
+places that the last ranges hit are compared with the same places in the images.
 """
 
 from __future__ import annotations

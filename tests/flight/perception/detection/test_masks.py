@@ -21,7 +21,7 @@ PLAIN = np.zeros((HEIGHT // 2, WIDTH // 2), np.float32)
 GREY = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
 AHEAD = np.array([4.0, 0.3, 0.2])
 RADIUS = 0.06
-"""Of a drone's disc, radians."""
+"""Radius of a drone's disc, radians."""
 COLOUR_WEIGHT = 4.0
 
 

@@ -43,7 +43,7 @@ def test_a_proposal_is_cropped_again_until_the_crop_suits_the_drone(wrong_by: tu
 
 
 def test_the_mirrored_crop_is_weighted_by_its_variance() -> None:
-    """Of a drone 3 m away: the last crop says 3 m, its mirror image 6."""
+    """A drone is 3 m away: the last crop says 3 m, its mirror image 6."""
     flyer = Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
     estimates = flyer.truth.sound("ranges")
     mirrors: list[bool] = []

@@ -29,7 +29,7 @@ def state(
     quality: float | None = 1.0,
     vertical: bool = False,
 ) -> VehicleState:
-    """Of a drone whose sensor measures from 0.2 to 12 m."""
+    """The state of a drone whose sensor measures from 0.2 to 12 m."""
     reading = None
     if range_m is not None:
         reading = RangeReading(time_s - age_s, range_m, vertical=vertical, min_m=0.2, max_m=12.0, quality=quality)
