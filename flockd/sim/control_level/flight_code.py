@@ -40,7 +40,7 @@ class FlightCode:
         self._tick_s = step_s / self._ticks
         self._substeps = motion.Substeps.of(vehicle, self._tick_s)
         self.substeps = self._substeps._replace(times=self._ticks * self._substeps.times)
-        """Flies a step with gates: the same number in each of its setpoints."""
+        """Substeps of a step with gates: the same number in each of its setpoints."""
         self._sent, self._height_m = np.zeros((2, drones)), np.zeros(drones)
 
     def around(
