@@ -23,10 +23,11 @@ from pymavlink.dialects.v20 import development as mavlink
 from flockd.core.earth import metres_a_degree
 from flockd.core.errors import UnavailableError
 from flockd.core.messages import FloatArray
+from flockd.flight.geometry import rotation_from_euler, rotation_from_quaternion
 from flockd.onboard.autopilot.mavlink_messages import StatusText
 from flockd.sim.autopilot.sticks import stick_curve
 from flockd.sim.leftovers import described, user_of_port
-from flockd.sim.vehicles import REFERENCE_DEG, euler_rotation
+from flockd.sim.vehicles import REFERENCE_DEG
 
 Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "OFFBOARD"]
 """By pymavlink's names; LOITER is Hold."""
@@ -272,7 +273,7 @@ def _pose(message: Any, now: float) -> _Pose:
         time_s=now,
         position=np.array([north, east, -message.alt * 1e-3]),
         velocity=np.array([message.vx, message.vy, message.vz]) * 1e-2,
-        R_ned_body=_rotation(message.attitude_quaternion),
+        R_ned_body=rotation_from_quaternion(np.roll(message.attitude_quaternion, -1)),
         turn_rad_s=np.array([message.rollspeed, message.pitchspeed, message.yawspeed]),
     )
 
@@ -284,17 +285,9 @@ def _extrapolated(pose: _Pose, now: float) -> _Pose:
         now,
         pose.position + elapsed_s * pose.velocity,
         pose.velocity,
-        pose.R_ned_body @ euler_rotation(*(elapsed_s * pose.turn_rad_s)),
+        pose.R_ned_body @ rotation_from_euler(*(elapsed_s * pose.turn_rad_s)),
         pose.turn_rad_s,
     )
-
-
-def _rotation(quaternion: Sequence[float]) -> FloatArray:
-    w, x, y, z = np.array(quaternion) / np.linalg.norm(quaternion)
-    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
-    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return euler_rotation(roll, pitch, yaw)
 
 
 def _packets(data: bytes) -> Iterator[bytes]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from flockd.core.config.scenario import SensorConfig, StartConfig, VehicleConfig
 from flockd.core.messages import FloatArray, VehicleState
+from flockd.flight.geometry import rotation_from_euler
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, Ground, level_ground
 
 GRAVITY_M_S2 = 9.81
@@ -156,7 +157,7 @@ class SimulatedAutopilot:
         ground_range = None if ranger is None else ranger.read(time_s, position, velocity, R_ned_body)
         return VehicleState(
             time_s=time_s,
-            R_ned_body=euler_rotation(*self._tilt_error) @ R_ned_body,
+            R_ned_body=rotation_from_euler(*self._tilt_error) @ R_ned_body,
             height_m=float(-position[2] + self._height_error[0] + noise),
             velocity_ned=velocity + self._velocity_error,
             position=position[:2] + self._position_error,
@@ -181,16 +182,4 @@ def attitude(thrust: FloatArray, yaw: FloatArray) -> FloatArray:
     forward = np.cos(yaw) * down[:, 0] + np.sin(yaw) * down[:, 1]
     right = np.cos(yaw) * down[:, 1] - np.sin(yaw) * down[:, 0]
     roll, pitch = -np.arcsin(right), np.arctan2(forward, down[:, 2])
-    return np.stack([euler_rotation(*angles) for angles in zip(roll, pitch, yaw, strict=True)])
-
-
-def euler_rotation(roll: float, pitch: float, yaw: float) -> FloatArray:
-    """R_ned_body (3, 3) from aerospace angles in rad: Rz(yaw) Ry(pitch) Rx(roll)."""
-    cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
+    return rotation_from_euler(roll, pitch, yaw)

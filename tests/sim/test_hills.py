@@ -11,10 +11,11 @@ from flockd.core.config import load_scenario
 from flockd.core.config.scenario import RangeFinderConfig, SensorConfig
 from flockd.core.data import data_path
 from flockd.core.messages import FloatArray, RangeReading
+from flockd.flight.geometry import rotation_from_euler
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground, range_to_ground
 from flockd.sim.hills import hills
 from flockd.sim.renderer import Renderer
-from flockd.sim.vehicles import SimulatedAutopilot, euler_rotation
+from flockd.sim.vehicles import SimulatedAutopilot
 from flockd.sim.world import World
 
 STILL, LEVEL = np.zeros(3), np.eye(3)
@@ -43,7 +44,7 @@ def test_the_range_is_that_of_the_ground_which_is_drawn(world: World) -> None:
     matrix = np.array([[400.0, 0.0, 32.5], [0.0, 400.0, 32.5], [0.0, 0.0, 1.0]])
     for north, east in random.uniform(-25.0, 25.0, (6, 2)):
         roll, pitch, yaw = random.uniform(-0.35, 0.35, 3) * [1.0, 1.0, 8.0]
-        R = euler_rotation(float(roll), float(pitch), float(yaw))
+        R = rotation_from_euler(float(roll), float(pitch), float(yaw))
         place = np.array([north, east, -7.0])
         R_body_camera = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         view = renderer.render(
@@ -65,7 +66,7 @@ def _readings(config: RangeFinderConfig, heights_m: FloatArray, step_s: float = 
 
 
 def test_over_a_hillside_the_range_solves_the_planes_equation() -> None:
-    R, place = euler_rotation(0.2, -0.3, 0.7), np.array([10.0, -4.0, -8.0])
+    R, place = rotation_from_euler(0.2, -0.3, 0.7), np.array([10.0, -4.0, -8.0])
     height_m = 8.0 - (0.15 * 10.0 + 0.05 * 4.0)
     expected_m = height_m / (R[2, 2] + 0.15 * R[0, 2] - 0.05 * R[1, 2])
     assert range_to_ground(place, R[:, 2], _hillside) == pytest.approx(expected_m, abs=2e-3)

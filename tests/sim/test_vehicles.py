@@ -14,8 +14,9 @@ from flockd.core.config.flocking import FlockingParameters
 from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.config.scenario import ScenarioConfig, SensorConfig, StartConfig, VehicleConfig
 from flockd.flight.flocking.metrics import min_distance, obj2, pair_distances
+from flockd.flight.geometry import rotation_from_euler
 from flockd.sim.exact_states import fly_exact_states, step_times
-from flockd.sim.vehicles import SimulatedAutopilot, Vehicles, attitude, euler_rotation
+from flockd.sim.vehicles import SimulatedAutopilot, Vehicles, attitude
 
 Array = NDArray[np.float64]
 START = StartConfig(position_m=(1.0, 2.0, -4.0))
@@ -121,7 +122,7 @@ def test_thrust_carries_the_weight_and_accelerates() -> None:
 def test_euler_angles_are_the_aerospace_ones() -> None:
     roll, pitch, yaw = 0.3, -0.4, 2.5
     reference = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
-    np.testing.assert_allclose(euler_rotation(roll, pitch, yaw), reference, atol=1e-15)
+    np.testing.assert_allclose(rotation_from_euler(roll, pitch, yaw), reference, atol=1e-15)
 
 
 def test_it_leans_into_the_air_that_comes_against_it() -> None:
@@ -162,7 +163,7 @@ def test_gusts_depend_on_the_seed_alone() -> None:
 def test_an_autopilot_without_errors_gives_true_values() -> None:
     perfect = SensorConfig(barometer_drift_m=0.0, barometer_noise_m=0.0, attitude_error_deg=0.0, velocity_error_m_s=0.0)
     autopilot = SimulatedAutopilot(perfect, seed=0, drone=0)
-    turn = euler_rotation(0.1, -0.2, 1.0)
+    turn = rotation_from_euler(0.1, -0.2, 1.0)
     state = autopilot.read(3.5, np.array([1.0, 2.0, -4.0]), np.array([1.0, 0.5, 0.0]), turn)
     assert (state.time_s, state.height_m) == (3.5, 4.0)
     np.testing.assert_array_equal(state.R_ned_body, turn)

@@ -8,15 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flockd.flight.geometry import rotation_from_euler
+
 
 def attitude(yaw: float, tilt: NDArray[Any]) -> NDArray[np.float64]:
     """R_ned_body (3, 3) of a heading, and roll and pitch (2,); all rad."""
     roll, pitch = tilt
-    cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
-    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    return np.asarray(about_z @ about_y @ about_x)
+    return rotation_from_euler(roll, pitch, yaw)
 
 
 def drawn_attitude(rng: np.random.Generator) -> NDArray[np.float64]:

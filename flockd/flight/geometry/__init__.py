@@ -12,7 +12,15 @@ from flockd.flight.geometry.polar import log_polar, log_polar_covariance, log_po
 from flockd.flight.geometry.rig import Rig, RigCamera, build_rig
 from flockd.flight.geometry.rigid_fit import fit_rigid
 from flockd.flight.geometry.robust.ransac import RansacResult, ransac_rigid
-from flockd.flight.geometry.rotations import euler_from_rotation, rotation_angle_deg, rotation_from_euler
+from flockd.flight.geometry.rotations import (
+    euler_from_rotation,
+    quaternion_from_rotation,
+    rotation_angle_deg,
+    rotation_from_euler,
+    rotation_from_quaternion,
+    rotation_from_vector,
+    vector_from_rotation,
+)
 from flockd.flight.geometry.transform import RigidTransform
 from flockd.flight.geometry.triangulation import inverse_depths
 from flockd.flight.geometry.virtual_camera import VirtualCrop, virtual_crop
@@ -44,10 +52,14 @@ __all__ = [
     "log_polar",
     "log_polar_covariance",
     "log_polar_residual",
+    "quaternion_from_rotation",
     "ransac_rigid",
     "refine_ego_motion",
     "rotation_angle_deg",
     "rotation_from_euler",
+    "rotation_from_quaternion",
+    "rotation_from_vector",
     "scale_on_track",
+    "vector_from_rotation",
     "virtual_crop",
 ]

@@ -15,7 +15,7 @@ from flockd.flight.geometry.rigid_fit import fit_rotation
 from flockd.flight.geometry.robust.kernels import Tukey
 from flockd.flight.geometry.robust.reweighting import reweighted, robust_rotation
 from flockd.flight.geometry.robust.solver import LevenbergMarquardt, NormalEquations, Problem, Solution
-from flockd.flight.geometry.rotations import rotation_from_vector
+from flockd.flight.geometry.rotations import rotation_from_vector, vector_from_rotation
 from flockd.ground.calibration.errors import CalibrationError
 from flockd.ground.calibration.turns import CameraTurn
 
@@ -194,7 +194,7 @@ class _Turns:
             raise CalibrationError(
                 f"{count} turns with attitudes are too few, {MIN_TURNS} are needed; record for longer"
             )
-        vectors = _logs(np.array([turn.rotation for turn in turns]))
+        vectors = vector_from_rotation(np.array([turn.rotation for turn in turns]))
         used = [turn for turn, one in zip(turns, known, strict=True) if one]
         return cls(used, attitudes, starts[known], ends[known], vectors[known])
 
@@ -202,7 +202,7 @@ class _Turns:
         """(n, 3) rotation vectors of the vehicle's turns meanwhile, in its axes."""
         first, _ = self.attitudes.at(self.starts_s + offset_s)
         second, _ = self.attitudes.at(self.ends_s + offset_s)
-        return _logs(np.swapaxes(first, 1, 2) @ second)
+        return vector_from_rotation(np.swapaxes(first, 1, 2) @ second)
 
     def scan(self, max_offset_s: float) -> tuple[float, FloatArray]:
         """The offset that leaves least, whatever the rotation, and the weights (n,) of the turns there."""
@@ -246,14 +246,3 @@ class _Alignment(Problem[_State]):
 def _tukey(left: FloatArray) -> Tukey:
     """For residuals (n,): what is far off counts nothing."""
     return Tukey(6.0 * max(float(np.median(left)), 1e-9))
-
-
-def _logs(rotations: FloatArray) -> FloatArray:
-    """(n, 3) rotation vectors of rotations (n, 3, 3) by less than half a turn."""
-    R = rotations
-    twice_sine = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
-    sine, cosine = np.linalg.norm(twice_sine, axis=1) / 2, (np.trace(R, axis1=1, axis2=2) - 1) / 2
-    angle = np.arctan2(sine, cosine)
-    factor = np.where(sine > 1e-12, angle / np.maximum(2 * sine, 1e-300), 0.5)
-    vectors: FloatArray = twice_sine * factor[:, None]
-    return vectors

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from flockd.core.messages import FloatArray
-from flockd.flight.geometry import RigidTransform
+from flockd.flight.geometry import RigidTransform, rotation_from_quaternion
 from flockd.ground.datasets.errors import DatasetError
 
 _MAX_GAP_S = 0.1
@@ -63,29 +63,3 @@ def track_of_rows(file: Path, times_s: FloatArray, translations: FloatArray, qua
     if np.any(np.linalg.norm(quaternions, axis=1) < 1e-6):
         raise DatasetError(f"{file}: a quaternion is all zero; delete that line")
     return PoseTrack(times_s, translations, quaternions)
-
-
-def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
-    """(3, 3) of a unit quaternion x y z w."""
-    x, y, z, w = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
-    """(4,) x y z w with w >= 0 of a (3, 3) rotation."""
-    # Row i of this matrix is 4 q_i q (Shepperd 1978): the longest row divides by the least.
-    r = rotation
-    skew = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
-    outer = np.empty((4, 4))
-    outer[:3, :3] = r + r.T + (1 - np.trace(r)) * np.eye(3)
-    outer[3, :3] = outer[:3, 3] = skew
-    outer[3, 3] = 1 + np.trace(r)
-    row = outer[int(np.argmax(np.diag(outer)))]
-    quaternion: FloatArray = row / np.linalg.norm(row) * (1.0 if row[3] >= 0 else -1.0)
-    return quaternion

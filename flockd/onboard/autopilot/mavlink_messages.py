@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from flockd.core.messages import FloatArray, RangeReading, VehicleState
+from flockd.flight.geometry import rotation_from_quaternion
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus, FlightMode, LandedState
 from flockd.onboard.autopilot.clock_sync import ClockSync
 from flockd.onboard.autopilot.refusals import CheckEvents, Refusal, refusals
@@ -244,7 +245,7 @@ class ReceivedMessages:
             return None
         place = _vector(position.fields, "x", "y", "z")
         velocity = _vector(position.fields, "vx", "vy", "vz")
-        quaternion = _vector(attitude.fields, "q1", "q2", "q3", "q4")
+        quaternion = _vector(attitude.fields, "q2", "q3", "q4", "q1")
         if place is None or velocity is None or quaternion is None:
             return None
         if abs(float(np.linalg.norm(quaternion)) - 1.0) > QUATERNION_TOLERANCE:
@@ -346,18 +347,6 @@ class StatusText:
 def result_text(result: int) -> str:
     """What a MAV_RESULT means, for people."""
     return RESULTS[result] if 0 <= result < len(RESULTS) else f"answered with the unknown result {result}"
-
-
-def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
-    """(3, 3) from (4,) w x y z; turns body into NED coordinates as MAVLink's attitude does."""
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def _range_reading(fields: Fields, time_s: float) -> RangeReading:

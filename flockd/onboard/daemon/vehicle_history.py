@@ -5,10 +5,8 @@ from __future__ import annotations
 import bisect
 from collections import deque
 
-import cv2
-import numpy as np
-
 from flockd.core.messages import FloatArray, RangeReading, VehicleState
+from flockd.flight.geometry import rotation_from_vector, vector_from_rotation
 
 HISTORY_S = 2.0
 
@@ -41,11 +39,10 @@ class VehicleHistory:
 def _between(before: VehicleState, after: VehicleState, time_s: float) -> VehicleState:
     """At constant rates of turn and motion from the one to the other."""
     share = (time_s - before.time_s) / (after.time_s - before.time_s)
-    turn, _ = cv2.Rodrigues(before.R_ned_body.T @ after.R_ned_body)
-    part, _ = cv2.Rodrigues(share * np.asarray(turn, np.float64))
+    turn = vector_from_rotation(before.R_ned_body.T @ after.R_ned_body)
     return VehicleState(
         time_s=time_s,
-        R_ned_body=before.R_ned_body @ np.asarray(part, np.float64),
+        R_ned_body=before.R_ned_body @ rotation_from_vector(share * turn),
         height_m=before.height_m + share * (after.height_m - before.height_m),
         velocity_ned=_between_vectors(before.velocity_ned, after.velocity_ned, share),
         position=_between_vectors(before.position, after.position, share),

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from flockd.flight.geometry import RigidTransform
-from flockd.ground.datasets.pose_track import quaternion_from_rotation
+from flockd.flight.geometry import RigidTransform, quaternion_from_rotation
 from flockd.review.replay.dataset_pairs import Pair
 
 

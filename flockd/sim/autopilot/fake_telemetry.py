@@ -14,6 +14,7 @@ from pymavlink.dialects.v20 import development as mavlink
 
 from flockd.core.earth import metres_a_degree
 from flockd.core.messages import FloatArray
+from flockd.flight.geometry import quaternion_from_rotation
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.sim.autopilot.fake_vehicle import MotionState
 
@@ -130,9 +131,7 @@ class TelemetryStreams:
         self._mav.current_mode_send(0, custom_mode(self._vehicle.mode), custom_mode(self._vehicle.intended_mode))
 
     def _send_attitude(self) -> None:
-        self._mav.attitude_quaternion_send(
-            self._boot_ms(), *quaternion_from_rotation(self._vehicle.motion.R_ned_body), 0, 0, 0
-        )
+        self._mav.attitude_quaternion_send(self._boot_ms(), *self._attitude(), 0, 0, 0)
 
     def _send_position(self) -> None:
         if self._vehicle.estimate_ok:
@@ -196,11 +195,15 @@ class TelemetryStreams:
 
     def _send_truth(self) -> None:
         attitude, place = (
-            quaternion_from_rotation(self._vehicle.motion.R_ned_body),
+            self._attitude(),
             self._place(self._vehicle.motion.position),
         )
         speeds = [round(100.0 * speed) for speed in self._vehicle.motion.velocity]
         self._truth.hil_state_quaternion_send(0, attitude, 0, 0, 0, *place, *speeds, 0, 0, 0, 0, 0)
+
+    def _attitude(self) -> list[float]:
+        """W x y z."""
+        return list(np.roll(quaternion_from_rotation(self._vehicle.motion.R_ned_body), 1))
 
     def _place(self, position: FloatArray) -> tuple[int, int, int]:
         """Latitude and longitude in 1e-7 degrees, and millimetres above the ground, of metres from home."""
@@ -227,18 +230,3 @@ def mode_by_number(main: int, sub: int) -> Mode | None:
     """The mode of PX4's numbers; None for one that the fake does not fly."""
     modes: tuple[Mode, ...] = ("POSCTL", "LOITER", "TAKEOFF", "LAND", "RTL", "OFFBOARD")
     return next((mode for mode in modes if mavutil.px4_map[mode][1:] == (main, sub)), None)
-
-
-def quaternion_from_rotation(rotation: FloatArray) -> tuple[float, float, float, float]:
-    """W x y z of a rotation (3, 3) by less than half a turn about any level axis, which is how a multirotor flies."""
-    R = rotation
-    yaw = math.atan2(R[1, 0], R[0, 0])
-    pitch = math.asin(max(-1.0, min(1.0, -R[2, 0])))
-    roll = math.atan2(R[2, 1], R[2, 2])
-    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a / 2), math.sin(a / 2)) for a in (roll, pitch, yaw))
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )

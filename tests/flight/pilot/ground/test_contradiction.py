@@ -13,10 +13,10 @@ from flockd.core.choices import HeightSource
 from flockd.core.config.perception import RangeFinderParameters
 from flockd.core.config.scenario import RangeFinderConfig
 from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, Reason, ReasonKind, VehicleState
+from flockd.flight.geometry import rotation_from_euler
 from flockd.flight.pilot.ground import GroundFilter
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.sim.hills import hills
-from flockd.sim.vehicles import euler_rotation
 
 STEP_S = 0.5
 LIE = Reason(ReasonKind.HEIGHT, "height: the range contradicts the barometer; the barometer's is used")
@@ -107,7 +107,7 @@ def test_what_stays_the_same_is_not_believed_however_far_the_drone_flies() -> No
     drone = Drone()
     drone.hovers(3.0)
     for k in range(200):
-        told = drone.step(0.3 + 0.01 * (k % 3), north_m_s=2.0, R=euler_rotation(0.0, 0.2 * math.sin(k), 0.0))
+        told = drone.step(0.3 + 0.01 * (k % 3), north_m_s=2.0, R=rotation_from_euler(0.0, 0.2 * math.sin(k), 0.0))
     assert source(told) == "barometer"
 
 
@@ -166,7 +166,7 @@ def test_hills_of_fifteen_per_cent_never_contradict_the_barometer(seed: int) -> 
     told, rises_m = set(), []
     for k in range(300):
         time_s = STEP_S * k
-        R = euler_rotation(float(rng.normal(0.0, 0.1)), float(rng.normal(0.0, 0.1)), heading)
+        R = rotation_from_euler(float(rng.normal(0.0, 0.1)), float(rng.normal(0.0, 0.1)), heading)
         position = velocity * time_s + np.array([0.0, 0.0, -8.0])
         reading = sensor.read(time_s, position, velocity, R)
         drift_m = 0.3 / 60.0 * time_s + float(rng.normal(0.0, 0.02))

@@ -11,8 +11,8 @@ import pytest
 from flockd.core.choices import HeightSource
 from flockd.core.config.perception import RangeFinderParameters
 from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, Reason, ReasonKind, VehicleState
+from flockd.flight.geometry import rotation_from_euler
 from flockd.flight.pilot.ground import GroundFilter
-from flockd.sim.vehicles import euler_rotation
 
 STEP_S = 0.5
 LEVEL = np.eye(3)
@@ -46,7 +46,7 @@ def known(found: tuple[GroundEstimate | None, Reason | None]) -> GroundEstimate:
 
 
 def test_a_slant_range_is_turned_upright() -> None:
-    R = euler_rotation(math.radians(10.0), math.radians(-20.0), 1.0)
+    R = rotation_from_euler(math.radians(10.0), math.radians(-20.0), 1.0)
     upright_m = 5.0 * math.cos(math.radians(10.0)) * math.cos(math.radians(20.0))
     ground = known(follower().update(state(0.0, 5.0, R=R)))
     assert ground.source == "range_finder"
