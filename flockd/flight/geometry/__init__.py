@@ -22,7 +22,7 @@ from flockd.flight.geometry.rotations import (
     vector_from_rotation,
 )
 from flockd.flight.geometry.transform import RigidTransform
-from flockd.flight.geometry.triangulation import inverse_depths
+from flockd.flight.geometry.triangulation import inverse_depths, inverse_depths_of_rays
 from flockd.flight.geometry.virtual_camera import VirtualCrop, virtual_crop
 
 __all__ = [
@@ -47,6 +47,7 @@ __all__ = [
     "grid_pixels",
     "ground_inverse_depth",
     "inverse_depths",
+    "inverse_depths_of_rays",
     "label_pixels",
     "lift_matches",
     "log_polar",

@@ -23,11 +23,21 @@ def inverse_depths(
         end: (n, 2) the same points in the second.
     """
     between = camera.T_body_camera.inverse() @ motion @ camera.T_body_camera
+    return inverse_depths_of_rays(camera.camera.rays(start), camera.camera.unproject(end, np.ones(len(end))), between)
+
+
+def inverse_depths_of_rays(p: FloatArray, q: FloatArray, between: RigidTransform) -> tuple[FloatArray, FloatArray]:
+    """The same, of rays in the camera's axes.
+
+    Args:
+        p: (n, 3) unit vectors in the first image.
+        q: (n, 3) points at depth 1 in the second.
+        between: takes coordinates of the camera at the second image to those at the first.
+    """
     # p is parallel to R q / w + t, so that p x R q + w (p x t) = 0: linear in w, and honest about noise around zero.
-    p = camera.camera.rays(start)
-    turned = camera.camera.unproject(end, np.ones(len(end))) @ between.rotation.T
-    across, parallax = np.cross(p, between.translation), np.cross(p, turned)
-    baseline = np.linalg.norm(across, axis=1)
+    # With unit p, by Lagrange, (p x a) . (p x b) = a . b - (p . a) (p . b).
+    turned, along = q @ between.rotation.T, p @ between.translation
+    parallax = turned @ between.translation - along * np.einsum("ij,ij->i", p, turned)
+    baseline = np.sqrt(np.maximum(between.translation @ between.translation - along**2, 0.0))
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = -(parallax * across).sum(axis=1) / baseline**2
-    return inverse, baseline
+        return -parallax / baseline**2, baseline

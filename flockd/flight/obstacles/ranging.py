@@ -21,7 +21,7 @@ from flockd.core.messages import (
     ObstacleRanges,
     UInt8Array,
 )
-from flockd.flight.geometry import Rig, RigCamera, grid_pixels
+from flockd.flight.geometry import Rig, RigCamera, RigidTransform, grid_pixels, inverse_depths_of_rays
 from flockd.flight.perception.observation import CameraObservation, Observation
 
 _STRIDE_PX = 4
@@ -207,9 +207,7 @@ class _Triangulation:
         """
         assert now.flow is not None
         mounted, lens = self._camera.T_body_camera, self._camera.camera
-        to_camera, offset = mounted.rotation.T, mounted.translation
-        rotation = to_camera @ ego.rotation @ mounted.rotation  # from the camera now to the camera before
-        translation = to_camera @ (ego.rotation @ offset + ego.translation - offset)
+        between = mounted.inverse() @ RigidTransform(ego.rotation, ego.translation) @ mounted
         near_level = np.abs(before.vehicle.R_ned_body[2] @ self._down_body) <= _STEEPEST
         start, p = self._pixels[near_level], self._rays[near_level]
         end = start + now.flow[self._grid].reshape(-1, 2)[near_level]
@@ -220,13 +218,8 @@ class _Triangulation:
         background = now.labels[row, column] == 0
         end, p = end[background], p[background]
         ray = lens.unproject(end, np.ones(len(end)))
-        # p is parallel to R q / w + t, so that p x R q + w (p x t) = 0: linear in the inverse depth w. With unit p,
-        # by Lagrange, (p x a) . (p x b) = a . b - (p . a) (p . b).
-        turned, along = ray @ rotation.T, p @ translation
-        parallax = turned @ translation - along * np.einsum("ij,ij->i", p, turned)
-        baseline = np.sqrt(np.maximum(translation @ translation - along**2, 0.0))
+        inverse, baseline = inverse_depths_of_rays(p, ray, between)
         with np.errstate(divide="ignore", invalid="ignore"):
-            inverse = -parallax / baseline**2
             sigma = _FLOW_SIGMA_PX / lens.focal_px / baseline
             certain = (baseline > _MIN_BASELINE_M) & (inverse > _CERTAIN_SIGMAS * sigma)
         places = mounted.rotation @ (ray[certain] / inverse[certain, None]).T
