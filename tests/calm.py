@@ -1,27 +1,30 @@
-"""Time for tests whose drone flies in this process: real time without the pauses in which the computer ran others.
+"""Time for tests whose drone flies in this process: without the pauses in which the computer ran others.
 
-The daemon, the fake autopilot, the cameras and the test itself read one clock. It advances with real time, but by
-`MOST_S` at most from one reading to the next. So a time-out that the drone keeps is kept however busy the computer is,
-and a bound that a test asserts is the requirement's.
+The daemon, the fake autopilot, the cameras and the test itself read one clock. It advances `SPEED_FACTOR` times as fast
+as real time, but by `MOST_S` at most from one reading to the next. So a time-out that the drone keeps is kept however
+busy the computer is, and a bound that a test asserts is the requirement's.
 """
 
 from __future__ import annotations
 
 import asyncio
+import math
 import selectors
 import threading
 import time
 from collections.abc import Callable, Coroutine
 from typing import Any
 
+SPEED_FACTOR = 2.0
+"""These flights wait much and compute little."""
 MOST_S = 0.05
-"""More than between two readings of a computer that is free: the fake autopilot reads every 0.02 s."""
+"""More than between two readings on a computer that is free: the fake autopilot reads every 0.02 s of real time."""
 
 
 class CalmClock:
     """Monotonic seconds, for any thread."""
 
-    def __init__(self, real: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, real: Callable[[], float]) -> None:
         self._real = real
         self._read_s = self._now_s = real()
         self._lock = threading.Lock()
@@ -35,7 +38,7 @@ class CalmClock:
             return self._now_s
 
 
-clock = CalmClock()
+clock = CalmClock(lambda: SPEED_FACTOR * time.monotonic())
 """This process's."""
 
 
@@ -51,7 +54,7 @@ class _Selector(selectors.DefaultSelector):
     """Returns often enough for the clock to advance while nothing happens."""
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, Any]]:
-        return super().select(MOST_S / 2 if timeout is None else min(timeout, MOST_S / 2))
+        return super().select(min(MOST_S / 2, math.inf if timeout is None else timeout) / SPEED_FACTOR)
 
 
 class _SteppedLoop(asyncio.SelectorEventLoop):
