@@ -84,8 +84,10 @@ def test_offboard_is_refused_and_the_whole_reason_reported(tmp_path: Path, recor
     port = free_port()
 
     async def story() -> None:
-        with _Refuses(port, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
-            async with aboard(autopilot, port, tmp_path, arm_and_take_off=True, height_m=HOVER_M) as ship:
+        autopilot = _Refuses(port, heartbeat_s=HEARTBEAT_S, clock=clock)
+        async with aboard(autopilot, port, tmp_path, arm_and_take_off=True, height_m=HOVER_M) as ship:
+            await until(lambda: bool(ship.session.info.peers_zid()), SECONDS_TO_FAIL)  # it receives events
+            with autopilot:
                 await until(lambda: ship.state() != "" and math.isfinite(autopilot.asked_s), SECONDS_TO_FAIL)
                 await ship.until_event("the autopilot was asked for offboard, which was ")
                 (refused,) = [event for event in ship.events if "asked for offboard" in event]

@@ -384,6 +384,8 @@ def test_what_the_autopilot_refuses_is_in_status_word_for_word_and_once_in_the_l
 
     async def story() -> None:
         async with aboard(fake_autopilot, port, tmp_path) as ship:
+            await ship.ask("about")  # the session that receives events is connected
+            fake_autopilot.failing = {"check_gyro_not_calibrated"}
             await ship.until_event(sentence)
             await until(lambda: ship.refusals() == {"check_gyro_not_calibrated"}, SECONDS_TO_FAIL)
             (row,) = status_rows(ship.watcher.drones(), clock())
@@ -393,7 +395,6 @@ def test_what_the_autopilot_refuses_is_in_status_word_for_word_and_once_in_the_l
             assert ship.events.count(sentence) == 1
 
     with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
-        fake_autopilot.failing = {"check_gyro_not_calibrated"}
         run(story)
 
 
