@@ -172,6 +172,15 @@ class MissionStatus:
     takeover: str | None = None
     """`land` or `return`: what the autopilot is to be asked for, as the mission is over; None: nothing."""
 
+    @property
+    def known(self) -> bool:
+        """Whether a mission has said it."""
+        return self.kind != NO_STATUS.kind
+
+
+NO_STATUS = MissionStatus("unknown", np.zeros(2), "has not begun")
+"""Before a pilot's first good step, of one that was not stepped, and in recordings that do not hold the circle's."""
+
 
 @dataclass(frozen=True, eq=False)
 class EgoMotion:
@@ -348,8 +357,8 @@ class PilotOutput:
     """Estimates refused in this step, by the reason's text."""
     stages_ms: Mapping[str, float] = field(default_factory=dict)
     """Time each stage took, as measured by the caller's clock; empty without one."""
-    mission: MissionStatus | None = None
-    """None for the paper's circle and tangent, which has no goal and no end."""
+    mission: MissionStatus = NO_STATUS
+    """As of the last good step."""
     noisy_cameras: tuple[str, ...] = ()
     """Whose images were noise, and were not used."""
     ground: GroundEstimate | None = None

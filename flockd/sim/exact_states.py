@@ -8,7 +8,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from flockd.core.config.scenario import ScenarioConfig
-from flockd.core.messages import BoolArray, FloatArray, MissionStatus, ObstacleRanges
+from flockd.core.messages import NO_STATUS, BoolArray, FloatArray, MissionStatus, ObstacleRanges
 from flockd.flight.flocking import FlockingLaw
 from flockd.flight.mission import Moment, Navigator
 from flockd.flight.mission.navigator import middle_of
@@ -31,7 +31,7 @@ class Commands:
     """(n,)"""
     height_m: FloatArray
     """(n,), up positive; NaN: as high as now."""
-    missions: tuple[MissionStatus | None, ...]
+    missions: tuple[MissionStatus, ...]
     """See `PilotOutput.mission`."""
     desired: FloatArray
     """(n, 2) m/s: what each mission wants, times its pull."""
@@ -42,12 +42,12 @@ class Commands:
     def of(cls, n: int) -> Self:
         """Standstill of n drones, to be filled."""
         still = (np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n), np.full(n, np.nan))
-        return cls(*still, missions=(None,) * n, desired=np.zeros((n, 2)), obstacles=(None,) * n)
+        return cls(*still, missions=(NO_STATUS,) * n, desired=np.zeros((n, 2)), obstacles=(None,) * n)
 
     @property
     def takeovers(self) -> list[str | None]:
         """Which autopilots take over, and how."""
-        return [None if mission is None else mission.takeover for mission in self.missions]
+        return [mission.takeover for mission in self.missions]
 
 
 class ExactFlock:
@@ -78,7 +78,7 @@ class ExactFlock:
 
     def _of(
         self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray, ranges: ObstacleRanges | None
-    ) -> tuple[FloatArray, FloatArray, float, float, MissionStatus | None, FloatArray]:
+    ) -> tuple[FloatArray, FloatArray, float, float, MissionStatus, FloatArray]:
         here, moving = positions[:, :2], velocities[:, :2]
         pilot = self._pilots[i]
         if isinstance(pilot, HandPilot):
@@ -112,7 +112,7 @@ class FlownByHand(NamedTuple):
     """(2,) m/s, north and east."""
     height_m: float
     """Up positive; NaN: as high as now."""
-    status: MissionStatus | None
+    status: MissionStatus
 
 
 class HandPilot:

@@ -14,7 +14,7 @@ from flockd import __version__
 from flockd.core.choices import TRUTH_ROLES, SimulatedPerception
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.errors import UsageError
-from flockd.core.messages import FloatArray, MissionStatus
+from flockd.core.messages import NO_STATUS, FloatArray
 from flockd.flight.mission.circle_then_tangent import desired_of
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.truth import TrueDrone, Truth
@@ -222,7 +222,7 @@ class _VisionPilots:
         """Commands of the pilots, and of the people who fly drones by hand."""
         count = len(self._scenario.vehicles)
         commands = Commands.of(count)
-        missions: list[MissionStatus | None] = [None] * count
+        missions = [NO_STATUS] * count
         for i, stepped in self._stepped.items():
             output, command = stepped.output, stepped.output.command
             commands.velocity[i], commands.acceleration[i] = command.velocity, command.acceleration

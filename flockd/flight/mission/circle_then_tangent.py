@@ -24,9 +24,11 @@ class CircleThenTangent:
         return Guidance(desired_velocity(p, time_s), where, course(p, time_s))
 
 
-def desired_of(parameters: MissionParameters, t: float, status: MissionStatus | None) -> FloatArray:
-    """(2,) m/s: what a drone wanted `t` seconds into its flight, by its output's status, which the circle has not."""
-    return desired_velocity(parameters, t) * parameters.pull if status is None else status.desired
+def desired_of(parameters: MissionParameters, t: float, status: MissionStatus) -> FloatArray:
+    """(2,) m/s: what a drone wanted `t` seconds into its flight; Eq. 43 where a recording lacks the circle's status."""
+    if not status.known and parameters.kind == "circle_then_tangent":
+        return desired_velocity(parameters, t) * parameters.pull
+    return status.desired
 
 
 def desired_velocity(parameters: MissionParameters, t: float) -> FloatArray:

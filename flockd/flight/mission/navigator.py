@@ -35,11 +35,6 @@ class Navigator:
         self._course_rad: float | None = None
         self._turned_s = 0.0
 
-    @property
-    def is_paper(self) -> bool:
-        """Whether it flies the paper's circle, which has no goal and no end."""
-        return self._parameters.kind == "circle_then_tangent"
-
     def step(self, moment: Moment) -> Guidance:
         """What the mission wants, `moment.time_s` after the flight began; an order may put another in its place.
 
@@ -51,7 +46,8 @@ class Navigator:
         if guidance.height_m is not None:
             self._height_m = guidance.height_m
         height_m = None if self._height_m is None else self._height_m + self._configured.height_offset_m
-        course_rad = guidance.course_rad if self.is_paper else self._turned(guidance.course_rad, moment.time_s)
+        is_paper = self._parameters.kind == "circle_then_tangent"
+        course_rad = guidance.course_rad if is_paper else self._turned(guidance.course_rad, moment.time_s)
         self._course_rad, self._turned_s = course_rad, moment.time_s
         return replace(guidance, height_m=height_m, course_rad=course_rad)
 
@@ -59,10 +55,8 @@ class Navigator:
         """(2,) m/s: efv of Eq. 42 with the mission's own part of W_i, which is 0 for `follow`."""
         return guidance.velocity * self._parameters.pull
 
-    def status(self, guidance: Guidance) -> MissionStatus | None:
+    def status(self, guidance: Guidance) -> MissionStatus:
         """For telemetry and recordings; see `PilotOutput.mission`."""
-        if self.is_paper:
-            return None
         return MissionStatus(
             kind=self._parameters.kind,
             desired=self.pull(guidance),

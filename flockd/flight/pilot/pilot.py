@@ -12,6 +12,7 @@ import numpy as np
 
 from flockd.core.config.drone import DroneConfig
 from flockd.core.messages import (
+    NO_STATUS,
     BoolArray,
     Detection,
     EgoMotion,
@@ -19,7 +20,6 @@ from flockd.core.messages import (
     FrameSet,
     GroundEstimate,
     MissionOrder,
-    MissionStatus,
     Neighbour,
     NeighbourMotion,
     ObstacleRanges,
@@ -112,6 +112,8 @@ class FlockPilot:
         """The heading asked for last; before the first, that of the first good attitude."""
         self._refused_in_a_row = 0
         self._order: MissionOrder | None = None
+        self._mission = NO_STATUS
+        """As of the last good step."""
 
     def step(
         self,
@@ -159,7 +161,7 @@ class FlockPilot:
         laps.end("tracking")
         obstacles = self._local_map(observation, ego, ground, velocity)
         laps.end("obstacles")
-        command, mission = self._command(observation, neighbours, velocity, obstacles)
+        command = self._command(observation, neighbours, velocity, obstacles)
         laps.end("flocking")
         self._last_time_s = observation.time_s
         of_height = () if why_no_ground is None else (why_no_ground,)
@@ -176,7 +178,7 @@ class FlockPilot:
             reasons=reasons,
             counts=Counter(reason.text for reason in reasons),
             stages_ms=laps.stages_ms,
-            mission=mission,
+            mission=self._mission,
             noisy_cameras=observation.noisy_cameras,
             ground=ground,
             obstacles=obstacles,
@@ -194,6 +196,7 @@ class FlockPilot:
             neighbour_motions={},
             neighbours=self._tracker.neighbours(),
             command=Wanted(np.zeros(2), np.zeros(2), self._yaw_rad),
+            mission=self._mission,
             reasons=(reason,),
             counts={reason.text: 1},
         )
@@ -324,7 +327,7 @@ class FlockPilot:
         neighbours: Sequence[Neighbour],
         velocity: FloatArray | None,
         obstacles: ObstacleRanges | None,
-    ) -> tuple[Wanted, MissionStatus | None]:
+    ) -> Wanted:
         if self._first_time_s is None:
             self._first_time_s = observation.time_s
         seen = [n for n in neighbours if n.confirmed]
@@ -341,7 +344,8 @@ class FlockPilot:
             )
         )
         self._order = None
-        desired = self._navigator.pull(guidance)
+        self._mission = self._navigator.status(guidance)
+        desired = self._mission.desired
         own = guidance.velocity if velocity is None else velocity[:2]  # before the first pair: as desired
         if obstacles is None:
             command, acceleration = self._law.command(
@@ -354,7 +358,7 @@ class FlockPilot:
         trim = self._trim.velocity
         return Wanted(
             self._trim.corrected(command), acceleration, self._yaw_rad, trim if trim.any() else None, guidance.height_m
-        ), self._navigator.status(guidance)
+        )
 
 
 def _why_refused(frames: FrameSet, vehicle: VehicleState) -> Reason | None:

@@ -101,8 +101,8 @@ class Control:
         result = self._pilot_loop.newest
         if self.decision.state not in FLYING or result is None or result.flight != self._flight:
             return None
-        mission = result.output.mission
-        return None if mission is None or mission.takeover is None else MissionEnd(mission.takeover)
+        takeover = result.output.mission.takeover
+        return None if takeover is None else MissionEnd(takeover)
 
     def _begin_or_end_flight(self, before: Decision, vehicle: VehicleState | None) -> None:
         """A flight begins with a new pilot, and holds the height and the heading that the drone has then."""

@@ -33,7 +33,7 @@ def publish_step(sink: TelemetrySink, drone: str, vehicle: VehicleState, output:
     if output.obstacles is not None:
         sink.publish(drone, "obstacles", _obstacles(output.obstacles))
     sink.publish(drone, "command", _command(output))
-    if output.mission is not None:
+    if output.mission.known:
         sink.publish(drone, "mission", _mission(output.time_s, vehicle, output.mission))
     sink.publish(drone, "health", _health(output))
     sink.publish(drone, "timings", TimingsMessage(time_s=output.time_s, stages_ms=dict(output.stages_ms)))

@@ -94,7 +94,7 @@ class CommandMessage(TypedDict):
 
 
 class MissionMessage(TypedDict):
-    """How far the drone is with its mission; not sent on the paper's circle."""
+    """How far the drone is with its mission; not sent before its pilot's first good step."""
 
     time_s: float
     kind: str

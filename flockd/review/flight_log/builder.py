@@ -56,7 +56,7 @@ class FlightLogBuilder:
         return self._position, self._velocity
 
     def add_missions(
-        self, step: int, desired: FloatArray, missions: Sequence[MissionStatus | None], homes: FloatArray | None = None
+        self, step: int, desired: FloatArray, missions: Sequence[MissionStatus], homes: FloatArray | None = None
     ) -> None:
         """What each drone's mission wants, (n, 2) m/s, and how far it is.
 
@@ -68,10 +68,10 @@ class FlightLogBuilder:
         goals = [
             tuple(np.round(mission.goal + (0.0 if homes is None else homes[i]), 3).tolist())
             for i, mission in enumerate(missions)
-            if mission is not None and mission.goal is not None and not self._mission_over[i]
+            if mission.goal is not None and not self._mission_over[i]
         ]
         for i, mission in enumerate(missions):
-            self._mission_over[i] |= mission is not None and mission.takeover is not None
+            self._mission_over[i] |= mission.takeover is not None
         if goals:
             self._goal[step] = Counter(goals).most_common(1)[0][0]
 

@@ -13,7 +13,7 @@ from flockd import __version__
 from flockd.core.config import DroneConfig
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.config.scenario import ScenarioConfig
-from flockd.core.messages import FloatArray, MissionStatus, PilotOutput
+from flockd.core.messages import NO_STATUS, FloatArray, MissionStatus, PilotOutput
 from flockd.flight.flocking.metrics import order, union
 from flockd.flight.mission.circle_then_tangent import desired_of
 from flockd.flight.perception import load_networks
@@ -93,7 +93,7 @@ def fleet_log(
         builder.add_truth(row, frame.position, frame.velocity, frame.R_ned_body)
     rows = {frame.time_s: row for row, frame in enumerate(frames)}
     flown = [i for i, vehicle in enumerate(scenario.vehicles) if not vehicle.by_hand]
-    statuses: list[dict[int, MissionStatus | None]] = [{} for _ in frames]
+    statuses: list[dict[int, MissionStatus]] = [{} for _ in frames]
     processed: dict[str, int] = {}
     over: set[str] = set()
     longest_s, spanning = 0.0, 0
@@ -109,7 +109,7 @@ def fleet_log(
             kept = replace(output, ego_motion=None) if spans_more else output
             builder.add_output(row, i, kept, R_ned_body, output.stages_ms)
             statuses[row][i] = output.mission
-            if output.mission is not None and output.mission.takeover is not None:
+            if output.mission.takeover is not None:
                 over.add(config.name)
         processed[config.name] = len(steps)
     _add_missions(builder, scenario, frames, times, statuses)
@@ -133,7 +133,7 @@ def fleet_log(
 
 def _add_missions(
     builder: FlightLogBuilder, scenario: ScenarioConfig, frames: Sequence[FleetFrame], times: FloatArray,
-    statuses: Sequence[Mapping[int, MissionStatus | None]],
+    statuses: Sequence[Mapping[int, MissionStatus]],
 ) -> None:  # fmt: skip
     """What each drone wanted at each frame; where its pilot left one out, what it wanted before.
 
@@ -142,7 +142,7 @@ def _add_missions(
     vehicles = range(len(scenario.vehicles))
     homes = np.array([vehicle.position_m[:2] for vehicle in scenario.vehicles])
     missions = [scenario.drone_of(i).mission for i in vehicles]
-    newest: dict[int, MissionStatus | None] = {}
+    newest: dict[int, MissionStatus] = {}
     for row, (frame, found) in enumerate(zip(frames, statuses, strict=True)):
         newest |= found
         desired = [
@@ -153,7 +153,7 @@ def _add_missions(
             else np.zeros(2)
             for i in vehicles
         ]
-        builder.add_missions(row, np.array(desired), [newest.get(i) for i in vehicles], homes)
+        builder.add_missions(row, np.array(desired), [newest.get(i, NO_STATUS) for i in vehicles], homes)
 
 
 def _metadata(

@@ -178,12 +178,13 @@ def test_an_operators_velocity_and_goal_hold_for_two_seconds() -> None:
 
 def test_a_goal_takes_the_place_of_any_other_mission_for_good() -> None:
     point = Point(mission(speed_m_s=1.5))
-    assert point.navigator.status(point.step()) is None
+    circling = point.navigator.status(point.step())
+    assert (circling.kind, circling.sentence, circling.goal) == ("circle_then_tangent", "on the circle", None)
+    np.testing.assert_allclose(circling.desired, [1.5, 0.0])
     ordered = point.step(MissionOrder(place=np.array([0.0, 20.0]), height_m=7.0, speed_m_s=0.5))
     assert ordered.height_m == 7.0
     assert math.hypot(*ordered.velocity) == pytest.approx(0.5)
     status = point.navigator.status(point.fly(60.0))
-    assert status is not None
     assert (status.kind, status.arrived) == ("waypoints", True)
     np.testing.assert_allclose(point.position, [0.0, 20.0], atol=1.0)
 

@@ -217,6 +217,17 @@ def blown_about(yaw: str, *headings_rad: float, height_m: float = 4.0) -> list[f
     ]
 
 
+def test_a_mission_is_unknown_before_the_first_good_step_and_stays_known_in_refused_ones() -> None:
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0)))
+    _, state = flyer.take_frames()
+    refused = replace(state, height_m=math.nan)
+    statuses = [flyer.pilot.step(FrameSet(0.5 * i, {}), s).mission for i, s in enumerate((refused, state, refused))]
+    assert [(status.kind, status.known) for status in statuses] == [
+        ("unknown", False), ("circle_then_tangent", True), ("circle_then_tangent", True)
+    ]  # fmt: skip
+    np.testing.assert_allclose(statuses[2].desired, [1.0, 0.0])  # where the paper's circle begins
+
+
 @pytest.mark.parametrize("yaw", ["hold", "course"])
 def test_a_heading_to_hold_is_the_first_one_whatever_the_wind_makes_of_it(yaw: str) -> None:
     """With `course`, where the mission has none."""

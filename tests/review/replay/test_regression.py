@@ -41,11 +41,14 @@ OF_NEIGHBOURS = (
 OF_EGO_MOTION = ("ego_motion.pairs=100", "ego_motion.inliers=100")
 """Of thousands of pairs; none changed on the processors that were simulated."""
 
+OF_MISSION = "mission=1e-9"
+"""Sine and cosine of the course."""
+
 Capture = pytest.CaptureFixture[str]
 
 
 def against_reference(flight: str, config: Path, expected: Path | None = None) -> int:
-    tolerances = [*TOLERANCES_OF.get(flight, TOLERANCES), *OF_EGO_MOTION, *OF_NEIGHBOURS]
+    tolerances = [*TOLERANCES_OF.get(flight, TOLERANCES), *OF_EGO_MOTION, *OF_NEIGHBOURS, OF_MISSION]
     arguments = [part for tolerance in tolerances for part in ("--tolerance", tolerance)]
     reference = ["--diff", "--reference", str(expected or HERE / f"{flight}.expected")]
     return main(["replay", str(HERE / f"{flight}.mcap"), "--config", str(config), *reference, *arguments])
