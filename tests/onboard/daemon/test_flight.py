@@ -267,7 +267,7 @@ def test_an_operator_sends_it_somewhere_and_the_recording_replays(
             await ship.flies()
             assert await ship.fleet("goto", "tiny", "300", "0") == 1
             assert await ship.fleet("hold", "tiny") == 1, "not among telemetry.commands"
-            assert "mission" not in ship.heard(), "nothing has changed: it flies the paper's tangent"
+            assert ship.mission("kind") == "circle_then_tangent", "nothing has changed"
             north, east = fake_autopilot.state.position[:2] - [0.0, 2.0]
             command = ("goto", "tiny", f"{north:.3f}", f"{east:.3f}", "--height", f"{HOVER_M + 1.0}", "--speed", "1")
             assert await ship.fleet(*command) == 0
