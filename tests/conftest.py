@@ -1,14 +1,21 @@
-"""Fails a skip that `permitted_skips.py` does not list."""
+"""Fails a skip that `permitted_skips.py` does not list, and runs tests that are coroutines."""
 
 from __future__ import annotations
 
+import asyncio
 from collections import Counter
 from collections.abc import Generator
 from typing import Any
 
 import pytest
 
+from tests.coroutine_tests import run_coroutine_test
 from tests.permitted_skips import permitted
+
+
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """An `async def` test runs in real time; a folder's own `conftest.py` may choose another clock."""
+    return run_coroutine_test(pyfuncitem, lambda story: asyncio.run(story()))
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)

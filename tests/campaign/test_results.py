@@ -21,6 +21,7 @@ from flockd.core.errors import UsageError
 from tests.campaign.flights import HEAD, Shuffled, campaign_file, flown, made_up
 from tools.docs.docs_campaign import table
 
+pytestmark = pytest.mark.usefixtures("made_up_flights")
 GRID = "vary: {drone.flocking.cohesion: {values: [0.1, 0.2]}}\nmeasure: [min_distance_m, order_tail]\n"
 
 
@@ -34,7 +35,6 @@ def plan(tmp_path: Path) -> Plan:
     return Plan.load(campaign_file(tmp_path, GRID))
 
 
-@pytest.mark.usefixtures("made_up_flights")
 def test_the_same_results_in_any_order_and_after_any_interruption(plan: Plan, tmp_path: Path) -> None:
     """12 flights; of one folder interrupted twice, and one whose parts are merged all the time."""
     assert flown(plan, tmp_path / "a", Shuffled(1)).flown == 12
@@ -49,7 +49,6 @@ def test_the_same_results_in_any_order_and_after_any_interruption(plan: Plan, tm
     assert len(pq.read_table(tmp_path / "b" / "timings.parquet")) == 12
 
 
-@pytest.mark.usefixtures("made_up_flights")
 def test_a_kill_leaves_what_was_finished(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Three flights, killed before they are merged, then in the middle of merging, then before parts are deleted."""
     path = tmp_path / "out"
@@ -89,7 +88,6 @@ def _end_after(patch: pytest.MonkeyPatch, files: int) -> None:
     patch.setattr(CampaignFolder, "merge", ended)
 
 
-@pytest.mark.usefixtures("made_up_flights")
 def test_a_flight_that_fails_is_a_row_with_its_reason(plan: Plan, tmp_path: Path) -> None:
     conducted = flown(plan, tmp_path / "out", Shuffled(1))
     assert conducted.failed == 2
@@ -101,7 +99,6 @@ def test_a_flight_that_fails_is_a_row_with_its_reason(plan: Plan, tmp_path: Path
     assert {row["drone.flocking.cohesion"] for row in rows} == {0.1, 0.2}
 
 
-@pytest.mark.usefixtures("made_up_flights")
 def test_another_campaign_is_refused(plan: Plan, tmp_path: Path) -> None:
     flown(plan, tmp_path / "out", Shuffled(1))
     changed = Plan.load(campaign_file(tmp_path, GRID.replace("0.2]", "0.3]")))
@@ -125,7 +122,6 @@ def test_another_campaign_is_refused(plan: Plan, tmp_path: Path) -> None:
             flown(plan, tmp_path / "out", Shuffled(1))
 
 
-@pytest.mark.usefixtures("made_up_flights")
 def test_the_report_says_what_was_flown(plan: Plan, tmp_path: Path) -> None:
     flown(plan, tmp_path / "out", Shuffled(1))
     results = Results.load(tmp_path / "out")
@@ -141,7 +137,6 @@ def test_the_report_says_what_was_flown(plan: Plan, tmp_path: Path) -> None:
     assert sorted(results.by_seed("min_distance_m", [0, 1])) == [0, 1, 2, 4, 5]
 
 
-@pytest.mark.usefixtures("made_up_flights")
 def test_figures_stand_under_the_case_and_the_value_that_were_flown(tmp_path: Path) -> None:
     """Neither cases nor values are in the order of the alphabet."""
     text = (
@@ -160,7 +155,6 @@ def test_figures_stand_under_the_case_and_the_value_that_were_flown(tmp_path: Pa
     assert [axes.get_xscale() for axes in parameter_curves(results, "order_tail").axes] == ["log"]
 
 
-@pytest.mark.usefixtures("made_up_flights")
 def test_two_campaigns_are_compared_by_pairs(tmp_path: Path) -> None:
     """One of 12 seeds fails; in the other 11 all figures are 0.1 larger: of 2^11 ways to give signs 2 are as far."""
     text = "vary: {drone.flocking.separation: {values: [5, 10]}}\nmeasure: [min_distance_m, collisions]\n"

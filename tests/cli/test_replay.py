@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import resource
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 import yaml
@@ -224,11 +223,9 @@ def scenario(overrides: Overrides) -> ScenarioConfig:
     return flight.model_copy(update={"drone": drone})
 
 
-@dataclass(frozen=True, eq=False)
-class Flight:
-    fly: Callable[[Path, list[str]], FlightLog]
-    """Again, recorded in a folder; what the recorders tell goes into the list."""
+class Flight(NamedTuple):
     folder: Path
+    """Of its recordings."""
     log: FlightLog
 
 
@@ -237,26 +234,14 @@ def flight(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     from flockd.flight.inference.hashes import model_hashes
     from flockd.sim.swarm import fly
 
-    flown = scenario({"drone.perception.flow": request.param})
-
-    def fly_recorded(folder: Path, told: list[str]) -> FlightLog:
-        with ExitStack() as stack:
-            recorders = [
-                Recorder(
-                    folder / f"{drone}.mcap",
-                    drone=drone,
-                    config=flown.drone,
-                    models=model_hashes(flown.drone.perception),
-                    on_event=told.append,
-                )
-                for drone in DRONES
-            ]
-            for recorder in recorders:
-                stack.enter_context(recorder)
-            return fly(flown, recorders=recorders, processes=1).log
-
-    folder = tmp_path_factory.mktemp("flight")
-    return Flight(fly_recorded, folder, fly_recorded(folder, []))
+    flown, folder = scenario({"drone.perception.flow": request.param}), tmp_path_factory.mktemp("flight")
+    models = model_hashes(flown.drone.perception)
+    with ExitStack() as stack:
+        recorders = [
+            stack.enter_context(Recorder(folder / f"{drone}.mcap", drone=drone, config=flown.drone, models=models))
+            for drone in DRONES
+        ]
+        return Flight(folder, fly(flown, recorders=recorders, processes=1).log)
 
 
 def test_a_replay_of_a_simulated_flight_equals_it_bit_for_bit(flight: Flight, capsys: Capture) -> None:
@@ -280,18 +265,3 @@ def test_the_recordings_make_the_flights_own_log(flight: Flight) -> None:
             assert getattr(again, part.name).tobytes() == getattr(flight.log, part.name).tobytes(), part.name
     facts = ("drones", "duration_s", "step_s", "perception", "flow", "scale", "circle_until_s", "desired_distance_m")
     assert again.metadata.model_dump(include=set(facts)) == flight.log.metadata.model_dump(include=set(facts))
-
-
-@pytest.mark.parametrize("flight", ["dis"], indirect=True)
-def test_a_flight_over_a_full_disk_is_the_same_flight(flight: Flight, tmp_path: Path) -> None:
-    told: list[str] = []
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, before[1]))
-    try:
-        again = flight.fly(tmp_path, told)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert sorted(event.split(":")[0] for event in told) == [f"recording {tmp_path / drone}.mcap" for drone in DRONES]
-    for part in fields(FlightLog):
-        if part.name not in ("stages_ms", "metadata"):
-            assert getattr(again, part.name).tobytes() == getattr(flight.log, part.name).tobytes(), part.name

@@ -21,8 +21,9 @@ import yaml
 from flockd.cli import main
 from flockd.core.data import data_path
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from tests.onboard.autopilot.conftest import HEARTBEAT_S, free_port
-from tests.onboard.daemon.aboard import Cameras, config_for, free_endpoint
+from flockd.sim.free_ports import free_endpoint, free_port
+from tests.onboard.autopilot.conftest import HEARTBEAT_S
+from tests.onboard.daemon.aboard import Cameras, config_for
 from tests.onboard.test_deadline import endless
 
 RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"

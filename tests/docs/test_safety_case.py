@@ -26,7 +26,11 @@ def rows(section: str) -> list[list[str]]:
 
 def functions_in(file: Path) -> set[str]:
     tree = ast.parse(file.read_text(encoding="utf-8"))
-    return {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")}
+    return {
+        node.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.name.startswith("test_")
+    }
 
 
 @pytest.mark.parametrize("row", [*rows("Requirements"), *rows("Faults")], ids=lambda row: row[0])

@@ -19,10 +19,11 @@ from flockd.core.messages import UInt8Array
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.sim.daemons import Daemons
+from flockd.sim.free_ports import free_endpoint, free_port
 from flockd.sim.processes import Program
-from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
+from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import until
-from tests.onboard.daemon.aboard import CAMERAS, HEIGHT, WIDTH, Cameras, Watched, config_for, free_endpoint, watched
+from tests.onboard.daemon.aboard import CAMERAS, HEIGHT, WIDTH, Cameras, Watched, config_for, watched
 
 SECONDS_TO_START = 60.0
 """To load three networks on a computer that is busy with other things."""

@@ -15,10 +15,11 @@ from flockd.core.config import DroneConfig
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_telemetry import Mode
 from flockd.sim.autopilot.fake_vehicle import Demand
+from flockd.sim.free_ports import free_port
 from tests.calm import clock, run
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import flying
-from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
+from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, aboard
 

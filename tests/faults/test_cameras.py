@@ -36,74 +36,62 @@ async def _is_held_and_stays_so(process: Process, fault_s: float, *, repair: Cal
     await process.until_state("ready")
 
 
-def test_no_camera_delivers_any_more(tmp_path: Path, record_property: RecordProperty) -> None:
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            process.cameras.silent |= set(CAMERAS)
-            fault_s = time.monotonic()
-            await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-            reacted(record_property, "camera-unplugged", time.monotonic() - fault_s)
-            await _is_held_and_stays_so(process, fault_s, repair=process.cameras.silent.clear)
-
-    asyncio.run(story())
+async def test_no_camera_delivers_any_more(tmp_path: Path, record_property: RecordProperty) -> None:
+    async with flying(tmp_path) as process:
+        process.cameras.silent |= set(CAMERAS)
+        fault_s = time.monotonic()
+        await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        reacted(record_property, "camera-unplugged", time.monotonic() - fault_s)
+        await _is_held_and_stays_so(process, fault_s, repair=process.cameras.silent.clear)
 
 
-def test_all_cameras_freeze(tmp_path: Path, record_property: RecordProperty) -> None:
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            process.cameras.spoil = lambda frame: replace(frame, sequence=17)
-            fault_s = time.monotonic()
-            await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-            reacted(record_property, "frozen-frames", time.monotonic() - fault_s)
-            await process.until_event("hover: too few cameras deliver images: front frozen, back frozen")
-            await _is_held_and_stays_so(process, fault_s, repair=lambda: _good_again(process))
-
-    asyncio.run(story())
+async def test_all_cameras_freeze(tmp_path: Path, record_property: RecordProperty) -> None:
+    async with flying(tmp_path) as process:
+        process.cameras.spoil = lambda frame: replace(frame, sequence=17)
+        fault_s = time.monotonic()
+        await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        reacted(record_property, "frozen-frames", time.monotonic() - fault_s)
+        await process.until_event("hover: too few cameras deliver images: front frozen, back frozen")
+        await _is_held_and_stays_so(process, fault_s, repair=lambda: _good_again(process))
 
 
-def test_time_stamps_are_repeated_and_run_backwards(tmp_path: Path, record_property: RecordProperty) -> None:
+async def test_time_stamps_are_repeated_and_run_backwards(tmp_path: Path, record_property: RecordProperty) -> None:
     """Half of the frames: they are dropped and counted, and the drone flies on, slower, by the others."""
 
     def stamped_badly(frame: Frame) -> Frame:
         return frame if frame.sequence % 2 else replace(frame, time_s=frame.time_s - 3.0)
 
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            process.cameras.spoil = stamped_badly
-            fault_s = time.monotonic()
-            await until(lambda: "frames_dropped" in process.matters(), SECONDS_TO_FAIL)
-            reacted(record_property, "time-stamps-backwards", time.monotonic() - fault_s)
-            assert process.fake_autopilot.mode == "OFFBOARD"
-            steps = process.heard()["computer"].message["steps"]
-            await until(lambda: process.heard()["computer"].message["steps"] > steps + 3, SECONDS_TO_FAIL)
-            assert process.heard()["computer"].message["cameras"]["front"]["counts"]["time_stamp"] > 1
-            _good_again(process)
-            await until(lambda: "frames_dropped" not in process.matters(), SECONDS_TO_FAIL)
-            await process.until_state("normal")
-
-    asyncio.run(story())
+    async with flying(tmp_path) as process:
+        process.cameras.spoil = stamped_badly
+        fault_s = time.monotonic()
+        await until(lambda: "frames_dropped" in process.matters(), SECONDS_TO_FAIL)
+        reacted(record_property, "time-stamps-backwards", time.monotonic() - fault_s)
+        assert process.fake_autopilot.mode == "OFFBOARD"
+        steps = process.heard()["computer"].message["steps"]
+        await until(lambda: process.heard()["computer"].message["steps"] > steps + 3, SECONDS_TO_FAIL)
+        assert process.heard()["computer"].message["cameras"]["front"]["counts"]["time_stamp"] > 1
+        _good_again(process)
+        await until(lambda: "frames_dropped" not in process.matters(), SECONDS_TO_FAIL)
+        await process.until_state("normal")
 
 
-def test_one_of_two_cameras_is_gone_and_comes_back(tmp_path: Path, record_property: RecordProperty) -> None:
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            process.cameras.silent.add("back")
-            fault_s = time.monotonic()
-            await process.until_event("degraded: a camera is lost: back silent")
-            reacted(record_property, "one-camera-gone", time.monotonic() - fault_s)
-            steps = process.heard()["computer"].message["steps"]
-            await until(lambda: process.heard()["computer"].message["steps"] > steps + 3, SECONDS_TO_FAIL)
-            assert process.fake_autopilot.mode == "OFFBOARD"
-            await until(lambda: "camera_lost" in process.matters(), SECONDS_TO_FAIL)  # as often as it is published
-            process.cameras.silent.clear()
-            await until(lambda: "camera_lost" not in process.matters(), SECONDS_TO_FAIL)
-            await process.until_state("normal")
-
-    asyncio.run(story())
+async def test_one_of_two_cameras_is_gone_and_comes_back(tmp_path: Path, record_property: RecordProperty) -> None:
+    async with flying(tmp_path) as process:
+        process.cameras.silent.add("back")
+        fault_s = time.monotonic()
+        await process.until_event("degraded: a camera is lost: back silent")
+        reacted(record_property, "one-camera-gone", time.monotonic() - fault_s)
+        steps = process.heard()["computer"].message["steps"]
+        await until(lambda: process.heard()["computer"].message["steps"] > steps + 3, SECONDS_TO_FAIL)
+        assert process.fake_autopilot.mode == "OFFBOARD"
+        await until(lambda: "camera_lost" in process.matters(), SECONDS_TO_FAIL)  # as often as it is published
+        process.cameras.silent.clear()
+        await until(lambda: "camera_lost" not in process.matters(), SECONDS_TO_FAIL)
+        await process.until_state("normal")
 
 
 @pytest.mark.parametrize("ahead_s", [3.0, 86_400.0, -86_400.0, 1e300], ids=["3 s", "a day", "a day ago", "absurd"])
-def test_a_frame_of_another_time_silences_nobody(
+async def test_a_frame_of_another_time_silences_nobody(
     ahead_s: float, tmp_path: Path, record_property: RecordProperty
 ) -> None:
     """Three frames of one camera; all good ones after it are used at once."""
@@ -115,64 +103,54 @@ def test_a_frame_of_another_time_silences_nobody(
         spoiled.append(time.monotonic())
         return replace(frame, time_s=frame.time_s + ahead_s)
 
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            steps = process.heard()["computer"].message["steps"]
-            process.cameras.spoil = of_another_time
-            await until(lambda: len(spoiled) == 3, SECONDS_TO_FAIL)
-            await until(lambda: _counted(process, "front", "time_stamp") == 3, SECONDS_TO_FAIL)
-            await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
-            await until(lambda: _all_see(process), SECONDS_TO_FAIL)
-            reacted(record_property, "time-stamps-jump", time.monotonic() - spoiled[-1])
-            assert process.fake_autopilot.mode == "OFFBOARD"
-            await process.until_state("normal")
-
-    asyncio.run(story())
+    async with flying(tmp_path) as process:
+        steps = process.heard()["computer"].message["steps"]
+        process.cameras.spoil = of_another_time
+        await until(lambda: len(spoiled) == 3, SECONDS_TO_FAIL)
+        await until(lambda: _counted(process, "front", "time_stamp") == 3, SECONDS_TO_FAIL)
+        await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
+        await until(lambda: _all_see(process), SECONDS_TO_FAIL)
+        reacted(record_property, "time-stamps-jump", time.monotonic() - spoiled[-1])
+        assert process.fake_autopilot.mode == "OFFBOARD"
+        await process.until_state("normal")
 
 
-def test_images_are_damaged(tmp_path: Path, record_property: RecordProperty) -> None:
+async def test_images_are_damaged(tmp_path: Path, record_property: RecordProperty) -> None:
     """Every second image is cut off: dropped and counted; the drone flies on by the others."""
 
     def cut_off(frame: Frame) -> Frame:
         return frame if frame.sequence % 2 else replace(frame, image=frame.image[:7])
 
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            process.cameras.spoil = cut_off
-            fault_s = time.monotonic()
-            await until(lambda: "frames_dropped" in process.matters(), SECONDS_TO_FAIL)
-            reacted(record_property, "damaged-images", time.monotonic() - fault_s)
-            assert sum(_counted(process, "front", what) for what in ("malformed", "corrupt")) > 0
-            assert process.fake_autopilot.mode == "OFFBOARD"
-            _good_again(process)
-            await until(lambda: "frames_dropped" not in process.matters(), SECONDS_TO_FAIL)
-            await process.until_state("normal")
-
-    asyncio.run(story())
+    async with flying(tmp_path) as process:
+        process.cameras.spoil = cut_off
+        fault_s = time.monotonic()
+        await until(lambda: "frames_dropped" in process.matters(), SECONDS_TO_FAIL)
+        reacted(record_property, "damaged-images", time.monotonic() - fault_s)
+        assert sum(_counted(process, "front", what) for what in ("malformed", "corrupt")) > 0
+        assert process.fake_autopilot.mode == "OFFBOARD"
+        _good_again(process)
+        await until(lambda: "frames_dropped" not in process.matters(), SECONDS_TO_FAIL)
+        await process.until_state("normal")
 
 
-def test_a_camera_shows_noise(tmp_path: Path, record_property: RecordProperty) -> None:
+async def test_a_camera_shows_noise(tmp_path: Path, record_property: RecordProperty) -> None:
     """It counts as lost, invents no neighbour, and the command stays what the other camera gives: 1 m/s north."""
-
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            await until(lambda: _speed_north(process) > 0.97, SECONDS_TO_FAIL)
-            process.cameras.noisy.add("back")
-            fault_s = time.monotonic()
-            lost = False
-            while not lost or time.monotonic() < fault_s + 5.0:
-                assert not any(n["confirmed"] for n in process.heard()["neighbours"].message["neighbours"])
-                assert abs(_speed_north(process) - 1.0) < 0.1
-                if not lost and any(event.startswith("degraded: a camera is lost: back") for event in process.events):
-                    lost = True
-                    reacted(record_property, "noisy-camera", time.monotonic() - fault_s)
-                assert time.monotonic() < fault_s + SECONDS_TO_FAIL
-                await asyncio.sleep(0.05)
-            assert process.fake_autopilot.mode == "OFFBOARD"
-            process.cameras.noisy.clear()
-            await until(lambda: "camera_lost" not in process.matters(), SECONDS_TO_FAIL)
-
-    asyncio.run(story())
+    async with flying(tmp_path) as process:
+        await until(lambda: _speed_north(process) > 0.97, SECONDS_TO_FAIL)
+        process.cameras.noisy.add("back")
+        fault_s = time.monotonic()
+        lost = False
+        while not lost or time.monotonic() < fault_s + 5.0:
+            assert not any(n["confirmed"] for n in process.heard()["neighbours"].message["neighbours"])
+            assert abs(_speed_north(process) - 1.0) < 0.1
+            if not lost and any(event.startswith("degraded: a camera is lost: back") for event in process.events):
+                lost = True
+                reacted(record_property, "noisy-camera", time.monotonic() - fault_s)
+            assert time.monotonic() < fault_s + SECONDS_TO_FAIL
+            await asyncio.sleep(0.05)
+        assert process.fake_autopilot.mode == "OFFBOARD"
+        process.cameras.noisy.clear()
+        await until(lambda: "camera_lost" not in process.matters(), SECONDS_TO_FAIL)
 
 
 def _speed_north(process: Process) -> float:

@@ -30,7 +30,11 @@ def test_its_stories_are_tests_that_exist(fault: Fault) -> None:
     for story in fault.stories:
         file, _, name = story.partition("[")[0].partition("::")
         tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
-        tests = {node.name for node in tree.body if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")}
+        tests = {
+            node.name
+            for node in tree.body
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.name.startswith("test_")
+        }
         assert name in tests if name else tests, story
 
 

@@ -19,12 +19,13 @@ from flockd.core.config import DroneConfig
 from flockd.onboard.daemon import DaemonError
 from flockd.onboard.daemon.host_monitors import WallClock
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from flockd.sim.free_ports import free_endpoint, free_port
 from tests.calm import clock, run
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import flying
-from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
+from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import until
-from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, Aboard, aboard, config_for, free_endpoint
+from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, Aboard, aboard, config_for
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import itertools
 import json
 import subprocess
@@ -16,9 +15,10 @@ import zenoh
 
 from flockd.core.config import DroneConfig
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
+from flockd.sim.free_ports import free_endpoint
 from tests.faults.process import Process, flying
 from tests.onboard.autopilot.flight import until
-from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, client, free_endpoint
+from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, client
 from tests.onboard.telemetry.test_malformed import FLIGHT
 
 pytestmark = pytest.mark.slow
@@ -45,47 +45,40 @@ def _router(endpoint: str) -> tuple[Any, list[str]]:
     return session, keys
 
 
-def test_the_router_of_the_telemetry_goes_and_comes_back(tmp_path: Path) -> None:
+async def test_the_router_of_the_telemetry_goes_and_comes_back(tmp_path: Path) -> None:
     endpoint = free_endpoint()
 
     def through_a_router(config: DroneConfig) -> DroneConfig:
         return config.model_copy(update={"telemetry": config.telemetry.model_copy(update={"connect": (endpoint,)})})
 
-    async def story() -> None:
+    router, keys = _router(endpoint)
+    async with flying(tmp_path, change=through_a_router) as process:
+        await until(lambda: "flockd/v1/test/tiny/flight" in keys, SECONDS_TO_FAIL)
+        gone_s = time.monotonic()
+        router.close()
+        await _flies_on(process)
+        sent = [at_s for at_s, _ in list(process.fake_autopilot.setpoints) if at_s > gone_s]
+        gaps = [after - before for before, after in itertools.pairwise(sent)]
+        assert max(gaps) < 0.5, "PX4 wants two setpoints a second"
         router, keys = _router(endpoint)
-        async with flying(tmp_path, change=through_a_router) as process:
-            await until(lambda: "flockd/v1/test/tiny/flight" in keys, SECONDS_TO_FAIL)
-            gone_s = time.monotonic()
-            router.close()
-            await _flies_on(process)
-            sent = [at_s for at_s, _ in list(process.fake_autopilot.setpoints) if at_s > gone_s]
-            gaps = [after - before for before, after in itertools.pairwise(sent)]
-            assert max(gaps) < 0.5, "PX4 wants two setpoints a second"
-            router, keys = _router(endpoint)
-            await until(lambda: "flockd/v1/test/tiny/flight" in keys, 60.0)
-            router.close()
-
-    asyncio.run(story())
+        await until(lambda: "flockd/v1/test/tiny/flight" in keys, 60.0)
+        router.close()
 
 
-def test_nonsense_on_the_telemetry_bus(tmp_path: Path) -> None:
+async def test_nonsense_on_the_telemetry_bus(tmp_path: Path) -> None:
     """The drone reads nothing but questions; `hold` is not among `telemetry.commands` of this one."""
-
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            session = zenoh.open(client(process.config.telemetry.listen[0]))
-            key = "flockd/v1/test/tiny"
-            for payload in (b"\xff\x00", b"[" * 10_000, b"", json.dumps({"time_s": "now"}).encode()):
-                for topic in ("state", "flight", "ask/hold", "ask/land", "about", "alive", "image/front", "x/y/z"):
-                    session.put(f"{key}/{topic}", payload)
-            for question in ("ask/hold", "ask/HOLD", "ask/land/now", "ask/*", "image/none", "image/" + "x" * 500):
-                list(session.get(f"{key}/{question}", payload=b"\xff" * 1000, timeout=1.0))
-            assert (await process.ask("ask/hold"))["accepted"] is False
-            await _flies_on(process)
-            assert not any("asked for land" in event for event in process.events)
-            session.close()  # type: ignore[no-untyped-call]
-
-    asyncio.run(story())
+    async with flying(tmp_path) as process:
+        session = zenoh.open(client(process.config.telemetry.listen[0]))
+        key = "flockd/v1/test/tiny"
+        for payload in (b"\xff\x00", b"[" * 10_000, b"", json.dumps({"time_s": "now"}).encode()):
+            for topic in ("state", "flight", "ask/hold", "ask/land", "about", "alive", "image/front", "x/y/z"):
+                session.put(f"{key}/{topic}", payload)
+        for question in ("ask/hold", "ask/HOLD", "ask/land/now", "ask/*", "image/none", "image/" + "x" * 500):
+            list(session.get(f"{key}/{question}", payload=b"\xff" * 1000, timeout=1.0))
+        assert (await process.ask("ask/hold"))["accepted"] is False
+        await _flies_on(process)
+        assert not any("asked for land" in event for event in process.events)
+        session.close()  # type: ignore[no-untyped-call]
 
 
 def test_status_shows_a_peer_that_publishes_nonsense() -> None:

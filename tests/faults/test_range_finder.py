@@ -70,52 +70,44 @@ async def _flies_by_range(process: Process) -> None:
     [(lambda range_m: HOVER_M, True), (lambda range_m: 0.3, False), (lambda range_m: range_m + 3.0, False)],
     ids=["stuck in a climb", "landing gear in the beam", "a jump"],
 )
-def test_the_range_finder_lies(
+async def test_the_range_finder_lies(
     lie: Callable[[float], float], climbs: bool, tmp_path: Path, record_property: RecordProperty
 ) -> None:
     sensor = _Lying()
-
-    async def story() -> None:
-        async with drone(tmp_path, change=_by("best"), range_finder=sensor) as process:
-            await _flies_by_range(process)
-            autopilot, told = process.fake_autopilot, len(process.events)
-            sensor.lie = lie
-            if climbs:
-                autopilot._demand = lambda: Demand(np.zeros(2), -HOVER_M - 4.0, 0.0)  # type: ignore[method-assign]
-                await until(lambda: -autopilot.state.position[2] > HOVER_M + NOTICED_M, SECONDS_TO_FAIL)
-            fault_s = time.monotonic()
-            await process.until_event(f"{LIE}; the barometer's is used")
-            reacted(record_property, "range-finder-lies", time.monotonic() - fault_s)
-            assert WORKS not in process.events[told:]
-            steps = process.heard()["computer"].message["steps"]
-            await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
-            assert autopilot.mode == "OFFBOARD", "it flies on by the barometer"
-            assert process.state() in {"normal", "degraded"}
-            sensor.lie = None
-            await until(lambda: WORKS in process.events[told:], SECONDS_TO_FAIL)
-            limit_m_s = process.config.safety.gate.max_speed_m_s
-            assert all(np.linalg.norm(sent.velocity[:2]) <= limit_m_s + 1e-6 for _, sent in autopilot.setpoints)
-
-    asyncio.run(story())
+    async with drone(tmp_path, change=_by("best"), range_finder=sensor) as process:
+        await _flies_by_range(process)
+        autopilot, told = process.fake_autopilot, len(process.events)
+        sensor.lie = lie
+        if climbs:
+            autopilot._demand = lambda: Demand(np.zeros(2), -HOVER_M - 4.0, 0.0)  # type: ignore[method-assign]
+            await until(lambda: -autopilot.state.position[2] > HOVER_M + NOTICED_M, SECONDS_TO_FAIL)
+        fault_s = time.monotonic()
+        await process.until_event(f"{LIE}; the barometer's is used")
+        reacted(record_property, "range-finder-lies", time.monotonic() - fault_s)
+        assert WORKS not in process.events[told:]
+        steps = process.heard()["computer"].message["steps"]
+        await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
+        assert autopilot.mode == "OFFBOARD", "it flies on by the barometer"
+        assert process.state() in {"normal", "degraded"}
+        sensor.lie = None
+        await until(lambda: WORKS in process.events[told:], SECONDS_TO_FAIL)
+        limit_m_s = process.config.safety.gate.max_speed_m_s
+        assert all(np.linalg.norm(sent.velocity[:2]) <= limit_m_s + 1e-6 for _, sent in autopilot.setpoints)
 
 
-def test_without_the_barometer_a_lie_is_no_scale_and_ends_in_hold(
+async def test_without_the_barometer_a_lie_is_no_scale_and_ends_in_hold(
     tmp_path: Path, record_property: RecordProperty
 ) -> None:
     sensor = _Lying()
-
-    async def story() -> None:
-        async with drone(tmp_path, change=_by("range_finder"), range_finder=sensor) as process:
-            await _flies_by_range(process)
-            sensor.lie = lambda range_m: 0.3
-            fault_s = time.monotonic()
-            await process.until_event(f"{LIE}; there is no scale")
-            reacted(record_property, "range-finder-lies", time.monotonic() - fault_s)
-            await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-            await process.until_event("silent: ")
-            sensor.lie = None
-            sent = len(process.fake_autopilot.setpoints)
-            await asyncio.sleep(QUIET_S)
-            assert len(process.fake_autopilot.setpoints) == sent, "no return by itself"
-
-    asyncio.run(story())
+    async with drone(tmp_path, change=_by("range_finder"), range_finder=sensor) as process:
+        await _flies_by_range(process)
+        sensor.lie = lambda range_m: 0.3
+        fault_s = time.monotonic()
+        await process.until_event(f"{LIE}; there is no scale")
+        reacted(record_property, "range-finder-lies", time.monotonic() - fault_s)
+        await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        await process.until_event("silent: ")
+        sensor.lie = None
+        sent = len(process.fake_autopilot.setpoints)
+        await asyncio.sleep(QUIET_S)
+        assert len(process.fake_autopilot.setpoints) == sent, "no return by itself"

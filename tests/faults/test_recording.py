@@ -32,39 +32,32 @@ async def _has_recorded(process: Process, bytes_: int) -> Path:
     return _recording(process)
 
 
-def test_sigterm_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            path = _recording(process)
-            await asyncio.sleep(2.0)
-            asked_s = process.signal(signal.SIGTERM)
-            await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-            reacted(record_property, "sigterm", time.monotonic() - asked_s)
-            assert not process.fake_autopilot.failsafe, "Hold was asked for"
-            assert process.standing_still(asked_s + 0.3) or process.last_setpoint_s() < asked_s + 0.3
-            assert await process.ended() == 0
-            recording = Recording(path)
-            assert recording.contents.finished
-            assert len(list(recording.steps())) > 3
-
-    asyncio.run(story())
+async def test_sigterm_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
+    async with flying(tmp_path) as process:
+        path = _recording(process)
+        await asyncio.sleep(2.0)
+        asked_s = process.signal(signal.SIGTERM)
+        await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        reacted(record_property, "sigterm", time.monotonic() - asked_s)
+        assert not process.fake_autopilot.failsafe, "Hold was asked for"
+        assert process.standing_still(asked_s + 0.3) or process.last_setpoint_s() < asked_s + 0.3
+        assert await process.ended() == 0
+        recording = Recording(path)
+        assert recording.contents.finished
+        assert len(list(recording.steps())) > 3
 
 
-def test_it_is_killed_while_it_records(
+async def test_it_is_killed_while_it_records(
     tmp_path: Path, record_property: RecordProperty, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """As for a loss of power: the autopilot's failsafe acts, and what was written can be read."""
     found: list[Path] = []
-
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            found.append(await _has_recorded(process, 150_000))
-            killed_s = process.signal(signal.SIGKILL)
-            await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-            reacted(record_property, "killed-while-recording", time.monotonic() - killed_s)
-            assert process.fake_autopilot.failsafe, "nobody was there to ask for Hold"
-
-    asyncio.run(story())
+    async with flying(tmp_path) as process:
+        found.append(await _has_recorded(process, 150_000))
+        killed_s = process.signal(signal.SIGKILL)
+        await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        reacted(record_property, "killed-while-recording", time.monotonic() - killed_s)
+        assert process.fake_autopilot.failsafe, "nobody was there to ask for Hold"
     whole = tmp_path / "whole.mcap"
     assert main(["record", "recover", str(found[0]), "--out", str(whole)]) == 0, capsys.readouterr()
     recording = Recording(whole)
@@ -72,41 +65,33 @@ def test_it_is_killed_while_it_records(
     assert len(list(recording.steps())) > 3
 
 
-def test_the_disk_is_full(tmp_path: Path, record_property: RecordProperty) -> None:
+async def test_the_disk_is_full(tmp_path: Path, record_property: RecordProperty) -> None:
     """No file of the process may grow any more, which to it is the same as a full disk."""
-
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            path = await _has_recorded(process, 50_000)
-            size = path.stat().st_size
-            full_s = time.monotonic()
-            resource.prlimit(process.program.process.pid, resource.RLIMIT_FSIZE, (size, size))
-            await until(lambda: any("recording" in event and "file too large" in event for event in process.events))
-            reacted(record_property, "disk-full", time.monotonic() - full_s)
-            steps = process.heard()["computer"].message["steps"]
-            await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
-            assert process.fake_autopilot.mode == "OFFBOARD"
-            assert "file too large" in process.heard()["computer"].message["recording"]
-
-    asyncio.run(story())
+    async with flying(tmp_path) as process:
+        path = await _has_recorded(process, 50_000)
+        size = path.stat().st_size
+        full_s = time.monotonic()
+        resource.prlimit(process.program.process.pid, resource.RLIMIT_FSIZE, (size, size))
+        await until(lambda: any("recording" in event and "file too large" in event for event in process.events))
+        reacted(record_property, "disk-full", time.monotonic() - full_s)
+        steps = process.heard()["computer"].message["steps"]
+        await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
+        assert process.fake_autopilot.mode == "OFFBOARD"
+        assert "file too large" in process.heard()["computer"].message["recording"]
 
 
-def test_foreign_things_lie_among_the_recordings(tmp_path: Path) -> None:
+async def test_foreign_things_lie_among_the_recordings(tmp_path: Path) -> None:
     (tmp_path / "tiny-folder.mcap").mkdir()
     (tmp_path / "tiny-link.mcap").symlink_to(tmp_path / "nowhere")
     os.mkfifo(tmp_path / "tiny-fifo.mcap")
     (tmp_path / "tiny-damaged.mcap").write_bytes(b"\x89MCAP0\r\nnot a recording")
-
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            path = await _has_recorded(process, 50_000)
-            assert process.heard()["computer"].message["recording"] == str(path)
-            process.signal(signal.SIGTERM)
-            assert await process.ended() == 0
-            assert Recording(path).contents.finished
-            log = process.log()
-            assert "tiny-fifo.mcap" in log
-            assert "tiny-folder.mcap" in log
-
-    asyncio.run(story())
+    async with flying(tmp_path) as process:
+        path = await _has_recorded(process, 50_000)
+        assert process.heard()["computer"].message["recording"] == str(path)
+        process.signal(signal.SIGTERM)
+        assert await process.ended() == 0
+        assert Recording(path).contents.finished
+        log = process.log()
+        assert "tiny-fifo.mcap" in log
+        assert "tiny-folder.mcap" in log
     assert (tmp_path / "tiny-damaged.mcap").exists(), "what is not a recording of its own is left alone"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import subprocess
 import sys
@@ -16,11 +15,11 @@ import pytest
 import yaml
 
 from flockd.core.data import data_path
+from flockd.sim.free_ports import free_endpoint, free_port
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import flying
-from tests.onboard.autopilot.conftest import free_port
 from tests.onboard.autopilot.flight import until
-from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, config_for, free_endpoint
+from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, config_for
 
 pytestmark = pytest.mark.slow
 RUN = "import sys; from flockd.cli import main; sys.exit(main(sys.argv[1:]))"
@@ -132,18 +131,15 @@ def test_a_manifest_is_hostile(
     reacted(record_property, "hostile-manifest", ended.took_s)
 
 
-def test_a_second_instance_is_started_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            began_s = time.monotonic()
-            first = process.program
-            process.daemons.start()
-            assert await process.ended() == 69
-            reacted(record_property, "second-instance", time.monotonic() - began_s)
-            assert f"another flockd (process {first.process.pid}) flies drone 'tiny'" in process.log()
-            steps = process.heard()["computer"].message["steps"]
-            await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
-            assert process.fake_autopilot.mode == "OFFBOARD"
-            assert first.ended is None
-
-    asyncio.run(story())
+async def test_a_second_instance_is_started_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
+    async with flying(tmp_path) as process:
+        began_s = time.monotonic()
+        first = process.program
+        process.daemons.start()
+        assert await process.ended() == 69
+        reacted(record_property, "second-instance", time.monotonic() - began_s)
+        assert f"another flockd (process {first.process.pid}) flies drone 'tiny'" in process.log()
+        steps = process.heard()["computer"].message["steps"]
+        await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
+        assert process.fake_autopilot.mode == "OFFBOARD"
+        assert first.ended is None

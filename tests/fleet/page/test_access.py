@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import re
 import socket
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
@@ -61,16 +61,13 @@ class Asked:
         return b"jpeg" if (drone, camera) == ("f/one", "front") else None
 
 
-def served(story: Callable[[Client, PageAccess, Asked], Awaitable[None]], *, may_command: bool = True) -> None:
-    """Tells a story to a server and a browser without a page."""
-
-    async def tell() -> None:
-        access, fleet = PageAccess(), Asked()
-        server = TestServer(PageServer(fleet, access, may_command=may_command).application(), host="127.0.0.1")
-        async with TestClient(server) as client:
-            await story(client, access, fleet)
-
-    asyncio.run(tell())
+@asynccontextmanager
+async def served(*, may_command: bool = True) -> AsyncIterator[tuple[Client, PageAccess, Asked]]:
+    """A server, and a browser without a page."""
+    access, fleet = PageAccess(), Asked()
+    server = TestServer(PageServer(fleet, access, may_command=may_command).application(), host="127.0.0.1")
+    async with TestClient(server) as client:
+        yield client, access, fleet
 
 
 async def opened(client: Client, access: PageAccess) -> dict[str, str]:
@@ -81,8 +78,8 @@ async def opened(client: Client, access: PageAccess) -> dict[str, str]:
     return {"Origin": f"http://127.0.0.1:{client.port}", "X-Flockd-Token": token[1]}
 
 
-def test_without_the_key_nothing_is_shown() -> None:
-    async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
+async def test_without_the_key_nothing_is_shown() -> None:
+    async with served() as (client, access, fleet):
         paths = (
             "/",
             "/fleet_page.js",
@@ -101,22 +98,18 @@ def test_without_the_key_nothing_is_shown() -> None:
             assert (await client.get(path)).status == 200, path
         assert fleet.commands == []
 
-    served(story)
 
-
-def test_the_key_moves_from_the_address_into_a_cookie_that_other_sites_cannot_send() -> None:
-    async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
+async def test_the_key_moves_from_the_address_into_a_cookie_that_other_sites_cannot_send() -> None:
+    async with served() as (client, access, _):
         reply = await client.get("/", params={"key": access.key}, allow_redirects=False)
         assert (reply.status, reply.headers["Location"]) == (303, "/")
         (cookie,) = reply.cookies.values()
         assert (cookie["samesite"], cookie["httponly"], cookie["path"]) == ("Strict", True, "/")
         assert access.key not in str(reply.cookies)
 
-    served(story)
 
-
-def test_a_command_needs_the_sessions_token_and_the_pages_own_origin() -> None:
-    async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
+async def test_a_command_needs_the_sessions_token_and_the_pages_own_origin() -> None:
+    async with served() as (client, access, fleet):
         own = await opened(client, access)
         other = await opened(client, access)  # a later session: the cookie is its own now
         refused: tuple[dict[str, str], ...] = (
@@ -138,21 +131,16 @@ def test_a_command_needs_the_sessions_token_and_the_pages_own_origin() -> None:
         assert await reply.json() == {"f/one": {"accepted": True, "sentence": "tried"}}
         assert fleet.commands == [("f/one", "hold", None)]
 
-    served(story)
 
-
-def test_a_name_that_was_made_to_lead_here_gets_nothing() -> None:
+async def test_a_name_that_was_made_to_lead_here_gets_nothing() -> None:
     """DNS rebinding: to the browser the stranger's page is then of the same origin as this server."""
-
-    async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
+    async with served() as (client, access, fleet):
         own = await opened(client, access)
         strange = {"Host": f"stranger.example:{client.port}", "Origin": f"http://stranger.example:{client.port}"}
         assert (await client.get("/", params={"key": access.key}, headers=strange)).status == 403
         assert (await client.get("/history", headers=strange)).status == 403
         assert (await client.post("/ask", json=HOLD, headers={**own, **strange})).status == 403
         assert fleet.commands == []
-
-    served(story)
 
 
 @pytest.mark.parametrize(
@@ -173,8 +161,8 @@ def test_the_host_of_a_request_is_an_address_or_this_computers_name(host: str, o
     assert is_own_host(host) == own
 
 
-def test_every_reply_forbids_what_is_not_from_here_and_lets_no_other_site_read_it() -> None:
-    async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
+async def test_every_reply_forbids_what_is_not_from_here_and_lets_no_other_site_read_it() -> None:
+    async with served() as (client, access, _):
         own = await opened(client, access)
         replies = [await client.get(path) for path in ("/", "/fleet_map.js", "/image/f/one/front", "/nothing.js", "/x")]
         replies += [await client.post("/ask", json=HOLD), await client.post("/ask", json=HOLD, headers=own)]
@@ -187,11 +175,9 @@ def test_every_reply_forbids_what_is_not_from_here_and_lets_no_other_site_read_i
             assert not [name for name in reply.headers if name.startswith("Access-Control")]
             assert reply.headers["Cross-Origin-Resource-Policy"] == "same-origin"
 
-    served(story)
 
-
-def test_live_data_go_to_the_sessions_own_page_only() -> None:
-    async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
+async def test_live_data_go_to_the_sessions_own_page_only() -> None:
+    async with served() as (client, access, _):
         own = await opened(client, access)
         assert (await client.get("/live", headers={"Origin": "http://stranger.example"})).status == 403
         async with client.ws_connect("/live", headers={"Origin": own["Origin"]}) as wrong:
@@ -207,17 +193,13 @@ def test_live_data_go_to_the_sessions_own_page_only() -> None:
             again = await page.receive_json()
             assert (again["order"], again["rows"], again["events"]) == (["f/one"], {}, []), "only what has changed"
 
-    served(story)
 
-
-def test_a_page_that_only_watches_commands_nothing() -> None:
-    async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
+async def test_a_page_that_only_watches_commands_nothing() -> None:
+    async with served(may_command=False) as (client, access, fleet):
         reply = await client.post("/ask", json=HOLD, headers=await opened(client, access))
         assert reply.status == 403
         assert "commands nothing" in await reply.text()
         assert fleet.commands == []
-
-    served(story, may_command=False)
 
 
 @pytest.mark.parametrize(
@@ -232,24 +214,20 @@ def test_a_page_that_only_watches_commands_nothing() -> None:
         (b'{"drones":["f/one"],"command":"goto","order":{"north_m":1,"east_m":NaN}}', "east_m has to be a number"),
     ],
 )
-def test_what_is_no_command_is_refused_in_one_sentence(body: bytes, told: str) -> None:
-    async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
+async def test_what_is_no_command_is_refused_in_one_sentence(body: bytes, told: str) -> None:
+    async with served() as (client, access, fleet):
         reply = await client.post("/ask", data=body, headers=await opened(client, access))
         assert reply.status == 400
         assert told in await reply.text()
         assert fleet.commands == []
 
-    served(story)
 
-
-def test_an_order_reaches_every_drone_once() -> None:
-    async def story(client: Client, access: PageAccess, fleet: Asked) -> None:
+async def test_an_order_reaches_every_drone_once() -> None:
+    async with served() as (client, access, fleet):
         order = {"north_m": 3, "east_m": -2.5}
         body = {"drones": ["f/one", "f/two", "f/one"], "command": "goto", "order": order}
         await client.post("/ask", json=body, headers=await opened(client, access))
         assert sorted(fleet.commands) == [("f/one", "goto", order), ("f/two", "goto", order)]
-
-    served(story)
 
 
 def test_the_oldest_session_ends_where_there_are_too_many() -> None:

@@ -25,7 +25,8 @@ from flockd.onboard.autopilot.clock_sync import ClockEstimate
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
-from tests.onboard.autopilot.conftest import HEARTBEAT_S, free_port
+from flockd.sim.free_ports import free_port
+from tests.onboard.autopilot.conftest import HEARTBEAT_S
 
 GOOD: dict[str, float | int] = {
     "COM_OF_LOSS_T": 1.0,

@@ -28,7 +28,7 @@ from flockd.ground.doctor.camera_checks import check_cameras
 from flockd.onboard.sources import FramePublisher
 from flockd.onboard.sources.gstreamer import open_pipeline
 from flockd.onboard.sources.v4l2_device import V4l2Device
-from tests.onboard.daemon.aboard import free_endpoint
+from flockd.sim.free_ports import free_endpoint
 from tests.onboard.sources.camera_images import SIZE, jpeg, scene
 from tests.onboard.sources.fake_kernel import FLAG_CLOCK_UNKNOWN, FLAG_ERROR, FakeCamera, FakeKernel
 

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Iterator
 
 import pytest
 
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from flockd.sim.free_ports import free_port
 from tests.calm import clock
 
 HOVER_M = 2.5
 HEARTBEAT_S = 0.25
 """Quicker than PX4's, so that a story does not begin with a second of waiting."""
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @pytest.fixture

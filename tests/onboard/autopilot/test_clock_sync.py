@@ -12,7 +12,7 @@ from flockd.onboard.autopilot.clock_sync import ClockSync
 from flockd.onboard.autopilot.mavlink_messages import ReceivedMessages
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from tests.calm import clock, run
+from tests.calm import clock
 from tests.onboard.autopilot.flight import until
 
 OFFSET_S = -47_000.25
@@ -128,8 +128,8 @@ def test_a_stamp_that_cannot_be_is_not_believed() -> None:
         assert state.time_s == 104.0
 
 
-def test_the_fake_autopilots_known_clock_is_found_through_mavsdk(port: int) -> None:
-    async def story() -> None:
+async def test_the_fake_autopilots_known_clock_is_found_through_mavsdk(port: int) -> None:
+    with FakeAutopilot(port, clock_ahead_s=1234.5, clock=clock) as fake_autopilot:
         link = await AutopilotLink.connect(AutopilotParameters(address=f"udpin://127.0.0.1:{port}"), clock=clock)
         synchronising = asyncio.create_task(link.synchronise())
         await until(lambda: link.clock() is not None)
@@ -139,6 +139,3 @@ def test_the_fake_autopilots_known_clock_is_found_through_mavsdk(port: int) -> N
         assert abs(error_s) <= estimate.error_s + 1e-6
         synchronising.cancel()
         await link.close()
-
-    with FakeAutopilot(port, clock_ahead_s=1234.5, clock=clock) as fake_autopilot:
-        run(story)

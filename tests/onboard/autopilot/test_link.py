@@ -21,8 +21,9 @@ from flockd.sim.autopilot.fake_autopilot import TICK_S, FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.sim.autopilot.fake_telemetry import TelemetryStreams
 from flockd.sim.autopilot.fake_vehicle import Demand, MotionState
-from tests.calm import clock, run
-from tests.onboard.autopilot.conftest import HEARTBEAT_S, free_port
+from flockd.sim.free_ports import free_port
+from tests.calm import clock
+from tests.onboard.autopilot.conftest import HEARTBEAT_S
 from tests.onboard.autopilot.flight import flying, until
 
 
@@ -43,7 +44,7 @@ def test_the_type_mask_says_horizontal_velocity_height_and_yaw() -> None:
     assert ignored == SETPOINT_TYPE_MASK
 
 
-def test_telemetry_is_what_the_vehicle_does(port: int) -> None:
+async def test_telemetry_is_what_the_vehicle_does(port: int) -> None:
     # Nose east, 30 degrees right side down; climbing to the north-east.
     sin, cos = math.sin(math.radians(30.0)), math.cos(math.radians(30.0))
     east_and_leaning = np.array([[0.0, -cos, sin], [1.0, 0.0, 0.0], [0.0, sin, cos]])
@@ -52,7 +53,8 @@ def test_telemetry_is_what_the_vehicle_does(port: int) -> None:
     def still(_demand: Demand, _interval_s: float) -> MotionState:
         return truth
 
-    async def story() -> None:
+    with FakeAutopilot(port, height_m=7.5, motion=still, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
+        fake_autopilot.battery_share = 0.42
         link = await AutopilotLink.connect(_parameters(port), clock=clock)
         await until(lambda: link.vehicle_state() is not None and link.status().battery_share is not None)
         await until(lambda: None not in {link.status().estimate_ok, link.status().gps_ok} and link.status().in_air)
@@ -77,12 +79,8 @@ def test_telemetry_is_what_the_vehicle_does(port: int) -> None:
         await until(lambda: link.status().heartbeat_age_s > 4 * HEARTBEAT_S)
         await link.close()
 
-    with FakeAutopilot(port, height_m=7.5, motion=still, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
-        fake_autopilot.battery_share = 0.42
-        run(story)
 
-
-def test_a_landed_state_that_mavlink_does_not_have_is_unknown_and_counted(
+async def test_a_landed_state_that_mavlink_does_not_have_is_unknown_and_counted(
     port: int, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A vehicle in the air reports 2, then 5: MAV_LANDED_STATE ends at 4."""
@@ -90,87 +88,72 @@ def test_a_landed_state_that_mavlink_does_not_have_is_unknown_and_counted(
     def sends_5(self: TelemetryStreams) -> None:
         self._mav.extended_sys_state_send(0, 5)
 
-    async def story() -> None:
-        link = await AutopilotLink.connect(_parameters(port), clock=clock)
-        await until(lambda: link.status().landed_state == "air")
-        monkeypatch.setattr(TelemetryStreams, "_send_landed", sends_5)
-        await until(lambda: link.status().landed_state == "unknown")
-        assert not link.status().in_air
-        assert link.unknown_values().keys() == {"EXTENDED_SYS_STATE.landed_state = 5"}
-        assert link.status().heartbeat_age_s < 2 * HEARTBEAT_S, "the link still receives"
-        await link.close()
-
-    run(story)
+    link = await AutopilotLink.connect(_parameters(port), clock=clock)
+    await until(lambda: link.status().landed_state == "air")
+    monkeypatch.setattr(TelemetryStreams, "_send_landed", sends_5)
+    await until(lambda: link.status().landed_state == "unknown")
+    assert not link.status().in_air
+    assert link.unknown_values().keys() == {"EXTENDED_SYS_STATE.landed_state = 5"}
+    assert link.status().heartbeat_age_s < 2 * HEARTBEAT_S, "the link still receives"
+    await link.close()
 
 
-def test_firmware_and_failsafe_parameters_can_be_read(port: int, fake_autopilot: FakeAutopilot) -> None:
+async def test_firmware_and_failsafe_parameters_can_be_read(port: int, fake_autopilot: FakeAutopilot) -> None:
     fake_autopilot.parameters |= {"COM_OF_LOSS_T": 0.75, "COM_OBL_RC_ACT": 4, "COM_LOW_BAT_ACT": -3}
-
-    async def story() -> None:
-        link = await AutopilotLink.connect(_parameters(port), clock=clock)
-        assert await link.parameter("COM_OF_LOSS_T", float) == 0.75
-        assert await link.parameter("COM_OBL_RC_ACT", int) == 4
-        assert await link.parameter("COM_LOW_BAT_ACT", int) == -3
-        assert await link.firmware() == Firmware("PX4", "0.0.1")
-        with pytest.raises(AutopilotError, match="parameter COM_OBL_RC_ACT could not be read"):
-            await link.parameter("COM_OBL_RC_ACT", float)
-        await link.close()
-
-    run(story)
+    link = await AutopilotLink.connect(_parameters(port), clock=clock)
+    assert await link.parameter("COM_OF_LOSS_T", float) == 0.75
+    assert await link.parameter("COM_OBL_RC_ACT", int) == 4
+    assert await link.parameter("COM_LOW_BAT_ACT", int) == -3
+    assert await link.firmware() == Firmware("PX4", "0.0.1")
+    with pytest.raises(AutopilotError, match="parameter COM_OBL_RC_ACT could not be read"):
+        await link.parameter("COM_OBL_RC_ACT", float)
+    await link.close()
 
 
-def test_offboard_without_setpoints_is_refused_and_the_reason_told(port: int, fake_autopilot: FakeAutopilot) -> None:
-    async def story() -> None:
-        link = await AutopilotLink.connect(_parameters(port), clock=clock)
-        with pytest.raises(
-            AutopilotError, match=r"asked for offboard, which was refused for now: .*no offboard signal"
-        ):
-            await link.request_offboard()
-        assert fake_autopilot.mode == "LOITER"
-        await link.close()
-
-    run(story)
+async def test_offboard_without_setpoints_is_refused_and_the_reason_told(
+    port: int, fake_autopilot: FakeAutopilot
+) -> None:
+    link = await AutopilotLink.connect(_parameters(port), clock=clock)
+    with pytest.raises(AutopilotError, match=r"asked for offboard, which was refused for now: .*no offboard signal"):
+        await link.request_offboard()
+    assert fake_autopilot.mode == "LOITER"
+    await link.close()
 
 
-def test_the_vehicle_follows_the_velocity_and_holds_its_own_height(port: int, fake_autopilot: FakeAutopilot) -> None:
+async def test_the_vehicle_follows_the_velocity_and_holds_its_own_height(
+    port: int, fake_autopilot: FakeAutopilot
+) -> None:
     wanted = Wanted(np.array([0.6, -0.8]), np.zeros(2), yaw_rad=-0.5, height_m=3.0)
-
-    async def story() -> None:
-        async with flying(port, wanted) as flight:
-            await flight.enter_offboard()
-            assert fake_autopilot.mode == "OFFBOARD"
-            await asyncio.sleep(1.5)
-            state = flight.link.vehicle_state()
-            assert state is not None
-            assert state.velocity_ned is not None
-            np.testing.assert_allclose(state.velocity_ned, np.array([0.6, -0.8, 0.0]), atol=0.15)
-            assert state.height_m == pytest.approx(3.0, abs=0.15)
-            assert math.atan2(state.R_ned_body[1, 0], state.R_ned_body[0, 0]) == pytest.approx(-0.5, abs=0.05)
-            assert fake_autopilot.refused_setpoints == 0
-
-    run(story)
-
-
-def test_a_setpoint_that_is_not_finite_never_leaves(port: int, fake_autopilot: FakeAutopilot) -> None:
-    async def story() -> None:
-        link = await AutopilotLink.connect(_parameters(port), clock=clock)
-        for broken in (
-            Setpoint(0.0, np.array([math.nan, 0.0]), 2.5, 0.0),
-            Setpoint(0.0, np.zeros(2), math.inf, 0.0),
-            Setpoint(0.0, np.zeros(2), 2.5, math.nan),
-        ):
-            with pytest.raises(AutopilotError, match="not finite"):
-                link.send_setpoint(broken)
-        await asyncio.sleep(0.1)
-        assert not fake_autopilot.setpoints
+    async with flying(port, wanted) as flight:
+        await flight.enter_offboard()
+        assert fake_autopilot.mode == "OFFBOARD"
+        await asyncio.sleep(1.5)
+        state = flight.link.vehicle_state()
+        assert state is not None
+        assert state.velocity_ned is not None
+        np.testing.assert_allclose(state.velocity_ned, np.array([0.6, -0.8, 0.0]), atol=0.15)
+        assert state.height_m == pytest.approx(3.0, abs=0.15)
+        assert math.atan2(state.R_ned_body[1, 0], state.R_ned_body[0, 0]) == pytest.approx(-0.5, abs=0.05)
         assert fake_autopilot.refused_setpoints == 0
-        await link.close()
-
-    run(story)
 
 
-def test_arming_taking_off_and_landing_from_offboard(port: int) -> None:
-    async def story() -> None:
+async def test_a_setpoint_that_is_not_finite_never_leaves(port: int, fake_autopilot: FakeAutopilot) -> None:
+    link = await AutopilotLink.connect(_parameters(port), clock=clock)
+    for broken in (
+        Setpoint(0.0, np.array([math.nan, 0.0]), 2.5, 0.0),
+        Setpoint(0.0, np.zeros(2), math.inf, 0.0),
+        Setpoint(0.0, np.zeros(2), 2.5, math.nan),
+    ):
+        with pytest.raises(AutopilotError, match="not finite"):
+            link.send_setpoint(broken)
+    await asyncio.sleep(0.1)
+    assert not fake_autopilot.setpoints
+    assert fake_autopilot.refused_setpoints == 0
+    await link.close()
+
+
+async def test_arming_taking_off_and_landing_from_offboard(port: int) -> None:
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
         async with flying(port) as flight:
             assert not flight.link.status().armed
             await flight.link.arm()
@@ -182,25 +165,20 @@ def test_arming_taking_off_and_landing_from_offboard(port: int) -> None:
             await until(lambda: fake_autopilot.mode == "LAND")
             await until(lambda: not flight.streamer.report().streaming)
 
-    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
-        run(story)
+
+async def test_return_flies_home(port: int, fake_autopilot: FakeAutopilot) -> None:
+    async with flying(port) as flight:
+        await flight.enter_offboard()
+        await until(lambda: fake_autopilot.state.position[0] > 1.0)
+        await flight.link.return_home()
+        await until(lambda: flight.link.status().flight_mode == "return")
+        await until(lambda: flight.link.status().flight_mode == "land")
+        assert abs(fake_autopilot.state.position[0]) < 0.5
 
 
-def test_return_flies_home(port: int, fake_autopilot: FakeAutopilot) -> None:
-    async def story() -> None:
-        async with flying(port) as flight:
-            await flight.enter_offboard()
-            await until(lambda: fake_autopilot.state.position[0] > 1.0)
-            await flight.link.return_home()
-            await until(lambda: flight.link.status().flight_mode == "return")
-            await until(lambda: flight.link.status().flight_mode == "land")
-            assert abs(fake_autopilot.state.position[0]) < 0.5
-
-    run(story)
-
-
-def test_two_links_on_two_ports_mind_their_own_vehicle(port: int, fake_autopilot: FakeAutopilot) -> None:
-    async def story() -> None:
+async def test_two_links_on_two_ports_mind_their_own_vehicle(port: int, fake_autopilot: FakeAutopilot) -> None:
+    second_port = free_port()
+    with FakeAutopilot(second_port, system_id=9, height_m=4.0, heartbeat_s=HEARTBEAT_S, clock=clock) as second:
         south = Wanted(np.array([-0.5, 0.0]), np.zeros(2), 0.0, height_m=4.0)
         async with flying(port) as one, flying(second_port, south) as two:
             await asyncio.gather(one.enter_offboard(), two.enter_offboard())
@@ -209,29 +187,22 @@ def test_two_links_on_two_ports_mind_their_own_vehicle(port: int, fake_autopilot
             assert second.state.velocity[0] == pytest.approx(-0.5, abs=0.15)
             assert (one.link.system_id, two.link.system_id) == (1, 9)
 
-    second_port = free_port()
-    with FakeAutopilot(second_port, system_id=9, height_m=4.0, heartbeat_s=HEARTBEAT_S, clock=clock) as second:
-        run(story)
 
-
-def test_the_stand_in_runs_as_a_program_too(port: int) -> None:
-    async def story() -> None:
-        link = await AutopilotLink.connect(_parameters(port, system_id=4))
-        await until(lambda: link.vehicle_state() is not None)
-        state = link.vehicle_state()
-        assert state is not None
-        assert state.height_m == pytest.approx(6.0)
-        await link.close()
-
+async def test_the_stand_in_runs_as_a_program_too(port: int) -> None:
     options = ["--port", str(port), "--system-id", "4", "--height", "6"]
     with subprocess.Popen([sys.executable, "-m", "flockd.sim.autopilot.fake_autopilot", *options]) as program:
         try:
-            run(story)
+            link = await AutopilotLink.connect(_parameters(port, system_id=4))
+            await until(lambda: link.vehicle_state() is not None)
+            state = link.vehicle_state()
+            assert state is not None
+            assert state.height_m == pytest.approx(6.0)
+            await link.close()
         finally:
             program.kill()
 
 
-def test_a_stand_in_that_is_late_for_every_tick_still_hears(port: int) -> None:
+async def test_a_stand_in_that_is_late_for_every_tick_still_hears(port: int) -> None:
     """As on a busy computer: to fly on takes it longer than a tick."""
 
     def slow(demand: Demand, interval_s: float) -> MotionState:
@@ -239,15 +210,12 @@ def test_a_stand_in_that_is_late_for_every_tick_still_hears(port: int) -> None:
             time.sleep(2 * TICK_S)
         return MotionState(np.array([0.0, 0.0, -2.5]), np.zeros(3), np.eye(3))
 
-    async def story() -> None:
+    with FakeAutopilot(port, height_m=2.5, motion=slow, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
         link = await AutopilotLink.connect(_parameters(port), clock=clock)
         assert await link.parameter("COM_OBL_RC_ACT", int) == 5
         link.send_setpoint(Setpoint(0.0, np.zeros(2), 2.5, 0.0))
         await until(lambda: len(fake_autopilot.setpoints) == 1)
         await link.close()
-
-    with FakeAutopilot(port, height_m=2.5, motion=slow, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
-        run(story)
 
 
 def test_nobody_there_is_told_with_what_to_check(port: int) -> None:
@@ -255,25 +223,19 @@ def test_nobody_there_is_told_with_what_to_check(port: int) -> None:
         asyncio.run(AutopilotLink.connect(_parameters(port), timeout_s=0.3))
 
 
-def test_somebody_elses_autopilot_is_not_taken_for_the_own(port: int, fake_autopilot: FakeAutopilot) -> None:
-    async def story() -> None:
-        with pytest.raises(AutopilotError, match=r"no autopilot with system id 5 .* heard instead: 1"):
-            await AutopilotLink.connect(_parameters(port, system_id=5), timeout_s=0.7, clock=clock)
-
-    run(story)
+async def test_somebody_elses_autopilot_is_not_taken_for_the_own(port: int, fake_autopilot: FakeAutopilot) -> None:
+    with pytest.raises(AutopilotError, match=r"no autopilot with system id 5 .* heard instead: 1"):
+        await AutopilotLink.connect(_parameters(port, system_id=5), timeout_s=0.7, clock=clock)
 
 
-def test_two_programs_cannot_command_one_drone(port: int, fake_autopilot: FakeAutopilot) -> None:
-    async def story() -> None:
-        link = await AutopilotLink.connect(_parameters(port), clock=clock)
-        with pytest.raises(AutopilotError, match="is another program on it"):
-            await AutopilotLink.connect(_parameters(port), clock=clock)
-        await link.close()
-
-    run(story)
+async def test_two_programs_cannot_command_one_drone(port: int, fake_autopilot: FakeAutopilot) -> None:
+    link = await AutopilotLink.connect(_parameters(port), clock=clock)
+    with pytest.raises(AutopilotError, match="is another program on it"):
+        await AutopilotLink.connect(_parameters(port), clock=clock)
+    await link.close()
 
 
-def test_the_range_finder_is_heard_along_the_bodys_down_axis_and_falls_silent_with_it(port: int) -> None:
+async def test_the_range_finder_is_heard_along_the_bodys_down_axis_and_falls_silent_with_it(port: int) -> None:
     """Leaning by 30 degrees at 6 m: the slant range is 6 m / cos 30; out of its reach it sends no signal."""
     sin, cos = math.sin(math.radians(30.0)), math.cos(math.radians(30.0))
     leaning = np.array([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])
@@ -283,7 +245,8 @@ def test_the_range_finder_is_heard_along_the_bodys_down_axis_and_falls_silent_wi
     def still(_demand: Demand, _interval_s: float) -> MotionState:
         return MotionState(place.copy(), np.zeros(3), leaning)
 
-    async def story() -> None:
+    finder = FakeRangeFinder(config, level_ground, (0,))
+    with FakeAutopilot(port, height_m=6.0, motion=still, heartbeat_s=HEARTBEAT_S, range_finder=finder, clock=clock):
         link = await AutopilotLink.connect(_parameters(port), clock=clock)
         await until(lambda: (state := link.vehicle_state()) is not None and state.ground_range is not None)
         reading = link.ground_range()
@@ -294,7 +257,3 @@ def test_the_range_finder_is_heard_along_the_bodys_down_axis_and_falls_silent_wi
         await until(lambda: (reading := link.ground_range()) is not None and reading.quality == 0.0)
         assert set(link.range_finders()) == {25}
         await link.close()
-
-    finder = FakeRangeFinder(config, level_ground, (0,))
-    with FakeAutopilot(port, height_m=6.0, motion=still, heartbeat_s=HEARTBEAT_S, range_finder=finder, clock=clock):
-        run(story)

@@ -13,7 +13,7 @@ from flockd.onboard.autopilot.mavlink_messages import ReceivedMessages
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.refusal_reasons import NAMES, REASONS, event_number
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from tests.calm import clock, run
+from tests.calm import clock
 from tests.onboard.autopilot.flight import flying, until
 
 HOLD, POSITION, LAND, OFFBOARD = (4 << 16 | 3 << 24), 3 << 16, (4 << 16 | 6 << 24), 6 << 16
@@ -236,8 +236,8 @@ REFUSING = (
 )
 
 
-def test_twelve_refusals_of_the_fake_autopilot_one_by_one_through_mavsdk(port: int) -> None:
-    async def story() -> None:
+async def test_twelve_refusals_of_the_fake_autopilot_one_by_one_through_mavsdk(port: int) -> None:
+    with FakeAutopilot(port, clock=clock) as fake_autopilot:
         link = await AutopilotLink.connect(AutopilotParameters(address=f"udpin://127.0.0.1:{port}"), clock=clock)
         await link.ask_for_checks()
         await until(link.knows_checks)
@@ -255,15 +255,9 @@ def test_twelve_refusals_of_the_fake_autopilot_one_by_one_through_mavsdk(port: i
         await link.arm()
         await link.close()
 
-    with FakeAutopilot(port, clock=clock) as fake_autopilot:
-        run(story)
 
-
-def test_offboard_that_is_possible_is_not_refused_by_anything(port: int, fake_autopilot: FakeAutopilot) -> None:
-    async def story() -> None:
-        async with flying(port) as flight:
-            await flight.enter_offboard()
-            assert flight.link.refusals() == ()
-
-    run(story)
+async def test_offboard_that_is_possible_is_not_refused_by_anything(port: int, fake_autopilot: FakeAutopilot) -> None:
+    async with flying(port) as flight:
+        await flight.enter_offboard()
+        assert flight.link.refusals() == ()
     assert fake_autopilot.armed

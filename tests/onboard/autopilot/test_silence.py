@@ -17,7 +17,7 @@ import pytest
 
 from flockd.core.messages import Setpoint
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from tests.calm import clock, run
+from tests.calm import clock
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import Flight, flying, until
 
@@ -86,18 +86,14 @@ def test_a_stopped_process_is_so_too_and_does_not_take_the_drone_back_when_it_go
         assert slow_autopilot.mode == "LOITER"
 
 
-def test_the_stand_in_itself_would_return_to_offboard(port: int, fake_autopilot: FakeAutopilot) -> None:
+async def test_the_stand_in_itself_would_return_to_offboard(port: int, fake_autopilot: FakeAutopilot) -> None:
     """Or the story above would tell nothing."""
-
-    async def story() -> None:
-        async with flying(port) as flight:
-            await flight.enter_offboard()
-            flight.streamer.end("for the test")
-            await until(lambda: fake_autopilot.failsafe)
-            flight.link.send_setpoint(Setpoint(0.0, np.array([1.0, 0.0]), 2.5, 0.0))
-            await until(lambda: fake_autopilot.mode == "OFFBOARD", 1.0)
-
-    run(story)
+    async with flying(port) as flight:
+        await flight.enter_offboard()
+        flight.streamer.end("for the test")
+        await until(lambda: fake_autopilot.failsafe)
+        flight.link.send_setpoint(Setpoint(0.0, np.array([1.0, 0.0]), 2.5, 0.0))
+        await until(lambda: fake_autopilot.mode == "OFFBOARD", 1.0)
 
 
 def _busy(duration_s: float) -> None:
@@ -108,53 +104,45 @@ def _busy(duration_s: float) -> None:
 
 
 @pytest.mark.parametrize("block", [time.sleep, _busy])
-def test_a_blocked_event_loop_is_silence_and_failsafe(
+async def test_a_blocked_event_loop_is_silence_and_failsafe(
     port: int, fake_autopilot: FakeAutopilot, block: Callable[[float], None]
 ) -> None:
-    async def story() -> None:
-        async with flying(port) as flight:
-            await flight.enter_offboard()
-            blocked_s = clock()
-            block(1.8)
-            assert fake_autopilot.setpoints[-1][0] - blocked_s < STOPS_WITHIN_S
-            assert fake_autopilot.mode == "LOITER"
-            assert fake_autopilot.failsafe
-            await asyncio.sleep(0.3)
-            assert fake_autopilot.setpoints[-1][0] - blocked_s < STOPS_WITHIN_S
-            assert not flight.streamer.report().streaming
-
-    run(story)
+    async with flying(port) as flight:
+        await flight.enter_offboard()
+        blocked_s = clock()
+        block(1.8)
+        assert fake_autopilot.setpoints[-1][0] - blocked_s < STOPS_WITHIN_S
+        assert fake_autopilot.mode == "LOITER"
+        assert fake_autopilot.failsafe
+        await asyncio.sleep(0.3)
+        assert fake_autopilot.setpoints[-1][0] - blocked_s < STOPS_WITHIN_S
+        assert not flight.streamer.report().streaming
 
 
-def test_a_dead_control_task_is_silence_and_failsafe(port: int, fake_autopilot: FakeAutopilot) -> None:
+async def test_a_dead_control_task_is_silence_and_failsafe(port: int, fake_autopilot: FakeAutopilot) -> None:
     fake_autopilot.parameters["COM_OBL_RC_ACT"] = 4
-
-    async def story() -> None:
-        async with flying(port) as flight:
-            await flight.enter_offboard()
-            died_s = clock()
-            flight.control.cancel()
-            await until(lambda: fake_autopilot.mode == "LAND", FAILSAFE_WITHIN_S)
-            assert fake_autopilot.setpoints[-1][0] - died_s < STOPS_WITHIN_S
-            assert flight.link.status().flight_mode in {"offboard", "land"}
-
-    run(story)
+    async with flying(port) as flight:
+        await flight.enter_offboard()
+        died_s = clock()
+        flight.control.cancel()
+        await until(lambda: fake_autopilot.mode == "LAND", FAILSAFE_WITHIN_S)
+        assert fake_autopilot.setpoints[-1][0] - died_s < STOPS_WITHIN_S
+        assert flight.link.status().flight_mode in {"offboard", "land"}
 
 
-def test_when_the_pilot_switches_it_is_silent_at_once_and_stays_so(port: int, fake_autopilot: FakeAutopilot) -> None:
-    async def story() -> None:
-        async with flying(port) as flight:
-            await flight.enter_offboard()
-            await asyncio.sleep(0.3)
-            fake_autopilot.pilot_selects("POSCTL")
-            seen_s = clock() + await until(lambda: flight.link.status().flight_mode == "position")
-            await asyncio.sleep(0.6)
-            assert fake_autopilot.setpoints[-1][0] - seen_s < 0.2
-            assert flight.streamer.report().silence == "the autopilot left offboard for position"
-            assert fake_autopilot.mode == "POSCTL"
-            await _begins_anew(flight, fake_autopilot)
-
-    run(story)
+async def test_when_the_pilot_switches_it_is_silent_at_once_and_stays_so(
+    port: int, fake_autopilot: FakeAutopilot
+) -> None:
+    async with flying(port) as flight:
+        await flight.enter_offboard()
+        await asyncio.sleep(0.3)
+        fake_autopilot.pilot_selects("POSCTL")
+        seen_s = clock() + await until(lambda: flight.link.status().flight_mode == "position")
+        await asyncio.sleep(0.6)
+        assert fake_autopilot.setpoints[-1][0] - seen_s < 0.2
+        assert flight.streamer.report().silence == "the autopilot left offboard for position"
+        assert fake_autopilot.mode == "POSCTL"
+        await _begins_anew(flight, fake_autopilot)
 
 
 async def _begins_anew(flight: Flight, fake_autopilot: FakeAutopilot) -> None:
@@ -165,16 +153,13 @@ async def _begins_anew(flight: Flight, fake_autopilot: FakeAutopilot) -> None:
     await until(lambda: flight.streamer.report().offboard)
 
 
-def test_a_lost_link_is_silence_though_the_autopilot_comes_back(port: int, fake_autopilot: FakeAutopilot) -> None:
-    async def story() -> None:
-        async with flying(port) as flight:
-            await flight.enter_offboard()
-            fake_autopilot.silent = True
-            await until(lambda: not flight.streamer.report().streaming, 4.0)
-            fake_autopilot.silent = False
-            before = len(fake_autopilot.setpoints)
-            await asyncio.sleep(2 * HEARTBEAT_S)
-            assert len(fake_autopilot.setpoints) == before
-            assert flight.streamer.report().silence == "the autopilot's heartbeat is lost"
-
-    run(story)
+async def test_a_lost_link_is_silence_though_the_autopilot_comes_back(port: int, fake_autopilot: FakeAutopilot) -> None:
+    async with flying(port) as flight:
+        await flight.enter_offboard()
+        fake_autopilot.silent = True
+        await until(lambda: not flight.streamer.report().streaming, 4.0)
+        fake_autopilot.silent = False
+        before = len(fake_autopilot.setpoints)
+        await asyncio.sleep(2 * HEARTBEAT_S)
+        assert len(fake_autopilot.setpoints) == before
+        assert flight.streamer.report().silence == "the autopilot's heartbeat is lost"

@@ -34,6 +34,7 @@ from flockd.onboard.autopilot.refusal_reasons import REASONS
 from flockd.onboard.daemon import Daemon, Ending, ServiceManager
 from flockd.onboard.sources import FramePublisher
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from flockd.sim.free_ports import free_endpoint
 from tests.calm import clock
 from tests.flight.perception.shipped import SECOND_STAGE
 from tests.onboard.autopilot.flight import until
@@ -140,12 +141,6 @@ class Cameras:
                     show = noise if camera in self.noisy else self._image
                     frame = Frame(camera, show(camera, number), self._clock(), number)
                     self._publisher.publish("tiny", self.spoil(frame))
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def config_for(

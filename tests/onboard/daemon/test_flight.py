@@ -22,8 +22,9 @@ from flockd.onboard.daemon import DaemonError, Ending
 from flockd.onboard.recording.codec import to_json
 from flockd.onboard.recording.reader import Recording
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
+from flockd.sim.free_ports import free_port
 from tests.calm import clock, run
-from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M, free_port
+from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import CAMERAS, PATIENT, SECONDS_TO_FAIL, SPEED_M_S, STEP_S, TinyPerceiver, aboard
 

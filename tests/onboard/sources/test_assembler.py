@@ -88,15 +88,6 @@ def test_a_slow_reader_gets_the_newest_and_the_others_are_superseded() -> None:
         assert (stage.count(camera, "used"), stage.count(camera, "superseded")) == (1, 14)
 
 
-def test_a_camera_that_is_late_within_the_wait_is_waited_for() -> None:
-    stage = Stage("front", "back")
-    stage.send("front", 0.0)
-    stage.now_s += 0.09
-    assert stage.take() is None
-    stage.send("back", 0.0)
-    assert stage.stamps() == {"front": 0.0, "back": 0.0}
-
-
 def test_a_constantly_later_camera_still_gets_its_place() -> None:
     """The back camera's images come 70 ms after the front's; sets are as old as that, and complete."""
     stage = Stage("front", "back")

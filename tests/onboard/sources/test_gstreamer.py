@@ -86,13 +86,6 @@ def test_images_come_with_the_times_of_their_buffers(start: Start) -> None:
     assert source.status()["camera0"].fault is None
 
 
-def test_two_pipelines_become_one_set(start: Start) -> None:
-    source = start("caps:64x48 500 stall", "caps:64x48 500 stall")
-    until_s = time.monotonic() + 30.0
-    while _next(source).frames.keys() != {"camera0", "camera1"}:
-        assert time.monotonic() < until_s
-
-
 def test_numbers_count_periods_so_that_what_is_missing_shows() -> None:
     """Three images 20 ms apart by their stamps, then one 100 ms after: four are missing. At 50 a second."""
     script = (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 
@@ -101,10 +100,3 @@ def test_plain_rgb_is_handed_on_as_it_is_even_if_it_shows_nothing() -> None:
         np.testing.assert_array_equal(RgbFormat(SIZE).decode(image.tobytes()), image)
     with pytest.raises(CorruptImageError, match="921599 bytes instead of 921600"):
         RgbFormat(SIZE).decode(scene().tobytes()[:-1])
-
-
-def test_the_decoders_agree_with_opencv() -> None:
-    data = jpeg(scene(3))
-    by_opencv = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    assert by_opencv is not None
-    np.testing.assert_array_equal(MjpegFormat(SIZE).decode(data), by_opencv[..., ::-1])

@@ -6,7 +6,6 @@ import ctypes
 import errno
 import mmap
 import os
-import struct
 import termios
 import time
 from collections.abc import Callable, Iterator
@@ -32,6 +31,7 @@ from tests.onboard.sources.fake_kernel import (
     METADATA_CAPTURE,
     STREAMING,
     FakeCamera,
+    FakeControl,
     FakeKernel,
     Request,
 )
@@ -170,25 +170,6 @@ def test_uncompressed_images_may_have_padded_rows(start: Start) -> None:
     np.testing.assert_allclose(image[:, 340:630].mean((0, 1)), (0, 0, 255), atol=2)
 
 
-def test_the_newest_frame_wins_and_the_others_are_counted(start: Start) -> None:
-    kernel = FakeKernel(front=FakeCamera())
-    source = start(kernel, _camera())
-    for number in range(4):
-        kernel.send("front", JPEGS[number])
-    _received(source, front=4)
-    assert _next(source).frames["front"].sequence == 3
-    assert source.status()["front"].counts == {"received": 4, "used": 1, "superseded": 3, "opened": 1}
-
-
-def test_gaps_in_the_sequence_are_frames_lost(start: Start) -> None:
-    kernel = FakeKernel(front=FakeCamera())
-    source = start(kernel, _camera())
-    kernel.send("front", JPEGS[0])
-    kernel.send("front", JPEGS[1], lost_before=3)
-    _received(source, front=2)
-    assert source.status()["front"].counts["lost"] == 3
-
-
 @pytest.mark.parametrize(
     ("data", "flags", "offset_s", "count"),
     [
@@ -251,17 +232,6 @@ def test_a_camera_whose_images_show_nothing_has_a_fault_until_one_shows_somethin
         assert _next(source).frames.keys() == ({"back"} if number < 3 else {"front", "back"})
     assert source.status()["front"].fault is None
     assert source.status()["front"].counts["undecodable"] == 3
-
-
-def test_a_stamp_that_does_not_increase_is_dropped(start: Start) -> None:
-    kernel = FakeKernel(front=FakeCamera())
-    source = start(kernel, _camera())
-    stamp = kernel.send("front", JPEGS[0])
-    kernel.send("front", JPEGS[1], time_s=stamp)
-    kernel.send("front", JPEGS[2], time_s=stamp - 0.01)
-    _received(source, front=3)
-    assert source.status()["front"].counts["time_stamp"] == 2
-    assert _next(source).frames["front"].sequence == 0
 
 
 def test_an_unplugged_camera_is_reported_at_once_and_comes_back_when_plugged_in(start: Start) -> None:
@@ -388,21 +358,18 @@ def test_an_error_of_the_stream_closes_the_camera_and_opens_it_again(start: Star
             {"controls": BY_HAND[1:]},
             "front: /dev/front cannot set exposure_time_absolute to 50 (Permission denied)",
         ),
+        (
+            FakeCamera(controls={GAIN: FakeControl(b"Gain", 0, 255, 64, step=16)}),
+            {"controls": (ControlParameters(name="gain", value=40),)},
+            "front: /dev/front makes 32 of gain 40; write a value it can keep",
+        ),
     ],
-    ids=["size", "rate", "metadata", "no such control", "range", "automatic on"],
+    ids=["size", "rate", "metadata", "no such control", "range", "automatic on", "step"],
 )
 def test_what_the_camera_cannot_do_is_said_in_one_sentence(
     start: Start, camera: FakeCamera, asked: dict[str, Any], sentence: str
 ) -> None:
     source = start(FakeKernel(front=camera), _camera("front", **asked))
-    assert _until(source, lambda status: status.fault is not None).fault == sentence
-
-
-def test_a_control_that_takes_no_such_step_is_reported(start: Start) -> None:
-    camera = FakeCamera()
-    camera.controls[GAIN].step = 16
-    source = start(FakeKernel(front=camera), _camera(controls=(ControlParameters(name="gain", value=40),)))
-    sentence = "front: /dev/front makes 32 of gain 40; write a value it can keep"
     assert _until(source, lambda status: status.fault is not None).fault == sentence
 
 
@@ -434,18 +401,6 @@ def test_stopping_gives_the_devices_back_and_waits_for_nothing(start: Start) -> 
     assert not kernel.open_files
     assert kernel.cameras["/dev/front"].owner is None
     assert source.newest(3600.0) is None, "who waits for frames is let go"
-
-
-def test_a_buffer_written_by_the_headers_offsets_is_read_field_by_field() -> None:
-    raw = bytearray(88)
-    struct.pack_into("<IIIII", raw, 0, 3, 1, 4711, 0x2040, 1)
-    struct.pack_into("<qq", raw, 24, 1_234_567, 654_321)
-    struct.pack_into("<IIII", raw, 56, 99, 1, 0x300000, 0)
-    struct.pack_into("<I", raw, 72, 614_400)
-    buffer = v4l2_kernel.Buffer.from_buffer(raw)
-    assert (buffer.index, buffer.bytesused, buffer.flags, buffer.field) == (3, 4711, 0x2040, 1)
-    assert (buffer.seconds, buffer.microseconds, buffer.sequence) == (1_234_567, 654_321, 99)
-    assert (buffer.offset, buffer.length) == (0x300000, 614_400)
 
 
 def test_the_real_system_calls_write_into_the_structures_they_are_given() -> None:

@@ -18,6 +18,7 @@ from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
+from flockd.sim.free_ports import free_endpoint, free_port
 
 EXAMPLE = (data_path("config") / "zenoh_tls.json5").read_text(encoding="utf-8")
 SECONDS_TO_FAIL = 60.0
@@ -74,9 +75,7 @@ def _answers(session: zenoh.Session, what: str, timeout_s: float) -> list[object
 
 
 def test_who_may_watch_hears_and_who_may_command_commands(settings: dict[str, Path]) -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tls/localhost:{probe.getsockname()[1]}"
+    endpoint = f"tls/localhost:{free_port(socket.SOCK_STREAM)}"
     asked: list[str] = []
 
     def ask(command: str, payload: bytes) -> AnswerMessage:
@@ -101,9 +100,7 @@ def test_settings_that_are_not_there_are_reported(tmp_path: Path) -> None:
 
 
 def test_what_is_no_message_is_counted_and_not_taken() -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     with FleetWatcher(None, listen=[endpoint], connect=[]) as watcher:
         session = open_session("a test", [], [endpoint])
         until_s = time.monotonic() + SECONDS_TO_FAIL

@@ -19,7 +19,7 @@ from flockd.fleet.watcher import MAX_BYTES, MAX_DRONES, FleetWatcher, Watched
 from flockd.onboard.telemetry.schema import completed, fault
 from flockd.onboard.telemetry.topics import TOPICS, ComputerMessage, FlightMessage, NeighboursMessage, StateMessage
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
-from tests.onboard.daemon.aboard import free_endpoint
+from flockd.sim.free_ports import free_endpoint
 
 ROOT = Path(__file__).parents[3]
 FLIGHT = {
