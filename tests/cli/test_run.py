@@ -71,8 +71,18 @@ def manager(tmp_path: Path) -> Iterator[Manager]:
     manager.close()
 
 
-def _written(path: Path, port: int, frames: str, telemetry: str) -> Path:
-    values = config_for(port, frames, telemetry).model_dump(mode="json", exclude_defaults=True)
+def _written(
+    folder: Path, port: int | None = None, frames: str | None = None, endpoint: str | None = None, **changes: Any
+) -> Path:
+    """A drone's file; ``changes`` are keys of its sections, and None leaves a section out."""
+    ends = port or free_port(), frames or free_endpoint(), endpoint or free_endpoint()
+    values = config_for(*ends).model_dump(mode="json", exclude_defaults=True)
+    for section, keys in changes.items():
+        if keys is None:
+            del values[section]
+        else:
+            values.setdefault(section, {}).update(keys)
+    path = folder / "tiny.yaml"
     path.write_text(yaml.safe_dump(values), encoding="utf-8")
     return path
 
@@ -90,7 +100,7 @@ def test_it_gets_ready_alone_reads_its_file_again_and_ends_when_told(
     tmp_path: Path, manager: Manager, capsys: pytest.CaptureFixture[str]
 ) -> None:
     port, frames, telemetry = free_port(), free_endpoint(), free_endpoint()
-    config = _written(tmp_path / "tiny.yaml", port, frames, telemetry)
+    config = _written(tmp_path, port, frames, telemetry)
     cameras = Cameras(frames)
     with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S), _run(config, tmp_path) as process:
         try:
@@ -139,10 +149,7 @@ def test_a_stall_of_the_computer_ends_in_the_autopilots_failsafe_and_is_named(tm
     """Stopped for 0.3 s, setpoints keep PX4's 2 Hz and it flies on; for 3 s, the autopilot has taken over meanwhile."""
 
     port, frames = free_port(), free_endpoint()
-    config = _written(tmp_path / "tiny.yaml", port, frames, free_endpoint())
-    values = yaml.safe_load(config.read_text(encoding="utf-8"))
-    values["telemetry"]["commands"] = []
-    config.write_text(yaml.safe_dump(values), encoding="utf-8")
+    config = _written(tmp_path, port, frames, telemetry={"commands": []})
     cameras = Cameras(frames)
     log = tmp_path / "log"
     with (
@@ -193,10 +200,7 @@ def test_a_changed_model_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
     flow = bytearray((models / "flow_int8.onnx").read_bytes())
     flow[len(flow) // 2] ^= 1
     (models / "flow_int8.onnx").write_bytes(flow)
-    config = _written(tmp_path / "tiny.yaml", free_port(), free_endpoint(), free_endpoint())
-    values = yaml.safe_load(config.read_text(encoding="utf-8"))
-    values["perception"]["models_dir"] = str(models)
-    config.write_text(yaml.safe_dump(values), encoding="utf-8")
+    config = _written(tmp_path, perception={"models_dir": str(models)})
     assert main(["run", "--config", str(config)]) == 78
     assert "flow_int8.yaml:5: sha256: " in capsys.readouterr().err
 
@@ -207,16 +211,13 @@ def test_a_changed_model_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_a_drone_that_cannot_be_flown_is_bad_configuration(
     section: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    config = _written(tmp_path / "tiny.yaml", free_port(), free_endpoint(), free_endpoint())
-    values = yaml.safe_load(config.read_text(encoding="utf-8"))
-    del values[section]
-    config.write_text(yaml.safe_dump(values), encoding="utf-8")
+    config = _written(tmp_path, **{section: None})
     assert main(["run", "--config", str(config)]) == 78
     assert capsys.readouterr().err.splitlines()[-1].startswith(f"{config}: {told}; ")
 
 
 def test_a_file_where_the_recordings_folder_would_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    config = _written(tmp_path / "tiny.yaml", free_port(), free_endpoint(), free_endpoint())
+    config = _written(tmp_path)
     for name in (config, config / "recordings"):
         assert main(["run", "--config", str(config), "--record", str(name)]) == 2
         assert capsys.readouterr().err == f"{name}: is no folder; name another with --record\n"
@@ -233,10 +234,7 @@ def test_a_fleet_that_is_not_there_is_unavailable(capsys: pytest.CaptureFixture[
 
 def test_without_an_autopilot_it_is_unavailable_and_not_aborted(tmp_path: Path) -> None:
     """The serial port is refused at once, while a thread still loads networks: ended then, the process was aborted."""
-    config = _written(tmp_path / "tiny.yaml", free_port(), free_endpoint(), free_endpoint())
-    values = yaml.safe_load(config.read_text(encoding="utf-8"))
-    values["autopilot"]["address"] = f"serial://{tmp_path / 'none'}:921600"
-    config.write_text(yaml.safe_dump(values), encoding="utf-8")
+    config = _written(tmp_path, autopilot={"address": f"serial://{tmp_path / 'none'}:921600"})
     recordings = tmp_path / "new" / "recordings"
     with _run(config, tmp_path, "--record", str(recordings)) as process:
         _, err = process.communicate(timeout=SECONDS_TO_FAIL)
@@ -248,10 +246,7 @@ def test_without_an_autopilot_it_is_unavailable_and_not_aborted(tmp_path: Path) 
 
 def test_a_network_that_never_ends_is_bad_configuration_within_ten_seconds(tmp_path: Path) -> None:
     """The daemon waits for an autopilot meanwhile, and none is there."""
-    config = _written(tmp_path / "tiny.yaml", free_port(), free_endpoint(), free_endpoint())
-    values = yaml.safe_load(config.read_text(encoding="utf-8"))
-    values["perception"]["flow"] = str(endless(tmp_path))
-    config.write_text(yaml.safe_dump(values), encoding="utf-8")
+    config = _written(tmp_path, perception={"flow": str(endless(tmp_path))})
     with _run(config, tmp_path) as process:
         _, err = process.communicate(timeout=SECONDS_TO_FAIL)
     assert process.returncode == 78, err
@@ -273,7 +268,7 @@ def test_without_files_or_memory_it_is_unavailable_and_not_aborted(
     limit: str, value: int, told: str, tmp_path: Path
 ) -> None:
     """Unchecked, the second is ended by glibc (127), the third by an ImportError; 24 files make a model look bad."""
-    config = _written(tmp_path / "tiny.yaml", free_port(), free_endpoint(), free_endpoint())
+    config = _written(tmp_path)
     limited = f"import resource; resource.setrlimit(resource.{limit}, ({value}, {value})); {RUN}"
     command = [sys.executable, "-c", limited, "run", "--config", str(config)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=SECONDS_TO_FAIL, check=False)
@@ -283,10 +278,7 @@ def test_without_files_or_memory_it_is_unavailable_and_not_aborted(
 
 
 def test_a_low_limit_that_may_be_raised_is_raised(tmp_path: Path) -> None:
-    config = _written(tmp_path / "tiny.yaml", free_port(), free_endpoint(), free_endpoint())
-    values = yaml.safe_load(config.read_text(encoding="utf-8"))
-    del values["source"]
-    config.write_text(yaml.safe_dump(values), encoding="utf-8")
+    config = _written(tmp_path, source=None)
     limited = f"import resource as r; r.setrlimit(r.RLIMIT_NOFILE, (20, 256)); {RUN}"
     command = [sys.executable, "-c", limited, "run", "--config", str(config)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=SECONDS_TO_FAIL, check=False)
@@ -309,6 +301,6 @@ def test_what_runs_out_while_networks_load_is_unavailable_and_no_damaged_model(
         raise error
 
     monkeypatch.setattr("onnxruntime.InferenceSession", lacks)
-    config = _written(tmp_path / "tiny.yaml", free_port(), free_endpoint(), free_endpoint())
+    config = _written(tmp_path)
     assert main(["run", "--config", str(config)]) == 69
     assert told in capsys.readouterr().err.splitlines()[-1]

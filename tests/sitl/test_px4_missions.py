@@ -71,11 +71,3 @@ def test_a_flight_that_left_its_mode_or_its_leader_is_not_kept() -> None:
         first, last = rows(MISSIONS[1], scenario, log)
         assert (first.time_s, last.time_s, last.error_m) == (9.0, 14.0, 0.0)
         assert last.kept is good
-
-
-def test_without_px4_it_says_what_to_do(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("FLOCKD_PX4", str(tmp_path))
-    assert main(["--only", "led_by_hand"]) == 69
-    assert f"there is no PX4 in {tmp_path}, which FLOCKD_PX4 names" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.sim.autopilots import SimulatedAutopilots
-from tools.checks.px4_modes import FAULTS, Fault, Result, _line, main, run
+from tools.checks.px4_modes import FAULTS, Fault, Result, _line, run
 
 PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
 
@@ -25,13 +26,14 @@ def test_px4_ends_in_the_mode_that_its_parameters_promise(fault: Fault) -> None:
         assert result.drift_m_s < 0.5
 
 
-def test_without_px4_it_says_what_to_do(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("tool", ["px4_missions", "px4_modes", "px4_reasons"])
+def test_without_px4_a_tool_says_what_to_do(
+    tool: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("FLOCKD_PX4", str(tmp_path))
-    monkeypatch.setattr("sys.argv", ["px4_modes"])
-    assert main() == 69
-    assert capsys.readouterr().err.startswith(f"there is no PX4 in {tmp_path}, which FLOCKD_PX4 names; set it to")
+    monkeypatch.setattr("sys.argv", [tool])
+    assert import_module(f"tools.checks.{tool}").main() == 69
+    assert f"there is no PX4 in {tmp_path}, which FLOCKD_PX4 names; set it to" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

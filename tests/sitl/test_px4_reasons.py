@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 import pytest
 
 from flockd.onboard.autopilot.refusal_reasons import REASONS
-from tools.checks.px4_reasons import PROVOCATIONS, Provocation, Result, _row, main, run
+from tools.checks.px4_reasons import PROVOCATIONS, Provocation, Result, _row, run
 
 PX4 = pytest.mark.skipif("FLOCKD_PX4" not in os.environ, reason="FLOCKD_PX4 names no SITL build folder of PX4")
 
@@ -27,15 +26,6 @@ def test_every_provocation_is_of_a_reason_in_the_table() -> None:
     names = [provocation.name for provocation in PROVOCATIONS]
     assert len(set(names)) == len(names) >= 12
     assert {provocation.reason for provocation in PROVOCATIONS} <= REASONS.keys()
-
-
-def test_without_px4_it_says_what_to_do(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("FLOCKD_PX4", str(tmp_path))
-    monkeypatch.setattr("sys.argv", ["px4_reasons"])
-    assert main() == 69
-    assert capsys.readouterr().err.startswith(f"there is no PX4 in {tmp_path}, which FLOCKD_PX4 names; set it to")
 
 
 def test_a_reason_that_was_not_shown_or_stays_is_not_kept() -> None:

@@ -23,7 +23,7 @@ from flockd.onboard.recording.codec import to_json
 from flockd.onboard.recording.reader import Recording
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.free_ports import free_port
-from tests.calm import clock, run
+from tests.calm import clock
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import CAMERAS, PATIENT, SECONDS_TO_FAIL, SPEED_M_S, STEP_S, TinyPerceiver, aboard
@@ -32,10 +32,9 @@ ALONE = PATIENT.model_copy(update={"alone_s": None})
 """Flies on without neighbours, however long this computer takes."""
 
 
-def test_from_the_ground_into_the_air_and_back_into_the_pilots_hands(tmp_path: Path) -> None:
+async def test_from_the_ground_into_the_air_and_back_into_the_pilots_hands(tmp_path: Path) -> None:
     port = free_port()
-
-    async def story() -> None:
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
         async with aboard(fake_autopilot, port, tmp_path) as ship:
             await until(lambda: "READY=1" in ship.service, SECONDS_TO_FAIL)
             await ship.until_state("idle")
@@ -66,9 +65,6 @@ def test_from_the_ground_into_the_air_and_back_into_the_pilots_hands(tmp_path: P
             assert "not_offboard" in ship.matters()
             assert fake_autopilot.mode == "POSCTL"
 
-    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
-        run(story)
-
 
 def _tells_what_it_does(heard: object) -> None:
     assert isinstance(heard, dict)
@@ -87,113 +83,99 @@ def _tells_what_it_does(heard: object) -> None:
     assert np.linalg.norm(heard["command"].message["velocity_ne"]) == pytest.approx(SPEED_M_S, abs=0.2)
 
 
-def test_eyes_that_lie_about_the_own_motion_add_half_a_metre_a_second_at_most_and_nothing_to_a_hover(
+async def test_eyes_that_lie_about_the_own_motion_add_half_a_metre_a_second_at_most_and_nothing_to_a_hover(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
     """They see a standstill, whatever is flown: the trim is at its limit, and no farther."""
+    async with aboard(fake_autopilot, port, tmp_path, own_velocity="vision") as ship:
+        await ship.is_ready_in_the_air()
+        await until(lambda: len(fake_autopilot.setpoints) > 5, SECONDS_TO_FAIL)
+        fake_autopilot.pilot_selects("OFFBOARD")
+        chosen_s = clock()
+        await until(lambda: ship.heard()["flight"].message["velocity_trim"][0] > 0.49, SECONDS_TO_FAIL)
+        off_s = next(at_s for at_s, sent in fake_autopilot.setpoints if np.linalg.norm(sent.velocity) > 0.01)
+        assert off_s - chosen_s > 2 * STEP_S - 0.1, "a neighbour counts from its third look on"
+        await asyncio.sleep(1.0)
+        commanded = np.array(ship.heard()["command"].message["velocity_ne"])
+        trim = np.array(ship.heard()["flight"].message["velocity_trim"])
+        np.testing.assert_allclose(trim, [0.5, 0.0], atol=0.02)
+        assert np.linalg.norm(commanded - trim) < 0.9 * SPEED_M_S, "it believes that it stands"
+        _, sent = fake_autopilot.setpoints[-1]
+        np.testing.assert_allclose(np.asarray(sent.velocity)[:2], commanded, atol=0.02)
 
-    async def story() -> None:
-        async with aboard(fake_autopilot, port, tmp_path, own_velocity="vision") as ship:
-            await ship.is_ready_in_the_air()
-            await until(lambda: len(fake_autopilot.setpoints) > 5, SECONDS_TO_FAIL)
-            fake_autopilot.pilot_selects("OFFBOARD")
-            chosen_s = clock()
-            await until(lambda: ship.heard()["flight"].message["velocity_trim"][0] > 0.49, SECONDS_TO_FAIL)
-            off_s = next(at_s for at_s, sent in fake_autopilot.setpoints if np.linalg.norm(sent.velocity) > 0.01)
-            assert off_s - chosen_s > 2 * STEP_S - 0.1, "a neighbour counts from its third look on"
-            await asyncio.sleep(1.0)
-            commanded = np.array(ship.heard()["command"].message["velocity_ne"])
-            trim = np.array(ship.heard()["flight"].message["velocity_trim"])
-            np.testing.assert_allclose(trim, [0.5, 0.0], atol=0.02)
-            assert np.linalg.norm(commanded - trim) < 0.9 * SPEED_M_S, "it believes that it stands"
-            _, sent = fake_autopilot.setpoints[-1]
-            np.testing.assert_allclose(np.asarray(sent.velocity)[:2], commanded, atol=0.02)
-
-            ship.cameras.silent |= set(CAMERAS)
-            silent_s = clock()
-            await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-            last = [sent for at_s, sent in fake_autopilot.setpoints if at_s > silent_s + 1.2]
-            assert last, "the hover is sent"
-            assert all(np.linalg.norm(sent.velocity) < 0.01 for sent in last)
-
-    run(story)
+        ship.cameras.silent |= set(CAMERAS)
+        silent_s = clock()
+        await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        last = [sent for at_s, sent in fake_autopilot.setpoints if at_s > silent_s + 1.2]
+        assert last, "the hover is sent"
+        assert all(np.linalg.norm(sent.velocity) < 0.01 for sent in last)
 
 
-def test_one_camera_gone_is_a_slower_flight_and_all_gone_a_hover_and_then_hold(
+async def test_one_camera_gone_is_a_slower_flight_and_all_gone_a_hover_and_then_hold(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
-    async def story() -> None:
-        async with aboard(fake_autopilot, port, tmp_path) as ship:
-            await ship.is_ready_in_the_air()
-            await ship.flies()
-            ship.cameras.silent.add("back")
-            await ship.until_event("degraded: a camera is lost: back silent")
-            assert fake_autopilot.mode == "OFFBOARD"
-            ship.cameras.silent.add("front")
-            silent_s = clock()
-            await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-            # Three frame periods of 0.2 s until it is noticed, 1 s of hovering, and some for Hold on a busy computer.
-            assert 1.0 < clock() - silent_s < 3.0
-            assert not fake_autopilot.failsafe, "it was asked for Hold, not left to its failsafe"
-            last = [sent for at_s, sent in fake_autopilot.setpoints if at_s > silent_s + 1.2]
-            assert last, "the hover is sent"
-            assert all(np.linalg.norm(sent.velocity) < 0.01 for sent in last)
-            await ship.until_state("silent")
-            ship.cameras.silent.clear()
-            await asyncio.sleep(1.0)
-            assert ship.state() == "silent", "no re-entry by itself"
-
-    run(story)
+    async with aboard(fake_autopilot, port, tmp_path) as ship:
+        await ship.is_ready_in_the_air()
+        await ship.flies()
+        ship.cameras.silent.add("back")
+        await ship.until_event("degraded: a camera is lost: back silent")
+        assert fake_autopilot.mode == "OFFBOARD"
+        ship.cameras.silent.add("front")
+        silent_s = clock()
+        await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        # Three frame periods of 0.2 s until it is noticed, 1 s of hovering, and some for Hold on a busy computer.
+        assert 1.0 < clock() - silent_s < 3.0
+        assert not fake_autopilot.failsafe, "it was asked for Hold, not left to its failsafe"
+        last = [sent for at_s, sent in fake_autopilot.setpoints if at_s > silent_s + 1.2]
+        assert last, "the hover is sent"
+        assert all(np.linalg.norm(sent.velocity) < 0.01 for sent in last)
+        await ship.until_state("silent")
+        ship.cameras.silent.clear()
+        await asyncio.sleep(1.0)
+        assert ship.state() == "silent", "no re-entry by itself"
 
 
-def test_a_noisy_camera_is_lost_and_said_so_until_it_is_good_again(
+async def test_a_noisy_camera_is_lost_and_said_so_until_it_is_good_again(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
-    async def story() -> None:
-        async with aboard(fake_autopilot, port, tmp_path) as ship:
-            await ship.is_ready_in_the_air()
-            await ship.flies()
-            ship.cameras.noisy.add("back")
-            await ship.until_event("degraded: a camera is lost: back noisy")
-            assert fake_autopilot.mode == "OFFBOARD"
-            await until(lambda: "frames_dropped" in ship.matters(), SECONDS_TO_FAIL)  # of two cameras' images a half
-            assert ship.heard()["computer"].message["cameras"]["back"]["counts"]["noisy"] > 0
-            assert "camera back: its image is noise" in ship.heard()["health"].message["reasons"]
-            ship.cameras.noisy.clear()
-            await until(lambda: "camera_lost" not in ship.matters(), SECONDS_TO_FAIL)
-            assert fake_autopilot.mode == "OFFBOARD"
-            ship.cameras.noisy |= set(CAMERAS)
-            await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-            await ship.until_event("hover: too few cameras deliver images: front noisy, back noisy")
-            assert not fake_autopilot.failsafe, "it was asked for Hold, not left to its failsafe"
-
-    run(story)
+    async with aboard(fake_autopilot, port, tmp_path) as ship:
+        await ship.is_ready_in_the_air()
+        await ship.flies()
+        ship.cameras.noisy.add("back")
+        await ship.until_event("degraded: a camera is lost: back noisy")
+        assert fake_autopilot.mode == "OFFBOARD"
+        await until(lambda: "frames_dropped" in ship.matters(), SECONDS_TO_FAIL)  # of two cameras' images a half
+        assert ship.heard()["computer"].message["cameras"]["back"]["counts"]["noisy"] > 0
+        assert "camera back: its image is noise" in ship.heard()["health"].message["reasons"]
+        ship.cameras.noisy.clear()
+        await until(lambda: "camera_lost" not in ship.matters(), SECONDS_TO_FAIL)
+        assert fake_autopilot.mode == "OFFBOARD"
+        ship.cameras.noisy |= set(CAMERAS)
+        await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        await ship.until_event("hover: too few cameras deliver images: front noisy, back noisy")
+        assert not fake_autopilot.failsafe, "it was asked for Hold, not left to its failsafe"
 
 
-def test_a_second_sender_with_the_autopilots_ids_moves_neither_height_band_nor_fence(
+async def test_a_second_sender_with_the_autopilots_ids_moves_neither_height_band_nor_fence(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
     """Home half a kilometre away and 20 m deeper, and the drone on the ground: outside of both, if it were believed."""
-
-    async def story() -> None:
-        async with aboard(fake_autopilot, port, tmp_path) as ship:
-            await ship.is_ready_in_the_air()
-            await ship.flies()
-            held_m = fake_autopilot.setpoints[-1][1].down_m
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
-                forged = mavlink.MAVLink(_Sender(wire, port), srcSystem=1, srcComponent=1)
-                for _ in range(10):
-                    forged.extended_sys_state_send(0, mavlink.MAV_LANDED_STATE_ON_GROUND)
-                    forged.home_position_send(0, 0, 0, 500.0, 0.0, 20.0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0)
-                    await asyncio.sleep(0.1)
-            await ship.until_event("the autopilot's home moved by 500.4 m in flight")  # sqrt(500^2 + 20^2)
-            await ship.until_event("the autopilot reports that the drone is on the ground")
-            assert not {"fence_left", "heights_left"} & ship.matters()
-            assert ship.state() in {"normal", "degraded"}
-            assert fake_autopilot.mode == "OFFBOARD"
-            assert fake_autopilot.setpoints[-1][1].down_m == pytest.approx(held_m, abs=0.01)
-
-    run(story)
+    async with aboard(fake_autopilot, port, tmp_path) as ship:
+        await ship.is_ready_in_the_air()
+        await ship.flies()
+        held_m = fake_autopilot.setpoints[-1][1].down_m
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
+            forged = mavlink.MAVLink(_Sender(wire, port), srcSystem=1, srcComponent=1)
+            for _ in range(10):
+                forged.extended_sys_state_send(0, mavlink.MAV_LANDED_STATE_ON_GROUND)
+                forged.home_position_send(0, 0, 0, 500.0, 0.0, 20.0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0)
+                await asyncio.sleep(0.1)
+        await ship.until_event("the autopilot's home moved by 500.4 m in flight")  # sqrt(500^2 + 20^2)
+        await ship.until_event("the autopilot reports that the drone is on the ground")
+        assert not {"fence_left", "heights_left"} & ship.matters()
+        assert ship.state() in {"normal", "degraded"}
+        assert fake_autopilot.mode == "OFFBOARD"
+        assert fake_autopilot.setpoints[-1][1].down_m == pytest.approx(held_m, abs=0.01)
 
 
 class _Sender:
@@ -206,32 +188,29 @@ class _Sender:
         self._wire.sendto(data, ("127.0.0.1", self._port))
 
 
-def test_networks_not_finite_or_stuck_degrade_and_sigterm_ends_in_hold(
+async def test_networks_not_finite_or_stuck_degrade_and_sigterm_ends_in_hold(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
-    async def story() -> None:
-        async with aboard(fake_autopilot, port, tmp_path, recordings=tmp_path) as ship:
-            await ship.is_ready_in_the_air()
-            await ship.flies()
-            await ship.until_state("normal")
-            ship.perceiver.not_finite = 1
-            await ship.until_event("degraded: a network's output is not finite or not plausible")
-            ship.perceiver.hangs.set()
-            await ship.until_event("a step failed: a network call took longer than 0.5 s")
-            assert ship.perceiver.told_to_end == 1
-            await ship.until_state("normal")
-            assert fake_autopilot.mode == "OFFBOARD"
-            assert ship.heard()["computer"].message["recording"].startswith(str(tmp_path))
+    async with aboard(fake_autopilot, port, tmp_path, recordings=tmp_path) as ship:
+        await ship.is_ready_in_the_air()
+        await ship.flies()
+        await ship.until_state("normal")
+        ship.perceiver.not_finite = 1
+        await ship.until_event("degraded: a network's output is not finite or not plausible")
+        ship.perceiver.hangs.set()
+        await ship.until_event("a step failed: a network call took longer than 0.5 s")
+        assert ship.perceiver.told_to_end == 1
+        await ship.until_state("normal")
+        assert fake_autopilot.mode == "OFFBOARD"
+        assert ship.heard()["computer"].message["recording"].startswith(str(tmp_path))
 
-            asked_s = clock()
-            ship.daemon.ask_to_stop()
-            await until(lambda: fake_autopilot.mode == "LOITER", 2.0)
-            assert not fake_autopilot.failsafe
-            assert await ship.ending == Ending(None)
-            assert "STOPPING=1" in ship.service
-            assert fake_autopilot.setpoints[-1][0] - asked_s < 2.0
-
-    run(story)
+        asked_s = clock()
+        ship.daemon.ask_to_stop()
+        await until(lambda: fake_autopilot.mode == "LOITER", 2.0)
+        assert not fake_autopilot.failsafe
+        assert await ship.ending == Ending(None)
+        assert "STOPPING=1" in ship.service
+        assert fake_autopilot.setpoints[-1][0] - asked_s < 2.0
     (path,) = tmp_path.glob("tiny-*.mcap")
     _replays_to_the_last_bit(Recording(path))
 
@@ -251,37 +230,34 @@ def _replays_to_the_last_bit(recording: Recording) -> None:
         assert {**again, "stages_ms": None} == {**step.output, "stages_ms": None}
 
 
-def test_an_operator_sends_it_somewhere_and_the_recording_replays(
+async def test_an_operator_sends_it_somewhere_and_the_recording_replays(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    async def story() -> None:
-        async with aboard(
-            fake_autopilot,
-            port,
-            tmp_path,
-            recordings=tmp_path,
-            change=lambda config: config.model_copy(update={"safety": ALONE}),
-        ) as ship:
-            await ship.is_ready_in_the_air()
-            assert await ship.fleet("goto", "tiny", "1", "0") == 1, "flockd does not fly it yet"
-            assert await ship.fleet("goto", "nobody", "1", "0") == 69
-            await ship.flies()
-            assert await ship.fleet("goto", "tiny", "300", "0") == 1
-            assert await ship.fleet("hold", "tiny") == 1, "not among telemetry.commands"
-            assert ship.mission("kind") == "circle_then_tangent", "nothing has changed"
-            north, east = fake_autopilot.state.position[:2] - [0.0, 2.0]
-            command = ("goto", "tiny", f"{north:.3f}", f"{east:.3f}", "--height", f"{HOVER_M + 1.0}", "--speed", "1")
-            assert await ship.fleet(*command) == 0
-            await until(lambda: ship.mission("arrived") is True, SECONDS_TO_FAIL)
-            await until(lambda: -fake_autopilot.state.position[2] > HOVER_M + 0.8, SECONDS_TO_FAIL)
-            away = fake_autopilot.state.position[:2] - [north, east]
-            assert float(np.linalg.norm(away)) < 1.5
-            assert fake_autopilot.mode == "OFFBOARD"
-            assert await ship.fleet("velocity", "tiny", "0.3", "0") == 0
-            await until(lambda: ship.mission("sentence") == "flies an operator's velocity", SECONDS_TO_FAIL)
-            await until(lambda: str(ship.mission("sentence")).startswith("hovers"), SECONDS_TO_FAIL)
-
-    run(story)
+    async with aboard(
+        fake_autopilot,
+        port,
+        tmp_path,
+        recordings=tmp_path,
+        change=lambda config: config.model_copy(update={"safety": ALONE}),
+    ) as ship:
+        await ship.is_ready_in_the_air()
+        assert await ship.fleet("goto", "tiny", "1", "0") == 1, "flockd does not fly it yet"
+        assert await ship.fleet("goto", "nobody", "1", "0") == 69
+        await ship.flies()
+        assert await ship.fleet("goto", "tiny", "300", "0") == 1
+        assert await ship.fleet("hold", "tiny") == 1, "not among telemetry.commands"
+        assert ship.mission("kind") == "circle_then_tangent", "nothing has changed"
+        north, east = fake_autopilot.state.position[:2] - [0.0, 2.0]
+        command = ("goto", "tiny", f"{north:.3f}", f"{east:.3f}", "--height", f"{HOVER_M + 1.0}", "--speed", "1")
+        assert await ship.fleet(*command) == 0
+        await until(lambda: ship.mission("arrived") is True, SECONDS_TO_FAIL)
+        await until(lambda: -fake_autopilot.state.position[2] > HOVER_M + 0.8, SECONDS_TO_FAIL)
+        away = fake_autopilot.state.position[:2] - [north, east]
+        assert float(np.linalg.norm(away)) < 1.5
+        assert fake_autopilot.mode == "OFFBOARD"
+        assert await ship.fleet("velocity", "tiny", "0.3", "0") == 0
+        await until(lambda: ship.mission("sentence") == "flies an operator's velocity", SECONDS_TO_FAIL)
+        await until(lambda: str(ship.mission("sentence")).startswith("hovers"), SECONDS_TO_FAIL)
     told = capsys.readouterr()
     assert "m from home, outside the fence of 100 m" in told.err
     assert "flockd does not fly the drone now" in told.err
@@ -293,24 +269,20 @@ def test_an_operator_sends_it_somewhere_and_the_recording_replays(
 
 
 @pytest.mark.parametrize(("end", "mode"), [("land", "LAND"), ("return", "RTL")])
-def test_at_its_end_a_mission_hands_over_to_the_autopilot(
+async def test_at_its_end_a_mission_hands_over_to_the_autopilot(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, end: Literal["land", "return"], mode: str
 ) -> None:
     goal = WaypointParameters(north_m=2.0, east_m=0.0)
     mission = MissionParameters(kind="waypoints", waypoints=(goal,), speed_m_s=1.0, at_end=end)
-
-    async def story() -> None:
-        async with aboard(
-            fake_autopilot, port, tmp_path, change=lambda config: config.model_copy(update={"mission": mission})
-        ) as ship:
-            await ship.is_ready_in_the_air()
-            fake_autopilot.pilot_selects("OFFBOARD")
-            await until(lambda: fake_autopilot.mode == mode, SECONDS_TO_FAIL)
-            assert not fake_autopilot.failsafe
-            await ship.until_event(f"asking: the mission is over and ends with {end.capitalize()}")
-            await ship.until_state("silent", "idle")
-
-    run(story)
+    async with aboard(
+        fake_autopilot, port, tmp_path, change=lambda config: config.model_copy(update={"mission": mission})
+    ) as ship:
+        await ship.is_ready_in_the_air()
+        fake_autopilot.pilot_selects("OFFBOARD")
+        await until(lambda: fake_autopilot.mode == mode, SECONDS_TO_FAIL)
+        assert not fake_autopilot.failsafe
+        await ship.until_event(f"asking: the mission is over and ends with {end.capitalize()}")
+        await ship.until_state("silent", "idle")
 
 
 @pytest.mark.parametrize(
@@ -320,50 +292,43 @@ def test_at_its_end_a_mission_hands_over_to_the_autopilot(
         ("pilot", "flockd.onboard.daemon.pilot_loop.PilotLoop._step"),
     ],
 )
-def test_a_dead_task_is_held_by_the_last_resort(
+async def test_a_dead_task_is_held_by_the_last_resort(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch, task: str, function: str
 ) -> None:
-    async def story() -> None:
-        async with aboard(fake_autopilot, port, tmp_path) as ship:
-            await ship.is_ready_in_the_air()
-            await ship.flies()
+    async with aboard(fake_autopilot, port, tmp_path) as ship:
+        await ship.is_ready_in_the_air()
+        await ship.flies()
 
-            def dies(*_: object) -> None:
-                raise ArithmeticError("for the test")
+        def dies(*_: object) -> None:
+            raise ArithmeticError("for the test")
 
-            monkeypatch.setattr(function, dies)
-            await until(lambda: fake_autopilot.mode == "LOITER", 2.0)
-            assert not fake_autopilot.failsafe
-            with pytest.raises(DaemonError, match=rf"a task died \({task}: ArithmeticError\('for the test'\)\)"):
-                await ship.ending
-
-    run(story)
+        monkeypatch.setattr(function, dies)
+        await until(lambda: fake_autopilot.mode == "LOITER", 2.0)
+        assert not fake_autopilot.failsafe
+        with pytest.raises(DaemonError, match=rf"a task died \({task}: ArithmeticError\('for the test'\)\)"):
+            await ship.ending
 
 
-def test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe(
+async def test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
-    async def story() -> None:
-        async with aboard(fake_autopilot, port, tmp_path) as ship:
-            await ship.is_ready_in_the_air()
-            await ship.flies()
-            ship.service.clear()
-            blocked_s = clock()
-            time.sleep(2.0)
-            assert fake_autopilot.setpoints[-1][0] - blocked_s < 0.5
-            assert fake_autopilot.mode == "LOITER"
-            assert fake_autopilot.failsafe
-            before = len(fake_autopilot.setpoints)
-            await ship.until_state("silent")
-            assert len(fake_autopilot.setpoints) == before, "one more, and PX4 would be in offboard again"
-
-    run(story)
+    async with aboard(fake_autopilot, port, tmp_path) as ship:
+        await ship.is_ready_in_the_air()
+        await ship.flies()
+        ship.service.clear()
+        blocked_s = clock()
+        time.sleep(2.0)
+        assert fake_autopilot.setpoints[-1][0] - blocked_s < 0.5
+        assert fake_autopilot.mode == "LOITER"
+        assert fake_autopilot.failsafe
+        before = len(fake_autopilot.setpoints)
+        await ship.until_state("silent")
+        assert len(fake_autopilot.setpoints) == before, "one more, and PX4 would be in offboard again"
 
 
-def test_arming_and_taking_off_by_itself_where_configured(tmp_path: Path) -> None:
+async def test_arming_and_taking_off_by_itself_where_configured(tmp_path: Path) -> None:
     port = free_port()
-
-    async def story() -> None:
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
         async with aboard(fake_autopilot, port, tmp_path, arm_and_take_off=True, height_m=HOVER_M) as ship:
             await until(lambda: fake_autopilot.mode == "OFFBOARD", SECONDS_TO_FAIL)
             await ship.until_state("normal", "degraded")
@@ -372,18 +337,16 @@ def test_arming_and_taking_off_by_itself_where_configured(tmp_path: Path) -> Non
             assert (await ship.ask("ask/land"))["accepted"] is True
             await until(lambda: fake_autopilot.mode == "LAND", SECONDS_TO_FAIL)
 
-    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
-        run(story)
-
 
 def _wrong() -> DroneConfig:
     raise ConfigError([ConfigProblem("tiny.yaml", 3, "step_s", "is missing")])
 
 
-def test_what_the_autopilot_refuses_is_in_status_word_for_word_and_once_in_the_log(tmp_path: Path, port: int) -> None:
+async def test_what_the_autopilot_refuses_is_in_status_word_for_word_and_once_in_the_log(
+    tmp_path: Path, port: int
+) -> None:
     sentence = "the autopilot refuses to arm: a gyroscope is not calibrated; calibrate it in the ground station"
-
-    async def story() -> None:
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
         async with aboard(fake_autopilot, port, tmp_path) as ship:
             await ship.ask("about")  # the session that receives events is connected
             fake_autopilot.failing = {"check_gyro_not_calibrated"}
@@ -395,28 +358,25 @@ def test_what_the_autopilot_refuses_is_in_status_word_for_word_and_once_in_the_l
             await until(lambda: not ship.refusals(), SECONDS_TO_FAIL)
             assert ship.events.count(sentence) == 1
 
-    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
-        run(story)
 
-
-def test_the_configuration_is_read_again_on_the_ground_only(
+async def test_the_configuration_is_read_again_on_the_ground_only(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
-    async def story() -> None:
-        async with aboard(fake_autopilot, port, tmp_path) as ship:
-            await ship.until_state("idle")
-            about = await ship.ask("about")
-            assert about["configuration"]["name"] == "tiny"
-            picture = cv2.imdecode(np.frombuffer(await ship.picture("front"), np.uint8), cv2.IMREAD_COLOR)
-            assert picture is not None
-            assert picture.shape == (48, 64, 3)
-            assert await ship.picture("bottom") == b"camera 'bottom' has no image"
-            ship.daemon.ask_to_reload(lambda: pytest.fail("read in the air"))
-            await ship.until_event("the configuration was not read again, because the drone is armed or in the air")
-            assert not ship.ending.done()
-
-    async def on_the_ground(fake_autopilot: FakeAutopilot, port: int) -> None:
-        async with aboard(fake_autopilot, port, tmp_path / "ground") as ship:
+    async with aboard(fake_autopilot, port, tmp_path) as ship:
+        await ship.until_state("idle")
+        about = await ship.ask("about")
+        assert about["configuration"]["name"] == "tiny"
+        picture = cv2.imdecode(np.frombuffer(await ship.picture("front"), np.uint8), cv2.IMREAD_COLOR)
+        assert picture is not None
+        assert picture.shape == (48, 64, 3)
+        assert await ship.picture("bottom") == b"camera 'bottom' has no image"
+        ship.daemon.ask_to_reload(lambda: pytest.fail("read in the air"))
+        await ship.until_event("the configuration was not read again, because the drone is armed or in the air")
+        assert not ship.ending.done()
+    (tmp_path / "ground").mkdir()
+    second = free_port()
+    with FakeAutopilot(second, heartbeat_s=HEARTBEAT_S, clock=clock) as on_ground:
+        async with aboard(on_ground, second, tmp_path / "ground") as ship:
             await ship.until_state("idle")
             await ship.ask("about")  # the session that receives events is connected
             ship.daemon.ask_to_reload(_wrong)
@@ -425,20 +385,11 @@ def test_the_configuration_is_read_again_on_the_ground_only(
             ship.daemon.ask_to_reload(lambda: other)
             assert await ship.ending == Ending(other)
 
-    run(story)
-    (tmp_path / "ground").mkdir()
-    second = free_port()
-    with FakeAutopilot(second, heartbeat_s=HEARTBEAT_S, clock=clock) as on_ground:
-        run(lambda: on_the_ground(on_ground, second))
 
-
-def test_it_can_be_told_to_stop_before_an_autopilot_is_heard(tmp_path: Path, port: int) -> None:
-    async def story() -> None:
-        silent = FakeAutopilot(port, clock=clock)  # never started
-        async with aboard(silent, port, tmp_path) as ship:
-            await asyncio.sleep(0.3)
-            ship.daemon.ask_to_stop()
-            async with asyncio.timeout(SECONDS_TO_FAIL):
-                assert await ship.ending == Ending(None)
-
-    run(story)
+async def test_it_can_be_told_to_stop_before_an_autopilot_is_heard(tmp_path: Path, port: int) -> None:
+    silent = FakeAutopilot(port, clock=clock)  # never started
+    async with aboard(silent, port, tmp_path) as ship:
+        await asyncio.sleep(0.3)
+        ship.daemon.ask_to_stop()
+        async with asyncio.timeout(SECONDS_TO_FAIL):
+            assert await ship.ending == Ending(None)

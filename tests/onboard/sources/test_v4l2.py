@@ -234,6 +234,17 @@ def test_a_camera_whose_images_show_nothing_has_a_fault_until_one_shows_somethin
     assert source.status()["front"].counts["undecodable"] == 3
 
 
+def test_a_stamp_that_does_not_increase_is_dropped(start: Start) -> None:
+    kernel = FakeKernel(front=FakeCamera())
+    source = start(kernel, _camera())
+    stamp = kernel.send("front", JPEGS[0])
+    kernel.send("front", JPEGS[1], time_s=stamp)
+    kernel.send("front", JPEGS[2], time_s=stamp - 0.01)
+    _received(source, front=3)
+    assert source.status()["front"].counts["time_stamp"] == 2
+    assert _next(source).frames["front"].sequence == 0
+
+
 def test_an_unplugged_camera_is_reported_at_once_and_comes_back_when_plugged_in(start: Start) -> None:
     kernel = FakeKernel(front=FakeCamera(), back=FakeCamera())
     source = start(kernel, _camera("front", controls=BY_HAND), _camera("back"))
