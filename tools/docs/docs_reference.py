@@ -19,6 +19,7 @@ from typing import Any
 from flockd.cli import _parser
 from flockd.core.config import schema_of
 from flockd.core.config.safety import SafetyParameters
+from flockd.core.services import SERVICES
 from flockd.flight.safety.policy import Barrier, Reaction, rules
 from flockd.onboard.autopilot.refusal_reasons import REASONS
 from flockd.onboard.telemetry import topics
@@ -361,6 +362,21 @@ def faults_page() -> str:
     for event, rule in rules(SafetyParameters()).items():
         later = "" if math.isinf(rule.after_s) else f"{_reaction(rule.later)} after {rule.after_s:g} s"
         lines.append(f"| `{event.value}` | {BEFORE[rule.barrier]} | {_reaction(rule.reaction)} | {later} |")
+    lines += [
+        "",
+        "## Time-outs",
+        "",
+        "How old each message may become, and what is done then. A reaction in code type is an event of the table",
+        "above. The keys of the [configuration](configuration.md) change a time-out for one drone.",
+        "",
+        "| message | rate, Hz | time-out | reaction | keys |",
+        "|---|---|---|---|---|",
+    ]
+    events = {event.value for event in rules(SafetyParameters())}
+    for one in SERVICES:
+        reaction = f"`{one.reaction}`" if one.reaction in events else one.reaction
+        keys = ", ".join(f"`{key}`" for key in one.keys)
+        lines.append(f"| {one.message} | {one.rate_hz:g} | {one.timeout:g} {one.unit} | {reaction} | {keys} |")
     return "\n".join(lines) + "\n"
 
 

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from flockd.core import services
 from flockd.core.config.base import Distance, Section, Share, Speed
 
 
@@ -16,15 +17,15 @@ class AutopilotParameters(Section):
     """`udpin://` waits for an autopilot that sends to this address; `serial:///dev/ttyS1:921600` is a cable."""
     system_id: Annotated[int, Field(ge=1, le=255)] | None = None
     """The autopilot's MAV_SYS_ID; other systems are ignored. By default that of the first heartbeat received."""
-    setpoint_rate_hz: Annotated[float, Field(ge=5, le=50)] = 20.0
-    max_setpoint_age_s: Annotated[float, Field(gt=0, le=10)] = 1.0
+    setpoint_rate_hz: Annotated[float, Field(ge=5, le=50)] = services.SETPOINT.rate_hz
+    max_setpoint_age_s: Annotated[float, Field(gt=0, le=10)] = services.REQUEST.timeout
     """An older setpoint is not sent."""
-    max_control_age_s: Annotated[float, Field(gt=0, le=0.4)] = 0.3
+    max_control_age_s: Annotated[float, Field(gt=0, le=0.4)] = services.CONTROL.timeout
     """Nothing is sent when the control loop has not run for this long."""
-    max_gap_s: Annotated[float, Field(gt=0, le=0.9)] = 0.5
+    max_gap_s: Annotated[float, Field(gt=0, le=0.9)] = services.SETPOINT.timeout
     """A longer gap between setpoints in offboard flight ends the stream until it is begun anew. Keep it below PX4's
     COM_OF_LOSS_T: PX4 returns to offboard by itself when setpoints come back."""
-    max_heartbeat_age_s: Annotated[float, Field(gt=0, le=10)] = 2.0
+    max_heartbeat_age_s: Annotated[float, Field(gt=0, le=10)] = services.HEARTBEAT.timeout
     """The link counts as lost when no heartbeat has arrived for this long."""
     on_failure: Literal["hold", "land"] = "hold"
     """The mode that flockd requests from the autopilot when it cannot go on."""

@@ -6,6 +6,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
+from flockd.core import services
 from flockd.core.choices import ROLES, FlowRefinement, HeightSource, Provider, Role, ScaleSource
 from flockd.core.config.base import Distance, NonNegative, Positive, Section, Share, refuse
 
@@ -82,7 +83,7 @@ class NoiseParameters(Section):
 class RangeFinderParameters(Section):
     """When a range to the ground is used, and how the ground below is followed from ranges."""
 
-    max_age_s: Annotated[float, Field(gt=0, le=5)] = 0.3
+    max_age_s: Annotated[float, Field(gt=0, le=5)] = services.GROUND_RANGE.timeout
     """An older reading is not used: the sensor has stopped."""
     min_quality: Share = 0.1
     """Nor is one whose signal is weaker, where the sensor says how strong it is."""

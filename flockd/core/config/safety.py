@@ -6,6 +6,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
+from flockd.core import services
 from flockd.core.choices import AutopilotMode
 from flockd.core.config.base import Duration, Positive, Section, Share
 
@@ -15,11 +16,11 @@ _Metres = Annotated[float, Field(ge=-100_000, le=100_000)]
 class GateParameters(Section):
     """The last limits on what is sent to the autopilot, whatever asks for it."""
 
-    permission_timeout_s: Annotated[float, Field(gt=0, le=0.4)] = 0.3
+    permission_timeout_s: Annotated[float, Field(gt=0, le=0.4)] = services.PERMISSION.timeout
     """The supervisor's permission is good for this long: what has stalled sends nothing half a second later."""
-    command_fresh_s: Annotated[float, Field(gt=0, le=60)] = 0.9
+    command_fresh_s: Annotated[float, Field(gt=0, le=60)] = services.WANTED.timeout
     """A command older than this is flown ever slower: the pilot has missed a step. Leave it a step and its duration."""
-    command_timeout_s: Annotated[float, Field(gt=0, le=60)] = 1.5
+    command_timeout_s: Annotated[float, Field(gt=0, le=60)] = services.WANTED_GONE.timeout
     """By this age of the command the drone stands still, and one that is older is not flown at all; leave the pilot
     three of its steps."""
     max_speed_m_s: Annotated[float, Field(gt=0, le=50)] = 4.0
@@ -74,13 +75,13 @@ class SafetyParameters(Section):
     """When the drone slows down, hovers, hands over to the autopilot and falls silent."""
 
     gate: GateParameters = GateParameters()
-    camera_timeout_periods: Annotated[float, Field(gt=0, le=100)] = 3.0
+    camera_timeout_periods: Annotated[float, Field(gt=0, le=100)] = services.FRAME.timeout
     """A camera without a usable frame for this many of its frame periods is lost."""
     max_lost_cameras: Annotated[int, Field(ge=0)] = 1
     """Fly on with the others, degraded, while no more than this many are lost; at least one has to see."""
     max_dropped_share: Share = 0.2
     """Limit of the share of dropped frames of late; above it, degraded."""
-    estimate_timeout_s: Annotated[float, Field(gt=0, le=60)] = 1.5
+    estimate_timeout_s: Annotated[float, Field(gt=0, le=60)] = services.ESTIMATE.timeout
     """Hover when the pilot's newest output is older than this; leave it three of its steps."""
     degraded_ego_motion_failures: Annotated[int, Field(ge=1)] = 2
     """Steps in a row without own motion, to be degraded."""
@@ -96,9 +97,9 @@ class SafetyParameters(Section):
     """The same, to hover."""
     max_loop_lag_s: Annotated[float, Field(gt=0, le=10)] = 0.2
     """Lag of the event loop; above it, degraded."""
-    heartbeat_timeout_s: Annotated[float, Field(gt=0, le=10)] = 2.0
+    heartbeat_timeout_s: Annotated[float, Field(gt=0, le=10)] = services.HEARTBEAT.timeout
     """The link to the autopilot counts as lost, and flockd falls silent for good."""
-    neighbours_timeout_s: Annotated[float, Field(gt=0, le=60)] = 2.0
+    neighbours_timeout_s: Annotated[float, Field(gt=0, le=60)] = services.NEIGHBOUR.timeout
     """No confirmed neighbour seen for this long: the drone is alone."""
     alone_s: Duration | None = 10.0
     """How long it flies on alone before it asks for Hold. null: for ever."""

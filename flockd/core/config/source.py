@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from flockd.core import services
 from flockd.core.choices import PixelFormat
 from flockd.core.config.base import Section, refuse
 
@@ -67,7 +68,7 @@ class SourceParameters(Section):
     """How far the time stamp of a frame may be from that of its set; half a frame period or more."""
     set_wait_s: Annotated[float, Field(gt=0, le=60)] = 0.1
     """How long a set waits for a camera that is late, or gone."""
-    silence_s: Annotated[float, Field(gt=0, le=60)] = 0.5
+    silence_s: Annotated[float, Field(gt=0, le=60)] = services.FRAME_SILENCE.timeout
     """A camera without a usable frame for this long is closed and opened again."""
     frozen_after: Annotated[int, Field(ge=0)] = 5
     """An image that repeats itself this many times is frozen, and counts as no image; 0: may repeat for ever."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flockd.core import services
 from flockd.core.messages import FloatArray
 
 WINDOW_S = 30.0
@@ -22,8 +23,6 @@ DRIFT = 5e-5
 JUMP_S = 0.01
 JUMPS = 3
 """So many round trips in a row that contradict the estimate by `JUMP_S` and half their duration begin a new one."""
-LONGEST_S = 1.0
-"""A longer round trip says nothing."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ class ClockSync:
     def add(self, sent_s: float, autopilot_s: float, received_s: float) -> None:
         """Takes a round trip: when it began and ended on this computer's clock, and the autopilot's time between."""
         duration_s, middle_s = received_s - sent_s, 0.5 * (sent_s + received_s)
-        if not 0.0 <= duration_s <= LONGEST_S:
+        if not 0.0 <= duration_s <= services.TIME_SYNC.timeout:
             return
         sample = middle_s, autopilot_s - middle_s, duration_s
         if self.estimate is not None and _contradict(sample, self.estimate.offset_s):

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from flockd.core import services
 from flockd.core.messages import FloatArray, RangeReading, VehicleState
 from flockd.flight.geometry import rotation_from_quaternion
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus, FlightMode, LandedState
@@ -69,8 +70,6 @@ FACES_DOWN = 25
 """MAV_SENSOR_ROTATION_PITCH_270 of MAV_SENSOR_ORIENTATION."""
 FULL_SIGNAL, NO_SIGNAL = 100, 1
 """Values of DISTANCE_SENSOR's `signal_quality`, in percent; 0 is for sensors that do not say."""
-RANGE_LOST_S = 0.5
-"""A range finder that is silent for so long gives way to the autopilot's own distance to bottom."""
 QUATERNION_TOLERANCE = 0.1
 """How far a quaternion's norm may be from 1; one that is farther off is no attitude."""
 HOME_TOLERANCE_M = 0.5
@@ -86,8 +85,6 @@ TEXTS_KEPT = 20
 TEXT_MEMORY_S = 10.0
 """For how long a text counts as a reason for a refusal; nor is it reported again meanwhile."""
 MAV_TYPE_ONBOARD_CONTROLLER = 18
-OTHER_COMPUTER_S = 5.0
-"""For how long another onboard computer counts as there after its last heartbeat."""
 TEXT_CHUNK = 50
 """Characters of a STATUSTEXT; one with fewer is the last of its text."""
 
@@ -162,7 +159,7 @@ class ReceivedMessages:
             self.check_events,
             {name: self._fields(name) for name in ("HEARTBEAT", "SYS_STATUS")},
             self.recent_texts(now_s, TEXT_MEMORY_S),
-            now_s - self._other_computer_s < OTHER_COMPUTER_S,
+            now_s - self._other_computer_s < services.OTHER_HEARTBEAT.timeout,
             streams=streams,
         )
 
@@ -266,7 +263,7 @@ class ReceivedMessages:
         bottom = None if altitude is None else _vector(altitude.fields, "bottom_clearance")
         if altitude is None or bottom is None or bottom[0] <= 0.0:
             return sensor
-        if sensor is not None and altitude.time_s - sensor.time_s <= RANGE_LOST_S:
+        if sensor is not None and altitude.time_s - sensor.time_s <= services.RANGE_FINDER.timeout:
             return sensor
         return RangeReading(altitude.time_s, float(bottom[0]), vertical=True)
 

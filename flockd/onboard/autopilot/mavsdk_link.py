@@ -26,6 +26,7 @@ from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkDirectError, Mav
 from mavsdk.plugins.param import Param, ParamError
 from mavsdk.system import System
 
+from flockd.core import services
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.messages import RangeReading, Setpoint, VehicleState
 from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware, FlightMode
@@ -51,7 +52,7 @@ COMMAND_RUN_CHECKS = 401
 STARTS = frozenset({COMMAND_ARM_DISARM, COMMAND_SET_MODE})
 """Commands that the autopilot's checks may refuse."""
 STREAMS_HZ = {
-    "ATTITUDE_QUATERNION": (31, 50.0),
+    "ATTITUDE_QUATERNION": (31, services.VEHICLE_STATE.rate_hz),
     "LOCAL_POSITION_NED": (32, 30.0),
     "EXTENDED_SYS_STATE": (245, 2.0),
     "SYS_STATUS": (1, 1.0),
@@ -59,20 +60,16 @@ STREAMS_HZ = {
     "ESTIMATOR_STATUS": (230, 2.0),
     "HOME_POSITION": (242, 1.0),
     "CURRENT_MODE": (436, 20.0),
-    "DISTANCE_SENSOR": (132, 30.0),
+    "DISTANCE_SENSOR": (132, services.RANGE_FINDER.rate_hz),
     "ALTITUDE": (141, 10.0),
 }
 """What is asked for, by message number and rate. PX4 sends CURRENT_MODE at once when the mode changes, at this rate at
 most; its heartbeat comes once a second whatever one asks."""
 RECEIVED = (*STREAMS_HZ, "HEARTBEAT", "AUTOPILOT_VERSION", "STATUSTEXT", "EVENT")
 TIME_SYNC = "TIMESYNC"
-TIME_SYNC_S = 0.1
-"""Between two exchanges."""
 MOST_OPEN = 20
 """Exchanges whose reply is waited for; older ones are lost."""
 TEXT_MEMORY_S = 2.0
-STREAMS_S = 0.5
-"""Setpoints that are not farther apart are a stream."""
 MOST_REPORTS = 100
 
 _log = logging.getLogger(__name__)
@@ -165,7 +162,7 @@ class AutopilotLink:
     def refusals(self) -> tuple[Refusal, ...]:
         """Why it would refuse to arm or to fly offboard now, the cause first."""
         now = self._clock()
-        return self._received.refusals(now, streams=now - self._sent_s < STREAMS_S)
+        return self._received.refusals(now, streams=now - self._sent_s < services.SETPOINT_STREAM.timeout)
 
     def knows_checks(self) -> bool:
         """Whether the autopilot's list of failed checks is here, and whole."""
@@ -186,7 +183,7 @@ class AutopilotLink:
             self._time_syncs.append(sent_ns)
             with suppress(MavlinkDirectError):  # a link that cannot send says so where setpoints are sent
                 self._direct.send_message(self._message(TIME_SYNC, {"tc1": 0, "ts1": sent_ns}))
-            await asyncio.sleep(TIME_SYNC_S)
+            await asyncio.sleep(services.TIME_SYNC.period_s)
 
     def take_reports(self) -> list[str]:
         """What happened to the messages since the last call that people should know, each in one sentence."""

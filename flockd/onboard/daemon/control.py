@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from flockd.core import services
 from flockd.core.config import DroneConfig
 from flockd.core.messages import VehicleState, Wanted
 from flockd.flight.obstacles import nearest_points
@@ -32,7 +33,7 @@ from flockd.onboard.daemon.pilot_loop import PilotLoop
 from flockd.onboard.daemon.supervisor_inputs import InputCollector, position_from_home
 from flockd.onboard.daemon.vehicle_history import VehicleHistory
 
-PERIOD_S = 0.05
+PERIOD_S = services.CONTROL.period_s
 FLYING = frozenset({State.NORMAL, State.DEGRADED, State.HOVER, State.ASKING})
 _TAKEOVERS: dict[Action, Takeover] = {Action.ASK_HOLD: "hold", Action.ASK_RETURN: "return", Action.ASK_LAND: "land"}
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import bisect
 from collections import deque
 
+from flockd.core import services
 from flockd.core.messages import FloatArray, RangeReading, VehicleState
 from flockd.flight.geometry import rotation_from_vector, vector_from_rotation
 
-HISTORY_S = 2.0
+HISTORY_S = services.VEHICLE_STATE.timeout
 
 
 class VehicleHistory:

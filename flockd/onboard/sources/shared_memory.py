@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 import zenoh
 from zenoh import shm
 
+from flockd.core import services
 from flockd.core.config.drone import DroneConfig
 from flockd.core.config.source import SourceParameters
 from flockd.core.messages import Frame, FrameSet
@@ -28,7 +29,6 @@ PREFIX = "flockd-frames/v1"
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7448"
 _HEADER = struct.Struct("<4sHHQd")
 _MAGIC = b"rgb8"
-MAX_AGE_S = 5.0
 """Largest age of a frame on arrival: a simulator stamps before it draws, and may draw for long."""
 POOL_BYTES = 16 << 20
 """For one drone, in whose memory it counts: four sets of four 640x480 cameras."""
@@ -154,7 +154,7 @@ class SharedMemorySource:
             why = f"{camera}: frames are {width}x{height}, but the rig has {asked}; correct one"
             self._receiver.refuse(camera, "corrupt", why)
             return
-        if not self._receiver.is_of_now(time_s, MAX_AGE_S):
+        if not self._receiver.is_of_now(time_s, services.FRAME_STAMP.timeout):
             why = f"{camera}: a time stamp is not of this computer's clock; correct the program"
             self._receiver.refuse(camera, "time_stamp", why)
             return

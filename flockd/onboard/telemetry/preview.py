@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
+from flockd.core import services
 from flockd.core.messages import Detection, Frame, FrameSet, PilotOutput, UInt8Array
 from flockd.flight.geometry import Rig, RigCamera
 
@@ -17,7 +18,7 @@ LARGEST_SIDE_PX = 320
 JPEG_QUALITY = 70
 EVERY_S = 1.0
 """A camera's picture is made no oftener, however many ask."""
-FRESH_S = 2.0
+FRESH_S = services.PREVIEW.timeout
 """While the pilot steps, frames of its newest step are at most this much older than the newest."""
 _COLOUR = (255, 109, 0)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX

@@ -16,6 +16,8 @@ import re
 from dataclasses import dataclass
 from typing import TypedDict
 
+from flockd.core import services
+
 PREFIX = "flockd/v1"
 _NAME = re.compile(r"[A-Za-z0-9_.-]+")
 
@@ -276,19 +278,22 @@ class Topic:
     recorded: bool
 
 
+_STEP = services.STEP_TOPIC.rate_hz, services.STEP_TOPIC.timeout
+_COMPUTER = services.COMPUTER_TOPIC.rate_hz, services.COMPUTER_TOPIC.timeout
+
 TOPICS = {
     topic.key: topic
     for topic in (
-        Topic("state", StateMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
-        Topic("neighbours", NeighboursMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
-        Topic("obstacles", ObstaclesMessage, rate_hz=2.0, stale_after_s=1.5, recorded=False),
-        Topic("command", CommandMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
-        Topic("mission", MissionMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
-        Topic("health", HealthMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
+        Topic("state", StateMessage, *_STEP, recorded=True),
+        Topic("neighbours", NeighboursMessage, *_STEP, recorded=True),
+        Topic("obstacles", ObstaclesMessage, *_STEP, recorded=False),
+        Topic("command", CommandMessage, *_STEP, recorded=True),
+        Topic("mission", MissionMessage, *_STEP, recorded=True),
+        Topic("health", HealthMessage, *_STEP, recorded=True),
         Topic("events", EventMessage, rate_hz=None, stale_after_s=None, recorded=True),
-        Topic("timings", TimingsMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
-        Topic("flight", FlightMessage, rate_hz=2.0, stale_after_s=1.5, recorded=True),
-        Topic("computer", ComputerMessage, rate_hz=1.0, stale_after_s=3.0, recorded=True),
-        Topic("clock", ClockMessage, rate_hz=1.0, stale_after_s=3.0, recorded=True),
+        Topic("timings", TimingsMessage, *_STEP, recorded=True),
+        Topic("flight", FlightMessage, *_STEP, recorded=True),
+        Topic("computer", ComputerMessage, *_COMPUTER, recorded=True),
+        Topic("clock", ClockMessage, *_COMPUTER, recorded=True),
     )
 }
