@@ -7,9 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from flockd.core.config import load_scenario
 from flockd.core.config.scenario import RangeFinderConfig, SensorConfig
-from flockd.core.data import data_path
 from flockd.core.messages import FloatArray, RangeReading
 from flockd.flight.geometry import rotation_from_euler
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground, range_to_ground
@@ -103,9 +101,3 @@ def test_a_drone_without_a_range_finder_has_no_range_and_its_other_errors_are_th
     assert bare.ground_range is None
     assert full.ground_range is not None
     assert bare.height_m == full.height_m
-
-
-def test_the_scenario_of_hills_begins_above_them() -> None:
-    scenario = load_scenario(data_path("config") / "hills.yaml")
-    assert (scenario.world.hills_m, scenario.world.hills_slope) == (5.0, 0.15)
-    assert max(start.position_m[2] for start in scenario.vehicles) <= -5.0

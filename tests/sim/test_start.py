@@ -34,10 +34,6 @@ def test_a_larger_flock_keeps_the_given_and_stands_apart(count: int) -> None:
     assert max(math.dist(place[:2], (1.92, 0.9)) for place in places) < 7.0 * math.sqrt(count / math.pi) + 7.0
 
 
-def test_the_same_request_gives_the_same_places() -> None:
-    assert with_drones(PAPER, 30) == with_drones(PAPER, 30)
-
-
 def test_an_empty_flock_is_refused() -> None:
     with pytest.raises(ValueError, match="at least 1"):
         with_drones(PAPER, 0)

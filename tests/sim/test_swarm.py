@@ -93,15 +93,6 @@ def test_each_drone_decides_from_its_own_images_alone() -> None:
     assert np.array_equal(right.command_velocity[0], wrong.command_velocity[0])
 
 
-def test_truth_flight_ends_as_the_pentagon() -> None:
-    """The paper's law with weight 1: sides 2.47 m, diagonals 4.00 m."""
-    paper = load_scenario(data_path("config") / "paper_flight.yaml")
-    end = fly(paper, perception="truth").log.position[-1, :, :2]
-    distances = np.sort(np.linalg.norm(end[:, None] - end[None], axis=2)[np.triu_indices(5, 1)])
-    assert np.allclose(distances[:5], 2.47, atol=0.03)
-    assert np.allclose(distances[5:], 4.00, atol=0.03)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_papers_flight_from_pixels(seed: int) -> None:

@@ -15,7 +15,7 @@ from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.config.scenario import ScenarioConfig, SensorConfig, StartConfig, VehicleConfig
 from flockd.flight.flocking.metrics import min_distance, obj2, pair_distances
 from flockd.flight.geometry import rotation_from_euler
-from flockd.sim.exact_states import fly_exact_states, step_times
+from flockd.sim.exact_states import fly_exact_states
 from flockd.sim.vehicles import SimulatedAutopilot, Vehicles, attitude
 
 Array = NDArray[np.float64]
@@ -119,12 +119,6 @@ def test_thrust_carries_the_weight_and_accelerates() -> None:
     np.testing.assert_allclose(np.linalg.det(R_ned_body), 1.0)
 
 
-def test_euler_angles_are_the_aerospace_ones() -> None:
-    roll, pitch, yaw = 0.3, -0.4, 2.5
-    reference = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
-    np.testing.assert_allclose(rotation_from_euler(roll, pitch, yaw), reference, atol=1e-15)
-
-
 def test_it_leans_into_the_air_that_comes_against_it() -> None:
     cruising = Vehicles([StartConfig(position_m=(0.0, 0.0, -3.0), velocity_m_s=(1.0, 0.0))], VehicleConfig())
     lean_deg = math.degrees(math.atan(0.3 / 9.81))
@@ -216,7 +210,3 @@ def test_five_with_exact_states_become_the_pentagon() -> None:
     assert np.abs(sums - sums.mean()).mean() < 0.0206
     assert sums.mean() == pytest.approx(15.27, abs=0.01)
     assert min(min_distance(step) for step in positions) > 1.19  # the start itself is the narrowest: 1.08 m, 0.5 m up
-
-
-def test_a_flight_has_a_step_for_each_interval() -> None:
-    np.testing.assert_allclose(step_times(FIVE.model_copy(update={"duration_s": 2.0})), [0.0, 0.5, 1.0, 1.5])

@@ -45,20 +45,18 @@ def test_wide_angle_projects_as_opencv_does_ahead(lens: tuple[float, ...]) -> No
     assert np.allclose(camera.jacobian(points), derivative[:, 11:14].reshape(-1, 2, 3), atol=1e-6)
 
 
-@pytest.mark.parametrize("camera", [PinholeCamera(MATRIX, SIZE, lens) for lens in PINHOLE_LENSES])
-def test_pinhole_lifts_to_depth_along_the_optical_axis(camera: PinholeCamera) -> None:
-    points = points_ahead()
-    lifted = camera.unproject(camera.project(points), points[:, 2])
+@pytest.mark.parametrize(
+    "camera",
+    [
+        *(PinholeCamera(MATRIX, SIZE, k) for k in PINHOLE_LENSES),
+        *(WideAngleCamera(MATRIX, SIZE, k) for k in WIDE_LENSES),
+    ],
+)
+def test_a_pinhole_lifts_to_depth_along_its_axis_and_a_wide_angle_to_range_along_the_ray(camera: Camera) -> None:
+    points, is_pinhole = points_ahead(), isinstance(camera, PinholeCamera)
+    lifted = camera.unproject(camera.project(points), points[:, 2] if is_pinhole else np.linalg.norm(points, axis=1))
     assert np.allclose(lifted, points, atol=1e-8)
-    assert camera.depth_kind == "z"
-
-
-@pytest.mark.parametrize("camera", [WideAngleCamera(MATRIX, SIZE, lens) for lens in WIDE_LENSES])
-def test_wide_angle_lifts_to_range_along_the_ray(camera: WideAngleCamera) -> None:
-    points = points_ahead()
-    lifted = camera.unproject(camera.project(points), np.linalg.norm(points, axis=1))
-    assert np.allclose(lifted, points, atol=1e-8)
-    assert camera.depth_kind == "range"
+    assert camera.depth_kind == ("z" if is_pinhole else "range")
 
 
 @pytest.mark.parametrize(

@@ -119,16 +119,6 @@ def test_a_map_of_another_size_is_refused() -> None:
         lift(grid_pixels(SIZE, 8), (flow, before, np.ones((64, 48), dtype=np.float32)))
 
 
-def test_pairs_of_two_cameras_join_and_part_again() -> None:
-    one = lift(grid_pixels(SIZE, 8), wall_maps())
-    other = lift(grid_pixels(SIZE, 16), wall_maps(), camera=RigCamera("elsewhere", CAMERA.camera, CAMERA.T_body_camera))
-    both = PointPairs.concatenate([one, other])
-    assert len(both) == len(one) + len(other)
-    parted = both.select(both.camera_names == "elsewhere")
-    assert np.array_equal(parted.previous, other.previous)
-    assert np.array_equal(parted.pixels_current, other.pixels_current)
-
-
 def test_the_grid_is_of_pixel_centres_inside_the_image() -> None:
     assert grid_pixels((4, 3), 1)[:5].tolist() == [[0.5, 0.5], [1.5, 0.5], [2.5, 0.5], [3.5, 0.5], [0.5, 1.5]]
     assert grid_pixels((10, 5), 4).tolist() == [[2.5, 2.5], [6.5, 2.5]]

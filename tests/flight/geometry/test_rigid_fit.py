@@ -37,12 +37,6 @@ def test_noisy_points_give_scipys_least_squares_result(weighted: bool) -> None:
         assert np.allclose(found.translation, target_mean - expected.apply(source_mean), atol=1e-9)
 
 
-def test_points_on_a_plane_suffice() -> None:
-    rotation = Rotation.from_rotvec([0.3, -2.0, 1.0]).as_matrix()
-    found = fit_rigid(SQUARE, SQUARE @ rotation.T + 2.0)
-    assert np.allclose(found.rotation, rotation)
-
-
 def test_a_mirror_image_is_answered_by_a_rotation_and_never_a_reflection() -> None:
     source = np.random.default_rng(2).normal(size=(20, 3))
     mirrored = source * [1.0, 1.0, -1.0]
@@ -50,14 +44,6 @@ def test_a_mirror_image_is_answered_by_a_rotation_and_never_a_reflection() -> No
     found = fit_rigid(source, mirrored)
     assert np.linalg.det(found.rotation) == pytest.approx(1.0)
     assert np.allclose(found.rotation, expected.as_matrix())
-
-
-def test_a_pair_of_weight_zero_has_no_say() -> None:
-    source = np.random.default_rng(3).normal(size=(6, 3))
-    target = source + np.array([1.0, 2.0, 3.0])
-    target[5] += 100.0
-    found = fit_rigid(source, target, np.array([1.0, 1.0, 1.0, 1.0, 1.0, 0.0]))
-    assert np.allclose(found.translation, [1.0, 2.0, 3.0])
 
 
 @pytest.mark.parametrize(

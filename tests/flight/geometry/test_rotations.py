@@ -18,14 +18,6 @@ def test_euler_angles_agree_with_scipy_both_ways() -> None:
         assert euler_from_rotation(expected) == pytest.approx((roll, pitch, yaw))
 
 
-def test_nose_up_lifts_the_forward_axis_and_yaw_turns_it_right() -> None:
-    forward = np.array([1.0, 0.0, 0.0])
-    assert (rotation_from_euler(0.0, 0.1, 0.0) @ forward)[2] < 0.0  # up is negative down
-    assert (rotation_from_euler(0.0, 0.0, np.pi / 2) @ forward) == pytest.approx([0.0, 1.0, 0.0])
-    right = np.array([0.0, 1.0, 0.0])
-    assert (rotation_from_euler(0.1, 0.0, 0.0) @ right)[2] > 0.0  # clockwise roll: the right wing drops
-
-
 @pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2])
 def test_a_nose_straight_up_or_down_still_gives_angles_of_the_same_attitude(pitch: float) -> None:
     attitude = Rotation.from_euler("ZYX", [0.4, pitch, 0.3]).as_matrix()

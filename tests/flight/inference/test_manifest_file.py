@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -29,16 +29,10 @@ def refused(complaint: str) -> Iterator[None]:
     assert "\n" not in str(error.value)
 
 
-def test_a_fifo_is_refused_without_waiting_for_its_writer(tmp_path: Path) -> None:
-    path = tmp_path / "pipe.yaml"
-    os.mkfifo(path)
-    with refused(rf"^{path}: is not an ordinary file; copy the manifest to one"):
-        read_manifest(path)
-
-
-def test_an_endless_device_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "zero.yaml"
-    path.symlink_to("/dev/zero")
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")], ids=["FIFO", "device"])
+def test_what_has_no_end_is_refused_without_waiting_for_it(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    path = tmp_path / "endless.yaml"
+    make(path)
     with refused(rf"^{path}: is not an ordinary file; copy the manifest to one"):
         read_manifest(path)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from flockd.cli import main
-from flockd.core.config import load_drone, load_scenario
+from flockd.core.config import DroneConfig, load_drone, load_scenario
 from flockd.core.config.mission import fault_of_place
 from flockd.core.config.safety import GateParameters
 from flockd.core.errors import ConfigError
@@ -236,6 +236,12 @@ def test_a_drone_that_stops_on_its_way_stays_at_the_height_of_that_way(loses: st
     assert guidance.height_m == 8.0
 
 
+@pytest.fixture
+def config(tmp_path: Path) -> DroneConfig:
+    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
+    return load_drone(tmp_path / "drone.yaml")
+
+
 @pytest.mark.parametrize(
     ("message", "command", "refusal"),
     [
@@ -249,10 +255,8 @@ def test_a_drone_that_stops_on_its_way_stays_at_the_height_of_that_way(loses: st
     ],
 )
 def test_an_order_that_cannot_be_flown_is_refused_with_the_reason(
-    tmp_path: Path, message: dict[str, object], command: str, refusal: str | None
+    config: DroneConfig, message: dict[str, object], command: str, refusal: str | None
 ) -> None:
-    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
-    config = load_drone(tmp_path / "drone.yaml")
     order = parse_order(command, json.dumps(message).encode())
     assert order_message(order) == message
     vehicle = VehicleState(0.0, np.eye(3), 5.0, np.zeros(3), ORIGIN)
@@ -261,9 +265,7 @@ def test_an_order_that_cannot_be_flown_is_refused_with_the_reason(
     assert order_fault(config, order, None) is not None
 
 
-def test_a_velocity_that_leads_out_of_the_fence_is_refused_and_one_back_is_not(tmp_path: Path) -> None:
-    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
-    config = load_drone(tmp_path / "drone.yaml")
+def test_a_velocity_that_leads_out_of_the_fence_is_refused_and_one_back_is_not(config: DroneConfig) -> None:
     edge = VehicleState(0.0, np.eye(3), 5.0, np.zeros(3), np.array([98.0, 0.0]))
     outward, inward = (MissionOrder(velocity=np.array([speed, 0.0])) for speed in (1.5, -1.5))
     assert "in 2 s the drone is 101.0 m from home" in str(order_fault(config, outward, edge))
@@ -278,10 +280,8 @@ def test_a_velocity_that_leads_out_of_the_fence_is_refused_and_one_back_is_not(t
     ids=["metres", "degrees"],
 )
 def test_a_goal_that_no_mission_can_have_is_refused_without_a_fence_too(
-    tmp_path: Path, message: dict[str, float]
+    config: DroneConfig, message: dict[str, float]
 ) -> None:
-    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
-    config = load_drone(tmp_path / "drone.yaml")
     gate = config.safety.gate.model_copy(update={"fence_radius_m": None, "fence_corners_m": ()})
     config = config.model_copy(update={"safety": config.safety.model_copy(update={"gate": gate})})
     vehicle = VehicleState(0.0, np.eye(3), 5.0, np.zeros(3), ORIGIN, np.array([47.4, 8.5]))

@@ -58,10 +58,6 @@ def test_from_within_its_clearance_a_drone_may_only_fly_off() -> None:
     np.testing.assert_array_equal(free_way(points, 0.9, np.array([0.0, math.pi, 0.5, 2.0])), [0.0, np.inf, 0.0, np.inf])
 
 
-def test_without_obstacles_every_way_is_free() -> None:
-    np.testing.assert_array_equal(free_way(np.empty((0, 2)), 1.0, np.array([0.0, 1.0])), [np.inf, np.inf])
-
-
 # Steering.
 
 

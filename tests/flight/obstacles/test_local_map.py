@@ -59,13 +59,6 @@ def test_two_obstacles_in_a_sector_are_both_kept_and_the_nearer_one_counts() -> 
     assert obstacles_in(local.step(1.0, ranges(1.0, {NORTH: 9.0}), STILL, 0.0)) == {NORTH: 9.0}  # seen past it twice
 
 
-def test_what_newer_ranges_look_past_twice_was_none() -> None:
-    local = LocalMap(PARAMETERS)
-    local.step(0.0, ranges(0.0, {NORTH: 3.0}), None, 0.0)
-    assert obstacles_in(local.step(0.5, ranges(0.5, {}), STILL, 0.0)) == {NORTH: 3.0}
-    assert obstacles_in(local.step(1.0, ranges(1.0, {}), STILL, 0.0)) == {}
-
-
 def test_what_newer_ranges_do_not_reach_stays() -> None:
     local = LocalMap(PARAMETERS)
     local.step(0.0, ranges(0.0, {NORTH: 8.0}), None, 0.0)

@@ -1,12 +1,16 @@
-"""Plain cameras, and crops of them."""
+"""Plain cameras, crops of them, and what they see of the simulator's drones."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
-from flockd.core.messages import UInt8Array
+from flockd.core.messages import FloatArray, UInt8Array
 from flockd.flight.geometry import PinholeCamera, RigCamera, RigidTransform
 from flockd.flight.perception import Crop
+from flockd.sim.drone_models import drone_model
+from flockd.sim.renderer import Renderer, View
+from flockd.sim.world import World
 
 
 def pinhole(focal_px: float, size: tuple[int, int]) -> PinholeCamera:
@@ -22,3 +26,20 @@ def camera_of(focal_px: float, size: tuple[int, int]) -> RigCamera:
 def crop_of(image: UInt8Array, focal_px: float, *, mirrored: bool = False) -> Crop:
     size = (image.shape[1], image.shape[0])
     return Crop(np.ascontiguousarray(image), pinhole(focal_px, size), RigidTransform(np.eye(3), np.zeros(3)), mirrored)
+
+
+def rendered(
+    focal_px: float,
+    size: tuple[int, int],
+    *drones: tuple[float, float, float],
+    turned: FloatArray | None = None,
+) -> View:
+    """World 11 from 4 m above ground to the north, or ``turned`` (3, 3) from there, with drones at places in NED."""
+    level = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    attitude, _ = cv2.Rodrigues(np.array([0.2, -0.4, 0.3]))
+    models = [drone_model(6 * number, number) for number in range(len(drones))]
+    return Renderer(World.generate(11), models).render(
+        pinhole(focal_px, size).matrix, size, level if turned is None else turned @ level, np.array([0.0, 0.0, -4.0]),
+        drone_rotations=np.tile(attitude, (len(drones), 1, 1)), drone_positions=np.reshape(drones, (-1, 3)),
+        shown=[True] * len(drones),
+    )  # fmt: skip

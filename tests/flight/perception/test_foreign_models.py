@@ -77,19 +77,22 @@ def test_what_lies_right_in_the_image_lies_right_in_the_map_although_its_input_w
     np.testing.assert_allclose(seen.depth[:, 34:], 1.0, atol=1e-6)
 
 
-def test_inverse_depth_in_a_unit_of_its_own_becomes_metres(tmp_path: Path) -> None:
-    path = one_channel_depth(tmp_path, output={"factor": 0.5, "depth": {"quantity": "inverse_depth"}})
-    seen = perception_with(path, scale="network").scene(front(plain((51, 0, 0))), camera_of(40.0, SIZE), None)
+@pytest.mark.parametrize(
+    ("output", "focal_px", "red", "size", "expected"),
+    [
+        ({"factor": 0.5, "depth": {"quantity": "inverse_depth"}}, 40.0, 51, SIZE, 10.0),  # 0.2 of brightness: 0.1 1/m
+        ({"depth": {"focal_px": 100.0}}, 300.0, 255, (96, 64), 1.5),  # enters at half its size: 300 px become 150 px
+    ],
+    ids=["inverse depth in a unit of its own", "depth for one focal length"],
+)
+def test_depth_becomes_metres_of_the_camera(
+    tmp_path: Path, output: dict[str, Any], focal_px: float, red: int, size: tuple[int, int], expected: float
+) -> None:
+    path = one_channel_depth(tmp_path, output=output)
+    image = plain((red, 0, 0), size)
+    seen = perception_with(path, scale="network").scene(front(image), camera_of(focal_px, size), None)
     assert isinstance(seen.depth, np.ndarray)
-    np.testing.assert_allclose(seen.depth, 10.0, rtol=1e-5)  # 0.2 of brightness is 0.1 1/m
-
-
-def test_depth_for_one_focal_length_is_scaled_to_the_cameras(tmp_path: Path) -> None:
-    path = one_channel_depth(tmp_path, output={"depth": {"focal_px": 100.0}})
-    size = (96, 64)  # enters at half its size, so that 300 px become 150 px
-    seen = perception_with(path, scale="network").scene(front(plain((255, 0, 0), size)), camera_of(300.0, size), None)
-    assert isinstance(seen.depth, np.ndarray)
-    np.testing.assert_allclose(seen.depth, 1.5, rtol=1e-3)
+    np.testing.assert_allclose(seen.depth, expected, rtol=1e-3)
 
 
 def test_a_relative_network_is_refused_where_nothing_fixes_its_scale(tmp_path: Path) -> None:

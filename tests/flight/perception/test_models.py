@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import onnxruntime as ort
 import pytest
 
 from flockd.cli import main
@@ -22,10 +20,7 @@ from flockd.flight.inference import OnnxModel, find_manifests, load_manifest
 from flockd.flight.perception import DisFlow, OnnxFlow, OnnxNetworks
 from flockd.flight.perception.flow import background_flow
 from flockd.flight.perception.onnx import CROPS_PER_RUN
-from flockd.sim.drone_models import drone_model
-from flockd.sim.renderer import Renderer
-from flockd.sim.world import World
-from tests.flight.perception.cameras import camera_of, crop_of
+from tests.flight.perception.cameras import camera_of, crop_of, rendered
 
 MODELS = data_path("models")
 NETWORKS = ("distance", "flow", "neighbours", "verification")
@@ -46,49 +41,12 @@ def test_a_model_opens_and_gives_its_golden_output(name: str) -> None:
     OnnxModel(MODELS / f"{name}.yaml", threads=1)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_the_manifest_names_what_the_model_file_has(name: str) -> None:
-    manifest, file = load_manifest(MODELS / f"{name}.yaml")
-    session = ort.InferenceSession(str(file), providers=["CPUExecutionProvider"])
-    assert {i.name: i.type for i in session.get_inputs()} == {
-        key: f"tensor({'float' if spec.dtype == 'float32' else spec.dtype})" for key, spec in manifest.inputs.items()
-    }
-    assert {o.name for o in session.get_outputs()} == set(manifest.outputs)
-
-
-def test_a_flipped_bit_is_refused(copies: Path) -> None:
-    file = copies / "flow.onnx"
-    content = bytearray(file.read_bytes())
-    content[len(content) // 2] ^= 1
-    file.write_bytes(content)
-    with pytest.raises(ModelError, match=r"flow\.yaml:5: sha256: .*flow\.onnx .* was changed or damaged; restore it"):
-        OnnxModel(copies / "flow.yaml", threads=1)
-
-
-def test_a_truncated_file_whose_hash_was_updated_is_still_refused(copies: Path) -> None:
-    file = copies / "flow.onnx"
-    content = file.read_bytes()
-    old = load_manifest(copies / "flow.yaml")[0].sha256
-    file.write_bytes(content[: len(content) // 2])
-    manifest = copies / "flow.yaml"
-    manifest.write_text(manifest.read_text().replace(old, hashlib.sha256(file.read_bytes()).hexdigest()))
-    with pytest.raises(ModelError, match=r"flow\.yaml:4: file: .*flow\.onnx cannot be loaded"):
-        OnnxModel(manifest, threads=1)
-
-
 def test_another_models_weights_do_not_give_the_golden_output(copies: Path) -> None:
     manifest = copies / "distance.yaml"
     text = manifest.read_text()
     golden = next(line for line in text.splitlines() if "golden_mean" in line)
     manifest.write_text(text.replace(golden, golden.split(":")[0] + ": 123.0"))
     with pytest.raises(ModelError, match=r"distance\.yaml:\d+: outputs\.range: the golden input gives mean"):
-        OnnxModel(manifest, threads=1)
-
-
-def test_an_input_that_does_not_fit_the_manifest_is_refused(copies: Path) -> None:
-    manifest = copies / "distance.yaml"
-    manifest.write_text(manifest.read_text().replace("  picture:", "  photograph:"))
-    with pytest.raises(ModelError, match=r"inputs: the manifest names \['photograph'\] but the model file has"):
         OnnxModel(manifest, threads=1)
 
 
@@ -145,13 +103,7 @@ def shifted_pictures(shift: tuple[int, int], size: tuple[int, int]) -> tuple[UIn
     """Two windows of one rendered picture, so that all of the first has moved by ``shift`` px right and down."""
     width, height = size
     margin = 16
-    matrix = np.array([[250.0, 0.0, width / 2], [0.0, 250.0, height / 2], [0.0, 0.0, 1.0]])
-    R_ned_camera = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    large = (width + 2 * margin, height + 2 * margin)
-    view = Renderer(World.generate(11), []).render(
-        matrix, large, R_ned_camera, np.array([0.0, 0.0, -4.0]),
-        drone_rotations=np.zeros((0, 3, 3)), drone_positions=np.zeros((0, 3)), shown=[],
-    )  # fmt: skip
+    view = rendered(250.0, (width + 2 * margin, height + 2 * margin))
 
     def window(right: int, down: int) -> UInt8Array:
         top, left = margin + down, margin + right
@@ -192,13 +144,7 @@ def test_dis_loses_what_moves_far_unless_it_begins_near() -> None:
 
 
 def test_the_twins_in_8_bits_say_what_the_float_networks_say() -> None:
-    matrix = np.array([[222.0, 0.0, 160.0], [0.0, 222.0, 160.0], [0.0, 0.0, 1.0]])
-    R_ned_camera = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    view = Renderer(World.generate(11), [drone_model(0, 0), drone_model(6, 1)]).render(
-        matrix, (320, 320), R_ned_camera, np.array([0.0, 0.0, -4.0]),
-        drone_rotations=np.stack([cv2.Rodrigues(np.array([0.2, -0.4, 0.3]))[0]] * 2), shown=[True, True],
-        drone_positions=np.array([[1.5, -0.5, -4.2], [1.5, 0.5, -3.8]]),
-    )  # fmt: skip
+    view = rendered(222.0, (320, 320), (1.5, -0.5, -4.2), (1.5, 0.5, -3.8))
     image = np.ascontiguousarray(view.rgb)
     roles = {"depth": "neighbours", "segmentation": "neighbours"}
     roles |= {name: name for name in ("flow", "distance", "verification")}
@@ -220,12 +166,7 @@ def test_the_twins_in_8_bits_say_what_the_float_networks_say() -> None:
 
 
 def test_what_a_mirror_shows_is_estimated_as_if_there_were_none() -> None:
-    view = Renderer(World.generate(11), [drone_model(0, 0)]).render(
-        np.array([[100.0, 0.0, 48.0], [0.0, 100.0, 48.0], [0.0, 0.0, 1.0]]), (96, 96),
-        np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([0.0, 0.0, -4.0]),
-        drone_rotations=np.stack([cv2.Rodrigues(np.array([0.2, -0.4, 0.3]))[0]]), shown=[True],
-        drone_positions=np.array([[1.5, -0.1, -4.1]]),
-    )  # fmt: skip
+    view = rendered(100.0, (96, 96), (1.5, -0.1, -4.1))
     image = np.ascontiguousarray(view.rgb)
     direct, mirrored = (crop_of(image, 100.0, mirrored=m) for m in (False, True))
     shown_so = crop_of(image[:, ::-1], 100.0)
@@ -275,12 +216,7 @@ def test_the_network_of_flow_is_sharpened_by_dis_unless_configured_otherwise() -
 
 
 def test_the_second_stage_marks_which_pixels_are_the_drones_in_a_mirror_too() -> None:
-    K = np.array([[200.0, 0.0, 48.0], [0.0, 200.0, 48.0], [0.0, 0.0, 1.0]])
-    view = Renderer(World.generate(11), [drone_model(0, 0)]).render(
-        K, (96, 96), np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([0.0, 0.0, -4.0]),
-        drone_rotations=np.stack([cv2.Rodrigues(np.array([0.2, -0.4, 0.3]))[0]]), shown=[True],
-        drone_positions=np.array([[1.5, 0.0, -4.0]]),
-    )  # fmt: skip
+    view = rendered(200.0, (96, 96), (1.5, 0.0, -4.0))
     pictures = [crop_of(view.rgb, 200.0, mirrored=m) for m in (False, True)]
     for told in OnnxNetworks(PerceptionConfig(), MODELS).ranges(pictures):
         assert told.mask is not None

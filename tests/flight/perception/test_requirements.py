@@ -44,25 +44,6 @@ def test_each_role_of_the_configuration_has_its_requirements() -> None:
     assert [path.stem for path in manifests_of(without)] == ["neighbours_int8"]
 
 
-def test_the_manifests_say_what_the_code_flew_with() -> None:
-    """Both twins alike, and the numbers that were constants before they stood in manifests."""
-    for suffix in ("", "_int8"):
-        distance = read_manifest(MODELS / f"distance{suffix}.yaml", check_roles).manifest
-        assert distance.crop is not None
-        assert distance.crop_size_px == 96
-        assert distance.crop.model_dump() == {
-            "fill": 0.68, "first_margin": 0.95, "cut_margin": 1.4, "mirror_scale": 0.9, "min_half_angle_deg": 1.0,
-            "max_half_angle_deg": 35.0, "max_resize": 1.7, "max_crops": 4,
-        }  # fmt: skip
-        assert distance.thresholds == {
-            "drone_probability": 0.8, "expected_drone_probability": 0.7, "another_crop_probability": 0.2,
-            "bearing_sigma_rad": 0.004, "min_relative_sigma": 0.005, "mean_sigma_factor": 0.98,
-        }  # fmt: skip
-        neighbours = read_manifest(MODELS / f"neighbours{suffix}.yaml", check_roles).manifest
-        assert neighbours.map_stride == 2
-        assert neighbours.thresholds == {"proposal_logit": -1.5, "mask_logit": 0.4, "proposal_logit_alone": 0.0}
-
-
 def without(section: str, key: str) -> Change:
     return lambda document: document[section].pop(key)
 

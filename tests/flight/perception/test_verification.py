@@ -17,27 +17,18 @@ from flockd.core.messages import Float32Array
 from flockd.flight.inference import OnnxModel
 from flockd.flight.perception import Crop, OnnxNetworks
 from flockd.flight.perception.maps import RangeEstimate
-from flockd.sim.drone_models import drone_model
-from flockd.sim.renderer import Renderer
-from flockd.sim.world import World
-from tests.flight.perception.cameras import crop_of
+from tests.flight.perception.cameras import crop_of, rendered
 
 MODELS = data_path("models")
 
 
 def crops() -> list[Crop]:
     """A drone before the sky, one before the ground, and ground alone."""
-    matrix = np.array([[100.0, 0.0, 48.0], [0.0, 100.0, 48.0], [0.0, 0.0, 1.0]])
-    R_ned_camera = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     taken = []
     for down_m, shown in ((-0.25, True), (0.35, True), (0.8, False)):
         pitch, _ = cv2.Rodrigues(np.array([0.0, -math.atan2(down_m, 1.5), 0.0]))
-        view = Renderer(World.generate(11), [drone_model(0, 0)]).render(
-            matrix, (96, 96), pitch @ R_ned_camera, np.array([0.0, 0.0, -4.0]),
-            drone_rotations=np.stack([cv2.Rodrigues(np.array([0.2, -0.4, 0.3]))[0]]), shown=[shown],
-            drone_positions=np.array([[1.5, 0.0, -4.0 + down_m]]),
-        )  # fmt: skip
-        taken.append(crop_of(np.ascontiguousarray(view.rgb), 100.0))
+        view = rendered(100.0, (96, 96), *[(1.5, 0.0, -4.0 + down_m)] * shown, turned=np.asarray(pitch))
+        taken.append(crop_of(view.rgb, 100.0))
     return taken
 
 

@@ -95,16 +95,6 @@ def test_dense_clutter_makes_a_detection_say_less() -> None:
     assert probability[1e5] < 0.5
 
 
-def test_a_dropout_of_three_frame_sets_keeps_a_confirmed_track() -> None:
-    tracker, now_s = _settled()
-    confirmed = []
-    for k in range(1, 5):
-        _step(tracker, now_s + k * STEP_S)
-        confirmed.append(len(_confirmed(tracker)))
-    assert confirmed == [1, 1, 1, 0], "1.5 s and no longer"
-    assert tracker.neighbours() == ()
-
-
 @pytest.mark.parametrize("blind_ahead", [False, True])
 def test_a_track_where_the_rig_is_blind_is_as_probable_as_before_but_ages(blind_ahead: bool) -> None:
     tracker = Tracker(TrackingParameters(max_unseen_s=1.5, survival_time_s=3600.0))
@@ -404,11 +394,6 @@ def test_assignment_is_the_best_of_all_and_not_the_nearest_pair_first() -> None:
     for k in range(4):
         numbers = _step(tracker, k * STEP_S, base, base + 1.0 * east, sigma_m=0.2)
     assert _step(tracker, 4 * STEP_S, base + 0.9 * east, base + 2.1 * east, sigma_m=0.2) == numbers
-
-
-def test_what_is_outside_the_gate_of_all_tracks_begins_a_new_one() -> None:
-    tracker, now_s = _settled(sigma_m=0.05)
-    assert _step(tracker, now_s + STEP_S, AHEAD + np.array([0.0, 3.0, 0.0])) == (2,)
 
 
 def test_a_detection_of_another_size_is_of_another_drone() -> None:

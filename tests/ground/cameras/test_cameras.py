@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -19,10 +17,9 @@ from flockd.ground.cameras.gstreamer_listing import cameras_of_monitor
 from flockd.ground.cameras.listing import Computer
 from flockd.ground.cameras.measuring import edge_width_px
 from flockd.ground.datasets.image_files import read_image
-from tests.onboard.sources.camera_images import jpeg, scene
+from tests.ground.filming import filming
 from tests.onboard.sources.fake_kernel import METADATA_CAPTURE, STREAMING, FakeCamera, FakeKernel
 
-JPEGS = [jpeg(scene(number)) for number in range(4)]
 Capture = pytest.CaptureFixture[str]
 BY_PATH = "platform-xhci-usb-0:{port}:1.0-video-index0"
 USB = FakeCamera(card=b"HD Camera", formats=((1280, 720, b"MJPG"), (640, 480, b"MJPG"), (640, 480, b"YUYV")))
@@ -89,27 +86,6 @@ class _Shelf:
         return kernel
 
 
-@contextmanager
-def _filming(kernel: FakeKernel, *names: str, hz: float = 30.0) -> Iterator[None]:
-    """Cameras that send images whenever they stream."""
-    ended = threading.Event()
-
-    def film(name: str) -> None:
-        number = 0
-        while not ended.wait(1.0 / hz):
-            if kernel.cameras[f"/dev/{name}"].streaming:
-                kernel.send(name, JPEGS[number % len(JPEGS)])
-                number += 1
-
-    threads = [threading.Thread(target=film, args=(name,), daemon=True) for name in names]
-    for thread in threads:
-        thread.start()
-    yield
-    ended.set()
-    for thread in threads:
-        thread.join()
-
-
 def test_usb_cameras_are_listed_by_the_path_of_their_socket(computer: type[_Shelf], capsys: Capture) -> None:
     metadata = FakeCamera(capabilities=METADATA_CAPTURE | STREAMING)
     kernel = computer.has(FakeKernel(video0=USB, video1=metadata, video10=USB))
@@ -143,7 +119,7 @@ def test_the_list_for_people_names_what_is_used(computer: type[_Shelf], capsys: 
 def test_all_are_measured_side_by_side_and_pictured(computer: type[_Shelf], capsys: Capture, tmp_path: Path) -> None:
     kernel = computer.has(FakeKernel(video0=FakeCamera(), video1=FakeCamera(), video2=FakeCamera()))
     begun_s = time.monotonic()
-    with _filming(kernel, "video0", "video1"):  # the third is silent
+    with filming(kernel, "video0", "video1"):  # the third is silent
         assert main(["cameras", "--seconds", "0.5", "--picture", str(tmp_path / "pictures"), "--json"]) == 1
     first, second, third = json.loads(capsys.readouterr().out)
     assert time.monotonic() - begun_s > 0.5

@@ -156,91 +156,55 @@ def test_an_image_without_depth_of_its_time_is_left_out_and_reported(
 # What people's files come with.
 
 
-def first(folder: Path) -> Path:
-    return min(folder.iterdir())
+def third(folder: Path) -> Path:
+    return sorted(folder.iterdir())[2]
 
 
 def cut_short(folder: Path) -> None:
-    file = sorted((folder / "images").iterdir())[2]
+    file = third(folder / "images")
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
 
 
 def flip_a_bit(folder: Path) -> None:
-    file = sorted((folder / "images").iterdir())[2]
+    file = third(folder / "images")
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 1
     file.write_bytes(data)
 
 
 def cut_jpeg(folder: Path) -> None:
-    file = sorted((folder / "images").iterdir())[2]
     _, data = cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8))
-    file.write_bytes(data.tobytes()[:-500])
+    third(folder / "images").write_bytes(data.tobytes()[:-500])
 
 
-def lose_an_image(folder: Path) -> None:
-    sorted((folder / "images").iterdir())[2].unlink()
+def with_poses(change: Callable[[np.ndarray], object]) -> Callable[[Path], None]:
+    """``change`` is given the matrices (n, 4, 4), and changes them."""
+
+    def happen(folder: Path) -> None:
+        poses = np.loadtxt(folder / "poses.txt").reshape(-1, 4, 4)
+        change(poses)
+        np.savetxt(folder / "poses.txt", poses.reshape(-1, 16))
+
+    return happen
 
 
-def lose_a_depth_map(folder: Path) -> None:
-    sorted((folder / "depth").iterdir())[2].unlink()
+def transpose(poses: np.ndarray) -> None:
+    """Their translation comes into the last row."""
+    poses[:] = poses.transpose(0, 2, 1).copy()
 
 
-def lose_a_pose(folder: Path) -> None:
-    lines = (folder / "poses.txt").read_text().splitlines()
-    (folder / "poses.txt").write_text("\n".join(lines[1:]))
+def drawn(kind: str, image: np.ndarray) -> Callable[[Path], object]:
+    """In the place of the third image or depth map."""
+    return lambda folder: cv2.imwrite(str(third(folder / kind)), image)
 
 
-def turn_poses_round(folder: Path) -> None:
-    """Transposed matrices have their translation in the last row."""
-    poses = np.loadtxt(folder / "poses.txt").reshape(-1, 4, 4).transpose(0, 2, 1)
-    np.savetxt(folder / "poses.txt", poses.reshape(-1, 16))
+def calibrated(matrix: np.ndarray) -> Callable[[Path], object]:
+    return lambda folder: np.savetxt(folder / "K.txt", matrix)
 
 
-def scale_a_pose(folder: Path) -> None:
-    poses = np.loadtxt(folder / "poses.txt")
-    poses[4, :12] *= 1.1
-    np.savetxt(folder / "poses.txt", poses)
-
-
-def lose_track(folder: Path) -> None:
-    poses = np.loadtxt(folder / "poses.txt")
-    poses[4] = -np.inf
-    np.savetxt(folder / "poses.txt", poses)
-
-
-def zero_depth(folder: Path) -> None:
-    file = sorted((folder / "depth").iterdir())[2]
-    cv2.imwrite(str(file), np.zeros((HEIGHT, WIDTH), np.uint16))
-
-
-def coarse_depth(folder: Path) -> None:
-    cv2.imwrite(str(first(folder / "depth")), np.full((HEIGHT, WIDTH), 200, np.uint8))
-
-
-def small_depth(folder: Path) -> None:
-    cv2.imwrite(str(first(folder / "depth")), np.full((HEIGHT // 2, WIDTH // 2), 2000, np.uint16))
-
-
-def one_small_image(folder: Path) -> None:
-    file = sorted((folder / "images").iterdir())[2]
-    cv2.imwrite(str(file), np.zeros((HEIGHT // 2, WIDTH // 2, 3), np.uint8))
-
-
-def doubled_calibration(folder: Path) -> None:
-    np.savetxt(folder / "K.txt", 2 * rendered_dataset.OTHERS_MATRIX - np.diag([0.0, 0.0, 1.0]))
-
-
-def halved_calibration(folder: Path) -> None:
-    np.savetxt(folder / "K.txt", np.diag([0.5, 0.5, 1.0]) @ rendered_dataset.OTHERS_MATRIX)
-
-
-def no_calibration(folder: Path) -> None:
-    (folder / "K.txt").unlink()
-
-
-def odd_calibration(folder: Path) -> None:
-    (folder / "K.txt").write_text("200 0 160\n0 200 120\n0 0 one\n")
+SMALL = (HEIGHT // 2, WIDTH // 2)
+DOUBLED, HALVED = (np.diag([scale, scale, 1.0]) @ rendered_dataset.OTHERS_MATRIX for scale in (2.0, 0.5))
+ODD = "200 0 160\n0 200 120\n0 0 one\n"
 
 
 @pytest.mark.parametrize(
@@ -249,24 +213,29 @@ def odd_calibration(folder: Path) -> None:
         (cut_short, 1, "00016.png: the PNG ends too early"),
         (flip_a_bit, 1, "00016.png: the PNG is damaged at byte"),
         (cut_jpeg, 1, "00016.png: the JPEG ends too early"),
-        (lose_an_image, 1, "depth/00016.png: its image is missing"),
-        (lose_a_depth_map, 1, "depth/00016.png: is missing; each image needs its depth"),
-        (lose_a_pose, 1, "poses.txt: has 5 poses, and"),
-        (turn_poses_round, 1, "poses.txt: pose 1: its last row is not 0 0 0 1"),
-        (scale_a_pose, 1, "poses.txt: pose 5: its first three columns are no rotation"),
-        (lose_track, 1, "poses.txt:5: does not fit"),
-        (zero_depth, 1, "00016.png: its depth is 0 everywhere"),
-        (coarse_depth, 1, "00010.png: is no depth map; it needs one channel of 16 bits"),
-        (small_depth, 1, "00010.png: is 160 x 120 pixels, and the camera 320 x 240"),
-        (one_small_image, 1, "00016.png: is 160 x 120 pixels, and the camera 320 x 240"),
-        (doubled_calibration, 78, "K.txt: is the calibration of another size"),
-        (halved_calibration, 78, "K.txt: is the calibration of another size"),
-        (no_calibration, 78, "K.txt: does not exist"),
-        (odd_calibration, 1, "K.txt:3: does not fit; it needs a 3x3 matrix"),
+        (lambda folder: third(folder / "images").unlink(), 1, "depth/00016.png: its image is missing"),
+        (lambda folder: third(folder / "depth").unlink(), 1, "depth/00016.png: is missing; each image needs its depth"),
+        (lambda folder: np.savetxt(folder / "poses.txt", np.ones((5, 16))), 1, "poses.txt: has 5 poses, and"),
+        (with_poses(transpose), 1, "poses.txt: pose 1: its last row is not 0 0 0 1"),
+        (with_poses(lambda poses: poses[4, :3].__imul__(1.1)), 1, "pose 5: its first three columns are no rotation"),
+        (with_poses(lambda poses: poses[4].fill(-np.inf)), 1, "poses.txt:5: does not fit"),
+        (drawn("depth", np.zeros((HEIGHT, WIDTH), np.uint16)), 1, "00016.png: its depth is 0 everywhere"),
+        (drawn("depth", np.full((HEIGHT, WIDTH), 200, np.uint8)), 1, "is no depth map; it needs one channel of 16"),
+        (drawn("depth", np.full(SMALL, 2000, np.uint16)), 1, "00016.png: is 160 x 120 pixels, and the camera 320"),
+        (drawn("images", np.zeros((*SMALL, 3), np.uint8)), 1, "00016.png: is 160 x 120 pixels, and the camera 320"),
+        (calibrated(DOUBLED), 78, "K.txt: is the calibration of another size"),
+        (calibrated(HALVED), 78, "K.txt: is the calibration of another size"),
+        (lambda folder: (folder / "K.txt").unlink(), 78, "K.txt: does not exist"),
+        (lambda folder: (folder / "K.txt").write_text(ODD), 1, "K.txt:3: does not fit; it needs a 3x3 matrix"),
     ],
-)
+    ids=[
+        "cut short", "flipped bit", "cut JPEG", "no image", "no depth map", "a pose too few", "poses turned round",
+        "scaled pose", "lost track", "no depth", "coarse depth", "small depth", "small image", "doubled calibration",
+        "halved calibration", "no calibration", "odd calibration",
+    ],
+)  # fmt: skip
 def test_what_is_wrong_is_one_sentence(
-    happen: Callable[[Path], None],
+    happen: Callable[[Path], object],
     code: int,
     words: str,
     folder: Path,

@@ -29,12 +29,11 @@ from flockd.onboard.sources import FramePublisher
 from flockd.onboard.sources.gstreamer import open_pipeline
 from flockd.onboard.sources.v4l2_device import V4l2Device
 from flockd.sim.free_ports import free_endpoint
+from tests.ground.filming import JPEGS, RATE_HZ, filming
 from tests.onboard.sources.camera_images import SIZE, jpeg, scene
 from tests.onboard.sources.fake_kernel import FLAG_CLOCK_UNKNOWN, FLAG_ERROR, FakeCamera, FakeKernel
 
-RATE_HZ = 30.0
 SECONDS = 0.7
-JPEGS = [jpeg(scene(number)) for number in range(4)]
 BLACK = [jpeg(np.full((SIZE[1], SIZE[0], 3), 4, np.uint8) + scene(n) // 32) for n in range(4)]
 BY_HAND = (
     ControlParameters(name="auto_exposure", value=1),
@@ -52,54 +51,6 @@ def _config(*names: str, controls: Sequence[ControlParameters] = BY_HAND) -> Dro
     return DroneConfig(rig=rig, source=SourceParameters(kind="v4l2", cameras=devices))
 
 
-@contextmanager
-def _filming(
-    kernel: FakeKernel,
-    *names: str,
-    beats_s: Callable[[int], float] = lambda number: number / RATE_HZ,
-    pictures: Sequence[bytes] = JPEGS,
-    lost: Callable[[int], int] = lambda number: 0,
-    flags: Callable[[int], int] | None = None,
-    old_s: float = 0.0,
-) -> Iterator[None]:
-    """Each camera takes picture n at its time stamp, as soon as it streams; a busy computer delays the hand-over."""
-    ended = threading.Event()
-
-    def film(name: str) -> None:
-        begun_s, number = time.monotonic(), 0
-        while not ended.is_set():
-            stamp = begun_s + beats_s(number)
-            if stamp > time.monotonic():
-                ended.wait(stamp - time.monotonic())
-            elif kernel.cameras[f"/dev/{name}"].streaming:
-                more = {} if flags is None else {"flags": flags(number)}
-                try:
-                    kernel.send(
-                        name,
-                        pictures[number % len(pictures)],
-                        time_s=stamp - old_s,
-                        lost_before=lost(number),
-                        wait_s=0.5,
-                        **more,
-                    )
-                except AssertionError:  # nobody takes it any more
-                    return
-                number += 1
-            else:
-                begun_s = time.monotonic() - beats_s(number)
-                time.sleep(0.005)
-
-    threads = [threading.Thread(target=film, args=(name,)) for name in names]
-    for thread in threads:
-        thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        for thread in threads:
-            thread.join()
-
-
 def _examined(config: DroneConfig, kernel: FakeKernel) -> dict[str, list[Finding]]:
     found: dict[str, list[Finding]] = {}
     for finding in check_cameras(config, SECONDS, kernel):
@@ -109,7 +60,7 @@ def _examined(config: DroneConfig, kernel: FakeKernel) -> dict[str, list[Finding
 
 def test_two_cameras_that_run_as_they_should() -> None:
     kernel = FakeKernel(front=FakeCamera(), back=FakeCamera())
-    with _filming(kernel, "front", "back"):
+    with filming(kernel, "front", "back"):
         found = _examined(_config("front", "back"), kernel)
     for name in ("front", "back"):
         (finding,) = found[f"camera {name}"]
@@ -128,70 +79,52 @@ def _problem(found: dict[str, list[Finding]], level: Level, told: str, about: st
     return problem
 
 
-@pytest.mark.parametrize(("rate_hz", "level"), [(15.0, Level.FAILURE), (27.0, Level.WARNING)])
-def test_a_camera_that_is_slower_than_it_says(rate_hz: float, level: Level) -> None:
-    kernel = FakeKernel(front=FakeCamera())
-    with _filming(kernel, "front", beats_s=lambda number: number / rate_hz):
-        found = _examined(_config("front"), kernel)
-    _problem(found, level, f"{rate_hz:.1f} images a second instead of 30")
-
-
-@pytest.mark.parametrize(("off_s", "level"), [(0.012, Level.WARNING), (0.03, Level.FAILURE)])
-def test_a_camera_out_of_step(off_s: float, level: Level) -> None:
-    kernel = FakeKernel(front=FakeCamera())
-    # Every fourth is late: two of four intervals are off by as much.
-    with _filming(kernel, "front", beats_s=lambda number: number / RATE_HZ + (off_s if number % 4 == 3 else 0.0)):
-        found = _examined(_config("front"), kernel)
-    _problem(found, level, "images come unevenly")
+def _late(off_s: float) -> Callable[[int], float]:
+    """Every fourth is late: two of four intervals are off by as much."""
+    return lambda number: number / RATE_HZ + (off_s if number % 4 == 3 else 0.0)
 
 
 @pytest.mark.parametrize(
     ("film", "level", "told"),
     [
+        ({"beats_s": lambda number: number / 15.0}, Level.FAILURE, "15.0 images a second instead of 30"),
+        ({"beats_s": lambda number: number / 27.0}, Level.WARNING, "27.0 images a second instead of 30"),
+        ({"beats_s": _late(0.012)}, Level.WARNING, "images come unevenly"),
+        ({"beats_s": _late(0.03)}, Level.FAILURE, "images come unevenly"),
         ({"lost": lambda number: int(number % 10 == 9)}, Level.WARNING, " lost ("),
         ({"lost": lambda number: 1}, Level.FAILURE, " lost ("),
-        (
-            {"flags": lambda number: 0x2000 | (FLAG_ERROR if number % 2 else 0)},
-            Level.FAILURE,
-            "damaged, as the driver reports",
-        ),
+        ({"flags": lambda n: 0x2000 | (FLAG_ERROR if n % 2 else 0)}, Level.FAILURE, "damaged, as the driver reports"),
         ({"pictures": JPEGS[:1]}, Level.FAILURE, "frozen"),
         ({"pictures": [*JPEGS[:3], JPEGS[3][:-100]]}, Level.FAILURE, "corrupt (JPEG ends too early)"),
+        ({"pictures": BLACK}, Level.WARNING, "the image is too dark"),
     ],
-    ids=["some lost", "many lost", "flagged", "frozen", "corrupt"],
+    ids=["half", "slower", "late", "very late", "some lost", "many lost", "flagged", "frozen", "corrupt", "cap"],
 )
-def test_images_that_are_worth_nothing(film: dict[str, Any], level: Level, told: str) -> None:
+def test_a_camera_that_does_not_run_as_it_should(film: dict[str, Any], level: Level, told: str) -> None:
     kernel = FakeKernel(front=FakeCamera())
-    with _filming(kernel, "front", **film):
-        found = _examined(_config("front"), kernel)
-    problem = found["camera front"][0]
+    with filming(kernel, "front", **film):
+        problem = _examined(_config("front"), kernel)["camera front"][0]
     assert problem.level is level, problem
     assert told in problem.measured, problem
+    assert problem.fix
 
 
 def test_time_stamps_of_another_clock_are_no_image_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
     """Some drivers do not name their clock: what counts is whether the stamps are of now."""
     kernel = FakeKernel(front=FakeCamera())
-    with _filming(kernel, "front", flags=lambda number: FLAG_CLOCK_UNKNOWN):
+    with filming(kernel, "front", flags=lambda number: FLAG_CLOCK_UNKNOWN):
         (finding,) = _examined(_config("front"), kernel)["camera front"]
     assert finding.level is Level.PASS, finding
     monkeypatch.setattr(V4l2Device, "start_s", 0.3)
-    with _filming(kernel, "front", old_s=2.0):
+    with filming(kernel, "front", old_s=2.0):
         found = _examined(_config("front"), kernel)
     _problem(found, Level.FAILURE, "no usable image came within 0.3 s (")
     _problem(found, Level.FAILURE, "with a time stamp far from now")
 
 
-def test_a_cap_on_the_lens() -> None:
-    kernel = FakeKernel(front=FakeCamera())
-    with _filming(kernel, "front", pictures=BLACK):
-        found = _examined(_config("front"), kernel)
-    _problem(found, Level.WARNING, "the image is too dark")
-
-
 def test_an_exposure_that_is_not_configured() -> None:
     kernel = FakeKernel(front=FakeCamera())
-    with _filming(kernel, "front"):
+    with filming(kernel, "front"):
         found = _examined(_config("front", controls=()), kernel)
     _problem(found, Level.WARNING, "its exposure is not configured")
 
@@ -225,7 +158,7 @@ def test_a_driver_that_hangs_is_reported_and_the_other_camera_is_seen(monkeypatc
             return super().open(path)
 
     kernel = Stuck(front=FakeCamera(), back=FakeCamera())
-    with _filming(kernel, "front"):
+    with filming(kernel, "front"):
         found = _examined(_config("front", "back"), kernel)
     ended.set()
     assert found["camera front"][0].level is Level.PASS

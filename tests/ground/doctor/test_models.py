@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from pathlib import Path
 
 import pytest
@@ -11,11 +10,13 @@ import pytest
 from flockd.core.config.drone import DroneConfig
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
-from flockd.core.data import data_path
 from flockd.core.messages import PilotOutput
 from flockd.ground.doctor import Check, Level, run_checks
 from flockd.ground.doctor.model_checks import STEPS, check_models, judge_steps, meadow, time_steps
+from tests.flight.inference.conftest import copies
 from tests.onboard.daemon.aboard import TinyPerceiver
+
+__all__ = ["copies"]
 
 LENS = IntrinsicsConfig(fx=32.0, fy=32.0, cx=32.0, cy=24.0)
 TINY = DroneConfig(rig=RigConfig(cameras=(CameraConfig(name="front", size_px=(64, 48), intrinsics=LENS),)))
@@ -23,14 +24,6 @@ TINY = DroneConfig(rig=RigConfig(cameras=(CameraConfig(name="front", size_px=(64
 
 def _with(**perception: object) -> DroneConfig:
     return TINY.model_copy(update={"perception": PerceptionConfig.model_validate({"threads": 1, **perception})})
-
-
-@pytest.fixture
-def copies(tmp_path: Path) -> Path:
-    """The shipped models, to be spoilt."""
-    folder = tmp_path / "models"
-    shutil.copytree(data_path("models"), folder)
-    return folder
 
 
 def test_a_flipped_bit_is_a_failure_of_that_model_alone(copies: Path) -> None:

@@ -204,22 +204,16 @@ def test_options_out_of_range_are_usage_errors(capsys: Capture, option: tuple[st
     assert f"argument {option[0]}: " in capsys.readouterr().err
 
 
-def huge_png() -> bytes:
-    """A header that claims 60,000 x 60,000 pixels, and nothing behind it."""
-    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBBBBB", 13, b"IHDR", 60000, 60000, 8, 2, 0, 0, 0) + bytes(4)
-
-
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        (huge_png(), "claims to be 60000 x 60000 pixels, more than any camera has"),
         (b"", "is empty"),
         (b"no picture", "is no image"),
         (NEAR.read_bytes()[:9000], "the JPEG ends too early"),
         (b"P6\n60000 60000\n255\n", "claims to be 60000 x 60000 pixels, more than any camera has"),
         (b"P6\n600 600\n255\n", "is no image"),
     ],
-    ids=["huge", "empty", "text", "cut", "huge PPM", "cut PPM"],
+    ids=["empty", "text", "cut", "huge PPM", "cut PPM"],
 )
 def test_a_picture_that_cannot_be_read_ends_it(capsys: Capture, tmp_path: Path, content: bytes, sentence: str) -> None:
     (tmp_path / "a.jpg").write_bytes(content)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -343,36 +343,23 @@ def test_pictures_are_of_the_recorded_images(alone: Path, flight: Path, monkeypa
 # ----------------------------------------------------------------------------------------------------------- refusals
 
 
-def several_flights(folder: Path) -> Path:
-    record_flight(folder / "drone2.mcap", 1, seed=4)
-    return folder
-
-
-def one_drone_twice(folder: Path) -> Path:
-    record_flight(folder / "again.mcap", 0)
-    return folder
-
-
-def one_without_truth(folder: Path) -> Path:
-    record_flight(folder / "drone2.mcap", 1, with_truth=False)
-    return folder
-
-
 @pytest.mark.parametrize(
-    ("spoil", "reason"),
+    ("other", "drone", "how", "reason"),
     [
-        (several_flights, "drone1.mcap, drone2.mcap are not of one flight; name one recording"),
-        (one_without_truth, "drone1.mcap, drone2.mcap are not of one flight; name one recording"),
-        (one_drone_twice, "holds several recordings of one drone; name one recording"),
+        ("drone2", 1, {"seed": 4}, "drone1.mcap, drone2.mcap are not of one flight; name one recording"),
+        ("drone2", 1, {"with_truth": False}, "drone1.mcap, drone2.mcap are not of one flight; name one recording"),
+        ("again", 0, {}, "holds several recordings of one drone; name one recording"),
     ],
+    ids=["several flights", "one without truth", "one drone twice"],
 )
 def test_recordings_that_do_not_belong_together_are_refused(
-    spoil: Callable[[Path], Path], reason: str, tmp_path: Path, capsys: Capture
+    other: str, drone: int, how: dict[str, Any], reason: str, tmp_path: Path, capsys: Capture
 ) -> None:
     folder = tmp_path / "flights"
     folder.mkdir()
     record_flight(folder / "drone1.mcap", 0)
-    _, err = told(capsys, 1, spoil(folder), "--without-pictures")
+    record_flight(folder / f"{other}.mcap", drone, **how)
+    _, err = told(capsys, 1, folder, "--without-pictures")
     assert err == f"{folder}: {reason}\n"
     assert [path.name for path in tmp_path.iterdir()] == ["flights"]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,13 +12,17 @@ from numpy.typing import NDArray
 from tools.training.crop_files import CropFiles
 
 
+def _write(file: Path, family: NDArray[Any], **arrays: NDArray[Any]) -> None:
+    """``arrays`` in the place of drones without any apparent size, target or mask."""
+    zeros = np.zeros(len(family))
+    plain = {"drone": zeros + 1.0, "apparent": zeros, "target": np.zeros((len(family), 3))}
+    np.savez(file, family=family, mask=np.zeros((len(family), 1, 1)), allow_pickle=False, **{**plain, **arrays})
+
+
 def test_a_family_of_few_images_is_drawn_as_often_as_one_of_many(tmp_path: Path) -> None:
     for name, families, drones in (("a", [0] * 90 + [1] * 5, 1.0), ("b", [0] * 5, 0.0), ("c", [1], 1.0)):
-        values = np.arange(len(families), dtype=np.float32)
-        np.savez(
-            tmp_path / f"{name}.npz", family=families, drone=np.full(len(families), drones), apparent=values,
-            target=np.zeros((len(families), 3)), mask=np.zeros((len(families), 1, 1)),
-        )  # fmt: skip
+        values, shown = np.arange(len(families), dtype=np.float32), np.full(len(families), drones)
+        _write(tmp_path / f"{name}.npz", np.array(families), apparent=values, drone=shown)
     files, rng = CropFiles(tmp_path), np.random.default_rng(0)
     drawn = [files.draw(rng) for _ in range(3000)]
     shares = [
@@ -46,21 +51,12 @@ def test_where_there_are_only_shapes_nothing_else_is_drawn(tmp_path: Path) -> No
     assert {int(files.draw(rng)["family"]) for _ in range(300)} == {1000, 1001, 1002}
 
 
-def _write(file: Path, family: NDArray[np.int64]) -> None:
-    zeros = np.zeros(len(family))
-    np.savez(
-        file, family=family, drone=zeros + 1.0, apparent=zeros, target=np.zeros((len(family), 3)),
-        mask=np.zeros((len(family), 1, 1)),
-    )  # fmt: skip
-
-
 def test_images_like_the_last_crop_of_a_drone_are_drawn_more_often_than_others(tmp_path: Path) -> None:
     target = np.zeros((100, 3))
     target[:80, 1], target[80:90, 2] = 20.0, -9.0
     values = np.full(100, np.log(70.0))
     values[90] = np.log(120.0)
-    masks = np.zeros((100, 1, 1))
-    np.savez(tmp_path / "a.npz", family=np.zeros(100), drone=np.ones(100), apparent=values, target=target, mask=masks)
+    _write(tmp_path / "a.npz", np.zeros(100), apparent=values, target=target)
     files, rng = CropFiles(tmp_path), np.random.default_rng(0)
     drawn = [files.draw(rng) for _ in range(3000)]
     like_it = [np.abs(sample["target"]).max() == 0.0 and sample["apparent"] < np.log(100.0) for sample in drawn]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from flockd.core.messages import Float32Array
 from flockd.flight.perception import group_instances
@@ -25,8 +26,9 @@ def painted(
     return logit, offset
 
 
-def test_an_empty_mask_has_no_drones() -> None:
-    labels, instances = group_instances(*painted((60, 80), []), scale=2)
+@pytest.mark.parametrize("discs", [[], [(30.5, 30.5, 0.6)]], ids=["nothing", "a speck"])
+def test_an_empty_mask_and_specks_are_no_drones(discs: list[tuple[float, float, float]]) -> None:
+    labels, instances = group_instances(*painted((60, 80), discs), scale=2)
     assert instances == ()
     assert not labels.any()
 
@@ -53,13 +55,6 @@ def test_a_drone_cut_by_the_border_points_outside() -> None:
     assert len(instances) == 1
     assert np.allclose(instances[0].centre, [-12.0, 100.0], atol=2.0)
     assert instances[0].box[0] == 0.0
-
-
-def test_specks_are_dropped() -> None:
-    logit, offset = painted((60, 80), [(30.5, 30.5, 0.6)])
-    labels, instances = group_instances(logit, offset, scale=2)
-    assert instances == ()
-    assert not labels.any()
 
 
 def test_a_dozen_drones_keep_their_own_pixels() -> None:

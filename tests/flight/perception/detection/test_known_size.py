@@ -62,8 +62,3 @@ def test_a_flights_detections_are_ranged_by_it() -> None:
 def test_sizes_that_cannot_be_are_refused(values: dict[str, object], complaint: str) -> None:
     with pytest.raises(ValidationError, match=complaint):
         PerceptionConfig.model_validate(values)
-
-
-def test_without_a_size_the_networks_judge_it() -> None:
-    assert PerceptionConfig().drone_size_m is None
-    assert PerceptionConfig.model_validate({"distance": "none"}).drone_size_m is None
