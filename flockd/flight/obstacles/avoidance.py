@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from flockd.core.config.avoidance import ObstacleParameters
@@ -58,9 +56,7 @@ class Avoidance:
         """
         velocity, free_m = self._steering.around(wanted, ranges, flock)
         most_m_s = float(stopping_speed(np.array(free_m), self._gate.braking_m_s2, self._reaction_s))
-        speed = math.hypot(*velocity)
-        slowed = velocity if speed <= most_m_s else velocity * (most_m_s / speed)
-        return slowed + self._away(ranges)
+        return limit_norm(velocity, most_m_s) + self._away(ranges)
 
     def within(
         self, velocity: FloatArray, ranges: ObstacleRanges, neighbours: FloatArray, velocities: FloatArray

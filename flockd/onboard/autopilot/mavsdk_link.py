@@ -105,7 +105,12 @@ class AutopilotLink:
 
     @classmethod
     async def connect(
-        cls, parameters: AutopilotParameters, *, timeout_s: float = 10.0, clock: Clock = time.monotonic
+        cls,
+        parameters: AutopilotParameters,
+        *,
+        timeout_s: float = 10.0,
+        clock: Clock = time.monotonic,
+        create: Callable[[Configuration], Mavsdk] = Mavsdk,
     ) -> Self:
         """The link, once an autopilot has been heard and told what to send.
 
@@ -114,7 +119,7 @@ class AutopilotLink:
         _refuse_a_taken_port(parameters.address)
         log_subscribe(_to_logging)
         executor = ThreadPoolExecutor(1, thread_name_prefix="mavsdk")  # never asyncio's own: it may be saturated
-        mavsdk = Mavsdk(_configuration(parameters.system_id))
+        mavsdk = create(_configuration(parameters.system_id))
         try:
             deadline = clock() + timeout_s
             await _open(mavsdk, parameters.address, executor)
@@ -124,7 +129,7 @@ class AutopilotLink:
             for name, (number, rate_hz) in STREAMS_HZ.items():
                 await link._request_stream(name, number, rate_hz)
         except BaseException:
-            mavsdk.destroy()
+            executor.submit(mavsdk.destroy)  # after a call of it that still runs, which would end the process
             executor.shutdown(wait=False)
             raise
         return link

@@ -10,6 +10,8 @@ import time
 
 import numpy as np
 import pytest
+from mavsdk.connection_result import ConnectionResult
+from mavsdk.mavsdk import Mavsdk
 from pymavlink.dialects.v20 import common as mavlink
 
 from flockd.core.config.autopilot import AutopilotParameters
@@ -257,3 +259,29 @@ async def test_the_range_finder_is_heard_along_the_bodys_down_axis_and_falls_sil
         await until(lambda: (reading := link.ground_range()) is not None and reading.quality == 0.0)
         assert set(link.range_finders()) == {25}
         await link.close()
+
+
+async def test_a_start_that_is_given_up_does_not_destroy_mavsdk_under_its_own_call(port: int) -> None:
+    """The library then reads freed memory, which ends the process (seen)."""
+    told: list[str] = []
+    destroyed = asyncio.Event()
+    loop = asyncio.get_running_loop()
+
+    class Slow(Mavsdk):  # type: ignore[misc]
+        def add_any_connection(self, connection_url: str) -> ConnectionResult:
+            told.append("begins")
+            time.sleep(0.2)
+            told.append("ends")
+            return super().add_any_connection(connection_url)
+
+        def destroy(self) -> None:
+            told.append("destroyed")
+            super().destroy()
+            loop.call_soon_threadsafe(destroyed.set)
+
+    connecting = asyncio.create_task(AutopilotLink.connect(_parameters(port), create=Slow))
+    await until(lambda: told == ["begins"])
+    connecting.cancel()
+    await asyncio.wait({connecting})
+    await asyncio.wait_for(destroyed.wait(), 10.0)
+    assert told[:3] == ["begins", "ends", "destroyed"]

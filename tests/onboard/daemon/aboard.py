@@ -266,6 +266,13 @@ class Aboard(Watched):
     ending: asyncio.Task[Ending]
     service: list[str]
 
+    async def until_state(self, *states: str) -> None:
+        """Raises what ended the daemon, if it is over before."""
+        await until(lambda: self.state() in states or self.ending.done(), SECONDS_TO_FAIL)
+        if self.ending.done():
+            self.ending.result()
+            assert self.state() in states
+
 
 @asynccontextmanager
 async def aboard(
