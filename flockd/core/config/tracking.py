@@ -24,8 +24,12 @@ class TrackingParameters(Section):
     all. Time constant of that average."""
     relative_speed_sigma_m_s: Positive = 0.7
     """Standard deviation an axis of a flock mate's velocity relative to the own drone's, before it is measured."""
-    speed_sigma_m_s: Positive = 1.5
-    """Standard deviation an axis of a neighbour's velocity where the own velocity is not known."""
+    speed_sigma_m_s: Positive = 2.0
+    """Standard deviation an axis of the velocity of a drone that does not fly with the flock: one that comes head-on, or
+    hovers, or any where the own velocity is not known."""
+    stranger_probability: Probability = 0.2
+    """That a drone seen for the first time does not fly with the flock. Both hypotheses are followed until detections
+    tell (static multiple models: Bar-Shalom, Li & Kirubarajan 2001, section 11.6.2)."""
     robust_sigma: Positive = 2.5
     """Innovations beyond this many standard deviations count less and less; of those of the motion and measurement
     model 82 % are nearer, of measured velocities 90 % (chi-square with 4 and 3 degrees of freedom)."""

@@ -9,7 +9,8 @@ from scipy.optimize import linear_sum_assignment
 
 from flockd.core.config.tracking import TrackingParameters
 from flockd.core.messages import BoolArray
-from flockd.flight.tracking.filter import MIN_RANGE_M, Innovation, State, innovation
+from flockd.flight.tracking.filter import MIN_RANGE_M, Innovation, State
+from flockd.flight.tracking.hypotheses import Hypotheses
 from flockd.flight.tracking.measurement import Measurement
 
 _FORBIDDEN = 1e9
@@ -17,7 +18,7 @@ _FORBIDDEN = 1e9
 
 
 def assign(
-    measurements: Sequence[Measurement], states: Sequence[State], parameters: TrackingParameters
+    measurements: Sequence[Measurement], tracks: Sequence[Hypotheses], parameters: TrackingParameters
 ) -> dict[int, tuple[int, Innovation]]:
     """One to one, the likeliest assignment of measurements to tracks: measurement -> (track, innovation), by index.
 
@@ -25,15 +26,16 @@ def assign(
     (twice its negative log likelihood but for a constant). A measurement without a track costs what the vaguest of its
     pairs would cost at the gate, so that no pair within the gate is given up for nothing.
     """
-    if not measurements or not states:
+    if not measurements or not tracks:
         return {}
     gate = parameters.gate_sigma**2
     pairs: dict[tuple[int, int], Innovation] = {}
+    states = [track.state for track in tracks]
     costs = np.full((len(measurements), len(states)), _FORBIDDEN)
     unassigned = np.full((len(measurements), len(measurements)), _FORBIDDEN)
     np.fill_diagonal(unassigned, -_FORBIDDEN)
     for row, column in np.argwhere(_near(measurements, states, parameters.gate_sigma)).tolist():
-        pair = innovation(states[column], measurements[row], parameters)
+        pair = tracks[column].innovation(measurements[row], parameters)
         squared, log_determinant = pair.squared_distance, pair.log_determinant
         if squared <= gate:
             pairs[row, column] = pair

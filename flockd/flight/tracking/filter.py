@@ -79,11 +79,8 @@ class Innovation:
         return -0.5 * (self.squared_distance + self.log_determinant + 4 * math.log(2 * math.pi))
 
 
-def initial(measurement: Measurement, own_velocity: FloatArray | None, parameters: TrackingParameters) -> State:
-    """The state after a first detection; flock mates move alike, so that it starts with the own velocity (3,)."""
-    velocity, sigma_m_s = np.zeros(3), parameters.speed_sigma_m_s
-    if own_velocity is not None:
-        velocity, sigma_m_s = own_velocity, parameters.relative_speed_sigma_m_s
+def initial(measurement: Measurement, velocity: FloatArray, sigma_m_s: float, parameters: TrackingParameters) -> State:
+    """The state after a first detection of a drone that flies at `velocity` (3,) m/s, `sigma_m_s` an axis uncertain."""
     of_place = np.vstack([measurement.range_m * np.eye(3, 4), np.zeros((3, 4)), [0.0, 0.0, 0.0, 1.0]])
     covariance = of_place @ _noise(measurement, parameters) @ of_place.T
     covariance[3:6, 3:6] = sigma_m_s**2 * np.eye(3)

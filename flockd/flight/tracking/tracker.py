@@ -12,6 +12,7 @@ from flockd.core.messages import BoolArray, FloatArray, Neighbour
 from flockd.flight.tracking import existence, filter  # noqa: A004 - the field's word
 from flockd.flight.tracking.association import assign
 from flockd.flight.tracking.filter import Innovation, State
+from flockd.flight.tracking.hypotheses import Hypotheses
 from flockd.flight.tracking.manoeuvres import Manoeuvres
 from flockd.flight.tracking.measurement import Measurement
 
@@ -58,8 +59,10 @@ class Tracker:
         self._manoeuvres.see(own_displacement, own_displacement_sigma_m, interval_s)
         density = self._manoeuvres.density
         for track in self._tracks:
-            track.state = filter.predict(
-                track.state, interval_s, own_displacement, own_displacement_sigma_m, density, self.parameters
+            track.hypotheses = track.hypotheses.changed(
+                lambda state: filter.predict(
+                    state, interval_s, own_displacement, own_displacement_sigma_m, density, self.parameters
+                )
             )
             track.existence = existence.predicted(track.existence, interval_s, self.parameters)
 
@@ -72,13 +75,13 @@ class Tracker:
     ) -> tuple[int, ...]:
         """Take in one frame set's measurements at `time_s`; the track number of each, new where it fits no track.
 
-        `own_velocity` (3,) NED m/s is what a new track starts with: flock mates move alike. A track that is missed
+        `own_velocity` (3,) NED m/s is what flock mates start with, as they move alike (`Hypotheses`). A track that is missed
         where the rig is `blind` (None: nowhere) is as probable as before, but ages as any other.
         """
         interval_s = max(0.0, time_s - self._time_s)
         weight = min(1.0, interval_s / self.parameters.evidence_interval_s)
         self._time_s = time_s
-        pairs = assign(measurements, [track.state for track in self._tracks], self.parameters)
+        pairs = assign(measurements, [track.hypotheses for track in self._tracks], self.parameters)
         missed = self._without({column for column, _ in pairs.values()})
         self._miss(missed, weight, blind)
         numbers = []
@@ -154,14 +157,14 @@ class Tracker:
         track.drone_probability = existence.averaged(
             track.drone_probability, measurement.drone_probability, track.hits, interval_s, self.parameters
         )
-        track.state = filter.update(track.state, measurement, self.parameters)
+        track.hypotheses = track.hypotheses.updated(measurement, track.hits, self.parameters)
         track.last_seen_s = self._time_s
 
     def _begin(self, measurement: Measurement, own_velocity: FloatArray | None) -> _Track:
         self._created += 1
         return _Track(
             number=self._created,
-            state=filter.initial(measurement, own_velocity, self.parameters),
+            hypotheses=Hypotheses.first(measurement, own_velocity, self.parameters),
             existence=self.parameters.birth_probability,
             drone_probability=measurement.drone_probability,
             first_seen_s=self._time_s,
@@ -185,7 +188,7 @@ class _Track:
     """One neighbour."""
 
     number: int
-    state: State
+    hypotheses: Hypotheses
     existence: float
     """Probability of being anything that persists."""
     drone_probability: float
@@ -197,3 +200,8 @@ class _Track:
     """How many of the hits were within `confirm_sigma`."""
     confirmed: bool = False
     was_confirmed: bool = False
+
+    @property
+    def state(self) -> State:
+        """Of all hypotheses together."""
+        return self.hypotheses.state
