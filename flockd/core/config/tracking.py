@@ -25,8 +25,8 @@ class TrackingParameters(Section):
     relative_speed_sigma_m_s: Positive = 0.7
     """Standard deviation an axis of a flock mate's velocity relative to the own drone's, before it is measured."""
     speed_sigma_m_s: Positive = 2.0
-    """Standard deviation an axis of the velocity of a drone that does not fly with the flock: one that comes head-on, or
-    hovers, or any where the own velocity is not known."""
+    """Standard deviation an axis of the velocity of a drone that does not fly with the flock, comes head-on or hovers;
+    and of any drone where the own velocity is not known."""
     stranger_probability: Probability = 0.2
     """That a drone seen for the first time does not fly with the flock. Both hypotheses are followed until detections
     tell (static multiple models: Bar-Shalom, Li & Kirubarajan 2001, section 11.6.2)."""

@@ -44,6 +44,8 @@ class Surroundings:
     """(n, 2) m/s over ground, north and east."""
     height_m: float
     """Height of the drone, as in `VehicleState`; NaN: not known."""
+    neighbour_sigmas: FloatArray | None = None
+    """(n, 2) standard deviations of the neighbours' positions, m, and velocities, m/s, an axis; None: exact."""
     obstacles: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     """(m, 2) metres, north and east, relative to the drone: points of obstacles, each the nearest that it may be."""
 
@@ -201,7 +203,9 @@ class Gate:
         separation_m = p.min_separation_m if action is Action.FLY else p.degraded_separation_m
         outward = offsets_outside(p, around.position)
         outward = _units(outward) if len(outward) else outward
-        to_neighbours = towards_neighbours(p, around.neighbours, around.neighbour_velocities, separation_m)
+        to_neighbours = towards_neighbours(
+            p, around.neighbours, around.neighbour_velocities, separation_m, around.neighbour_sigmas
+        )
         to_obstacles = towards_obstacles(around.obstacles, p.obstacle_clearance_m, p.braking_m_s2, p.reaction_s)
         limits = {
             Objection.FENCE: (outward, np.zeros(len(outward))),

@@ -1,4 +1,4 @@
-"""Who a drone is that was just seen: a flock mate, which moves as one does oneself, or a stranger, which may come head-on.
+"""What a drone may be that was just seen: a flock mate, which moves as one does oneself, or a stranger, which may come.
 
 Static multiple models (Y. Bar-Shalom, X. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation",
 2001, section 11.6.2): each hypothesis has a filter of its own, and detections weigh them by Bayes' rule.

@@ -75,8 +75,8 @@ class Tracker:
     ) -> tuple[int, ...]:
         """Take in one frame set's measurements at `time_s`; the track number of each, new where it fits no track.
 
-        `own_velocity` (3,) NED m/s is what flock mates start with, as they move alike (`Hypotheses`). A track that is missed
-        where the rig is `blind` (None: nowhere) is as probable as before, but ages as any other.
+        `own_velocity` (3,) NED m/s is what flock mates start with, as they move alike (`Hypotheses`). A track that is
+        missed where the rig is `blind` (None: nowhere) is as probable as before, but ages as any other.
         """
         interval_s = max(0.0, time_s - self._time_s)
         weight = min(1.0, interval_s / self.parameters.evidence_interval_s)
