@@ -22,7 +22,9 @@ class Avoidance:
     """One drone's. Remembers which way around it goes."""
 
     def __init__(self, parameters: ObstacleParameters, gate: GateParameters, step_s: float) -> None:
-        self._parameters, self._gate = parameters, gate
+        self._parameters = parameters
+        # A step passes before the next velocity here, too, but the gate that follows keeps its own, longer distance.
+        self._gate = gate.model_copy(update={"neighbour_reaction_s": gate.reaction_s})
         self._step_s = step_s
         self._reaction_s = gate.reaction_s + step_s
         self._steering = Steering(parameters)

@@ -24,6 +24,7 @@ from flockd.flight.safety import (
     Supervisor,
     Surroundings,
 )
+from flockd.flight.safety.surroundings import surroundings
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
@@ -145,20 +146,15 @@ class Control:
         velocity = vehicle.velocity_ned if vehicle is not None and known else np.full(3, np.nan)
         assert velocity is not None
         result = self._pilot_loop.newest
-        tracks = () if result is None else result.output.neighbours  # not confirmed ones too: caution comes first
-        age_s = 0.0 if result is None else now - result.time_s
-        own = np.nan_to_num(velocity)
         ranges = None if result is None else result.output.obstacles
-        places = [n.position + age_s * (n.velocity - own) for n in tracks]  # at constant velocity since the step
-        return Surroundings(
+        return surroundings(
+            () if result is None else result.output.neighbours,
+            0.0 if result is None else now - result.time_s,
             position=position_from_home(status),
-            velocity=velocity[:2],
+            velocity=velocity,
             yaw_rad=math.nan if vehicle is None else _yaw(vehicle),
             height_m=math.nan if vehicle is None else vehicle.height_m,
-            neighbours=np.reshape(places, (len(places), 3)),
-            neighbour_velocities=np.reshape([n.velocity[:2] for n in tracks], (len(tracks), 2)),
-            neighbour_sigmas=np.reshape([(n.position_sigma_m, n.velocity_sigma_m_s) for n in tracks], (len(tracks), 2)),
-            obstacles=np.empty((0, 2)) if ranges is None else nearest_points(ranges, self._sigmas) - age_s * own[:2],
+            obstacles=np.empty((0, 2)) if ranges is None else nearest_points(ranges, self._sigmas),
         )
 
     def _takeover(self) -> Takeover | None:

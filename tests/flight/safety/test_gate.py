@@ -482,14 +482,14 @@ def test_no_velocity_towards_a_neighbour_that_is_too_near() -> None:
 
 
 def test_away_from_it_and_below_or_far_from_another_the_drone_may_fly() -> None:
-    for around in (near([-0.9, 0.0, 0.0]), near([3.0, 0.0, 0.0]), near([0.7, 0.0, 3.0]), near([0.7, 0.0, -3.0])):
+    for around in (near([-0.9, 0.0, 0.0]), near([4.0, 0.0, 0.0]), near([0.7, 0.0, 3.0]), near([0.7, 0.0, -3.0])):
         verdict = Stream().second([1.0, 0.5], around=around)
         np.testing.assert_allclose(sent(verdict).velocity, [1.0, 0.5])
         assert verdict.objections == ()
 
 
 def test_degraded_it_keeps_farther_away() -> None:
-    parameters = DRAG_FREE.model_copy(update={"min_separation_m": 1.0, "degraded_separation_m": 1.5})
+    parameters = DRAG_FREE.model_copy(update={"degraded_separation_m": 1.5, "neighbour_reaction_s": 0.5})
     for action, velocity in ((Action.FLY, [0.2, 0.5]), (Action.FLY_DEGRADED, [0.0, 0.5])):
         np.testing.assert_allclose(
             sent(Stream(parameters).second([0.2, 0.5], action, near([1.4, 0.0, 0.0]))).velocity, velocity
@@ -512,7 +512,7 @@ def test_a_neighbour_nearer_than_its_direction_can_be_measured_is_in_no_directio
 
 
 def test_towards_a_neighbour_it_flies_no_faster_than_it_can_brake() -> None:
-    parameters = DRAG_FREE.model_copy(update={"braking_m_s2": 2.0, "reaction_s": 0.5})
+    parameters = DRAG_FREE.model_copy(update={"braking_m_s2": 2.0, "neighbour_reaction_s": 0.5})
     # 3 m to the minimum distance of 1 m. Both at 1.65 m/s: half a second takes 1.65 m, braking 2 * 1.65^2 / (2 * 2) m.
     verdict = Stream(parameters).second([3.5, 0.5], around=near([4.0, 0.0, 0.0]))
     np.testing.assert_allclose(sent(verdict).velocity, [1.6458, 0.5], atol=1e-4)
@@ -527,6 +527,25 @@ def test_towards_a_neighbour_it_flies_no_faster_than_it_can_brake() -> None:
     # Behind one that flies ahead at the same 2 m/s just outside the minimum distance nothing is held back.
     ahead = replace(near([1.01, 0.0, 0.0]), neighbour_velocities=np.array([[2.0, 0.0]]))
     np.testing.assert_allclose(sent(Stream(parameters).second([2.0, 0.0], around=ahead)).velocity, [2.0, 0.0])
+
+
+def test_an_uncertain_neighbour_counts_as_nearer_and_faster() -> None:
+    """Two standard deviations: 4 m +- 0.25 m is 3.5 m, and 1 +- 0.5 m/s towards the drone are 2 m/s."""
+    exact = replace(near([3.5, 0.0, 0.0]), neighbour_velocities=np.array([[-2.0, 0.0]]))
+    uncertain = replace(
+        near([4.0, 0.0, 0.0]),
+        neighbour_velocities=np.array([[-1.0, 0.0]]),
+        neighbour_sigmas=np.array([[0.25, 0.5]]),
+    )
+    parameters = DRAG_FREE.model_copy(update={"neighbour_reaction_s": 0.2})
+    expected = sent(Stream(parameters).second([3.5, 0.0], around=exact)).velocity
+    assert 0.3 < expected[0] < 3.0
+    np.testing.assert_allclose(sent(Stream(parameters).second([3.5, 0.0], around=uncertain)).velocity, expected)
+    # A flock mate that flies ahead is followed by its likeliest velocity: doubt about it holds nobody back.
+    ahead = replace(
+        near([4.0, 0.0, 0.0]), neighbour_velocities=np.array([[1.0, 0.0]]), neighbour_sigmas=np.array([[0.1, 0.2]])
+    )
+    np.testing.assert_allclose(sent(Stream(parameters).second([1.0, 0.0], around=ahead)).velocity, [1.0, 0.0])
 
 
 @pytest.mark.parametrize(("lag_s", "period_s", "least_m"), [(0.0, 0.05, 1.0), (0.35, 0.5, 0.999)])
@@ -718,7 +737,7 @@ def test_what_is_left_is_the_nearest_to_what_was_asked_for() -> None:
     angles = np.linspace(0.0, math.tau, 360, endpoint=False)
     speeds = np.linspace(0.0, 1.5, 151)
     grid = np.concatenate([speed * np.column_stack([np.cos(angles), np.sin(angles)]) for speed in speeds])
-    parameters = DRAG_FREE.model_copy(update={"braking_m_s2": 1.5, "reaction_s": 0.5})
+    parameters = DRAG_FREE.model_copy(update={"braking_m_s2": 1.5, "neighbour_reaction_s": 0.5})
     for _ in range(40):
         bearings, ranges = rng.uniform(0.0, math.tau, (n := int(rng.integers(1, 4)))), rng.uniform(0.1, 1.4, n)
         towards = np.column_stack([np.cos(bearings), np.sin(bearings)])

@@ -262,7 +262,13 @@ def test_a_track_follows_a_jump_that_stays() -> None:
 
 def test_the_first_update_is_the_textbook_kalman_filter() -> None:
     """By hand: 0.1 m at first sight, velocity +-0.7 m/s, 1 s on: 0.01 + 0.49 + 0.4^2 * 0.5 / 3 = 0.526667 m^2."""
-    tracker = Tracker(TrackingParameters(acceleration_sigma_m_s2=0.4, size_correlation=1e-6))  # of the range alone
+    tracker = Tracker(
+        TrackingParameters(
+            acceleration_sigma_m_s2=0.4,
+            size_correlation=1e-6,
+            stranger_probability=1e-9,  # the range of a mate alone
+        )
+    )
     tracker.update(0.0, [_seen(AHEAD, 0.1)], CRUISE)
     tracker.predict(1.0, np.array([0.6, 0.0, 0.0]))
     (before,) = tracker.neighbours()
@@ -298,17 +304,42 @@ def test_without_the_own_displacement_tracks_stay_put_and_grow_uncertain() -> No
     assert after.position_sigma_m**2 > before.position_sigma_m**2 + (0.7 * STEP_S) ** 2
 
 
-def test_a_new_track_flies_as_the_own_drone_does_or_stands_where_that_is_unknown() -> None:
-    for own, velocity, sigma in ((CRUISE, CRUISE, 0.7), (None, np.zeros(3), 1.5)):
-        tracker = Tracker(TrackingParameters())
-        tracker.update(0.0, [_seen(AHEAD)], own)
-        (neighbour,) = tracker.neighbours()
-        np.testing.assert_array_equal(neighbour.velocity, velocity)
-        assert neighbour.velocity_sigma_m_s == pytest.approx(sigma)
+def test_a_new_track_is_a_flock_mates_or_a_strangers() -> None:
+    """A mate at 1 +- 0.7 m/s by 0.8, a stranger at 0 +- 2 m/s by 0.2: north 0.8 m/s, 0.8 * 0.49 + 0.2 * 4 + 0.16."""
+    tracker = Tracker(TrackingParameters())
+    tracker.update(0.0, [_seen(AHEAD)], CRUISE)
+    (neighbour,) = tracker.neighbours()
+    np.testing.assert_allclose(neighbour.velocity, [0.8, 0.0, 0.0], atol=1e-12)
+    north, across = 0.8 * 0.49 + 0.2 * 4.0 + 0.8 * 0.2, 0.8 * 0.49 + 0.2 * 4.0
+    assert neighbour.velocity_sigma_m_s == pytest.approx(math.sqrt((north + 2 * across) / 3))
+
+
+def test_where_the_own_velocity_is_not_known_all_are_strangers() -> None:
+    tracker = Tracker(TrackingParameters())
+    tracker.update(0.0, [_seen(AHEAD)], None)
+    (neighbour,) = tracker.neighbours()
+    np.testing.assert_array_equal(neighbour.velocity, np.zeros(3))
+    assert neighbour.velocity_sigma_m_s == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("comes_m_s", [-3.0, 0.0, 1.0])
+def test_whom_a_track_is_of_is_known_after_a_few_detections(comes_m_s: float) -> None:
+    """Head-on at 3 m/s, hovering, or along with the own drone at 1 m/s: 20 m ahead, a detection each half second."""
+    tracker = Tracker(TrackingParameters())
+    rng = np.random.default_rng(1)
+    for step in range(5):
+        place = np.array([20.0 + 0.5 * step * (comes_m_s - 1.0), 0.0, 0.0])
+        if step:
+            tracker.predict(STEP_S, STEP_S * CRUISE, 0.02)
+        tracker.update(0.5 * step, [_seen(place * math.exp(0.05 * rng.normal()), 0.05 * place[0])], CRUISE)
+    (neighbour,) = tracker.neighbours()
+    assert neighbour.confirmed
+    assert abs(neighbour.velocity[0] - comes_m_s) < 2.5 * neighbour.velocity_sigma_m_s
+    assert neighbour.velocity_sigma_m_s < 1.2
 
 
 def test_a_measured_velocity_counts_by_its_variance() -> None:
-    tracker = Tracker(TrackingParameters())
+    tracker = Tracker(TrackingParameters(stranger_probability=1e-9))
     measured = replace(_seen(AHEAD), velocity=np.array([1.0, 0.7, 0.0]), velocity_sigma_m_s=math.sqrt(0.49 / 3))
     tracker.update(0.0, [measured], CRUISE)
     (neighbour,) = tracker.neighbours()
