@@ -44,10 +44,10 @@ class Surroundings:
     """(n, 2) m/s over ground, north and east."""
     height_m: float
     """Height of the drone, as in `VehicleState`; NaN: not known."""
-    neighbour_sigmas: FloatArray | None = None
-    """(n, 2) standard deviations of the neighbours' positions, m, and velocities, m/s, an axis; None: exact."""
     obstacles: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     """(m, 2) metres, north and east, relative to the drone: points of obstacles, each the nearest that it may be."""
+    neighbour_sigmas: FloatArray | None = None
+    """(n, 2) standard deviations of the neighbours' positions, m, and velocities, m/s, an axis; None: exact."""
 
 
 @dataclass(frozen=True, eq=False)
