@@ -149,3 +149,12 @@ def test_a_pole_that_is_passed_between_two_steps_counts() -> None:
     found = clearances(Obstacles([POLE]), times, position, velocity)
     # Beside the pole, at 10 m north, its surface is 0.5 m away; at the steps it is 0.91 m and more.
     assert found[:, 0] == pytest.approx([0.5, math.sqrt(2.0) - 0.5, math.hypot(3.0, 1.0) - 0.5], abs=1e-9)
+
+
+def test_between_the_samples_of_a_step_a_clearance_errs_by_half_their_spacing_at_most() -> None:
+    """2 m a step, 10 samples: 0.2 m apart. The pole at 10 m is passed 1 m aside, halfway between two of them."""
+    times, velocity = np.array([0.0, 0.5]), np.tile([4.0, 0.0, 0.0], (2, 1, 1))
+    position = np.array([[9.1, 1.0, -4.0], [11.1, 1.0, -4.0]])[:, None]
+    found = clearances(Obstacles([POLE]), times, position, velocity)[0, 0]
+    assert found == pytest.approx(math.hypot(0.1, 1.0) - 0.5)
+    assert 0.5 <= found <= 0.5 + 0.1

@@ -30,6 +30,7 @@ from flockd.core.choices import AutopilotKind
 from flockd.core.config import ScenarioConfig, load_drone, load_scenario
 from flockd.core.data import data_path
 from flockd.core.messages import FloatArray
+from flockd.flight.flocking.metrics import closest_distances
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.flight_folder import save_flight, write_report_files
 from flockd.sim.fleet import fly_fleet
@@ -143,7 +144,7 @@ def rows(mission: Mission, scenario: ScenarioConfig, log: FlightLog) -> list[Row
     fleet = log.metadata.fleet
     assert fleet is not None
     plan = log.position[..., :2]
-    gaps = np.linalg.norm(log.position[:, :, None] - log.position[:, None], axis=-1)
+    gaps = closest_distances(log.position)
     common = {
         "flight": mission.name,
         "closest_m": round(float(gaps[:, *np.triu_indices(plan.shape[1], 1)].min()), 2),

@@ -11,6 +11,7 @@ import numpy as np
 
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import BoolArray, FloatArray
+from flockd.flight.geometry import closest_approach
 
 
 def obj1(velocities: FloatArray, desired: FloatArray, *, circling: bool) -> FloatArray:
@@ -88,6 +89,15 @@ def min_distance(positions: FloatArray) -> float:
     """The nearest pair's distance, m; infinite for a single UAV."""
     n = len(positions)
     return float(np.min(pair_distances(positions)[np.triu_indices(n, 1)], initial=np.inf))
+
+
+def closest_distances(positions: FloatArray) -> FloatArray:
+    """(S, n, n) m: how near each pair of (S, n, k) m comes from each step to the next, at the last step just then.
+
+    Each is taken to fly straight from step to step (`flockd.flight.geometry.closest_approach`).
+    """
+    offsets = positions[:, None] - positions[:, :, None]
+    return np.concatenate([closest_approach(offsets[:-1], offsets[1:]), np.linalg.norm(offsets[-1:], axis=-1)])
 
 
 def pair_distances(positions: FloatArray) -> FloatArray:

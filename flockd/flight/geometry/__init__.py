@@ -1,6 +1,7 @@
 """Camera models, rigid fits, Algorithm 1, ego- and neighbour motion. Pure: no clock, no files, the same every time."""
 
 from flockd.flight.geometry.cameras import Camera, PinholeCamera, WideAngleCamera
+from flockd.flight.geometry.closest_approach import closest_approach, share_at_closest
 from flockd.flight.geometry.ego_motion import estimate_ego_motion
 from flockd.flight.geometry.ego_motion_refinement import refine_ego_motion
 from flockd.flight.geometry.ground import ground_inverse_depth
@@ -39,6 +40,7 @@ __all__ = [
     "VirtualCrop",
     "WideAngleCamera",
     "build_rig",
+    "closest_approach",
     "estimate_ego_motion",
     "estimate_neighbour_motion",
     "euler_from_rotation",
@@ -61,6 +63,7 @@ __all__ = [
     "rotation_from_quaternion",
     "rotation_from_vector",
     "scale_on_track",
+    "share_at_closest",
     "vector_from_rotation",
     "virtual_crop",
 ]

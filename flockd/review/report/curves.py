@@ -18,6 +18,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from flockd.core.messages import BoolArray, FloatArray
+from flockd.flight.flocking.metrics import closest_distances
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.paper_results import TABLE_2
 from flockd.review.report.style import BAND, FEW, INK, MUTED, STYLE, colour_of, drone_name
@@ -98,10 +99,12 @@ def _flight_column(axes: Mapping[str, Axes], log: FlightLog, position: FloatArra
 
 
 def _distance_lines(axes: Axes, time_s: FloatArray, position: FloatArray) -> None:
-    """Horizontal distance of each pair in both drones' colours; of many drones, each one's distance to its nearest."""
+    """Horizontal distance of each pair in both drones' colours; of many drones, each one's distance to its nearest.
+
+    From each step to the next it is the least.
+    """
     drones = position.shape[1]
-    plan = position[..., :2]
-    distances = np.linalg.norm(plan[:, :, None] - plan[:, None], axis=3)
+    distances = closest_distances(position[..., :2])
     if drones > FEW:
         nearest = np.where(np.eye(drones, dtype=bool), np.inf, distances).min(axis=2)
         _flock_lines(axes, time_s, nearest)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from flockd.flight.flocking.metrics import closest_distances
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import EXACT_STATES
 from flockd.review.report.paper_results import TABLE_2, TABLE_3
@@ -192,7 +193,7 @@ def _fact(name: str, value: str, remark: str, unit: str = "") -> dict[str, str]:
 
 def _closest(log: FlightLog) -> str:
     """Which two drones came closest, and when."""
-    gaps = np.linalg.norm(log.position[:, :, None] - log.position[:, None], axis=3)
+    gaps = closest_distances(log.position)
     gaps[:, np.eye(gaps.shape[1], dtype=bool)] = np.inf
     step, one, other = np.unravel_index(np.argmin(gaps), gaps.shape)
     return f"drones {one + 1} and {other + 1} at {log.time_s[step]:.1f} s"

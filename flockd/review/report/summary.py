@@ -10,7 +10,7 @@ import numpy as np
 
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import BoolArray, FloatArray
-from flockd.flight.flocking.metrics import connectivity, min_distance, obj1, obj2, order, safety, union
+from flockd.flight.flocking.metrics import closest_distances, connectivity, obj1, obj2, order, safety, union
 from flockd.review.flight_log.log import FlightLog
 
 TAIL_S = 10.0
@@ -30,14 +30,14 @@ def summarise(log: FlightLog) -> Json:
 
     `table2`: absolute errors over all drones, steps and seen neighbours, before and from `circle_until_s`. `table3`:
     convergence of the companion with exact states ("truth") and of this flight ("vision"), null unless the flight goes
-    on for 10 s after the circle. `flock`: distances and `safety` between drone centres in three dimensions over all
-    steps; order, union and connectivity are horizontal means over the last 10 s, with the law's observation distance as
-    interaction distance. `neighbours`: the share of all drones within 10 m, at all steps, of which there was a
-    confirmed track, and new false tracks; of drones and steps that were recorded. A flight whose perception is "truth"
-    has no perception: its `neighbours` are null and it is itself Table 3's "truth". Of a recording without truth
-    (`has_truth`) all of these are null. `mission` is `mission_figures`, `obstacles` is `obstacle_figures`.
-    `own_account` needs no truth: the recorded drones' own estimates. `autopilot` names what real daemons flew, and
-    `fleet` holds their figures; null where the simulator ran the pilots.
+    on for 10 s after the circle. `flock`: the smallest distances between drone centres in three dimensions, between
+    steps too (`closest_distances`), and `safety` at all steps; order, union and connectivity are horizontal means over
+    the last 10 s, with the law's observation distance as interaction distance. `neighbours`: the share of all drones
+    within 10 m, at all steps, of which there was a confirmed track, and new false tracks; of drones and steps that were
+    recorded. A flight whose perception is "truth" has no perception: its `neighbours` are null and it is itself Table
+    3's "truth". Of a recording without truth (`has_truth`) all of these are null. `mission` is `mission_figures`,
+    `obstacles` is `obstacle_figures`. `own_account` needs no truth: the recorded drones' own estimates. `autopilot`
+    names what real daemons flew, and `fleet` holds their figures; null where the simulator ran the pilots.
     """
     metadata, value = log.metadata, log.metadata.model_dump()
     return {
@@ -211,7 +211,8 @@ def _flock(log: FlightLog) -> Json:
     if not log.has_truth:
         return dict.fromkeys(_FLOCK)
     steps = range(len(log.time_s))
-    nearest = np.array([min_distance(log.position[s]) for s in steps])
+    pairs = np.triu_indices(log.position.shape[1], 1)
+    nearest = closest_distances(log.position)[:, *pairs].min(axis=1, initial=np.inf)
     tail = np.flatnonzero(_tail(log))
     reach_m = log.metadata.observation_distance_m
     return {

@@ -1,4 +1,4 @@
-"""Figures of many flights while they fly: distances in each step, and order and union at the end of a flight."""
+"""Figures of many flights while they fly: distances from step to step, and order and union at the end of a flight."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from flockd.core.messages import FloatArray
+from flockd.flight.geometry import share_at_closest
 from flockd.sim.control_level.cells import row_of, slice_of_row
 
 TAIL_S = 10.0
@@ -17,43 +18,83 @@ SAFE_M = 1.0
 """Nearer than this a pair counts against `safety`, as in `flockd.flight.flocking.metrics`."""
 
 
+_share_at_closest = njit(nogil=True, cache=True, error_model="numpy")(share_at_closest)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def find_ways(first: int, last: int, before: Any, now: Any, order: Any, ways: Any, farthest: Any) -> None:
+    """How far drones flew between two steps, beside the mean of their flight; of the flights from `first` to `last`.
+
+    `before` and `now` (6, flights, n) are states. Fills `ways` (3, flights, n) m by slot, and `farthest` (flights,)
+    with the longest of them, m. The mean is left out as it moves no two drones towards each other.
+    """
+    n = now.shape[2]
+    for f in range(first, last):
+        for part in range(3):
+            mean = (now[part, f] - before[part, f]).sum() / n
+            for slot in range(n):
+                d = order[f, slot]
+                ways[part, f, slot] = now[part, f, d] - before[part, f, d] - mean
+        most = 0.0
+        for slot in range(n):
+            most = max(most, ways[0, f, slot] ** 2 + ways[1, f, slot] ** 2 + ways[2, f, slot] ** 2)
+        farthest[f] = math.sqrt(most)
+
+
 @njit(nogil=True, cache=True, error_model="numpy")
 def nearest_distances(
-    begin: int, end: int, by_slot: Any, grids: Any, starts: Any, order: Any, level: Any, straight: Any, unsafe: Any
+    begin: int, end: int, by_slot: Any, grids: Any, starts: Any, order: Any, ways: Any, farthest: Any, found: Any
 ) -> None:
     """Figures of the drones `begin` to before `end`, counted slot by slot through all flights.
 
-    Fills `level` and `straight` (flights, n) with the distance to the nearest other drone in the plane and in space, m,
-    infinite for one that is alone, and `unsafe` (flights, n) with how many are nearer than `SAFE_M`.
+    Fills `found` (5, flights, n) with the distance to the nearest other drone, m, infinite for one that is alone: since
+    the last step in the plane and in space, each drone taken to have flown straight on its way (`find_ways`), and now
+    in the plane and in space; then with how many are nearer than `SAFE_M` now.
     """
     n = by_slot.shape[2]
     for i in range(begin, end):
         f = i // n
         slot = i - f * n
         x, y, z, grid = by_slot[0, f], by_slot[1, f], by_slot[2, f], grids[f]
-        hx, hy, hz = x[slot], y[slot], z[slot]
-        least_level = math.inf
-        least = math.inf
+        u, v, w = ways[0, f], ways[1, f], ways[2, f]
+        hx, hy, hz, hu, hv, hw = x[slot], y[slot], z[slot], u[slot], v[slot], w[slot]
+        # A drone now farther away than `reach` was never nearer than `reach` less both drones' ways.
+        both_ways = math.sqrt(hu * hu + hv * hv + hw * hw) + farthest[f]
+        least_level = least = now_level = now = math.inf
         near = 0
-        reach = max(grid[2], SAFE_M)
+        reach = max(grid[2], SAFE_M) + both_ways
         while n > 1:
-            least_level, least, near = math.inf, math.inf, 0
+            least_level = least = now_level = now = math.inf
+            near = 0
             for row in range(row_of(hx - reach, grid), row_of(hx + reach, grid) + 1):
                 a, b = slice_of_row(row, hx, hy, reach, grid, starts[f])
                 for j in range(a, b):
                     if j != slot:
-                        d2 = (x[j] - hx) ** 2 + (y[j] - hy) ** 2
-                        s2 = d2 + (z[j] - hz) ** 2
-                        least_level = min(least_level, d2)
-                        least = min(least, s2)
+                        dx, dy, dz = x[j] - hx, y[j] - hy, z[j] - hz
+                        d2 = dx * dx + dy * dy
+                        s2 = d2 + dz * dz
+                        now_level = min(now_level, d2)
+                        now = min(now, s2)
                         near += s2 < SAFE_M * SAFE_M
-            if least <= reach * reach:
+                        # Back along the way from now, at a share s of it: |d + s w|^2 >= |d|^2 + 2 min(d . w, 0).
+                        du, dv, dw = hu - u[j], hv - v[j], hw - w[j]
+                        along = dx * du + dy * dv
+                        if d2 + 2.0 * min(along, 0.0) < least_level:
+                            s = _share_at_closest(along, du * du + dv * dv)
+                            least_level = min(least_level, (dx + s * du) ** 2 + (dy + s * dv) ** 2)
+                        along += dz * dw
+                        if s2 + 2.0 * min(along, 0.0) < least:
+                            s = _share_at_closest(along, du * du + dv * dv + dw * dw)
+                            least = min(least, (dx + s * du) ** 2 + (dy + s * dv) ** 2 + (dz + s * dw) ** 2)
+            if now <= reach * reach and math.sqrt(least) + both_ways <= reach:
                 break
             reach *= 2.0
         d = order[f, slot]
-        level[f, d] = math.sqrt(least_level)
-        straight[f, d] = math.sqrt(least)
-        unsafe[f, d] = near
+        found[0, f, d] = math.sqrt(least_level)
+        found[1, f, d] = math.sqrt(least)
+        found[2, f, d] = math.sqrt(now_level)
+        found[3, f, d] = math.sqrt(now)
+        found[4, f, d] = near
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -87,26 +128,26 @@ def _root(parent: Any, i: int) -> int:
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def gather(
-    time_s: float, level: Any, straight: Any, unsafe: Any, touch_m: float, touching: Any, contacts: Any, first_s: Any,
-    out: Any,
-) -> None:  # fmt: skip
-    """Takes one step's `nearest_distances` into the contacts so far; `out` (4, flights) is what else is of the step.
+def gather(since_s: float, found: Any, touch_m: float, touching: Any, contacts: Any, first_s: Any, out: Any) -> None:
+    """Takes one step's `nearest_distances` into the contacts so far; `out` (5, flights) is what else is of the step.
 
-    That is the least distance in space and in the plane, the mean of the latter, and how many pairs are not safe.
-    `touching` (flights, n), `contacts` and `first_s` (flights,) are changed in place.
+    That is the least distance since the last step, at `since_s`, in the plane and in space, the mean of the distances
+    in the plane now, the least in space now, and how many pairs are not safe now. `touching` (flights, n), `contacts`
+    and `first_s` (flights,) are changed in place.
     """
-    for f in range(level.shape[0]):
-        out[:, f] = math.inf, math.inf, 0.0, 0.0
-        for i in range(level.shape[1]):
-            out[0, f] = min(out[0, f], straight[f, i])
-            out[1, f] = min(out[1, f], level[f, i])
-            out[2, f] += level[f, i] / level.shape[1]
-            out[3, f] += unsafe[f, i] / 2
-            touches = straight[f, i] < touch_m
+    n = found.shape[2]
+    for f in range(found.shape[1]):
+        out[:, f] = math.inf, math.inf, 0.0, math.inf, 0.0
+        for i in range(n):
+            out[0, f] = min(out[0, f], found[0, f, i])
+            out[1, f] = min(out[1, f], found[1, f, i])
+            out[2, f] += found[2, f, i] / n
+            out[3, f] = min(out[3, f], found[3, f, i])
+            out[4, f] += found[4, f, i] / 2
+            touches = found[1, f, i] < touch_m
             if touches and not touching[f, i]:
                 contacts[f] += 1
-                first_s[f] = min(first_s[f], time_s)
+                first_s[f] = min(first_s[f], since_s)
             touching[f, i] = touches
 
 
@@ -130,6 +171,7 @@ class FlightFigures:
     def __init__(self, flights: int, drones: int, times: FloatArray, step_s: float, radius_m: float) -> None:
         self._n, self._radius_m = drones, radius_m
         self._tail = times > times[-1] + step_s - TAIL_S - 1e-6
+        self._late = times >= TAIL_S
         self._times = times
         self._least = np.full(flights, np.inf)
         self._least_level = np.full(flights, np.inf)
@@ -139,27 +181,27 @@ class FlightFigures:
         self._touching = np.zeros((flights, drones), dtype=bool)
         self._contacts = np.zeros(flights, dtype=np.int64)
         self._first_s = np.full(flights, np.inf)
-        self._of_step = np.empty((4, flights))
+        self._of_step = np.empty((5, flights))
         self._order, self._union, self._mean_nearest, self._extent = (np.zeros(flights) for _ in range(4))
 
     def needs_union(self, step: int) -> bool:
         """Whether `add_tail` has to be called in this step."""
         return bool(self._tail[step])
 
-    def add(self, step: int, level: FloatArray, straight: FloatArray, unsafe: FloatArray) -> None:
-        """Distances of one step, as `nearest_distances` gives them."""
-        time_s = float(self._times[step])
+    def add(self, step: int, found: FloatArray) -> None:
+        """Distances of one step and since the one before, as `nearest_distances` gives them."""
+        last = max(step - 1, 0)
         gather(
-            time_s, level, straight, unsafe, 2 * self._radius_m, self._touching, self._contacts, self._first_s,
+            float(self._times[last]), found, 2 * self._radius_m, self._touching, self._contacts, self._first_s,
             self._of_step,
         )  # fmt: skip
-        least, least_level, mean_level, unsafe_pairs = self._of_step
+        least_level, least, mean_level, least_now, unsafe_pairs = self._of_step
         np.minimum(self._least, least, out=self._least)
         np.minimum(self._least_level, least_level, out=self._least_level)
-        if time_s >= TAIL_S:
-            np.minimum(self._least_late, least, out=self._least_late)
+        for of_window, begins in (self._least_late, self._late), (self._least_tail, self._tail):
+            if begins[step]:
+                np.minimum(of_window, least if begins[last] else least_now, out=of_window)
         if self._tail[step]:
-            np.minimum(self._least_tail, least, out=self._least_tail)
             self._mean_nearest += mean_level
         self._unsafe += unsafe_pairs
 

@@ -101,7 +101,8 @@ class FlockFlights:
         """Velocities that drones were asked to fly with in the last step, m/s."""
         self._middles, self._own = (np.zeros((2, f, n)) for _ in range(2))
         self._room = perceived_sums.Room.of(n)
-        self._level, self._straight, self._unsafe = (np.empty((f, n)) for _ in range(3))
+        self._before = self.states.copy()
+        self._ways, self._farthest, self._nearest = np.empty((3, f, n)), np.empty(f), np.empty((5, f, n))
 
     def step(self, step: int, pool: ThreadPoolExecutor | None, threads: int) -> None:
         """One step of all flights."""
@@ -198,17 +199,22 @@ class FlockFlights:
     def _measure(self, step: int, pool: ThreadPoolExecutor | None, threads: int) -> None:
         """Takes the figures of a step."""
         f, n = self._shape
+        if step == 0:
+            self._before[:] = self.states
+        of_ways = self._before, self.states, self._order, self._ways, self._farthest
+        flights = _parts(f, threads, least=max(_LEAST_DRONES // n, 1))
+        _run(pool, flights, lambda a, b: flock_figures.find_ways(a, b, *of_ways))
+        self._before[:] = self.states
         cells = self._by_slot, self._grids, self._starts
-        found = self._level, self._straight, self._unsafe
+        ways = self._order, self._ways, self._farthest, self._nearest
         parts = _parts(f * n, threads, _LEAST_DRONES)
-        _run(pool, parts, lambda a, b: flock_figures.nearest_distances(a, b, *cells, self._order, *found))
-        self._figures.add(step, *found)
+        _run(pool, parts, lambda a, b: flock_figures.nearest_distances(a, b, *cells, *ways))
+        self._figures.add(step, self._nearest)
         if self._obstacles is not None:
             self._obstacles.measure(self.states, ends=step == self.steps - 1)
         if self._figures.needs_union(step):
             unions, reach = np.empty(f), self._drone.flocking.observation_distance_m
-            parts = _parts(f, threads, least=max(_LEAST_DRONES // n, 1))
-            _run(pool, parts, lambda a, b: flock_figures.unions(a, b, *cells, reach, unions))
+            _run(pool, flights, lambda a, b: flock_figures.unions(a, b, *cells, reach, unions))
             self._figures.add_tail(self.states, unions)
 
     def _next_gusts(self) -> FloatArray:

@@ -175,6 +175,20 @@ def test_a_sum_that_leaves_its_band_at_the_last_step_has_not_converged() -> None
     assert table["obj2"]["error"] == pytest.approx(2 * 19 / 20 * 2 * 1.0 / 20, rel=0.05)  # one of 20 is 2 off the rest
 
 
+def test_drones_that_pass_between_two_steps_are_as_near_as_they_were() -> None:
+    """At 2 m/s each, 0.34 m aside: 0.996 m apart at 12 s, and 2 m farther on their ways at 12.5 s."""
+    log = _hand_made()
+    position = log.position.copy()
+    position[:, 0] = [0.0, 0.0, -4.0]
+    position[:, 1, 0] = math.sqrt(0.996**2 - 0.34**2) - 4.0 * (TIME_S - 12.0)
+    position[:, 1, 1:] = [0.34, -4.0]
+    passing = replace(log, position=position)
+    assert np.linalg.norm(position[:, 0] - position[:, 1], axis=1).min() == pytest.approx(0.996)
+    flock = summarise(passing)["flock"]
+    assert (flock["min_distance_m"], flock["min_distance_after_10s_m"]) == pytest.approx((0.34, 0.34))
+    assert summarise(_first(passing, 25))["flock"]["min_distance_m"] == pytest.approx(0.996)  # ends at 12 s
+
+
 def test_the_flocks_figures_by_hand() -> None:
     flock = summarise(_hand_made())["flock"]
     assert flock["min_distance_m"] == pytest.approx(math.hypot(0.6, 0.5))

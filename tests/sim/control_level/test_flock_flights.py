@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import Any
 
@@ -14,7 +15,7 @@ from flockd.core.data import data_path
 from flockd.core.errors import UsageError
 from flockd.core.messages import FloatArray
 from flockd.flight.flocking import FlockingLaw, FlockingParameters, WeightParameters
-from flockd.flight.flocking.metrics import min_distance, order, safety, union
+from flockd.flight.flocking.metrics import closest_distances, order, safety, union
 from flockd.sim.control_level import fly_flocks
 from flockd.sim.control_level.flock_figures import orders
 from flockd.sim.control_level.flock_flights import FlockFlights
@@ -114,11 +115,14 @@ def test_the_figures_are_those_of_the_metrics() -> None:
     positions, velocities = _flown(flights)
     for flight, figures in enumerate(flights.figures()):
         x, v = positions[:, flight], velocities[:, flight]
-        nearest = np.array([min_distance(step) for step in x])
+        pairs = np.triu_indices(9, 1)
+        nearest = closest_distances(x)[:, *pairs].min(axis=1)
         assert figures["min_distance_m"] == pytest.approx(nearest.min(), abs=1e-12)
         assert figures["min_distance_after_10s_m"] == pytest.approx(nearest[20:].min(), abs=1e-12)
         assert figures["min_distance_tail_m"] == pytest.approx(nearest[10:].min(), abs=1e-12)
-        assert figures["min_level_distance_m"] == pytest.approx(min(min_distance(step[:, :2]) for step in x), abs=1e-12)
+        assert figures["min_level_distance_m"] == pytest.approx(
+            closest_distances(x[..., :2])[:, *pairs].min(), abs=1e-12
+        )
         assert figures["order_tail"] == pytest.approx(np.mean([order(step[:, :2]) for step in v[10:]]), abs=1e-12)
         assert figures["union_tail"] == pytest.approx(np.mean([union(step[:, :2], 20.0) for step in x[10:]]))
         assert figures["safety"] == pytest.approx(np.mean([safety(step) for step in x]))
@@ -137,10 +141,53 @@ def test_contacts_are_counted_from_touch_to_free() -> None:
     scenario = with_drones(_scenario(duration_s=4.0, drone__flocking__max_acceleration_m_s2=0.001), 2)
     flights = FlockFlights([scenario])
     flights.states[:, 0] = np.array([[0.0, 0.0, -4.0, 1.0, 0.0, 0.0], [3.0, 0.0, -4.0, -1.0, 0.0, 0.0]]).T
-    figures = _and_fly(flights)  # 3 m apart, at 2 m/s towards each other: within 0.7 m at 1.5 s only
+    figures = _and_fly(flights)  # 3 m apart, at 2 m/s towards each other: within 0.7 m from 1.15 to 1.85 s
     assert figures["drone_collisions"] == 2  # each of the two drones has one
-    assert figures["first_collision_s"] == 1.5
+    assert figures["first_collision_s"] == 1.0  # in the step that begins there
     assert figures["min_distance_m"] == pytest.approx(0.0, abs=0.01)
+
+
+def test_drones_that_pass_between_two_steps_are_as_near_as_they_were() -> None:
+    """At 2 m/s each, 0.34 m aside. A step before they meet one is ahead of the other by a, with a^2 + 0.34^2 = 0.996^2:
+    then at the steps they are 0.996 m and farther apart."""
+    ahead_m = math.sqrt(0.996**2 - 0.34**2) + 2 * 2.0  # two steps of 2 m before that
+    free = {"drone__flocking__max_acceleration_m_s2": 1e-6, "drone__flocking__max_speed_m_s": 2.0}
+    flights = FlockFlights([with_drones(_scenario(duration_s=4.0, **free), 2)])
+    flights.states[:, 0] = np.array([[0.0, 0.0, -4.0, 2.0, 0.0, 0.0], [ahead_m, 0.34, -4.0, -2.0, 0.0, 0.0]]).T
+    positions, _ = _flown(flights)
+    at_steps = np.linalg.norm(positions[:, 0, 0] - positions[:, 0, 1], axis=1).min()
+    assert at_steps == pytest.approx(0.996, abs=1e-4)
+    figures = flights.figures()[0]
+    for name in ("min_distance_m", "min_distance_tail_m", "min_level_distance_m"):
+        assert figures[name] == pytest.approx(0.34, abs=1e-4)
+    assert figures["min_distance_after_10s_m"] is None
+    assert (figures["drone_collisions"], figures["first_collision_s"]) == (2, 1.0)
+    assert figures["safety"] == pytest.approx(1 - 1 / 8)  # nearer than 1 m at one step of eight
+
+
+@pytest.mark.parametrize(("fast", "speed_m_s"), [(64, 0.3), (64, 4.0), (2, 20.0)])
+def test_of_many_that_cross_the_nearest_are_found(fast: int, speed_m_s: float) -> None:
+    """All pairs of 64 drones that fly every which way while their flock moves on, beside what cells find.
+
+    Two that are fast have passed drones that are many cells away by the next step.
+    """
+    flights = FlockFlights([with_drones(_scenario(duration_s=1.0), 64)] * 8)
+    random = np.random.default_rng(1)
+    lattice = 2.5 * np.stack(np.divmod(np.arange(64.0), 8.0))
+    flights.states[:2] = lattice[:, None] + random.uniform(-0.3, 0.3, (2, 8, 64))
+    flights.states[2] = random.normal(0.0, 0.2, (8, 64))
+    flights.states[3:5] = np.array([5.0, -3.0])[:, None, None]
+    flights.states[3:5, :, :fast] += random.normal(0.0, speed_m_s, (2, 8, fast))
+    positions, _ = _flown(flights)
+    share = np.linspace(0.0, 1.0, 2001)[:, None, None]
+    for flight, figures in enumerate(flights.figures()):
+        begin, end = positions[:, flight]
+        ways = begin + share * (end - begin)
+        offsets = ways[:, :, None] - ways[:, None]
+        apart = [np.linalg.norm(offsets[..., :k], axis=-1)[:, *np.triu_indices(64, 1)].min() for k in (2, 3)]
+        fine_m = 4 * speed_m_s * 0.5 / 2000  # how much a distance changes from one sample to the next
+        found = figures["min_level_distance_m"], figures["min_distance_m"]
+        assert found == pytest.approx(apart, abs=2 * fine_m)
 
 
 def _and_fly(flights: FlockFlights) -> dict[str, Any]:
