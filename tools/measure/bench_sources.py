@@ -19,9 +19,9 @@ import cv2
 import numpy as np
 
 from flockd.core.config.source import CameraDeviceParameters
-from flockd.ground.cameras.watching import Watched, opener
+from flockd.ground.cameras.watching import Watched
+from flockd.onboard.sources.device_source import Devices
 from flockd.onboard.sources.devices import CameraDevice, CapturedBuffer
-from flockd.onboard.sources.v4l2_kernel import LinuxKernel
 
 IMAGES, WARM_UP = 200, 10
 Size = tuple[int, int]
@@ -48,7 +48,7 @@ def main() -> None:
     rows = []
     for camera in cameras:
         parameters = CameraDeviceParameters.model_validate({"name": "bench", "rate_hz": arguments.rate, **camera})
-        with opener(LinuxKernel())(parameters, size) as device:
+        with Devices().open(parameters, size) as device:
             rows.append({"camera": parameters.place, **measure_camera(device)})
     if arguments.json:
         print(json.dumps(rows, indent=1))

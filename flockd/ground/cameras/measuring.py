@@ -12,7 +12,8 @@ import numpy as np
 from flockd.core.config.source import SourceParameters
 from flockd.core.messages import UInt8Array
 from flockd.ground.cameras.found import FoundCamera, Mode
-from flockd.ground.cameras.watching import Watched, opener, watch_devices
+from flockd.ground.cameras.watching import Watched, watch
+from flockd.onboard.sources.device_source import Devices
 from flockd.onboard.sources.v4l2_kernel import Kernel
 
 _NEIGHBOURHOOD_PX = 25
@@ -21,6 +22,8 @@ _STEEPEST = 0.5
 """Per cent of an image's pixels that are looked at: where its edges are."""
 _LEAST_CONTRAST = 30.0
 """Grey levels; a weaker edge has more noise than slope."""
+_SILENCE_S = 3.0
+"""A camera without an image for this long is opened again: longer than two images of any are apart."""
 _BLACK, _WHITE = 4, 251
 """Grey levels beyond which nothing can be told apart."""
 
@@ -43,9 +46,9 @@ def measure(cameras: Sequence[tuple[FoundCamera, Mode]], seconds: float, kernel:
     """Runs all cameras side by side, for ``seconds`` from their first image on."""
     names = [f"camera{number}" for number in range(len(cameras))]
     entries = [camera.parameters(name, mode) for name, (camera, mode) in zip(names, cameras, strict=True)]
-    source = SourceParameters(kind="v4l2").model_copy(update={"cameras": entries})  # of both kinds
+    source = SourceParameters(kind="v4l2").model_copy(update={"cameras": entries, "silence_s": _SILENCE_S})
     sizes = {name: mode.size for name, (_, mode) in zip(names, cameras, strict=True)}
-    watched = watch_devices(sizes, source, seconds, opener(kernel))
+    watched = watch(sizes, source, seconds, Devices(kernel))
     return [_measured(mode, watched[name]) for name, (_, mode) in zip(names, cameras, strict=True)]
 
 

@@ -1,9 +1,8 @@
-"""Watches cameras: runs them side by side for some seconds, and writes down what came."""
+"""Watches cameras: runs them side by side for some seconds, as a source does in flight, and writes down what came."""
 
 from __future__ import annotations
 
 import statistics
-import threading
 import time
 from collections import Counter
 from collections.abc import Mapping
@@ -11,24 +10,24 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flockd.core.config import DroneConfig
-from flockd.core.config.source import CameraDeviceParameters, SourceParameters
+from flockd.core.config.source import SourceParameters
 from flockd.core.messages import UInt8Array
-from flockd.onboard.sources.device_source import OpenDevice
-from flockd.onboard.sources.devices import CameraDevice, CameraError, CapturedBuffer
-from flockd.onboard.sources.frame_receiver import MAX_AHEAD_S
-from flockd.onboard.sources.gstreamer import open_pipeline
-from flockd.onboard.sources.image_formats import CorruptImageError, ImageFormat
+from flockd.onboard.sources.device_source import Devices, DeviceSource
+from flockd.onboard.sources.frames import CameraStatus, Count, FrameSource, RawFrame
+from flockd.onboard.sources.image_formats import CorruptImageError
 from flockd.onboard.sources.shared_memory import SharedMemorySource
-from flockd.onboard.sources.v4l2 import open_v4l2
-from flockd.onboard.sources.v4l2_kernel import Kernel
 
-START_S = 5.0
-"""To get another program's first image."""
-LONGEST_START_S = 10.0
-"""To open any device and get its first image."""
-STOP_S = 2.0
+START_S = 10.0
+"""To open any device, or to find another program, and to get the first image."""
 _LOOK_S = 0.05
+_REFUSED: Mapping[Count, str] = {
+    "flagged": "damaged, as the driver reports",
+    "time_stamp": "with a time stamp far from now",
+    "corrupt": "corrupt",
+    "frozen": "frozen",
+    "malformed": "malformed",
+}
+"""What images are that are worth nothing, in words."""
 
 
 @dataclass
@@ -39,21 +38,19 @@ class Watched:
     """Why it gives nothing, in one sentence that ends in its fix."""
     stamps_s: list[float] = field(default_factory=list)
     """When each image was taken, as its time stamp says."""
-    arrivals_s: list[float] = field(default_factory=list)
-    """When each was here, where its time stamp may be of another clock."""
     lost: int = 0
     """Gaps in the sequence numbers."""
     refused: Counter[str] = field(default_factory=Counter)
     """Images that are worth nothing, by reason."""
     image: UInt8Array | None = None
+    """The last one."""
 
     @property
     def rate_hz(self) -> float:
-        """As they came; 0 for less than two images."""
-        times_s = self.arrivals_s or self.stamps_s
-        if len(times_s) < 2:
+        """0 for less than two images."""
+        if len(self.stamps_s) < 2:
             return 0.0
-        return (len(times_s) - 1) / max(times_s[-1] - times_s[0], 1e-9)
+        return (len(self.stamps_s) - 1) / max(self.stamps_s[-1] - self.stamps_s[0], 1e-9)
 
     def jitter_s(self) -> float:
         """95th percentile of how far an interval is from the nearest multiple of the usual one."""
@@ -65,136 +62,72 @@ class Watched:
         return float(np.percentile(np.abs(intervals - beats * usual), 95))
 
 
-def opener(kernel: Kernel) -> OpenDevice:
-    """What opens cameras, by their pipeline where they have one."""
-
-    def opened(camera: CameraDeviceParameters, size: tuple[int, int]) -> CameraDevice:
-        return open_pipeline(camera, size) if camera.pipeline else open_v4l2(camera, size, kernel)
-
-    return opened
-
-
-def watch_devices(
-    sizes: Mapping[str, tuple[int, int]], source: SourceParameters, seconds: float, open_device: OpenDevice
-) -> dict[str, Watched]:
-    """Runs all devices of a source side by side, as a USB bus has to carry them in flight; ``sizes`` by camera."""
-    stopping = threading.Event()
-    watched, threads = {}, {}
-    for device in source.cameras:
-        record = watched[device.name] = Watched()
-        arguments = (device, sizes[device.name], seconds, source, open_device, record, stopping)
-        threads[device.name] = threading.Thread(target=_watch_device, args=arguments, daemon=True)
-        threads[device.name].start()
-    until_s = time.monotonic() + LONGEST_START_S + seconds + STOP_S
-    for name, thread in threads.items():
-        thread.join(max(until_s - time.monotonic(), 0.0))
-        if thread.is_alive():
-            hangs = Watched(fault="its driver does not respond; unplug the camera and plug it in again")
-            watched[name] = hangs
-    stopping.set()
-    return watched
-
-
-def _watch_device(
-    parameters: CameraDeviceParameters,
-    size: tuple[int, int],
+def watch(
+    sizes: Mapping[str, tuple[int, int]],
+    parameters: SourceParameters,
     seconds: float,
-    source: SourceParameters,
-    open_device: OpenDevice,
-    record: Watched,
-    stopping: threading.Event,
-) -> None:
+    devices: Devices,
+    start_s: float = START_S,
+) -> dict[str, Watched]:
+    """Runs all cameras of a source side by side, as a USB bus has to carry them in flight; ``sizes`` by camera.
+
+    Each is watched for ``seconds`` from its first image on, which has to come within ``start_s``. Raises
+    UnavailableError for an endpoint that cannot be one.
+    """
+    watched = {name: Watched() for name in sizes}
+    last: dict[str, RawFrame] = {}
+
+    def take(frame: RawFrame) -> None:
+        watched[frame.camera].stamps_s.append(frame.time_s)
+        last[frame.camera] = frame
+
+    shared = parameters.kind == "shared_memory"
+    source: FrameSource = (
+        SharedMemorySource(sizes, parameters, on_frame=take)
+        if shared
+        else DeviceSource(sizes, parameters, devices, take)
+    )
+    source.start()
     try:
-        with open_device(parameters, size) as camera:
-            _record(camera, seconds, source, record, stopping)
-    except CameraError as error:
-        record.fault = str(error)
-
-
-def _record(
-    camera: CameraDevice, seconds: float, source: SourceParameters, record: Watched, stopping: threading.Event
-) -> None:
-    """Everything from the first usable image on; the last one is decoded."""
-    until_s, last = time.monotonic() + camera.start_s, None
-    sequence: int | None = None
-    repeats = 0
-    while time.monotonic() < until_s and not stopping.is_set():
-        captured = camera.read(_LOOK_S)
-        if captured is None:
-            continue
-        if sequence is not None:
-            record.lost += max(captured.sequence - sequence - 1, 0)
-        sequence = captured.sequence
-        repeats = repeats + 1 if last is not None and captured.data == last.data else 0
-        reason = _refusal(captured, camera.image_format(), source.silence_s)
-        if reason is None and 0 < source.frozen_after <= repeats:
-            reason = "frozen"
-        if reason is not None:
-            record.refused[reason] += 1
-            continue
-        if not record.stamps_s:
-            until_s = time.monotonic() + seconds
-        record.stamps_s.append(captured.time_s)
-        last = captured
-    if last is None:
-        seen = ", ".join(f"{count} {reason}" for reason, count in record.refused.items())
-        came = f"no {'usable ' if seen else ''}image came within {camera.start_s:g} s{f' ({seen})' if seen else ''}"
-        record.fault = f"{came}; try another cable, port and pixel_format"
-        return
-    try:
-        record.image = camera.image_format().decode(last.data)
-    except CorruptImageError as error:
-        record.refused[f"not to be decoded ({error})"] += 1
-
-
-def _refusal(captured: CapturedBuffer, image_format: ImageFormat, silence_s: float) -> str | None:
-    """As the source in flight would refuse it."""
-    if captured.flagged:
-        return "damaged, as the driver reports"
-    if not -MAX_AHEAD_S <= time.monotonic() - captured.time_s <= silence_s:
-        return "with a time stamp far from now"
-    try:
-        image_format.check(captured.data)
-    except CorruptImageError as error:
-        return f"corrupt ({error})"
-    return None
-
-
-def watch_shared_memory(config: DroneConfig, source: SourceParameters, seconds: float) -> dict[str, Watched]:
-    """Receives what another program publishes. Raises UnavailableError for an endpoint that cannot be one."""
-    frames = SharedMemorySource(config, source)
-    watched = {camera.name: Watched() for camera in config.rig.cameras}
-    frames.start()
-    try:
-        until_s, first = time.monotonic() + START_S, True
-        while time.monotonic() < until_s:
-            newest = frames.newest(_LOOK_S)
-            if newest is None:
-                continue
-            if first:
-                until_s, first = time.monotonic() + seconds, False
-            for name, frame in newest.frames.items():
-                watched[name].stamps_s.append(frame.time_s)
-                watched[name].arrivals_s.append(time.monotonic())
-                watched[name].image = frame.image
-        status = frames.status()
+        _wait(source, watched, seconds, start_s)
+        status = source.status()
     finally:
-        frames.stop()
+        source.stop()
     for name, record in watched.items():
-        counts = status[name].counts
-        record.lost = counts.get("lost", 0)
-        record.refused.update(
-            {
-                reason.replace("_", " "): counts[reason]
-                for reason in ("time_stamp", "frozen", "corrupt", "malformed")
-                if counts.get(reason)
-            }
-        )
-        if not record.stamps_s:
-            where = source.shared_memory
-            nothing = (
-                f"no frame of {where.drone}/{name} came from {', '.join(where.connect)} within {START_S:g} s; "
+        silent = f"{name}: its driver does not respond; unplug the camera and plug it in again"
+        if shared:
+            silent = (
+                f"no frame of {parameters.shared_memory.drone}/{name} came from "
+                f"{', '.join(parameters.shared_memory.connect)} within {start_s:g} s; "
                 "start the program that publishes them, or fix source.shared_memory"
             )
-            record.fault = status[name].fault or nothing
+        _conclude(record, status[name], last.get(name), silent)
     return watched
+
+
+def _wait(source: FrameSource, watched: Mapping[str, Watched], seconds: float, start_s: float) -> None:
+    """Until each camera was watched for long enough, or has a fault."""
+    now_s = began_s = time.monotonic()
+    until_s: dict[str, float] = {}
+    while now_s < max([began_s + start_s, *until_s.values()]):
+        time.sleep(_LOOK_S)
+        now_s = time.monotonic()
+        status = source.status()
+        until_s |= {name: now_s + seconds for name in watched.keys() - until_s if watched[name].stamps_s}
+        if all(now_s >= until_s[name] if name in until_s else status[name].fault for name in watched):
+            return
+
+
+def _conclude(record: Watched, status: CameraStatus, last: RawFrame | None, silent: str) -> None:
+    record.fault = status.fault if record.stamps_s else status.fault or silent
+    if record.fault is not None and "; " not in record.fault:
+        record.fault += "; try another cable, port and pixel_format"
+    record.refused.update({words: status.counts[what] for what, words in _REFUSED.items() if status.counts.get(what)})
+    # What is refused before its number is looked at leaves a gap, too.
+    unseen = sum(status.counts.get(what, 0) for what in ("flagged", "corrupt"))
+    record.lost = max(status.counts.get("lost", 0) - unseen, 0)
+    if last is not None:
+        try:
+            record.image = last.decode(last.data)
+        except CorruptImageError as error:
+            record.refused[f"not to be decoded ({error})"] += 1

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from flockd.core.config import DroneConfig
 from flockd.core.config.rig import CameraConfig
 from flockd.core.config.source import CameraDeviceParameters
-from flockd.ground.cameras.watching import Watched, opener, watch_devices, watch_shared_memory
+from flockd.ground.cameras.watching import START_S, Watched, watch
 from flockd.ground.doctor.finding import Finding, failed, failed_from_error, passed, warned
 from flockd.ground.doctor.lens_checks import coverage, lens_problems, width_deg
-from flockd.onboard.sources.v4l2_kernel import Kernel, LinuxKernel
+from flockd.onboard.sources.device_source import Devices
 
 SLOW, TOO_SLOW = 0.95, 0.8
 """Shares of the configured rate. Cheap cameras halve theirs by themselves in dim light."""
@@ -23,18 +23,18 @@ DARK, BRIGHT = 12.0, 243.0
 """Mean grey, 0 to 255, of an image in which little can be seen."""
 
 
-def check_cameras(config: DroneConfig, seconds: float, kernel: Kernel | None = None) -> Iterator[Finding]:
+def check_cameras(
+    config: DroneConfig, seconds: float, devices: Devices | None = None, start_s: float = START_S
+) -> Iterator[Finding]:
     """Every camera of the rig, and what they see together."""
     source = config.source
     if source is None:
         measured = "the configuration has no `source`: this drone can be simulated but not flown"
         yield warned("cameras", measured, "add a `source`, as in config/quadrotor.yaml")
         watched = {}
-    elif source.kind == "shared_memory":
-        watched = watch_shared_memory(config, source, seconds)
     else:
         sizes = {camera.name: camera.size_px for camera in config.rig.cameras}
-        watched = watch_devices(sizes, source, seconds, opener(kernel or LinuxKernel()))
+        watched = watch(sizes, source, seconds, devices or Devices(), start_s)
     for camera in config.rig.cameras:
         yield from _judged(camera, config, watched.get(camera.name))
     with contextlib.suppress(ValueError):  # a calibration that makes no camera, which was reported above

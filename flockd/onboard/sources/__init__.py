@@ -6,10 +6,9 @@ from collections.abc import Callable
 from flockd.core.config import DroneConfig
 from flockd.core.errors import ConfigError, ConfigProblem
 from flockd.onboard.sources.clock import clock_at
+from flockd.onboard.sources.device_source import DeviceSource
 from flockd.onboard.sources.frames import CameraStatus, Count, FrameSource
-from flockd.onboard.sources.gstreamer import GstreamerSource
 from flockd.onboard.sources.shared_memory import FramePublisher, SharedMemorySource
-from flockd.onboard.sources.v4l2 import V4l2Source
 
 __all__ = ["CameraStatus", "Count", "FramePublisher", "FrameSource", "clock_at", "open_source"]
 
@@ -23,8 +22,7 @@ def open_source(config: DroneConfig, file: str, *, clock: Callable[[], float] = 
     """
     if config.source is None:
         raise ConfigError([ConfigProblem(file, 0, "source", "is missing; add one, as in config/quadrotor.yaml")])
-    if config.source.kind == "v4l2":
-        return V4l2Source(config, config.source)
-    if config.source.kind == "gstreamer":
-        return GstreamerSource(config, config.source)
-    return SharedMemorySource(config, config.source, clock=clock)
+    sizes = {camera.name: camera.size_px for camera in config.rig.cameras}
+    if config.source.kind == "shared_memory":
+        return SharedMemorySource(sizes, config.source, clock)
+    return DeviceSource(sizes, config.source)

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
-from flockd.core.config.drone import DroneConfig
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
 from flockd.core.messages import FrameSet
 from flockd.onboard.sources.devices import CameraDevice, CameraError, CapturedBuffer
 from flockd.onboard.sources.frame_receiver import FrameReceiver
 from flockd.onboard.sources.frames import CameraStatus, Count, RawFrame
+from flockd.onboard.sources.gstreamer_device import CHILD, GstreamerDevice
 from flockd.onboard.sources.image_formats import CorruptImageError, ImageFormat
+from flockd.onboard.sources.v4l2_device import V4l2Device
+from flockd.onboard.sources.v4l2_kernel import Kernel, LinuxKernel
 
 _LOOK_S = 0.05
 """How long a thread waits for a frame before it checks whether it should stop."""
@@ -21,26 +24,37 @@ _STOP_S = 1.0
 """A thread that hangs in a driver for longer is left to end with the process."""
 
 
-OpenDevice = Callable[[CameraDeviceParameters, tuple[int, int]], CameraDevice]
-"""Opens a camera, for images of a width and height; raises CameraError."""
+@dataclass(frozen=True)
+class Devices:
+    """Opens cameras: one with a pipeline by a process of ``command``, all others by the ``kernel``."""
+
+    kernel: Kernel = field(default_factory=LinuxKernel)
+    command: Sequence[str] = CHILD
+
+    def open(self, camera: CameraDeviceParameters, size: tuple[int, int]) -> CameraDevice:
+        """The camera, set up for images of this width and height, and started. Raises CameraError."""
+        if camera.pipeline:
+            return GstreamerDevice(camera, size, self.command)
+        return V4l2Device(camera, size, self.kernel)
 
 
 class DeviceSource:
-    """A ``FrameSource`` of cameras that are opened by ``open_device``, with their own time stamps and numbers."""
+    """A ``FrameSource`` of the kernel's cameras and of pipelines, with their own time stamps and numbers."""
 
     def __init__(
         self,
-        config: DroneConfig,
+        sizes: Mapping[str, tuple[int, int]],
         parameters: SourceParameters,
-        open_device: OpenDevice,
-        *,
-        clock: Callable[[], float] = time.monotonic,
+        devices: Devices | None = None,
+        on_frame: Callable[[RawFrame], None] = lambda frame: None,
     ) -> None:
-        """``parameters`` have one entry for each camera of the rig; ``clock`` is that of the time stamps."""
-        sizes = {camera.name: camera.size_px for camera in config.rig.cameras}
-        self._receiver = FrameReceiver(tuple(sizes), parameters, clock)
+        """``sizes``: width and height by camera, each of which has its entry in ``parameters``.
+
+        ``on_frame`` is called with each usable frame, on its camera's thread.
+        """
+        self._receiver = FrameReceiver(tuple(sizes), parameters, on_frame=on_frame)
         self._cameras = [
-            _Camera(camera, sizes[camera.name], parameters.silence_s, self._receiver, open_device, clock)
+            _Camera(camera, sizes[camera.name], parameters.silence_s, self._receiver, devices or Devices())
             for camera in parameters.cameras
         ]
 
@@ -80,16 +94,14 @@ class _Camera:
         size: tuple[int, int],
         silence_s: float,
         receiver: FrameReceiver,
-        open_device: OpenDevice,
-        clock: Callable[[], float],
+        devices: Devices,
     ) -> None:
         self._name = parameters.name
         self._parameters = parameters
         self._size = size
         self._silence_s = silence_s
         self._receiver = receiver
-        self._open_device = open_device
-        self._clock = clock
+        self._devices = devices
         self._delivered = False
         """Whether this opening of the device has brought a usable frame."""
         self._has_delivered = False
@@ -112,7 +124,7 @@ class _Camera:
         while not self._stopping.is_set():
             self._delivered = False
             try:
-                with self._open_device(self._parameters, self._size) as device:
+                with self._devices.open(self._parameters, self._size) as device:
                     self._receiver.count(self._name, "opened")
                     self._capture(device)
             except CameraError as error:
@@ -123,7 +135,7 @@ class _Camera:
 
     def _capture(self, device: CameraDevice) -> None:
         """Until it is asked to stop; raises CameraError when the camera fails or falls silent."""
-        usable_s, refused = self._clock(), None
+        usable_s, refused = time.monotonic(), None
         left_over = self._has_delivered  # drivers may begin again with the last image of before, stamped as of now
         while not self._stopping.is_set():
             captured = device.read(_LOOK_S)
@@ -133,10 +145,10 @@ class _Camera:
             elif captured is not None:
                 refused = self._take(captured, device.image_format())
                 if refused is None:
-                    usable_s, self._delivered, self._has_delivered = self._clock(), True, True
+                    usable_s, self._delivered, self._has_delivered = time.monotonic(), True, True
             limit_s = self._silence_s if self._delivered else max(device.start_s, self._silence_s)
-            if self._clock() - usable_s > limit_s:
-                last = f"; the last was refused ({refused.replace('_', ' ')})" if refused else ""
+            if time.monotonic() - usable_s > limit_s:
+                last = f" (the last was refused: {refused.replace('_', ' ')})" if refused else ""
                 raise CameraError(
                     f"{self._name}: {self._parameters.place} gave no usable image for {limit_s:g} s{last}"
                 )

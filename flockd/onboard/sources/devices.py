@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Literal, Protocol, Self
+from typing import Protocol, Self
 
 from flockd.core.errors import UnavailableError
 from flockd.onboard.sources.image_formats import ImageFormat
-
-Clock = Literal["monotonic", "copied", "unknown"]
 
 
 class CameraError(UnavailableError):
@@ -22,7 +20,6 @@ class CapturedBuffer:
 
     data: bytes
     time_s: float
-    clock: Clock
     sequence: int
     flagged: bool
     """The driver says that the data may be damaged."""

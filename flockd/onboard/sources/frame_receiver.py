@@ -27,9 +27,14 @@ class FrameReceiver:
     """The assembler behind a lock, and the decoding in front of it: what all sources have in common."""
 
     def __init__(
-        self, cameras: Sequence[str], parameters: SourceParameters, clock: Callable[[], float] = time.monotonic
+        self,
+        cameras: Sequence[str],
+        parameters: SourceParameters,
+        clock: Callable[[], float] = time.monotonic,
+        on_frame: Callable[[RawFrame], None] = lambda frame: None,
     ) -> None:
-        self._clock = clock
+        """``on_frame`` is called with each usable frame, on the thread that brings it."""
+        self._clock, self._on_frame = clock, on_frame
         self._assembler = Assembler(cameras, parameters)
         self._faults: dict[str, str | None] = dict.fromkeys(cameras)
         self._useless: Counter[str] = Counter()
@@ -53,6 +58,7 @@ class FrameReceiver:
             if refused is None:
                 self._faults[frame.camera] = None
                 self._refused[frame.camera] = 0
+                self._on_frame(frame)
                 self._changed.notify_all()
             elif refused == "frozen":
                 self._faults[frame.camera] = f"{frame.camera}: the image is frozen; restart its camera or program"

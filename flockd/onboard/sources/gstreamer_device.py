@@ -1,4 +1,7 @@
-"""One camera behind a GStreamer pipeline that runs in a process of its own: what crashes there, crashes there."""
+"""One camera behind a GStreamer pipeline that runs in a process of its own: what crashes there, crashes there.
+
+Such are those on the CSI ports of a Jetson or a Raspberry Pi, network cameras, and files.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from flockd.core.config.source import CameraDeviceParameters
 from flockd.onboard.sources import gstreamer_child
 from flockd.onboard.sources.devices import CameraError, CapturedBuffer
 from flockd.onboard.sources.gstreamer_child import CAPS, DAMAGED, END, ERROR, HEADER, IMAGE
@@ -47,30 +51,24 @@ class GstreamerDevice:
 
     start_s = 10.0
 
-    def __init__(
-        self,
-        name: str,
-        pipeline: str,
-        *,
-        size: tuple[int, int],
-        rate_hz: float,
-        command: Sequence[str] = CHILD,
-    ) -> None:
+    def __init__(self, camera: CameraDeviceParameters, size: tuple[int, int], command: Sequence[str] = CHILD) -> None:
         """Starts the process, whose ``command`` gets the pipeline and what is asked of it; raises CameraError."""
-        self._name, self._size, self._rate_hz = name, size, rate_hz
+        self._name, self._size, self._rate_hz = camera.name, size, camera.rate_hz
         self._format: ImageFormat | None = None
         self._last_s: float | None = None
         self._sequence = 0
         try:
             self._process = subprocess.Popen(
-                [*command, pipeline, caps(size, rate_hz)],
+                [*command, camera.pipeline, caps(size, camera.rate_hz)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 bufsize=0,
                 start_new_session=True,  # Ctrl-C is not for it
             )
         except OSError as error:
-            raise CameraError(f"{name}: the process of its pipeline cannot be started ({error.strerror})") from error
+            raise CameraError(
+                f"{camera.name}: the process of its pipeline cannot be started ({error.strerror})"
+            ) from error
         assert self._process.stdout is not None
         self._stream = _Stream(self._process.stdout.fileno())
 
@@ -129,7 +127,7 @@ class GstreamerDevice:
         if self._last_s is not None:
             self._sequence += max(round((time_s - self._last_s) * self._rate_hz), 1)
         self._last_s = time_s
-        return CapturedBuffer(message.data, time_s, "monotonic", self._sequence, bool(message.flags & DAMAGED))
+        return CapturedBuffer(message.data, time_s, self._sequence, bool(message.flags & DAMAGED))
 
     def _set_format(self, text: str) -> None:
         found = format_of(text)

@@ -10,50 +10,20 @@ import cv2
 import numpy as np
 
 from flockd.core.messages import UInt8Array
-from flockd.onboard.sources.image_formats import ImageFormat, MjpegFormat, check_length, plausible
+from flockd.onboard.sources.image_formats import (
+    PACKED,
+    ImageFormat,
+    MjpegFormat,
+    PackedFormat,
+    check_length,
+    plausible,
+    up_to,
+)
 
-_PACKED: Mapping[str, tuple[int, int | None]] = {
-    "RGB": (3, None),
-    "BGR": (3, cv2.COLOR_BGR2RGB),
-    "RGBx": (4, cv2.COLOR_RGBA2RGB),
-    "RGBA": (4, cv2.COLOR_RGBA2RGB),
-    "BGRx": (4, cv2.COLOR_BGRA2RGB),
-    "BGRA": (4, cv2.COLOR_BGRA2RGB),
-    "YUY2": (2, cv2.COLOR_YUV2RGB_YUY2),
-    "UYVY": (2, cv2.COLOR_YUV2RGB_UYVY),
-    "GRAY8": (1, cv2.COLOR_GRAY2RGB),
-}
-"""Bytes a pixel, and OpenCV's conversion."""
 _PLANAR: Mapping[str, int] = {"NV12": cv2.COLOR_YUV2RGB_NV12, "I420": cv2.COLOR_YUV2RGB_I420}
-FORMATS = (*_PLANAR, *_PACKED)
+FORMATS = (*_PLANAR, *PACKED)
 """Cheapest first: a pipeline that can choose gives the first."""
 _FIELD = re.compile(r"(format|width|height)=\(\w+\)([^,;\s]+)")
-
-
-@dataclass(frozen=True)
-class PackedFormat:
-    """Whole pixels row by row; each row is filled up to four bytes."""
-
-    name: str
-    size: tuple[int, int]
-    """Width, height."""
-
-    def check(self, data: bytes) -> None:
-        """See ``ImageFormat``: size."""
-        check_length(data, self._bytes_per_line() * self.size[1])
-
-    def decode(self, data: bytes) -> UInt8Array:
-        """See ``ImageFormat``."""
-        self.check(data)
-        (width, height), (depth, conversion) = self.size, _PACKED[self.name]
-        across = _up_to(2, width) if depth == 2 else width  # two pixels share their colours
-        rows = np.frombuffer(data, np.uint8).reshape(height, self._bytes_per_line())
-        pixels = np.ascontiguousarray(rows[:, : depth * across]).reshape(height, across, depth)
-        image = pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion), np.uint8)
-        return plausible(np.ascontiguousarray(image[:, :width]))
-
-    def _bytes_per_line(self) -> int:
-        return _up_to(4, _PACKED[self.name][0] * self.size[0])
 
 
 @dataclass(frozen=True)
@@ -81,12 +51,12 @@ class PlanarFormat:
         return plausible(np.ascontiguousarray(image[: self.size[1], : self.size[0]]))
 
     def _padded(self) -> tuple[int, int]:
-        return _up_to(4, self.size[0]), _up_to(2, self.size[1])
+        return up_to(4, self.size[0]), up_to(2, self.size[1])
 
     def _colour_line(self) -> int:
         """Bytes for the colours of two rows."""
         width = self._padded()[0]
-        return width if self.name == "NV12" else 2 * _up_to(4, _up_to(2, self.size[0]) // 2)
+        return width if self.name == "NV12" else 2 * up_to(4, up_to(2, self.size[0]) // 2)
 
 
 def caps(size: tuple[int, int], rate_hz: float) -> str:
@@ -108,10 +78,6 @@ def format_of(text: str) -> tuple[ImageFormat, tuple[int, int]] | None:
     if text.startswith("image/jpeg"):
         return MjpegFormat(size), size
     name = fields.get("format", "")
-    if name in _PACKED:
+    if name in PACKED:
         return PackedFormat(name, size), size
     return (PlanarFormat(name, size), size) if name in _PLANAR else None
-
-
-def _up_to(multiple: int, number: int) -> int:
-    return -(-number // multiple) * multiple

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,6 +15,18 @@ from flockd.core.messages import UInt8Array
 Decoder = Callable[[bytes], UInt8Array]
 """Bytes to (height, width, 3) RGB; raises CorruptImageError."""
 
+PACKED: Mapping[str, tuple[int, int | None]] = {
+    "RGB": (3, None),
+    "BGR": (3, cv2.COLOR_BGR2RGB),
+    "RGBx": (4, cv2.COLOR_RGBA2RGB),
+    "RGBA": (4, cv2.COLOR_RGBA2RGB),
+    "BGRx": (4, cv2.COLOR_BGRA2RGB),
+    "BGRA": (4, cv2.COLOR_BGRA2RGB),
+    "YUY2": (2, cv2.COLOR_YUV2RGB_YUY2),
+    "UYVY": (2, cv2.COLOR_YUV2RGB_UYVY),
+    "GRAY8": (1, cv2.COLOR_GRAY2RGB),
+}
+"""Bytes a pixel, and OpenCV's conversion, by GStreamer's name."""
 _START, _END = b"\xff\xd8", b"\xff\xd9"
 _SAMPLE_STRIDE = 8
 _FLAT_DEVIATION = 1.0
@@ -71,24 +83,32 @@ class MjpegFormat:
 
 
 @dataclass(frozen=True)
-class YuyvFormat:
-    """YUYV 4:2:2 by BT.601, luma from 16 to 235."""
+class PackedFormat:
+    """Whole pixels row by row; YUV by BT.601, luma from 16 to 235."""
 
+    name: str
+    """GStreamer's, of `PACKED`."""
     size: tuple[int, int]
     """Width, height."""
-    bytes_per_line: int
+    bytes_per_line: int | None = None
+    """None: each row is filled up to four bytes, as GStreamer does."""
 
     def check(self, data: bytes) -> None:
         """See ``ImageFormat``: size."""
-        check_length(data, self.bytes_per_line * self.size[1])
+        check_length(data, self._bytes_per_line() * self.size[1])
 
     def decode(self, data: bytes) -> UInt8Array:
         """See ``ImageFormat``."""
         self.check(data)
-        width, height = self.size
-        rows = np.frombuffer(data, np.uint8).reshape(height, self.bytes_per_line)
-        pixels = np.ascontiguousarray(rows[:, : 2 * width]).reshape(height, width, 2)
-        return plausible(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_YUV2RGB_YUY2), np.uint8))
+        (width, height), (depth, conversion) = self.size, PACKED[self.name]
+        across = up_to(2, width) if depth == 2 else width  # two pixels share their colours
+        rows = np.frombuffer(data, np.uint8).reshape(height, self._bytes_per_line())
+        pixels = np.ascontiguousarray(rows[:, : depth * across]).reshape(height, across, depth)
+        image = pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion), np.uint8)
+        return plausible(np.ascontiguousarray(image[:, :width]))
+
+    def _bytes_per_line(self) -> int:
+        return self.bytes_per_line or up_to(4, PACKED[self.name][0] * self.size[0])
 
 
 @dataclass(frozen=True)
@@ -124,3 +144,8 @@ def plausible(image: UInt8Array) -> UInt8Array:
     if np.all(strip == strip[0, 0]) and np.any((strip[0, 0] > low) & (strip[0, 0] < high)):
         raise CorruptImageError("image stops short of its last rows")
     return image
+
+
+def up_to(multiple: int, number: int) -> int:
+    """The least multiple that is not below the number."""
+    return -(-number // multiple) * multiple

@@ -16,7 +16,6 @@ import zenoh
 from zenoh import shm
 
 from flockd.core import services
-from flockd.core.config.drone import DroneConfig
 from flockd.core.config.source import SourceParameters
 from flockd.core.messages import Frame, FrameSet
 from flockd.onboard.sources.frame_receiver import FrameReceiver
@@ -98,11 +97,16 @@ class SharedMemorySource:
     """A ``FrameSource`` of what a ``FramePublisher`` publishes for one drone."""
 
     def __init__(
-        self, config: DroneConfig, parameters: SourceParameters, *, clock: Callable[[], float] = time.monotonic
+        self,
+        sizes: Mapping[str, tuple[int, int]],
+        parameters: SourceParameters,
+        clock: Callable[[], float] = time.monotonic,
+        on_frame: Callable[[RawFrame], None] = lambda frame: None,
     ) -> None:
-        self._formats = {camera.name: RgbFormat(camera.size_px) for camera in config.rig.cameras}
+        """``sizes``: width, height by camera; ``on_frame``: called with each usable frame, on a thread of zenoh's."""
+        self._formats = {camera: RgbFormat(size) for camera, size in sizes.items()}
         self._where = parameters.shared_memory
-        self._receiver = FrameReceiver(tuple(self._formats), parameters, clock)
+        self._receiver = FrameReceiver(tuple(self._formats), parameters, clock, on_frame)
         self._session: zenoh.Session | None = None
         self._subscribers: list[zenoh.Subscriber[None]] = []
         self._notes: list[str] = []

@@ -1,4 +1,7 @@
-"""One V4L2 camera through the kernel's own interface (linux/videodev2.h): ioctl, mmap and poll, on 64-bit Linux."""
+"""One V4L2 camera through the kernel's own interface (linux/videodev2.h): ioctl, mmap and poll, on 64-bit Linux.
+
+Frames have the kernel's time stamps and numbers.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +16,9 @@ from types import TracebackType
 from typing import Self
 
 from flockd.core.choices import PixelFormat
-from flockd.core.config.source import ControlParameters
-from flockd.onboard.sources.devices import CameraError, CapturedBuffer, Clock
-from flockd.onboard.sources.image_formats import ImageFormat, MjpegFormat, YuyvFormat
+from flockd.core.config.source import CameraDeviceParameters, ControlParameters
+from flockd.onboard.sources.devices import CameraError, CapturedBuffer
+from flockd.onboard.sources.image_formats import ImageFormat, MjpegFormat, PackedFormat
 from flockd.onboard.sources.v4l2_kernel import (
     VIDIOC_DQBUF,
     VIDIOC_G_CTRL,
@@ -48,8 +51,6 @@ CAN_CAPTURE = 0x00000001
 _CAN_STREAM = 0x04000000
 _HAS_DEVICE_CAPABILITIES = 0x80000000
 _FLAG_ERROR = 0x0040
-_CLOCK_MASK = 0xE000
-_CLOCKS: dict[int, Clock] = {0x2000: "monotonic", 0x4000: "copied"}
 _NEXT_CONTROL = 0x80000000
 _CONTROL_DISABLED = 0x0001
 FOURCC = {name: int.from_bytes(code, "little") for name, code in (("mjpeg", b"MJPG"), ("yuyv", b"YUYV"))}
@@ -62,30 +63,20 @@ class V4l2Device:
 
     start_s = 3.0
 
-    def __init__(
-        self,
-        name: str,
-        path: str,
-        *,
-        size: tuple[int, int],
-        pixel_format: PixelFormat,
-        rate_hz: float,
-        controls: Sequence[ControlParameters] = (),
-        kernel: Kernel | None = None,
-    ) -> None:
+    def __init__(self, camera: CameraDeviceParameters, size: tuple[int, int], kernel: Kernel | None = None) -> None:
         """Opens the device, sets it up as asked, and starts it; what the driver does not grant is a CameraError."""
         self._kernel = kernel or LinuxKernel()
-        self._who = f"{name}: {path}"
-        self._size, self._pixel_format = size, pixel_format
+        self._who = f"{camera.name}: {camera.device}"
+        self._size, self._pixel_format = size, camera.pixel_format
         self._maps: list[Mapping] = []
         self._bytes_per_line = 0
         with self._telling("cannot be opened"):
-            self._descriptor = self._kernel.open(path)
+            self._descriptor = self._kernel.open(camera.device)
         try:
             self._check_capabilities()
-            self._set_format(size, pixel_format)
-            self._set_rate(rate_hz)
-            self._set_controls(controls)
+            self._set_format(size, camera.pixel_format)
+            self._set_rate(camera.rate_hz)
+            self._set_controls(camera.controls)
             self._start()
         except BaseException:
             self.close()
@@ -106,7 +97,6 @@ class V4l2Device:
         captured = CapturedBuffer(
             data=self._maps[buffer.index][slice(0, buffer.bytesused)],
             time_s=buffer.seconds + buffer.microseconds * 1e-6,
-            clock=_CLOCKS.get(buffer.flags & _CLOCK_MASK, "unknown"),
             sequence=buffer.sequence,
             flagged=bool(buffer.flags & _FLAG_ERROR),
         )
@@ -118,7 +108,7 @@ class V4l2Device:
         """See ``CameraDevice``."""
         if self._pixel_format == "mjpeg":
             return MjpegFormat(self._size)
-        return YuyvFormat(self._size, self._bytes_per_line)
+        return PackedFormat("YUY2", self._size, self._bytes_per_line)
 
     def close(self) -> None:
         """Stops the camera and gives it back."""

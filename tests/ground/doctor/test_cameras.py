@@ -22,12 +22,10 @@ from flockd.core.config.source import (
     SourceParameters,
 )
 from flockd.core.messages import Frame
-from flockd.ground.cameras import watching
 from flockd.ground.doctor import Finding, Level
 from flockd.ground.doctor.camera_checks import check_cameras
 from flockd.onboard.sources import FramePublisher
-from flockd.onboard.sources.gstreamer import open_pipeline
-from flockd.onboard.sources.v4l2_device import V4l2Device
+from flockd.onboard.sources.device_source import Devices
 from flockd.sim.free_ports import free_endpoint
 from tests.ground.filming import JPEGS, RATE_HZ, filming
 from tests.onboard.sources.camera_images import SIZE, jpeg, scene
@@ -51,9 +49,9 @@ def _config(*names: str, controls: Sequence[ControlParameters] = BY_HAND) -> Dro
     return DroneConfig(rig=rig, source=SourceParameters(kind="v4l2", cameras=devices))
 
 
-def _examined(config: DroneConfig, kernel: FakeKernel) -> dict[str, list[Finding]]:
+def _examined(config: DroneConfig, kernel: FakeKernel, start_s: float = 60.0) -> dict[str, list[Finding]]:
     found: dict[str, list[Finding]] = {}
-    for finding in check_cameras(config, SECONDS, kernel):
+    for finding in check_cameras(config, SECONDS, Devices(kernel), start_s):
         found.setdefault(finding.about, []).append(finding)
     return found
 
@@ -95,7 +93,7 @@ def _late(off_s: float) -> Callable[[int], float]:
         ({"lost": lambda number: 1}, Level.FAILURE, " lost ("),
         ({"flags": lambda n: 0x2000 | (FLAG_ERROR if n % 2 else 0)}, Level.FAILURE, "damaged, as the driver reports"),
         ({"pictures": JPEGS[:1]}, Level.FAILURE, "frozen"),
-        ({"pictures": [*JPEGS[:3], JPEGS[3][:-100]]}, Level.FAILURE, "corrupt (JPEG ends too early)"),
+        ({"pictures": [*JPEGS[:3], JPEGS[3][:-100]]}, Level.FAILURE, "corrupt"),
         ({"pictures": BLACK}, Level.WARNING, "the image is too dark"),
     ],
     ids=["half", "slower", "late", "very late", "some lost", "many lost", "flagged", "frozen", "corrupt", "cap"],
@@ -109,17 +107,15 @@ def test_a_camera_that_does_not_run_as_it_should(film: dict[str, Any], level: Le
     assert problem.fix
 
 
-def test_time_stamps_of_another_clock_are_no_image_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_time_stamps_of_another_clock_are_no_image_at_all() -> None:
     """Some drivers do not name their clock: what counts is whether the stamps are of now."""
     kernel = FakeKernel(front=FakeCamera())
     with filming(kernel, "front", flags=lambda number: FLAG_CLOCK_UNKNOWN):
         (finding,) = _examined(_config("front"), kernel)["camera front"]
     assert finding.level is Level.PASS, finding
-    monkeypatch.setattr(V4l2Device, "start_s", 0.3)
     with filming(kernel, "front", old_s=2.0):
         found = _examined(_config("front"), kernel)
-    _problem(found, Level.FAILURE, "no usable image came within 0.3 s (")
-    _problem(found, Level.FAILURE, "with a time stamp far from now")
+    _problem(found, Level.FAILURE, "gave no usable image for 3 s (the last was refused: time stamp)")
 
 
 def test_an_exposure_that_is_not_configured() -> None:
@@ -146,9 +142,7 @@ def test_cameras_that_do_not_open_are_reported_one_by_one() -> None:
     )
 
 
-def test_a_driver_that_hangs_is_reported_and_the_other_camera_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(watching, "LONGEST_START_S", 5.0)
-    monkeypatch.setattr(watching, "STOP_S", 0.2)
+def test_a_driver_that_hangs_is_reported_and_the_other_camera_is_seen() -> None:
     ended = threading.Event()
 
     class Stuck(FakeKernel):
@@ -159,22 +153,21 @@ def test_a_driver_that_hangs_is_reported_and_the_other_camera_is_seen(monkeypatc
 
     kernel = Stuck(front=FakeCamera(), back=FakeCamera())
     with filming(kernel, "front"):
-        found = _examined(_config("front", "back"), kernel)
+        found = _examined(_config("front", "back"), kernel, start_s=5.0)
     ended.set()
     assert found["camera front"][0].level is Level.PASS
     _problem(found, Level.FAILURE, "its driver does not respond", "camera back")
 
 
-def test_a_pipeline_is_watched_as_a_device_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pipeline_is_watched_as_a_device_is() -> None:
     fake = (sys.executable, "-IS", str(Path(__file__).parents[2] / "onboard" / "sources" / "fake_pipeline.py"))
-    monkeypatch.setattr(watching, "open_pipeline", lambda camera, size: open_pipeline(camera, size, fake))
     lens = IntrinsicsConfig(model="wide_angle", fx=30.0, fy=30.0, cx=32.0, cy=24.0)
     names = {"front": "caps:64x48 500 stall", "back": "fail:has_failed_(no_such_sensor)"}
     rig = RigConfig(cameras=tuple(CameraConfig(name=name, size_px=(64, 48), intrinsics=lens) for name in names))
     cameras = tuple(CameraDeviceParameters(name=n, pipeline=text, rate_hz=40.0) for n, text in names.items())
     config = DroneConfig(rig=rig, source=SourceParameters(kind="gstreamer", cameras=cameras))
     found: dict[str, list[Finding]] = {}
-    for finding in check_cameras(config, SECONDS):
+    for finding in check_cameras(config, SECONDS, Devices(command=fake)):
         found.setdefault(finding.about, []).append(finding)
     told = " ".join(finding.measured for finding in found["camera front"])
     assert "images a second" in told
@@ -215,18 +208,15 @@ def test_frames_of_another_program() -> None:
     endpoint = free_endpoint()
     with _publishing(endpoint, (64, 48)):
         found = {finding.about: finding for finding in check_cameras(_shared(endpoint), SECONDS)}
-    assert "jitter 0.0 ms, no gaps, calibration fits 64x48" in found["camera front"].measured or (
-        "images a second instead of 20" in found["camera front"].measured  # on a computer too busy to publish
-    )
+    assert "20.0 of 20 images a second, jitter 0.0 ms, no gaps" in found["camera front"].measured
 
 
-def test_frames_of_the_wrong_size_and_none_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_of_the_wrong_size_and_none_at_all() -> None:
     endpoint = free_endpoint()
     with _publishing(endpoint, (32, 48)):
         problem = next(iter(check_cameras(_shared(endpoint), SECONDS)))
     assert (problem.level, problem.measured) == (Level.FAILURE, "frames are 32x48, but the rig has 64x48")
-    monkeypatch.setattr(watching, "START_S", 0.3)
-    problem = next(iter(check_cameras(_shared(endpoint), SECONDS)))
+    problem = next(iter(check_cameras(_shared(endpoint), SECONDS, start_s=0.3)))
     assert problem.level is Level.FAILURE
     assert problem.measured == f"no frame of tiny/front came from {endpoint} within 0.3 s"
 

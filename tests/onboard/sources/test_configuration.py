@@ -10,9 +10,8 @@ import pytest
 from flockd.core.config import load_drone
 from flockd.core.errors import ConfigError
 from flockd.onboard.sources import open_source
-from flockd.onboard.sources.gstreamer import GstreamerSource
+from flockd.onboard.sources.device_source import DeviceSource
 from flockd.onboard.sources.shared_memory import SharedMemorySource
-from flockd.onboard.sources.v4l2 import V4l2Source
 
 QUADROTOR = Path(__file__).parents[3] / "config" / "quadrotor.yaml"
 RIG = """\
@@ -52,7 +51,7 @@ def test_the_quadrotors_file_is_four_wide_usb_cameras() -> None:
         assert [control.name for control in camera.controls] == ["auto_exposure", "exposure_time_absolute", "gain"]
     # An equidistant lens images 120 degrees on the width: r = f theta.
     assert config.rig.cameras[0].intrinsics.fx * 1.0471976 == pytest.approx(320.0, abs=0.1)
-    assert isinstance(open_source(config, "quadrotor.yaml"), V4l2Source)
+    assert isinstance(open_source(config, "quadrotor.yaml"), DeviceSource)
 
 
 def test_frames_may_come_from_another_program(tmp_path: Path) -> None:
@@ -70,7 +69,7 @@ def test_frames_may_come_from_a_pipeline_a_camera(tmp_path: Path) -> None:
     config = load_drone(path)
     assert config.source is not None
     assert [camera.place for camera in config.source.cameras] == ["nvarguscamerasrc sensor-id=0", "libcamerasrc"]
-    assert isinstance(open_source(config, str(path)), GstreamerSource)
+    assert isinstance(open_source(config, str(path)), DeviceSource)
 
 
 def test_the_pipelines_of_the_documentation_check(tmp_path: Path) -> None:

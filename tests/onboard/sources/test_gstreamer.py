@@ -12,13 +12,11 @@ import cv2
 import numpy as np
 import pytest
 
-from flockd.core.config.drone import DroneConfig
-from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
 from flockd.core.messages import FrameSet, UInt8Array
 from flockd.onboard.sources import CameraStatus
+from flockd.onboard.sources.device_source import Devices, DeviceSource
 from flockd.onboard.sources.devices import CameraError
-from flockd.onboard.sources.gstreamer import GstreamerSource
 from flockd.onboard.sources.gstreamer_child import HEADER, Buffer
 from flockd.onboard.sources.gstreamer_device import CHILD, GstreamerDevice
 from flockd.onboard.sources.gstreamer_formats import FORMATS, caps, format_of
@@ -27,24 +25,23 @@ from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat
 FAKE = (sys.executable, "-IS", str(Path(__file__).with_name("fake_pipeline.py")))
 SIZE = (64, 48)
 RATE_HZ = 50.0
-Start = Callable[..., GstreamerSource]
+CAMERA = CameraDeviceParameters(name="front", pipeline="any", rate_hz=RATE_HZ)
+Start = Callable[..., DeviceSource]
 
 
 @pytest.fixture
 def start() -> Iterator[Start]:
     """Starts a source of the given pipelines, called camera0 and so on."""
-    started: list[GstreamerSource] = []
+    started: list[DeviceSource] = []
 
-    def begin(*pipelines: str, silence_s: float = 30.0) -> GstreamerSource:
-        lens = IntrinsicsConfig(fx=60.0, fy=60.0, cx=32.0, cy=24.0)
+    def begin(*pipelines: str, silence_s: float = 30.0) -> DeviceSource:
         names = [f"camera{number}" for number in range(len(pipelines))]
-        rig = RigConfig(cameras=tuple(CameraConfig(name=name, size_px=SIZE, intrinsics=lens) for name in names))
         cameras = tuple(
             CameraDeviceParameters(name=name, pipeline=pipeline, rate_hz=RATE_HZ)
             for name, pipeline in zip(names, pipelines, strict=True)
         )
         parameters = SourceParameters(kind="gstreamer", cameras=cameras, silence_s=silence_s, set_tolerance_s=5.0)
-        source = GstreamerSource(DroneConfig(rig=rig, source=parameters), parameters, command=FAKE)
+        source = DeviceSource(dict.fromkeys(names, SIZE), parameters, Devices(command=FAKE))
         started.append(source)
         source.start()
         return source
@@ -54,7 +51,7 @@ def start() -> Iterator[Start]:
         source.stop()
 
 
-def _until(source: GstreamerSource, holds: Callable[[CameraStatus], bool], camera: str = "camera0") -> CameraStatus:
+def _until(source: DeviceSource, holds: Callable[[CameraStatus], bool], camera: str = "camera0") -> CameraStatus:
     until_s = time.monotonic() + 30.0
     while not holds(status := source.status()[camera]):
         assert time.monotonic() < until_s, status
@@ -62,13 +59,13 @@ def _until(source: GstreamerSource, holds: Callable[[CameraStatus], bool], camer
     return status
 
 
-def _next(source: GstreamerSource) -> FrameSet:
+def _next(source: DeviceSource) -> FrameSet:
     frames = source.newest(30.0)
     assert frames is not None
     return frames
 
 
-def _fault(source: GstreamerSource) -> str:
+def _fault(source: DeviceSource) -> str:
     return str(_until(source, lambda status: status.fault is not None).fault)
 
 
@@ -96,7 +93,7 @@ def test_numbers_count_periods_so_that_what_is_missing_shows() -> None:
         "os.read(0, 1)\n"
     )
     command = (sys.executable, "-ISc", script)
-    with GstreamerDevice("front", "any", size=SIZE, rate_hz=RATE_HZ, command=command) as device:
+    with GstreamerDevice(CAMERA, SIZE, command) as device:
         read = [device.read(30.0) for _ in range(5)]
     assert [one.sequence for one in read if one is not None] == [0, 1, 2, 7, 8]
     assert [one.time_s for one in read if one is not None] == pytest.approx([1.0, 1.02, 1.04, 1.14, 1.159])
@@ -127,7 +124,7 @@ def test_a_silent_pipeline_is_started_again_and_comes_back(start: Start, tmp_pat
 def test_a_frozen_pipeline_counts_as_silent(start: Start) -> None:
     source = start("caps:64x48 3 same:500 stall", silence_s=1.0)
     assert _fault(source) == "camera0: the image is frozen; restart its camera or program"
-    _until(source, lambda status: "gave no usable image for 1 s; the last was refused (frozen)" in str(status.fault))
+    _until(source, lambda status: "gave no usable image for 1 s (the last was refused: frozen)" in str(status.fault))
 
 
 @pytest.mark.parametrize(
@@ -174,7 +171,7 @@ def test_a_crash_is_followed_by_images_when_the_driver_is_back(start: Start, tmp
 
 def test_a_process_that_hangs_is_ended_when_its_camera_is_closed() -> None:
     script = "import time\ntime.sleep(3600)"  # reads nothing, not even that the other side has gone
-    device = GstreamerDevice("front", "any", size=SIZE, rate_hz=30.0, command=(sys.executable, "-ISc", script))
+    device = GstreamerDevice(CAMERA, SIZE, (sys.executable, "-ISc", script))
     assert device.read(0.0) is None
     process = device._process
     device.close()
@@ -183,7 +180,7 @@ def test_a_process_that_hangs_is_ended_when_its_camera_is_closed() -> None:
 
 def test_a_program_that_is_not_there_is_one_sentence() -> None:
     with pytest.raises(CameraError, match=r"^front: the process of its pipeline cannot be started \(No such file"):
-        GstreamerDevice("front", "any", size=SIZE, rate_hz=30.0, command=("/nowhere/python",))
+        GstreamerDevice(CAMERA, SIZE, ("/nowhere/python",))
 
 
 def test_the_real_process_says_so_where_gstreamer_is_not_installed(tmp_path: Path) -> None:

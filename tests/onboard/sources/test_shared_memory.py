@@ -14,8 +14,6 @@ import numpy as np
 import pytest
 import zenoh
 
-from flockd.core.config.drone import DroneConfig
-from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.config.source import SharedMemoryParameters, SourceParameters
 from flockd.core.errors import UnavailableError
 from flockd.core.messages import Frame, FrameSet
@@ -36,12 +34,10 @@ def endpoint() -> str:
 @pytest.fixture
 def source(endpoint: str) -> Iterator[SharedMemorySource]:
     """Drone 3 of a flock, waiting for its frames."""
-    lens = IntrinsicsConfig(fx=300.0, fy=300.0, cx=320.0, cy=240.0)
-    rig = RigConfig(cameras=tuple(CameraConfig(name=name, size_px=SIZE, intrinsics=lens) for name in CAMERAS))
     parameters = SourceParameters(
         kind="shared_memory", set_wait_s=5.0, shared_memory=SharedMemoryParameters(drone="3", connect=(endpoint,))
     )
-    source = SharedMemorySource(DroneConfig(rig=rig, source=parameters), parameters)
+    source = SharedMemorySource(dict.fromkeys(CAMERAS, SIZE), parameters)
     source.start()
     yield source
     source.stop()

@@ -14,12 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockd.core.config.drone import DroneConfig
-from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.config.source import CameraDeviceParameters, ControlParameters, SourceParameters
 from flockd.core.messages import FrameSet
 from flockd.onboard.sources import CameraStatus, v4l2_kernel
-from flockd.onboard.sources.v4l2 import V4l2Source
+from flockd.onboard.sources.device_source import Devices, DeviceSource
 from flockd.onboard.sources.v4l2_device import control_name
 from flockd.onboard.sources.v4l2_kernel import Kernel, LinuxKernel
 from tests.onboard.sources.camera_images import SIZE, jpeg, scene, yuyv
@@ -42,20 +40,18 @@ BY_HAND = (
     ControlParameters(name="exposure_time_absolute", value=50),
     ControlParameters(name="gain", value=32),
 )
-Start = Callable[..., V4l2Source]
+Start = Callable[..., DeviceSource]
 SECONDS_TO_FAIL = 60.0
 
 
 @pytest.fixture
 def start() -> Iterator[Start]:
     """Starts a source of the given cameras; each camera's device is /dev/ and its name."""
-    started: list[V4l2Source] = []
+    started: list[DeviceSource] = []
 
-    def begin(kernel: Kernel, *cameras: CameraDeviceParameters, silence_s: float = SECONDS_TO_FAIL) -> V4l2Source:
-        lens = IntrinsicsConfig(fx=300.0, fy=300.0, cx=320.0, cy=240.0)
-        rig = RigConfig(cameras=tuple(CameraConfig(name=c.name, size_px=SIZE, intrinsics=lens) for c in cameras))
+    def begin(kernel: Kernel, *cameras: CameraDeviceParameters, silence_s: float = SECONDS_TO_FAIL) -> DeviceSource:
         parameters = SourceParameters(kind="v4l2", cameras=cameras, silence_s=silence_s, set_tolerance_s=5.0)
-        source = V4l2Source(DroneConfig(rig=rig, source=parameters), parameters, kernel=kernel)
+        source = DeviceSource({c.name: SIZE for c in cameras}, parameters, Devices(kernel))
         started.append(source)
         source.start()
         return source
@@ -69,7 +65,7 @@ def _camera(name: str = "front", **changes: object) -> CameraDeviceParameters:
     return CameraDeviceParameters.model_validate({"name": name, "device": f"/dev/{name}", **changes})
 
 
-def _until(source: V4l2Source, holds: Callable[[CameraStatus], bool], camera: str = "front") -> CameraStatus:
+def _until(source: DeviceSource, holds: Callable[[CameraStatus], bool], camera: str = "front") -> CameraStatus:
     until_s = time.monotonic() + SECONDS_TO_FAIL
     while not holds(status := source.status()[camera]):
         assert time.monotonic() < until_s, status
@@ -77,7 +73,7 @@ def _until(source: V4l2Source, holds: Callable[[CameraStatus], bool], camera: st
     return status
 
 
-def _received(source: V4l2Source, **counts: int) -> None:
+def _received(source: DeviceSource, **counts: int) -> None:
     """Waits until so many frames of each camera have come."""
     until_s = time.monotonic() + SECONDS_TO_FAIL
     for camera, count in counts.items():
@@ -86,7 +82,7 @@ def _received(source: V4l2Source, **counts: int) -> None:
             time.sleep(0.005)
 
 
-def _next(source: V4l2Source) -> FrameSet:
+def _next(source: DeviceSource) -> FrameSet:
     frames = source.newest(SECONDS_TO_FAIL)
     assert frames is not None
     return frames
@@ -300,8 +296,8 @@ def test_a_frozen_camera_counts_as_silent(start: Start) -> None:
     assert used == 5, "the picture and four repetitions; the fifth is one too many"
     counts = source.status()["front"].counts
     assert counts["frozen"] == 4
-    _until(source, lambda status: status.fault == "front: /dev/front gave no usable image for 0.2 s; "
-           "the last was refused (frozen)")  # fmt: skip
+    _until(source, lambda status: status.fault == "front: /dev/front gave no usable image for 0.2 s "
+           "(the last was refused: frozen)")  # fmt: skip
     kernel.send("front", JPEGS[0])
     kernel.send("front", JPEGS[1])
     _next(source)

@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flockd.core.config.drone import DroneConfig
-from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
-from flockd.onboard.sources.v4l2 import V4l2Source
+from flockd.onboard.sources.device_source import DeviceSource
 
 RATE_HZ = 25.0
 
@@ -26,11 +24,9 @@ def test_the_virtual_camera_streams_without_gaps_at_its_rate() -> None:
     device = _vivid()
     if device is None:
         pytest.skip("no virtual camera: `modprobe vivid` needs a kernel that has it")
-    lens = IntrinsicsConfig(fx=300.0, fy=300.0, cx=320.0, cy=240.0)
-    rig = RigConfig(cameras=(CameraConfig(name="front", size_px=(640, 480), intrinsics=lens),))
     camera = CameraDeviceParameters(name="front", device=device, pixel_format="yuyv", rate_hz=RATE_HZ)
     parameters = SourceParameters(kind="v4l2", cameras=(camera,), frozen_after=0)
-    source = V4l2Source(DroneConfig(rig=rig, source=parameters), parameters)
+    source = DeviceSource({"front": (640, 480)}, parameters)
     source.start()
     try:
         frames = [source.newest(2.0) for _ in range(50)]

@@ -12,12 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from flockd.core.config.drone import DroneConfig
-from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
+from flockd.onboard.sources.device_source import DeviceSource
 from flockd.onboard.sources.devices import CameraError, CapturedBuffer
 from flockd.onboard.sources.frames import CameraStatus
-from flockd.onboard.sources.gstreamer import GstreamerSource
 from flockd.onboard.sources.gstreamer_device import GstreamerDevice
 from tools.checks.device_check import datagrams
 from tools.checks.device_check.datagrams import DatagramCamera
@@ -167,18 +165,16 @@ def _streams(name: str, pipeline: str) -> Iterator[Finding]:
 
 @contextmanager
 def _opened(pipeline: str, size: tuple[int, int]) -> Iterator[GstreamerDevice]:
-    with GstreamerDevice("check", pipeline, size=size, rate_hz=RATE_HZ) as device:
+    with GstreamerDevice(CameraDeviceParameters(name="check", pipeline=pipeline, rate_hz=RATE_HZ), size) as device:
         yield device
 
 
 @contextmanager
-def _running(pipeline: str, size: tuple[int, int] = datagrams.SIZE, *, wait: bool = True) -> Iterator[GstreamerSource]:
+def _running(pipeline: str, size: tuple[int, int] = datagrams.SIZE, *, wait: bool = True) -> Iterator[DeviceSource]:
     """A source of this one camera; begins when images come, unless asked not to wait."""
-    lens = IntrinsicsConfig(fx=90.0, fy=90.0, cx=48.0, cy=32.0)
-    rig = RigConfig(cameras=(CameraConfig(name="check", size_px=size, intrinsics=lens),))
     camera = CameraDeviceParameters(name="check", pipeline=pipeline, rate_hz=RATE_HZ)
     parameters = SourceParameters(kind="gstreamer", cameras=(camera,), set_tolerance_s=0.03, silence_s=SILENCE_S)
-    source = GstreamerSource(DroneConfig(rig=rig, source=parameters), parameters)
+    source = DeviceSource({"check": size}, parameters)
     source.start()
     try:
         if wait:
@@ -199,7 +195,7 @@ def _read(device: GstreamerDevice) -> list[tuple[CapturedBuffer, float]]:
     return got[10:]
 
 
-def _status(source: GstreamerSource) -> CameraStatus:
+def _status(source: DeviceSource) -> CameraStatus:
     return source.status()["check"]
 
 

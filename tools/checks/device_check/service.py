@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from flockd.core.config.source import CameraDeviceParameters
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.sources.devices import CameraError
@@ -37,6 +38,8 @@ ENDPOINT = "tcp/127.0.0.1:7447"
 CAMERAS = ("front", "back")
 FRONT_SIZE, BACK_SIZE, RATE_HZ, SILENCE_S = (160, 120), (320, 180), 5.0, 0.8
 """As in drone.yaml."""
+TAKEN = CameraDeviceParameters(name="back", device=WEBCAM, pixel_format="yuyv", rate_hz=RATE_HZ)
+"""The camera that two want."""
 MAX_EXPOSURE = 1.5
 NOTICED_S = 0.5
 """Three frame periods, or this."""
@@ -82,7 +85,7 @@ class Service:
     def starts(self) -> Iterator[Finding]:
         """No camera gives a frame at first: one is in use by us, and nobody feeds the other."""
         begun_s = time.monotonic()
-        with V4l2Device("occupant", WEBCAM, size=BACK_SIZE, pixel_format="yuyv", rate_hz=RATE_HZ):
+        with V4l2Device(TAKEN, BACK_SIZE):
             starting = subprocess.Popen(["bash", "-ec", self._start])
             until(
                 lambda: "in use by another program" in _shown("StatusText"),
@@ -210,7 +213,7 @@ class Service:
     def _is_refused_to_others(self) -> Finding:
         before, reported = self._counts("back"), "opened it"
         try:
-            V4l2Device("second", WEBCAM, size=BACK_SIZE, pixel_format="yuyv", rate_hz=RATE_HZ).close()
+            V4l2Device(TAKEN, BACK_SIZE).close()
         except CameraError as error:
             reported = str(error)
         lost = self._counts("back").get("lost", 0) - before.get("lost", 0)

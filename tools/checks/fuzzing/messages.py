@@ -29,7 +29,7 @@ from flockd.onboard.daemon.operator_commands import OperatorRequests, command_ha
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.mcap_file import RecordingError
 from flockd.onboard.recording.reader import decoded_image
-from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat, YuyvFormat
+from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat, PackedFormat
 from flockd.onboard.sources.shared_memory import SharedMemorySource
 from flockd.onboard.telemetry.topics import TOPICS
 from tools.checks.fuzzing.mutation import ABSURD_NUMBERS, ABSURD_TEXTS, absurd, any_float, mutated_bytes, mutated_json
@@ -215,7 +215,7 @@ def _frames(folder: Path) -> Check:
         if which < 0.5:
             _shared_memory(random, config, photo)
         elif which < 0.75:
-            with_format = random.choice(((MjpegFormat(size), jpeg), (YuyvFormat(size, 2 * size[0]), yuyv)))
+            with_format = random.choice(((MjpegFormat(size), jpeg), (PackedFormat("YUY2", size, 2 * size[0]), yuyv)))
             try:
                 image = with_format[0].decode(mutated_bytes(random, with_format[1]))
             except CorruptImageError as error:
@@ -234,7 +234,8 @@ def _frames(folder: Path) -> Check:
 def _shared_memory(random: Random, config: Any, photo: Any) -> None:
     """A few frames from a program that has gone mad, then good ones, which have to come through."""
     now_s = [1000.0]
-    source = SharedMemorySource(config, SourceParameters(kind="shared_memory"), clock=lambda: now_s[0])
+    sizes = {camera.name: camera.size_px for camera in config.rig.cameras}
+    source = SharedMemorySource(sizes, SourceParameters(kind="shared_memory"), lambda: now_s[0])
     good = photo.tobytes()
     for number in range(random.randrange(1, 8)):
         now_s[0] += 0.05
