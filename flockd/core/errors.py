@@ -75,6 +75,11 @@ class ConfigError(FlockdError):
             told.append(f"and {more} more {'problem' if more == 1 else 'problems'}; correct these first")
         super().__init__("\n".join(told))
 
+    @classmethod
+    def at(cls, file: object, message: str, key: str = "", line: int = 0) -> ConfigError:
+        """With one problem."""
+        return cls([ConfigProblem(str(file), line, key, message)])
+
 
 _SHORTAGES = {
     errno.EMFILE: "file descriptors",

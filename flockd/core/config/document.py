@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import yaml
@@ -67,7 +68,7 @@ def read_document(path: Path, what: str = "configuration") -> Document:
     except yaml.reader.ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
         message = f"holds the control character {error.character:#04x}; delete it"
-        raise ConfigError([ConfigProblem(str(path), line, "", message)]) from error
+        raise ConfigError.at(path, message, line=line) from error
     return document
 
 
@@ -78,9 +79,7 @@ def key_text(path: KeyPath) -> str:
 
 
 def _read_text(path: Path, what: str) -> str:
-    def fault(message: str, line: int = 0) -> ConfigError:
-        return ConfigError([ConfigProblem(str(path), line, "", message)])
-
+    fault = partial(ConfigError.at, path)
     try:
         if path.is_dir():
             raise fault("is a folder; name the YAML file in it")
@@ -102,7 +101,7 @@ def _read_text(path: Path, what: str) -> str:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
-        raise fault("is not UTF-8 text; save the file in UTF-8", line) from error
+        raise fault("is not UTF-8 text; save the file in UTF-8", line=line) from error
 
 
 class _Builder:

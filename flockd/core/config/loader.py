@@ -16,7 +16,7 @@ from flockd.core.config.drone import DroneConfig
 from flockd.core.config.perceived import PerceivedErrors
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.config.validation_messages import path_in_file, problems_of
-from flockd.core.errors import ConfigError, ConfigProblem
+from flockd.core.errors import ConfigError
 
 PATHS = {("perception", key) for key in ("models_dir", "engines_dir", *ROLES)} | {("telemetry", "zenoh_config")}
 """Keys of a drone whose values are paths; of a model's role only where it ends in `.yaml`, else it is a name."""
@@ -102,7 +102,7 @@ def _drone_document(path: Path, overrides: Overrides) -> Document:
         drone = document.values.get("drone")
         hint = f"{path.parent / drone}" if isinstance(drone, str) else "one with the key `rig`"
         fault = f"is a scenario, and a drone's own file is needed here; name that: {hint}"
-        raise ConfigError([ConfigProblem(str(path), 0, "", fault)])
+        raise ConfigError.at(path, fault)
     _override(document, overrides)
     return document
 
@@ -111,7 +111,7 @@ def _scenario_document(path: Path, overrides: Overrides) -> Document:
     document = read_document(path)
     if "rig" in document.values and _kind(document) == "drone":
         fault = "is a drone's own file, and a scenario is needed here; name one with the keys `vehicles` and `drone`"
-        raise ConfigError([ConfigProblem(str(path), 0, "", fault)])
+        raise ConfigError.at(path, fault)
     _merge_drone(document, path.parent)
     for key in _BESIDE_DRONE:
         _merge_section(document, key)

@@ -19,7 +19,6 @@ from flockd.onboard.recording import RecordingError
 from flockd.onboard.recording.codec import from_json, parsed
 from flockd.onboard.recording.foxglove import image_stream
 from flockd.onboard.recording.mcap_file import Entry, read_records
-from flockd.onboard.recording.migration import migrate_output
 from flockd.onboard.recording.reader import Recording, head_of
 from flockd.onboard.recording.streams import OUTPUT, TABLE, VEHICLE
 from flockd.onboard.telemetry import TOPICS, publish_step
@@ -203,7 +202,7 @@ class _Taking:
         elif topic in self._images:
             story.pictures.take_image(self._images[topic], entry.data)
         elif topic == OUTPUT.topic and self._vehicle is not None:
-            output: PilotOutput = from_json(PilotOutput, migrate_output(parsed(entry.data)))
+            output: PilotOutput = from_json(PilotOutput, parsed(entry.data))
             publish_step(story, story.drone, self._vehicle, output)
             story.pictures.take_step(output.time_s, output.detections)
         elif topic in _OWN:

@@ -12,7 +12,7 @@ import numpy as np
 
 from flockd.core.config import DroneConfig
 from flockd.core.config.rig import CameraConfig
-from flockd.core.errors import ConfigError, ConfigProblem
+from flockd.core.errors import ConfigError
 from flockd.core.messages import UInt8Array, VehicleState
 from flockd.flight.geometry import RigidTransform, build_rig
 from flockd.ground.calibration.alignment import Alignment, Attitudes, align
@@ -135,7 +135,7 @@ class RigSession:
                         f"of camera {camera.name!r} is {width} x {height}, and its image {one.name} has "
                         f"{image.shape[1]} x {image.shape[0]} pixels; calibrate the lens for that size"
                     )
-                    raise ConfigError([ConfigProblem(self.where, 0, "rig.cameras: size_px", message)])
+                    raise ConfigError.at(self.where, message, "rig.cameras: size_px")
                 greys[camera.name] = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
         return greys
 

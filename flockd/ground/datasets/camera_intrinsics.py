@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from flockd.core.choices import LensModel
 from flockd.core.config import load_drone
 from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
-from flockd.core.errors import ConfigError, ConfigProblem
+from flockd.core.errors import ConfigError
 from flockd.flight.geometry import build_rig
 from flockd.ground.datasets.tables import read_rows
 
@@ -29,14 +29,14 @@ def read_calibration(file: Path, size: tuple[int, int]) -> CameraConfig:
     Raises ConfigError, also where it is of another size.
     """
     if not file.is_file():
-        raise _problem(file, "does not exist; put the calibration there, or name one with --calibration")
+        raise ConfigError.at(file, "does not exist; put the calibration there, or name one with --calibration")
     if file.suffix.lower() in {".yaml", ".yml"}:
         return _camera_of_drone(file, size)
     matrix = read_rows(file, columns=3, what="a 3x3 matrix, three numbers a line")
     if len(matrix) != 3:
-        raise _problem(file, f"is no 3x3 matrix, it has {len(matrix)} rows; give it three, of three numbers each")
+        raise ConfigError.at(file, f"is no 3x3 matrix, it has {len(matrix)} rows; give it three, of three numbers each")
     if np.any(matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] != (0, 0, 0, 0, 1)):
-        raise _problem(file, "is no camera matrix; write [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+        raise ConfigError.at(file, "is no camera matrix; write [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     return camera_of(file, size, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
 
 
@@ -51,7 +51,7 @@ def camera_of(
     fx, fy, cx, cy = (float(value) for value in intrinsics)
     for centre, length, side in ((cx, size[0], "width"), (cy, size[1], "height")):
         if not _CENTRAL[0] * length <= centre <= _CENTRAL[1] * length:
-            raise _problem(
+            raise ConfigError.at(
                 file,
                 f"is the calibration of another size: its principal point lies at {centre:.0f} of {length} pixels of "
                 f"the images' {side}; name the one that belongs to {size[0]} x {size[1]} pixels",
@@ -68,28 +68,26 @@ def camera_of(
         build_rig(RigConfig(cameras=(camera,)))
     except ValidationError as error:
         first = error.errors()[0]
-        raise _problem(file, f"{'.'.join(map(str, first['loc']))}: {first['msg']}; correct the calibration") from None
+        raise ConfigError.at(
+            file, f"{'.'.join(map(str, first['loc']))}: {first['msg']}; correct the calibration"
+        ) from None
     except ValueError as error:
-        raise _problem(file, f"{error}; correct the calibration") from None
+        raise ConfigError.at(file, f"{error}; correct the calibration") from None
     return camera
 
 
 def _camera_of_drone(file: Path, size: tuple[int, int]) -> CameraConfig:
     cameras = load_drone(file).rig.cameras
     if len(cameras) != 1:
-        raise _problem(
+        raise ConfigError.at(
             file, f"has {len(cameras)} cameras; name a file with the one that took the images", "rig.cameras"
         )
     wanted = cameras[0].size_px
     if wanted != size:
-        raise _problem(
+        raise ConfigError.at(
             file,
             f"is the calibration of another size, {wanted[0]} x {wanted[1]}; name the one that belongs to "
             f"{size[0]} x {size[1]} pixels",
             "rig.cameras[0].size_px",
         )
     return cameras[0]
-
-
-def _problem(file: Path, message: str, key: str = "") -> ConfigError:
-    return ConfigError([ConfigProblem(str(file), 0, key, message)])

@@ -11,7 +11,7 @@ import yaml
 
 from flockd.core.choices import LensModel
 from flockd.core.config.rig import CameraConfig
-from flockd.core.errors import ConfigError, ConfigProblem
+from flockd.core.errors import ConfigError
 from flockd.flight.geometry import RigidTransform
 from flockd.ground.datasets.camera_intrinsics import camera_of, read_calibration
 from flockd.ground.datasets.dataset import Entry, FileDataset
@@ -71,24 +71,24 @@ def _settings(sensor: Path) -> Mapping[str, Any]:
     try:
         settings = yaml.safe_load(body)
     except yaml.YAMLError as error:
-        raise _problem(sensor, "", f"is not YAML ({str(error).splitlines()[0]}); correct it") from None
+        raise ConfigError.at(sensor, f"is not YAML ({str(error).splitlines()[0]}); correct it") from None
     if not isinstance(settings, dict):
-        raise _problem(sensor, "", "holds no calibration; it needs intrinsics, distortion and T_BS")
+        raise ConfigError.at(sensor, "holds no calibration; it needs intrinsics, distortion and T_BS")
     return settings
 
 
 def _camera(sensor: Path, settings: Mapping[str, Any], size: tuple[int, int]) -> CameraConfig:
     resolution = tuple(_numbers(sensor, settings, "resolution", 2))
     if resolution != size:
-        raise _problem(
+        raise ConfigError.at(
             sensor,
-            "resolution",
             f"is {resolution[0]:g} x {resolution[1]:g}, and the images {size[0]} x {size[1]}; "
             "it is the calibration of another size",
+            "resolution",
         )
     name = str(settings.get("distortion_model"))
     if name not in _MODELS:
-        raise _problem(sensor, "distortion_model", f"is {name}; one of {', '.join(_MODELS)} can be used")
+        raise ConfigError.at(sensor, f"is {name}; one of {', '.join(_MODELS)} can be used", "distortion_model")
     intrinsics = _numbers(sensor, settings, "intrinsics", 4)
     distortion = _numbers(sensor, settings, "distortion_coefficients", 4)
     return camera_of(sensor, size, list(intrinsics), list(distortion), _MODELS[name])
@@ -99,7 +99,7 @@ def _numbers(sensor: Path, settings: Mapping[str, Any], key: str, count: int) ->
     for part in key.split("."):
         value = value.get(part) if isinstance(value, dict) else None
     if not (isinstance(value, list) and len(value) == count and all(isinstance(v, int | float) for v in value)):
-        raise _problem(sensor, key, f"is no list of {count} numbers; write one")
+        raise ConfigError.at(sensor, f"is no list of {count} numbers; write one", key)
     return np.array(value, np.float64)
 
 
@@ -111,7 +111,3 @@ def _track(table: Path) -> PoseTrack:
 def _camera_pose(track: PoseTrack | None, time_s: float, T_body_camera: RigidTransform) -> RigidTransform | None:
     T_world_body = track.at(time_s) if track else None
     return T_world_body @ T_body_camera if T_world_body else None
-
-
-def _problem(sensor: Path, key: str, message: str) -> ConfigError:
-    return ConfigError([ConfigProblem(str(sensor), 0, key, message)])

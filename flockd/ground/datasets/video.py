@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from flockd.core.config.rig import CameraConfig
-from flockd.core.errors import ConfigError, ConfigProblem
+from flockd.core.errors import ConfigError
 from flockd.core.messages import UInt8Array
 from flockd.ground.datasets.camera_intrinsics import read_calibration
 from flockd.ground.datasets.dataset import DatasetFrame, Moment
@@ -59,8 +59,7 @@ def open_video(path: Path, calibration: Path | None) -> VideoDataset:
     if first is None or not rate_hz > 0 or claimed < 1:
         raise DatasetError(f"{path}: is no video that can be decoded; restore it, or convert it to MP4")
     if calibration is None:
-        message = "brings no calibration; name one with --calibration"
-        raise ConfigError([ConfigProblem(str(path), 0, "", message)])
+        raise ConfigError.at(path, "brings no calibration; name one with --calibration")
     camera = read_calibration(calibration, (first.shape[1], first.shape[0]))
     return VideoDataset(path, camera, claimed, rate_hz)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -47,67 +49,27 @@ def plan(
         only: of `CHECKS`.
     """
 
-    # Each imports what it checks when it runs: a library that does not load fails its check alone.
-    def instance() -> Iterable[Finding]:
-        from flockd.ground.doctor.service_checks import check_instance
-
-        return check_instance(config.name, environment)
-
-    def memory() -> Iterable[Finding]:
-        from flockd.ground.doctor.computer_checks import check_memory
-
-        return check_memory(config)
-
-    def disk() -> Iterable[Finding]:
-        from flockd.ground.doctor.computer_checks import check_disk
-
-        return check_disk(config, recordings)
-
-    def temperature() -> Iterable[Finding]:
-        from flockd.ground.doctor.computer_checks import check_temperature
-
-        return check_temperature(config)
-
-    def clock() -> Iterable[Finding]:
-        from flockd.ground.doctor.computer_checks import check_clock
-
-        return check_clock()
-
-    def exposure() -> Iterable[Finding]:
-        from flockd.ground.doctor.service_checks import check_unit
-
-        return check_unit(unit)
-
-    def zenoh() -> Iterable[Finding]:
-        from flockd.ground.doctor.telemetry_checks import check_fleet
-
-        return check_fleet(config)
-
-    def autopilot() -> Iterable[Finding]:
-        from flockd.ground.doctor.autopilot_checks import check_autopilot
-
-        return check_autopilot(config)
-
-    def cameras() -> Iterable[Finding]:
-        from flockd.ground.doctor.camera_checks import check_cameras
-
-        return check_cameras(config, seconds)
-
-    def models() -> Iterable[Finding]:
-        from flockd.ground.doctor.model_checks import check_models
-
-        return check_models(config)
-
-    runs: dict[str, tuple[Callable[[], Iterable[Finding]], float]] = {
-        "instance": (instance, 5.0),
-        "memory": (memory, 5.0),
-        "disk": (disk, 20.0),
-        "temperature": (temperature, 10.0),
-        "clock": (clock, 10.0),
-        "unit": (exposure, 30.0),
-        "zenoh": (zenoh, 20.0),
-        "autopilot": (autopilot, 60.0),
-        "cameras": (cameras, seconds + 20.0),
-        "models": (models, 180.0),
+    checks: dict[str, tuple[str, tuple[object, ...], float]] = {
+        "instance": ("service_checks.check_instance", (config.name, environment), 5.0),
+        "memory": ("computer_checks.check_memory", (config,), 5.0),
+        "disk": ("computer_checks.check_disk", (config, recordings), 20.0),
+        "temperature": ("computer_checks.check_temperature", (config,), 10.0),
+        "clock": ("computer_checks.check_clock", (), 10.0),
+        "unit": ("service_checks.check_unit", (unit,), 30.0),
+        "zenoh": ("telemetry_checks.check_fleet", (config,), 20.0),
+        "autopilot": ("autopilot_checks.check_autopilot", (config,), 60.0),
+        "cameras": ("camera_checks.check_cameras", (config, seconds), seconds + 20.0),
+        "models": ("model_checks.check_models", (config,), 180.0),
     }
-    return tuple(Check(name, *runs[name]) for name in CHECKS if name in only)
+    return tuple(
+        Check(name, partial(_run, function, arguments), limit_s)
+        for name, (function, arguments, limit_s) in checks.items()
+        if name in only
+    )
+
+
+def _run(function: str, arguments: Sequence[object]) -> Iterable[Finding]:
+    """Imports what checks only when it runs: a library that does not load fails its check alone."""
+    module, _, name = function.partition(".")
+    found: Iterable[Finding] = getattr(import_module(f"flockd.ground.doctor.{module}"), name)(*arguments)
+    return found

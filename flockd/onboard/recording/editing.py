@@ -13,7 +13,6 @@ from flockd.core.messages import VehicleState
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.codec import from_json, parsed
 from flockd.onboard.recording.mcap_file import Entry, McapFile, Note, RecordingError, read_records
-from flockd.onboard.recording.migration import migrate_output
 from flockd.onboard.recording.reader import (
     Contents,
     Recording,
@@ -125,7 +124,7 @@ def _can_be_read(entry: Entry, images: bool) -> bool:
         if entry.stream.topic in _KINDS:
             from_json(_KINDS[entry.stream.topic], parsed(entry.data))
         elif entry.stream.topic == OUTPUT.topic:
-            migrate_output(parsed(entry.data))
+            parsed(entry.data)
         elif images and is_image(entry.stream.topic):
             decoded_image(entry.data)
     except (ValueError, RecordingError):

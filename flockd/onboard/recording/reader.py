@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -20,7 +19,6 @@ from flockd.core.messages import Frame, FrameSet, MissionOrder, UInt8Array, Vehi
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.codec import from_json, parsed
 from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, Note, Record, RecordingError, read_records
-from flockd.onboard.recording.migration import migrate_configuration, migrate_output
 from flockd.onboard.recording.streams import (
     CONFIGURATION,
     END_NOTE,
@@ -51,8 +49,7 @@ class RecordedStep:
     frames: FrameSet
     vehicle: VehicleState
     output: Mapping[str, Any] | None
-    """A `PilotOutput` as JSON, every number exact; None where the recording ends before it. Of an earlier version: as
-    `migrate_output` converts it."""
+    """A `PilotOutput` as JSON, every number exact; None where the recording ends before it."""
     truth: Truth | None
     """The truth of a simulated flight."""
     order: MissionOrder | None = None
@@ -171,7 +168,7 @@ class Recording:
             if not start_s <= listed.time_s <= end_s:
                 return
             vehicle: VehicleState = from_json(VehicleState, parsed(messages[VEHICLE.topic]))
-            output = migrate_output(parsed(messages[OUTPUT.topic])) if OUTPUT.topic in messages else None
+            output = parsed(messages[OUTPUT.topic]) if OUTPUT.topic in messages else None
             truth = from_json(Truth, parsed(messages[TRUTH.topic])) if TRUTH.topic in messages else None
             order = from_json(MissionOrder, parsed(messages[ORDER.topic])) if ORDER.topic in messages else None
             frames = {}
@@ -288,12 +285,7 @@ def _time_of(path: Path, data: bytes) -> float:
 
 def _config(path: Path, contents: Contents) -> DroneConfig:
     try:
-        document = migrate_configuration(parsed(contents.configuration))
-    except ValueError as error:
-        raise RecordingError(f"{path}: the configuration in it is not JSON ({error}); use another copy") from error
-    try:
-        # Strict checks allow in JSON what they refuse in Python values, such as a list for a tuple.
-        return DroneConfig.model_validate_json(json.dumps(document))
+        return DroneConfig.model_validate_json(contents.configuration)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "the whole"

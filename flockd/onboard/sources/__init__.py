@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 
 from flockd.core.config import DroneConfig
-from flockd.core.errors import ConfigError, ConfigProblem
+from flockd.core.errors import ConfigError
 from flockd.onboard.sources.clock import clock_at
 from flockd.onboard.sources.device_source import DeviceSource
 from flockd.onboard.sources.frames import CameraStatus, Count, FrameSource
@@ -21,7 +21,7 @@ def open_source(config: DroneConfig, file: str, *, clock: Callable[[], float] = 
     Raises ConfigError if it asks for none.
     """
     if config.source is None:
-        raise ConfigError([ConfigProblem(file, 0, "source", "is missing; add one, as in config/quadrotor.yaml")])
+        raise ConfigError.at(file, "is missing; add one, as in config/quadrotor.yaml", "source")
     sizes = {camera.name: camera.size_px for camera in config.rig.cameras}
     if config.source.kind == "shared_memory":
         return SharedMemorySource(sizes, config.source, clock)

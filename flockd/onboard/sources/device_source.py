@@ -8,10 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
-from flockd.core.messages import FrameSet
 from flockd.onboard.sources.devices import CameraDevice, CameraError, CapturedBuffer
-from flockd.onboard.sources.frame_receiver import FrameReceiver
-from flockd.onboard.sources.frames import CameraStatus, Count, RawFrame
+from flockd.onboard.sources.frame_receiver import FrameReceiver, ReceivedFrames
+from flockd.onboard.sources.frames import Count, RawFrame
 from flockd.onboard.sources.gstreamer_device import CHILD, GstreamerDevice
 from flockd.onboard.sources.image_formats import CorruptImageError, ImageFormat
 from flockd.onboard.sources.v4l2_device import V4l2Device
@@ -38,7 +37,7 @@ class Devices:
         return V4l2Device(camera, size, self.kernel)
 
 
-class DeviceSource:
+class DeviceSource(ReceivedFrames):
     """A ``FrameSource`` of the kernel's cameras and of pipelines, with their own time stamps and numbers."""
 
     def __init__(
@@ -62,18 +61,6 @@ class DeviceSource:
         """See ``FrameSource``."""
         for camera in self._cameras:
             camera.start()
-
-    def newest(self, timeout_s: float = 0.0) -> FrameSet | None:
-        """See ``FrameSource``."""
-        return self._receiver.newest(timeout_s)
-
-    def status(self) -> Mapping[str, CameraStatus]:
-        """See ``FrameSource``."""
-        return self._receiver.status()
-
-    def notes(self) -> tuple[str, ...]:
-        """See ``FrameSource``."""
-        return ()
 
     def stop(self) -> None:
         """See ``FrameSource``."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from flockd.core.config.source import SourceParameters
 from flockd.core.messages import Frame, FrameSet
@@ -21,6 +21,24 @@ _USELESS_AFTER = 3
 
 MAX_AHEAD_S = 0.02
 """Drivers that work out time stamps from the camera's own clock may be this much ahead."""
+
+
+class ReceivedFrames:
+    """What all sources have in common for the pilot: sets are fetched from a receiver."""
+
+    _receiver: FrameReceiver
+
+    def newest(self, timeout_s: float = 0.0) -> FrameSet | None:
+        """See ``FrameSource``."""
+        return self._receiver.newest(timeout_s)
+
+    def status(self) -> Mapping[str, CameraStatus]:
+        """See ``FrameSource``."""
+        return self._receiver.status()
+
+    def notes(self) -> tuple[str, ...]:
+        """See ``FrameSource``."""
+        return ()
 
 
 class FrameReceiver:

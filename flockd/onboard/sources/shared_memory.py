@@ -17,9 +17,9 @@ from zenoh import shm
 
 from flockd.core import services
 from flockd.core.config.source import SourceParameters
-from flockd.core.messages import Frame, FrameSet
-from flockd.onboard.sources.frame_receiver import FrameReceiver
-from flockd.onboard.sources.frames import CameraStatus, RawFrame
+from flockd.core.messages import Frame
+from flockd.onboard.sources.frame_receiver import FrameReceiver, ReceivedFrames
+from flockd.onboard.sources.frames import RawFrame
 from flockd.onboard.sources.image_formats import RgbFormat
 from flockd.onboard.telemetry.zenoh_session import SessionError, SessionOwner, close_session, open_session
 
@@ -93,7 +93,7 @@ class FramePublisher(SessionOwner):
         return publisher
 
 
-class SharedMemorySource:
+class SharedMemorySource(ReceivedFrames):
     """A ``FrameSource`` of what a ``FramePublisher`` publishes for one drone."""
 
     def __init__(
@@ -121,14 +121,6 @@ class SharedMemorySource:
             )
             for camera in self._formats
         ]
-
-    def newest(self, timeout_s: float = 0.0) -> FrameSet | None:
-        """See ``FrameSource``."""
-        return self._receiver.newest(timeout_s)
-
-    def status(self) -> Mapping[str, CameraStatus]:
-        """See ``FrameSource``."""
-        return self._receiver.status()
 
     def notes(self) -> tuple[str, ...]:
         """See ``FrameSource``."""

@@ -12,7 +12,6 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
-from types import TracebackType
 from typing import Self
 
 from flockd.core.choices import PixelFormat
@@ -121,9 +120,7 @@ class V4l2Device:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _check_capabilities(self) -> None:
