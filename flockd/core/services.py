@@ -59,8 +59,5 @@ STEP_TOPIC = Service("telemetry of a step", 2.0, 1.5, "watchers show nothing for
 PREVIEW = Service("picture with detections", 2.0, 2.0, "the newest picture is shown without them")
 COMPUTER_TOPIC = Service("telemetry of the computer", 1.0, 3.0, "watchers show nothing for it")
 
-SERVICES = (
-    FRAME, FRAME_SILENCE, FRAME_STAMP, ESTIMATE, NEIGHBOUR, WANTED, WANTED_GONE, PERMISSION, REQUEST, CONTROL, SETPOINT,
-    SETPOINT_STREAM, HEARTBEAT, OTHER_HEARTBEAT, VEHICLE_STATE, GROUND_RANGE, RANGE_FINDER, TIME_SYNC, STEP_TOPIC,
-    PREVIEW, COMPUTER_TOPIC,
-)  # fmt: skip
+SERVICES = tuple(one for one in list(globals().values()) if isinstance(one, Service))
+"""All of them, in this order."""

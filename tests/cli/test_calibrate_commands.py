@@ -23,6 +23,7 @@ from flockd.ground.calibration.board import BoardFinder, BoardSpec
 from flockd.ground.calibration.image_sources import identity
 from flockd.onboard.recording import Recorder
 from flockd.onboard.sources import CameraStatus
+from flockd.onboard.sources.device_source import Devices
 from tests.ground.calibration import darkroom
 from tests.ground.calibration.darkroom import PINHOLE, WIDE, facing, photograph
 from tests.ground.calibration.test_rig import MOUNTS, OFFSET_S, attitude, boards_between, in_camera
@@ -187,7 +188,7 @@ def test_before_a_live_camera_a_person_gets_instructions(
 
 def test_a_v4l2_camera_is_read(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     kernel = FakeKernel(video7=FakeCamera(formats=((480, 360, b"MJPG"),)))
-    monkeypatch.setattr("flockd.onboard.sources.v4l2.LinuxKernel", lambda: kernel)
+    monkeypatch.setattr("flockd.onboard.sources.device_source.Devices", lambda: Devices(kernel))
     monkeypatch.setattr("flockd.ground.calibration.image_sources.FIRST_FRAME_S", 60.0)
     done = threading.Event()
 

@@ -15,8 +15,7 @@ from flockd.core.config import DroneConfig
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_telemetry import Mode
 from flockd.sim.autopilot.fake_vehicle import Demand
-from flockd.sim.free_ports import free_port
-from tests.calm import clock, run
+from tests.calm import clock
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import flying
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
@@ -29,41 +28,35 @@ QUIET_S = 1.5
 REASON = "Arming and offboard are denied: the estimator of this vehicle has not converged yet"
 
 
-def test_the_link_is_lost_and_comes_back(tmp_path: Path, record_property: RecordProperty) -> None:
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            process.fake_autopilot.silent = True
-            fault_s = time.monotonic()
-            await process.until_event("silent: no heartbeat from the autopilot for ")
-            reacted(record_property, "link-lost", time.monotonic() - fault_s)
-            await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-            assert process.fake_autopilot.failsafe
-            process.fake_autopilot.silent = False
-            sent = len(process.fake_autopilot.setpoints)
-            await until(lambda: process.heard()["flight"].message["heartbeat_age_s"] < 1.0, SECONDS_TO_FAIL)
-            await asyncio.sleep(QUIET_S)
-            assert len(process.fake_autopilot.setpoints) == sent
-            assert process.state() == "silent"
-
-    asyncio.run(story())
+async def test_the_link_is_lost_and_comes_back(tmp_path: Path, record_property: RecordProperty) -> None:
+    async with flying(tmp_path) as process:
+        process.fake_autopilot.silent = True
+        fault_s = time.monotonic()
+        await process.until_event("silent: no heartbeat from the autopilot for ")
+        reacted(record_property, "link-lost", time.monotonic() - fault_s)
+        await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        assert process.fake_autopilot.failsafe
+        process.fake_autopilot.silent = False
+        sent = len(process.fake_autopilot.setpoints)
+        await until(lambda: process.heard()["flight"].message["heartbeat_age_s"] < 1.0, SECONDS_TO_FAIL)
+        await asyncio.sleep(QUIET_S)
+        assert len(process.fake_autopilot.setpoints) == sent
+        assert process.state() == "silent"
 
 
-def test_the_pilot_takes_over(tmp_path: Path, record_property: RecordProperty) -> None:
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            fault_s = time.monotonic()
-            process.fake_autopilot.pilot_selects("POSCTL")
-            await process.until_event("silent: the flight mode is position")
-            await asyncio.sleep(QUIET_S)
-            reacted(record_property, "pilot-takes-over", max(0.0, process.last_setpoint_s() - fault_s))
-            sent = len(process.fake_autopilot.setpoints)
-            process.fake_autopilot.pilot_selects("LOITER")
-            await asyncio.sleep(QUIET_S)
-            assert len(process.fake_autopilot.setpoints) == sent
-            assert process.fake_autopilot.mode == "LOITER"
-            assert process.state() == "silent"
-
-    asyncio.run(story())
+async def test_the_pilot_takes_over(tmp_path: Path, record_property: RecordProperty) -> None:
+    async with flying(tmp_path) as process:
+        fault_s = time.monotonic()
+        process.fake_autopilot.pilot_selects("POSCTL")
+        await process.until_event("silent: the flight mode is position")
+        await asyncio.sleep(QUIET_S)
+        reacted(record_property, "pilot-takes-over", max(0.0, process.last_setpoint_s() - fault_s))
+        sent = len(process.fake_autopilot.setpoints)
+        process.fake_autopilot.pilot_selects("LOITER")
+        await asyncio.sleep(QUIET_S)
+        assert len(process.fake_autopilot.setpoints) == sent
+        assert process.fake_autopilot.mode == "LOITER"
+        assert process.state() == "silent"
 
 
 class _Refuses(FakeAutopilot):
@@ -81,26 +74,24 @@ class _Refuses(FakeAutopilot):
         return False
 
 
-def test_offboard_is_refused_and_the_whole_reason_reported(tmp_path: Path, record_property: RecordProperty) -> None:
-    port = free_port()
+async def test_offboard_is_refused_and_the_whole_reason_reported(
+    tmp_path: Path, port: int, record_property: RecordProperty
+) -> None:
 
-    async def story() -> None:
-        autopilot = _Refuses(port, heartbeat_s=HEARTBEAT_S, clock=clock)
-        async with aboard(autopilot, port, tmp_path, arm_and_take_off=True, height_m=HOVER_M) as ship:
-            await until(lambda: bool(ship.session.info.peers_zid()), SECONDS_TO_FAIL)  # it receives events
-            with autopilot:
-                await until(lambda: ship.state() != "" and math.isfinite(autopilot.asked_s), SECONDS_TO_FAIL)
-                await ship.until_event("the autopilot was asked for offboard, which was ")
-                (refused,) = [event for event in ship.events if "asked for offboard" in event]
-                assert refused.endswith(REASON)
-                await ship.until_state("idle")
-                reacted(record_property, "offboard-refused", clock() - autopilot.asked_s)
-                assert "offboard_refused" in ship.matters()
-                sent = len(autopilot.setpoints)
-                await asyncio.sleep(QUIET_S)
-                assert len(autopilot.setpoints) == sent
-
-    run(story)
+    autopilot = _Refuses(port, heartbeat_s=HEARTBEAT_S, clock=clock)
+    async with aboard(autopilot, port, tmp_path, arm_and_take_off=True, height_m=HOVER_M) as ship:
+        await until(lambda: bool(ship.session.info.peers_zid()), SECONDS_TO_FAIL)  # it receives events
+        with autopilot:
+            await until(lambda: ship.state() != "" and math.isfinite(autopilot.asked_s), SECONDS_TO_FAIL)
+            await ship.until_event("the autopilot was asked for offboard, which was ")
+            (refused,) = [event for event in ship.events if "asked for offboard" in event]
+            assert refused.endswith(REASON)
+            await ship.until_state("idle")
+            reacted(record_property, "offboard-refused", clock() - autopilot.asked_s)
+            assert "offboard_refused" in ship.matters()
+            sent = len(autopilot.setpoints)
+            await asyncio.sleep(QUIET_S)
+            assert len(autopilot.setpoints) == sent
 
 
 @pytest.mark.parametrize(
@@ -112,74 +103,63 @@ def test_offboard_is_refused_and_the_whole_reason_reported(tmp_path: Path, recor
     ],
     ids=["battery", "battery, to return", "estimate"],
 )
-def test_the_battery_is_low_or_the_position_lost(
+async def test_the_battery_is_low_or_the_position_lost(
     what: str, value: float, event: str, configured: dict[str, Any], mode: Mode, tmp_path: Path,
     record_property: RecordProperty,
 ) -> None:  # fmt: skip
     def change(config: DroneConfig) -> DroneConfig:
         return config.model_copy(update={"safety": config.safety.model_copy(update=configured)})
 
-    async def story() -> None:
-        async with flying(tmp_path, change=change) as process:
-            setattr(process.fake_autopilot, what, value)
-            fault_s = time.monotonic()
-            await until(lambda: process.fake_autopilot.mode == mode, SECONDS_TO_FAIL)
-            reacted(record_property, "battery-or-estimate", time.monotonic() - fault_s)
-            await process.until_event("silent: ")
-            await until(lambda: event in process.matters(), SECONDS_TO_FAIL)
-            sent = len(process.fake_autopilot.setpoints)
-            await asyncio.sleep(QUIET_S)
-            assert len(process.fake_autopilot.setpoints) == sent
-
-    asyncio.run(story())
+    async with flying(tmp_path, change=change) as process:
+        setattr(process.fake_autopilot, what, value)
+        fault_s = time.monotonic()
+        await until(lambda: process.fake_autopilot.mode == mode, SECONDS_TO_FAIL)
+        reacted(record_property, "battery-or-estimate", time.monotonic() - fault_s)
+        await process.until_event("silent: ")
+        await until(lambda: event in process.matters(), SECONDS_TO_FAIL)
+        sent = len(process.fake_autopilot.setpoints)
+        await asyncio.sleep(QUIET_S)
+        assert len(process.fake_autopilot.setpoints) == sent
 
 
-def test_messages_with_absurd_values(tmp_path: Path) -> None:
+async def test_messages_with_absurd_values(tmp_path: Path) -> None:
     """None of them ends a task, and the drone flies on."""
-
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            mav, nan = process.fake_autopilot._mav, math.nan
-            for _ in range(5):
-                with process.fake_autopilot._lock:
-                    mav.extended_sys_state_send(0, 5)
-                    mav.extended_sys_state_send(255, 255)
-                    mav.sys_status_send(0, 0, 0, 60000, 65535, -32768, -128, 0, 0, 0, 0, 0, 0)
-                    mav.gps_raw_int_send(0, 99, 0, 0, 0, 65535, 65535, 65535, 65535, 255)
-                    mav.local_position_ned_send(0, nan, nan, nan, nan, nan, nan)
-                    mav.attitude_quaternion_send(0, nan, nan, nan, nan, nan, nan, nan)
-                    mav.attitude_quaternion_send(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-                    mav.home_position_send(0, 0, 0, nan, nan, nan, [nan] * 4, nan, nan, nan)
-                    mav.statustext_send(2, b"\x1b[2J\x07")
-                    mav.command_ack_send(65535, 200)
-                await asyncio.sleep(0.1)
-            steps = process.heard()["computer"].message["steps"]
-            await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
-            assert process.fake_autopilot.mode == "OFFBOARD"
-            await process.until_state("normal", "degraded")
-            assert process.program.ended is None
-            assert "landed_state = 5" in process.log(), "counted and logged"
-            assert "\x1b" not in process.log()
-
-    asyncio.run(story())
+    async with flying(tmp_path) as process:
+        mav, nan = process.fake_autopilot._mav, math.nan
+        for _ in range(5):
+            with process.fake_autopilot._lock:
+                mav.extended_sys_state_send(0, 5)
+                mav.extended_sys_state_send(255, 255)
+                mav.sys_status_send(0, 0, 0, 60000, 65535, -32768, -128, 0, 0, 0, 0, 0, 0)
+                mav.gps_raw_int_send(0, 99, 0, 0, 0, 65535, 65535, 65535, 65535, 255)
+                mav.local_position_ned_send(0, nan, nan, nan, nan, nan, nan)
+                mav.attitude_quaternion_send(0, nan, nan, nan, nan, nan, nan, nan)
+                mav.attitude_quaternion_send(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+                mav.home_position_send(0, 0, 0, nan, nan, nan, [nan] * 4, nan, nan, nan)
+                mav.statustext_send(2, b"\x1b[2J\x07")
+                mav.command_ack_send(65535, 200)
+            await asyncio.sleep(0.1)
+        steps = process.heard()["computer"].message["steps"]
+        await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
+        assert process.fake_autopilot.mode == "OFFBOARD"
+        await process.until_state("normal", "degraded")
+        assert process.program.ended is None
+        assert "landed_state = 5" in process.log(), "counted and logged"
+        assert "\x1b" not in process.log()
 
 
-def test_the_ground_is_reached_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
+async def test_the_ground_is_reached_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
     """The vehicle sinks whatever it is told; its barometer says zero and less. Landing is reported and recorded."""
-
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            autopilot = process.fake_autopilot
-            autopilot._demand = lambda: Demand(np.zeros(2), 0.4, 0.0)  # type: ignore[method-assign]
-            await until(lambda: float(autopilot.state.position[2]) > -0.1, SECONDS_TO_FAIL)
-            fault_s = time.monotonic()
-            await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-            reacted(record_property, "ground-reached", time.monotonic() - fault_s)
-            await until(lambda: process.heard()["flight"].message["in_air"] is False, SECONDS_TO_FAIL)
-            assert any("land" in event or "ground" in event for event in process.events), process.events
-            steps = process.heard()["computer"].message["steps"]
-            await until(lambda: process.heard()["computer"].message["steps"] > steps + 3, SECONDS_TO_FAIL)
-            assert process.program.ended is None
-            assert "Traceback" not in process.log()
-
-    asyncio.run(story())
+    async with flying(tmp_path) as process:
+        autopilot = process.fake_autopilot
+        autopilot._demand = lambda: Demand(np.zeros(2), 0.4, 0.0)  # type: ignore[method-assign]
+        await until(lambda: float(autopilot.state.position[2]) > -0.1, SECONDS_TO_FAIL)
+        fault_s = time.monotonic()
+        await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        reacted(record_property, "ground-reached", time.monotonic() - fault_s)
+        await until(lambda: process.heard()["flight"].message["in_air"] is False, SECONDS_TO_FAIL)
+        assert any("land" in event or "ground" in event for event in process.events), process.events
+        steps = process.heard()["computer"].message["steps"]
+        await until(lambda: process.heard()["computer"].message["steps"] > steps + 3, SECONDS_TO_FAIL)
+        assert process.program.ended is None
+        assert "Traceback" not in process.log()

@@ -18,14 +18,13 @@ import yaml
 from flockd.core.config import DroneConfig
 from flockd.onboard.daemon import DaemonError
 from flockd.onboard.daemon.host_monitors import WallClock
-from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.free_ports import free_endpoint, free_port
-from tests.calm import clock, run
+from tests.calm import clock
 from tests.faults.catalogue import RecordProperty, reacted
+from tests.faults.conftest import InTheAir
 from tests.faults.process import flying
-from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import until
-from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, Aboard, aboard, config_for
+from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, Aboard, config_for
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
@@ -41,89 +40,61 @@ def _alone(config: DroneConfig, **safety: object) -> DroneConfig:
     return config.model_copy(update={"safety": changed})
 
 
-@pytest.fixture
-def in_the_air() -> tuple[FakeAutopilot, int]:
-    port = free_port()
-    return FakeAutopilot(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock), port
+async def test_a_networks_output_is_not_finite(in_the_air: InTheAir, record_property: RecordProperty) -> None:
+    async with in_the_air(change=_alone) as ship:
+        await _flies(ship)
+        await ship.until_state("normal")
+        ship.perceiver.not_finite = 2
+        fault_s = clock()
+        await ship.until_event("degraded: a network's output is not finite or not plausible")
+        reacted(record_property, "network-not-finite", clock() - fault_s)
+        assert ship.fake_autopilot.mode == "OFFBOARD"
+        await ship.until_state("normal")
+        assert ship.heard()["computer"].message["steps_failed"] == 0, "one camera's flow was left out"
 
 
-def test_a_networks_output_is_not_finite(
-    tmp_path: Path, in_the_air: tuple[FakeAutopilot, int], record_property: RecordProperty
-) -> None:
-    autopilot, port = in_the_air
-
-    async def story() -> None:
-        with autopilot:
-            async with aboard(autopilot, port, tmp_path, change=_alone) as ship:
-                await _flies(ship)
-                await ship.until_state("normal")
-                ship.perceiver.not_finite = 2
-                fault_s = clock()
-                await ship.until_event("degraded: a network's output is not finite or not plausible")
-                reacted(record_property, "network-not-finite", clock() - fault_s)
-                assert autopilot.mode == "OFFBOARD"
-                await ship.until_state("normal")
-                assert ship.heard()["computer"].message["steps_failed"] == 0, "one camera's flow was left out"
-
-    run(story)
-
-
-def test_a_step_ends_in_an_error_that_nobody_expects(
-    tmp_path: Path, in_the_air: tuple[FakeAutopilot, int], record_property: RecordProperty
+async def test_a_step_ends_in_an_error_that_nobody_expects(
+    in_the_air: InTheAir, record_property: RecordProperty
 ) -> None:
     """One such step is lost, and the flight goes on; three in a row end in Hold."""
-    autopilot, port = in_the_air
+    async with in_the_air(change=_alone) as ship:
+        await _flies(ship)
+        await ship.until_state("normal")
+        ship.perceiver.unexpected = 1
+        await ship.until_event("a step failed: KeyError: 'for the test'")
+        await until(lambda: ship.heard()["computer"].message["steps_failed"] == 1, SECONDS_TO_FAIL)
+        await ship.until_state("normal")
+        assert ship.fake_autopilot.mode == "OFFBOARD"
 
-    async def story() -> None:
-        with autopilot:
-            async with aboard(autopilot, port, tmp_path, change=_alone) as ship:
-                await _flies(ship)
-                await ship.until_state("normal")
-                ship.perceiver.unexpected = 1
-                await ship.until_event("a step failed: KeyError: 'for the test'")
-                await until(lambda: ship.heard()["computer"].message["steps_failed"] == 1, SECONDS_TO_FAIL)
-                await ship.until_state("normal")
-                assert autopilot.mode == "OFFBOARD"
-
-                ship.perceiver.unexpected = 3
-                fault_s = clock()
-                await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-                reacted(record_property, "step-exception", clock() - fault_s)
-                assert not autopilot.failsafe
-                with pytest.raises(
-                    DaemonError,
-                    match=r"StepsFailedError.*3 steps in a row failed",
-                ):
-                    await ship.ending
-
-    run(story)
+        ship.perceiver.unexpected = 3
+        fault_s = clock()
+        await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        reacted(record_property, "step-exception", clock() - fault_s)
+        assert not ship.fake_autopilot.failsafe
+        with pytest.raises(
+            DaemonError,
+            match=r"StepsFailedError.*3 steps in a row failed",
+        ):
+            await ship.ending
 
 
-def test_a_network_never_returns(
-    tmp_path: Path, in_the_air: tuple[FakeAutopilot, int], record_property: RecordProperty
-) -> None:
+async def test_a_network_never_returns(in_the_air: InTheAir, record_property: RecordProperty) -> None:
     """Not even when it is told to: hover and Hold first, then the watchdog of the service manager is not fed."""
-    autopilot, port = in_the_air
-
-    async def story() -> None:
-        with autopilot:
-            async with aboard(autopilot, port, tmp_path, change=_alone) as ship:
-                await _flies(ship)
-                ship.perceiver.ends_when_told = False
-                ship.perceiver.hangs.set()
-                fault_s = clock()
-                await ship.until_event("a step failed: a network call took longer than 0.5 s")
-                reacted(record_property, "network-stuck", clock() - fault_s)
-                await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-                assert not autopilot.failsafe
-                fed = ship.service.count("WATCHDOG=1")
-                await until(lambda: _is_not_fed(ship), SECONDS_TO_FAIL)
-                assert ship.service.count("WATCHDOG=1") >= fed
-                before = ship.service.count("WATCHDOG=1")
-                await asyncio.sleep(1.5)
-                assert ship.service.count("WATCHDOG=1") == before, "only a new process can help"
-
-    run(story)
+    async with in_the_air(change=_alone) as ship:
+        await _flies(ship)
+        ship.perceiver.ends_when_told = False
+        ship.perceiver.hangs.set()
+        fault_s = clock()
+        await ship.until_event("a step failed: a network call took longer than 0.5 s")
+        reacted(record_property, "network-stuck", clock() - fault_s)
+        await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        assert not ship.fake_autopilot.failsafe
+        fed = ship.service.count("WATCHDOG=1")
+        await until(lambda: _is_not_fed(ship), SECONDS_TO_FAIL)
+        assert ship.service.count("WATCHDOG=1") >= fed
+        before = ship.service.count("WATCHDOG=1")
+        await asyncio.sleep(1.5)
+        assert ship.service.count("WATCHDOG=1") == before, "only a new process can help"
 
 
 def _is_not_fed(ship: Aboard) -> bool:
@@ -131,165 +102,122 @@ def _is_not_fed(ship: Aboard) -> bool:
     return components is not None and components.networks.hopeless
 
 
-def test_steps_take_longer_than_they_may(
-    tmp_path: Path, in_the_air: tuple[FakeAutopilot, int], record_property: RecordProperty,
-) -> None:  # fmt: skip
+async def test_steps_take_longer_than_they_may(in_the_air: InTheAir, record_property: RecordProperty) -> None:
     """Frames are not queued: each step takes the newest; the drone hovers and asks for Hold."""
-    autopilot, port = in_the_air
     change = functools.partial(_alone, degraded_load=1.05, max_load=1.1)
 
-    async def story() -> None:
-        with autopilot:
-            async with aboard(autopilot, port, tmp_path, change=change) as ship:
-                await _flies(ship)
-                ship.perceiver.slow_s = 0.15
-                fault_s = clock()
-                await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-                reacted(record_property, "overrun", clock() - fault_s)
-                assert not autopilot.failsafe
-                (hover,) = [event for event in ship.events if event.startswith("hover: ")]
-                assert "a step takes " in hover
-                counts = ship.heard()["computer"].message["cameras"]["front"]["counts"]
-                assert counts["superseded"] > 0, "the newest frame wins"
-
-    run(story)
+    async with in_the_air(change=change) as ship:
+        await _flies(ship)
+        ship.perceiver.slow_s = 0.15
+        fault_s = clock()
+        await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        reacted(record_property, "overrun", clock() - fault_s)
+        assert not ship.fake_autopilot.failsafe
+        (hover,) = [event for event in ship.events if event.startswith("hover: ")]
+        assert "a step takes " in hover
+        counts = ship.heard()["computer"].message["cameras"]["front"]["counts"]
+        assert counts["superseded"] > 0, "the newest frame wins"
 
 
-def test_it_gets_too_hot(
-    tmp_path: Path, in_the_air: tuple[FakeAutopilot, int], record_property: RecordProperty,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    autopilot, port = in_the_air
+async def test_it_gets_too_hot(
+    in_the_air: InTheAir, record_property: RecordProperty, monkeypatch: pytest.MonkeyPatch
+) -> None:
     temperature_c = [50.0]
     monkeypatch.setattr("flockd.onboard.daemon.host_monitors.hottest_zone_c", lambda _: temperature_c[0])
 
-    async def story() -> None:
-        with autopilot:
-            async with aboard(autopilot, port, tmp_path, change=_alone) as ship:
-                await _flies(ship)
-                temperature_c[0] = 88.0
-                await ship.until_event("degraded: the computer is at 88.0 °C")
-                assert autopilot.mode == "OFFBOARD"
-                temperature_c[0] = 97.0
-                fault_s = clock()
-                await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-                reacted(record_property, "overrun", clock() - fault_s)
-                assert not autopilot.failsafe
-
-    run(story)
+    async with in_the_air(change=_alone) as ship:
+        await _flies(ship)
+        temperature_c[0] = 88.0
+        await ship.until_event("degraded: the computer is at 88.0 °C")
+        assert ship.fake_autopilot.mode == "OFFBOARD"
+        temperature_c[0] = 97.0
+        fault_s = clock()
+        await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        reacted(record_property, "overrun", clock() - fault_s)
+        assert not ship.fake_autopilot.failsafe
 
 
-def test_the_event_loop_is_stuck(
-    tmp_path: Path, in_the_air: tuple[FakeAutopilot, int], record_property: RecordProperty
+async def test_the_event_loop_is_stuck(in_the_air: InTheAir, record_property: RecordProperty) -> None:
+    async with in_the_air(change=_alone) as ship:
+        await _flies(ship)
+        ship.service.clear()
+        stuck_s = clock()
+        time.sleep(2.0)
+        reacted(record_property, "event-loop-stuck", max(0.0, ship.fake_autopilot.setpoints[-1][0] - stuck_s))
+        assert ship.fake_autopilot.failsafe
+        assert ship.service == [], "the watchdog of systemd acts after two seconds"
+        sent = len(ship.fake_autopilot.setpoints)
+        await ship.until_state("silent")
+        await asyncio.sleep(1.0)
+        assert len(ship.fake_autopilot.setpoints) == sent
+
+
+async def test_a_task_dies(
+    in_the_air: InTheAir, record_property: RecordProperty, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    autopilot, port = in_the_air
+    async with in_the_air(change=_alone) as ship:
+        await _flies(ship)
 
-    async def story() -> None:
-        with autopilot:
-            async with aboard(autopilot, port, tmp_path, change=_alone) as ship:
-                await _flies(ship)
-                ship.service.clear()
-                stuck_s = clock()
-                time.sleep(2.0)
-                reacted(record_property, "event-loop-stuck", max(0.0, autopilot.setpoints[-1][0] - stuck_s))
-                assert autopilot.failsafe
-                assert ship.service == [], "the watchdog of systemd acts after two seconds"
-                sent = len(autopilot.setpoints)
-                await ship.until_state("silent")
-                await asyncio.sleep(1.0)
-                assert len(autopilot.setpoints) == sent
+        def dies(*_: object) -> None:
+            raise ArithmeticError("for the test")
 
-    run(story)
+        monkeypatch.setattr("flockd.onboard.daemon.status_messages._computer_message", dies)
+        fault_s = clock()
+        await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        reacted(record_property, "task-dies", clock() - fault_s)
+        assert not ship.fake_autopilot.failsafe
+        with pytest.raises(DaemonError, match="telemetry: ArithmeticError") as ended:
+            await ship.ending
+        assert ended.value.exit_code != 0
 
 
-def test_a_task_dies(
-    tmp_path: Path, in_the_air: tuple[FakeAutopilot, int], record_property: RecordProperty,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    autopilot, port = in_the_air
-
-    async def story() -> None:
-        with autopilot:
-            async with aboard(autopilot, port, tmp_path, change=_alone) as ship:
-                await _flies(ship)
-
-                def dies(*_: object) -> None:
-                    raise ArithmeticError("for the test")
-
-                monkeypatch.setattr("flockd.onboard.daemon.status_messages._computer_message", dies)
-                fault_s = clock()
-                await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-                reacted(record_property, "task-dies", clock() - fault_s)
-                assert not autopilot.failsafe
-                with pytest.raises(DaemonError, match="telemetry: ArithmeticError") as ended:
-                    await ship.ending
-                assert ended.value.exit_code != 0
-
-    run(story)
-
-
-def test_the_wall_clock_is_set(
-    tmp_path: Path, in_the_air: tuple[FakeAutopilot, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    autopilot, port = in_the_air
+async def test_the_wall_clock_is_set(in_the_air: InTheAir, monkeypatch: pytest.MonkeyPatch) -> None:
     ahead_s = [0.0]
     watch = functools.partial(WallClock, wall=lambda: time.time() + ahead_s[0])
     monkeypatch.setattr("flockd.onboard.daemon.startup.WallClock", watch)
 
-    async def story() -> None:
-        with autopilot:
-            async with aboard(autopilot, port, tmp_path, change=_alone) as ship:
-                await _flies(ship)
-                await ship.until_state("normal")
-                ahead_s[0] = -86_400.0
-                await ship.until_event("the wall clock was set by -86400.0 s")
-                steps = ship.heard()["computer"].message["steps"]
-                await until(lambda: ship.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
-                assert autopilot.mode == "OFFBOARD"
-                assert ship.state() == "normal"
-
-    run(story)
+    async with in_the_air(change=_alone) as ship:
+        await _flies(ship)
+        await ship.until_state("normal")
+        ahead_s[0] = -86_400.0
+        await ship.until_event("the wall clock was set by -86400.0 s")
+        steps = ship.heard()["computer"].message["steps"]
+        await until(lambda: ship.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
+        assert ship.fake_autopilot.mode == "OFFBOARD"
+        assert ship.state() == "normal"
 
 
-def test_the_memory_is_used_up_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
+async def test_the_memory_is_used_up_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
     """No more can be had, so nothing is commanded; then Linux kills the process, and a new one is idle."""
-
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            fault_s = time.monotonic()
-            resource.prlimit(process.program.process.pid, resource.RLIMIT_AS, (1, 1))
-            await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-            reacted(record_property, "out-of-memory", time.monotonic() - fault_s)
-            process.signal(signal.SIGKILL)
-            assert await process.ended() == -signal.SIGKILL
-            sent = len(process.fake_autopilot.setpoints)
-            process.fake_autopilot.pilot_selects("LOITER")
-            process.daemons.start()
-            await until(lambda: "ready: models loaded" in process.log() or process.program.ended is not None, 60.0)
-            assert process.program.ended is None, process.log()
-            await process.until_state("idle")
-            assert len(process.fake_autopilot.setpoints) == sent
-
-    asyncio.run(story())
+    async with flying(tmp_path) as process:
+        fault_s = time.monotonic()
+        resource.prlimit(process.program.process.pid, resource.RLIMIT_AS, (1, 1))
+        await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        reacted(record_property, "out-of-memory", time.monotonic() - fault_s)
+        process.signal(signal.SIGKILL)
+        assert await process.ended() == -signal.SIGKILL
+        sent = len(process.fake_autopilot.setpoints)
+        process.fake_autopilot.pilot_selects("LOITER")
+        process.daemons.start()
+        await until(lambda: "ready: models loaded" in process.log() or process.program.ended is not None, 60.0)
+        assert process.program.ended is None, process.log()
+        await process.until_state("idle")
+        assert len(process.fake_autopilot.setpoints) == sent
 
 
-def test_the_computer_stalls_for_seconds(tmp_path: Path, record_property: RecordProperty) -> None:
+async def test_the_computer_stalls_for_seconds(tmp_path: Path, record_property: RecordProperty) -> None:
     """Stopped for 3 s: the failsafe acts, and when it goes on it stays silent and says what happened."""
-
-    async def story() -> None:
-        async with flying(tmp_path) as process:
-            stopped_s = process.signal(signal.SIGSTOP)
-            await asyncio.sleep(3.0)
-            process.signal(signal.SIGCONT)
-            reacted(record_property, "computer-stalls", max(0.0, process.last_setpoint_s() - stopped_s))
-            assert process.fake_autopilot.failsafe
-            await process.until_event("silent: ")
-            sent = len(process.fake_autopilot.setpoints)
-            await asyncio.sleep(1.5)
-            assert len(process.fake_autopilot.setpoints) == sent, "one more, and PX4 would be in offboard again"
-            assert any("stall" in event or "stopped" in event or "late" in event for event in process.events)
-
-    asyncio.run(story())
+    async with flying(tmp_path) as process:
+        stopped_s = process.signal(signal.SIGSTOP)
+        await asyncio.sleep(3.0)
+        process.signal(signal.SIGCONT)
+        reacted(record_property, "computer-stalls", max(0.0, process.last_setpoint_s() - stopped_s))
+        assert process.fake_autopilot.failsafe
+        await process.until_event("silent: ")
+        sent = len(process.fake_autopilot.setpoints)
+        await asyncio.sleep(1.5)
+        assert len(process.fake_autopilot.setpoints) == sent, "one more, and PX4 would be in offboard again"
+        assert any("stall" in event or "stopped" in event or "late" in event for event in process.events)
 
 
 def test_no_descriptors_are_left_at_the_start(tmp_path: Path) -> None:

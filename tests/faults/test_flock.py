@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,22 +15,14 @@ from flockd.core.messages import FrameSet, Neighbour, PilotOutput, VehicleState
 from flockd.flight.pilot import FlockPilot
 from flockd.flight.tracking.tracker import Tracker
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from flockd.sim.free_ports import free_port
-from tests.calm import clock, run
+from tests.calm import clock
 from tests.faults.catalogue import RecordProperty, reacted
+from tests.faults.conftest import InTheAir
 from tests.faults.process import flying
-from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import until
-from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, aboard
+from tests.onboard.daemon.aboard import SECONDS_TO_FAIL
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture
-def in_the_air() -> Iterator[tuple[FakeAutopilot, int]]:
-    port = free_port()
-    with FakeAutopilot(port, height_m=HOVER_M, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
-        yield autopilot, port
 
 
 def _neighbour(north_m: float, east_m: float, down_m: float = 0.0, north_m_s: float = 0.0) -> Neighbour:
@@ -46,75 +36,66 @@ def _changed(config: DroneConfig, **safety: Any) -> DroneConfig:
     return config.model_copy(update={"safety": config.safety.model_copy(update={"alone_s": None, **safety})})
 
 
-def test_a_neighbour_comes_too_near(
-    tmp_path: Path, in_the_air: tuple[FakeAutopilot, int], record_property: RecordProperty,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+async def test_a_neighbour_comes_too_near(
+    in_the_air: InTheAir, record_property: RecordProperty, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """In the way that it wants to fly: whatever the law says, no velocity towards it is sent."""
-    autopilot, port = in_the_air
     seen: list[Neighbour] = []
     monkeypatch.setattr(Tracker, "neighbours", lambda _: tuple(seen))
 
-    async def story() -> None:
-        async with aboard(autopilot, port, tmp_path, change=_changed) as ship:
-            await ship.is_ready_in_the_air()
-            await ship.flies()
-            seen.append(_neighbour(0.6, 0.0))
-            fault_s = clock()
-            await until(lambda: autopilot.setpoints[-1][1].velocity[0] <= 0.01, SECONDS_TO_FAIL)
-            reacted(record_property, "neighbour-too-near", clock() - fault_s)
-            await until(lambda: "neighbour_close" in ship.matters(), SECONDS_TO_FAIL)
-            near_s = clock()
-            await until(lambda: clock() > near_s + 1.0, SECONDS_TO_FAIL)
-            sent = [setpoint.velocity[0] for at_s, setpoint in list(autopilot.setpoints) if at_s > near_s]
-            assert sent
-            assert max(sent) <= 0.01
-            seen.clear()
-            await until(lambda: ship.speed() > 0.5, SECONDS_TO_FAIL)
-            assert autopilot.mode == "OFFBOARD"
-
-    run(story)
+    async with in_the_air(change=_changed) as ship:
+        await ship.is_ready_in_the_air()
+        await ship.flies()
+        seen.append(_neighbour(0.6, 0.0))
+        fault_s = clock()
+        await until(lambda: ship.fake_autopilot.setpoints[-1][1].velocity[0] <= 0.01, SECONDS_TO_FAIL)
+        reacted(record_property, "neighbour-too-near", clock() - fault_s)
+        await until(lambda: "neighbour_close" in ship.matters(), SECONDS_TO_FAIL)
+        near_s = clock()
+        await until(lambda: clock() > near_s + 1.0, SECONDS_TO_FAIL)
+        sent = [setpoint.velocity[0] for at_s, setpoint in list(ship.fake_autopilot.setpoints) if at_s > near_s]
+        assert sent
+        assert max(sent) <= 0.01
+        seen.clear()
+        await until(lambda: ship.speed() > 0.5, SECONDS_TO_FAIL)
+        assert ship.fake_autopilot.mode == "OFFBOARD"
 
 
-def test_all_neighbours_are_lost(
-    tmp_path: Path, in_the_air: tuple[FakeAutopilot, int], record_property: RecordProperty,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+async def test_all_neighbours_are_lost(
+    in_the_air: InTheAir, record_property: RecordProperty, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It flies on as desired, to the north, and not after the one that was last seen in the east; then Hold."""
-    autopilot, port = in_the_air
     seen = [_neighbour(0.0, 3.5, north_m_s=1.0)]
     monkeypatch.setattr(Tracker, "neighbours", lambda _: tuple(seen))
 
     def change(config: DroneConfig) -> DroneConfig:
         return _changed(config, neighbours_timeout_s=1.0, alone_s=3.0)
 
-    async def story() -> None:
-        async with aboard(autopilot, port, tmp_path, change=change) as ship:
-            await ship.until_state("idle")
-            await until(lambda: ship.matters() == {"started", "not_offboard"}, SECONDS_TO_FAIL)
-            assert (await ship.ask("ask/resume"))["accepted"] is True
-            await ship.until_state("ready")
-            await ship.flies()
-            seen.clear()
-            fault_s = clock()
-            await until(lambda: "neighbours_lost" in ship.matters(), SECONDS_TO_FAIL)
-            assert autopilot.mode == "OFFBOARD"
-            velocity = autopilot.setpoints[-1][1].velocity
-            np.testing.assert_allclose(velocity, [1.0, 0.0], atol=0.2)
-            await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-            reacted(record_property, "alone", clock() - fault_s)
-            assert not autopilot.failsafe
-            await ship.until_event("asking: no neighbour seen for ")
-
-    run(story)
+    async with in_the_air(change=change) as ship:
+        await ship.until_state("idle")
+        await until(lambda: ship.matters() == {"started", "not_offboard"}, SECONDS_TO_FAIL)
+        assert (await ship.ask("ask/resume"))["accepted"] is True
+        await ship.until_state("ready")
+        await ship.flies()
+        seen.clear()
+        fault_s = clock()
+        await until(lambda: "neighbours_lost" in ship.matters(), SECONDS_TO_FAIL)
+        assert ship.fake_autopilot.mode == "OFFBOARD"
+        velocity = ship.fake_autopilot.setpoints[-1][1].velocity
+        np.testing.assert_allclose(velocity, [1.0, 0.0], atol=0.2)
+        await until(lambda: ship.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        reacted(record_property, "alone", clock() - fault_s)
+        assert not ship.fake_autopilot.failsafe
+        await ship.until_event("asking: no neighbour seen for ")
 
 
 @pytest.mark.parametrize("velocity", [(np.nan, 0.0), (np.inf, 0.0), (1e6, 0.0)], ids=["NaN", "infinite", "too large"])
-def test_a_command_that_cannot_be_flown(
-    velocity: tuple[float, float], tmp_path: Path, in_the_air: tuple[FakeAutopilot, int],
-    record_property: RecordProperty, monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    autopilot, port = in_the_air
+async def test_a_command_that_cannot_be_flown(
+    velocity: tuple[float, float],
+    in_the_air: InTheAir,
+    record_property: RecordProperty,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     wrong: list[bool] = []
     step = FlockPilot.step
 
@@ -126,58 +107,53 @@ def test_a_command_that_cannot_be_flown(
 
     monkeypatch.setattr(FlockPilot, "step", spoiled)
 
-    async def story() -> None:
-        async with aboard(autopilot, port, tmp_path, change=_changed) as ship:
-            await ship.is_ready_in_the_air()
-            await ship.flies()
-            wrong.append(True)
-            fault_s = clock()
-            await until(lambda: float(np.linalg.norm(autopilot.setpoints[-1][1].velocity)) < 0.05, SECONDS_TO_FAIL)
-            reacted(record_property, "command-not-finite", clock() - fault_s)
-            await ship.until_event("degraded: a command was not finite or far too large")
-            assert autopilot.refused_setpoints == 0, "it never left"
-            wrong.clear()
-            await until(lambda: ship.speed() > 0.8, SECONDS_TO_FAIL)
-            assert autopilot.mode == "OFFBOARD"
+    async with in_the_air(change=_changed) as ship:
+        await ship.is_ready_in_the_air()
+        await ship.flies()
+        wrong.append(True)
+        fault_s = clock()
+        await until(
+            lambda: float(np.linalg.norm(ship.fake_autopilot.setpoints[-1][1].velocity)) < 0.05, SECONDS_TO_FAIL
+        )
+        reacted(record_property, "command-not-finite", clock() - fault_s)
+        await ship.until_event("degraded: a command was not finite or far too large")
+        assert ship.fake_autopilot.refused_setpoints == 0, "it never left"
+        wrong.clear()
+        await until(lambda: ship.speed() > 0.8, SECONDS_TO_FAIL)
+        assert ship.fake_autopilot.mode == "OFFBOARD"
 
-    run(story)
 
-
-def test_the_fence_is_left(tmp_path: Path, record_property: RecordProperty) -> None:
+async def test_the_fence_is_left(tmp_path: Path, record_property: RecordProperty) -> None:
     """It wants to go on to the north, beyond the fence 4 m from home."""
 
     def fenced(config: DroneConfig) -> DroneConfig:
         gate = config.safety.gate.model_copy(update={"fence_radius_m": 4.0})
         return _changed(config, gate=gate)
 
-    async def story() -> None:
-        async with flying(tmp_path, change=fenced) as process:
-            autopilot = process.fake_autopilot
-            await until(lambda: float(autopilot.state.position[0]) > 4.0, SECONDS_TO_FAIL)
-            fault_s = time.monotonic()
-            await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
-            reacted(record_property, "fence-left", time.monotonic() - fault_s)
-            assert not autopilot.failsafe
-            assert float(autopilot.state.position[0]) < 5.5
-            late = [setpoint.velocity[0] for at_s, setpoint in list(autopilot.setpoints) if at_s > fault_s + 1.0]
-            assert late
-            assert max(late) < 0.05, "nothing outward"
-            assert any("outside the fence" in event for event in process.events)
-
-    asyncio.run(story())
+    async with flying(tmp_path, change=fenced) as process:
+        autopilot = process.fake_autopilot
+        await until(lambda: float(autopilot.state.position[0]) > 4.0, SECONDS_TO_FAIL)
+        fault_s = time.monotonic()
+        await until(lambda: autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        reacted(record_property, "fence-left", time.monotonic() - fault_s)
+        assert not autopilot.failsafe
+        assert float(autopilot.state.position[0]) < 5.5
+        late = [setpoint.velocity[0] for at_s, setpoint in list(autopilot.setpoints) if at_s > fault_s + 1.0]
+        assert late
+        assert max(late) < 0.05, "nothing outward"
+        assert any("outside the fence" in event for event in process.events)
 
 
-def test_two_drones_at_one_spot_part(
-    tmp_path: Path, in_the_air: tuple[FakeAutopilot, int], monkeypatch: pytest.MonkeyPatch
+async def test_two_drones_at_one_spot_part(
+    in_the_air: InTheAir, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One hovers above this one: this one leaves to its own right, and the other's right is another.
 
     It faces north and looks up, so that its right is the west.
     """
-    autopilot, port = in_the_air
 
     def other(_: Tracker) -> tuple[Neighbour, ...]:
-        away = -autopilot.state.position
+        away = -fake_autopilot.state.position
         return (_neighbour(float(away[0]), float(away[1]) + 0.0005, -0.8),)
 
     monkeypatch.setattr(Tracker, "neighbours", other)
@@ -186,15 +162,12 @@ def test_two_drones_at_one_spot_part(
         mission = config.mission.model_copy(update={"speed_m_s": 0.0})
         return _changed(config).model_copy(update={"mission": mission})
 
-    async def story() -> None:
-        async with aboard(autopilot, port, tmp_path, change=still) as ship:
-            await ship.until_state("idle")
-            await until(lambda: ship.matters() <= {"started", "not_offboard", "neighbour_close"}, SECONDS_TO_FAIL)
-            assert (await ship.ask("ask/resume"))["accepted"] is True
-            await ship.until_state("ready")
-            await until(lambda: len(autopilot.setpoints) > 5, SECONDS_TO_FAIL)
-            autopilot.pilot_selects("OFFBOARD")
-            await until(lambda: float(autopilot.state.position[1]) < -0.5, SECONDS_TO_FAIL)
-            assert abs(float(autopilot.state.position[0])) < 0.5
-
-    run(story)
+    async with in_the_air(change=still) as ship:
+        await ship.until_state("idle")
+        await until(lambda: ship.matters() <= {"started", "not_offboard", "neighbour_close"}, SECONDS_TO_FAIL)
+        assert (await ship.ask("ask/resume"))["accepted"] is True
+        await ship.until_state("ready")
+        await until(lambda: len(fake_autopilot.setpoints) > 5, SECONDS_TO_FAIL)
+        fake_autopilot.pilot_selects("OFFBOARD")
+        await until(lambda: float(fake_autopilot.state.position[1]) < -0.5, SECONDS_TO_FAIL)
+        assert abs(float(fake_autopilot.state.position[0])) < 0.5

@@ -36,7 +36,7 @@ def load_drone(path: Path | str, overrides: Overrides | None = None) -> DroneCon
     `overrides` sets single values over the file's, by dotted key: `{"perception.flow": "dis"}`.
     Raises ConfigError with every problem found.
     """
-    return _validated(DroneConfig, _drone_document(Path(path), overrides or {}))
+    return validated(DroneConfig, _drone_document(Path(path), overrides or {}))
 
 
 def load_scenario(path: Path | str, overrides: Overrides | None = None) -> ScenarioConfig:
@@ -45,13 +45,13 @@ def load_scenario(path: Path | str, overrides: Overrides | None = None) -> Scena
     `overrides` sets single values over the files', by dotted key: `{"seed": 3, "drone.perception.flow": "dis"}`.
     Raises ConfigError with every problem found in both files.
     """
-    return _validated(ScenarioConfig, _scenario_document(Path(path), overrides or {}))
+    return validated(ScenarioConfig, _scenario_document(Path(path), overrides or {}))
 
 
 def load_perceived_errors(path: Path | str) -> PerceivedErrors:
     """How perception errs, as `tools.training.fit_perception` writes it. Raises ConfigError with every problem
     found."""
-    return _validated(PerceivedErrors, read_document(Path(path)))
+    return validated(PerceivedErrors, read_document(Path(path)))
 
 
 def load(path: Path | str) -> DroneConfig | ScenarioConfig:
@@ -64,15 +64,15 @@ def load_with_places(path: Path | str) -> tuple[DroneConfig | ScenarioConfig, Ma
     path = Path(path)
     if _kind(read_document(path)) == "drone":
         document = _drone_document(path, {})
-        return _validated(DroneConfig, document), document.places
+        return validated(DroneConfig, document), document.places
     document = _scenario_document(path, {})
-    return _validated(ScenarioConfig, document), document.places
+    return validated(ScenarioConfig, document), document.places
 
 
 def load_campaign(path: Path | str) -> tuple[CampaignConfig, Mapping[KeyPath, Place]]:
     """A campaign's file, and the place of each value in it; of its scenario only the path. Raises ConfigError."""
     document = read_document(Path(path), "campaign")
-    return _validated(CampaignConfig, document), document.places
+    return validated(CampaignConfig, document), document.places
 
 
 def schema_of(kind: FileKind) -> dict[str, Any]:
@@ -200,7 +200,8 @@ def _override(document: Document, overrides: Overrides) -> None:
             document.spoiled.discard(path)
 
 
-def _validated(model: type[Model], document: Document) -> Model:
+def validated(model: type[Model], document: Document) -> Model:
+    """The file as its type. Raises ConfigError with every problem found."""
     _anchor(document)
     try:
         config = model.model_validate(document.values)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from flockd.core.config.base import Section
 from flockd.core.config.document import read_document
-from flockd.core.config.validation_messages import problems_of
-from flockd.core.errors import ConfigError
+from flockd.core.config.loader import validated
 
 MAX_DISTANCE_M = 200.0
 """Nobody measures more with a tape, and no network detects a drone there."""
@@ -33,12 +32,5 @@ class DistancesConfig(Section):
 
 def read_distances(path: Path) -> list[tuple[float, Path]]:
     """Distances in metres, with what was photographed there. Raises ConfigError with all that is wrong."""
-    document = read_document(path, "list of distances")
-    try:
-        listed = DistancesConfig.model_validate(document.values)
-    except ValidationError as error:
-        problems = [*document.problems, *problems_of(error.errors(), DistancesConfig, document.places)]
-        raise ConfigError(problems) from None
-    if document.problems:
-        raise ConfigError(document.problems)
+    listed = validated(DistancesConfig, read_document(path, "list of distances"))
     return [(one.distance_m, path.parent / one.file) for one in listed.pictures]

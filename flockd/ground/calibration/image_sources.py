@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
-import numpy as np
 from pydantic import ValidationError
 
 from flockd.core.config import DroneConfig
@@ -16,7 +15,7 @@ from flockd.core.errors import UnavailableError, UsageError
 from flockd.core.messages import UInt8Array, VehicleState
 from flockd.ground.calibration.errors import CalibrationError
 from flockd.ground.datasets.image_files import SUFFIXES, read_image
-from flockd.ground.datasets.video import opened_video
+from flockd.ground.datasets.video import images_of_video, opened_video
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.sources import FrameSource, open_source
 
@@ -81,21 +80,10 @@ def from_video(path: Path, camera: str, every: int) -> ImageStream:
     """Every ``every``-th frame of a video. Raises CalibrationError for one that cannot be decoded."""
     with opened_video(path) as video:
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-        if not video.isOpened() or not video.read()[0]:
-            raise CalibrationError(f"{path}: is no video that can be decoded; restore it, or convert it to MP4")
-
-    def sets() -> Iterator[ImageSet]:
-        with opened_video(path) as video:
-            index = 0
-            while video.grab():
-                if index % every == 0:
-                    there, image = video.retrieve()
-                    if there:
-                        rgb = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
-                        yield ImageSet(f"frame {index}", {camera: rgb})
-                index += 1
-
-    return ImageStream(sets(), -(-count // every), live=False, identities={camera: f"not known (video {path.name})"})
+    if next(images_of_video(path), None) is None:
+        raise CalibrationError(f"{path}: is no video that can be decoded; restore it, or convert it to MP4")
+    sets = (ImageSet(f"frame {index}", {camera: image}) for index, image in images_of_video(path, every))
+    return ImageStream(sets, -(-count // every), live=False, identities={camera: f"not known (video {path.name})"})
 
 
 def from_recording(recording: Recording, every: int) -> tuple[ImageStream, DroneConfig]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from flockd.ground.cameras.found import FoundCamera, Mode
 from flockd.ground.cameras.gstreamer_listing import MONITOR, cameras_of_monitor
 from flockd.ground.cameras.v4l2_listing import SENSOR_ONLY, read_camera
-from flockd.onboard.sources.v4l2_kernel import Kernel, LinuxKernel
+from flockd.onboard.sources.v4l2_kernel import Kernel
 
 BY_PATH = Path("/dev/v4l/by-path")
 """udev's links by the socket that a camera is plugged into: they stay the same whatever is plugged in elsewhere."""
@@ -33,7 +33,7 @@ def run_program(command: Sequence[str]) -> str | None:
 class Computer:
     """Where cameras are looked for."""
 
-    kernel: Kernel = field(default_factory=LinuxKernel)
+    kernel: Kernel = field(default_factory=Kernel)
     nodes: Path = Path("/sys/class/video4linux")
     links: Path = BY_PATH
     run: Callable[[Sequence[str]], str | None] = run_program

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flockd.ground.datasets.dataset import Dataset, DatasetFrame
+from flockd.ground.datasets.dataset import DatasetFrame, FileDataset
 from flockd.ground.datasets.errors import DatasetError
 from flockd.ground.datasets.euroc import open_euroc
 from flockd.ground.datasets.rgbd_folder import open_rgbd_folder
 from flockd.ground.datasets.tum import open_tum
-from flockd.ground.datasets.video import SUFFIXES, open_video
+from flockd.ground.datasets.video import SUFFIXES, VideoDataset, open_video
 
 __all__ = ["Dataset", "DatasetError", "DatasetFrame", "is_dataset", "open_dataset"]
+
+Dataset = FileDataset | VideoDataset
+"""A sequence of images of one camera, in whichever layout."""
 
 
 def is_dataset(path: Path) -> bool:

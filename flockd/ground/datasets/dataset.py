@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from flockd.core.config.rig import CameraConfig
 from flockd.core.messages import Float32Array, UInt8Array
@@ -37,32 +36,6 @@ class DatasetFrame:
     """(h, w) metres along the optical axis, NaN where there is none; None where it was not asked for."""
 
 
-class Dataset(Protocol):
-    """A sequence of images of one camera."""
-
-    @property
-    def path(self) -> Path:
-        """Where it lies."""
-
-    @property
-    def camera(self) -> CameraConfig:
-        """The camera that took it; pixel centres at +0.5."""
-
-    @property
-    def has_depth(self) -> bool:
-        """Whether depth was recorded."""
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What a person should know although nothing is wrong: each is one sentence."""
-
-    def __len__(self) -> int:
-        """Number of frames."""
-
-    def frames(self, *, with_depth: bool) -> Iterator[DatasetFrame]:
-        """All frames in order, read one by one. Raises DatasetError at one that is missing or damaged."""
-
-
 @dataclass(frozen=True)
 class Entry:
     """Where the parts of one frame are."""
@@ -80,9 +53,11 @@ class FileDataset:
 
     path: Path
     camera: CameraConfig
+    """The one that took it; pixel centres at +0.5."""
     entries: tuple[Entry, ...]
     depth_units_per_m: float = 1000.0
     notes: tuple[str, ...] = ()
+    """What a person should know although nothing is wrong: each is one sentence."""
 
     def __post_init__(self) -> None:
         """Raises DatasetError if a file is missing: better now than after an hour."""
@@ -93,14 +68,14 @@ class FileDataset:
 
     @property
     def has_depth(self) -> bool:
-        """See ``Dataset``."""
+        """Whether depth was recorded."""
         return any(entry.depth for entry in self.entries)
 
     def __len__(self) -> int:
         return len(self.entries)
 
     def frames(self, *, with_depth: bool) -> Iterator[DatasetFrame]:
-        """See ``Dataset``."""
+        """All frames in order, read one by one. Raises DatasetError at one that is missing or damaged."""
         size = self.camera.size_px
         for index, entry in enumerate(self.entries):
             depth = read_depth(entry.depth, size, self.depth_units_per_m) if with_depth and entry.depth else None

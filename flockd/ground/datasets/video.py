@@ -13,6 +13,7 @@ import numpy as np
 
 from flockd.core.config.rig import CameraConfig
 from flockd.core.errors import ConfigError
+from flockd.core.image_header import MAX_IMAGE_PIXELS
 from flockd.core.messages import UInt8Array
 from flockd.ground.datasets.camera_intrinsics import read_calibration
 from flockd.ground.datasets.dataset import DatasetFrame, Moment
@@ -39,14 +40,13 @@ class VideoDataset:
         return self.claimed
 
     def frames(self, *, with_depth: bool) -> Iterator[DatasetFrame]:
-        """See ``Dataset``; there is no depth."""
-        with opened_video(self.path) as video:
-            index = 0
-            while (image := _next(video)) is not None:
-                yield DatasetFrame(Moment(index, f"{index}", index / self.rate_hz, None), image, None)
-                index += 1
-        if index < self.claimed - _COUNT_TOLERANCE:
-            raise DatasetError(f"{self.path}: ends after {index} of {self.claimed} frames; restore it")
+        """See ``FileDataset``; there is no depth."""
+        count = 0
+        for index, image in images_of_video(self.path):
+            yield DatasetFrame(Moment(index, f"{index}", index / self.rate_hz, None), image, None)
+            count = index + 1
+        if count < self.claimed - _COUNT_TOLERANCE:
+            raise DatasetError(f"{self.path}: ends after {count} of {self.claimed} frames; restore it")
 
 
 def open_video(path: Path, calibration: Path | None) -> VideoDataset:
@@ -54,8 +54,8 @@ def open_video(path: Path, calibration: Path | None) -> VideoDataset:
     if not path.is_file():
         raise DatasetError(f"{path}: does not exist; name a video")
     with opened_video(path) as video:
-        first = _next(video)
         rate_hz, claimed = video.get(cv2.CAP_PROP_FPS), int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+    _, first = next(images_of_video(path), (0, None))
     if first is None or not rate_hz > 0 or claimed < 1:
         raise DatasetError(f"{path}: is no video that can be decoded; restore it, or convert it to MP4")
     if calibration is None:
@@ -81,7 +81,21 @@ def opened_video(path: Path) -> Iterator[cv2.VideoCapture]:
         video.release()
 
 
-def _next(video: cv2.VideoCapture) -> UInt8Array | None:
-    """(h, w, 3) RGB; None at the end."""
-    there, image = video.read()
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8) if there else None
+def images_of_video(path: Path, every: int = 1, *, upright: bool = False) -> Iterator[tuple[int, UInt8Array]]:
+    """Number and image (h, w, 3), RGB, of every ``every``-th frame, as far as frames can be decoded.
+
+    ``upright``: turned as the file's orientation says. Raises DatasetError for a video that claims to be huge.
+    """
+    with opened_video(path) as video:
+        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, int(upright))
+        width, height = (int(video.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        if width * height > MAX_IMAGE_PIXELS:
+            raise DatasetError(f"{path}: says that it has {width} x {height} pixels; convert it to a smaller one")
+        index = 0
+        while video.grab():
+            if index % every == 0:
+                there, image = video.retrieve()
+                if not there:
+                    return
+                yield index, np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+            index += 1

@@ -150,8 +150,6 @@ def wall_clock_error_us() -> int:
 def check_clock(
     error_us: Callable[[], int] = wall_clock_error_us,
     today: Callable[[], datetime] = lambda: datetime.now(UTC),
-    monotonic: Callable[[], float] = time.monotonic,
-    sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[Finding]:
     """The wall clock, by which recordings and logs are dated, and the monotonic one, by which it flies."""
     date = today()
@@ -163,14 +161,14 @@ def check_clock(
         yield warned("wall clock", measured, "start a time service, as with `timedatectl set-ntp true`")
     else:
         yield passed("wall clock", f"{date:%Y-%m-%d %H:%M} UTC, synchronised to {1e-3 * error_us():.0f} ms")
-    yield judge_monotonic(_ticks(monotonic, sleep))
+    yield judge_monotonic(_ticks())
 
 
-def _ticks(monotonic: Callable[[], float], sleep: Callable[[float], None]) -> list[float]:
-    ticks = [monotonic()]
+def _ticks() -> list[float]:
+    ticks = [time.monotonic()]
     for _ in range(SAMPLES):
-        sleep(SAMPLE_S)
-        ticks.append(monotonic())
+        time.sleep(SAMPLE_S)
+        ticks.append(time.monotonic())
     return ticks
 
 

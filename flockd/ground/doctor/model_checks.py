@@ -38,7 +38,7 @@ def check_models(config: DroneConfig) -> Iterator[Finding]:
         intact = intact and finding.level is not Level.FAILURE
         yield finding
     if intact:
-        yield judge_steps(config, time_steps(config))
+        yield judge_steps(config, time_steps(config), os.getloadavg()[0], os.cpu_count() or 1)
 
 
 def _each(config: DroneConfig) -> Iterator[Finding]:
@@ -90,8 +90,8 @@ def meadow(size: tuple[int, int], number: int) -> UInt8Array:
     return image
 
 
-def judge_steps(config: DroneConfig, timed: list[tuple[float, PilotOutput]]) -> Finding:
-    """Whether the steps leave time to spare."""
+def judge_steps(config: DroneConfig, timed: list[tuple[float, PilotOutput]], busy: float, cores: int) -> Finding:
+    """Whether the steps leave time to spare; ``busy``: the load of the computer's ``cores``."""
     took_s = statistics.median(seconds for seconds, _ in timed[1:])
     stages = timed[-1][1].stages_ms
     longest = ", ".join(f"{stage} {stages[stage]:.0f}" for stage in sorted(stages, key=lambda s: -stages[s])[:3])
@@ -102,7 +102,6 @@ def judge_steps(config: DroneConfig, timed: list[tuple[float, PilotOutput]]) -> 
     )
     load = took_s / config.step_s
     fix = "give perception.threads more cores, raise step_s, take smaller images, or `perception.flow: dis`"
-    busy, cores = os.getloadavg()[0], os.cpu_count() or 1
     if busy > cores:
         fix = f"stop other programs first (a load of {busy:.0f} on {cores} cores), and {fix}"
     if load > config.safety.degraded_load:

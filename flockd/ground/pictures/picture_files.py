@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 
 from flockd.core.errors import UsageError
-from flockd.core.image_header import MAX_IMAGE_PIXELS
 from flockd.core.messages import UInt8Array
 from flockd.ground.datasets import image_files, video
 from flockd.ground.datasets.errors import DatasetError
@@ -49,22 +48,10 @@ class PictureFile:
         if not self.is_video:
             yield str(self.path), image_files.read_image(self.path, upright=True)
             return
-        with video.opened_video(self.path) as opened:
-            opened.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
-            width, height = (int(opened.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-            if width * height > MAX_IMAGE_PIXELS:
-                raise DatasetError(
-                    f"{self.path}: says that it has {width} x {height} pixels; convert it to a smaller one"
-                )
-            index = 0
-            while opened.grab():
-                if index % every == 0:
-                    is_there, image = opened.retrieve()
-                    if not is_there:
-                        break
-                    yield f"{self.path}#{index}", np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
-                index += 1
-        if index == 0:
+        index = None
+        for index, image in video.images_of_video(self.path, every, upright=True):
+            yield f"{self.path}#{index}", image
+        if index is None:
             raise DatasetError(f"{self.path}: is no video that can be decoded; restore it, or convert it to MP4")
 
     def rate_hz(self) -> float:

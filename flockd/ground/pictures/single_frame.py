@@ -147,17 +147,16 @@ class PictureDetector:
 
 
 @lru_cache(maxsize=8)  # one object for pictures of one size, as rays are cached by it
-def camera_with_fov(size: tuple[int, int], fov_deg: float, max_side_px: int = MAX_SIDE_PX) -> PinholeCamera:
+def camera_with_fov(size: tuple[int, int], fov_deg: float) -> PinholeCamera:
     """A camera without distortion, of a picture's size or, for a larger one, of the size to resize it to.
 
     Args:
         size: width and height of the picture.
         fov_deg: field of view across the longer side, as of a phone that is held either way.
-        max_side_px: what a longer side is resized to.
     """
     longer = max(size)
-    if longer > max_side_px:
-        size = (max(round(size[0] * max_side_px / longer), 1), max(round(size[1] * max_side_px / longer), 1))
+    if longer > MAX_SIDE_PX:
+        size = (max(round(size[0] * MAX_SIDE_PX / longer), 1), max(round(size[1] * MAX_SIDE_PX / longer), 1))
     focal = max(size) / 2 / math.tan(math.radians(fov_deg) / 2)
     matrix = np.array([[focal, 0.0, size[0] / 2], [0.0, focal, size[1] / 2], [0.0, 0.0, 1.0]])
     return PinholeCamera(matrix, size)

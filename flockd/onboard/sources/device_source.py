@@ -14,7 +14,7 @@ from flockd.onboard.sources.frames import Count, RawFrame
 from flockd.onboard.sources.gstreamer_device import CHILD, GstreamerDevice
 from flockd.onboard.sources.image_formats import CorruptImageError, ImageFormat
 from flockd.onboard.sources.v4l2_device import V4l2Device
-from flockd.onboard.sources.v4l2_kernel import Kernel, LinuxKernel
+from flockd.onboard.sources.v4l2_kernel import Kernel
 
 _LOOK_S = 0.05
 """How long a thread waits for a frame before it checks whether it should stop."""
@@ -27,7 +27,7 @@ _STOP_S = 1.0
 class Devices:
     """Opens cameras: one with a pipeline by a process of ``command``, all others by the ``kernel``."""
 
-    kernel: Kernel = field(default_factory=LinuxKernel)
+    kernel: Kernel = field(default_factory=Kernel)
     command: Sequence[str] = CHILD
 
     def open(self, camera: CameraDeviceParameters, size: tuple[int, int]) -> CameraDevice:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol, Self
+from typing import Self
 
 from flockd.core.errors import UnavailableError
 from flockd.onboard.sources.image_formats import ImageFormat
@@ -24,18 +25,26 @@ class CapturedBuffer:
     """The driver says that the data may be damaged."""
 
 
-class CameraDevice(Protocol):
+class CameraDevice(ABC):
     """An open camera that streams; a context manager that closes it. Every method raises CameraError when it fails."""
 
     start_s: float
     """How long it may take to its first frame."""
 
+    @abstractmethod
     def read(self, timeout_s: float) -> CapturedBuffer | None:
         """The next image; None if there is none within the time."""
 
+    @abstractmethod
     def image_format(self) -> ImageFormat:
         """Format of the image that `read` gave last."""
 
-    def __enter__(self) -> Self: ...
+    @abstractmethod
+    def close(self) -> None:
+        """Stops the camera and gives it back."""
 
-    def __exit__(self, *_: object) -> None: ...
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

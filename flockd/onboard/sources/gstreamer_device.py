@@ -16,11 +16,10 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 from flockd.core.config.source import CameraDeviceParameters
 from flockd.onboard.sources import gstreamer_child
-from flockd.onboard.sources.devices import CameraError, CapturedBuffer
+from flockd.onboard.sources.devices import CameraDevice, CameraError, CapturedBuffer
 from flockd.onboard.sources.gstreamer_child import CAPS, DAMAGED, END, ERROR, HEADER, IMAGE
 from flockd.onboard.sources.gstreamer_formats import caps, format_of
 from flockd.onboard.sources.image_formats import ImageFormat
@@ -42,7 +41,7 @@ class _Message:
     data: bytes
 
 
-class GstreamerDevice:
+class GstreamerDevice(CameraDevice):
     """A ``CameraDevice`` of a pipeline. Its time stamps are those of GStreamer's buffers, on CLOCK_MONOTONIC.
 
     Images are numbered by their times, in periods of the rate: a number that is missing is a frame that is.
@@ -104,12 +103,6 @@ class GstreamerDevice:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _next(self, timeout_s: float) -> _Message | None:
         try:

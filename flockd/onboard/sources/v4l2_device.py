@@ -8,15 +8,15 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
+import mmap
 import os
 import re
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
-from typing import Self
 
 from flockd.core.choices import PixelFormat
 from flockd.core.config.source import CameraDeviceParameters, ControlParameters
-from flockd.onboard.sources.devices import CameraError, CapturedBuffer
+from flockd.onboard.sources.devices import CameraDevice, CameraError, CapturedBuffer
 from flockd.onboard.sources.image_formats import ImageFormat, MjpegFormat, PackedFormat
 from flockd.onboard.sources.v4l2_kernel import (
     VIDIOC_DQBUF,
@@ -36,8 +36,6 @@ from flockd.onboard.sources.v4l2_kernel import (
     Control,
     Format,
     Kernel,
-    LinuxKernel,
-    Mapping,
     QueryControl,
     RequestBuffers,
     StreamParameters,
@@ -57,17 +55,17 @@ _BUFFERS = 4
 _RATE_TOLERANCE = 0.1
 
 
-class V4l2Device:
+class V4l2Device(CameraDevice):
     """A ``CameraDevice`` of the kernel's."""
 
     start_s = 3.0
 
     def __init__(self, camera: CameraDeviceParameters, size: tuple[int, int], kernel: Kernel | None = None) -> None:
         """Opens the device, sets it up as asked, and starts it; what the driver does not grant is a CameraError."""
-        self._kernel = kernel or LinuxKernel()
+        self._kernel = kernel or Kernel()
         self._who = f"{camera.name}: {camera.device}"
         self._size, self._pixel_format = size, camera.pixel_format
-        self._maps: list[Mapping] = []
+        self._maps: list[mmap.mmap] = []
         self._bytes_per_line = 0
         with self._telling("cannot be opened"):
             self._descriptor = self._kernel.open(camera.device)
@@ -116,12 +114,6 @@ class V4l2Device:
         while self._maps:
             self._maps.pop().close()
         self._kernel.close(self._descriptor)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _check_capabilities(self) -> None:
         capability = Capability()

@@ -8,7 +8,7 @@ import fcntl
 import mmap
 import os
 import select
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 NAME_LENGTH = 32
 
@@ -178,59 +178,30 @@ VIDIOC_ENUM_FRAMESIZES = _request(74, FrameSize, _READ | _WRITE)
 VIDIOC_ENUM_FRAMEINTERVALS = _request(75, FrameInterval, _READ | _WRITE)
 
 
-class Mapping(Protocol):
-    """Memory of a driver, as `mmap.mmap` gives it."""
-
-    def __getitem__(self, part: slice) -> bytes:
-        """A copy of some of it."""
-
-    def close(self) -> None:
-        """Gives it back; the driver holds the device open until then."""
-
-
-class Kernel(Protocol):
-    """The system calls a camera is driven by; each raises OSError as the kernel does."""
+class Kernel:
+    """The system calls of Linux that a camera is driven by; each raises OSError as the kernel does."""
 
     def open(self, path: str) -> int:
         """A file descriptor for reading and writing that never blocks."""
-
-    def close(self, descriptor: int) -> None:
-        """Ends the descriptor."""
-
-    def ioctl(self, descriptor: int, request: int, argument: ctypes.Structure | ctypes.c_int) -> None:
-        """Runs the request; the kernel writes its result into ``argument``."""
-
-    def map(self, descriptor: int, length: int, offset: int) -> Mapping:
-        """Maps a buffer of the driver."""
-
-    def wait(self, descriptor: int, timeout_s: float) -> bool:
-        """Whether there is something to fetch, a frame or an error, within the time."""
-
-
-class LinuxKernel:
-    """The system calls of Linux."""
-
-    def open(self, path: str) -> int:
-        """See ``Kernel``."""
         return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
 
     def close(self, descriptor: int) -> None:
-        """See ``Kernel``."""
+        """Ends the descriptor."""
         os.close(descriptor)
 
     def ioctl(self, descriptor: int, request: int, argument: ctypes.Structure | ctypes.c_int) -> None:
-        """See ``Kernel``."""
+        """Runs the request; the kernel writes its result into ``argument``."""
         while True:
             with contextlib.suppress(InterruptedError):
                 fcntl.ioctl(descriptor, request, argument)
                 return
 
-    def map(self, descriptor: int, length: int, offset: int) -> Mapping:
-        """See ``Kernel``."""
+    def map(self, descriptor: int, length: int, offset: int) -> mmap.mmap:
+        """Maps a buffer of the driver, which holds the device open until that is closed."""
         return mmap.mmap(descriptor, length, mmap.MAP_SHARED, mmap.PROT_READ | mmap.PROT_WRITE, offset=offset)
 
     def wait(self, descriptor: int, timeout_s: float) -> bool:
-        """See ``Kernel``."""
+        """Whether there is something to fetch, a frame or an error, within the time."""
         poll = select.poll()
         poll.register(descriptor, select.POLLIN)
         return bool(poll.poll(timeout_s * 1000.0))

@@ -22,7 +22,8 @@ from flockd.core.messages import (
 from flockd.flight.geometry import RigCamera, RigidTransform, build_rig, rotation_angle_deg
 from flockd.flight.perception import Crop, Networks, RangeEstimate, SceneMaps
 from flockd.flight.pilot import FlockPilot
-from flockd.ground.datasets.dataset import Dataset, DatasetFrame, Moment
+from flockd.ground.datasets import Dataset, DatasetFrame
+from flockd.ground.datasets.dataset import Moment
 
 _FLAT_DEVIATION = 1.0
 """Grey levels of standard deviation under which an image shows nothing: matched with anything, it would stand still."""

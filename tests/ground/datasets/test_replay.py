@@ -327,6 +327,12 @@ def test_a_folder_of_something_else_is_no_dataset(tmp_path: Path, capsys: Captur
     assert "is in none of the layouts that can be read" in capsys.readouterr().err
 
 
+def test_a_name_that_cannot_be_a_path_is_one_sentence(tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "rgb.txt").write_text("1.0 rgb/a\0b.png\n", encoding="utf-8")
+    assert main(["replay", str(tmp_path)]) == 1
+    assert "b.png: cannot be read (embedded null byte); restore it" in capsys.readouterr().err
+
+
 def test_real_images_give_real_motions(tmp_path: Path, capsys: Capture) -> None:
     """Six frames of somebody's walk through an office, with the networks that come with flockd."""
     data = Path(os.environ.get("FLOCKD_DATA", "/nonexistent")) / "hololens"

@@ -22,7 +22,6 @@ from flockd.ground.doctor.autopilot_checks import (
 )
 from flockd.onboard.autopilot.autopilot_status import Firmware
 from flockd.onboard.autopilot.clock_sync import ClockEstimate
-from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.sim.free_ports import free_port
@@ -37,7 +36,8 @@ GOOD: dict[str, float | int] = {
     "GF_MAX_VER_DIST": 15.0,
 }
 """For the quadrotor's own fence of 50 m and 10 m of height."""
-LISTENS, REQUESTS_MESSAGE, RUNS_CHECKS = 511, 512, 401
+QUESTIONS = {511, 512, 401}
+"""MAV_CMD_SET_MESSAGE_INTERVAL, _REQUEST_MESSAGE and _RUN_PREARM_CHECKS."""
 
 
 def _config(port: int) -> DroneConfig:
@@ -50,25 +50,32 @@ def _examined(port: int, heard_s: float = 60.0) -> dict[str, Finding]:
     return {finding.about: finding for finding in run_checks([check], lambda done, total: None)["autopilot"]}
 
 
-def test_an_autopilot_that_is_set_up_well_and_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[int] = []
-    obey = FakeAutopilot._obey
+class _Noting(FakeAutopilot):
+    """Keeps what it is asked for; its cable is cut before the question for ``cut_at``."""
 
-    def noting(self: FakeAutopilot, command: int, message: Any) -> int:
-        asked.append(command)
-        return obey(self, command, message)
+    asked: tuple[int, ...] = ()
+    cut_at = ""
 
-    monkeypatch.setattr(FakeAutopilot, "_obey", noting)
+    def _obey(self, command: int, message: Any) -> int:
+        self.asked += (command,)
+        return super()._obey(command, message)
+
+    def _send_parameter(self, name: str) -> None:
+        self.silent = name == self.cut_at
+        super()._send_parameter(name)
+
+
+def test_an_autopilot_that_is_set_up_well_and_left_as_it_is() -> None:
     port = free_port()
     finder = FakeRangeFinder(RangeFinderConfig(dropouts_per_min=0.0), level_ground, (0,))
-    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, range_finder=finder) as fake_autopilot:
+    with _Noting(port, heartbeat_s=HEARTBEAT_S, range_finder=finder) as fake_autopilot:
         fake_autopilot.parameters.update(GOOD)
         found = _examined(port)
         assert (fake_autopilot.armed, fake_autopilot.mode) == (False, "LOITER")
         assert not fake_autopilot.setpoints
         assert fake_autopilot.refused_setpoints == 0
         assert fake_autopilot.parameters == {**fake_autopilot.parameters, **GOOD}
-    assert set(asked) <= {LISTENS, REQUESTS_MESSAGE, RUNS_CHECKS}, "it listens and asks, and commands nothing"
+    assert set(fake_autopilot.asked) <= QUESTIONS, "it listens and asks, and commands nothing"
     assert found.keys() == {"heartbeat", "firmware", "signing", "arming", "clock", "range finder", *GOOD}
     del found["clock"]  # how even it is depends on how busy this computer is
     assert {about for about, finding in found.items() if finding.level is not Level.PASS} == {"firmware"}
@@ -135,17 +142,10 @@ def test_nobody_there_is_a_failure() -> None:
     assert finding.fix.startswith("check autopilot.address")
 
 
-def test_an_autopilot_that_falls_silent_under_examination_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_autopilot_that_falls_silent_under_examination_is_a_failure() -> None:
     port = free_port()
-    read = AutopilotLink.parameter
-
-    async def cut(self: AutopilotLink, name: str, kind: type[float]) -> float:
-        """The cable, before the second question."""
-        fake_autopilot.silent = name == "COM_OBL_RC_ACT"
-        return await read(self, name, kind)
-
-    monkeypatch.setattr(AutopilotLink, "parameter", cut)
-    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
+    with _Noting(port, heartbeat_s=HEARTBEAT_S) as fake_autopilot:
+        fake_autopilot.cut_at = "COM_OBL_RC_ACT"
         fake_autopilot.parameters.update(GOOD)
         check = Check("autopilot", lambda: check_autopilot(_config(port)), limit_s=60.0)
         found = run_checks([check], lambda done, total: None)["autopilot"]

@@ -18,6 +18,8 @@ from collections import deque
 from dataclasses import dataclass, field
 from enum import IntEnum
 
+from flockd.onboard.sources.v4l2_kernel import Kernel
+
 
 class Request(IntEnum):
     """The numbers of the ioctl requests."""
@@ -87,7 +89,7 @@ class FakeCamera:
     """The error number of every DQBUF; 0: none."""
 
 
-class FakeKernel:
+class FakeKernel(Kernel):
     """Cameras by the path of their device."""
 
     def __init__(self, **cameras: FakeCamera) -> None:

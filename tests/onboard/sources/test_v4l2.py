@@ -19,7 +19,7 @@ from flockd.core.messages import FrameSet
 from flockd.onboard.sources import CameraStatus, v4l2_kernel
 from flockd.onboard.sources.device_source import Devices, DeviceSource
 from flockd.onboard.sources.v4l2_device import control_name
-from flockd.onboard.sources.v4l2_kernel import Kernel, LinuxKernel
+from flockd.onboard.sources.v4l2_kernel import Kernel
 from tests.onboard.sources.camera_images import SIZE, jpeg, scene, yuyv
 from tests.onboard.sources.fake_kernel import (
     FLAG_CLOCK_UNKNOWN,
@@ -412,7 +412,7 @@ def test_stopping_gives_the_devices_back_and_waits_for_nothing(start: Start) -> 
 
 def test_the_real_system_calls_write_into_the_structures_they_are_given() -> None:
     """Without a camera: a pipe tells how many bytes wait in it (FIONREAD), and when; a file is mapped."""
-    kernel = LinuxKernel()
+    kernel = Kernel()
     reading, writing = os.pipe()
     try:
         assert not kernel.wait(reading, 0.0)
@@ -435,6 +435,6 @@ def test_the_real_system_calls_write_into_the_structures_they_are_given() -> Non
 
 def test_what_is_no_camera_is_reported_by_the_real_kernel(start: Start) -> None:
     camera = CameraDeviceParameters(name="front", device="/dev/null")
-    source = start(LinuxKernel(), camera)
+    source = start(Kernel(), camera)
     sentence = "front: /dev/null is not a V4L2 camera (Inappropriate ioctl for device)"
     assert _until(source, lambda status: status.fault is not None).fault == sentence
