@@ -105,7 +105,7 @@ def _lead(results: Results) -> str:
     config = results.plan.config
     varied = ", ".join(results.parameters)
     how = {"truth": "on exact states", "sight": "by sight", "control": "at control level"}[config.perception]
-    how += " with safety gates" if config.gated else ""
+    how += "" if config.gated else ", without safety gates"
     return f"Each flight lasts {_durations(results)} {how}. " + (f"What varies: {varied}." if varied else "")
 
 

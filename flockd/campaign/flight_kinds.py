@@ -42,8 +42,10 @@ class FlightKind:
 def _alone(perception: SimulatedPerception) -> Fly:
     """Flies one after the other, each on this thread alone, without key frames."""
 
-    def flown(scenarios: Sequence[ScenarioConfig], wanted: Sequence[Figure], _: ControlLevel) -> list[Figures]:
-        logs = (fly(scenario, perception=perception, processes=0, pictured=False).log for scenario in scenarios)
+    def flown(scenarios: Sequence[ScenarioConfig], wanted: Sequence[Figure], control: ControlLevel) -> list[Figures]:
+        logs = (
+            fly(one, perception=perception, gated=control.gated, processes=0, pictured=False).log for one in scenarios
+        )
         return [figures_of(log, wanted) for log in logs]
 
     return flown

@@ -63,8 +63,8 @@ class ControlLevel:
 
     errors: PerceivedErrors | None = None
     """Perception's errors; None: exact states."""
-    gated: bool = False
-    """Whether safety gates limit how fast drones fly towards neighbours and obstacles."""
+    gated: bool = True
+    """See `CampaignConfig.gated`."""
 
 
 @dataclass(frozen=True)

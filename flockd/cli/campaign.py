@@ -165,13 +165,14 @@ def _rerun(args: argparse.Namespace) -> int:
         raise UsageError(f"{folder}: {name} has {len(scenario.vehicles)} drones; reports are of up to {MAX_DRONES}")
     directory = args.out or folder / RERUNS / name
     prepare_folder(directory, force=args.force)
-    if plan.errors is not None or plan.config.gated:
-        complain(f"{name} is flown again by exact states and without a gate; the campaign has others at control level")
+    if plan.errors is not None:
+        complain(f"{name} is flown again by exact states; the campaign has others at control level")
     with Phases() as phases:
         perception = FLIGHT_KINDS[plan.config.perception].perception
         flight = fly(
             scenario,
             perception=perception,
+            gated=plan.config.gated,
             progress=phases.of("flying", "steps"),
             preparing=phases.of("loading networks and building the world", "parts"),
         )

@@ -54,6 +54,7 @@ def _key_figures(summary: Mapping[str, Any]) -> dict[str, str]:
         "flown": f"{summary['duration_s']:g} s",
         "speed": _number(summary["realtime_factor"], "x real time", 2),
         "closest two drones": _number(flock["min_distance_m"], "m", 2),
+        "slowed by safety gates": "" if summary["gated"] is None else _slowed(summary["slowed_share"]),
         "order at the end": _number(flock["order_tail"], "of 1", 3),
         "union at the end": _number(flock["union_tail"], "of 1", 2),
         "mission": _mission(summary["mission"]),
@@ -63,6 +64,10 @@ def _key_figures(summary: Mapping[str, Any]) -> dict[str, str]:
         "false neighbours": _number(neighbours["false_per_drone_minute"], "a drone and minute", 2),
     }
     return {name: value for name, value in figures.items() if value}
+
+
+def _slowed(share: float | None) -> str:
+    return "flown without gates" if share is None else f"{100 * share:.1f} % of the time"
 
 
 def _mission(mission: Mapping[str, Any]) -> str:

@@ -102,6 +102,12 @@ def add(commands: Commands) -> None:
         type=Path,
         help="a new folder; default: out/SCENARIO-PERCEPTION-seedN, or -AUTOPILOT-, with -2, -3, ... if there is one",
     )
+    parser.add_argument(
+        "--no-gate",
+        dest="gated",
+        action="store_false",
+        help="fly what the pilots ask for, without their safety gates: to study the flocking law alone",
+    )
     parser.add_argument("--force", action="store_true", help="overwrite an earlier flight in that folder")
     parser.add_argument("--telemetry", action="store_true", help="publish over zenoh while flying")
     parser.add_argument(
@@ -180,6 +186,7 @@ def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespac
             scenario,
             perception=args.perception,
             swap=args.swap,
+            gated=args.gated,
             telemetry=telemetry,
             recorders=_recorders(scenario, args.swap, directory / RECORDINGS, stack) if args.record else (),
             progress=phases.of("flying", "steps"),

@@ -2,52 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
 from flockd.core.config.scenario import ScenarioConfig
-from flockd.core.messages import NO_STATUS, BoolArray, FloatArray, MissionStatus, ObstacleRanges
+from flockd.core.messages import BoolArray, FloatArray, MissionStatus, Neighbour, ObstacleRanges
 from flockd.flight.flocking import FlockingLaw
 from flockd.flight.mission import Moment, Navigator
 from flockd.flight.mission.navigator import middle_of
 from flockd.flight.obstacles import Avoidance
-from flockd.sim.handover import Handover
+from flockd.sim.commands import Commands
+from flockd.sim.control_loop import ControlLoop
 from flockd.sim.vehicles import REFERENCE_DEG, Vehicles
 from flockd.sim.worlds.obstacle_worlds import obstacles_of
 from flockd.sim.worlds.obstacles import true_ranges
-
-
-@dataclass(frozen=True, eq=False)
-class Commands:
-    """What n drones are asked for in one step."""
-
-    velocity: FloatArray
-    """(n, 2) m/s, north and east."""
-    acceleration: FloatArray
-    """(n, 2) m/s^2; 0 of a drone that is flown by hand."""
-    yaw_rad: FloatArray
-    """(n,)"""
-    height_m: FloatArray
-    """(n,), up positive; NaN: as high as now."""
-    missions: tuple[MissionStatus, ...]
-    """See `PilotOutput.mission`."""
-    desired: FloatArray
-    """(n, 2) m/s: what each mission wants, times its pull."""
-    obstacles: tuple[ObstacleRanges | None, ...]
-    """What each drone saw of them; None where it does not look for any."""
-
-    @classmethod
-    def of(cls, n: int) -> Self:
-        """Standstill of n drones, to be filled."""
-        still = (np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n), np.full(n, np.nan))
-        return cls(*still, missions=(NO_STATUS,) * n, desired=np.zeros((n, 2)), obstacles=(None,) * n)
-
-    @property
-    def takeovers(self) -> list[str | None]:
-        """Which autopilots take over, and how."""
-        return [mission.takeover for mission in self.missions]
 
 
 class ExactFlock:
@@ -73,7 +42,7 @@ class ExactFlock:
         self._yaw_rad = np.array(yaw_rad)
         return Commands(
             np.array(velocity), np.array(acceleration), self._yaw_rad, np.array(height_m), missions, np.array(desired),
-            tuple(seen),
+            tuple(seen), tuple(self._neighbours(i, positions, velocities) for i in range(len(positions))),
         )  # fmt: skip
 
     def _of(
@@ -99,6 +68,17 @@ class ExactFlock:
         yaw_rad = float(self._yaw_rad[i]) if guidance.course_rad is None else guidance.course_rad
         height_m = np.nan if guidance.height_m is None else guidance.height_m
         return command, acceleration, yaw_rad, height_m, pilot.status(guidance), desired
+
+    def _neighbours(self, i: int, positions: FloatArray, velocities: FloatArray) -> tuple[Neighbour, ...]:
+        seen = self._sees(positions[:, :2] - positions[i, :2])
+        seen[i] = False
+        return tuple(
+            Neighbour(
+                int(j) + 1, positions[j] - positions[i], velocities[j], position_sigma_m=0.0, velocity_sigma_m_s=0.0,
+                age_s=0.0, unseen_s=0.0, hits=1, confirmed=True,
+            )
+            for j in np.flatnonzero(seen)
+        )  # fmt: skip
 
     def _sees(self, offsets: FloatArray) -> BoolArray:
         near: BoolArray = np.hypot(offsets[:, 0], offsets[:, 1]) <= self._law.parameters.observation_distance_m
@@ -137,24 +117,20 @@ def start_yaw(scenario: ScenarioConfig) -> float:
     return Navigator(mission, scenario.drone.safety.gate).step(moment).course_rad or 0.0
 
 
-def fly_exact_states(scenario: ScenarioConfig) -> tuple[FloatArray, FloatArray, FloatArray]:
+def fly_exact_states(scenario: ScenarioConfig, *, gated: bool = True) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Times (S,) s, positions (S, N, 3) m and velocities (S, N, 3) m/s in NED, as each step begins.
 
     The paper's "UAV flocking based on ground truth cluster state": each vehicle gets what the flocking law commands on
     the true positions and velocities of all.
     """
     times = step_times(scenario)
-    flock, handover = ExactFlock(scenario), Handover(scenario)
+    flock, loop = ExactFlock(scenario), ControlLoop(scenario, gated=gated)
     vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=start_yaw(scenario), seed=scenario.seed)
     positions, velocities = [], []
     for time_s in times:
         positions.append(vehicles.position)
         velocities.append(vehicles.velocity)
-        commands = flock.step(float(time_s), vehicles.position, vehicles.velocity)
-        velocity, height_m = handover.applied(
-            commands.takeovers, vehicles.position, commands.velocity, commands.height_m
-        )
-        vehicles.step(velocity, commands.yaw_rad, scenario.drone.step_s, height_m)
+        loop.fly(float(time_s), vehicles, flock.step(float(time_s), vehicles.position, vehicles.velocity))
     return times, np.array(positions), np.array(velocities)
 
 

@@ -21,6 +21,11 @@ class Handover:
         self._starts = np.array([vehicle.position_m[:2] for vehicle in scenario.vehicles])
         self._taken: dict[int, str] = {}
 
+    @property
+    def taken(self) -> frozenset[int]:
+        """Whose autopilot has taken over, by its number."""
+        return frozenset(self._taken)
+
     def applied(
         self, takeovers: Sequence[str | None], positions: FloatArray, velocity: FloatArray, height_m: FloatArray
     ) -> tuple[FloatArray, FloatArray]:

@@ -26,8 +26,9 @@ from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import FlightMetadata, MissionMetadata
 from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.clearances import with_obstacles
-from flockd.sim.exact_states import Commands, ExactFlock, HandPilot, fly_exact_states, start_yaw, step_times
-from flockd.sim.handover import Handover
+from flockd.sim.commands import Commands
+from flockd.sim.control_loop import ControlLoop
+from flockd.sim.exact_states import ExactFlock, HandPilot, fly_exact_states, start_yaw, step_times
 from flockd.sim.pilot_pool import PilotPool
 from flockd.sim.pilots import Stepped
 from flockd.sim.vehicles import SimulatedAutopilot, Vehicles
@@ -51,6 +52,7 @@ def fly(
     *,
     perception: SimulatedPerception = "learned",
     swap: frozenset[str] = frozenset(),
+    gated: bool = True,
     telemetry: TelemetrySink | None = None,
     recorders: Sequence[Recorder] = (),
     processes: int | None = None,
@@ -66,6 +68,7 @@ def fly(
         scenario: what to fly.
         perception: `learned` flies from rendered images; `truth` from exact relative states.
         swap: roles of perception that take the truth instead of a network's estimate.
+        gated: whether each drone's gate turns what its pilot asks for into setpoints, as in the daemon.
         telemetry: where every drone's output is published; nothing comes back from there.
         recorders: one a drone, or none; nothing comes back from there either.
         processes: for pilots that see, beside this one, which draws the images; 1: they step in this one; 0: they step,
@@ -84,7 +87,7 @@ def fly(
     times = step_times(scenario)
     builder = FlightLogBuilder(times, len(scenario.vehicles))
     preparing(0, _PREPARATIONS)
-    handover = Handover(scenario)
+    loop = ControlLoop(scenario, gated=gated)
     vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=start_yaw(scenario), seed=scenario.seed)
     chosen = key_frame_steps(len(times)) if pictured else set()
     key_frames: list[KeyFrame] = []
@@ -94,7 +97,7 @@ def fly(
         companion = None
         pilots: _ExactStatePilots | _VisionPilots = _ExactStatePilots(scenario)
         if pool is not None:
-            companion = fly_exact_states(scenario)[1:]
+            companion = fly_exact_states(scenario, gated=gated)[1:]
             pilots = _VisionPilots(scenario, pool, telemetry, recorders, companion, preparing)
         preparing(_PREPARATIONS, _PREPARATIONS)
         try:
@@ -103,10 +106,7 @@ def fly(
                 commands = pilots.step(step, float(time_s), vehicles, builder, pictured=step in chosen)
                 builder.add_missions(step, commands.desired, commands.missions)
                 key_frames += pilots.key_frames()
-                velocity, height_m = handover.applied(
-                    commands.takeovers, vehicles.position, commands.velocity, commands.height_m
-                )
-                vehicles.step(velocity, commands.yaw_rad, scenario.drone.step_s, height_m)
+                loop.fly(float(time_s), vehicles, commands)
                 flown = step + 1
                 progress(flown, len(times))
         except KeyboardInterrupt:
@@ -127,6 +127,8 @@ def fly(
         perception=perception if not swap else f"learned, true {', '.join(sorted(swap))}",
         flow="none" if perception == "truth" else "truth" if "flow" in swap else scenario.drone.perception.flow,
         wall_s=time.perf_counter() - begin,
+        gated=gated,
+        slowed_share=loop.slowed_share,
     )
     key_frames = sorted((frame for frame in key_frames if frame.time_s < metadata.duration_s), key=lambda f: f.drone)
     return Flight(with_obstacles(builder.build(metadata, companion or builder.true_path), scenario), tuple(key_frames))
@@ -223,19 +225,20 @@ class _VisionPilots:
         count = len(self._scenario.vehicles)
         commands = Commands.of(count)
         missions = [NO_STATUS] * count
+        obstacles, neighbours = list(commands.obstacles), list(commands.neighbours)
         for i, stepped in self._stepped.items():
             output, command = stepped.output, stepped.output.command
             commands.velocity[i], commands.acceleration[i] = command.velocity, command.acceleration
             commands.yaw_rad[i] = self._yaw_rad if command.yaw_rad is None else command.yaw_rad
             commands.height_m[i] = np.nan if command.height_m is None else command.height_m
-            missions[i] = output.mission
+            missions[i], obstacles[i], neighbours[i] = output.mission, output.obstacles, output.neighbours
             commands.desired[i] = desired_of(self._scenario.drone_of(i).mission, time_s, output.mission)
         for i, hand in self._hands.items():
             flown = hand.step(time_s, vehicles.position[i, :2])
             commands.velocity[i] = commands.desired[i] = flown.velocity
             commands.height_m[i], missions[i] = flown.height_m, flown.status
             commands.yaw_rad[i] = self._yaw_rad
-        return replace(commands, missions=tuple(missions))
+        return replace(commands, missions=tuple(missions), obstacles=tuple(obstacles), neighbours=tuple(neighbours))
 
     def _truth(self, step: int, time_s: float, vehicles: Vehicles) -> Truth:
         """For recordings only: no pilot gets it."""

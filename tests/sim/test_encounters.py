@@ -32,6 +32,7 @@ class Step:
     """What one step of the pilot gave, and when its frames were taken."""
 
     time_s: float
+    place: FloatArray
     wanted: Wanted
     neighbours: tuple[Neighbour, ...]
 
@@ -64,7 +65,7 @@ class Drone:
             self.desired,
             STEP_S,
         )
-        self.coming = Step(time_s, Wanted(command, u, 0.0), neighbours)
+        self.coming = Step(time_s, place, Wanted(command, u, 0.0), neighbours)
 
     def setpoint(self, now_s: float, place: FloatArray, velocity: FloatArray) -> FloatArray:
         """What its gate sends now."""
@@ -75,6 +76,7 @@ class Drone:
         around = surroundings(
             self.known.neighbours,
             now_s - self.known.time_s,
+            moved=place - self.known.place,
             position=place[:2],
             velocity=velocity,
             yaw_rad=0.0,

@@ -117,8 +117,8 @@ class CampaignConfig(Section):
     errors: str | None = None
     """For `control`: the path of a file of perception's errors, relative to this one, as
     `tools.training.fit_perception` writes it. none: exact states. Ranges to obstacles are exact in any case."""
-    gated: bool = False
-    """For `control`: whether each drone's safety gate limits how fast it flies towards neighbours and obstacles."""
+    gated: bool = True
+    """Whether each drone flies through its safety gate, as in the daemon; false: to study the flocking law alone."""
     seed: Annotated[int, Field(ge=0, le=2**53)] = 0
     """Flight n of each cell, from 0, flies with the scenario's seed `seed` + n, in all cells alike: so differences
     between cells and between campaigns are of flights with the same gusts and worlds."""
@@ -156,8 +156,6 @@ class CampaignConfig(Section):
                 faults["cases", case, "seed"] = "is set for each flight; write `seed` and `seeds` at the top level"
         if self.errors is not None and self.perception != "control":
             faults["errors",] = "is for `perception: control`; delete one of them"
-        if self.gated and self.perception != "control":
-            faults["gated",] = "is for `perception: control`; delete one of them"
         if self.stop is not None and self.measure is not None and self.stop.figure not in self.measure:
             faults["stop", "figure"] = f"is not measured; add {self.stop.figure} to `measure`"
         if self.stop is not None and self.stop.batch > self.seeds:

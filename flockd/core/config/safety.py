@@ -48,6 +48,10 @@ class GateParameters(Section):
     neighbour_reaction_s: Annotated[float, Field(ge=0, le=5)] = 1.0
     """From a neighbour's change of velocity until the own drone has begun to brake: a step of the pilot, in which the
     change is not seen, how long the step takes, and the drone's response."""
+    response_s: Annotated[float, Field(gt=0, le=5)] = 0.25
+    """Time constant with which the drone's velocity follows a setpoint."""
+    max_drift_m_s: Annotated[float, Field(ge=0, le=20)] = 2.0
+    """By how much at most a setpoint is corrected for wind, which carries the drone off it; 0: not at all."""
     fence_radius_m: Annotated[float, Field(gt=0, le=100_000)] | None = 100.0
     """Around home, level; beyond it only inward velocity. null: no circle."""
     fence_corners_m: tuple[tuple[_Metres, _Metres], ...] = ()

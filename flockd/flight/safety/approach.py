@@ -51,7 +51,8 @@ def towards_neighbours(
     lag = p.braking_m_s2 * p.neighbour_reaction_s
     square = lag**2 + 2 * p.braking_m_s2 * (left_m - soonest * p.neighbour_reaction_s) - soonest * np.abs(soonest)
     most_m_s = np.sqrt(np.maximum(square, lag**2)) - lag
-    if_both_come = np.sqrt(lag**2 + p.braking_m_s2 * np.maximum(left_m, 0.0)) - lag
+    soon = p.braking_m_s2 * p.reaction_s  # it begins to come from standstill, or from less
+    if_both_come = np.sqrt(soon**2 + p.braking_m_s2 * np.maximum(left_m, 0.0)) - soon
     most_m_s = np.minimum(most_m_s, np.maximum(if_both_come, -comes))
     return towards, np.where(left_m > 0, most_m_s, 0.0)
 

@@ -19,6 +19,7 @@ from flockd.flight.safety.approach import towards_neighbours, towards_obstacles
 from flockd.flight.safety.fence import is_fenced, offsets_outside
 from flockd.flight.safety.half_planes import nearest_within
 from flockd.flight.safety.policy import Action
+from flockd.flight.safety.response import ResponseObserver
 
 
 @dataclass(frozen=True)
@@ -107,17 +108,35 @@ class Gate:
     Towards a neighbour or an obstacle the drone flies no faster than it can brake before the minimum distance. Every
     change of velocity stays within the acceleration limit, except that this one, and no velocity outward beyond the
     fence, win.
+
+    These limits are on the velocity that results, not on the one that is asked for: what the measured velocity shows of
+    wind (`ResponseObserver`) is taken off the setpoint.
     """
 
     def __init__(self, parameters: GateParameters) -> None:
         self._parameters = parameters
         self._last: Setpoint | None = None
+        self._result = np.zeros(2)
+        """Velocity, m/s, that the last setpoint is to result in."""
+        self._response = ResponseObserver(parameters.response_s, parameters.max_drift_m_s)
         self.counts: Counter[Objection] = Counter()
         """Objections since the start."""
+
+    @property
+    def drift(self) -> FloatArray:
+        """(2,) m/s by which the drone's velocity settles off its setpoint, as of the last step."""
+        return self._response.drift
 
     def step(self, now_s: float, request: Request) -> Verdict:
         """What may be sent at `now_s`, on the clock of the other times; never raises, whatever the numbers are."""
         objections: list[Objection] = []
+        last = self._recent(now_s)
+        follows = last is not None and request.permission.action is not Action.OFFER
+        self._response.step(
+            request.around.velocity,
+            last.velocity if last is not None and follows else None,
+            0.0 if last is None else now_s - last.time_s,
+        )
         self._last = self._setpoint(now_s, request, objections)
         self.counts.update(objections)
         return Verdict(self._last, tuple(objections))
@@ -143,13 +162,14 @@ class Gate:
                 if (target != wanted.velocity).any():
                     objections.append(Objection.SLOWED)
         velocity = self._within_acceleration(target, now_s, around)
-        velocity = self._within_space(velocity, permission.action, around, objections)
+        result, sent = self._within_space(velocity, permission.action, around, objections)
         wanted_m = request.height_m if wanted.height_m is None else wanted.height_m
-        if not all(map(math.isfinite, (*velocity, wanted_m, yaw_rad))):
+        if not all(map(math.isfinite, (*sent, wanted_m, yaw_rad))):
             objections.append(Objection.SETPOINT_NOT_FINITE)
             return None
         height_m = self._within_climb(now_s, wanted_m, request, objections)
-        return Setpoint(now_s, velocity, self._within_heights(height_m, objections), yaw_rad)
+        self._result = result
+        return Setpoint(now_s, sent, self._within_heights(height_m, objections), yaw_rad)
 
     def _slowed(self, velocity: FloatArray, age_s: float, action: Action) -> FloatArray:
         """A command's velocity: slower once a newer command is missed, nothing when it is too old, slow if degraded."""
@@ -180,10 +200,10 @@ class Gate:
         return not found
 
     def _within_acceleration(self, target: FloatArray, now_s: float, around: Surroundings) -> FloatArray:
-        """The velocity nearest to the target that can be reached from the last one sent, or else from the true one."""
+        """The velocity nearest to the target that can be reached from the last one, or else from the measured one."""
         p, last = self._parameters, self._recent(now_s)
         if last is not None:
-            start, elapsed_s = last.velocity, max(now_s - last.time_s, 0.0)
+            start, elapsed_s = self._result, max(now_s - last.time_s, 0.0)
         elif np.isfinite(around.velocity).all():
             start, elapsed_s = limit_norm(around.velocity, p.max_speed_m_s), 0.0
         else:
@@ -195,29 +215,44 @@ class Gate:
         last = self._last
         return None if last is None or now_s - last.time_s > self._parameters.permission_timeout_s else last
 
-    def _within_space(
-        self, velocity: FloatArray, action: Action, around: Surroundings, objections: list[Objection]
-    ) -> FloatArray:
-        """The velocity without what leads out of the fence, too fast towards a neighbour, or too near an obstacle."""
+    def _space(self, action: Action, around: Surroundings) -> dict[Objection, tuple[FloatArray, FloatArray]]:
+        """Directions (n, 2), and how fast to fly there, (n,) m/s: out of the fence, to neighbours and to obstacles."""
         p = self._parameters
         separation_m = p.min_separation_m if action is Action.FLY else p.degraded_separation_m
         outward = offsets_outside(p, around.position)
         outward = _units(outward) if len(outward) else outward
-        to_neighbours = towards_neighbours(
-            p, around.neighbours, around.neighbour_velocities, separation_m, around.neighbour_sigmas
-        )
-        to_obstacles = towards_obstacles(around.obstacles, p.obstacle_clearance_m, p.braking_m_s2, p.reaction_s)
-        limits = {
+        return {
             Objection.FENCE: (outward, np.zeros(len(outward))),
-            Objection.SEPARATION: to_neighbours,
-            Objection.OBSTACLE: to_obstacles,
+            Objection.SEPARATION: towards_neighbours(
+                p, around.neighbours, around.neighbour_velocities, separation_m, around.neighbour_sigmas
+            ),
+            Objection.OBSTACLE: towards_obstacles(
+                around.obstacles, p.obstacle_clearance_m, p.braking_m_s2, p.reaction_s
+            ),
         }
-        over = [name for name, (directions, most_m_s) in limits.items() if (directions @ velocity > most_m_s).any()]
-        if not over:
-            return velocity
-        objections.extend(over)
-        every_direction, every_limit = zip(*limits.values(), strict=True)
-        return nearest_within(velocity, np.concatenate(every_direction), np.concatenate(every_limit))
+
+    def _within_space(
+        self, velocity: FloatArray, action: Action, around: Surroundings, objections: list[Objection]
+    ) -> tuple[FloatArray, FloatArray]:
+        """The velocity that is to result, (2,) m/s, without what leads too fast anywhere, and the setpoint for it.
+
+        A drone that is measured to be faster than a limit has to brake: the limit counts as lower by as much. The
+        setpoint keeps the limits too: a drift that carries the drone away from something may end at any time.
+        """
+        limits = self._space(action, around)
+        directions = np.concatenate([towards for towards, _ in limits.values()])
+        most_m_s = np.concatenate([most for _, most in limits.values()])
+        names = np.repeat(np.arange(len(limits)), [len(most) for _, most in limits.values()])
+        lowered = most_m_s
+        if np.isfinite(around.velocity).all():
+            lowered = np.maximum(most_m_s - np.maximum(directions @ around.velocity - most_m_s, 0.0), 0.0)
+        over = directions @ velocity > lowered
+        result = nearest_within(velocity, directions, lowered) if over.any() else velocity
+        objections.extend(list(limits)[i] for i in np.unique(names[over]))
+        sent = limit_norm(result - self.drift, self._parameters.max_speed_m_s)
+        if (directions @ sent > most_m_s).any():
+            sent = nearest_within(sent, directions, most_m_s)
+        return result, sent
 
     def _within_climb(self, now_s: float, wanted_m: float, request: Request, objections: list[Objection]) -> float:
         """The height nearest to the one to hold that may be asked for now.

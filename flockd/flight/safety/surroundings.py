@@ -14,6 +14,7 @@ def surroundings(
     neighbours: Sequence[Neighbour],
     age_s: float,
     *,
+    moved: FloatArray,
     position: FloatArray,
     velocity: FloatArray,
     yaw_rad: float,
@@ -23,17 +24,17 @@ def surroundings(
     """The surroundings `age_s` after the step that gave the `neighbours`, which fly on at constant velocity.
 
     Caution comes before confirmation: a track limits the speed towards it from its first detection on, by its
-    uncertainty. `position` (2,) m from home, `velocity` (3,) m/s NED, NaN where not known; `obstacles` (m, 2) m from
-    where the drone was then.
+    uncertainty. `moved` (3,) m NED is how far the drone itself flew since then; `position` (2,) m from home, `velocity`
+    (3,) m/s NED, NaN where not known; `obstacles` (m, 2) m from where the drone was then.
     """
-    own, n = np.nan_to_num(velocity), len(neighbours)
+    n = len(neighbours)
     return Surroundings(
         position=position,
         velocity=velocity[:2],
         yaw_rad=yaw_rad,
-        neighbours=np.reshape([one.position + age_s * (one.velocity - own) for one in neighbours], (n, 3)),
+        neighbours=np.reshape([one.position + age_s * one.velocity - moved for one in neighbours], (n, 3)),
         neighbour_velocities=np.reshape([one.velocity[:2] for one in neighbours], (n, 2)),
         neighbour_sigmas=np.reshape([(one.position_sigma_m, one.velocity_sigma_m_s) for one in neighbours], (n, 2)),
         height_m=height_m,
-        obstacles=obstacles - age_s * own[:2],
+        obstacles=obstacles - moved[:2],
     )

@@ -150,6 +150,7 @@ class Control:
         return surroundings(
             () if result is None else result.output.neighbours,
             0.0 if result is None else now - result.time_s,
+            moved=np.zeros(3) if result is None else self._history.moved_since(result.time_s),
             position=position_from_home(status),
             velocity=velocity,
             yaw_rad=math.nan if vehicle is None else _yaw(vehicle),

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import bisect
 from collections import deque
+from itertools import pairwise
+
+import numpy as np
 
 from flockd.core import services
 from flockd.core.messages import FloatArray, RangeReading, VehicleState
@@ -35,6 +38,19 @@ class VehicleHistory:
         if later in (0, len(self._states)):
             return self._states[max(0, later - 1)]
         return _between(self._states[later - 1], self._states[later], time_s)
+
+    def moved_since(self, time_s: float) -> FloatArray:
+        """(3,) m NED from where the vehicle was then to where it was last, by its velocities; 0 where none are known.
+
+        Positions of an autopilot jump when its estimator is reset; velocities hardly do.
+        """
+        then = self.at(time_s)
+        states = [*([] if then is None else [then]), *(one for one in self._states if one.time_s > time_s)]
+        known = [(one.time_s, one.velocity_ned) for one in states if one.velocity_ned is not None]
+        moved = np.zeros(3)
+        for (before_s, before), (after_s, after) in pairwise(known):
+            moved += (after_s - before_s) * (before + after) / 2
+        return moved
 
 
 def _between(before: VehicleState, after: VehicleState, time_s: float) -> VehicleState:

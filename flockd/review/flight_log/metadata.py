@@ -114,6 +114,10 @@ class FlightMetadata(BaseModel):
     """Wall time, ISO 8601, at which the flight, or its first recording, was begun."""
     version: str | None = None
     """Version of flockd."""
+    gated: bool | None = None
+    """Whether simulated drones flew through their gates; None where that is not known."""
+    slowed_share: float | None = None
+    """Share of their time in which gates let drones fly otherwise than their pilots asked for; None: not known."""
     interrupted: bool = False
     """It was ended before its time; `duration_s` is what was flown."""
     mission: MissionMetadata

@@ -108,9 +108,11 @@ def _headline(summary: Summary) -> str:
 
 
 def _means(summary: Summary) -> str:
+    gates = ", without safety gates" if summary["gated"] is False else ""
     if summary["perception"] == EXACT_STATES:
-        return "with exact states"
-    return "by sight" if summary["perception"] == "learned" else f"by sight ({summary['perception']})"
+        return f"with exact states{gates}"
+    sight = "by sight" if summary["perception"] == "learned" else f"by sight ({summary['perception']})"
+    return sight + gates
 
 
 _SCALES = {

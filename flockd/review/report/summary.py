@@ -36,8 +36,9 @@ def summarise(log: FlightLog) -> Json:
     within 10 m, at all steps, of which there was a confirmed track, and new false tracks; of drones and steps that were
     recorded. A flight whose perception is "truth" has no perception: its `neighbours` are null and it is itself Table
     3's "truth". Of a recording without truth (`has_truth`) all of these are null. `mission` is `mission_figures`,
-    `obstacles` is `obstacle_figures`. `own_account` needs no truth: the recorded drones' own estimates. `autopilot`
-    names what real daemons flew, and `fleet` holds their figures; null where the simulator ran the pilots.
+    `obstacles` is `obstacle_figures`. `own_account` needs no truth: the recorded drones' own estimates. `gated` and
+    `slowed_share` are as in `FlightMetadata`. `autopilot` names what real daemons flew, and `fleet` holds their
+    figures; null where the simulator ran the pilots.
     """
     metadata, value = log.metadata, log.metadata.model_dump()
     return {
@@ -61,7 +62,7 @@ def summarise(log: FlightLog) -> Json:
 
 _FROM_METADATA = (
     "scenario", "perception", "flow", "scale", "drones", "duration_s", "step_s", "seed", "wall_s", "circle_until_s",
-    "desired_distance_m",
+    "desired_distance_m", "gated", "slowed_share",
     "recorded", "began", "version", "interrupted", "autopilot", "fleet",
 )  # fmt: skip
 

@@ -63,17 +63,18 @@ class FlightCode:
         wanted = Wanted(commands[:, i].copy(), np.zeros(2), 0.0)
         holds = bool(np.isnan(heights[i]))
         height_m = float(-states[2, i] if holds else heights[i])
+        began = states[:3, i].copy()
         for tick in range(self._ticks):
             age_s = tick * self._tick_s
-            own = states[3:, i].copy()
+            moved = states[:3, i] - began
             around = Surroundings(
                 position=states[:2, i].copy(),
-                velocity=own[:2],
+                velocity=states[3:5, i].copy(),
                 yaw_rad=0.0,
-                neighbours=seen.offsets + age_s * (seen.velocities - own),
+                neighbours=seen.offsets + age_s * seen.velocities - moved,
                 neighbour_velocities=seen.velocities[:, :2],
                 height_m=float(-states[2, i]),
-                obstacles=points - age_s * own[:2],
+                obstacles=points - moved[:2],
             )
             now_s = begin_s + age_s
             request = Request(Permission(Action.FLY, now_s), wanted, begin_s, height_m, around)

@@ -83,7 +83,7 @@ def test_the_figures_are_those_of_a_flight_on_exact_states(enabled: bool) -> Non
     scenarios = [_scenario("forest", 4, seed=seed, **keys) for seed in (2, 3)]
     flown = fly_flocks(scenarios)
     for scenario, figures in zip(scenarios, flown, strict=True):
-        expected = obstacle_figures(fly(scenario, perception="truth", pictured=False).log)
+        expected = obstacle_figures(fly(scenario, perception="truth", gated=False, pictured=False).log)
         assert {key: figures[key] for key in expected} == pytest.approx(expected, abs=1e-8)
     assert (max(one["collisions"] or 0 for one in flown) > 0) is not enabled
 
@@ -92,7 +92,7 @@ def test_the_figures_are_those_of_a_flight_on_exact_states(enabled: bool) -> Non
 @pytest.mark.parametrize("seed", range(4))
 def test_the_shipped_forest_is_flown_as_the_simulator_flies_it(seed: int) -> None:
     scenario = load_scenario(data_path("config") / "forest.yaml", {"seed": seed})
-    flights, log = FlockFlights([scenario]), fly(scenario, perception="truth", pictured=False).log
+    flights, log = FlockFlights([scenario]), fly(scenario, perception="truth", gated=False, pictured=False).log
     for step in range(flights.steps):
         np.testing.assert_allclose(flights.states[:3, 0].T, log.position[step], atol=1e-9)
         flights.step(step, None, 1)

@@ -1,0 +1,51 @@
+"""How the drone follows its setpoints, by what it measures of its velocity: what carries it off, and how fast."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flockd.core.messages import FloatArray
+from flockd.flight.geometry.level import limit_norm
+
+_POLE_PER_S = 10.0
+"""Both poles of the observer: gusts of a second are followed, and a response that is 0.2 s late, or of a time constant
+half or twice the one that is configured, stays stable."""
+_FASTEST_M_S = 100.0
+"""What is measured to be faster is no velocity."""
+
+
+class ResponseObserver:
+    """The drift of one drone: the velocity at which it settles, less its setpoint.
+
+    A Luenberger observer of v' = (setpoint - v) / tau + g, with g constant: what wind, and an autopilot that is weak,
+    add (D. Luenberger, "Observers for multivariable systems", IEEE Transactions on Automatic Control 11(2), 1966). Such
+    a disturbance observer is the usual answer to wind (W. Chen et al., "Disturbance-observer-based control and related
+    methods: an overview", IEEE Transactions on Industrial Electronics 63(2), 2016).
+    """
+
+    def __init__(self, response_s: float, max_drift_m_s: float) -> None:
+        """`response_s`: tau; `max_drift_m_s`: the drift's largest norm, beyond which velocity or model is wrong."""
+        self._response_s, self._max_drift_m_s = response_s, max_drift_m_s
+        self._velocity: FloatArray | None = None
+        self._push = np.zeros(2)
+        self.drift: FloatArray = np.zeros(2)
+        """(2,) m/s, north and east."""
+
+    def step(self, velocity: FloatArray, setpoint: FloatArray | None, elapsed_s: float) -> None:
+        """With the measured `velocity` (2,) m/s, and the `setpoint` (2,) m/s that was flown for the last `elapsed_s`.
+
+        Where none was (None), or the velocity is not known, it begins anew, without drift.
+        """
+        known = bool(np.isfinite(velocity).all()) and math.hypot(*velocity) <= _FASTEST_M_S
+        if setpoint is None or self._velocity is None or not known or not elapsed_s >= 0:
+            self._velocity, self._push = (velocity.copy() if known else None), np.zeros(2)
+        elif elapsed_s > 0:
+            wanted = (setpoint - self._velocity) / self._response_s
+            predicted = self._velocity + elapsed_s * (wanted + self._push)
+            keep = math.exp(-_POLE_PER_S * elapsed_s)
+            error = velocity - predicted
+            self._velocity = predicted + (1 - keep**2) * error
+            self._push = self._push + (1 - keep) ** 2 / elapsed_s * error
+        self.drift = limit_norm(self._response_s * self._push, self._max_drift_m_s)

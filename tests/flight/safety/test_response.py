@@ -1,0 +1,143 @@
+"""The gate closes the loop: in wind the velocity that results is the one that it lets through, within all limits."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from flockd.core.messages import FloatArray, Wanted
+from flockd.flight.safety import Action, Gate, GateParameters, Permission, Request, Surroundings
+from flockd.flight.safety.response import ResponseObserver
+
+TICK_S = 0.05
+RESPONSE_S = 0.25
+FREE = GateParameters(fence_radius_m=None, response_s=RESPONSE_S)
+NOWHERE = Surroundings(np.zeros(2), np.zeros(2), 0.0, np.empty((0, 3)), np.empty((0, 2)), 5.0)
+
+
+def flown(
+    asked: ArrayLike,
+    wind: ArrayLike,
+    gate: Gate,
+    *,
+    around: Surroundings = NOWHERE,
+    response_s: float = RESPONSE_S,
+    late: int = 0,
+    ticks: int = 200,
+    action: Action = Action.FLY,
+) -> tuple[FloatArray, FloatArray]:
+    """Setpoints and velocities (ticks, 2) m/s of a drone that settles at its setpoint and the ``wind``, from rest.
+
+    It is a first-order lag, whose setpoints come so many ticks ``late``.
+    """  # fmt: skip
+    velocity, wanted = np.zeros(2), Wanted(np.array(asked, float), np.zeros(2), 0.0)
+    setpoints, velocities = [np.zeros(2)] * late, []
+    keep = math.exp(-TICK_S / response_s)
+    for tick in range(ticks):
+        now_s = tick * TICK_S
+        request = Request(Permission(action, now_s), wanted, now_s, 5.0, replace(around, velocity=velocity))
+        setpoint = gate.step(now_s, request).setpoint
+        assert setpoint is not None
+        setpoints.append(setpoint.velocity)
+        velocity = keep * velocity + (1 - keep) * (setpoints[-1 - late] + np.array(wind))
+        velocities.append(velocity)
+    return np.array(setpoints[late:]), np.array(velocities)
+
+
+def test_in_steady_wind_the_drone_flies_as_asked() -> None:
+    setpoints, velocities = flown([1.0, -0.5], [-0.6, 0.8], Gate(FREE))
+    np.testing.assert_allclose(velocities[-1], [1.0, -0.5], atol=1e-6)
+    np.testing.assert_allclose(setpoints[-1], [1.6, -1.3], atol=1e-6)
+
+
+def test_without_a_drift_it_does_not() -> None:
+    _, velocities = flown([1.0, -0.5], [-0.6, 0.8], Gate(FREE.model_copy(update={"max_drift_m_s": 0.0})))
+    np.testing.assert_allclose(velocities[-1], [0.4, 0.3], atol=1e-6)
+
+
+@pytest.mark.parametrize("response_s", [0.12, 0.5])
+@pytest.mark.parametrize("late", [0, 2, 4])
+def test_a_drone_that_answers_otherwise_than_configured_settles_all_the_same(response_s: float, late: int) -> None:
+    _, velocities = flown([1.0, 0.0], [-0.5, 0.5], Gate(FREE), response_s=response_s, late=late, ticks=400)
+    np.testing.assert_allclose(velocities[-20:], np.tile([1.0, 0.0], (20, 1)), atol=0.01)
+    assert np.abs(velocities).max() < 2.0
+
+
+def test_a_drift_is_limited() -> None:
+    gate = Gate(FREE)
+    setpoints, _ = flown([0.0, 0.0], [3.0, 4.0], gate)
+    np.testing.assert_allclose(gate.drift, [1.2, 1.6], rtol=1e-3)  # of 5 m/s, 2
+    np.testing.assert_allclose(setpoints[-1], [-1.2, -1.6], rtol=1e-3)
+
+
+def test_what_is_sent_stays_within_the_speed_limit() -> None:
+    setpoints, _ = flown([3.5, 0.0], [-1.5, 0.0], Gate(FREE))
+    assert np.linalg.norm(setpoints, axis=1).max() <= FREE.max_speed_m_s
+
+
+def test_blown_towards_a_neighbour_the_drone_does_not_move_there() -> None:
+    """0.9 m north of it; the wind is such that a setpoint of standstill would be 0.5 m/s towards it."""
+    around = replace(NOWHERE, neighbours=np.array([[0.9, 0.0, 0.0]]), neighbour_velocities=np.zeros((1, 2)))
+    setpoints, velocities = flown([0.5, 0.2], [0.5, 0.0], Gate(FREE), around=around)
+    np.testing.assert_allclose(velocities[-1], [0.0, 0.2], atol=1e-6)
+    np.testing.assert_allclose(setpoints[-1], [-0.5, 0.2], atol=1e-6)
+
+
+def test_blown_away_from_a_neighbour_it_is_not_sent_there() -> None:
+    """The wind may end at any time."""
+    around = replace(NOWHERE, neighbours=np.array([[0.9, 0.0, 0.0]]), neighbour_velocities=np.zeros((1, 2)))
+    setpoints, velocities = flown([0.5, 0.2], [-0.5, 0.0], Gate(FREE), around=around)
+    assert setpoints[:, 0].max() <= 1e-9
+    np.testing.assert_allclose(velocities[-1], [-0.5, 0.2], atol=1e-6)
+
+
+def test_measured_faster_than_a_limit_it_brakes_harder() -> None:
+    """2 m from a neighbour that may begin to come, 0.75 v + v^2 / 3 = 0.5 m gives the limit."""
+    limit = math.sqrt(0.75**2 + 1.5) - 0.75
+    p = FREE.model_copy(update={"max_acceleration_m_s2": 1e6, "max_drift_m_s": 0.0})
+    around = replace(NOWHERE, neighbours=np.array([[2.0, 0.0, 0.0]]), neighbour_velocities=np.zeros((1, 2)))
+    sent = {}
+    for measured in (0.0, 0.9):
+        gate, here = Gate(p), replace(around, velocity=np.array([measured, 0.0]))
+        for now_s in (0.0, TICK_S):
+            request = Request(
+                Permission(Action.FLY, now_s), Wanted(np.array([1.0, 0.0]), np.zeros(2), 0.0), now_s, 5.0, here
+            )
+            verdict = gate.step(now_s, request)
+        assert verdict.setpoint is not None
+        sent[measured] = float(verdict.setpoint.velocity[0])
+    assert sent[0.0] == pytest.approx(limit, abs=1e-9)
+    assert sent[0.9] == pytest.approx(limit - (0.9 - limit), abs=1e-9)
+
+
+def test_while_another_flies_the_drone_nothing_is_learnt() -> None:
+    """Standstill is offered, and the pilot flies at 2 m/s."""
+    gate = Gate(FREE)
+    flown([1.0, 0.0], [2.0, 0.0], gate, action=Action.OFFER)
+    np.testing.assert_array_equal(gate.drift, [0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("velocity", "elapsed_s"),
+    [((math.nan, 0.0), TICK_S), ((math.inf, 0.0), TICK_S), ((1e9, 0.0), TICK_S), ((1.0, 0.0), math.nan)],
+)
+def test_what_is_no_velocity_ends_the_drift(velocity: tuple[float, float], elapsed_s: float) -> None:
+    observer = ResponseObserver(RESPONSE_S, 2.0)
+    for _ in range(40):
+        observer.step(np.array([0.5, 0.0]), np.zeros(2), TICK_S)
+    assert observer.drift[0] == pytest.approx(0.5, abs=0.01)
+    observer.step(np.array(velocity), np.zeros(2), elapsed_s)
+    np.testing.assert_array_equal(observer.drift, [0.0, 0.0])
+
+
+def test_two_readings_at_one_time_change_nothing() -> None:
+    observer = ResponseObserver(RESPONSE_S, 2.0)
+    for _ in range(40):
+        observer.step(np.array([0.5, 0.0]), np.zeros(2), TICK_S)
+    before = observer.drift.copy()
+    observer.step(np.array([0.9, 0.0]), np.zeros(2), 0.0)
+    np.testing.assert_array_equal(observer.drift, before)
