@@ -104,6 +104,11 @@ class SafetyParameters(Section):
     """The same, to hover."""
     max_loop_lag_s: Annotated[float, Field(gt=0, le=10)] = 0.2
     """Lag of the event loop; above it, degraded."""
+    degraded_gusts_m_s: Positive = 0.6
+    """By how much wind carries the drone off its setpoints (root mean square over ten seconds, what the gate corrects
+    included), to be degraded."""
+    max_gusts_m_s: Positive = 0.8
+    """The same, to ask for Hold."""
     heartbeat_timeout_s: Annotated[float, Field(gt=0, le=10)] = services.HEARTBEAT.timeout
     """The link to the autopilot counts as lost, and flockd falls silent for good."""
     neighbours_timeout_s: Annotated[float, Field(gt=0, le=60)] = services.NEIGHBOUR.timeout
@@ -129,6 +134,7 @@ class SafetyParameters(Section):
             ("degraded_ego_motion_failures", "max_ego_motion_failures"),
             ("degraded_load", "max_load"),
             ("degraded_temperature_c", "max_temperature_c"),
+            ("degraded_gusts_m_s", "max_gusts_m_s"),
         ):
             if getattr(self, mild) > getattr(self, grave):
                 raise ValueError(f"{mild} is above {grave}; write a smaller one")

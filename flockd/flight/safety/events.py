@@ -58,6 +58,8 @@ class Inputs:
     """Temperature of the hottest thermal zone; None on a computer that has none."""
     loop_lag_s: float
     """How late the event loop runs."""
+    gusts_m_s: float
+    """How strongly the drone was carried off its setpoints in the last seconds."""
     dead_tasks: tuple[str, ...]
     """Names of tasks that have ended and should not have."""
     neighbours_age_s: float
@@ -109,6 +111,8 @@ class Event(StrEnum):
     HOT = "hot"
     TOO_HOT = "too_hot"
     LOOP_LATE = "loop_late"
+    GUSTS_STRONG = "gusts_strong"
+    GUSTS_TOO_STRONG = "gusts_too_strong"
     TASK_DIED = "task_died"
     NEIGHBOURS_LOST = "neighbours_lost"
     NEIGHBOUR_CLOSE = "neighbour_close"
@@ -183,6 +187,16 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
             Event.LOOP_LATE,
             not inputs.loop_lag_s <= p.max_loop_lag_s,
             f"the event loop is {inputs.loop_lag_s:.2f} s late",
+        ),
+        (
+            Event.GUSTS_STRONG,
+            p.degraded_gusts_m_s < inputs.gusts_m_s <= p.max_gusts_m_s,
+            f"gusts carry the drone {inputs.gusts_m_s:.1f} m/s off its setpoints",
+        ),
+        (
+            Event.GUSTS_TOO_STRONG,
+            not inputs.gusts_m_s <= p.max_gusts_m_s,
+            f"gusts carry the drone {inputs.gusts_m_s:.1f} m/s off its setpoints, more than it can bear",
         ),
         (Event.TASK_DIED, len(inputs.dead_tasks) > 0, f"ended and should not have: {', '.join(inputs.dead_tasks)}"),
         (

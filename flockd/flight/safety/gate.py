@@ -127,6 +127,11 @@ class Gate:
         """(2,) m/s by which the drone's velocity settles off its setpoint, as of the last step."""
         return self._response.drift
 
+    @property
+    def gusts_m_s(self) -> float:
+        """How strong the drift was in the last seconds; see `ResponseObserver`."""
+        return self._response.gusts_m_s
+
     def step(self, now_s: float, request: Request) -> Verdict:
         """What may be sent at `now_s`, on the clock of the other times; never raises, whatever the numbers are."""
         objections: list[Objection] = []

@@ -97,6 +97,8 @@ def rules(p: SafetyParameters) -> dict[Event, Rule]:
         Event.HOT: Rule(Barrier.NONE, Reaction.DEGRADE),
         Event.TOO_HOT: Rule(Barrier.WAIT, Reaction.HOVER),
         Event.LOOP_LATE: Rule(Barrier.NONE, Reaction.DEGRADE),
+        Event.GUSTS_STRONG: Rule(Barrier.NONE, Reaction.DEGRADE),
+        Event.GUSTS_TOO_STRONG: Rule(Barrier.NONE, Reaction.HOLD),
         Event.TASK_DIED: Rule(Barrier.WAIT, Reaction.HOLD),
         Event.NEIGHBOURS_LOST: Rule(Barrier.NONE, Reaction.NOTE, alone_s, Reaction.HOLD),
         Event.NEIGHBOUR_CLOSE: Rule(Barrier.NONE, Reaction.NOTE),

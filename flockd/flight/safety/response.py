@@ -12,6 +12,8 @@ from flockd.flight.geometry.level import limit_norm
 _POLE_PER_S = 10.0
 """Both poles of the observer: gusts of a second are followed, and a response that is 0.2 s late, or of a time constant
 half or twice the one that is configured, stays stable."""
+_GUSTS_S = 10.0
+"""Memory of the mean strength of gusts: a few of them."""
 _FASTEST_M_S = 100.0
 """What is measured to be faster is no velocity."""
 
@@ -32,6 +34,12 @@ class ResponseObserver:
         self._push = np.zeros(2)
         self.drift: FloatArray = np.zeros(2)
         """(2,) m/s, north and east."""
+        self._mean_square = 0.0
+
+    @property
+    def gusts_m_s(self) -> float:
+        """Root mean square of the drift's norm over the last ten seconds or so."""
+        return math.sqrt(self._mean_square)
 
     def step(self, velocity: FloatArray, setpoint: FloatArray | None, elapsed_s: float) -> None:
         """With the measured `velocity` (2,) m/s, and the `setpoint` (2,) m/s that was flown for the last `elapsed_s`.
@@ -41,6 +49,7 @@ class ResponseObserver:
         known = bool(np.isfinite(velocity).all()) and math.hypot(*velocity) <= _FASTEST_M_S
         if setpoint is None or self._velocity is None or not known or not elapsed_s >= 0:
             self._velocity, self._push = (velocity.copy() if known else None), np.zeros(2)
+            self._mean_square = self._mean_square if setpoint is not None else 0.0
         elif elapsed_s > 0:
             wanted = (setpoint - self._velocity) / self._response_s
             predicted = self._velocity + elapsed_s * (wanted + self._push)
@@ -48,4 +57,6 @@ class ResponseObserver:
             error = velocity - predicted
             self._velocity = predicted + (1 - keep**2) * error
             self._push = self._push + (1 - keep) ** 2 / elapsed_s * error
+            square = float(np.sum((self._response_s * self._push) ** 2))
+            self._mean_square += (1 - math.exp(-elapsed_s / _GUSTS_S)) * (square - self._mean_square)
         self.drift = limit_norm(self._response_s * self._push, self._max_drift_m_s)

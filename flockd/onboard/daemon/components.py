@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass, field
 
+from flockd.flight.safety import Gate
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
 from flockd.onboard.daemon.autopilot_requests import AutopilotRequests
@@ -24,6 +25,7 @@ class Components:
     """Created and connected by `startup.open_components`."""
 
     link: AutopilotLink
+    gate: Gate
     streamer: SetpointStreamer
     source: FrameSource
     pilot_loop: PilotLoop

@@ -92,7 +92,8 @@ async def open_components(
     previews = Previews(build_rig(config.rig), lambda: (pilot_loop.frames, pilot_loop.stepped))
     telemetry.announce(config.name, _about(config), handle, previews.picture)
     return Components(
-        link=link, streamer=streamer, source=source, pilot_loop=pilot_loop, networks=networks, control=control,
+        link=link, gate=gate, streamer=streamer, source=source, pilot_loop=pilot_loop, networks=networks,
+        control=control,
         requests=requests, refusals=RefusalWatch(link, sinks.event, clock), take_off=take_off, sinks=sinks,
         telemetry=telemetry, lag=lag, thermometer=thermometer,
         wall_clock=WallClock(sinks.event, time.monotonic), dead_tasks=dead_tasks,

@@ -36,6 +36,7 @@ QUIET = Inputs(
     load=0.6,
     temperature_c=60.0,
     loop_lag_s=0.01,
+    gusts_m_s=0.1,
     dead_tasks=(),
     neighbours_age_s=0.4,
     nearest_neighbour_m=2.5,

@@ -141,3 +141,14 @@ def test_two_readings_at_one_time_change_nothing() -> None:
     before = observer.drift.copy()
     observer.step(np.array([0.9, 0.0]), np.zeros(2), 0.0)
     np.testing.assert_array_equal(observer.drift, before)
+
+
+def test_how_strong_gusts_are_is_learnt_in_ten_seconds_and_forgotten_when_another_flies() -> None:
+    """Of a steady 0.5 m/s the root mean square comes up with a time constant of 10 s in its square."""
+    observer = ResponseObserver(RESPONSE_S, 2.0)
+    observer.step(np.array([0.5, 0.0]), np.zeros(2), TICK_S)
+    for _ in range(200):
+        observer.step(np.array([0.5, 0.0]), np.zeros(2), TICK_S)
+    assert observer.gusts_m_s == pytest.approx(0.5 * math.sqrt(1 - math.exp(-1)), rel=0.03)
+    observer.step(np.array([0.5, 0.0]), None, TICK_S)
+    assert observer.gusts_m_s == 0.0
