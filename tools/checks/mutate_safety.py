@@ -34,10 +34,12 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 SAFETY = Path("flockd/flight/safety")
 TESTS = {
-    "gate.py": ("test_gate.py", "test_obstacles.py", "test_fence.py", "test_supervisor.py"),
+    "gate.py": ("test_gate.py", "test_obstacles.py", "test_fence.py", "test_response.py", "test_supervisor.py"),
     "approach.py": ("test_obstacles.py", "test_gate.py", "test_fence.py", "test_supervisor.py"),
     "half_planes.py": ("test_obstacles.py", "test_gate.py", "test_fence.py", "test_supervisor.py"),
     "fence.py": ("test_fence.py", "test_gate.py", "test_supervisor.py"),
+    "response.py": ("test_response.py",),
+    "surroundings.py": ("test_surroundings.py",),
 }
 """The files of tests/flight/safety, the likeliest to notice first; else the supervisor's."""
 SUPERVISORS_TESTS = ("test_supervisor.py", "test_gate.py", "test_obstacles.py", "test_fence.py")
@@ -58,12 +60,9 @@ EQUIVALENT: dict[str, str] = {
     "supervisor.py Supervisor.__init__: pass  # self._now_s = -math.inf": "each step writes it before it is read",
     "supervisor.py Supervisor.__init__: self._now_s = (math.inf)": "each step writes it before it is read",
     "supervisor.py Supervisor.__init__: self._now_s = -(0.0)": "each step writes it before it is read",
-    "gate.py Gate._within_space: every_direction, every_limit = (zip(*limits.values()))": "each of them is a pair",
-    "gate.py Gate._within_space: every_direction, every_limit = zip(*limits.values(), strict=(False))": (
-        "each of them is a pair"
-    ),
-    "gate.py Gate._within_space: outward = (_units(outward))": "of none there are none; it only saves time",
-    "gate.py Gate._within_space: if False:": "the velocity nearest to one within all limits is itself",
+    "gate.py Gate.__init__: pass  # self._result = np.zeros(2)": "read only after it was written",
+    "gate.py Gate.__init__: self._result = np.zeros((3))": "read only after it was written",
+    "gate.py Gate.__init__: self._result = np.zeros((0))": "read only after it was written",
     "gate.py Gate._between_neighbours: if False:": "the room beside nobody is infinite; it only saves time",
     "approach.py towards_neighbours: if False:": "of none there are no limits; it only saves time",
     "approach.py towards_obstacles: if False:": "of none there are no limits; it only saves time",
@@ -76,15 +75,13 @@ EQUIVALENT: dict[str, str] = {
     ),
     "half_planes.py nearest_within: binding = ~((limits >= np.hypot(*velocity) + _ROUNDING_M_S))"
     "  # the others hold for all that is no longer": "a limit of just this speed binds nothing",
-    "half_planes.py nearest_within: binding = ~(limits > (np.hypot(*velocity) - _ROUNDING_M_S))"
-    "  # the others hold for all that is no longer": "differs by the rounding allowed",
     "half_planes.py nearest_within: fits = (np.max(candidates @ directions.T - limits, axis=1)) <= _ROUNDING_M_S": (
         "a limit that is exceeded binds, so that there always is one, unless a direction is longer than 1 by rounding"
     ),
     "half_planes.py : _PARALLEL = (0.0)": "lines that are all but parallel cross far away, or as near as a foot",
     "half_planes.py _crossings: cross = (np.abs(determinants) >= _PARALLEL)": "the same, at just this angle",
     "half_planes.py _crossings: i, j = np.triu_indices(len(directions), (0))": "a line is parallel to itself",
-    "fence.py _nearest_on_outline: sides = np.roll(corners, (1), axis=0) - corners": (
+    "fence.py _nearest_of_sides: sides = np.roll(corners, (1), axis=0) - corners": (
         "the same outline, the other way round"
     ),
 }

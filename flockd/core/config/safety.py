@@ -53,7 +53,8 @@ class GateParameters(Section):
     max_drift_m_s: Annotated[float, Field(ge=0, le=20)] = 2.0
     """By how much at most a setpoint is corrected for wind, which carries the drone off it; 0: not at all."""
     fence_radius_m: Annotated[float, Field(gt=0, le=100_000)] | None = 100.0
-    """Around home, level; beyond it only inward velocity. null: no circle."""
+    """Around home, level: the drone brakes before it as before an obstacle; beyond it only inward velocity. null: no
+    circle."""
     fence_corners_m: tuple[tuple[_Metres, _Metres], ...] = ()
     """A fence of any shape: its corners north and east of home, in order. With a radius too, both hold."""
     min_height_m: Annotated[float, Field(ge=-1000, le=10_000)] = 1.0

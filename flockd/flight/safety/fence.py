@@ -9,12 +9,14 @@ import numpy as np
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray
 from flockd.core.polygon import is_inside
+from flockd.flight.safety.approach import NOTHING_NEAR, stopping_speed
 
 
 def outside_fence(parameters: GateParameters, position: FloatArray) -> bool:
     """Whether (2,) metres north and east of home are outside the fence; so is what is not finite, if there is one."""
-    unknown = not np.isfinite(position).all()
-    return is_fenced(parameters) and bool(unknown or len(offsets_outside(parameters, position)))
+    radius_m, corners_m = parameters.fence_radius_m, parameters.fence_corners_m
+    beyond = radius_m is not None and not math.hypot(*position) <= radius_m
+    return beyond or (len(corners_m) > 0 and not is_inside(corners_m, *position.tolist()))
 
 
 def outside_heights(parameters: GateParameters, height_m: float) -> bool:
@@ -22,28 +24,38 @@ def outside_heights(parameters: GateParameters, height_m: float) -> bool:
     return not parameters.min_height_m <= height_m <= parameters.max_height_m
 
 
-def is_fenced(p: GateParameters) -> bool:
-    """Whether there is a fence at all."""
-    return p.fence_radius_m is not None or bool(p.fence_corners_m)
+def towards_fence(p: GateParameters, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Directions (n, 2) to the fences, or outward where one was left, and how fast to fly there, (n,) m/s.
 
-
-def offsets_outside(p: GateParameters, position: FloatArray) -> FloatArray:
-    """(n, 2) metres, for each fence that was left: from its nearest point to the position, if that is finite."""
+    A fence counts as a wall, to which the drone keeps `obstacle_clearance_m`: see `stopping_speed`. Beyond it, not at
+    all outward. For a `position` that is not finite there is no direction.
+    """
     offsets: list[FloatArray] = []
+    left_m: list[float] = []
     if not np.isfinite(position).all():
-        return np.empty((0, 2))
-    distance = math.hypot(*position)
-    if p.fence_radius_m is not None and distance > p.fence_radius_m:
-        offsets.append(position * (1 - p.fence_radius_m / distance))
-    if p.fence_corners_m and not is_inside(p.fence_corners_m, *position.tolist()):
-        offsets.append(position - _nearest_on_outline(position, np.array(p.fence_corners_m)))
-    return np.reshape(offsets, (len(offsets), 2))
+        return NOTHING_NEAR
+    if p.fence_radius_m is not None:
+        offsets.append(position)
+        left_m.append(p.fence_radius_m - math.hypot(*position))
+    if p.fence_corners_m:
+        to_sides = _nearest_of_sides(position, np.array(p.fence_corners_m)) - position
+        ranges_m = np.linalg.norm(to_sides, axis=1)
+        if is_inside(p.fence_corners_m, *position.tolist()):
+            offsets.extend(to_sides)
+            left_m.extend(ranges_m.tolist())
+        else:
+            offsets.append(-to_sides[np.argmin(ranges_m)])
+            left_m.append(0.0)
+    directions = np.reshape(offsets, (len(offsets), 2))
+    lengths = np.hypot(directions[:, 0], directions[:, 1])
+    somewhere = lengths > 0
+    most_m_s = stopping_speed(np.array(left_m) - p.obstacle_clearance_m, p.braking_m_s2, p.reaction_s)
+    return directions[somewhere] / lengths[somewhere, None], most_m_s[somewhere]
 
 
-def _nearest_on_outline(point: FloatArray, corners: FloatArray) -> FloatArray:
-    """The point (2,) of a polygon's outline that is nearest to a point."""
+def _nearest_of_sides(point: FloatArray, corners: FloatArray) -> FloatArray:
+    """(n, 2): of each side of a polygon the point that is nearest to a point."""
     sides = np.roll(corners, -1, axis=0) - corners
     along = np.sum((point - corners) * sides, axis=1) / np.sum(sides**2, axis=1)
-    feet = corners + np.clip(along, 0.0, 1.0)[:, None] * sides
-    nearest: FloatArray = feet[np.argmin(np.linalg.norm(feet - point, axis=1))]
+    nearest: FloatArray = corners + np.clip(along, 0.0, 1.0)[:, None] * sides
     return nearest

@@ -16,7 +16,7 @@ from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray, Setpoint, Wanted
 from flockd.flight.geometry.level import limit_norm
 from flockd.flight.safety.approach import towards_neighbours, towards_obstacles
-from flockd.flight.safety.fence import is_fenced, offsets_outside
+from flockd.flight.safety.fence import outside_fence, towards_fence
 from flockd.flight.safety.half_planes import nearest_within
 from flockd.flight.safety.policy import Action
 from flockd.flight.safety.response import ResponseObserver
@@ -105,9 +105,8 @@ class Gate:
     """Passes each setpoint, makes it smaller, or sends nothing.
 
     A speed above the limit or a number that is not finite is refused: the drone is brought to a standstill instead.
-    Towards a neighbour or an obstacle the drone flies no faster than it can brake before the minimum distance. Every
-    change of velocity stays within the acceleration limit, except that this one, and no velocity outward beyond the
-    fence, win.
+    Towards a neighbour, an obstacle or the fence the drone flies no faster than it can brake before the minimum
+    distance. Every change of velocity stays within the acceleration limit, except that this one wins.
 
     These limits are on the velocity that results, not on the one that is asked for: what the measured velocity shows of
     wind (`ResponseObserver`) is taken off the setpoint.
@@ -135,13 +134,11 @@ class Gate:
     def step(self, now_s: float, request: Request) -> Verdict:
         """What may be sent at `now_s`, on the clock of the other times; never raises, whatever the numbers are."""
         objections: list[Objection] = []
-        last = self._recent(now_s)
-        follows = last is not None and request.permission.action is not Action.OFFER
-        self._response.step(
-            request.around.velocity,
-            last.velocity if last is not None and follows else None,
-            0.0 if last is None else now_s - last.time_s,
-        )
+        last, measured = self._recent(now_s), request.around.velocity
+        if last is None or request.permission.action is Action.OFFER:
+            self._response.restart(measured)
+        else:
+            self._response.step(measured, last.velocity, now_s - last.time_s)
         self._last = self._setpoint(now_s, request, objections)
         self.counts.update(objections)
         return Verdict(self._last, tuple(objections))
@@ -189,11 +186,14 @@ class Gate:
 
     def _accepts(self, wanted: Wanted, around: Surroundings, objections: list[Objection]) -> bool:
         """Whether what is wanted may move the drone at all."""
-        numbers = (*wanted.velocity, 0.0 if wanted.yaw_rad is None else wanted.yaw_rad)
+        numbers = [number for number in (*wanted.velocity, wanted.yaw_rad) if number is not None]
         refusals = (
             (Objection.COMMAND_NOT_FINITE, not all(map(math.isfinite, numbers))),
             (Objection.COMMAND_TOO_LARGE, math.hypot(*wanted.velocity) > self._parameters.max_speed_m_s),
-            (Objection.POSITION_UNKNOWN, is_fenced(self._parameters) and not np.isfinite(around.position).all()),
+            (
+                Objection.POSITION_UNKNOWN,
+                outside_fence(self._parameters, around.position) and not np.isfinite(around.position).all(),
+            ),
             (
                 Objection.NEIGHBOUR_UNKNOWN,
                 not (np.isfinite(around.neighbours).all() and np.isfinite(around.neighbour_velocities).all()),
@@ -221,13 +221,11 @@ class Gate:
         return None if last is None or now_s - last.time_s > self._parameters.permission_timeout_s else last
 
     def _space(self, action: Action, around: Surroundings) -> dict[Objection, tuple[FloatArray, FloatArray]]:
-        """Directions (n, 2), and how fast to fly there, (n,) m/s: out of the fence, to neighbours and to obstacles."""
+        """Directions (n, 2), and how fast to fly there, (n,) m/s: to the fence, to neighbours and to obstacles."""
         p = self._parameters
         separation_m = p.min_separation_m if action is Action.FLY else p.degraded_separation_m
-        outward = offsets_outside(p, around.position)
-        outward = _units(outward) if len(outward) else outward
         return {
-            Objection.FENCE: (outward, np.zeros(len(outward))),
+            Objection.FENCE: towards_fence(p, around.position),
             Objection.SEPARATION: towards_neighbours(
                 p, around.neighbours, around.neighbour_velocities, separation_m, around.neighbour_sigmas
             ),
@@ -252,12 +250,10 @@ class Gate:
         if np.isfinite(around.velocity).all():
             lowered = np.maximum(most_m_s - np.maximum(directions @ around.velocity - most_m_s, 0.0), 0.0)
         over = directions @ velocity > lowered
-        result = nearest_within(velocity, directions, lowered) if over.any() else velocity
+        result = nearest_within(velocity, directions, lowered)
         objections.extend(list(limits)[i] for i in np.unique(names[over]))
         sent = limit_norm(result - self.drift, self._parameters.max_speed_m_s)
-        if (directions @ sent > most_m_s).any():
-            sent = nearest_within(sent, directions, most_m_s)
-        return result, sent
+        return result, nearest_within(sent, directions, most_m_s)
 
     def _within_climb(self, now_s: float, wanted_m: float, request: Request, objections: list[Objection]) -> float:
         """The height nearest to the one to hold that may be asked for now.
@@ -306,10 +302,3 @@ class Gate:
         if within != height_m:
             objections.append(Objection.HEIGHT)
         return within
-
-
-def _units(vectors: FloatArray) -> FloatArray:
-    """The vectors (n, 2) at length 1, without those of no length."""
-    lengths = np.hypot(vectors[:, 0], vectors[:, 1])
-    units: FloatArray = vectors[lengths > 0] / lengths[lengths > 0, None]
-    return units

@@ -31,8 +31,7 @@ class ResponseObserver:
         """`response_s`: tau; `max_drift_m_s`: the drift's largest norm, beyond which velocity or model is wrong."""
         self._response_s, self._max_drift_m_s = response_s, max_drift_m_s
         self._velocity: FloatArray | None = None
-        self._push = np.zeros(2)
-        self.drift: FloatArray = np.zeros(2)
+        self._push = self.drift = np.zeros(2)
         """(2,) m/s, north and east."""
         self._mean_square = 0.0
 
@@ -41,15 +40,18 @@ class ResponseObserver:
         """Root mean square of the drift's norm over the last ten seconds or so."""
         return math.sqrt(self._mean_square)
 
-    def step(self, velocity: FloatArray, setpoint: FloatArray | None, elapsed_s: float) -> None:
+    def restart(self, velocity: FloatArray) -> None:
+        """Begins anew, while something else flies the drone, with its measured `velocity` (2,) m/s."""
+        self._begin(velocity)
+        self._mean_square = 0.0
+
+    def step(self, velocity: FloatArray, setpoint: FloatArray, elapsed_s: float) -> None:
         """With the measured `velocity` (2,) m/s, and the `setpoint` (2,) m/s that was flown for the last `elapsed_s`.
 
-        Where none was (None), or the velocity is not known, it begins anew, without drift.
+        Where a velocity is not known, or no time, the drift begins anew.
         """
-        known = bool(np.isfinite(velocity).all()) and math.hypot(*velocity) <= _FASTEST_M_S
-        if setpoint is None or self._velocity is None or not known or not elapsed_s >= 0:
-            self._velocity, self._push = (velocity.copy() if known else None), np.zeros(2)
-            self._mean_square = self._mean_square if setpoint is not None else 0.0
+        if self._velocity is None or not _is_known(velocity) or not elapsed_s >= 0:
+            self._begin(velocity)
         elif elapsed_s > 0:
             wanted = (setpoint - self._velocity) / self._response_s
             predicted = self._velocity + elapsed_s * (wanted + self._push)
@@ -59,4 +61,12 @@ class ResponseObserver:
             self._push = self._push + (1 - keep) ** 2 / elapsed_s * error
             square = float(np.sum((self._response_s * self._push) ** 2))
             self._mean_square += (1 - math.exp(-elapsed_s / _GUSTS_S)) * (square - self._mean_square)
-        self.drift = limit_norm(self._response_s * self._push, self._max_drift_m_s)
+            self.drift = limit_norm(self._response_s * self._push, self._max_drift_m_s)
+
+    def _begin(self, velocity: FloatArray) -> None:
+        self._velocity = velocity.copy() if _is_known(velocity) else None
+        self._push = self.drift = np.zeros(2)
+
+
+def _is_known(velocity: FloatArray) -> bool:
+    return math.hypot(*velocity) <= _FASTEST_M_S

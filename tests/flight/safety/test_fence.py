@@ -7,13 +7,27 @@ import math
 import numpy as np
 import pytest
 
-from flockd.core.messages import FloatArray
-from flockd.flight.safety import GateParameters, outside_fence, outside_heights
-from flockd.flight.safety.fence import offsets_outside
+from flockd.core.messages import FloatArray, Wanted
+from flockd.flight.safety import (
+    Action,
+    Gate,
+    GateParameters,
+    Permission,
+    Request,
+    Surroundings,
+    outside_fence,
+    outside_heights,
+)
+from flockd.flight.safety.fence import towards_fence
 
 SQUARE = ((-10.0, -10.0), (-10.0, 10.0), (10.0, 10.0), (10.0, -10.0))
 L_SHAPE = ((0.0, 0.0), (40.0, 0.0), (40.0, 10.0), (10.0, 10.0), (10.0, 40.0), (0.0, 40.0))
 NOWHERE = np.full(2, math.nan)
+
+
+def _speed(left_m: float) -> float:
+    """From which a drone stops within it with the defaults' 0.5 s and 1.5 m/s^2, by the quadratic formula."""
+    return -0.75 + math.sqrt(0.5625 + 3.0 * left_m)
 
 
 def _is_inside(point: FloatArray, corners: tuple[tuple[float, float], ...]) -> bool:
@@ -36,15 +50,18 @@ def test_a_circle_around_home() -> None:
     assert outside_fence(fence, np.array([30.0, 40.0])) is False
     assert outside_fence(fence, np.array([30.0, 40.01])) is True
     assert outside_fence(fence, np.array([-30.0, -40.01]))
-    # 6, 8 outward of the point 30, 40 where the ray from home leaves the circle
-    np.testing.assert_allclose(offsets_outside(fence, np.array([36.0, 48.0])), [[6.0, 8.0]])
+    for position, most_m_s in (([36.0, 48.0], 0.0), ([29.7, 39.6], 0.0), ([27.0, 36.0], _speed(5.0 - 0.6))):
+        directions, limits = towards_fence(fence, np.array(position))
+        np.testing.assert_allclose(directions, [[0.6, 0.8]])
+        assert limits == pytest.approx([most_m_s])
+    assert len(towards_fence(fence, np.zeros(2))[1]) == 0  # home, from where no direction is the nearest
 
 
 def test_without_a_fence_nothing_is_outside_not_even_the_unknown() -> None:
     nothing = GateParameters(fence_radius_m=None)
     assert outside_fence(nothing, np.array([1e6, 1e6])) is False
     assert not outside_fence(nothing, NOWHERE)
-    assert len(offsets_outside(nothing, np.array([1e6, 1e6]))) == 0
+    assert len(towards_fence(nothing, np.array([1e6, 1e6]))[1]) == 0
 
 
 @pytest.mark.parametrize(
@@ -53,7 +70,7 @@ def test_without_a_fence_nothing_is_outside_not_even_the_unknown() -> None:
 def test_where_the_drone_is_not_known_it_counts_as_outside_but_in_no_direction(fence: GateParameters) -> None:
     for position in (NOWHERE, np.array([0.0, math.nan]), np.array([math.inf, 0.0])):
         assert outside_fence(fence, position)
-        assert offsets_outside(fence, position).shape == (0, 2)
+        assert towards_fence(fence, position)[0].shape == (0, 2)
 
 
 @pytest.mark.parametrize("corners", [SQUARE, L_SHAPE, L_SHAPE[::-1]])
@@ -61,15 +78,20 @@ def test_a_fence_of_any_shape(corners: tuple[tuple[float, float], ...]) -> None:
     fence = GateParameters(fence_radius_m=None, fence_corners_m=corners)
     outline = _outline(corners)
     for point in np.random.default_rng(0).uniform(-20.0, 50.0, (200, 2)):
-        offsets = offsets_outside(fence, point)
-        if _is_inside(point, corners):
-            assert len(offsets) == 0
-            assert not outside_fence(fence, point)
+        directions, limits = towards_fence(fence, point)
+        nearest = outline[np.argmin(np.linalg.norm(outline - point, axis=1))]
+        range_m = float(np.linalg.norm(nearest - point))
+        outside = not _is_inside(point, corners)
+        assert outside_fence(fence, point) is outside
+        np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0)
+        if outside:
+            (direction,) = directions
+            np.testing.assert_array_equal(limits, [0.0])
+            np.testing.assert_allclose(range_m * direction, point - nearest, atol=0.06)
         else:
-            assert outside_fence(fence, point)
-            (offset,) = offsets
-            assert np.linalg.norm(offset) == pytest.approx(np.linalg.norm(outline - point, axis=1).min(), abs=0.03)
-            assert np.linalg.norm(outline - (point - offset), axis=1).min() < 0.03  # it begins on the fence
+            assert len(directions) == len(corners)
+            np.testing.assert_allclose(range_m * directions[np.argmin(limits)], nearest - point, atol=0.06)
+            assert limits.min() == pytest.approx(_speed(max(range_m - 0.6, 0.0)), abs=0.01)
 
 
 def test_a_corner_beside_the_drone_does_not_count_twice() -> None:
@@ -86,9 +108,42 @@ def test_a_corner_beside_the_drone_does_not_count_twice() -> None:
 def test_with_a_circle_and_corners_both_have_to_be_kept() -> None:
     fence = GateParameters(fence_radius_m=12.0, fence_corners_m=SQUARE)
     assert not outside_fence(fence, np.array([8.0, 8.0]))
-    np.testing.assert_allclose(offsets_outside(fence, np.array([11.0, 0.0])), [[1.0, 0.0]])
-    np.testing.assert_allclose(offsets_outside(fence, np.array([9.6, 9.6])), [np.full(2, 9.6 - 12.0 / math.sqrt(2))])
-    np.testing.assert_allclose(offsets_outside(fence, np.array([14.0, 0.0])), [[2.0, 0.0], [4.0, 0.0]])
+    for position, outward in (
+        ([11.0, 0.0], [[1.0, 0.0]]),
+        ([-14.0, 0.0], [[-1.0, 0.0], [-1.0, 0.0]]),
+        ([9.6, 9.6], [[math.sqrt(0.5), math.sqrt(0.5)], [0.0, 1.0], [1.0, 0.0]]),
+    ):
+        directions, limits = towards_fence(fence, np.array(position))
+        np.testing.assert_allclose(directions[limits == 0.0], outward, atol=1e-12)
+
+
+@pytest.mark.parametrize("asked", [(3.0, 0.0), (-2.0, 2.0), (1.0, -2.5)])
+@pytest.mark.parametrize(
+    "fence",
+    [
+        GateParameters(fence_radius_m=12.0),
+        GateParameters(fence_radius_m=None, fence_corners_m=SQUARE),
+        GateParameters(fence_radius_m=None, fence_corners_m=tuple((n - 5.0, e - 5.0) for n, e in L_SHAPE)),
+    ],
+)
+@pytest.mark.parametrize("wind", [(0.0, 0.0), (0.5, 0.5)])
+def test_who_flies_at_a_fence_stops_before_it(
+    fence: GateParameters, asked: tuple[float, float], wind: tuple[float, float]
+) -> None:
+    """In the closed loop: a drone that follows its setpoints, and the wind, with a time constant of 0.4 s."""
+    gate, position, velocity, nearest_m = Gate(fence), np.zeros(2), np.zeros(2), math.inf
+    outline = _outline(fence.fence_corners_m) if fence.fence_corners_m else None
+    for now_s in np.arange(0.0, 30.0, 0.05):
+        around = Surroundings(position, velocity, 0.0, np.empty((0, 3)), np.empty((0, 2)), 5.0)
+        request = Request(Permission(Action.FLY, now_s), Wanted(np.array(asked), np.zeros(2), 0.0), now_s, 5.0, around)
+        setpoint = gate.step(now_s, request).setpoint
+        assert setpoint is not None
+        velocity = velocity + 0.05 / 0.4 * (setpoint.velocity + wind - velocity)
+        position = position + 0.05 * velocity
+        assert not outside_fence(fence, position)
+        left_m = 12.0 - np.hypot(*position) if outline is None else np.linalg.norm(outline - position, axis=1).min()
+        nearest_m = min(nearest_m, float(left_m))
+    assert 0.3 < nearest_m < 1.0
 
 
 def test_the_heights_are_a_band_and_an_unknown_height_is_outside() -> None:

@@ -348,8 +348,11 @@ def test_outside_the_fence_only_what_leads_inward_or_along_it_is_left() -> None:
     verdict = Stream().second([-1.0, 0.5], around=outside)
     np.testing.assert_allclose(sent(verdict).velocity, [-1.0, 0.5])
     assert verdict.objections == ()
-    inside = replace(HOME, position=np.array([99.0, 0.0]))
+    inside = replace(HOME, position=np.array([98.0, 0.0]))  # 2 m, of which 0.6 m are kept: 0.5 v + v^2 / 3 = 1.4 m
     np.testing.assert_allclose(sent(Stream().second([1.0, 0.5], around=inside)).velocity, [1.0, 0.5])
+    verdict = Stream().second([2.0, 0.5], around=inside)
+    np.testing.assert_allclose(sent(verdict).velocity, [math.sqrt(0.5625 + 3.0 * 1.4) - 0.75, 0.5])
+    assert verdict.objections == (Objection.FENCE,)
 
 
 def test_along_the_fence_and_past_a_neighbour_nothing_is_held_back() -> None:
@@ -527,6 +530,11 @@ def test_towards_a_neighbour_it_flies_no_faster_than_it_can_brake() -> None:
     # Behind one that flies ahead at the same 2 m/s just outside the minimum distance nothing is held back.
     ahead = replace(near([1.01, 0.0, 0.0]), neighbour_velocities=np.array([[2.0, 0.0]]))
     np.testing.assert_allclose(sent(Stream(parameters).second([2.0, 0.0], around=ahead)).velocity, [2.0, 0.0])
+
+
+def test_towards_one_that_comes_faster_than_both_can_brake_it_does_not_fly() -> None:
+    coming = replace(near([2.5, 0.0, 0.0]), neighbour_velocities=np.array([[-3.0, 0.0]]))
+    np.testing.assert_allclose(sent(Stream().second([1.0, 0.0], around=coming)).velocity, STILL, atol=1e-12)
 
 
 def test_an_uncertain_neighbour_counts_as_nearer_and_faster() -> None:

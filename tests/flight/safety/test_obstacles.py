@@ -13,7 +13,6 @@ from flockd.core.messages import FloatArray, Wanted
 from flockd.flight.geometry.level import SAME_SPOT_M
 from flockd.flight.safety import Action, Gate, GateParameters, Objection, Permission, Request, Surroundings, Verdict
 from flockd.flight.safety.approach import stopping_speed, towards_neighbours, towards_obstacles
-from flockd.flight.safety.gate import _units
 from flockd.flight.safety.half_planes import nearest_within
 
 PARAMETERS = GateParameters(obstacle_clearance_m=0.6, braking_m_s2=1.5, reaction_s=0.5).model_copy(
@@ -176,7 +175,3 @@ def test_each_neighbours_own_velocity_counts() -> None:
 def test_nobody_follows_a_neighbour_at_the_separation_itself() -> None:
     assert fastest((1.0, 0.0), velocities=[[2.0, 0.0]], separation_m=1.0) == 0.0
     assert fastest((1.001, 0.0), velocities=[[2.0, 0.0]], separation_m=1.0) > 0.0
-
-
-def test_what_has_no_length_has_no_direction() -> None:
-    assert np.allclose(_units(np.array([[0.0, 0.0], [3.0, 4.0]])), [[0.6, 0.8]])

@@ -71,6 +71,7 @@ def test_a_drift_is_limited() -> None:
     gate = Gate(FREE)
     setpoints, _ = flown([0.0, 0.0], [3.0, 4.0], gate)
     np.testing.assert_allclose(gate.drift, [1.2, 1.6], rtol=1e-3)  # of 5 m/s, 2
+    assert gate.gusts_m_s > gate.drift[1]
     np.testing.assert_allclose(setpoints[-1], [-1.2, -1.6], rtol=1e-3)
 
 
@@ -119,25 +120,56 @@ def test_while_another_flies_the_drone_nothing_is_learnt() -> None:
     gate = Gate(FREE)
     flown([1.0, 0.0], [2.0, 0.0], gate, action=Action.OFFER)
     np.testing.assert_array_equal(gate.drift, [0.0, 0.0])
+    assert gate.gusts_m_s == 0.0
 
 
-@pytest.mark.parametrize(
-    ("velocity", "elapsed_s"),
-    [((math.nan, 0.0), TICK_S), ((math.inf, 0.0), TICK_S), ((1e9, 0.0), TICK_S), ((1.0, 0.0), math.nan)],
-)
-def test_what_is_no_velocity_ends_the_drift(velocity: tuple[float, float], elapsed_s: float) -> None:
+def settled() -> ResponseObserver:
+    """An observer of a drone that flies at 0.5 m/s north where it should stand."""
     observer = ResponseObserver(RESPONSE_S, 2.0)
     for _ in range(40):
         observer.step(np.array([0.5, 0.0]), np.zeros(2), TICK_S)
     assert observer.drift[0] == pytest.approx(0.5, abs=0.01)
+    return observer
+
+
+@pytest.mark.parametrize(
+    ("velocity", "elapsed_s"),
+    [((math.nan, 0.0), TICK_S), ((math.inf, 0.0), TICK_S), ((100.1, 0.0), TICK_S), ((1.0, 0.0), math.nan)],
+)
+def test_what_is_no_velocity_ends_the_drift_and_not_what_is_known_of_gusts(
+    velocity: tuple[float, float], elapsed_s: float
+) -> None:
+    observer = settled()
+    before = observer.gusts_m_s
     observer.step(np.array(velocity), np.zeros(2), elapsed_s)
     np.testing.assert_array_equal(observer.drift, [0.0, 0.0])
+    assert observer.gusts_m_s == before > 0.0
+    for _ in range(40):
+        observer.step(np.array([0.5, 0.0]), np.zeros(2), TICK_S)
+    assert observer.drift[0] == pytest.approx(0.5, abs=0.01)
+
+
+def test_at_first_there_is_no_drift_and_100_m_s_is_a_velocity() -> None:
+    observer = ResponseObserver(RESPONSE_S, 2.0)
+    np.testing.assert_array_equal(observer.drift, [0.0, 0.0])
+    for _ in range(2):
+        observer.step(np.array([100.0, 0.0]), np.zeros(2), TICK_S)
+    assert observer.drift[0] == pytest.approx(2.0)
+
+
+def test_its_poles_are_10_per_second() -> None:
+    """A drone that does not answer is pushed: with p = exp(-10 t), 1 - (1 + k (1 - p)) p^k is learnt in k steps."""
+    push, response_s = 0.3, 1e9
+    observer = ResponseObserver(response_s, math.inf)
+    p = math.exp(-10 * TICK_S)
+    for k in range(20):
+        observer.step(np.array([push * k * TICK_S, 0.0]), np.zeros(2), TICK_S)
+        learnt = observer.drift[0] / response_s / push
+        assert learnt == pytest.approx(1 - (1 + k * (1 - p)) * p**k, abs=1e-6)
 
 
 def test_two_readings_at_one_time_change_nothing() -> None:
-    observer = ResponseObserver(RESPONSE_S, 2.0)
-    for _ in range(40):
-        observer.step(np.array([0.5, 0.0]), np.zeros(2), TICK_S)
+    observer = settled()
     before = observer.drift.copy()
     observer.step(np.array([0.9, 0.0]), np.zeros(2), 0.0)
     np.testing.assert_array_equal(observer.drift, before)
@@ -150,5 +182,6 @@ def test_how_strong_gusts_are_is_learnt_in_ten_seconds_and_forgotten_when_anothe
     for _ in range(200):
         observer.step(np.array([0.5, 0.0]), np.zeros(2), TICK_S)
     assert observer.gusts_m_s == pytest.approx(0.5 * math.sqrt(1 - math.exp(-1)), rel=0.03)
-    observer.step(np.array([0.5, 0.0]), None, TICK_S)
+    observer.restart(np.array([0.5, 0.0]))
     assert observer.gusts_m_s == 0.0
+    np.testing.assert_array_equal(observer.drift, [0.0, 0.0])

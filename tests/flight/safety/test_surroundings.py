@@ -1,0 +1,68 @@
+"""What the gate is told of the neighbours: moved on to now, in the level frame of the drone that has moved too."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flockd.core.messages import FloatArray, Neighbour
+from flockd.flight.safety import Surroundings
+from flockd.flight.safety.surroundings import surroundings
+
+
+def told(neighbours: list[Neighbour], obstacles: FloatArray) -> Surroundings:
+    """Half a second after the step, in which the drone flew 1 m north, 2 m west and 0.5 m up."""
+    return surroundings(
+        neighbours,
+        0.5,
+        moved=np.array([1.0, -2.0, -0.5]),
+        position=np.array([30.0, 40.0]),
+        velocity=np.array([2.0, -4.0, -1.0]),
+        yaw_rad=0.3,
+        height_m=6.0,
+        obstacles=obstacles,
+    )
+
+
+def neighbour(number: int, position: list[float], velocity: list[float], *, confirmed: bool) -> Neighbour:
+    return Neighbour(
+        number,
+        np.array(position),
+        np.array(velocity),
+        position_sigma_m=0.1 * number,
+        velocity_sigma_m_s=0.2 * number,
+        age_s=1.0,
+        unseen_s=0.0,
+        hits=3,
+        confirmed=confirmed,
+    )
+
+
+def test_neighbours_fly_on_and_the_drone_has_moved() -> None:
+    both = [
+        neighbour(1, [5.0, 0.0, 0.0], [2.0, 4.0, 6.0], confirmed=True),
+        neighbour(2, [0.0, 8.0, -1.0], [0.0, -2.0, 1.0], confirmed=False),
+    ]
+    around = told(both, np.empty((0, 2)))
+    np.testing.assert_allclose(around.neighbours, [[5.0, 4.0, 3.5], [-1.0, 9.0, 0.0]])
+    np.testing.assert_allclose(around.neighbour_velocities, [[2.0, 4.0], [0.0, -2.0]])
+    assert around.neighbour_sigmas is not None
+    np.testing.assert_allclose(around.neighbour_sigmas, [[0.1, 0.2], [0.2, 0.4]])
+
+
+def test_obstacles_stand_still() -> None:
+    around = told([], np.array([[3.0, 0.0], [0.0, -6.0]]))
+    np.testing.assert_allclose(around.obstacles, [[2.0, 2.0], [-1.0, -4.0]])
+
+
+def test_of_nobody_and_nothing_there_are_arrays_all_the_same() -> None:
+    around = told([], np.empty((0, 2)))
+    assert around.neighbours.shape == (0, 3)
+    assert around.neighbour_sigmas is not None
+    assert around.neighbour_velocities.shape == around.neighbour_sigmas.shape == around.obstacles.shape == (0, 2)
+
+
+def test_the_drone_itself_is_where_it_is_now() -> None:
+    around = told([], np.empty((0, 2)))
+    np.testing.assert_array_equal(around.position, [30.0, 40.0])
+    np.testing.assert_array_equal(around.velocity, [2.0, -4.0])
+    assert (around.yaw_rad, around.height_m) == (0.3, 6.0)
