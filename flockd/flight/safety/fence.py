@@ -16,7 +16,7 @@ def outside_fence(parameters: GateParameters, position: FloatArray) -> bool:
     """Whether (2,) metres north and east of home are outside the fence; so is what is not finite, if there is one."""
     radius_m, corners_m = parameters.fence_radius_m, parameters.fence_corners_m
     beyond = radius_m is not None and not math.hypot(*position) <= radius_m
-    return beyond or (len(corners_m) > 0 and not is_inside(corners_m, *position.tolist()))
+    return beyond or (corners_m != () and not is_inside(corners_m, *position.tolist()))
 
 
 def outside_heights(parameters: GateParameters, height_m: float) -> bool:
