@@ -12,6 +12,7 @@ from matplotlib.patches import Patch
 
 from flockd.review.flight_log.autopilot_log import AutopilotLog
 from flockd.review.flight_log.log import FlightLog
+from flockd.review.flight_log.response import velocity_response
 from flockd.review.report.style import DRONE_COLOURS, INK, MUTED, STYLE, drone_name
 
 FLOWN, COMMANDED, FAILSAFE = DRONE_COLOURS[0], DRONE_COLOURS[1], "#c0392b"
@@ -85,5 +86,17 @@ def autopilot_texts(log: FlightLog, autopilot: AutopilotLog | None) -> dict[str,
         "autopilot_drone": drone_name(autopilot.drone) if names is None else names[autopilot.drone],
         "autopilot_source": autopilot.source,
         "autopilot_placed_by": autopilot.placed_by,
+        "autopilot_response": _response_text(autopilot),
         "autopilot_rows": cells + [{"begin": "", "end": "", "what": f"and {more} more"}] * (more > 0),
     }
+
+
+def _response_text(autopilot: AutopilotLog) -> str:
+    fitted = velocity_response(autopilot)
+    if fitted is None:
+        return "Its setpoints changed too little, or for too short a time, to fit its response."
+    return (
+        f"The velocity followed its setpoints with a time constant of {fitted.time_constant_s:.2f} s after a dead time "
+        f"of {fitted.dead_time_s:.2f} s (root mean square error {fitted.error_m_s:.2f} m/s): set "
+        "safety.gate.response_s to the time constant."
+    )
