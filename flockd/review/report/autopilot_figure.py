@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 
 from flockd.review.flight_log.autopilot_log import AutopilotLog
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.flight_log.response import velocity_response
+from flockd.review.flight_log.velocity_response import velocity_response
 from flockd.review.report.style import DRONE_COLOURS, INK, MUTED, STYLE, drone_name
 
 FLOWN, COMMANDED, FAILSAFE = DRONE_COLOURS[0], DRONE_COLOURS[1], "#c0392b"

@@ -7,7 +7,7 @@ import pytest
 
 from flockd.core.messages import FloatArray
 from flockd.review.flight_log.autopilot_log import AutopilotLog
-from flockd.review.flight_log.response import velocity_response
+from flockd.review.flight_log.velocity_response import velocity_response
 
 FINE_S = 0.001
 
