@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,20 @@ _SLOWED = 0.05
 """A velocity that differs from the one asked for by a smaller share of it counts as the same."""
 
 
+_SAME_TIME_S = 1e-9
+
+
+class _Order(NamedTuple):
+    """What pilots asked for, and when and where the drones were as they looked."""
+
+    time_s: float
+    places: FloatArray
+    commands: Commands
+    velocity: FloatArray
+    """(n, 2) m/s, and heights (n,) m, as asked for or as the autopilots that took over fly."""
+    height_m: FloatArray
+
+
 class ControlLoop:
     """Flies all drones of a flight from one step of their pilots to the next.
 
@@ -37,6 +52,8 @@ class ControlLoop:
             if gated and not vehicle.by_hand
         }
         self._start_m = [-vehicle.position_m[2] for vehicle in scenario.vehicles]
+        self._latency_s = scenario.detections.latency_s if scenario.detections is not None else 0.0
+        self._in_force: _Order | None = None
         self._flown_s = self._slowed_s = 0.0
 
     @property
@@ -50,40 +67,43 @@ class ControlLoop:
             commands.takeovers, vehicles.position, commands.velocity, commands.height_m
         )
         gates = {i: gate for i, gate in self._gates.items() if i not in self._handover.taken}
+        coming = _Order(time_s, vehicles.position, commands, velocity, height_m)
+        order = self._in_force or coming
         periods = max(round(self._step_s / PERIOD_S), 1) if gates else 1
-        period_s, began = self._step_s / periods, vehicles.position
+        period_s = self._step_s / periods
         for period in range(periods):
-            age_s = period * period_s
-            setpoints, heights = velocity.copy(), height_m.copy()
+            now_s = time_s + period * period_s
+            if now_s - time_s >= self._latency_s - _SAME_TIME_S:
+                order = coming
+            setpoints, heights = order.velocity.copy(), order.height_m.copy()
             for i, gate in gates.items():
-                setpoint = self._setpoint(i, gate, time_s, age_s, vehicles, began[i], commands)
+                setpoint = self._setpoint(i, gate, now_s, vehicles, order)
                 setpoints[i] = setpoint.velocity
-                if math.isfinite(height_m[i]):
+                if math.isfinite(order.height_m[i]):
                     heights[i] = setpoint.height_m
-                off_m_s = math.hypot(*(setpoint.velocity + gate.drift - velocity[i]))
-                self._slowed_s += period_s * (off_m_s > _SLOWED * math.hypot(*velocity[i]))
+                asked = order.velocity[i]
+                off_m_s = math.hypot(*(setpoint.velocity + gate.drift - asked))
+                self._slowed_s += period_s * (off_m_s > _SLOWED * math.hypot(*asked))
                 self._flown_s += period_s
-            vehicles.step(setpoints, commands.yaw_rad, period_s, heights)
+            vehicles.step(setpoints, order.commands.yaw_rad, period_s, heights)
+        self._in_force = coming
 
-    def _setpoint(
-        self, i: int, gate: Gate, time_s: float, age_s: float, vehicles: Vehicles, began: FloatArray, commands: Commands
-    ) -> Setpoint:
-        here, height_m = vehicles.position[i], float(commands.height_m[i])
+    def _setpoint(self, i: int, gate: Gate, now_s: float, vehicles: Vehicles, order: _Order) -> Setpoint:
+        here, height_m, commands = vehicles.position[i], float(order.commands.height_m[i]), order.commands
         ranges = commands.obstacles[i]
         around = surroundings(
             commands.neighbours[i],
-            age_s,
-            moved=here - began,
+            now_s - order.time_s,
+            moved=here - order.places[i],
             position=here[:2],
             velocity=vehicles.velocity[i],
             yaw_rad=float(commands.yaw_rad[i]),
             height_m=float(-here[2]),
             obstacles=np.empty((0, 2)) if ranges is None else nearest_points(ranges, self._sigmas),
         )
-        now_s = time_s + age_s
         wanted = Wanted(commands.velocity[i], commands.acceleration[i], float(commands.yaw_rad[i]))
         held_m = height_m if math.isfinite(height_m) else self._start_m[i]
-        request = Request(Permission(Action.FLY, now_s), wanted, time_s, held_m, around)
+        request = Request(Permission(Action.FLY, now_s), wanted, order.time_s, held_m, around)
         setpoint = gate.step(now_s, request).setpoint
         assert setpoint is not None, "all that it is told is finite and of now"
         return setpoint

@@ -7,20 +7,24 @@ from typing import NamedTuple
 import numpy as np
 
 from flockd.core.config.scenario import ScenarioConfig
-from flockd.core.messages import BoolArray, FloatArray, MissionStatus, Neighbour, ObstacleRanges
+from flockd.core.messages import FloatArray, MissionStatus, Neighbour, ObstacleRanges
 from flockd.flight.flocking import FlockingLaw
 from flockd.flight.mission import Moment, Navigator
 from flockd.flight.mission.navigator import middle_of
 from flockd.flight.obstacles import Avoidance
 from flockd.sim.commands import Commands
 from flockd.sim.control_loop import ControlLoop
+from flockd.sim.made_up_detections import TrackedNeighbours
 from flockd.sim.vehicles import REFERENCE_DEG, Vehicles
 from flockd.sim.worlds.obstacle_worlds import obstacles_of
 from flockd.sim.worlds.obstacles import true_ranges
 
 
 class ExactFlock:
-    """The flocking law and each drone's mission on the exact states of all drones, and exact ranges to obstacles."""
+    """The flocking law and each drone's mission on the states of all drones, and exact ranges to obstacles.
+
+    The states are exact, or tracked from made-up detections where the scenario has `detections`.
+    """
 
     def __init__(self, scenario: ScenarioConfig) -> None:
         drone = scenario.drone
@@ -30,6 +34,8 @@ class ExactFlock:
             for i, vehicle in enumerate(scenario.vehicles)
         ]
         self._yaw_rad = np.full(len(self._pilots), start_yaw(scenario))
+        made_up, n = scenario.detections, len(self._pilots)
+        self._tracked = [] if made_up is None else [TrackedNeighbours(scenario, made_up, i) for i in range(n)]
         self._obstacles = obstacles_of(scenario)
         self._avoids = drone.obstacles.enabled
         self._avoidances = [Avoidance(drone.obstacles, drone.safety.gate, drone.step_s) for _ in self._pilots]
@@ -37,40 +43,44 @@ class ExactFlock:
     def step(self, time_s: float, positions: FloatArray, velocities: FloatArray) -> Commands:
         """The commands for drones at (n, 3) m and (n, 3) m/s in NED; called in order of time."""
         seen = [true_ranges(self._obstacles, time_s, place) if self._obstacles.solids else None for place in positions]
-        found = [self._of(i, time_s, positions, velocities, ranges) for i, ranges in enumerate(seen)]
+        known = [self._neighbours(i, time_s, positions, velocities) for i in range(len(positions))]
+        found = [self._of(i, time_s, positions, velocities, known[i], ranges) for i, ranges in enumerate(seen)]
         velocity, acceleration, yaw_rad, height_m, missions, desired = zip(*found, strict=True)
         self._yaw_rad = np.array(yaw_rad)
         return Commands(
             np.array(velocity), np.array(acceleration), self._yaw_rad, np.array(height_m), missions, np.array(desired),
-            tuple(seen), tuple(self._neighbours(i, positions, velocities) for i in range(len(positions))),
+            tuple(seen), tuple(known),
         )  # fmt: skip
 
     def _of(
-        self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray, ranges: ObstacleRanges | None
-    ) -> tuple[FloatArray, FloatArray, float, float, MissionStatus, FloatArray]:
+        self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray, known: tuple[Neighbour, ...],
+        ranges: ObstacleRanges | None,
+    ) -> tuple[FloatArray, FloatArray, float, float, MissionStatus, FloatArray]:  # fmt: skip
         here, moving = positions[:, :2], velocities[:, :2]
         pilot = self._pilots[i]
         if isinstance(pilot, HandPilot):
             flown = pilot.step(time_s, here[i])
             return flown.velocity, np.zeros(2), float(self._yaw_rad[i]), flown.height_m, flown.status, flown.velocity
-        others = np.arange(len(here)) != i
-        offsets = here[others] - here[i]
-        moment = Moment(time_s, here[i], middle_of(offsets[self._sees(offsets)]), np.array(REFERENCE_DEG))
-        guidance = pilot.step(moment)
+        seen = [one for one in known if one.confirmed]
+        places = np.reshape([one.position for one in seen], (len(seen), 3))
+        others = np.reshape([one.velocity for one in seen], (len(seen), 3))[:, :2]
+        guidance = pilot.step(Moment(time_s, here[i], middle_of(places[:, :2]), np.array(REFERENCE_DEG)))
         desired = pilot.pull(guidance)
         if ranges is None or not self._avoids:
-            command, acceleration = self._law.command(moving[i], offsets, moving[others], desired, self._step_s)
+            command, acceleration = self._law.command(moving[i], places[:, :2], others, desired, self._step_s)
         else:
-            places = positions[others] - positions[i]
-            command, acceleration = self._avoidances[i].command(
-                self._law, moving[i], places, moving[others], desired, ranges
-            )
+            command, acceleration = self._avoidances[i].command(self._law, moving[i], places, others, desired, ranges)
         yaw_rad = float(self._yaw_rad[i]) if guidance.course_rad is None else guidance.course_rad
         height_m = np.nan if guidance.height_m is None else guidance.height_m
         return command, acceleration, yaw_rad, height_m, pilot.status(guidance), desired
 
-    def _neighbours(self, i: int, positions: FloatArray, velocities: FloatArray) -> tuple[Neighbour, ...]:
-        seen = self._sees(positions[:, :2] - positions[i, :2])
+    def _neighbours(
+        self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray
+    ) -> tuple[Neighbour, ...]:
+        if self._tracked:
+            return self._tracked[i].step(time_s, positions, velocities)
+        offsets = positions[:, :2] - positions[i, :2]
+        seen = np.hypot(offsets[:, 0], offsets[:, 1]) <= self._law.parameters.observation_distance_m
         seen[i] = False
         return tuple(
             Neighbour(
@@ -79,10 +89,6 @@ class ExactFlock:
             )
             for j in np.flatnonzero(seen)
         )  # fmt: skip
-
-    def _sees(self, offsets: FloatArray) -> BoolArray:
-        near: BoolArray = np.hypot(offsets[:, 0], offsets[:, 1]) <= self._law.parameters.observation_distance_m
-        return near
 
 
 class FlownByHand(NamedTuple):

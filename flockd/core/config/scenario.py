@@ -117,6 +117,22 @@ class WorldConfig(Section):
         return self
 
 
+class DetectionsConfig(Section):
+    """Detections made up from the truth with independent errors, for flights without images through the drone's own
+    tracker."""
+
+    range_m: Positive = 20.0
+    """Farther away nobody is detected."""
+    missed: Share = 0.05
+    """Probability that a drone is not detected in a step."""
+    range_error: Annotated[float, Field(gt=0, le=1)] = 0.05
+    """Standard deviation of the logarithm of a range."""
+    bearing_error_rad: Annotated[float, Field(gt=0, le=1)] = 0.005
+    """Standard deviation of a bearing, each axis."""
+    latency_s: NonNegative = 0.3
+    """From the images until the commands that follow from them are flown; below a step."""
+
+
 class CameraFaultConfig(Section):
     """What goes wrong with one simulated camera."""
 
@@ -145,6 +161,8 @@ class ScenarioConfig(Section):
     vehicle: VehicleConfig = VehicleConfig()
     sensors: SensorConfig = SensorConfig()
     world: WorldConfig = WorldConfig()
+    detections: DetectionsConfig | None = None
+    """For `--perception truth`: drones know each other by tracking such detections; null: exactly and at once."""
     faults: tuple[CameraFaultConfig, ...] = ()
     """None, unless a flight is to show what flockd does about them."""
     drone: DroneConfig
@@ -175,6 +193,9 @@ class ScenarioConfig(Section):
         if round(self.duration_s / step_s) < 1:
             text = f"{self.duration_s:g} s is shorter than a step of {step_s:g} s; write {step_s:g} or more"
             refuse(self, {("duration_s",): text})
+        if self.detections is not None and self.detections.latency_s >= step_s:
+            text = f"is not below a step of {step_s:g} s; write a smaller number"
+            refuse(self, {("detections", "latency_s"): text})
         return self
 
     @model_validator(mode="after")

@@ -1,0 +1,45 @@
+"""Neighbours as the drone's own tracker makes them of detections that are made up from the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flockd.core.config.scenario import DetectionsConfig, ScenarioConfig
+from flockd.core.messages import FloatArray, Neighbour
+from flockd.flight.tracking import Measurement, Tracker
+
+_OWN_MOTION_ERROR_M = 0.02
+"""Standard deviation, each axis and step, that the tracker is told of its own motion, which is exact."""
+
+
+class TrackedNeighbours:
+    """What one drone knows of the others."""
+
+    def __init__(self, scenario: ScenarioConfig, config: DetectionsConfig, drone: int) -> None:
+        self._config, self._drone, self._step_s = config, drone, scenario.drone.step_s
+        self._tracker = Tracker(scenario.drone.tracking)
+        self._random = np.random.default_rng([scenario.seed, drone])
+        self._position: FloatArray | None = None
+
+    def step(self, time_s: float, positions: FloatArray, velocities: FloatArray) -> tuple[Neighbour, ...]:
+        """With all drones at (n, 3) m and (n, 3) m/s in NED; called once a step."""
+        here = positions[self._drone]
+        if self._position is not None:
+            self._tracker.predict(self._step_s, here - self._position, _OWN_MOTION_ERROR_M)
+        self._position = here
+        offsets = np.delete(positions, self._drone, axis=0) - here
+        found = [detection for offset in offsets if (detection := self._detection(offset)) is not None]
+        self._tracker.update(time_s, found, velocities[self._drone])
+        return self._tracker.neighbours()
+
+    def _detection(self, offset: FloatArray) -> Measurement | None:
+        config = self._config
+        range_m = float(np.linalg.norm(offset))
+        if range_m > config.range_m or self._random.random() < config.missed:
+            return None
+        bearing = offset / range_m + self._random.normal(0.0, config.bearing_error_rad, 3)
+        bearing /= np.linalg.norm(bearing)
+        across, along = config.bearing_error_rad**2, config.range_error**2
+        covariance = across * np.eye(3) + (along - across) * np.outer(bearing, bearing)
+        log_range = float(np.log(range_m) + config.range_error * self._random.normal())
+        return Measurement(bearing, log_range, covariance, 0.6, 0.95)
