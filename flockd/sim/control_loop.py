@@ -69,7 +69,7 @@ class ControlLoop:
         gates = {i: gate for i, gate in self._gates.items() if i not in self._handover.taken}
         coming = _Order(time_s, vehicles.position, commands, velocity, height_m)
         order = self._in_force or coming
-        periods = max(round(self._step_s / PERIOD_S), 1) if gates else 1
+        periods = max(round(self._step_s / PERIOD_S), 1) if gates or self._latency_s else 1
         period_s = self._step_s / periods
         for period in range(periods):
             now_s = time_s + period * period_s

@@ -1,0 +1,80 @@
+"""Detections made up from the truth, and the flights on them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flockd.core.config import load_scenario
+from flockd.core.config.scenario import DetectionsConfig, ScenarioConfig
+from flockd.core.errors import ConfigError
+from flockd.sim.commands import Commands
+from flockd.sim.control_loop import ControlLoop
+from flockd.sim.exact_states import fly_exact_states
+from flockd.sim.made_up_detections import TrackedNeighbours
+from flockd.sim.vehicles import Vehicles
+
+CONFIG = Path(__file__).parents[2] / "config"
+ENCOUNTER = load_scenario(CONFIG / "encounter.yaml")
+AHEAD = np.array([[0.0, 0.0, -5.0], [8.0, 6.0, -5.0]])
+
+
+def known(seed: int = 0, steps: int = 20, positions: np.ndarray = AHEAD, **changes: float) -> list[np.ndarray]:
+    """Where the second drone, which hovers as the first does, is known to be after each step; NaN: nowhere."""
+    config = DetectionsConfig(**changes)
+    tracked = TrackedNeighbours(ENCOUNTER.model_copy(update={"seed": seed}), config, 0)
+    found = [tracked.step(0.5 * i, positions, np.zeros((2, 3))) for i in range(steps)]
+    return [one[0].position if one else np.full(3, np.nan) for one in found]
+
+
+def test_who_is_near_is_tracked_to_within_the_errors() -> None:
+    finals = np.array([known(seed, range_error=0.1, bearing_error_rad=0.01)[-1] for seed in range(20)])
+    errors = finals - [8.0, 6.0, 0.0]
+    assert 0.02 < np.sqrt(np.mean(errors**2)) < 0.5  # one detection: 1 m along, 0.1 m across
+    assert np.abs(errors.mean(axis=0)).max() < 0.3
+
+
+def test_nobody_is_known_beyond_the_range_nor_when_all_are_missed() -> None:
+    assert np.isnan(known(range_m=9.9)).all()
+    assert np.isfinite(known(range_m=10.1)[0]).all()
+    assert np.isnan(known(missed=1.0)).all()
+
+
+def test_the_same_seed_gives_the_same_and_each_drone_its_own() -> None:
+    np.testing.assert_array_equal(known(3), known(3))
+    assert not np.array_equal(known(3), known(4))
+
+
+def _nearest_m(scenario: ScenarioConfig) -> float:
+    positions = fly_exact_states(scenario)[1]
+    return float(np.linalg.norm(positions[:, 0] - positions[:, 1], axis=1).min())
+
+
+def test_two_meet_head_on_and_stay_apart_and_would_not_if_they_were_blind() -> None:
+    assert _nearest_m(ENCOUNTER) >= 1.0
+    blind = DetectionsConfig(missed=1.0)
+    assert _nearest_m(ENCOUNTER.model_copy(update={"detections": blind})) < 0.1
+
+
+@pytest.mark.parametrize("gated", [True, False])
+def test_commands_come_late(*, gated: bool) -> None:
+    """Asked for a metre a second to the north, and a step later to the east instead."""
+    east_m = []
+    for latency_s in (0.0, 0.3, 0.45):
+        scenario = ENCOUNTER.model_copy(update={"detections": DetectionsConfig(latency_s=latency_s)})
+        loop, vehicles = ControlLoop(scenario, gated=gated), Vehicles(scenario.vehicles, scenario.vehicle)
+        for time_s, velocity in ((0.0, [1.0, 0.0]), (0.5, [0.0, 1.0])):
+            loop.fly(time_s, vehicles, replace(Commands.of(2), velocity=np.tile(velocity, (2, 1))))
+        east_m.append(float(vehicles.position[0, 1]))
+    assert east_m[0] > 2 * east_m[1] > 4 * east_m[2] > 0.0
+
+
+def test_a_latency_of_a_step_is_refused(tmp_path: Path) -> None:
+    text = (CONFIG / "encounter.yaml").read_text(encoding="utf-8")
+    text = text.replace("simulator.yaml", str(CONFIG / "simulator.yaml")).replace("missed: 0.05", "latency_s: 0.5")
+    (tmp_path / "late.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"detections\.latency_s.*is not below a step of 0\.5 s"):
+        load_scenario(tmp_path / "late.yaml")
