@@ -42,8 +42,7 @@ def _in(*keys: str) -> Callable[[FlightLog, dict[str, Any]], Any]:
 
 def _tail_mean(name: str) -> Callable[[FlightLog, dict[str, Any]], float]:
     def mean(log: FlightLog, _: dict[str, Any]) -> float:
-        with np.errstate(invalid="ignore", divide="ignore"):  # a mission may want to stand still
-            sums = objective_sums(log, log.position, log.velocity)[name]
+        sums = objective_sums(log, log.position, log.velocity)[name]
         return float(np.mean(sums[log.time_s > log.time_s[-1] + log.metadata.step_s - TAIL_S - 1e-6]))
 
     return mean

@@ -101,10 +101,9 @@ def objective_sums(log: FlightLog, position: FloatArray, velocity: FloatArray) -
     circling = log.time_s < log.metadata.circle_until_s
     plan, speed = position[..., :2], velocity[..., :2]
     steps = range(len(plan))
-    return {
-        "obj1": np.array([obj1(speed[s], log.desired[s], circling=bool(circling[s])).sum() for s in steps]),
-        "obj2": np.array([obj2(plan[s], speed[s], parameters).sum() for s in steps]),
-    }
+    with np.errstate(invalid="ignore", divide="ignore"):  # what the flock wants may be a standstill in the mean
+        first = np.array([obj1(speed[s], log.desired[s], circling=bool(circling[s])).sum() for s in steps])
+    return {"obj1": first, "obj2": np.array([obj2(plan[s], speed[s], parameters).sum() for s in steps])}
 
 
 def mission_figures(log: FlightLog) -> Json:

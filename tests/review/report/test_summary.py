@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -124,6 +125,15 @@ def test_the_flights_own_facts_are_carried_over() -> None:
     assert (summary["duration_s"], summary["step_s"], summary["wall_s"]) == (15.0, 0.5, 60.0)
     assert summary["realtime_factor"] == 0.25
     assert summary["stages_ms"] == {"flow": {"p50": 51.0, "p95": 96.0}}
+
+
+def test_a_flock_that_wants_to_stand_still_in_the_mean_has_a_summary_without_a_warning() -> None:
+    """As two drones that want to fly at each other do: obj1 has no desired velocity to compare with."""
+    log = _hand_made()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        flock = summarise(replace(log, desired=np.zeros_like(log.desired)))["flock"]
+    assert flock["min_distance_m"] == pytest.approx(math.hypot(0.6, 0.5))
 
 
 def test_table_2_by_hand() -> None:
