@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from flockd.cli import config_new
 from flockd.cli.output import say, say_json
 from flockd.cli.parser import Commands, add_commands
+from flockd.cli.real_drone import add_force, permit
 from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, ModelError
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ def _add_check(commands: Commands) -> None:
     parser = commands("check", "Report all errors in drone and scenario files.", examples)
     parser.add_argument("files", nargs="+", metavar="FILE", type=Path, help="of drones or scenarios")
     parser.add_argument("--json", action="store_true", help="print the problems as JSON")
+    add_force(parser)
     parser.set_defaults(run=_check)
 
 
@@ -54,7 +56,7 @@ def _check(args: argparse.Namespace) -> int:
     results: dict[str, ConfigError | None] = {}
     for file in args.files:
         try:
-            _check_file(file)
+            _check_file(file, force=args.force)
         except ConfigError as error:
             results[str(file)] = error
         else:
@@ -72,9 +74,12 @@ def _check(args: argparse.Namespace) -> int:
     return ExitCode.DONE
 
 
-def _check_file(file: Path) -> None:
-    """Raises ConfigError for what is wrong with the file, and for models that it names and that are not there."""
-    from flockd.core.config import ScenarioConfig, load_with_places
+def _check_file(file: Path, *, force: bool) -> None:
+    """Raises ConfigError for what is wrong with the file, and for models that it names and that are not there.
+
+    Of a real drone also for what is outside the proven envelope, unless that is forced.
+    """
+    from flockd.core.config import ScenarioConfig, load_with_places, outside_envelope
     from flockd.core.config.document import KeyPath
     from flockd.flight.inference.manifest_file import find_manifests, manifest_path, models_folder, read_manifest
 
@@ -106,6 +111,8 @@ def _check_file(file: Path) -> None:
             problems.append(problem(role, f"names a model that cannot be used: {error}"))
     if problems:
         raise ConfigError(problems)
+    if not isinstance(config, ScenarioConfig):
+        permit(outside_envelope(config, places), force=force)
 
 
 def _show(args: argparse.Namespace) -> int:

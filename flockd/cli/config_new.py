@@ -17,6 +17,8 @@ MISSIONS = ("circle_then_tangent", "hover", "velocity", "waypoints", "follow", "
 OBSTACLES = ("none", "forest", "village")
 SOURCES = ("v4l2", "gstreamer", "shared_memory")
 MOST_CAMERAS = 16
+LEAST_MAX_HEIGHT_M, ABOVE_LAYER_M = 10.0, 3.0
+"""The gate's limit of height in a new file: at least, and above the layer of first flights."""
 
 
 def add(commands: Commands) -> None:
@@ -76,6 +78,14 @@ class _Question:
 def _drone_questions() -> tuple[_Question, ...]:
     return (
         _Question("name", "its name in telemetry and recordings", "name of the drone", "drone1", metavar="NAME"),
+        _Question(
+            "number",
+            "its number in the flock, from 1: the layer of its first flights",
+            "number of the drone in its flock",
+            "1",
+            positive_count,
+            "N",
+        ),
         _Question(
             "cameras", "number of cameras, evenly spaced around the drone", "number of cameras", "4", _camera_count, "N"
         ),
@@ -152,12 +162,18 @@ def _add_new(parser: Parser, questions: Sequence[_Question], run: Callable[[argp
 
 def _new_drone(args: argparse.Namespace) -> int:
     from flockd.core.config.new_files import camera_names, new_file, rig_cameras, source_cameras
+    from flockd.core.config.safety import layer_height_m
 
     _refuse_what_is_there(args)
     answers = {question.key: question.answer(args) for question in _drone_questions()}
     names = camera_names(answers["cameras"])
     rig = rig_cameras(dict.fromkeys(names, answers["size"]), answers["field_of_view"])
-    values = answers | {"rig": rig, "cameras": source_cameras(answers["source"], names)}
+    max_height_m = max(LEAST_MAX_HEIGHT_M, layer_height_m(answers["number"]) + ABOVE_LAYER_M)
+    values = answers | {
+        "rig": rig,
+        "max_height": f"{max_height_m:.1f}",
+        "cameras": source_cameras(answers["source"], names),
+    }
     write_checked(args.file, new_file("drone", values, (answers["source"], answers["mission"])))
     return ExitCode.DONE
 

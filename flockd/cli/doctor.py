@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.output import progress, say, say_json, tables_console
 from flockd.cli.parser import Commands, positive_number
+from flockd.cli.real_drone import add_force, load_to_fly
 from flockd.core.errors import ExitCode, UsageError
 from flockd.core.printable import printable
 
@@ -51,14 +52,14 @@ def add(commands: Commands) -> None:
         "--only", metavar="CHECK", action="append", choices=CHECKS, help=f"only this one, of {', '.join(CHECKS)}"
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
+    add_force(parser)
     parser.set_defaults(run=_run)
 
 
 def _run(args: argparse.Namespace) -> int:
-    from flockd.core.config import load_drone
     from flockd.ground.doctor import CHECKS, Level, plan, run_checks
 
-    config = load_drone(args.config)
+    config = load_to_fly(args.config, force=args.force)
     if args.unit is not None and not args.unit.is_file():
         raise UsageError(f"{args.unit}: is no file; name the unit with --unit")
     checks = plan(

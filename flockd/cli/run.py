@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli.parser import Commands
+from flockd.cli.real_drone import add_force, load_to_fly
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ def add(commands: Commands) -> None:
         type=Path,
         help="write a recording of each flight to this folder, which is made; see `recording` in the configuration",
     )
+    add_force(parser)
     parser.set_defaults(run=_run)
 
 
@@ -57,11 +59,10 @@ def _run(args: argparse.Namespace) -> int:
 
 def _run_daemon(args: argparse.Namespace) -> int:
     """Until it is asked to end, with each configuration that it is asked to reload."""
-    from flockd.core.config import load_drone
     from flockd.onboard.daemon import ServiceManager, event_loop_at, only_instance
 
     service = ServiceManager(os.environ)
-    config: DroneConfig | None = load_drone(args.config)
+    config: DroneConfig | None = load_to_fly(args.config, force=args.force)
     if args.record is not None:
         try:
             args.record.mkdir(parents=True, exist_ok=True)
@@ -94,7 +95,6 @@ def _check_limits() -> None:
 
 async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceManager) -> Ending:
     """With SIGTERM and Ctrl-C for standstill, Hold and the end, and SIGHUP for the configuration."""
-    from flockd.core.config import load_drone
     from flockd.flight.inference.hashes import model_hashes
     from flockd.flight.perception import load_networks
     from flockd.onboard.daemon import Daemon, clock_at
@@ -112,7 +112,8 @@ async def _fly(config: DroneConfig, args: argparse.Namespace, service: ServiceMa
     loop = asyncio.get_running_loop()
     loop.add_signal_handler(signal.SIGTERM, daemon.ask_to_stop)
     loop.add_signal_handler(signal.SIGINT, daemon.ask_to_stop)
-    loop.add_signal_handler(signal.SIGHUP, lambda: daemon.ask_to_reload(lambda: load_drone(args.config)))
+    read = functools.partial(load_to_fly, args.config, force=args.force)
+    loop.add_signal_handler(signal.SIGHUP, lambda: daemon.ask_to_reload(read))
     waiting = asyncio.create_task(_say_what_it_waits_for(daemon, WAITING_EVERY_S * config.speed_factor))
     try:
         return await daemon.run()

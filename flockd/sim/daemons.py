@@ -108,7 +108,7 @@ class Daemons:
             file = self._folder / f"{config.name}.yaml"
             values = config.model_dump(mode="json", exclude_defaults=True)
             file.write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
-            options = ["--config", str(file), "--record", str(self._recordings)]
+            options = ["--config", str(file), "--record", str(self._recordings), "--force"]  # a study may go beyond
             self._programs.start(
                 config.name,
                 [sys.executable, "-c", _RUN, "run", *options],

@@ -2,11 +2,13 @@
 
 from flockd.core.config.campaign import CampaignConfig
 from flockd.core.config.drone import DroneConfig
+from flockd.core.config.envelope import outside_envelope
 from flockd.core.config.loader import (
     Overrides,
     load,
     load_campaign,
     load_drone,
+    load_real_drone,
     load_scenario,
     load_with_places,
     schema_of,
@@ -21,7 +23,9 @@ __all__ = [
     "load",
     "load_campaign",
     "load_drone",
+    "load_real_drone",
     "load_scenario",
     "load_with_places",
+    "outside_envelope",
     "schema_of",
 ]

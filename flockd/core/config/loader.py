@@ -13,10 +13,12 @@ from flockd.core.choices import ROLES
 from flockd.core.config.campaign import CampaignConfig
 from flockd.core.config.document import Document, KeyPath, Place, Value, read_document
 from flockd.core.config.drone import DroneConfig
+from flockd.core.config.envelope import outside_envelope
+from flockd.core.config.first_flight import as_flown
 from flockd.core.config.perceived import PerceivedErrors
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.config.validation_messages import path_in_file, problems_of
-from flockd.core.errors import ConfigError
+from flockd.core.errors import ConfigError, ConfigProblem
 
 PATHS = {("perception", key) for key in ("models_dir", "engines_dir", *ROLES)} | {("telemetry", "zenoh_config")}
 """Keys of a drone whose values are paths; of a model's role only where it ends in `.yaml`, else it is a name."""
@@ -37,6 +39,16 @@ def load_drone(path: Path | str, overrides: Overrides | None = None) -> DroneCon
     Raises ConfigError with every problem found.
     """
     return validated(DroneConfig, _drone_document(Path(path), overrides or {}))
+
+
+def load_real_drone(path: Path | str) -> tuple[DroneConfig, list[ConfigProblem]]:
+    """What a real drone flies with, first flights' limits included, and where that is outside the proven envelope.
+
+    Raises ConfigError with every problem found.
+    """
+    document = _drone_document(Path(path), {})
+    config = as_flown(validated(DroneConfig, document))
+    return config, outside_envelope(config, document.places)
 
 
 def load_scenario(path: Path | str, overrides: Overrides | None = None) -> ScenarioConfig:

@@ -8,8 +8,10 @@ from pydantic import Field, model_validator
 
 from flockd.core import services
 from flockd.core.choices import AutopilotMode
-from flockd.core.config.base import Duration, Positive, Section, Share
+from flockd.core.config.base import Duration, Positive, Section, Share, refuse
 
+LOWEST_LAYER_M, LAYERS_APART_M = 3.0, 4.0
+"""Of first flights: a metre more than `vertical_separation_m` for errors of two drones' heights."""
 _Metres = Annotated[float, Field(ge=-100_000, le=100_000)]
 
 
@@ -128,6 +130,10 @@ class SafetyParameters(Section):
     """How long all has to be well before a degraded drone flies as usual again."""
     ask_timeout_s: Annotated[float, Field(gt=0, le=5)] = 2.0
     """How long the autopilot has to leave offboard when asked, before silence makes it."""
+    first_flight_layer: Annotated[int, Field(ge=1, le=100)] | None = None
+    """For first flights: the drone's number in its flock, another for each. A real drone then flies at 1 m/s at most,
+    and at 3 m above the ground at home and 4 m more for each number after 1, whatever its mission says. null: off.
+    Simulated flights ignore it."""
 
     @model_validator(mode="after")
     def _worse_comes_later(self) -> Self:
@@ -140,3 +146,25 @@ class SafetyParameters(Section):
             if getattr(self, mild) > getattr(self, grave):
                 raise ValueError(f"{mild} is above {grave}; write a smaller one")
         return self
+
+    @model_validator(mode="after")
+    def _the_layer_can_be_flown(self) -> Self:
+        layer, gate = self.first_flight_layer, self.gate
+        if layer is None:
+            return self
+        height_m, fault = layer_height_m(layer), ""
+        if not gate.min_height_m <= height_m <= gate.max_height_m:
+            band = f"{gate.min_height_m:g} to {gate.max_height_m:g} m"
+            fault = f"leads to a height of {height_m:g} m, and safety.gate allows {band}; correct one of them"
+        elif gate.vertical_separation_m >= LAYERS_APART_M:
+            fault = (
+                f"puts drones {LAYERS_APART_M:g} m above each other, and gate.vertical_separation_m is not below that; "
+                "write a smaller one there"
+            )
+        refuse(self, {("first_flight_layer",): fault} if fault else {})
+        return self
+
+
+def layer_height_m(layer: int) -> float:
+    """Height above the ground at home of a layer of first flights, counted from 1."""
+    return LOWEST_LAYER_M + (layer - 1) * LAYERS_APART_M

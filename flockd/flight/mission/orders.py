@@ -25,6 +25,8 @@ def order_fault(config: DroneConfig, order: MissionOrder, vehicle: VehicleState 
         return "an order's numbers have to be finite"
     if (order.velocity is None) == (order.place is None and order.place_deg is None):
         return "an order needs a goal or a velocity, and not both"
+    if order.height_m is not None and config.safety.first_flight_layer is not None:
+        return "in first flights each drone keeps to its layer; leave the height out"
     if order.height_m is not None and (fault := fault_of_height(gate, order.height_m + mission.height_offset_m)):
         return f"the order {fault}"
     speed_m_s = math.hypot(*order.velocity) if order.velocity is not None else order.speed_m_s

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from flockd.core.config import DroneConfig
 
 CHECKS = (
+    "limits",
     "instance",
     "memory",
     "disk",
@@ -50,6 +51,7 @@ def plan(
     """
 
     checks: dict[str, tuple[str, tuple[object, ...], float]] = {
+        "limits": ("limit_checks.check_limits", (config,), 5.0),
         "instance": ("service_checks.check_instance", (config.name, environment), 5.0),
         "memory": ("computer_checks.check_memory", (config,), 5.0),
         "disk": ("computer_checks.check_disk", (config, recordings), 20.0),
