@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from flockd.cli import main
-from flockd.core.config import load_drone, load_scenario
+from flockd.core.config import load_drone, load_real_drone, load_scenario
 from flockd.core.data import data_path
 
 
@@ -44,6 +44,19 @@ def test_a_real_drone_hovers_at_a_metre_per_second_at_most_until_its_owner_says_
     assert drone.flocking.max_speed_m_s <= 1.0
     assert drone.autopilot is not None
     assert not drone.autopilot.arm_and_take_off
+
+
+def test_new_drones_of_a_flock_begin_with_first_flights_each_in_its_layer(tmp_path: Path) -> None:
+    heights = []
+    for number in ("1", "2", "9"):
+        file = tmp_path / f"{number}.yaml"
+        assert main(["config", "new", "drone", str(file), "--number", number, "--defaults"]) == 0
+        drone, outside = load_real_drone(file)
+        assert not outside
+        assert drone.flocking.max_speed_m_s <= 1.0
+        heights.append(drone.mission.height_m)
+    assert heights == [3.0, 7.0, 35.0]
+    assert load_real_drone(data_path("config") / "quadrotor.yaml")[0].mission.height_m == 3.0
 
 
 @pytest.mark.parametrize("source", ["v4l2", "gstreamer", "shared_memory"])

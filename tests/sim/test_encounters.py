@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
+from flockd.core.config.envelope import PROVEN_M_S
 from flockd.core.config.safety import GateParameters
 from flockd.core.config.scenario import StartConfig, VehicleConfig
 from flockd.core.messages import FloatArray, Neighbour, Wanted
@@ -124,7 +125,15 @@ def nearest_m(seed: int, speed_m_s: float) -> float:
     return nearest
 
 
-@pytest.mark.parametrize("speed_m_s", [1.5, 2.0, 3.0])
+SPEEDS_M_S = 1.5, 2.0, 3.0
+
+
+def test_the_envelope_of_real_drones_is_what_flies_here() -> None:
+    assert max(SPEEDS_M_S) == FlockingLaw().parameters.max_speed_m_s == PROVEN_M_S["flocking", "max_speed_m_s"]
+    assert GATE.max_speed_m_s == PROVEN_M_S["safety", "gate", "max_speed_m_s"]
+
+
+@pytest.mark.parametrize("speed_m_s", SPEEDS_M_S)
 def test_drones_that_meet_head_on_stay_apart(speed_m_s: float) -> None:
     """At least 1 m apart at every instant, with 5 % of range error, 5 % missed and a step every half second."""
     assert min(nearest_m(seed, speed_m_s) for seed in range(12)) >= 1.0

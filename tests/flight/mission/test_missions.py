@@ -265,6 +265,16 @@ def test_an_order_that_cannot_be_flown_is_refused_with_the_reason(
     assert order_fault(config, order, None) is not None
 
 
+def test_in_first_flights_no_order_takes_a_drone_out_of_its_layer(config: DroneConfig) -> None:
+    vehicle = VehicleState(0.0, np.eye(3), 5.0, np.zeros(3), ORIGIN)
+    order = MissionOrder(place=np.array([9.0, 0.0]), height_m=7.0)
+    assert order_fault(config, order, vehicle) is None
+    first = config.safety.model_copy(update={"first_flight_layer": 1})
+    config = config.model_copy(update={"safety": first})
+    assert "keeps to its layer" in str(order_fault(config, order, vehicle))
+    assert order_fault(config, replace(order, height_m=None), vehicle) is None
+
+
 def test_a_velocity_that_leads_out_of_the_fence_is_refused_and_one_back_is_not(config: DroneConfig) -> None:
     edge = VehicleState(0.0, np.eye(3), 5.0, np.zeros(3), np.array([98.0, 0.0]))
     outward, inward = (MissionOrder(velocity=np.array([speed, 0.0])) for speed in (1.5, -1.5))

@@ -1,0 +1,158 @@
+"""A real drone flies no faster than was shown to be safe, and slowly and in a layer of its own at first."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+
+import pytest
+
+from flockd.cli import main
+from flockd.core.config import DroneConfig, load_drone, load_real_drone
+from flockd.core.errors import ConfigError
+
+CONFIG = Path(__file__).parents[3] / "config"
+RIG = """\
+rig:
+  cameras:
+    - name: front
+      size_px: [640, 480]
+      intrinsics: {fx: 320, fy: 320.0, cx: 320, cy: 240}
+"""
+AUTOPILOT = "autopilot: {max_velocity_trim_m_s: 0.5}\n"
+FLOCK = range(1, 6)
+SEPARATION_M = 3.0
+"""Nearer above or below than this counts as at one height: the lower is in the other's downwash."""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "drone.yaml"
+
+
+def _write(file: Path, law: float = 3.0, gate: float = 4.0, more: str = AUTOPILOT) -> str:
+    file.write_text(
+        f"{RIG}flocking:\n  max_speed_m_s: {law}\nsafety:\n  gate:\n    max_speed_m_s: {gate}\n{more}", encoding="utf-8"
+    )
+    return str(file)
+
+
+def _flown(file: Path, layer: int, mission: str, law: float = 3.0) -> DroneConfig:
+    text = f"safety: {{first_flight_layer: {layer}}}\nflocking: {{max_speed_m_s: {law}}}\nmission: {mission}\n"
+    file.write_text(RIG + AUTOPILOT + text, encoding="utf-8")
+    return load_real_drone(file)[0]
+
+
+@pytest.mark.parametrize("command", [["config", "check"], ["doctor", "--config"], ["run", "--config"]], ids=" ".join)
+def test_a_speed_outside_the_envelope_is_refused_with_its_line(
+    command: list[str], file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*command, _write(file, law=5.0, gate=6.0)]) == 78
+    assert capsys.readouterr().err == (
+        f"{file}:7: flocking.max_speed_m_s: 5 m/s is above the 3 m/s up to which drones were shown to keep apart; "
+        "write 3 or less, or go beyond it with --force\n"
+        f"{file}:10: safety.gate.max_speed_m_s: 6 m/s is above the 4 m/s up to which drones were shown to keep apart; "
+        "write 4 or less, or go beyond it with --force\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("command", "then"),
+    [
+        (["config", "check"], (0, "")),
+        (["doctor", "--only", "memory", "--config"], (0, "")),
+        (["run", "--config"], (78, "{file}: source: is missing")),
+    ],
+    ids=["config check", "doctor", "run"],
+)
+def test_force_goes_beyond_it_with_a_warning(
+    command: list[str], then: tuple[int, str], file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*command, _write(file, law=3.1), "--force"]) == then[0]
+    warning, _, rest = capsys.readouterr().err.partition("\n")
+    assert warning == (
+        f"warning: {file}:7: flocking.max_speed_m_s: 3.1 m/s is above the 3 m/s up to which drones were shown to keep "
+        "apart; --force goes beyond it"
+    )
+    assert then[1].format(file=file) in rest
+
+
+@pytest.mark.parametrize(
+    ("law", "gate", "refused"),
+    [(3.0, 4.0, 0), (3.001, 4.0, 1), (3.0, 4.001, 1), (1.0, 9.0, 1), (3.5, 4.5, 2)],
+)
+def test_the_envelope_ends_where_the_encounters_did(law: float, gate: float, refused: int, file: Path) -> None:
+    _write(file, law, gate)
+    assert len(load_real_drone(file)[1]) == refused
+
+
+def test_defaults_and_shipped_drones_are_inside_and_studies_may_go_beyond(file: Path) -> None:
+    file.write_text(RIG + AUTOPILOT, encoding="utf-8")
+    for inside in (file, CONFIG / "quadrotor.yaml", CONFIG / "px4_sitl.yaml", CONFIG / "simulator.yaml"):
+        assert load_real_drone(inside)[1] == []
+    assert main(["config", "check", _write(file, law=9.0, gate=9.0, more="")]) == 0, "it has no autopilot to fly"
+
+
+@pytest.mark.parametrize(
+    "mission",
+    [
+        "{kind: hover, height_m: 20.0}",
+        "{kind: velocity, velocity_m_s: [2.0, -1.5], height_offset_m: 2.0}",
+        "{speed_m_s: 3.0}",
+        "{kind: waypoints, speed_m_s: 2.0, waypoints: [{north_m: 9, east_m: 0, height_m: 5, speed_m_s: 3},"
+        " {north_m: 0, east_m: 0, speed_m_s: 0.5}]}",
+    ],
+    ids=["hover", "velocity", "circle", "waypoints"],
+)
+def test_first_flights_are_slow_and_in_layers_whatever_the_mission(mission: str, file: Path) -> None:
+    flock = [_flown(file, layer, mission) for layer in FLOCK]
+    heights = [(drone.mission.height_m or math.nan) + drone.mission.height_offset_m for drone in flock]
+    assert heights[0] == 3.0
+    for one, other in itertools.combinations(heights, 2):
+        assert abs(one - other) > SEPARATION_M + 0.5
+    for drone in flock:
+        assert [place.height_m for place in drone.mission.waypoints] == [None] * len(drone.mission.waypoints)
+        assert drone.flocking.max_speed_m_s == 1.0
+        speeds = [drone.mission.speed_m_s, *(place.speed_m_s or 0.0 for place in drone.mission.waypoints)]
+        assert max(*speeds, math.hypot(*(drone.mission.velocity_m_s or (0.0, 0.0)))) <= 1.0
+        assert DroneConfig.model_validate(drone.model_dump()) == drone, "recordings hold what was flown"
+
+
+def test_first_flights_change_the_drones_flight_alone(file: Path) -> None:
+    flown = _flown(file, 2, "{kind: velocity, speed_m_s: 0.8, velocity_m_s: [0.6, 0.5]}", law=0.8)
+    assert flown.mission.velocity_m_s == (0.6, 0.5), "slow already"
+    assert flown.flocking.max_speed_m_s == 0.8
+    as_written = load_drone(file)
+    assert as_written.mission.height_m is None, "for a simulation"
+    assert flown.safety == as_written.safety
+
+
+@pytest.mark.parametrize(
+    ("safety", "told"),
+    [
+        ("{first_flight_layer: 8}", "leads to a height of 31 m, and safety.gate allows 1 to 30 m"),
+        ("{first_flight_layer: 1, gate: {min_height_m: 3.5}}", "leads to a height of 3 m, and safety.gate allows 3.5"),
+        ("{first_flight_layer: 1, gate: {vertical_separation_m: 4.0}}", "puts drones 4 m above each other"),
+        ("{first_flight_layer: 0}", "0 is not at least 1"),
+    ],
+)
+def test_a_layer_that_cannot_be_flown_is_refused(safety: str, told: str, file: Path) -> None:
+    file.write_text(f"{RIG}safety: {safety}\n", encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load_real_drone(file)
+    (problem,) = caught.value.problems
+    assert (problem.line, problem.key) == (6, "safety.first_flight_layer")
+    assert told in problem.message
+
+
+def test_doctor_says_whether_it_is_a_first_flight(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for text, told in (
+        ("safety: {first_flight_layer: 3}\n", "on: layer 3, 11 m above the ground at home, 1 m/s at most"),
+        ("", "off: 3 m/s at most"),
+    ):
+        file.write_text(RIG + AUTOPILOT + text, encoding="utf-8")
+        assert main(["doctor", "--config", str(file), "--only", "limits"]) == 0
+        assert f"PASS  first flight  {told}" in capsys.readouterr().out
+    assert main(["doctor", "--config", _write(file, law=3.5), "--only", "limits", "--force"]) == 0
+    assert "WARNING  flocking.max_speed_m_s  3.5 m/s is above the 3 m/s" in capsys.readouterr().out
