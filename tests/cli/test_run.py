@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import json
+import os
 import re
 import shutil
 import signal
@@ -19,7 +21,10 @@ import pytest
 import yaml
 
 from flockd.cli import main
+from flockd.core.config import DroneConfig
 from flockd.core.data import data_path
+from flockd.core.errors import ConfigError
+from flockd.onboard.daemon import Ending
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.free_ports import free_endpoint, free_port
 from tests.onboard.autopilot.conftest import HEARTBEAT_S
@@ -214,6 +219,58 @@ def test_a_drone_that_cannot_be_flown_is_bad_configuration(
     config = _written(tmp_path, **{section: None})
     assert main(["run", "--config", str(config)]) == 78
     assert capsys.readouterr().err.splitlines()[-1].startswith(f"{config}: {told}; ")
+
+
+@pytest.mark.parametrize("options", [(), ("--force",)], ids=["checked", "forced"])
+def test_it_flies_in_its_layer_and_reads_no_file_again_that_is_outside_the_envelope(
+    options: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = _written(tmp_path, safety={"first_flight_layer": 2})
+    flown: list[DroneConfig] = []
+    refusals: list[str] = []
+
+    class Grounded:
+        """A daemon that never flies. The file is changed while it runs, and SIGHUP asks it to read it again."""
+
+        def __init__(self, drone: DroneConfig, *_: object, **__: object) -> None:
+            flown.append(drone)
+            self._ended = asyncio.Event()
+            self._again: DroneConfig | None = None
+
+        def waits_for(self) -> None:
+            return None
+
+        def ask_to_stop(self) -> None:
+            self._ended.set()
+
+        def ask_to_reload(self, read: Callable[[], DroneConfig]) -> None:
+            try:
+                self._again = read()
+            except ConfigError as error:
+                refusals.append(str(error))
+            self._ended.set()
+
+        async def run(self) -> Ending:
+            if len(flown) == 1:
+                values = yaml.safe_load(config.read_text())
+                values["flocking"] = {"max_speed_m_s": 3.5}
+                del values["safety"]["first_flight_layer"]
+                config.write_text(yaml.safe_dump(values))
+                os.kill(os.getpid(), signal.SIGHUP)
+                await self._ended.wait()
+            return Ending(self._again)
+
+    monkeypatch.setattr("flockd.onboard.daemon.Daemon", Grounded)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert main(["run", "--config", str(config), *options]) == 0
+    assert (flown[0].mission.height_m, flown[0].flocking.max_speed_m_s) == (7.0, 1.0)
+    told = "flocking.max_speed_m_s: 3.5 m/s is above the 3 m/s"
+    if options:
+        assert [drone.flocking.max_speed_m_s for drone in flown] == [1.0, 3.5]
+        assert told in capsys.readouterr().err
+    else:
+        assert len(flown) == 1
+        assert told in refusals[0]
 
 
 def test_a_file_where_the_recordings_folder_would_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
