@@ -189,6 +189,7 @@ CATALOGUE = (
         "separation wins; never faster than can be braked",
         (
             f"{_HERE}flock.py::test_a_neighbour_comes_too_near",
+            f"{_HERE}encounters.py::test_two_drones_that_meet_head_on_stay_apart[1.5]",
             "tests/flight/safety/test_gate.py::test_two_that_fly_at_each_other_at_3_m_s_stop_before_the_minimum_distance",
         ),
         within_s=1.5,
@@ -434,6 +435,35 @@ CATALOGUE = (
             "tests/flight/pilot/ground/test_contradiction.py",
         ),
         within_s=3.0,
+    ),
+    Fault(
+        48, "head-on", "two drones meet head-on", "at least 1.0 m apart at every instant",
+        (
+            f"{_HERE}encounters.py::test_two_drones_that_meet_head_on_stay_apart[2.0]",
+            "tests/sim/test_encounters.py",
+        ),
+    ),
+    Fault(
+        49, "one-that-does-not-avoid", "a drone that does not avoid stands in the way", "stopped 1.0 m before it",
+        (
+            f"{_HERE}encounters.py::test_a_drone_that_hovers_in_the_way_and_does_not_avoid_is_stopped_before",
+        ),
+    ),
+    Fault(
+        50, "gusts", "gusts up to the limit, and beyond it", "no contact; beyond: slower, then Hold with the reason",
+        (
+            f"{_HERE}encounters.py::test_gusts_up_to_the_limit_do_not_bring_two_drones_together",
+            f"{_HERE}encounters.py::test_gusts_beyond_the_limit_end_in_hold_with_the_reason",
+            "tests/flight/safety/test_response.py",
+        ),
+    ),
+    Fault(
+        51, "autopilot-obeys-late", "an autopilot that obeys late or weakly", "as for gusts",
+        (
+            f"{_HERE}encounters.py::test_two_drones_whose_autopilots_obey_a_little_late_and_weakly_stay_apart",
+            f"{_HERE}encounters.py::"
+            "test_an_autopilot_that_obeys_a_second_late_and_weakly_ends_in_hold_with_the_reason",
+        ),
     ),
     Fault(
         60, "step-exception", "an exception that nobody expected in the pilot's step",

@@ -23,6 +23,9 @@ def surroundings(
 ) -> Surroundings:
     """The surroundings `age_s` after the step that gave the `neighbours`, which fly on at constant velocity.
 
+    One that would have flown through the drone since, to its other side on the level, has braked instead, and counts as
+    where it was: such drones stop before each other, and what has passed is seen behind in the next step.
+
     Caution comes before confirmation: a track limits the speed towards it from its first detection on, by its
     uncertainty. `moved` (3,) m NED is how far the drone itself flew since then; `position` (2,) m from home, `velocity`
     (3,) m/s NED, NaN where not known; `obstacles` (m, 2) m from where the drone was then.
@@ -32,9 +35,15 @@ def surroundings(
         position=position,
         velocity=velocity[:2],
         yaw_rad=yaw_rad,
-        neighbours=np.reshape([one.position + age_s * one.velocity - moved for one in neighbours], (n, 3)),
+        neighbours=np.reshape([_by_now(one.position, age_s * one.velocity, moved) for one in neighbours], (n, 3)),
         neighbour_velocities=np.reshape([one.velocity[:2] for one in neighbours], (n, 2)),
         neighbour_sigmas=np.reshape([(one.position_sigma_m, one.velocity_sigma_m_s) for one in neighbours], (n, 2)),
         height_m=height_m,
         obstacles=obstacles - moved[:2],
     )
+
+
+def _by_now(place: FloatArray, way: FloatArray, moved: FloatArray) -> FloatArray:
+    """(3,) m from the drone, which moved: a neighbour that was at `place` and flew `way` on, or else braked."""
+    flown, braked = place + way - moved, place - moved
+    return braked if flown[:2] @ braked[:2] <= 0 else flown

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from flockd.core.messages import FloatArray, Neighbour
 from flockd.flight.safety import Surroundings
@@ -47,6 +48,34 @@ def test_neighbours_fly_on_and_the_drone_has_moved() -> None:
     np.testing.assert_allclose(around.neighbour_velocities, [[2.0, 4.0], [0.0, -2.0]])
     assert around.neighbour_sigmas is not None
     np.testing.assert_allclose(around.neighbour_sigmas, [[0.1, 0.2], [0.2, 0.4]])
+
+
+@pytest.mark.parametrize(
+    ("velocity", "by_now"),
+    [
+        ([-4.0, 0.0, 0.0], [3.0, 0.0, 0.0]),
+        ([-8.0, 0.0, 0.0], [1.0, 0.0, 0.0]),
+        ([-10.0, 2.0, 2.0], [5.0, 0.0, 0.0]),  # exactly abeam
+        ([-16.0, 0.0, 0.0], [5.0, 0.0, 0.0]),  # it would be 3 m behind
+        ([-16.0, 16.0, 0.0], [5.0, 0.0, 0.0]),
+    ],
+)
+def test_a_neighbour_that_would_have_flown_through_the_drone_has_braked(
+    velocity: list[float], by_now: list[float]
+) -> None:
+    around = told([neighbour(1, [6.0, -2.0, -0.5], velocity, confirmed=False)], np.empty((0, 2)))
+    np.testing.assert_allclose(around.neighbours, [by_now])
+
+
+def test_one_that_passes_below_at_the_drones_place_has_braked_too() -> None:
+    """The gate takes one that is above or below by less than `vertical_separation_m` for one at its height."""
+    around = told([neighbour(1, [6.0, -2.0, 2.0], [-16.0, 0.0, 0.0], confirmed=True)], np.empty((0, 2)))
+    np.testing.assert_allclose(around.neighbours, [[5.0, 0.0, 2.5]])
+
+
+def test_one_that_the_drone_itself_has_passed_is_behind() -> None:
+    around = told([neighbour(1, [0.5, -2.0, -0.5], [-2.0, 0.0, 0.0], confirmed=True)], np.empty((0, 2)))
+    np.testing.assert_allclose(around.neighbours, [[-1.5, 0.0, 0.0]])
 
 
 def test_obstacles_stand_still() -> None:

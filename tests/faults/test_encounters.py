@@ -1,0 +1,176 @@
+"""Encounters of whole drones: `flockd run` processes with the shipped networks on rendered images, at fake autopilots.
+
+Each daemon has its own tracker and gate, and knows the other drone by sight only. Simulated time passes so slowly that
+a busy computer keeps up.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flockd.core.config import load_drone, load_scenario
+from flockd.core.config.mission import MissionParameters
+from flockd.core.config.scenario import StartConfig, VehicleConfig
+from flockd.core.data import data_path
+from flockd.core.messages import FloatArray
+from flockd.review.flight_log.metadata import FleetMetadata
+from flockd.sim import autopilots, fleet
+from flockd.sim.ground_station import GroundStation, Poses
+from flockd.sim.vehicles import Vehicles
+from tests.faults.catalogue import RecordProperty
+
+pytestmark = pytest.mark.slow
+SPEED_FACTOR = 0.2
+APART_M = 1.0
+"""What faults 16 and 48 to 51 promise, at every instant."""
+START_M, HEIGHT_M = 12.0, 3.0
+NEAR_M = 5.0
+"""Drones that have been so near have met."""
+CALM = VehicleConfig()
+WEAK = VehicleConfig(max_acceleration_m_s2=CALM.max_acceleration_m_s2 / 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Encounter:
+    """What became of two drones, by their true states many times a second."""
+
+    apart_m: FloatArray
+    """(t,)"""
+    fastest_m_s: float
+    """Of the first drone."""
+    fleet: FleetMetadata
+
+
+Fly = Callable[..., Encounter]
+
+
+@pytest.fixture
+def fly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, record_property: RecordProperty) -> Fly:
+    """Flies two drones for some seconds."""
+    stations: list[GroundStation] = []
+
+    def station(*given: object) -> GroundStation:
+        stations.append(GroundStation(*given))  # type: ignore[arg-type]
+        return stations[-1]
+
+    monkeypatch.setattr(fleet, "GroundStation", station)
+
+    def flown(vehicles: Sequence[StartConfig], duration_s: float, vehicle: VehicleConfig = CALM) -> Encounter:
+        changes = {"vehicles": tuple(vehicles), "duration_s": duration_s, "vehicle": vehicle}
+        seen: list[Poses] = []
+        flight = fleet.fly_fleet(
+            load_scenario(data_path("config") / "head_on.yaml").model_copy(update=changes),
+            load_drone(data_path("config") / "px4_sitl.yaml"),
+            kind="standin",
+            speed_factor=SPEED_FACTOR,
+            logs=tmp_path / "logs",
+            recordings=None,
+            environment=os.environ,
+            progress=lambda done, total: seen.append(stations[-1].poses()),
+        )
+        assert flight.log.metadata.fleet is not None
+        offsets = np.array([poses.position[1] - poses.position[0] for poses in seen])
+        apart_m = np.linalg.norm(offsets, axis=1)
+        record_property("nearest_m", round(float(apart_m.min()), 2))
+        return Encounter(
+            apart_m,
+            max(float(np.linalg.norm(poses.velocity[0, :2])) for poses in seen),
+            flight.log.metadata.fleet,
+        )
+
+    return flown
+
+
+def _drone(north_m: float, north_m_s: float, *, by_hand: bool = False) -> StartConfig:
+    """One that wants to fly north or south, or to hover."""
+    mission = MissionParameters(kind="velocity", velocity_m_s=(north_m_s, 0.0)) if north_m_s else None
+    return StartConfig(
+        position_m=(north_m, 0.0, -HEIGHT_M), mission=mission or MissionParameters(kind="hover"), by_hand=by_hand
+    )
+
+
+def _head_on(speed_m_s: float) -> tuple[StartConfig, StartConfig]:
+    """Near enough to meet before either has been alone for `safety.alone_s`, and asks for Hold."""
+    return _drone(-START_M, speed_m_s), _drone(START_M, -speed_m_s)
+
+
+@pytest.mark.parametrize("speed_m_s", [1.5, 2.0])
+def test_two_drones_that_meet_head_on_stay_apart(speed_m_s: float, fly: Fly) -> None:
+    met = fly(_head_on(speed_m_s), START_M / speed_m_s + 7.0)
+    assert met.fastest_m_s > 0.8 * speed_m_s
+    assert met.apart_m.min() < NEAR_M
+    assert met.apart_m.min() >= APART_M
+    assert met.fleet.handed_over == {}
+
+
+def test_a_drone_that_hovers_in_the_way_and_does_not_avoid_is_stopped_before(fly: Fly) -> None:
+    met = fly((_drone(-START_M, 2.0), _drone(0.0, 0.0, by_hand=True)), 14.0)
+    assert met.fastest_m_s > 1.6
+    assert met.apart_m.min() < NEAR_M
+    assert met.apart_m.min() >= APART_M
+    assert met.fleet.handed_over == {}
+
+
+def test_gusts_up_to_the_limit_do_not_bring_two_drones_together(fly: Fly) -> None:
+    """Each axis deviates by 0.4 m/s, so that drift is 0.57 m/s: below `safety.degraded_gusts_m_s`."""
+    met = fly(_head_on(1.5), 15.0, VehicleConfig(gust_m_s=0.4))
+    assert met.apart_m.min() < NEAR_M
+    assert met.apart_m.min() >= APART_M
+
+
+def test_gusts_beyond_the_limit_end_in_hold_with_the_reason(fly: Fly) -> None:
+    """1.4 m/s of drift, and `safety.max_gusts_m_s` is 0.8."""
+    met = fly(_head_on(1.0), 10.0, VehicleConfig(gust_m_s=1.0))
+    assert met.apart_m.min() >= APART_M
+    _held_for_what_carries_them_off(met)
+
+
+class _Late(Vehicles):
+    """Obeys setpoints some time after they came."""
+
+    def __init__(self, delay_s: float, starts: Sequence[StartConfig], config: VehicleConfig, *, seed: int) -> None:
+        super().__init__(starts, config, seed=seed)
+        self._delay_s, self._now_s, self._obeyed = delay_s, 0.0, np.zeros((1, 2))
+        self._waiting: deque[tuple[float, FloatArray]] = deque()
+
+    def step(
+        self, setpoints: FloatArray, yaw_setpoints: FloatArray, interval_s: float, heights: FloatArray | None = None
+    ) -> None:
+        self._now_s += interval_s
+        self._waiting.append((self._now_s + self._delay_s, setpoints))
+        while self._waiting[0][0] <= self._now_s:
+            self._obeyed = self._waiting.popleft()[1]
+        super().step(self._obeyed, yaw_setpoints, interval_s, heights)
+
+
+def test_two_drones_whose_autopilots_obey_a_little_late_and_weakly_stay_apart(
+    fly: Fly, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(autopilots, "Vehicles", partial(_Late, 0.3))
+    met = fly(_head_on(1.5), 15.0, WEAK)
+    assert met.apart_m.min() < NEAR_M
+    assert met.apart_m.min() >= APART_M
+
+
+def test_an_autopilot_that_obeys_a_second_late_and_weakly_ends_in_hold_with_the_reason(
+    fly: Fly, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(autopilots, "Vehicles", partial(_Late, 1.0))
+    met = fly(_head_on(2.0), 10.0, WEAK)
+    assert met.apart_m.min() >= APART_M
+    _held_for_what_carries_them_off(met)
+
+
+def _held_for_what_carries_them_off(met: Encounter) -> None:
+    """Both; said by the daemons themselves."""
+    assert met.fleet.handed_over.keys() == {"drone1", "drone2"}
+    assert all("off its setpoints, more than it can bear" in why for why in met.fleet.handed_over.values())
+    assert all(modes == ["OFFBOARD", "LOITER"] for modes in met.fleet.modes.values())
