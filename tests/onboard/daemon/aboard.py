@@ -28,7 +28,7 @@ from flockd.core.config.source import SharedMemoryParameters, SourceParameters
 from flockd.core.config.telemetry import OperatorCommand, TelemetryParameters
 from flockd.core.messages import Float32Array, Frame, UInt8Array
 from flockd.fleet.watcher import FleetWatcher, Heard
-from flockd.flight.geometry import RigCamera
+from flockd.flight.geometry import RigCamera, ZMap
 from flockd.flight.perception import Crop, RangeEstimate, SceneMaps
 from flockd.onboard.autopilot.refusal_reasons import REASONS
 from flockd.onboard.daemon import Daemon, Ending, ServiceManager
@@ -91,7 +91,7 @@ class TinyPerceiver:
         height, width = frame.image.shape[:2]
         rows, columns = np.mgrid[0:height, 0:width]
         depth = (5.0 + 0.02 * rows + 0.01 * columns).astype(np.float32)
-        return SceneMaps(depth, np.zeros((height, width), np.uint8), ())
+        return SceneMaps(ZMap(depth), np.zeros((height, width), np.uint8), ())
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         return ()

@@ -26,7 +26,7 @@ from flockd.core.messages import (
     VehicleState,
     Wanted,
 )
-from flockd.flight.geometry import log_polar, log_polar_covariance
+from flockd.flight.geometry import RangeMap, log_polar, log_polar_covariance
 from flockd.flight.perception import CameraObservation, Observation
 from flockd.flight.pilot import StepTrace
 from flockd.onboard.recording import Recorder, RecordingError
@@ -347,7 +347,7 @@ class Looking:
         cameras = {
             name: CameraObservation(
                 frame.image,
-                np.full((HEIGHT, WIDTH), 3.0, np.float32),
+                RangeMap(np.full((HEIGHT, WIDTH), 3.0, np.float32)),
                 np.zeros((HEIGHT, WIDTH), np.uint8),
                 None,
             )

@@ -55,9 +55,10 @@ def propose_instances(
 ) -> list[Proposal]:
     """What the first stage segments, of each image those of the highest score, in the order of the instances."""
     return [
-        Proposal((name,), roi_of_instance(rig.cameras[name], instance, rules), instance)
+        Proposal((name,), roi, instance)
         for name, scene in scenes.items()
         for instance in best_instances(scene, parameters.max_proposals)
+        if (roi := roi_of_instance(rig.cameras[name], instance, rules)) is not None
     ]
 
 
@@ -132,7 +133,11 @@ def propose_residuals(
             camera = rig.cameras[name]
             most = min(parameters.max_residuals, parameters.max_proposals - len(proposed))
             blobs = largest_blobs(residual, most, parameters.residual_px)
-            proposals += [Proposal((name,), roi_of_instance(camera, blob, rules), blob) for blob in blobs]
+            proposals += [
+                Proposal((name,), roi, blob)
+                for blob in blobs
+                if (roi := roi_of_instance(camera, blob, rules)) is not None
+            ]
     return proposals
 
 

@@ -70,14 +70,17 @@ class Roi:
         return moved < shift and resized < math.log(resize)
 
 
-def roi_of_instance(camera: RigCamera, instance: Instance, rules: CropRules) -> Roi:
-    """Around a box of the first stage."""
+def roi_of_instance(camera: RigCamera, instance: Instance, rules: CropRules) -> Roi | None:
+    """Around a box of the first stage; None where the lens images nothing there."""
     left, top, right, bottom = instance.box
     corners = np.array([[left, top], [right, top], [left, bottom], [right, bottom], instance.centre])
     rays = camera.camera.rays(corners)
     inside = camera.camera.in_image(instance.centre[None])[0] and np.isfinite(rays[4]).all()
-    centre = rays[4] if inside else rays[:4].mean(0) / np.linalg.norm(rays[:4].mean(0))
-    reach = float(np.arccos(np.clip(rays[:4] @ centre, -1, 1)).max())
+    imaged = rays[:4][np.isfinite(rays[:4, 0])]  # a corner may lie outside a fisheye's image circle
+    if not len(imaged):
+        return None
+    centre = rays[4] if inside else imaged.mean(0) / np.linalg.norm(imaged.mean(0))
+    reach = float(np.arccos(np.clip(imaged @ centre, -1, 1)).max())
     far_border = np.array(camera.camera.size) - _BORDER_PX
     cut = bool((instance.box[:2] < _BORDER_PX).any() or (instance.box[2:] > far_border).any())
     half_angle = rules.bounded((rules.cut_margin if cut else rules.first_margin) * reach)
