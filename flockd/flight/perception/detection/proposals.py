@@ -16,7 +16,7 @@ from flockd.core.config.perception import DetectionParameters
 from flockd.core.messages import UNCLASSED, BoolArray, FloatArray, Reason, ReasonKind, UInt8Array, VehicleState
 from flockd.flight.geometry import Rig, log_polar
 from flockd.flight.perception.detection.instances import Instance
-from flockd.flight.perception.detection.roi import CropRules, Roi, angle_between, roi_of_instance
+from flockd.flight.perception.detection.roi import CropRules, Roi, angle_between, pixel_angle, roi_of_instance
 from flockd.flight.perception.maps import SceneMaps
 from flockd.flight.tracking import Prediction
 
@@ -96,10 +96,12 @@ def propose_predictions(
             continue
         range_m = math.exp(log_range)
         covariance = R_body_ned @ prediction.covariance @ R_body_ned.T / range_m**2
-        roi = Roi(bearing, rules.half_angle(prediction.size_m, range_m))
         cameras = tuple(name for name, pixel in rig.pixels_of(place[None]).items() if np.isfinite(pixel).all())
+        if not cameras:
+            continue
+        roi = Roi(bearing, rules.half_angle(prediction.size_m, range_m, pixel_angle(rig, cameras, bearing)))
         found = any(angle_between(roi.direction, bearing) < roi.half_angle for bearing in detected)
-        if cameras and not found:
+        if not found:
             proposals.append(Proposal(cameras, roi, predicted=Predicted(bearing, log_range, covariance)))
     return proposals, reasons
 

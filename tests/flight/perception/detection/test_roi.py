@@ -49,10 +49,20 @@ def test_where_a_lens_images_nothing_the_rest_of_a_box_counts() -> None:
 
 
 def test_a_region_suits_a_drones_size_and_stays_near_the_last_one() -> None:
-    assert RULES.half_angle(0.5, 4.0) == pytest.approx(math.atan(0.68 * 0.125))
-    assert RULES.half_angle(0.5, 4.0, before=0.4) == pytest.approx(0.4 / 1.7)
-    assert RULES.half_angle(0.5, 400.0) == pytest.approx(math.radians(1.0))
-    assert RULES.half_angle(50.0, 1.0) == pytest.approx(math.radians(35.0))
+    assert RULES.half_angle(0.5, 4.0, 0.003) == pytest.approx(math.atan(0.68 * 0.125))
+    assert RULES.half_angle(0.5, 4.0, 0.003, before=0.4) == pytest.approx(0.4 / 1.7)
+    assert RULES.half_angle(0.5, 400.0, 0.003) == pytest.approx(0.012), "4 px of the image"
+    assert RULES.half_angle(50.0, 1.0, 0.003) == pytest.approx(math.radians(35.0))
+
+
+@pytest.mark.parametrize("fov_deg", [25.0, 40.0, 60.0, 90.0])
+def test_the_crop_of_a_small_drone_shows_the_same_pixels_whatever_the_lens_is_said_to_be(fov_deg: float) -> None:
+    """A drone 8 px wide; before the crop was at least 2 degrees wide, 32 px of a lens of 40 degrees."""
+    camera = camera_of(320.0 / math.tan(math.radians(fov_deg / 2)), (640, 480))
+    drone = Instance(1, np.array([320.0, 240.0]), np.array([316.0, 237.0, 324.0, 243.0]), 40.0)
+    roi = roi_of_instance(camera, drone, RULES)
+    assert roi is not None
+    assert math.tan(roi.half_angle) * camera.camera.focal_px == pytest.approx(0.95 * math.hypot(4, 3), rel=0.001)
 
 
 @pytest.mark.parametrize(
