@@ -14,6 +14,7 @@ from flockd.cli import main
 from flockd.core.image_header import image_size
 from flockd.ground.datasets.errors import DatasetError
 from flockd.ground.datasets.image_files import read_image
+from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat
 
 HUGE = 60_000
 
@@ -85,6 +86,33 @@ def test_an_ordinary_image_is_read_as_before(suffix: str, tmp_path: Path) -> Non
     path = tmp_path / f"image{suffix}"
     path.write_bytes(_written(suffix, channels=1 if suffix == ".pgm" else 3))
     np.testing.assert_array_equal(read_image(path), cv2.imread(str(path), cv2.IMREAD_COLOR_RGB))
+
+
+def _with_scans(data: bytes, scans: int) -> bytes:
+    """A progressive JPEG whose last scan comes so many times more."""
+    begin = data.rfind(b"\xff\xc4", 0, data.rfind(b"\xff\xda"))
+    return data[:-2] + data[begin:-2] * scans + data[-2:]
+
+
+@pytest.mark.parametrize(("side", "scans"), [(4096, 7_000), (4096, 80), (64, 7_000)])
+def test_a_jpeg_that_takes_long_for_its_many_scans_is_refused_before_it_is_decoded(
+    side: int, scans: int, tmp_path: Path
+) -> None:
+    """0.46 MB of 4096 x 4096 pixels take a minute and a half. Each scan goes over all pixels."""
+    plain = np.full((side, side), 128, np.uint8)
+    done, data = cv2.imencode(".jpg", plain, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])
+    assert done
+    path = tmp_path / "slow.jpg"
+    path.write_bytes(_with_scans(bytes(data), scans))
+    own = bytes(data).count(b"\xff\xda")
+    with pytest.raises(DatasetError) as refused:
+        read_image(path)
+    told = f"{path}: has {own + scans} scans of {side} x {side} pixels, more than any camera writes; "
+    assert str(refused.value).startswith(told)
+    with pytest.raises(CorruptImageError, match="scans of"):
+        MjpegFormat((side, side)).decode(path.read_bytes())
+    path.write_bytes(bytes(data))
+    assert read_image(path).shape == (side, side, 3), "as an encoder writes it, it is read"
 
 
 def test_a_pipe_is_refused_without_waiting_for_its_writer(tmp_path: Path) -> None:
