@@ -141,8 +141,9 @@ def _check(path: Path, plan: Plan) -> None:
     old, new = _plan_values(path), json.loads(plan.to_json())
     if not isinstance(old, dict):
         raise _no_plan(path, ValueError("it holds something else"))
-    if old != new:
-        key, before, now = next(differences(old, new))
+    difference = next(differences(old, new), None) if old != new else None  # NaN is no difference
+    if difference is not None:
+        key, before, now = difference
         raise UsageError(
             f"{path}: was begun with other flights, as `{key}` was {before} and is {now} now; name another folder with "
             "--out, or put the file back as it was to go on"

@@ -161,6 +161,22 @@ def test_a_plan_that_is_none_is_one_sentence(
     assert "\n" not in str(refused.value)
 
 
+def test_a_plan_with_a_number_that_is_none_is_gone_on_with_or_refused_but_never_a_traceback(
+    plan: Plan, tmp_path: Path
+) -> None:
+    """JSON as Python writes it has NaN, which differs from itself."""
+    flown(plan, tmp_path / "out", Shuffled(1))
+    path = tmp_path / "out" / "campaign.json"
+    path.write_text(path.read_text(encoding="utf-8").replace('"seeds": 6', '"seeds": NaN'), encoding="utf-8")
+    with pytest.raises(UsageError, match=r"`campaign\.seeds` was NaN and is 6 now"):
+        flown(plan, tmp_path / "out", Shuffled(1))
+    nan = Plan(plan.config, {**plan.base, "x": float("nan")})
+    with CampaignFolder(tmp_path / "nan", nan):
+        pass
+    with CampaignFolder(tmp_path / "nan", nan):
+        pass
+
+
 @pytest.mark.parametrize("damage", ["other columns", "other types", "no table", "pipe"])
 @pytest.mark.parametrize("name", ["parts/c0-s0.parquet", "flights.parquet", "timings.parquet"])
 def test_a_table_that_is_another_campaigns_is_one_sentence(damage: str, name: str, plan: Plan, tmp_path: Path) -> None:

@@ -46,6 +46,8 @@ WARNING = 4
 BEFORE_S, AFTER_S = 10.0, 20.0
 """How much of the log is shown before and after the flight."""
 GRID_S = 0.05
+LONGEST_S = 86_400.0
+"""Of a log that is laid on a flight."""
 LEAST_SHARE = 0.6
 """Least share of the commands' squares that the log's setpoints explain where they are laid on each other."""
 LEAST_MOTION_M_S = 0.1
@@ -195,6 +197,8 @@ def _by_setpoints(ulog: UlogContents, path: Path, log: FlightLog, drone: int) ->
     refusal = "cannot be laid on the flight's time, as the recording holds no clock of the autopilot and "
     if len(logged_s) < 2 or len(command_s) < 2 or float(np.std(command, axis=0).max()) < LEAST_MOTION_M_S:
         raise unusable(path, f"{refusal}too little was commanded to tell by")
+    if not 0.0 <= logged_s[-1] - logged_s[0] <= LONGEST_S:
+        raise unusable(path, f"{refusal}its times are damaged: they span more than a day, or run backwards")
     times_s = np.arange(command_s[0], command_s[-1], GRID_S)
     held = command[np.searchsorted(command_s, times_s, side="right") - 1]
     shifts_s = np.arange(logged_s[0] - times_s[-1], logged_s[-1] - times_s[0], GRID_S)

@@ -14,6 +14,8 @@ from flockd.cli import main
 from flockd.core.image_header import image_size
 from flockd.ground.datasets.errors import DatasetError
 from flockd.ground.datasets.image_files import read_image
+from flockd.ground.datasets.tables import read_lines
+from flockd.ground.pictures import read_labels
 from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat
 
 HUGE = 60_000
@@ -121,6 +123,18 @@ def test_a_pipe_is_refused_without_waiting_for_its_writer(tmp_path: Path) -> Non
         read_image(tmp_path / "pipe.png")
     with pytest.raises(DatasetError, match="is not an ordinary file"):
         read_image(Path("/dev/zero"))
+
+
+def test_a_table_or_a_list_of_labels_that_is_a_pipe_is_refused_too(tmp_path: Path) -> None:
+    pipe = tmp_path / "poses.txt"
+    os.mkfifo(pipe)
+    with pytest.raises(DatasetError, match=r"poses\.txt: is not an ordinary file"):
+        read_lines(pipe)
+    with pytest.raises(DatasetError, match=r"poses\.txt: is not an ordinary file"):
+        read_labels(pipe, [])
+    (tmp_path / "endless.txt").symlink_to("/dev/zero")
+    with pytest.raises(DatasetError, match=r"endless\.txt: is not an ordinary file"):
+        read_lines(tmp_path / "endless.txt")
 
 
 def test_a_calibration_from_such_an_image_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

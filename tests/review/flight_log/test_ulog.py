@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -188,6 +189,16 @@ def test_logs_that_cannot_be_of_the_flight_are_refused(tmp_path: Path) -> None:
     other.command_velocity[20:40] = 5.0
     with pytest.raises(UsageError, match="its setpoints are not those of the flight"):
         autopilot_log(read_ulog(path), path, other, 0, None)
+
+
+def test_times_that_a_damaged_log_claims_take_no_memory(tmp_path: Path) -> None:
+    path = _ulog(tmp_path / "log.ulg")
+    ulog = read_ulog(path)
+    setpoints = {name: np.array(values) for name, values in ulog.topics["trajectory_setpoint"].items()}
+    setpoints["timestamp"][-1] = 2**64 - 1
+    damaged = replace(ulog, topics={**ulog.topics, "trajectory_setpoint": setpoints})
+    with pytest.raises(UsageError, match="its times are damaged: they span more than a day, or run backwards"):
+        autopilot_log(damaged, path, _log(), 0, None)
 
 
 def _two_drones() -> FlightLog:
