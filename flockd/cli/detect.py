@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 NOTES = """\
 Larger pictures are resized to 1280 pixels for the networks; boxes are in pixels of the picture.
 --labels: a drone is found when the centre of a detection lies in its box, each box once; any other detection is false.
-A picture or a label file that cannot be read ends the command with exit code 1, before anything is printed."""
+A picture that cannot be read is reported and left out, and the exit code is 1. A label file that cannot be read ends
+the command with exit code 1."""
 
 
 def add(commands: Commands) -> None:
@@ -76,6 +77,7 @@ class _Detected:
 
 
 def _run(args: argparse.Namespace) -> int:
+    from flockd.ground.datasets.errors import DatasetError
     from flockd.ground.pictures import PictureDetector, find_pictures, read_labels
     from flockd.ground.pictures.copies import Copies
 
@@ -91,8 +93,11 @@ def _run(args: argparse.Namespace) -> int:
         if args.out is not None:
             copies = stack.enter_context(Copies(args.out, pictures, args.every, overwrite=args.force))
         detector = PictureDetector(config)
-        detected = list(_detected(args, pictures, labels, detector, cameras, copies))
-    result = _result(detected, measure=labels is not None)
+        left_out: list[str] = []
+        detected = list(_detected(args, pictures, labels, detector, cameras, copies, left_out))
+    if left_out and not detected:
+        raise DatasetError("\n".join(left_out))
+    result = {**_result(detected, measure=labels is not None), "left_out": left_out}
     if args.json:
         say_json(result)
     else:
@@ -100,9 +105,11 @@ def _run(args: argparse.Namespace) -> int:
     unlabelled = 0 if labels is None else sum(one.labels is None for one in detected)
     if unlabelled:
         complain(f"{args.labels}: does not list {unlabelled} of the {len(detected)} pictures; they are not measured")
-    if args.out is not None:
-        complain(f"written: {len(pictures)} {'copies' if len(pictures) > 1 else 'copy'} in {args.out}")
-    return ExitCode.DONE
+    if copies is not None:
+        complain(f"written: {copies.written} {'copy' if copies.written == 1 else 'copies'} in {args.out}")
+    for fault in left_out:
+        complain(f"left out: {fault}")
+    return ExitCode.CHECK_FAILED if left_out else ExitCode.DONE
 
 
 def _detected(
@@ -112,7 +119,10 @@ def _detected(
     detector: PictureDetector,
     cameras: PictureCameras,
     copies: Copies | None,
+    left_out: list[str],
 ) -> Iterator[_Detected]:
+    """In order; what cannot be read is skipped, and why appended to ``left_out``."""
+    from flockd.ground.datasets.errors import DatasetError
     from flockd.ground.pictures.coco_labels import check_size
     from flockd.ground.pictures.drawing import annotated
 
@@ -121,7 +131,15 @@ def _detected(
         done = 0
         for picture in pictures:
             known = None if labels is None else labels.get(picture)
-            for name, image in picture.images(args.every):
+            images = picture.images(args.every)
+            while True:
+                try:
+                    name, image = next(images)
+                except StopIteration:
+                    break
+                except DatasetError as error:
+                    left_out.append(str(error))
+                    break
                 size = (image.shape[1], image.shape[0])
                 if known is not None:
                     check_size(args.labels, name, known, size)

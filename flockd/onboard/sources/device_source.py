@@ -116,6 +116,8 @@ class _Camera:
                     self._capture(device)
             except CameraError as error:
                 self._receiver.fault(self._name, str(error))
+            except Exception as error:  # noqa: BLE001 - the thread's border: a camera that fails so is seen, too
+                self._receiver.fault(self._name, f"{self._name}: cannot be run ({type(error).__name__}: {error})")
             pause_s = _FIRST_PAUSE_S if self._delivered else pause_s
             self._stopping.wait(pause_s)
             pause_s = min(2.0 * pause_s, _LONGEST_PAUSE_S)

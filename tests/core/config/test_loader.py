@@ -162,6 +162,19 @@ def test_an_alias_is_refused_once_and_not_also_for_its_value(tmp_path: Path) -> 
     ]
 
 
+@pytest.mark.parametrize(("escape", "shown"), [("\\0", "0x0000"), ("\\ud800", "0xd800")])
+def test_a_text_that_no_program_takes_is_refused(escape: str, shown: str, tmp_path: Path) -> None:
+    """In a pipeline it killed the camera's thread, after the check had passed it."""
+    source = f"""\
+source:
+  kind: gstreamer
+  cameras:
+    - {{name: front, pipeline: "videotestsrc{escape} ! videoconvert"}}"""
+    assert _drone_problems(tmp_path, _with(source)) == [
+        f"drone.yaml:9: source.cameras[0].pipeline: holds the character {shown}, which no program takes; delete it"
+    ]
+
+
 def test_a_rig_without_cameras_is_refused(tmp_path: Path) -> None:
     assert _drone_problems(tmp_path, "rig:\n  cameras: []\n") == [
         "drone.yaml:2: rig.cameras: has 0 entries; write a list of at least 1 entry"

@@ -69,6 +69,14 @@ def _fault(source: DeviceSource) -> str:
     return str(_until(source, lambda status: status.fault is not None).fault)
 
 
+def test_a_camera_whose_opening_fails_for_a_reason_nobody_expects_is_seen_to_fail(start: Start) -> None:
+    """Its thread ended with a traceback, and its status said nothing."""
+    source = start("words\0", "caps:64x48 1000")
+    failed = _until(source, lambda status: status.fault is not None, "camera0")
+    assert failed.fault == "camera0: cannot be run (ValueError: embedded null byte)"
+    _until(source, lambda status: status.counts.get("received", 0) > 2, "camera1")
+
+
 def test_images_come_with_the_times_of_their_buffers(start: Start) -> None:
     begun_s = time.monotonic()
     source = start("caps:64x48 500 stall")

@@ -32,7 +32,15 @@ from flockd.onboard.recording.reader import decoded_image
 from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat, PackedFormat
 from flockd.onboard.sources.shared_memory import SharedMemorySource
 from flockd.onboard.telemetry.topics import TOPICS
-from tools.checks.fuzzing.mutation import ABSURD_NUMBERS, ABSURD_TEXTS, absurd, any_float, mutated_bytes, mutated_json
+from tools.checks.fuzzing.mutation import (
+    ABSURD_NUMBERS,
+    ABSURD_TEXTS,
+    absurd,
+    any_float,
+    mutated_bytes,
+    mutated_json,
+    nested,
+)
 from tools.checks.fuzzing.target import CORPUS, Check, Target, assert_readable
 
 COMMANDS = ("hold", "land", "goto", "velocity", "resume", "HOLD", "hold ", "hold/land", "__init__")
@@ -142,7 +150,7 @@ def _status(folder: Path) -> Check:
             message = mutated_json(random, examples[topic]) if random.random() < 0.9 else absurd(random)
             payload = json.dumps(message).encode("utf-8", "surrogatepass")
             if random.random() < 0.1:
-                payload = random.choice((mutated_bytes(random, payload), b"[" * 100_000, b"9" * 10_000))
+                payload = random.choice((mutated_bytes(random, payload), nested(random), b"9" * 10_000))
             key = f"flockd/v1/{random.choice(NAMES)}/{random.choice(NAMES)}/{topic}"
             watcher._take_message(_sample(key, payload))
             now_s[0] += random.choice((0.0, 0.1))
