@@ -71,11 +71,11 @@ def _slowed(share: float | None) -> str:
 
 
 def _mission(mission: Mapping[str, Any]) -> str:
-    """Whether the flock's middle arrived, for a mission with a goal."""
+    """Whether the flock's middle, or who leads it by hand, arrived, for a mission with a goal."""
     if mission["arrived"] is None:
         return ""
     when = f"first there after {mission['time_s']:g} s" if mission["time_s"] is not None else "never there"
-    return f"{mission['final_error_m']:.2f} m from the last goal at the end, {when}"
+    return f"{mission['who']} {mission['final_error_m']:.2f} m from the last goal at the end, {when}"
 
 
 def _obstacles(obstacles: Mapping[str, Any]) -> str:

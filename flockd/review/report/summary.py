@@ -109,19 +109,22 @@ def objective_sums(log: FlightLog, position: FloatArray, velocity: FloatArray) -
 def mission_figures(log: FlightLog) -> Json:
     """Whether the flock's true middle is at its last goal at the end, since when, and how far away; null without one.
 
-    The end is that of the mission, where the autopilots land or return then, else that of the flight. `time_s`: the
-    first time that it was there, once that goal was the one to fly to.
+    `who`: the flock's middle, or the drone that leads it by hand, where only that has goals. The end is that of the
+    mission, where the autopilots land or return then, else that of the flight. `time_s`: the first time that it was
+    there, once that goal was the one to fly to.
     """
     mission = log.metadata.mission
-    figures: Json = {"kind": mission.kind, "arrived": None, "time_s": None}
+    who = "the middle" if mission.led_by is None else f"drone{mission.led_by + 1}, by hand,"
+    figures: Json = {"kind": mission.kind, "who": who, "arrived": None, "time_s": None}
     goals = np.flatnonzero(np.isfinite(log.goal).all(axis=1))
     if not len(goals) or not log.has_truth:
         return {**figures, "final_error_m": None}
     last = log.goal[goals[-1]]
-    away_m = np.linalg.norm(log.position[..., :2].mean(axis=1) - last, axis=1)
+    level = log.position[..., :2]
+    away_m = np.linalg.norm((level.mean(axis=1) if mission.led_by is None else level[:, mission.led_by]) - last, axis=1)
     same = np.linalg.norm(log.goal - last, axis=1) <= SAME_GOAL_M
     others = goals[~same[goals]]
-    since = others[-1] + 1 if len(others) else 0
+    since = goals[goals > (others[-1] if len(others) else -1)][0]
     there = np.flatnonzero((away_m <= mission.reached_m) & (np.arange(len(away_m)) >= since))
     return {
         **figures,
