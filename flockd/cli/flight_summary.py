@@ -55,7 +55,7 @@ def _key_figures(summary: Mapping[str, Any]) -> dict[str, str]:
         "speed": _number(summary["realtime_factor"], "x real time", 2),
         "closest two drones": _number(flock["min_distance_m"], "m", 2),
         "slowed by safety gates": "" if summary["gated"] is None else _slowed(summary["slowed_share"]),
-        "order at the end": _number(flock["order_tail"], "of 1", 3),
+        "order at the end": _order(flock),
         "union at the end": _number(flock["union_tail"], "of 1", 2),
         "mission": _mission(summary["mission"]),
         "obstacles": _obstacles(summary["obstacles"]),
@@ -64,6 +64,13 @@ def _key_figures(summary: Mapping[str, Any]) -> dict[str, str]:
         "false neighbours": _number(neighbours["false_per_drone_minute"], "a drone and minute", 2),
     }
     return {name: value for name, value in figures.items() if value}
+
+
+def _order(flock: Mapping[str, Any]) -> str:
+    """Of a flock that flies; one drone has none, and a recording without truth tells nothing of it."""
+    if flock["order_tail"] is None and flock["union_tail"] is not None:
+        return "none, as the flock hovers"
+    return _number(flock["order_tail"], "of 1", 3)
 
 
 def _slowed(share: float | None) -> str:

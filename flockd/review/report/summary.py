@@ -18,6 +18,8 @@ TAIL_S = 10.0
 CONVERGENCE_BAND = {"obj1": 0.05, "obj2": 0.2}
 """How near to its tail mean a sum must stay to have converged."""
 RECALL_RANGE_M = 10.0
+HOVERS_M_S = 0.1
+"""Slower on the mean, a flock has no direction of flight that its drones could share."""
 SAME_GOAL_M = 1e-6
 NEAR_M = 1.0
 """To an obstacle."""
@@ -31,8 +33,8 @@ def summarise(log: FlightLog) -> Json:
     `table2`: absolute errors over all drones, steps and seen neighbours, before and from `circle_until_s`. `table3`:
     convergence of the companion with exact states ("truth") and of this flight ("vision"), null unless the flight goes
     on for 10 s after the circle. `flock`: the smallest distances between drone centres in three dimensions, between
-    steps too (`closest_distances`), and `safety` at all steps; order, union and connectivity are horizontal means over
-    the last 10 s, with the law's observation distance as interaction distance. `neighbours`: the share of all drones
+    steps too (`closest_distances`), and `safety` at all steps; order (null of a flock that hovers), union and connectivity are horizontal means
+    over the last 10 s, with the law's observation distance as interaction distance. `neighbours`: the share of all drones
     within 10 m, at all steps, of which there was a confirmed track, and new false tracks; of drones and steps that were
     recorded. A flight whose perception is "truth" has no perception: its `neighbours` are null and it is itself Table
     3's "truth". Of a recording without truth (`has_truth`) all of these are null. `mission` is `mission_figures`,
@@ -218,10 +220,11 @@ def _flock(log: FlightLog) -> Json:
     nearest = closest_distances(log.position)[:, *pairs].min(axis=1, initial=np.inf)
     tail = np.flatnonzero(_tail(log))
     reach_m = log.metadata.observation_distance_m
+    hovers = np.linalg.norm(log.velocity[tail, :, :2], axis=-1).mean() < HOVERS_M_S
     return {
         "min_distance_m": _finite(nearest.min(initial=np.inf)),
         "min_distance_after_10s_m": _finite(nearest[log.time_s >= 10.0].min(initial=np.inf)),
-        "order_tail": _mean([order(log.velocity[s, :, :2]) for s in tail]),
+        "order_tail": None if hovers else _mean([order(log.velocity[s, :, :2]) for s in tail]),
         "union_tail": _mean([union(log.position[s, :, :2], reach_m) for s in tail]),
         "connectivity_tail": _mean([connectivity(log.position[s, :, :2], reach_m) for s in tail]),
         "safety": _mean([safety(log.position[s]) for s in steps]),

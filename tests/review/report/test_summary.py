@@ -352,6 +352,13 @@ def test_a_mission_has_arrived_where_the_middle_is_at_the_last_goal() -> None:
     assert (nowhere["arrived"], nowhere["time_s"], nowhere["final_error_m"]) == (None, None, None)
 
 
+def test_a_flock_that_hovers_has_no_order() -> None:
+    """Of drones that stand still, what is left of a velocity points anywhere."""
+    log = _hand_made()
+    assert summarise(replace(log, velocity=0.099 * log.velocity))["flock"]["order_tail"] is None
+    assert summarise(replace(log, velocity=0.101 * log.velocity))["flock"]["order_tail"] == pytest.approx(1.0)
+
+
 def test_a_goal_counts_from_when_it_was_ordered() -> None:
     """The middle was 1 m from there at 11 s already; until the order at 11.5 s there was no goal."""
     goal = np.full((STEPS, 2), np.nan)
