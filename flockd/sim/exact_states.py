@@ -20,7 +20,6 @@ from flockd.sim.vehicles import REFERENCE_DEG, Vehicles
 from flockd.sim.worlds.obstacle_worlds import obstacles_of
 from flockd.sim.worlds.obstacles import true_ranges
 
-
 Orders = Mapping[int, Sequence[tuple[float, MissionOrder]]]
 """What operators ordered of a flight's drones, by the drone's number from 0, and when, s; in order of time."""
 

@@ -166,7 +166,12 @@ def _facts(summary: Summary, log: FlightLog) -> list[dict[str, str]]:
     if mission["arrived"] is not None:
         when = "never reached" if mission["time_s"] is None else f"reached at {mission['time_s']:g} s"
         facts.append(
-            _fact("From the last goal", _number(mission["final_error_m"], 2), f"{mission['who'].rstrip(',')}, at the end; {when}", "m")
+            _fact(
+                "From the last goal",
+                _number(mission["final_error_m"], 2),
+                f"{mission['who'].rstrip(',')}, at the end; {when}",
+                "m",
+            )
         )
     obstacles = summary["obstacles"]
     if obstacles["collisions"] is not None:

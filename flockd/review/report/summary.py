@@ -33,14 +33,14 @@ def summarise(log: FlightLog) -> Json:
     `table2`: absolute errors over all drones, steps and seen neighbours, before and from `circle_until_s`. `table3`:
     convergence of the companion with exact states ("truth") and of this flight ("vision"), null unless the flight goes
     on for 10 s after the circle. `flock`: the smallest distances between drone centres in three dimensions, between
-    steps too (`closest_distances`), and `safety` at all steps; order (null of a flock that hovers), union and connectivity are horizontal means
-    over the last 10 s, with the law's observation distance as interaction distance. `neighbours`: the share of all drones
-    within 10 m, at all steps, of which there was a confirmed track, and new false tracks; of drones and steps that were
-    recorded. A flight whose perception is "truth" has no perception: its `neighbours` are null and it is itself Table
-    3's "truth". Of a recording without truth (`has_truth`) all of these are null. `mission` is `mission_figures`,
-    `obstacles` is `obstacle_figures`. `own_account` needs no truth: the recorded drones' own estimates. `gated` and
-    `slowed_share` are as in `FlightMetadata`. `autopilot` names what real daemons flew, and `fleet` holds their
-    figures; null where the simulator ran the pilots.
+    steps too (`closest_distances`), and `safety` at all steps; order (null of a flock that hovers), union and
+    connectivity are horizontal means over the last 10 s, with the law's observation distance as interaction distance.
+    `neighbours`: the share of all drones within 10 m, at all steps, of which there was a confirmed track, and new
+    false tracks; of drones and steps that were recorded. A flight whose perception is "truth" has no perception: its
+    `neighbours` are null and it is itself Table 3's "truth". Of a recording without truth (`has_truth`) all of these
+    are null. `mission` is `mission_figures`, `obstacles` is `obstacle_figures`. `own_account` needs no truth: the
+    recorded drones' own estimates. `gated` and `slowed_share` are as in `FlightMetadata`. `autopilot` names what real
+    daemons flew, and `fleet` holds their figures; null where the simulator ran the pilots.
     """
     metadata, value = log.metadata, log.metadata.model_dump()
     return {
