@@ -181,7 +181,7 @@ def _say(detected: Sequence[_Detected], result: Mapping[str, Any]) -> None:
         console.print(table)
     drones = sum(len(one.detections) for one in detected)
     cost = f"{result['proposals_per_image']:g} proposals and {result['ms_per_image']:g} ms a picture"
-    say(f"{drones} detections in {result['images']} pictures; {cost}")
+    say(f"{drones} {'detection' if drones == 1 else 'detections'} in {_pictures(result['images'])}; {cost}")
     if "boxes" not in result:
         return
     widths = Table("box width, px", "boxes", "found", "found, IoU 0.3", box=None, pad_edge=False)
@@ -189,7 +189,21 @@ def _say(detected: Sequence[_Detected], result: Mapping[str, Any]) -> None:
         widths.add_row(width, str(counts["boxes"]), *(_share(counts, key) for key in ("found", "found_iou30")))
     console.print(widths)
     ap50 = "unknown" if result["ap50"] is None else f"{100 * result['ap50']:.1f} %"
-    say(f"{result['boxes']} boxes; AP50 {ap50}; {result['false_per_500_images']:g} false detections in 500 pictures")
+    say(f"{result['boxes']} boxes; AP50 {ap50}; {_false(result)}")
+
+
+def _false(result: Mapping[str, Any]) -> str:
+    """The rate with what it rests on: few pictures without a false detection prove little."""
+    count, pictures = result["false"], result["measured"]
+    told = f"{count} false {'detection' if count == 1 else 'detections'} in {_pictures(pictures)}"
+    if not pictures:
+        return told
+    low, high = result["false_per_picture_95"]
+    return f"{told}: {result['false_per_picture']:.2g} a picture (95 % interval: {low:.2g} to {high:.2g})"
+
+
+def _pictures(count: int) -> str:
+    return f"{count} {'picture' if count == 1 else 'pictures'}"
 
 
 def _values(found: DetectedDrone) -> tuple[tuple[float, float], tuple[float, float]]:
