@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from flockd.cli import _parser, main
+from flockd.cli import _parser, installing, main
 from flockd.core.errors import ModelError
 
 ROOT = Path(__file__).parents[2]
@@ -250,7 +250,7 @@ def test_a_shell_completes_commands_and_options() -> None:
 @pytest.mark.parametrize(
     ("error", "code", "told"),
     [
-        (ModuleNotFoundError("", name="numba"), 69, "numba is not installed; run: pip install 'flockd[sim]'"),
+        (ModuleNotFoundError("", name="numba"), 69, f"numba is not installed; run: {installing('sim')}"),
         (
             ModelError("models/flow.yaml: sha256: differs; restore it"),
             78,
@@ -268,6 +268,11 @@ def test_what_a_flight_lacks_is_one_sentence(
     monkeypatch.setattr("flockd.cli.sim._scenario", fails)
     assert main(["sim"]) == code
     assert capsys.readouterr().err == f"{told}\n"
+
+
+def test_an_extra_is_added_to_a_checkout_without_freezing_it() -> None:
+    checkout = Path(__file__).parents[2]
+    assert installing("view") == f"{sys.executable} -m pip install -e '{checkout}[view]'"
 
 
 def test_models_in_an_empty_folder_are_unavailable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
