@@ -147,7 +147,7 @@ def test_config_check_finds_models_that_are_not_there(scenario: Path, capsys: py
     assert main(["config", "check", str(scenario)]) == 78
     error = capsys.readouterr().err
     assert error.startswith(f"{drone}:23: perception.flow: flow_in8 is not a known model, as ")
-    assert error.endswith("is missing; write one of flow, flow_int8\n")
+    assert error.endswith("is missing; write one of flow, flow_int8, dis\n")
     drone.write_text(SIMULATOR.replace("flow: flow_int8", "flow: distance_int8"), encoding="utf-8")
     assert main(["config", "check", str(drone)]) == 78
     assert capsys.readouterr().err == (
