@@ -147,7 +147,7 @@ def _add_drone(commands: Commands) -> None:
 def _add_scenario(commands: Commands) -> None:
     examples = (
         "flockd config new scenario my_flight.yaml",
-        "flockd config new scenario my_flight.yaml --drones 3 --duration 30 --mission waypoints --defaults",
+        "flockd config new scenario my_flight.yaml --drones 3 --duration 60 --mission waypoints --defaults",
     )
     parser = commands("scenario", "Write the configuration of a simulated flight.", examples)
     _add_new(parser, _scenario_questions(), _new_scenario)
