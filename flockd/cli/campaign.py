@@ -76,7 +76,7 @@ def _add_rerun(commands: Commands) -> None:
     parser.add_argument("--out", metavar="DIR", type=Path, help="default: FOLDER/reruns/NAME")
     parser.add_argument("--force", action="store_true", help="overwrite an earlier flight in that folder")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
-    parser.set_defaults(run=_rerun, quiet=False, verbose=False)
+    parser.set_defaults(run=_rerun, quiet=False, verbose=False, settings={})
 
 
 def _add_report(commands: Commands) -> None:

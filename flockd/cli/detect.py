@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -171,12 +172,13 @@ def _say(detected: Sequence[_Detected], result: Mapping[str, Any]) -> None:
     from rich.table import Table
 
     console = tables_console()
+    names = _short_names([one.name for one in detected])
     table = Table("picture", "box, px", "probability", "range, m", "size, m", box=None, pad_edge=False)
     for one in detected:
         for found in one.detections:
             box = " ".join(f"{value:.0f}" for value in found.box)
             range_m, size_m = (f"{v:.2f} +- {s:.2f}" for v, s in _values(found))
-            table.add_row(one.name, box, f"{found.probability:.2f}", range_m, size_m)
+            table.add_row(names[one.name], box, f"{found.probability:.2f}", range_m, size_m)
     if table.row_count:
         console.print(table)
     drones = sum(len(one.detections) for one in detected)
@@ -190,6 +192,12 @@ def _say(detected: Sequence[_Detected], result: Mapping[str, Any]) -> None:
     console.print(widths)
     ap50 = "unknown" if result["ap50"] is None else f"{100 * result['ap50']:.1f} %"
     say(f"{result['boxes']} boxes; AP50 {ap50}; {_false(result)}")
+
+
+def _short_names(names: Sequence[str]) -> dict[str, str]:
+    """Each picture's name from the folder on that all are in."""
+    common = os.path.commonpath([Path(name).parent for name in names]) if names else ""
+    return {name: os.path.relpath(name, common or ".") for name in names}
 
 
 def _false(result: Mapping[str, Any]) -> str:

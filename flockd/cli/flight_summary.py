@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,9 +19,11 @@ def report_flight(directory: Path, flight: Flight, args: argparse.Namespace) -> 
     """Saves a flight, writes its report with progress, and shows its summary as --json and --quiet say."""
     from flockd.review.report.flight_folder import REPORT_NAME, save_flight, write_report_files
 
+    metadata = flight.log.metadata.model_copy(update={"settings": args.settings})
+    log = replace(flight.log, metadata=metadata)
     with Phases(quiet=args.quiet, verbose=args.verbose) as phases:
-        save_flight(directory, flight.log, flight.key_frames)
-        summary = write_report_files(directory, flight.log, phases.of("writing the report", "figures"))
+        save_flight(directory, log, flight.key_frames)
+        summary = write_report_files(directory, log, phases.of("writing the report", "figures"))
     if args.quiet and not args.json:
         say(f"{directory / REPORT_NAME}")
         return ExitCode.DONE

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
 
 from flockd.cli.flight_summary import show_summary
-from flockd.cli.output import complain, progress, say_json, tables_console
+from flockd.cli.output import complain, progress, say, say_json, tables_console
 from flockd.cli.parser import Commands
 from flockd.cli.recording_options import opened, require
 from flockd.core.errors import ExitCode, UsageError
@@ -179,7 +179,9 @@ def _compare(args: argparse.Namespace) -> int:
         return ExitCode.DONE
     from rich.table import Table
 
-    table = Table("", *(str(flight) for flight in flights), "difference", box=None, pad_edge=False)
+    for name, flight in zip(("first", "second"), flights, strict=True):
+        say(f"{name}: {flight}")
+    table = Table("figure", "first", "second", "difference", box=None, pad_edge=False)
     for row in rows:
         table.add_row(row.name, *row.cells)
     tables_console().print(table)

@@ -331,9 +331,20 @@ def test_each_flight_has_its_own_folder(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("flockd.review.report.flight_folder.write_report", lambda folder, progress, processes: folder)
+    short = ["sim", "--perception", "truth", "--duration", "2", "--quiet"]
     for expected in ("", "-2", "-3"):
-        assert main(["sim", "--perception", "truth", "--duration", "2", "--quiet"]) == 0
-        assert capsys.readouterr().out == f"out/paper_flight-truth-seed0{expected}/report.html\n"
+        assert main(short) == 0
+        assert capsys.readouterr().out == f"out/paper_flight-truth-duration_2-seed0{expected}/report.html\n"
+    windy = [*short, "--wind", "3,-1.5", "--drones", "3", "--no-gate"]
+    assert main(windy) == 0
+    folder = "out/paper_flight-truth-duration_2-wind_3,-1.5-drones_3-no-gate-seed0"
+    assert capsys.readouterr().out == f"{folder}/report.html\n"
+    assert main(["report", "out/paper_flight-truth-duration_2-seed0", folder]) == 0
+    first, second, heads, *rows = capsys.readouterr().out.splitlines()
+    assert (first, second) == ("first: out/paper_flight-truth-duration_2-seed0", f"second: {folder}")
+    assert heads.split() == ["figure", "first", "second", "difference"]
+    assert "--wind 3,-1.5 differs" in [" ".join(row.split()) for row in rows]
+    assert max(map(len, rows)) <= 80
 
 
 def test_an_interrupted_flight_leaves_its_report_and_can_be_flown_again(
@@ -395,7 +406,7 @@ def test_two_flights_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[
     rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)["rows"]}
     assert (rows["seed"]["first"], rows["seed"]["second"]) == (0, 1)
     assert (rows["flown"]["first"], rows["flown"]["second"], rows["flown"]["difference"]) == (5.0, 6.0, 1.0)
-    assert "neighbours known within 10 m" not in rows, "neither has it"
+    assert "known within 10 m" not in rows, "neither has it"
     assert main(["report", str(tmp_path / "a"), str(tmp_path / "b")]) == 0
     table = capsys.readouterr().out
     assert "+1.0 s" in table

@@ -124,6 +124,8 @@ class FlightMetadata(BaseModel):
     """Whether simulated drones flew through their gates; None where that is not known."""
     slowed_share: float | None = None
     """Share of their time in which gates let drones fly otherwise than their pilots asked for; None: not known."""
+    settings: dict[str, str] = {}
+    """What the command line set otherwise than the scenario's file, by option."""
     interrupted: bool = False
     """It was ended before its time; `duration_s` is what was flown."""
     mission: MissionMetadata
