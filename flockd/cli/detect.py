@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -189,17 +190,18 @@ def _say(detected: Sequence[_Detected], result: Mapping[str, Any]) -> None:
     from rich.table import Table
 
     console = tables_console()
+    names = _short_names([one.name for one in detected])
     table = Table("picture", "box, px", "probability", "range, m", "size, m", box=None, pad_edge=False)
     for one in detected:
         for found in one.detections:
             box = " ".join(f"{value:.0f}" for value in found.box)
             range_m, size_m = (f"{v:.2f} +- {s:.2f}" for v, s in _values(found))
-            table.add_row(one.name, box, f"{found.probability:.2f}", range_m, size_m)
+            table.add_row(names[one.name], box, f"{found.probability:.2f}", range_m, size_m)
     if table.row_count:
         console.print(table)
     drones = sum(len(one.detections) for one in detected)
     cost = f"{result['proposals_per_image']:g} proposals and {result['ms_per_image']:g} ms a picture"
-    say(f"{drones} detections in {result['images']} pictures; {cost}")
+    say(f"{drones} {'detection' if drones == 1 else 'detections'} in {_pictures(result['images'])}; {cost}")
     if "boxes" not in result:
         return
     widths = Table("box width, px", "boxes", "found", "found, IoU 0.3", box=None, pad_edge=False)
@@ -207,7 +209,27 @@ def _say(detected: Sequence[_Detected], result: Mapping[str, Any]) -> None:
         widths.add_row(width, str(counts["boxes"]), *(_share(counts, key) for key in ("found", "found_iou30")))
     console.print(widths)
     ap50 = "unknown" if result["ap50"] is None else f"{100 * result['ap50']:.1f} %"
-    say(f"{result['boxes']} boxes; AP50 {ap50}; {result['false_per_500_images']:g} false detections in 500 pictures")
+    say(f"{result['boxes']} boxes; AP50 {ap50}; {_false(result)}")
+
+
+def _short_names(names: Sequence[str]) -> dict[str, str]:
+    """Each picture's name from the folder on that all are in."""
+    common = os.path.commonpath([Path(name).parent for name in names]) if names else ""
+    return {name: os.path.relpath(name, common or ".") for name in names}
+
+
+def _false(result: Mapping[str, Any]) -> str:
+    """The rate with what it rests on: few pictures without a false detection prove little."""
+    count, pictures = result["false"], result["measured"]
+    told = f"{count} false {'detection' if count == 1 else 'detections'} in {_pictures(pictures)}"
+    if not pictures:
+        return told
+    low, high = result["false_per_picture_95"]
+    return f"{told}: {result['false_per_picture']:.2g} a picture (95 % interval: {low:.2g} to {high:.2g})"
+
+
+def _pictures(count: int) -> str:
+    return f"{count} {'picture' if count == 1 else 'pictures'}"
 
 
 def _values(found: DetectedDrone) -> tuple[tuple[float, float], tuple[float, float]]:

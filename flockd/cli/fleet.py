@@ -36,7 +36,7 @@ def add(commands: Commands) -> None:
     examples = (
         "flockd fleet",
         "flockd fleet --connect tcp/10.0.0.11:7447 --connect tcp/10.0.0.12:7447",
-        "flockd fleet --recordings out/paper-flight-learned-seed1/recordings",
+        "flockd fleet --recordings out/paper_flight-learned-seed1/recordings",
         "flockd fleet goto all 20 -5 --height 4",
         "flockd fleet velocity drone1 0.5 0 --seconds 10",
         "flockd fleet hold all",

@@ -21,7 +21,7 @@ def add(commands: Commands) -> None:
     examples = (
         "flockd foxglove",
         "flockd foxglove --connect tcp/10.0.0.11:7447 --connect tcp/10.0.0.12:7447",
-        "flockd foxglove --recordings out/paper-flight-learned-seed1/recordings",
+        "flockd foxglove --recordings out/paper_flight-learned-seed1/recordings",
     )
     parser = commands("foxglove", "Serve the fleet to Foxglove's app: live, or from recordings.", examples, _NOTES)
     add_server_options(parser, PORT)

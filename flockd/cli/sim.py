@@ -151,6 +151,7 @@ def _roles(text: str) -> frozenset[str]:
 
 def _run(args: argparse.Namespace) -> int:
     _check_options(args)
+    args.settings = _settings_of(args)
     scenario = _scenario(args)
     directory = _folder(scenario, args)
     try:
@@ -297,9 +298,27 @@ def _folder(scenario: ScenarioConfig, args: argparse.Namespace) -> Path:
 
 
 def _folder_name(scenario: ScenarioConfig, args: argparse.Namespace) -> str:
-    swapped = "".join(f"-true-{role}" for role in sorted(args.swap))
-    flown = args.autopilot or f"{args.perception}{swapped}"
-    return f"{_plain(scenario.scenario)}-{flown}-seed{scenario.seed}"
+    set_otherwise = "".join(
+        f"-{option}" if value == "yes" else f"-{option}_{re.sub('[^A-Za-z0-9_.,+-]+', '-', Path(value).name)}"
+        for option, value in args.settings.items()
+        if option != "seed"
+    )
+    return f"{_plain(scenario.scenario)}-{args.autopilot or args.perception}{set_otherwise}-seed{scenario.seed}"
+
+
+def _settings_of(args: argparse.Namespace) -> dict[str, str]:
+    """What options set otherwise than the scenario's file, as text; what differs between two flights of it."""
+    values = {option: getattr(args, option) for option in (*OPTIONS, "drones")}
+    settings = {option: _as_text(value) for option, value in values.items() if value is not None}
+    if args.swap:
+        settings["swap"] = ",".join(sorted(args.swap))
+    return settings if args.gated else {**settings, "no-gate": "yes"}
+
+
+def _as_text(value: object) -> str:
+    if isinstance(value, tuple):
+        return ",".join(_as_text(part) for part in value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _plain(name: str) -> str:

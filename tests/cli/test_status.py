@@ -147,6 +147,6 @@ def test_a_piped_table_is_not_cut_at_80_columns(capsys: pytest.CaptureFixture[st
     sentence = "no heartbeat from the autopilot for 12.5 s, and more words than a line of 80 columns has room for"
     drone = _drone("a", "degraded", reasons=[{"event": "link_lost", "sentence": sentence}])
     tables_console().print(_table(status_rows([drone], NOW_S)))
-    _, row = capsys.readouterr().out.splitlines()
+    _, _, row = capsys.readouterr().out.splitlines()
     assert row.rstrip().endswith(sentence)
     assert row == row.rstrip(), "no padding to the width of a terminal that is not there"

@@ -7,13 +7,19 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from flockd.core import services
-from flockd.core.config.base import Distance, Section, Share, Speed
+from flockd.core.config.base import Distance, Section, Share, Speed, text
 
 
 class AutopilotParameters(Section):
     """How flockd reaches this drone's autopilot, and what it may ask of it."""
 
-    address: Annotated[str, Field(pattern=r"^(udpin|udpout|tcpin|tcpout|serial)://.+:\d+$")] = "udpin://127.0.0.1:14540"
+    address: Annotated[
+        str,
+        text(
+            r"^((udpin|udpout|tcpin|tcpout)://[^/]+|serial:///.+):\d+$",
+            "an address, as in `serial:///dev/ttyAMA0:921600` for a cable and its baud rate, or `udpin://0.0.0.0:14540`",
+        ),
+    ] = "udpin://127.0.0.1:14540"
     """`udpin://` waits for an autopilot that sends to this address; `serial:///dev/ttyS1:921600` is a cable."""
     system_id: Annotated[int, Field(ge=1, le=255)] | None = None
     """The autopilot's MAV_SYS_ID; other systems are ignored. By default that of the first heartbeat received."""

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from flockd.core.config.base import NonNegative, Positive, Section, refuse
+from flockd.core.config.base import Name, NonNegative, Positive, Section, refuse
 
 FlightKindName = Literal["truth", "sight", "control"]
 """How the flights of a campaign are flown."""
@@ -46,7 +46,7 @@ MAX_CONTROL_DRONES = 10_000
 """The most drones in a flight at control level."""
 MAX_VALUES = 1000
 MAX_SEEDS = 1_000_000
-_Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=60)]
+_Name = Annotated[Name, Field(max_length=60)]
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Bound = _Number | Annotated[tuple[_Number, ...], Field(min_length=1, max_length=16)]
 

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from flockd.core.choices import OwnVelocitySource
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.avoidance import ObstacleParameters
-from flockd.core.config.base import Section, refuse
+from flockd.core.config.base import Name, Section, refuse
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.config.geometry import GeometryParameters
 from flockd.core.config.mission import MissionParameters, mission_faults
@@ -30,7 +30,7 @@ from flockd.core.config.tracking import TrackingParameters
 class DroneConfig(Section):
     """Everything one drone's pilot needs."""
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")] = "drone"
+    name: Name = "drone"
     """By which it is known in telemetry and recordings; different for each drone of a fleet."""
     step_s: Annotated[float, Field(gt=0, le=60)] = 0.5
     rig: RigConfig

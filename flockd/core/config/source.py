@@ -8,13 +8,13 @@ from pydantic import Field, model_validator
 
 from flockd.core import services
 from flockd.core.choices import PixelFormat
-from flockd.core.config.base import Section, refuse
+from flockd.core.config.base import Endpoint, Name, PlainName, Section, refuse, text
 
 
 class ControlParameters(Section):
     """One setting of a camera's driver."""
 
-    name: Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
+    name: Annotated[str, text(r"^[a-z0-9_]+$", "a control's name, of small letters, digits and `_`")]
     """As `v4l2-ctl --list-ctrls` prints it."""
     value: int
     """A menu's entry by its number; a switch as 0 or 1."""
@@ -23,9 +23,9 @@ class ControlParameters(Section):
 class CameraDeviceParameters(Section):
     """Where one camera of the rig is plugged in, and how it is run. Its image has the size the rig says."""
 
-    name: Annotated[str, Field(pattern=r"^[a-z0-9_-]+$")]
+    name: PlainName
     """The camera's name in the rig."""
-    device: Annotated[str, Field(pattern=r"^/dev/")] = ""
+    device: Annotated[str, text(r"^/dev/", "a device, as in `/dev/video0` or an entry of `/dev/v4l/by-path`")] = ""
     """For kind `v4l2`: its path, best one of /dev/v4l/by-path."""
     pipeline: Annotated[str, Field(min_length=1)] = ""
     """For kind `gstreamer`: elements as `gst-launch-1.0` takes them, without a sink."""
@@ -44,9 +44,9 @@ class CameraDeviceParameters(Section):
 class SharedMemoryParameters(Section):
     """Where frames come from when another program on this computer takes or draws them."""
 
-    drone: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")] = "drone"
+    drone: Name = "drone"
     """Whose frames: the name under which they are published."""
-    connect: Annotated[tuple[str, ...], Field(min_length=1)] = ("tcp/127.0.0.1:7448",)
+    connect: Annotated[tuple[Endpoint, ...], Field(min_length=1)] = ("tcp/127.0.0.1:7448",)
     """zenoh endpoints of the program that publishes them."""
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
     """How often each camera's frames come; `safety.camera_timeout_periods` counts in these."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flockd.core.choices import Provider
-from flockd.core.config.base import Positive, Section
+from flockd.core.config.base import PlainName, Positive, Section, text
 from flockd.core.errors import ModelError
 from flockd.core.messages import Float32Array
 
@@ -161,11 +161,11 @@ class CropSpec(Section):
 class Manifest(Section):
     """All that is known about one model."""
 
-    name: Annotated[str, Field(pattern=r"^[a-z0-9_-]+$")]
+    name: PlainName
     roles: Annotated[tuple[str, ...], Field(min_length=1)]
     """What it can be used for; who uses it knows what each role needs."""
     file: Annotated[str, Field(min_length=1)]
-    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    sha256: Annotated[str, text(r"^[0-9a-f]{64}$", "a SHA-256, 64 hexadecimal digits in small letters")]
     description: str
     image_scale: Positive = 1.0
     """The images are resized by this factor before they enter. A model of fixed size takes them as large as fits."""

@@ -18,7 +18,7 @@ from flockd.flight.geometry import RigCamera, ZMap, blind_pixels
 from flockd.flight.inference.checks import Deadline, no_deadline
 from flockd.flight.inference.fitting import fit
 from flockd.flight.inference.manifest import Unknown
-from flockd.flight.inference.manifest_file import manifest_path, models_folder
+from flockd.flight.inference.manifest_file import manifest_path, models_folder, models_for
 from flockd.flight.inference.providers import engines_folder
 from flockd.flight.inference.session import OnnxModel
 from flockd.flight.perception.detection.instances import group_instances
@@ -233,7 +233,7 @@ class _Models:
         if role not in model.manifest.roles:
             raise ModelError(
                 f"perception.{role}: model {name!r} fills {', '.join(model.manifest.roles)} and not {role}; "
-                "choose another"
+                f"{_one_of(role, self._folder)}"
             )
         return model
 
@@ -248,8 +248,12 @@ def _what_to_name_instead(name: str, role: Role, path: Path, folder: Path) -> st
         return f"{name} is a model's ONNX file; name the manifest beside it, {Path(name).with_suffix('.yaml')}"
     if "/" in name and not name.endswith(".yaml"):
         return f"{name!r} is no model's name, and no manifest; name the manifest, as in {Path(name) / role}.yaml"
-    at_hand = ", ".join(sorted(p.stem for p in folder.glob("*.yaml"))) or "none at hand"
-    return f"there is no model {name!r} ({path} is missing); choose one of {at_hand}"
+    return f"there is no model {name!r} ({path} is missing); {_one_of(role, folder)}"
+
+
+def _one_of(role: Role, folder: Path) -> str:
+    known = models_for(role, folder)
+    return f"choose one of {', '.join(known)}" if known else "name another"
 
 
 def _in_batches(model: OnnxModel, images: Sequence[UInt8Array]) -> dict[str, Float32Array]:

@@ -152,7 +152,11 @@ def _facts(summary: Summary, log: FlightLog) -> list[dict[str, str]]:
     if summary["drones"] > 1 and summary["has_truth"]:
         facts += [
             _fact("Closest two drones", _number(flock["min_distance_m"], 2), f"in 3D, {_closest(log)}", "m"),
-            _fact("Order", _number(flock["order_tail"], 3), "1 is all flying one way"),
+            _fact(
+                "Order",
+                _number(flock["order_tail"], 3),
+                "the flock hovers" if flock["order_tail"] is None else "1 is all flying one way",
+            ),
             _fact("Union", _number(flock["union_tail"], 2), "1 is one connected flock"),
         ]
     if summary["has_truth"]:
@@ -162,7 +166,12 @@ def _facts(summary: Summary, log: FlightLog) -> list[dict[str, str]]:
     if mission["arrived"] is not None:
         when = "never reached" if mission["time_s"] is None else f"reached at {mission['time_s']:g} s"
         facts.append(
-            _fact("From the last goal", _number(mission["final_error_m"], 2), f"the middle, at the end; {when}", "m")
+            _fact(
+                "From the last goal",
+                _number(mission["final_error_m"], 2),
+                f"{mission['who'].rstrip(',')}, at the end; {when}",
+                "m",
+            )
         )
     obstacles = summary["obstacles"]
     if obstacles["collisions"] is not None:
@@ -358,7 +367,11 @@ _DEFINITIONS = (
         "of the flight with exact states.",
     ),
     ("closest", "Distances are between the drones’ middles, in three dimensions."),
-    ("order", "Mean cosine between the velocities of all pairs over the last 10 s: 1 is all flying one way."),
+    (
+        "order",
+        "Mean cosine between the velocities of all pairs over the last 10 s: 1 is all flying one way. A flock that "
+        "hovers, slower than 0.1 m/s on the mean, has none.",
+    ),
     ("union", "(N − groups) / (N − 1) over the last 10 s, linked within the observation distance: 1 is one flock."),
     (
         "connectivity",

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from flockd.core.config import Overrides, load_drone, load_scenario, schema_of
+from flockd.core.config import Overrides, load_campaign, load_drone, load_scenario, schema_of
 from flockd.core.config.document import core_scalar
 from flockd.core.errors import ConfigError, ConfigProblem, ModelError
 from flockd.flight.perception import load_networks
@@ -491,3 +492,45 @@ def test_the_trim_that_an_error_recommends_is_taken_though_rounding_adds_up(tmp_
     path = tmp_path / "drone.yaml"
     path.write_text(f"{DRONE}{limits}autopilot: {{max_velocity_trim_m_s: 0.1}}\n", encoding="utf-8")
     assert load_drone(path).autopilot is not None
+
+
+def test_a_scenario_without_its_drones_file_has_one_fault_and_no_false_ones(tmp_path: Path) -> None:
+    scenario = tmp_path / "square.yaml"
+    scenario.write_text((CONFIG / "square.yaml").read_text(encoding="utf-8"), encoding="utf-8")
+    with pytest.raises(ConfigError) as refused:
+        load_scenario(scenario)
+    assert str(refused.value).splitlines() == [
+        f"{tmp_path}/simulator.yaml: does not exist; check the path",
+        f"{scenario}:5: drone: names simulator.yaml, which cannot be used; correct it or name another",
+    ]
+
+
+def test_files_of_another_kind_are_refused_by_what_they_are() -> None:
+    campaign = CONFIG / "campaigns" / "nightly.yaml"
+    refusals: tuple[tuple[Callable[[Path], object], Path, str], ...] = (
+        (load_drone, campaign, "is a campaign, and a drone's own file is needed here; `flockd campaign` flies it"),
+        (load_scenario, campaign, "is a campaign, and a scenario is needed here; `flockd campaign` flies it"),
+        (load_campaign, CONFIG / "square.yaml", "is a scenario, and a campaign is needed here; name one with the keys"),
+        (load_campaign, CONFIG / "quadrotor.yaml", "is a drone's own file, and a campaign is needed here; name one"),
+    )
+    for load_file, file, fault in refusals:
+        with pytest.raises(ConfigError) as refused:
+            load_file(file)
+        assert str(refused.value).startswith(f"{file}: {fault}")
+
+
+def test_texts_that_have_to_look_so_say_how(tmp_path: Path) -> None:
+    slips = {
+        "autopilot: {address: /dev/ttyAMA0}": "autopilot.address: /dev/ttyAMA0 is not an address; write an address, "
+        "as in `serial:///dev/ttyAMA0:921600` for a cable and its baud rate, or `udpin://0.0.0.0:14540`",
+        "autopilot: {address: 'serial://ttyAMA0:921600'}": "autopilot.address: 'serial://ttyAMA0:921600' is not an",
+        "telemetry: {listen: ['0.0.0.0:7447']}": "telemetry.listen[0]: '0.0.0.0:7447' is not a zenoh endpoint; write a "
+        "zenoh endpoint, as in `tcp/0.0.0.0:7447`",
+        "name: my drone": "name: my drone is not a name; write my_drone",
+    }
+    for text, told in slips.items():
+        file = tmp_path / "drone.yaml"
+        file.write_text(_with(text), encoding="utf-8")
+        with pytest.raises(ConfigError) as refused:
+            load_drone(file)
+        assert told in str(refused.value)

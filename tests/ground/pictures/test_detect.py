@@ -42,7 +42,7 @@ def test_a_labelled_folder_is_measured(capsys: Capture) -> None:
     result = told_json(capsys, RENDERED, *FOV, "--labels", LABELS)
     assert list(result) == [
         "images", "pictures", "proposals_per_image", "ms_per_image", "boxes", "by_width", "ap50",
-        "false_per_500_images", "left_out",
+         "measured", "false", "false_per_picture", "false_per_picture_95", "left_out",
     ]  # fmt: skip
     assert (result["images"], result["boxes"]) == (10, 9)
     assert result["proposals_per_image"] > 0
@@ -110,7 +110,7 @@ def test_copies_show_what_was_found_and_nothing_is_lost(capsys: Capture, tmp_pat
     out = tmp_path / "drawn"
     for force in ((), ("--force",)):  # the second time, copies of before lie in the folder
         text = told(capsys, 0, "detect", tmp_path, *FOV, "--out", out, *force)
-        assert "1 detections in 1 pictures" in text
+        assert "1 detection in 1 picture;" in text
     assert [path.name for path in out.rglob("*")] == ["a.jpg"]
     before, after = (cv2.imread(str(path)) for path in (tmp_path / "a.jpg", out / "a.jpg"))
     assert before is not None
