@@ -31,8 +31,6 @@ class AutopilotParameters(Section):
     max_gap_s: Annotated[float, Field(gt=0, le=0.9)] = services.SETPOINT.timeout
     """A longer gap between setpoints in offboard flight ends the stream until it is begun anew. Keep it below PX4's
     COM_OF_LOSS_T: PX4 returns to offboard by itself when setpoints come back."""
-    max_heartbeat_age_s: Annotated[float, Field(gt=0, le=10)] = services.HEARTBEAT.timeout
-    """The link counts as lost when no heartbeat has arrived for this long."""
     on_failure: Literal["hold", "land"] = "hold"
     """The mode that flockd requests from the autopilot when it cannot go on."""
     arm_and_take_off: bool = False

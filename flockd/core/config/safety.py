@@ -113,7 +113,10 @@ class SafetyParameters(Section):
     max_gusts_m_s: Positive = 0.8
     """The same, to ask for Hold."""
     heartbeat_timeout_s: Annotated[float, Field(gt=0, le=10)] = services.HEARTBEAT.timeout
-    """The link to the autopilot counts as lost, and flockd falls silent for good."""
+    """The link to the autopilot counts as lost without a heartbeat for this long, and flockd falls silent for good; two
+    of them may be lost while other messages arrive."""
+    link_timeout_s: Annotated[float, Field(gt=0, le=10)] = services.AUTOPILOT.timeout
+    """The same, without any message of the autopilot."""
     neighbours_timeout_s: Annotated[float, Field(gt=0, le=60)] = services.NEIGHBOUR.timeout
     """No confirmed neighbour seen for this long: the drone is alone."""
     alone_s: Duration | None = 10.0

@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 
+from flockd.core import services
 from flockd.core.config import DroneConfig
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.safety import GateParameters
@@ -49,7 +50,7 @@ async def _ask(config: DroneConfig, parameters: AutopilotParameters, heard_s: fl
             found += [failed_from_error("firmware", str(firmware)), signing]
         else:
             found += [failed_from_error("firmware", str(firmware)), *await _parameters(link, config, parameters)]
-        if link.status().heartbeat_age_s <= parameters.max_heartbeat_age_s:
+        if link.status().heartbeat_age_s <= services.HEARTBEAT.timeout:
             found += judge_refusals(await _refusals(link))
             found.append(judge_clock(await _clock(link)))
             found += await _range_finder(link, config)
@@ -99,7 +100,7 @@ async def _parameters(link: AutopilotLink, config: DroneConfig, parameters: Auto
         except AutopilotError as error:
             fix = f"check whether this firmware has {name}, and whether the link loses messages"
             found.append(failed(name, str(error), fix))
-            if link.status().heartbeat_age_s > parameters.max_heartbeat_age_s:
+            if link.status().heartbeat_age_s > services.HEARTBEAT.timeout:
                 found.append(judge_heartbeat(link.system_id, link.status(), parameters))
                 break
         else:
@@ -110,7 +111,7 @@ async def _parameters(link: AutopilotLink, config: DroneConfig, parameters: Auto
 def judge_heartbeat(system_id: int, status: AutopilotStatus, parameters: AutopilotParameters) -> Finding:
     """Heard, and at rest."""
     measured = f"system {system_id} at {parameters.address}, heard {status.heartbeat_age_s:.1f} s ago"
-    if status.heartbeat_age_s > parameters.max_heartbeat_age_s:
+    if status.heartbeat_age_s > services.HEARTBEAT.timeout:
         return failed("heartbeat", f"{measured} and not since", "check the cable, its baud rate, and what else uses it")
     if status.armed:
         return warned("heartbeat", f"{measured}, and armed", "disarm it on the ground before you examine it")
@@ -121,7 +122,7 @@ def judge_signing(responds: bool, heartbeat_age_s: float, parameters: AutopilotP
     """Whether it accepts messages that are not signed (MAVLink 2): flockd's are not, and others' need not be either."""
     if responds:
         return passed("signing", "it accepts unsigned messages of any sender: keep all others off its link")
-    if heartbeat_age_s > parameters.max_heartbeat_age_s:
+    if heartbeat_age_s > services.HEARTBEAT.timeout:
         return warned("signing", "not known: it is not heard any more", "repair the link first")
     measured = "it is heard and does not respond: nothing reaches it, or it accepts signed messages only"
     return failed("signing", measured, "check the cable's other direction; remove the signing key from its SD card")

@@ -9,8 +9,9 @@ from flockd.core.errors import UnavailableError
 from flockd.core.messages import FloatArray
 
 FlightMode = Literal[
-    "manual", "altitude", "position", "hold", "mission", "return", "land", "take-off", "offboard", "other", "unknown"
-]
+    "manual", "stabilized", "acro", "altitude", "position", "hold", "mission", "return", "land", "take-off", "offboard",
+    "other", "unknown"
+]  # fmt: skip
 """PX4's flight modes as flockd tells them apart; unknown: not heard yet."""
 LandedState = Literal["unknown", "ground", "air", "taking off", "landing"]
 
@@ -26,6 +27,8 @@ class AutopilotStatus:
     time_s: float
     heartbeat_age_s: float
     """Since the last heartbeat; infinite before the first."""
+    message_age_s: float
+    """Since its last message of any kind."""
     flight_mode: FlightMode
     armed: bool
     failsafe: bool
@@ -42,6 +45,10 @@ class AutopilotStatus:
     """(3,) metres from the estimator's origin, which is not home."""
     home_ned: FloatArray | None
     """(3,) metres, likewise."""
+    foreign_setpoints: str | None = None
+    """What was seen of setpoints that flockd did not send."""
+    parameter_fault: str | None = None
+    """What is wrong with a parameter that was changed since it was armed."""
 
     @property
     def in_air(self) -> bool:

@@ -330,6 +330,8 @@ TEXTS: tuple[tuple[tuple[str, ...], str], ...] = (
 
 NAVIGATION_STATES: Mapping[FlightMode, int] = {
     "manual": 0,
+    "stabilized": 15,
+    "acro": 10,
     "altitude": 1,
     "position": 2,
     "mission": 3,

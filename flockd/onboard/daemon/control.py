@@ -85,7 +85,9 @@ class Control:
         status, vehicle = self._link.status(), self._link.vehicle_state()
         if vehicle is not None:
             self._history.add(vehicle)
-        inputs = self._input_collector.collect(status, vehicle, self._operator, self._mission_over())
+        inputs = self._input_collector.collect(
+            status, vehicle, self._operator, self._mission_over(), self._streamer.report().fault
+        )
         before, now = self.decision, self._clock()
         self.decision = self._supervisor.step(now, inputs)
         self._begin_or_end_flight(before, vehicle)

@@ -73,7 +73,9 @@ async def open_components(
     )
     stack.push_async_callback(_close_async, link.close)
     gate = Gate(config.safety.gate)
-    streamer = SetpointStreamer(link.send_setpoint, link.status, gate.step, config.autopilot, clock=clock)
+    streamer = SetpointStreamer(
+        link.send_setpoint, link.status, gate.step, config.autopilot, config.safety, clock=clock
+    )
     streamer.start()
     stack.callback(streamer.close)
     history, lag, thermometer = VehicleHistory(), LoopLag(clock), Thermometer()

@@ -392,10 +392,17 @@ class _Parts:
     def _make_room(self) -> None:
         """Deletes this drone's oldest recordings in the folder until a whole file more stays within the quota.
 
-        Only what a recorder wrote: what someone cut or recovered from it stays and does not count.
+        Only what a recorder wrote: what someone cut or recovered from it stays and does not count. So does the flight
+        before this one: somebody may want to know how it ended.
         """
-        others = [path for path in self._first.parent.glob("*.mcap") if path != self.path and self._may_delete(path)]
-        others.sort(key=lambda path: path.stat().st_mtime)
+        flights = {
+            path: facts.get("recording")
+            for path in self._first.parent.glob("*.mcap")
+            if path != self.path and (facts := self._written_by_a_recorder(path))
+        }
+        others = sorted(flights, key=lambda path: path.stat().st_mtime)
+        earlier = [flights[path] for path in others if flights[path] != self._flight["recording"]]
+        others = [path for path in others if flights[path] not in earlier[-1:]]
         room = (self._settings.quota_mb - self._settings.file_mb) * _MB - sum(path.stat().st_size for path in others)
         for path in others:
             if room >= 0:
@@ -404,8 +411,8 @@ class _Parts:
             path.unlink()
             self._tell(f"recording: {path} was deleted, as all recordings may take {self._settings.quota_mb:g} MB")
 
-    def _may_delete(self, path: Path) -> bool:
-        """Whether a recorder of this drone wrote the file; what is no readable file is reported once and left alone."""
+    def _written_by_a_recorder(self, path: Path) -> Mapping[str, str] | None:
+        """What is known of a file that a recorder of this drone wrote; what is no readable file is reported once."""
         try:
             facts = head_of(path)[0].facts if path.is_file() else None  # a pipe would wait for ever to be opened
             why = "is not a file"
@@ -415,8 +422,8 @@ class _Parts:
             if path not in self._skipped:
                 self._skipped.add(path)
                 self._tell(f"recording: {path} was skipped and does not count for the quota: it {why}")
-            return False
-        return facts.get("drone") == self._flight["drone"] and not facts.keys() & EDITED
+            return None
+        return facts if facts.get("drone") == self._flight["drone"] and not facts.keys() & EDITED else None
 
 
 def _step_entries(

@@ -161,6 +161,8 @@ class FlightMessage(TypedDict):
     in_air: bool | None
     heartbeat_age_s: float | None
     """Age of the autopilot's newest heartbeat; null before the first."""
+    heartbeats_lost: int
+    """Of the autopilot's, since the start, while its other messages came."""
     battery_share: float | None
     """0 to 1."""
     height_m: float | None

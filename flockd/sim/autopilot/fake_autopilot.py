@@ -16,7 +16,7 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, Self
 
@@ -100,12 +100,15 @@ class FakeAutopilot:
         self.estimate_ok = True
         self.failing: set[str] = set()
         """PX4's names of further checks that fail; each refuses to arm."""
+        self.wordless = False
+        """True: it refuses without a text or an event."""
         self.silent = False
         """True: as if the cable were cut, in both directions."""
         self.parameters: dict[str, float | int] = {
             "COM_OF_LOSS_T": 1.0,
             "COM_OBL_RC_ACT": 5,
             "COM_LOW_BAT_ACT": 0,
+            "NAV_DLL_ACT": 0,
             "GF_ACTION": 2,
             "GF_MAX_HOR_DIST": 0.0,
             "GF_MAX_VER_DIST": 0.0,
@@ -139,7 +142,12 @@ class FakeAutopilot:
         """When a person last moved them, and forward and right from -1 to 1."""
         self.clock_offset_s = clock_ahead_s - self._clock()
         """Its own clock, of its stamps and of TIMESYNC, less ``clock`` times the speed factor."""
-        self._streams = TelemetryStreams(self._mav, truth, heartbeat_s, home_deg, -self.clock_offset_s, range_finder)
+
+        def streams() -> TelemetryStreams:
+            return TelemetryStreams(self._mav, truth, heartbeat_s, home_deg, -self.clock_offset_s, range_finder)
+
+        self._new_streams = streams
+        self._streams = streams()
         self._heard_s = -math.inf
         """When no packet waited any more: what is taken later came later, whatever the wall clock says."""
         self._lock = threading.RLock()
@@ -181,6 +189,11 @@ class FakeAutopilot:
         return self._mode != self._intended
 
     @property
+    def has_ground_station(self) -> bool:
+        """It hears one on its link, and sends its texts there."""
+        return self.checks.has_ground_station(self._clock())
+
+    @property
     def state(self) -> MotionState:
         """The truth."""
         return self._state
@@ -196,6 +209,28 @@ class FakeAutopilot:
             self._intended = mode
             self._update_mode()
 
+    @property
+    def stream_intervals_s(self) -> Mapping[int, float]:
+        """Seconds between two messages of each kind, by number."""
+        return self._streams.intervals_s
+
+    def lose_heartbeats(self, count: int) -> None:
+        """So many of the next heartbeats do not arrive, while all else does."""
+        self._streams.heartbeats_to_lose = count
+
+    def restart(self) -> None:
+        """It starts anew, on the ground: its clock, its events and the streams it sends begin as at first."""
+        with self._lock:
+            self._disarm()
+            self.clock_offset_s = -self._clock()
+            self.checks = FakeChecks(self._mav)
+            self._streams = self._new_streams()
+
+    def send_from_elsewhere(self, data: bytes) -> None:
+        """It receives a packet of another program, as one on another of its links."""
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.sendto(data, self._socket.getsockname())
+
     def write(self, data: bytes) -> None:
         """Takes what pymavlink has packed."""
         if self.silent:
@@ -206,7 +241,13 @@ class FakeAutopilot:
 
     def _snapshot(self) -> VehicleSnapshot:
         return VehicleSnapshot(
-            self._state, self._mode, self._intended, self._armed, self.estimate_ok, self.battery_share
+            self._state,
+            self._mode,
+            self._intended,
+            self._armed,
+            self.estimate_ok,
+            self.battery_share,
+            self.setpoints[-1][1].velocity if self._mode == "OFFBOARD" and self.setpoints else None,
         )
 
     def _clock(self) -> float:
@@ -220,7 +261,9 @@ class FakeAutopilot:
                 now = self._clock()
                 self._fly(min(now - flown_s, MAX_STEP_S))
                 self._streams.send_due(now, self._snapshot())
-                self.checks.tell_changes(self._failing())
+                if not self.wordless:
+                    self.checks.tell_changes(self._failing())
+                self.checks.announce(now)
             flown_s = now
 
     def _receive_until(self, deadline: float) -> None:
@@ -262,7 +305,7 @@ class FakeAutopilot:
     def _select(self, mode: Mode) -> bool:
         """A mode requested over MAVLink: while armed, only one that can run."""
         if mode == "OFFBOARD" and self._armed and not self._signal():
-            self.checks.say("Offboard not possible: no offboard signal")
+            self.checks.say("Offboard not possible: no offboard signal", self._clock())
             self.checks.deny("commander_modeswitch_not_avail", custom_mode(mode))
             return False
         self.pilot_selects(mode)
@@ -270,11 +313,12 @@ class FakeAutopilot:
 
     def _arm(self) -> bool:
         if self._intended == "OFFBOARD" and not self._signal():
-            self.checks.say("Arming denied: no offboard signal")
+            self.checks.say("Arming denied: no offboard signal", self._clock())
             return False
         if self._failing() - {NO_SETPOINTS}:
-            self.checks.say("Arming denied: Resolve system health failures first")
-            self.checks.deny(CHECKS_FAIL)
+            if not self.wordless:
+                self.checks.say("Arming denied: Resolve system health failures first", self._clock())
+                self.checks.deny(CHECKS_FAIL)
             return False
         self._armed, self._landed_s = True, None
         return True
@@ -355,6 +399,12 @@ class FakeAutopilot:
                 self._mav.timesync_send(own_ns, message.ts1)
             case "PARAM_REQUEST_READ":
                 self._send_parameter(message.param_id)
+            case "PARAM_SET":
+                self._set_parameter(message.param_id, message.param_value)
+            case "HEARTBEAT" if message.type == mavlink.MAV_TYPE_GCS:
+                self.checks.hear_ground_station(self._clock())
+            case "UNKNOWN_412":  # REQUEST_EVENT, which pymavlink does not have
+                self.checks.send_again(*struct.unpack("<HH", bytes(message.get_msgbuf())[10:14]))
             case _:
                 pass
 
@@ -389,6 +439,13 @@ class FakeAutopilot:
             case _:
                 return int(mavlink.MAV_RESULT_UNSUPPORTED)
         return int(mavlink.MAV_RESULT_ACCEPTED if done else mavlink.MAV_RESULT_TEMPORARILY_REJECTED)
+
+    def _set_parameter(self, name: str, wire: float) -> None:
+        """Takes it from whoever sends it, and tells the new value."""
+        value = self.parameters.get(name)
+        if value is not None:
+            self.parameters[name] = struct.unpack("<i", struct.pack("<f", wire))[0] if isinstance(value, int) else wire
+            self._send_parameter(name)
 
     def _send_parameter(self, name: str) -> None:
         value = self.parameters.get(name)

@@ -324,6 +324,16 @@ async def test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe(
         before = len(fake_autopilot.setpoints)
         await ship.until_state("silent")
         assert len(fake_autopilot.setpoints) == before, "one more, and PX4 would be in offboard again"
+        silent = next(event for event in ship.events if event.startswith("silent: "))
+        assert silent.startswith("silent: setpoints ended: the control loop is late, for more than 0.5 s in offboard")
+        assert "; the flight mode is hold" in silent, "the consequence beside the cause, and after it"
+        assert (await ship.ask("ask/resume"))["accepted"] is True
+        await until(lambda: "autopilot_failsafe" in ship.matters(), SECONDS_TO_FAIL)
+        await asyncio.sleep(1.0)
+        assert (ship.state(), len(fake_autopilot.setpoints)) == ("idle", before), "not ready, as nothing is offered"
+        fake_autopilot.pilot_selects("LOITER")
+        await ship.until_state("ready")
+        await ship.flies()
 
 
 async def test_arming_and_taking_off_by_itself_where_configured(tmp_path: Path) -> None:
@@ -336,6 +346,11 @@ async def test_arming_and_taking_off_by_itself_where_configured(tmp_path: Path) 
             assert fake_autopilot.mode == "OFFBOARD"
             assert (await ship.ask("ask/land"))["accepted"] is True
             await until(lambda: fake_autopilot.mode == "LAND", SECONDS_TO_FAIL)
+            await until(lambda: "not_armed" in ship.matters(), SECONDS_TO_FAIL)
+            assert "land_asked" not in ship.matters(), "it was for the flight that is over"
+            fake_autopilot.pilot_arms()
+            fake_autopilot.pilot_selects("TAKEOFF")
+            await ship.until_state("ready")
 
 
 def _wrong() -> DroneConfig:
