@@ -21,7 +21,7 @@ from flockd.onboard.daemon.control import Control
 from flockd.onboard.daemon.host_monitors import LoopLag, Thermometer, WallClock
 from flockd.onboard.daemon.message_sinks import MessageSinks
 from flockd.onboard.daemon.mission_orders import MissionOrders
-from flockd.onboard.daemon.operator_commands import OperatorRequests, command_handler
+from flockd.onboard.daemon.operator_commands import OperatorCommands, OperatorRequests
 from flockd.onboard.daemon.pilot_loop import PilotLoop
 from flockd.onboard.daemon.refusal_watch import RefusalWatch
 from flockd.onboard.daemon.supervisor_inputs import InputCollector
@@ -90,14 +90,16 @@ async def open_components(
     take_off = TakeOff(link, streamer, operator, lambda: control.decision, sinks.event)
     missions = MissionOrders(config, pilot_loop, link.vehicle_state, lambda: control.decision.state)
     loop = asyncio.get_running_loop()
-    handle = command_handler(config.telemetry.commands, operator, missions, loop, sinks.event)
+    commands = OperatorCommands(
+        config.telemetry.commands, operator, missions, loop, sinks.event, identity=telemetry.identity
+    )
     previews = Previews(build_rig(config.rig), lambda: (pilot_loop.frames, pilot_loop.stepped))
-    telemetry.announce(config.name, _about(config), handle, previews.picture)
+    telemetry.announce(config.name, _about(config), commands.handle, previews.picture)
     return Components(
         link=link, gate=gate, streamer=streamer, source=source, pilot_loop=pilot_loop, networks=networks,
         control=control,
         requests=requests, refusals=RefusalWatch(link, sinks.event, clock), take_off=take_off, sinks=sinks,
-        telemetry=telemetry, lag=lag, thermometer=thermometer,
+        telemetry=telemetry, commands=commands, lag=lag, thermometer=thermometer,
         wall_clock=WallClock(sinks.event, time.monotonic), dead_tasks=dead_tasks,
     )  # fmt: skip
 

@@ -97,6 +97,8 @@ def _flight_message(components: Components, now: float) -> FlightMessage:
         silence=stream.silence,
         setpoints_sent=stream.sent,
         setpoints_missed=stream.missed,
+        orders=components.commands.recent(),
+        orders_refused=components.commands.refused,
     )
 
 

@@ -27,6 +27,7 @@ def open_session(
     *,
     settings: Path | None = None,
     shared_memory: bool | None = None,
+    max_message_bytes: int | None = None,
 ) -> zenoh.Session:
     """A session that listens on and connects to these endpoints only, for ever where nobody is there yet.
 
@@ -36,11 +37,15 @@ def open_session(
         connect: zenoh endpoints.
         settings: a file of zenoh's own to begin with: for TLS and access control.
         shared_memory: whether large messages go through it; None: as zenoh or the settings have it.
+        max_message_bytes: longer ones are not received; None: as zenoh or the settings have it.
 
     Raises SessionError.
     """
     try:
-        return zenoh.open(_config(listen, connect, settings, shared_memory))
+        config = _config(listen, connect, settings, shared_memory)
+        if max_message_bytes is not None:
+            config.insert_json5("transport/link/rx/max_message_size", json.dumps(max_message_bytes))
+        return zenoh.open(config)
     except zenoh.ZError as error:
         endpoints = ", ".join([*listen, *connect]) or "no endpoint"
         with_settings = f" with the settings of {settings}" if settings else ""

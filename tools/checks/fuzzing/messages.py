@@ -25,7 +25,7 @@ from flockd.fleet.fleet_status import status_rows
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.autopilot.mavlink_messages import ReceivedMessages
 from flockd.onboard.autopilot.mavsdk_link import RECEIVED
-from flockd.onboard.daemon.operator_commands import OperatorRequests, command_handler
+from flockd.onboard.daemon.operator_commands import OperatorCommands, OperatorRequests
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.mcap_file import RecordingError
 from flockd.onboard.recording.reader import decoded_image
@@ -184,7 +184,8 @@ def _commands(folder: Path) -> Check:
     loop = asyncio.new_event_loop()
     allowed = ("hold", "land", "goto", "velocity")
     orders = ({"north_m": 3.0, "east_m": 1.0, "speed_m_s": 1.0}, {"velocity_ne": [1.0, 0.5], "height_m": 4.0})
-    seeds = [json.dumps(order).encode() for order in orders]
+    ask = {"identity": "d", "operator": "a", "session": "s", "sequence": 1, "time_s": 7.0}
+    seeds = [json.dumps({**ask, "order": order}).encode() for order in orders]
 
     def check(random: Random) -> None:
         said: list[str] = []
@@ -195,7 +196,8 @@ def _commands(folder: Path) -> Check:
         payload = random.choice(seeds)
         if random.random() < 0.7:
             payload = mutated_bytes(random, payload)
-        reply = command_handler(allowed, requests, missions, loop, said.append)(command, payload)
+        commands = OperatorCommands(allowed, requests, missions, loop, said.append, identity="d", clock=lambda: 8.0)
+        reply = commands.handle(command, payload)
         loop.call_soon(loop.stop)
         loop.run_forever()
         assert command in allowed or not reply["accepted"]
