@@ -21,6 +21,7 @@ from flockd.cli import (
     record,
     replay,
     report,
+    ros,
     run,
     sim,
     status,
@@ -41,6 +42,7 @@ EXTRAS = {
     "argcomplete": "completion",
     **dict.fromkeys(("aiohttp", "plotly"), "fleet"),
     "foxglove": "foxglove",
+    "rosbags": "bags",
 }
 
 EXIT_CODES = """\
@@ -108,6 +110,7 @@ def _parser() -> Parser:
         status,
         fleet,
         foxglove,
+        ros,
         doctor,
         sim,
         campaign,
