@@ -21,6 +21,7 @@ from flockd.onboard.ros.message_trees import Tree
 
 HERE_ONLY = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 """Environment of a node that only this computer's find: ROS 2 has no rule of its own about who may publish."""
+NOT_INSTALLED = "there is no rclpy; source a ROS 2, or, with Python 3.11 on x86-64 Linux, pip install 'flockd[ros]'"
 _THREADS = 8
 _TRIGGER = "std_srvs/srv/Trigger"
 _ELEMENT = re.compile(r"(?:sequence<)?([a-z0-9_]+/\w+)(?:, \d+)?>?(?:\[\d*\])?")
@@ -133,20 +134,17 @@ def has_type(kind: str) -> bool:
 
 
 def _rclpy() -> Any:
-    """Raises ModuleNotFoundError without any, UnavailableError for that of another Python."""
+    """Raises UnavailableError without any, and for that of another Python."""
     try:
-        return importlib.import_module("rclpy")
-    except ModuleNotFoundError as error:
-        if error.name == "rclpy":
-            raise
-        raise UnavailableError(
-            f"rclpy cannot be loaded ({error}); source a whole ROS 2, or pip install 'flockd[ros]'"
-        ) from error
+        import rclpy  # noqa: PLC0415 - of an extra, or of a ROS 2 that is sourced
     except ImportError as error:
+        if getattr(error, "name", None) == "rclpy":
+            raise UnavailableError(NOT_INSTALLED) from error
         reason = str(error).splitlines()[0]
         raise UnavailableError(
-            f"rclpy cannot be loaded ({reason}); run flockd with the Python of this ROS 2"
+            f"rclpy cannot be loaded ({reason}); run flockd with the Python of a whole ROS 2"
         ) from error
+    return rclpy
 
 
 def _no_signals() -> Any:
