@@ -15,6 +15,7 @@ DISTRIBUTIONS = {
     "yaml": "pyyaml",
     "zenoh": "eclipse-zenoh",
     "rerun": "rerun-sdk",
+    "rclpy": "ros-rclpy",
     "google": "protobuf",
     "foxglove": "foxglove-sdk",
     "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",

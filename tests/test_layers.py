@@ -16,7 +16,7 @@ ROOMS = ("core", "flight", "onboard", "fleet", "ground", "review", "sim", "campa
 """From the ground up: a room imports itself and rooms below it."""
 FLIGHT = ("geometry", "inference", "tracking", "perception", "flocking", "safety", "obstacles", "mission", "pilot")
 """The order inside `flight`. Mission and obstacles ask for the fence and the half planes of safety."""
-ONBOARD = ("autopilot", "telemetry", "sources", "recording", "daemon")
+ONBOARD = ("autopilot", "telemetry", "ros", "sources", "recording", "daemon")
 """The order inside `onboard`: frames may come over zenoh; recording asks telemetry for the table of topics."""
 
 PURE_ROOMS = ("flight", "core/messages.py", "core/choices.py")
@@ -159,6 +159,7 @@ ZENOH_READERS = {
         ("joblib", {"campaign/process_engine.py"}),
         ("ray", {"campaign/ray_engine.py"}),
         ("foxglove", {"fleet/foxglove"}),
+        ("rclpy", {"onboard/ros/ros_node.py", "onboard/sources/ros_child.py"}),
         ("rerun", {"review/view/flock_file.py", "review/view/rerun_file.py"}),
     ],
 )

@@ -22,6 +22,7 @@ from flockd.cli import (
     record,
     replay,
     report,
+    ros,
     run,
     sim,
     status,
@@ -42,6 +43,7 @@ EXTRAS = {
     "argcomplete": "completion",
     **dict.fromkeys(("aiohttp", "plotly"), "fleet"),
     "foxglove": "foxglove",
+    "rosbags": "bags",
 }
 
 EXIT_CODES = """\
@@ -117,6 +119,7 @@ def _parser() -> Parser:
         status,
         fleet,
         foxglove,
+        ros,
         doctor,
         sim,
         campaign,

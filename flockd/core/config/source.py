@@ -10,6 +10,9 @@ from flockd.core import services
 from flockd.core.choices import PixelFormat
 from flockd.core.config.base import Endpoint, Name, PlainName, Section, refuse, text
 
+_TOPIC = r"^(/[A-Za-z_][A-Za-z0-9_]*)+$"
+"""A whole name of ROS 2."""
+
 
 class ControlParameters(Section):
     """One setting of a camera's driver."""
@@ -29,16 +32,23 @@ class CameraDeviceParameters(Section):
     """For kind `v4l2`: its path, best one of /dev/v4l/by-path."""
     pipeline: Annotated[str, Field(min_length=1)] = ""
     """For kind `gstreamer`: elements as `gst-launch-1.0` takes them, without a sink."""
+    topic: Annotated[str, Field(pattern=_TOPIC)] = ""
+    """For kind `ros`: of sensor_msgs/Image or CompressedImage, as in `/front/image_raw`."""
+    camera_info: Annotated[str, Field(pattern=_TOPIC)] = ""
+    """For kind `ros`: of its CameraInfo, which is compared with the rig; by default `camera_info` beside the images."""
+    stamps: Literal["system", "simulator"] = "system"
+    """For kind `ros`: what the images' stamps are of, this computer's clock or that of a simulator in `/clock`, which
+    has to run in real time."""
     pixel_format: PixelFormat = "mjpeg"
-    """For kind `v4l2`; a pipeline says it itself."""
+    """For kind `v4l2`; pipelines and topics say it themselves."""
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 30.0
     controls: tuple[ControlParameters, ...] = ()
     """For kind `v4l2`: set in this order whenever the camera is opened; what is not named here stays as it was."""
 
     @property
     def place(self) -> str:
-        """Where its images come from: the device or the pipeline."""
-        return self.device or self.pipeline
+        """Where its images come from: the device, the pipeline or the topic."""
+        return self.device or self.pipeline or self.topic
 
 
 class SharedMemoryParameters(Section):
@@ -58,10 +68,10 @@ class SharedMemoryParameters(Section):
 class SourceParameters(Section):
     """Where camera frames come from, and how those of several cameras become sets."""
 
-    kind: Literal["v4l2", "gstreamer", "shared_memory"]
-    """Cameras of the kernel, those behind a GStreamer pipeline each, or another program's frames."""
+    kind: Literal["v4l2", "gstreamer", "ros", "shared_memory"]
+    """Cameras of the kernel, those behind a GStreamer pipeline each, topics of ROS 2, or another program's frames."""
     cameras: tuple[CameraDeviceParameters, ...] = ()
-    """For kinds `v4l2` and `gstreamer`: one for each camera of the rig."""
+    """For all kinds but `shared_memory`: one for each camera of the rig."""
     shared_memory: SharedMemoryParameters = SharedMemoryParameters()
     """For kind `shared_memory`."""
     set_tolerance_s: Annotated[float, Field(gt=0, le=60)] = 0.02
@@ -91,23 +101,34 @@ class SourceParameters(Section):
                     f"silence_s {self.silence_s:g} is less than two frame periods of camera {camera.name!r}; "
                     f"write {2.0 / camera.rate_hz:.3f} or more"
                 )
-        devices = [camera.device for camera in self.cameras if camera.device]
+        devices = [place for camera in self.cameras if (place := camera.device or camera.topic)]
         doubled = {device for device in devices if devices.count(device) > 1}
         if doubled:
-            raise ValueError(f"two cameras share {sorted(doubled)[0]}; give each its own device")
+            raise ValueError(f"two cameras share {sorted(doubled)[0]}; give each its own")
         return self
+
+
+_KEYS = {
+    "v4l2": ("device", "pixel_format", "controls"),
+    "gstreamer": ("pipeline",),
+    "ros": ("topic", "camera_info", "stamps"),
+}
+"""Keys of a camera that only one kind of source has; the first says where the camera is."""
+_LACKS = {
+    "v4l2": "has no `device`; write the camera's path, as `flockd cameras` lists it",
+    "gstreamer": "has no `pipeline`; write elements such as `v4l2src device=/dev/video0`",
+    "ros": "has no `topic`; write that of its images, as `ros2 topic list` shows it",
+}
 
 
 def _misplaced(camera: CameraDeviceParameters, kind: str) -> dict[tuple[str, ...], str]:
     """What a camera of this kind of source must not have, by its key, or what it lacks."""
-    if kind == "v4l2":
-        wrong = {"pipeline": "is of a source of kind `gstreamer`; delete it, or write `kind: gstreamer`"}
-        lacks = "" if camera.device else "has no `device`; write the camera's path, as `flockd cameras` lists it"
-    else:
-        text = "is of a source of kind `v4l2`; let the pipeline say it, and delete this"
-        wrong = dict.fromkeys(("device", "pixel_format", "controls"), text)
-        lacks = "" if camera.pipeline else "has no `pipeline`; write elements such as `v4l2src device=/dev/video0`"
-    faults: dict[tuple[str, ...], str] = {(key,): text for key, text in wrong.items() if key in camera.model_fields_set}
-    if lacks and not faults:
-        faults[()] = lacks
+    faults: dict[tuple[str, ...], str] = {
+        (key,): f"is of a source of kind `{other}`; delete it, or write `kind: {other}`"
+        for other, keys in _KEYS.items()
+        for key in keys
+        if other != kind and key in camera.model_fields_set
+    }
+    if not faults and kind in _KEYS and not getattr(camera, _KEYS[kind][0]):
+        faults[()] = _LACKS[kind]
     return faults

@@ -2,41 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable
-from typing import NamedTuple
 
 import foxglove.messages as fm
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flockd.core.config.rig import CameraConfig, RigConfig
+from flockd.core.config.rig import CameraConfig
+from flockd.fleet.camera_rigs import DroneCamera
 from flockd.fleet.foxglove.fleet_scene import attitude, transform
 from flockd.fleet.page.drone_rows import Row
-from flockd.flight.geometry import RigCamera, build_rig
+from flockd.flight.geometry import RigCamera
 from flockd.onboard.recording import foxglove
-from flockd.onboard.telemetry.topics import AboutMessage
 
 _CENTRE_PX = 0.5
 """Pixel centres lie at whole numbers in Foxglove, and half a pixel farther here."""
-
-
-class DroneCamera(NamedTuple):
-    """One camera of a drone, as its configuration has it."""
-
-    config: CameraConfig
-    mounted: RigCamera
-
-
-def cameras_of(about: AboutMessage | None) -> dict[str, DroneCamera]:
-    """A drone's cameras by name; none where its configuration is not known or cannot be."""
-    try:
-        config = RigConfig.model_validate_json(json.dumps((about or {"configuration": {}})["configuration"].get("rig")))
-        mounted = build_rig(config).cameras
-    except (ValueError, ArithmeticError, RecursionError):  # of a peer of another version, or a hostile one
-        return {}
-    return {camera.name: DroneCamera(camera, mounted[camera.name]) for camera in config.cameras}
 
 
 def frame_of(drone: str, camera: str) -> str:

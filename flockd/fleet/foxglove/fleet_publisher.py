@@ -14,8 +14,9 @@ from foxglove import Channel, Context
 
 from flockd.core.image_header import jpeg_size
 from flockd.core.messages import FloatArray
+from flockd.fleet.camera_rigs import cameras_of
 from flockd.fleet.fleet_status import GONE
-from flockd.fleet.foxglove.drone_cameras import calibration, camera_transforms, cameras_of, frame_of, image, tracks
+from flockd.fleet.foxglove.drone_cameras import calibration, camera_transforms, frame_of, image, tracks
 from flockd.fleet.foxglove.fleet_scene import (
     COLOURS,
     SCENE_TOPICS,
@@ -30,11 +31,12 @@ from flockd.fleet.foxglove.fleet_scene import (
 from flockd.fleet.foxglove.json_rows import fleet_row, fleet_schema, json_schema
 from flockd.fleet.page.drone_rows import Known, Row
 from flockd.fleet.page.fleet_source import Event, FleetSource, events_after
-from flockd.onboard.telemetry.preview import EVERY_S
 from flockd.onboard.telemetry.topics import TOPICS
 
 FLEET, LOG, TRANSFORMS = "/fleet", "/log", "/tf"
 PATH_S = 60.0
+EVERY_S = 1.0
+"""A camera's picture is asked for no oftener."""
 _THREADS = 8
 """That wait for pictures."""
 _CALIBRATION = partial(Channel, schema=fm.CameraCalibration.get_schema(), message_encoding="protobuf")

@@ -1,4 +1,4 @@
-"""Where camera frames come from: devices of this computer, GStreamer pipelines, or another program's shared memory."""
+"""Where camera frames come from: devices of this computer, GStreamer pipelines, ROS 2, or shared memory."""
 
 import time
 from collections.abc import Callable
@@ -6,7 +6,7 @@ from collections.abc import Callable
 from flockd.core.config import DroneConfig
 from flockd.core.errors import ConfigError
 from flockd.onboard.sources.clock import clock_at
-from flockd.onboard.sources.device_source import DeviceSource
+from flockd.onboard.sources.device_source import Devices, DeviceSource
 from flockd.onboard.sources.frames import CameraStatus, Count, FrameSource
 from flockd.onboard.sources.shared_memory import FramePublisher, SharedMemorySource
 
@@ -25,4 +25,5 @@ def open_source(config: DroneConfig, file: str, *, clock: Callable[[], float] = 
     sizes = {camera.name: camera.size_px for camera in config.rig.cameras}
     if config.source.kind == "shared_memory":
         return SharedMemorySource(sizes, config.source, clock)
-    return DeviceSource(sizes, config.source)
+    lenses = {camera.name: camera.intrinsics for camera in config.rig.cameras}
+    return DeviceSource(sizes, config.source, Devices(lenses=lenses))

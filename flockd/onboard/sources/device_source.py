@@ -7,12 +7,15 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from flockd.core.config.rig import IntrinsicsConfig
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
 from flockd.onboard.sources.devices import CameraDevice, CameraError, CapturedBuffer
 from flockd.onboard.sources.frame_receiver import FrameReceiver, ReceivedFrames
 from flockd.onboard.sources.frames import Count, RawFrame
 from flockd.onboard.sources.gstreamer_device import CHILD, GstreamerDevice
 from flockd.onboard.sources.image_formats import CorruptImageError, ImageFormat
+from flockd.onboard.sources.ros_device import CHILD as ROS_CHILD
+from flockd.onboard.sources.ros_device import RosDevice
 from flockd.onboard.sources.v4l2_device import V4l2Device
 from flockd.onboard.sources.v4l2_kernel import Kernel
 
@@ -25,20 +28,25 @@ _STOP_S = 1.0
 
 @dataclass(frozen=True)
 class Devices:
-    """Opens cameras: one with a pipeline by a process of ``command``, all others by the ``kernel``."""
+    """Opens cameras: those with a pipeline or a topic by a process each, all others by the ``kernel``."""
 
     kernel: Kernel = field(default_factory=Kernel)
     command: Sequence[str] = CHILD
+    ros_command: Sequence[str] = ROS_CHILD
+    lenses: Mapping[str, IntrinsicsConfig] = field(default_factory=dict)
+    """Of the rig, by camera: what a topic's CameraInfo must not contradict."""
 
     def open(self, camera: CameraDeviceParameters, size: tuple[int, int]) -> CameraDevice:
         """The camera, set up for images of this width and height, and started. Raises CameraError."""
         if camera.pipeline:
             return GstreamerDevice(camera, size, self.command)
+        if camera.topic:
+            return RosDevice(camera, size, self.lenses.get(camera.name), self.ros_command)
         return V4l2Device(camera, size, self.kernel)
 
 
 class DeviceSource(ReceivedFrames):
-    """A ``FrameSource`` of the kernel's cameras and of pipelines, with their own time stamps and numbers."""
+    """A ``FrameSource`` of the kernel's cameras, pipelines and topics, with their own time stamps and numbers."""
 
     def __init__(
         self,

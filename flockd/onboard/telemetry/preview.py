@@ -16,7 +16,7 @@ from flockd.flight.geometry import Rig, RigCamera
 
 LARGEST_SIDE_PX = 320
 JPEG_QUALITY = 70
-EVERY_S = 1.0
+EVERY_S = 0.2
 """A camera's picture is made no oftener, however many ask."""
 FRESH_S = services.PREVIEW.timeout
 """While the pilot steps, frames of its newest step are at most this much older than the newest."""

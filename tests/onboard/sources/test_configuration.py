@@ -128,7 +128,7 @@ def test_slips_inside_the_optional_section_are_reported_with_what_to_do(tmp_path
         ),
         (
             "source:\n  kind: v4l2\n" + TWO.replace("video2", "video0"),
-            "drone.yaml:5: source: two cameras share /dev/video0; give each its own device",
+            "drone.yaml:5: source: two cameras share /dev/video0; give each its own",
         ),
         (
             "source:\n  kind: shared_memory\n" + TWO,
@@ -145,8 +145,8 @@ def test_slips_inside_the_optional_section_are_reported_with_what_to_do(tmp_path
         ),
         (
             "source:\n  kind: gstreamer\n" + PIPELINES.replace("libcamerasrc", "libcamerasrc, pixel_format: yuyv"),
-            "drone.yaml:9: source.cameras[1].pixel_format: is of a source of kind `v4l2`; let the pipeline say it, "
-            "and delete this",
+            "drone.yaml:9: source.cameras[1].pixel_format: is of a source of kind `v4l2`; delete it, or write "
+            "`kind: v4l2`",
         ),
         (
             "source:\n  kind: gstreamer\n" + PIPELINES.replace("pipeline: libcamerasrc", "rate_hz: 20"),

@@ -1,0 +1,63 @@
+"""`flockd ros`: the fleet in ROS 2, orders from there, and perception alone for other people's stacks."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from contextlib import ExitStack, suppress
+
+from flockd.cli.endpoint_options import add_endpoint_options, endpoints
+from flockd.cli.output import complain, say
+from flockd.cli.parser import Commands, Parser, add_commands
+from flockd.core.errors import ExitCode
+
+_NOTES = """\
+Without a command it publishes each drone of the fleet in its namespace, as in `ros2 topic echo /drone1/odometry`.
+A sourced ROS 2 is used where there is one; else: pip install 'flockd[ros]'. docs/ros.md lists the topics."""
+
+
+def add(commands: Commands) -> None:
+    """Adds the command."""
+    examples = (
+        "flockd ros",
+        "flockd ros --connect tcp/10.0.0.11:7447 --connect tcp/10.0.0.12:7447 --orders",
+        "flockd ros perceive --config my_drone.yaml",
+    )
+    what = "Show the fleet to ROS 2, and take orders from there; with `perceive`: only see drones, for another stack."
+    parser = commands("ros", what, examples, _NOTES)
+    add_commands(parser, ())
+    add_endpoint_options(parser, "--drones-at")
+    parser.add_argument(
+        "--orders", action="store_true", help="offer services and topics that order drones (default: watch only)"
+    )
+    _add_network(parser)
+    parser.set_defaults(run=_run)
+
+
+def _add_network(parser: Parser) -> None:
+    parser.add_argument(
+        "--network", action="store_true", help="let other computers find it in ROS 2 (default: this computer alone)"
+    )
+
+
+def _run(args: argparse.Namespace) -> int:
+    """Until Ctrl-C."""
+    from flockd.fleet.page.live_fleet import LiveFleet
+    from flockd.fleet.ros.fleet_bridge import FleetBridge
+    from flockd.fleet.watcher import FleetWatcher
+    from flockd.onboard.ros.ros_node import RosNode
+
+    listen, connect = endpoints(args)
+    with ExitStack() as stack, suppress(KeyboardInterrupt):
+        watcher = FleetWatcher(args.fleet, listen=listen, connect=connect, settings=args.zenoh_config)
+        source = stack.enter_context(LiveFleet(stack.enter_context(watcher)))
+        node = stack.enter_context(RosNode("flockd", here_only=not args.network))
+        bridge = stack.enter_context(FleetBridge(source, node, may_command=args.orders))
+        if not bridge.has_transforms:
+            complain("this ROS 2 has no tf2_msgs, so there is no /tf; the markers for RViz are in `map` and need none")
+        if args.orders and args.network:
+            complain("whoever reaches this ROS domain may order what this computer may; use SROS 2, or drop --network")
+        say(f"each drone found at {', '.join([*listen, *connect])} is published in its namespace; Ctrl-C ends it")
+        sys.stdout.flush()
+        bridge.wait()
+    return ExitCode.DONE

@@ -1,0 +1,89 @@
+"""Between flockd's axes and those of ROS, by its REP 103 and REP 105: the only place that converts them. Pure.
+
+flockd's world is north, east, down (NED), its body forward, right, down (FRD); those of ROS are east, north, up (ENU)
+and forward, left, up (FLU). A camera's axes are the same in both: right, down, forward, which REP 103 calls `_optical`.
+Yaw counts from east counter-clockwise in ROS, and from north clockwise in flockd; pixel centres lie at whole numbers in
+ROS, and half a pixel farther in flockd. ``R_a_b`` takes coordinates from b to a.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from flockd.core.messages import FloatArray, IntArray
+
+CENTRE_PX = 0.5
+"""Coordinates of the first pixel's centre in flockd; 0 in ROS."""
+MAP = "map"
+"""REP 105: the world of all drones, which does not drift; here with its origin at the home of one of them."""
+_ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_FLU_FRD = np.diag([1.0, -1.0, -1.0])
+
+
+def enu_of_ned(ned: FloatArray) -> FloatArray:
+    """(..., 3) in ENU of (..., 3) in NED. It is its own inverse."""
+    enu: FloatArray = np.asarray(ned, np.float64) @ _ENU_NED.T
+    return enu
+
+
+def ned_of_enu(enu: FloatArray) -> FloatArray:
+    """(..., 3) in NED of (..., 3) in ENU."""
+    return enu_of_ned(enu)
+
+
+def flu_of_frd(frd: FloatArray) -> FloatArray:
+    """(..., 3) in FLU of (..., 3) in FRD. It is its own inverse."""
+    flu: FloatArray = np.asarray(frd, np.float64) @ _FLU_FRD.T
+    return flu
+
+
+def frd_of_flu(flu: FloatArray) -> FloatArray:
+    """(..., 3) in FRD of (..., 3) in FLU."""
+    return flu_of_frd(flu)
+
+
+def attitude_in_ros(R_ned_frd: FloatArray) -> FloatArray:
+    """R_enu_flu (3, 3) of an attitude."""
+    return _ENU_NED @ R_ned_frd @ _FLU_FRD
+
+
+def attitude_of_ros(R_enu_flu: FloatArray) -> FloatArray:
+    """R_ned_frd (3, 3) of an attitude in ROS."""
+    return _ENU_NED @ R_enu_flu @ _FLU_FRD
+
+
+def camera_in_ros(R_frd_camera: FloatArray) -> FloatArray:
+    """R_flu_optical (3, 3) of a camera's mounting."""
+    return _FLU_FRD @ R_frd_camera
+
+
+def attitude_of_angles(roll_deg: float, pitch_deg: float, yaw_deg: float) -> FloatArray:
+    """R_ned_frd (3, 3) of flockd's angles: yaw, then pitch, then roll."""
+    R: FloatArray = Rotation.from_euler("ZYX", [yaw_deg, pitch_deg, roll_deg], degrees=True).as_matrix()
+    return R
+
+
+def quaternion_of(R: FloatArray) -> FloatArray:
+    """(4,) x, y, z, w of a rotation, in the order of ROS, with w not below 0."""
+    quaternion: FloatArray = Rotation.from_matrix(R).as_quat(canonical=True)
+    return quaternion
+
+
+def rotation_of(quaternion: FloatArray) -> FloatArray:
+    """(3, 3) of x, y, z, w. Raises ValueError for what is not of length 1, to a hundredth: a message left empty."""
+    length = float(np.linalg.norm(quaternion))
+    if not abs(length - 1.0) < 0.01:  # true for NaN too
+        raise ValueError(f"its orientation is no rotation: a quaternion of length {length:.3g}; fill it in")
+    R: FloatArray = Rotation.from_quat(quaternion).as_matrix()
+    return R
+
+
+def scan_order(count: int) -> IntArray:
+    """For each ray of a scan in ENU the sector of `ObstacleRanges`, in which azimuths count clockwise from north.
+
+    The scan's first ray points at -180 degrees, which is west, its next ones counter-clockwise from there.
+    """
+    if count % 4:
+        raise ValueError(f"a scan of {count} sectors has none to the west; their number has to be a multiple of four")
+    return (3 * count // 4 - np.arange(count)) % count

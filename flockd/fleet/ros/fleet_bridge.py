@@ -1,0 +1,287 @@
+"""A fleet's telemetry in ROS 2, and orders from there: a process beside the drones, for which no drone waits."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from typing import Any, cast
+
+import numpy as np
+
+from flockd.core.image_header import jpeg_size
+from flockd.core.ros_frames import MAP, attitude_in_ros, camera_in_ros, flu_of_frd
+from flockd.fleet.camera_rigs import cameras_of
+from flockd.fleet.fleet_status import GONE, QUIET
+from flockd.fleet.page.drone_rows import Known, Row
+from flockd.fleet.page.fleet_source import FleetSource
+from flockd.fleet.ros.drone_names import DroneNames, ros_name
+from flockd.fleet.ros.fleet_markers import home_in_map, markers
+from flockd.fleet.ros.order_requests import Whereabouts, goal_of, velocity_of
+from flockd.fleet.watcher import Watched
+from flockd.onboard.ros import message_trees as trees
+from flockd.onboard.ros.message_trees import Names, Tree
+from flockd.onboard.ros.ros_node import Answer, Delivery, RosNode, has_type
+from flockd.onboard.telemetry.topics import (
+    AboutMessage,
+    NeighboursMessage,
+    ObstaclesMessage,
+    OrderMessage,
+    StateMessage,
+)
+
+UPDATE_EVERY_S = 0.05
+PICTURE_EVERY_S = 0.2
+STATE_EVERY_S = 1.0
+"""A drone's state is sent when it changes, and so often where it does not."""
+PLAIN = ("hold", "land", "resume")
+"""Orders without a place, each a service."""
+_THREADS = 16
+"""That wait for pictures and answers."""
+_LEVELS = {
+    **dict.fromkeys(("normal", "ready", "idle"), trees.OK),
+    **dict.fromkeys(("degraded", "hover", "silent"), trees.WARN),
+    **dict.fromkeys(("asking", GONE), trees.ERROR),
+    QUIET: trees.STALE,
+}
+_VALUES = (
+    "flight_mode", "armed", "in_air", "height_m", "speed_m_s", "battery_share", "mission", "neighbours", "rate_hz",
+    "load", "temperature_c", "setpoints_missed", "messages_lost", "delay_ms", "clock_s", "recording", "silence",
+    "version",
+)  # fmt: skip
+"""What of a row of the fleet page stands in a drone's DiagnosticStatus."""
+
+
+class FleetBridge:
+    """Publishes between ``__enter__`` and ``__exit__`` on a thread of its own."""
+
+    def __init__(self, source: FleetSource, node: RosNode, *, may_command: bool) -> None:
+        """``source`` and ``node`` stay their owner's. ``may_command``: whether orders are passed on at all."""
+        self._source, self._node, self._may_command = source, node, may_command
+        self._names = DroneNames()
+        self._has_transforms = has_type(trees.TRANSFORMS)
+        self._sent: dict[tuple[str, str], float] = {}
+        self._told: dict[str, tuple[float, Tree]] = {}
+        self._drawn: dict[str, Row] = {}
+        self._served: set[str] = set()
+        self._pictures: dict[str, tuple[float, Future[None]]] = {}
+        self._threads = ThreadPoolExecutor(_THREADS, "ROS 2 pictures and orders")
+        self._over = threading.Event()
+        self._thread = ThreadPoolExecutor(1, "fleet in ROS 2")
+
+    @property
+    def has_transforms(self) -> bool:
+        """Whether this ROS 2 has `tf2_msgs`; without it there is no `/tf`."""
+        return self._has_transforms
+
+    def __enter__(self) -> FleetBridge:
+        self._publishing = self._thread.submit(self._publish)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.shutdown()
+        self._threads.shutdown(cancel_futures=True)
+
+    def wait(self) -> None:
+        """Until it is closed. Raises what ended it before."""
+        self._publishing.result()
+
+    def _publish(self) -> None:
+        while not self._over.wait(UPDATE_EVERY_S):
+            self.update()
+
+    def update(self) -> None:
+        """Publishes what is new."""
+        now_s = self._source.now_s()
+        rows, known = self._source.rows(now_s), self._source.known()
+        for drone in self._source.drones(now_s):
+            key = f"{drone.fleet}/{drone.drone}"
+            name, row = self._names.of(key), rows.get(key)
+            if row is None:
+                continue
+            if self._may_command and name not in self._served:
+                self._served.add(name)
+                self._serve(key, name)
+            self._publish_step(drone, name, row, known.get(key, Known()).about, now_s)
+            self._publish_state(name, row, now_s)
+            self._publish_markers(name, row)
+            self._ask_for_pictures(key, name, row, known.get(key, Known()), now_s)
+
+    def _publish_step(self, drone: Watched, name: str, row: Row, about: AboutMessage | None, now_s: float) -> None:
+        """What each step of the drone's pilot told, once."""
+        makers: Mapping[str, Callable[[int, Names, Any], list[tuple[str, str, Tree | None]]]] = {
+            "state": lambda at, names, one: self._of_state(at, names, one, row, about),
+            "neighbours": _of_neighbours,
+            "obstacles": _of_obstacles,
+        }
+        for topic, make in makers.items():
+            heard, message = drone.topics.get(topic), drone.message(topic, now_s)
+            if heard is None or message is None or self._sent.get((name, topic)) == heard.time_s:
+                continue
+            self._sent[name, topic] = heard.time_s
+            time_ns = round(1e9 * self._source.wall_s(heard.time_s))
+            for place, kind, tree in make(time_ns, Names(name), message):
+                if tree is not None:
+                    self._node.publish(place, kind, tree, Delivery.SENSOR if place != "/tf" else Delivery.EVENT)
+
+    def _of_state(
+        self, time_ns: int, names: Names, state: StateMessage, row: Row, about: AboutMessage | None
+    ) -> list[tuple[str, str, Tree | None]]:
+        found = [(f"/{names.drone}/odometry", trees.ODOMETRY, trees.state_odometry(time_ns, names, state))]
+        if self._has_transforms:
+            found.append(("/tf", trees.TRANSFORMS, _transforms(time_ns, names, state, row, about)))
+        return found
+
+    def _publish_state(self, name: str, row: Row, now_s: float) -> None:
+        status = _status(name, row)
+        told_s, told = self._told.get(name, (-STATE_EVERY_S, {}))
+        changed = (status["level"], status["message"]) != (told.get("level"), told.get("message"))
+        if not changed and now_s - told_s < STATE_EVERY_S:
+            return
+        self._told[name] = now_s, status
+        tree = trees.diagnostics(round(1e9 * self._source.wall_s(now_s)), [status])
+        self._node.publish(f"/{name}/diagnostics", trees.DIAGNOSTICS, tree, Delivery.STATE)
+        self._node.publish("/diagnostics", trees.DIAGNOSTICS, tree, Delivery.EVENT)
+
+    def _publish_markers(self, name: str, row: Row) -> None:
+        topic = f"/{name}/markers"
+        self._node.advertise(topic, trees.MARKERS, Delivery.STATE)
+        if self._drawn.get(name) != row:
+            self._drawn[name] = row
+            time_ns = round(1e9 * self._source.wall_s(self._source.now_s()))
+            number = list(self._drawn).index(name)
+            self._node.publish(topic, trees.MARKERS, markers(time_ns, name, number, row), Delivery.STATE)
+
+    def _ask_for_pictures(self, key: str, name: str, row: Row, known: Known, now_s: float) -> None:
+        """Of cameras that somebody reads; each waits on a thread of its own, as the drone may take seconds."""
+        for camera in row["cameras"]:
+            base = f"/{name}/camera/{ros_name(camera)}"
+            self._node.advertise(f"{base}/image/compressed", trees.COMPRESSED_IMAGE, Delivery.SENSOR)
+            self._node.advertise(f"{base}/camera_info", trees.CAMERA_INFO, Delivery.SENSOR)
+            asked_s, asked = self._pictures.get(base, (-PICTURE_EVERY_S, None))
+            if asked is not None and asked.done():
+                asked.result()  # raises what it met
+            if now_s - asked_s < PICTURE_EVERY_S or (asked is not None and not asked.done()):
+                continue
+            if self._node.is_read(f"{base}/image/compressed"):
+                job = self._threads.submit(self._publish_picture, key, name, camera, base, known)
+                # From when it was due, so that a late look does not slow the pictures down.
+                due_s = asked_s + PICTURE_EVERY_S
+                self._pictures[base] = due_s if now_s - due_s < PICTURE_EVERY_S else now_s, job
+
+    def _publish_picture(self, key: str, name: str, camera: str, base: str, known: Known) -> None:
+        now_s = self._source.now_s()
+        picture = self._source.image(key, camera, now_s)
+        size_px = None if picture is None else jpeg_size(picture)
+        if picture is None or size_px is None:
+            return
+        time_ns, frame = round(1e9 * self._source.wall_s(now_s)), Names(name).optical(ros_name(camera))
+        image = trees.compressed_image(time_ns, frame, picture, "jpeg")
+        self._node.publish(f"{base}/image/compressed", trees.COMPRESSED_IMAGE, image, Delivery.SENSOR)
+        mounted = cameras_of(known.about).get(camera)
+        if mounted is not None:
+            info = trees.camera_info(time_ns, frame, mounted.config, size_px)
+            self._node.publish(f"{base}/camera_info", trees.CAMERA_INFO, info, Delivery.SENSOR)
+
+    def _serve(self, key: str, name: str) -> None:
+        """Its services, and the topics of orders that carry something."""
+        for command in PLAIN:
+            self._node.serve(f"/{name}/{command}", partial(self._ask, key, command, None))
+        for topic, kind, command, parse in (
+            ("goal", trees.POSE, "goto", goal_of),
+            ("cmd_vel", trees.TWIST, "velocity", velocity_of),
+        ):
+            take = partial(self._order, key, name, command, parse)
+            self._node.subscribe(f"/{name}/{topic}", kind, take, Delivery.EVENT)
+        self._node.advertise(f"/{name}/order_answer", trees.DIAGNOSTIC, Delivery.EVENT)
+
+    def _order(
+        self, key: str, name: str, command: str, parse: Callable[[Tree, Whereabouts], OrderMessage], message: Tree
+    ) -> None:
+        """On a thread of the node's; what became of it is published, as a topic has no reply."""
+        try:
+            answer = self._ask(key, command, parse(message, self._whereabouts(key, name)))
+        except ValueError as error:
+            answer = Answer(accepted=False, sentence=str(error))
+        level = trees.OK if answer.accepted else trees.ERROR
+        told = trees.diagnostic(f"{name}: {command}", level, answer.sentence, {"accepted": answer.accepted})
+        self._node.publish(f"/{name}/order_answer", trees.DIAGNOSTIC, told, Delivery.EVENT)
+
+    def _ask(self, key: str, command: str, order: OrderMessage | None) -> Answer:
+        """Asks the drone itself, which decides."""
+        answer = self._source.ask(key, command, cast("Mapping[str, object] | None", order))
+        return Answer(answer["accepted"], answer["sentence"])
+
+    def _whereabouts(self, key: str, name: str) -> Whereabouts:
+        now_s = self._source.now_s()
+        row, about = self._source.rows(now_s).get(key), self._source.known().get(key, Known()).about
+        state = next((d for d in self._source.drones(now_s) if f"{d.fleet}/{d.drone}" == key), None)
+        told = None if state is None else state.message("state", now_s)
+        home = None if row is None else row["home_ne"]
+        return Whereabouts(
+            Names(name),
+            None if home is None else np.array(home),
+            None if about is None else _origin(about["configuration"]),
+            None if told is None else trees.attitude_of_state(cast("StateMessage", told)),
+        )
+
+
+def _of_neighbours(time_ns: int, names: Names, message: NeighboursMessage) -> list[tuple[str, str, Tree | None]]:
+    seen = message["neighbours"]
+    return [
+        (f"/{names.drone}/neighbours", trees.POSE_ARRAY, trees.neighbour_poses(time_ns, names, seen)),
+        (f"/{names.drone}/neighbours/tracks", trees.POINT_CLOUD, trees.tracks(time_ns, names, seen)),
+    ]
+
+
+def _of_obstacles(time_ns: int, names: Names, message: ObstaclesMessage) -> list[tuple[str, str, Tree | None]]:
+    return [(f"/{names.drone}/obstacles", trees.LASER_SCAN, trees.scan(time_ns, names, message))]
+
+
+def _transforms(time_ns: int, names: Names, state: StateMessage, row: Row, about: AboutMessage | None) -> Tree | None:
+    """map, odom, level, body and cameras, of a drone that knows its position."""
+    odometry = trees.state_odometry(time_ns, names, state)
+    if odometry is None:
+        return None
+    place = np.array(list(odometry["pose"]["pose"]["position"].values()))
+    R = attitude_in_ros(trees.attitude_of_state(state))
+    cameras = [
+        trees.transform(
+            time_ns,
+            names.base_link,
+            names.optical(ros_name(name)),
+            flu_of_frd(camera.mounted.T_body_camera.translation),
+            camera_in_ros(camera.mounted.T_body_camera.rotation),
+        )
+        for name, camera in cameras_of(about).items()
+    ]
+    return {
+        "transforms": [
+            trees.transform(time_ns, MAP, names.odom, home_in_map(row), np.eye(3)),
+            trees.transform(time_ns, names.odom, names.level, place, np.eye(3)),
+            trees.transform(time_ns, names.odom, names.base_link, place, R),
+            *cameras,
+        ]
+    }
+
+
+def _status(name: str, row: Row) -> Tree:
+    """Level, state and reasons; the camera's faults are among the reasons."""
+    sentence = ": ".join([row["state"], *filter(None, ["; ".join(row["why"])])])
+    return trees.diagnostic(
+        f"{name}: flockd",
+        _LEVELS[row["state"]],
+        sentence,
+        {"state": row["state"], **{one: row[one] for one in _VALUES}},
+    )
+
+
+def _origin(configuration: Mapping[str, object]) -> np.ndarray[Any, np.dtype[np.float64]] | None:
+    """(2,) of a peer's configuration; None for what is none."""
+    mission = configuration.get("mission")
+    origin = mission.get("origin_m") if isinstance(mission, dict) else None
+    if not isinstance(origin, list) or len(origin) != 2 or not all(isinstance(one, int | float) for one in origin):
+        return None
+    return np.array(origin, np.float64)

@@ -1,0 +1,135 @@
+"""What RViz draws of a drone in the frame `map`: one MarkerArray, which takes the place of the one before. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from flockd.core.messages import FloatArray
+from flockd.core.ros_frames import MAP, attitude_in_ros, attitude_of_angles, enu_of_ned
+from flockd.fleet.fleet_status import GONE, QUIET
+from flockd.fleet.page.drone_rows import Row
+from flockd.onboard.ros.message_trees import LEVEL_TURN, Tree, header, turn, vector
+
+COURSE_S = 2.0
+"""A course leads to where the drone is then."""
+COLOURS = (
+    (0.0, 0.45, 0.7),
+    (0.9, 0.62, 0.0),
+    (0.0, 0.62, 0.45),
+    (0.84, 0.37, 0.0),
+    (0.8, 0.47, 0.65),
+    (0.34, 0.7, 0.91),
+)
+_OBSTACLE, _FENCE, _LABEL = (0.45, 0.45, 0.45), (0.8, 0.2, 0.2), (1.0, 1.0, 1.0)
+_ARROW, _SPHERE, _CYLINDER, _LINE_STRIP, _LINE_LIST, _TEXT = 0, 2, 3, 4, 5, 9
+_DELETE_ALL = 3
+_ABOVE = np.array([0.0, 0.0, 0.6])
+"""From a drone to its name."""
+
+
+def markers(time_ns: int, name: str, number: int, row: Row) -> Tree:
+    """Of one drone; nothing but its deletion where its position is not known. ``number`` chooses its colour."""
+    drawn: list[Tree] = [{"header": header(time_ns, MAP), "action": _DELETE_ALL}]
+    place = place_in_map(row)
+    if place is not None:
+        colour = COLOURS[number % len(COLOURS)]
+        parts = [
+            *_body(name, row, place, colour),
+            *_course(row, place, colour),
+            *_neighbours(row, place, colour),
+            *_obstacles(row, place),
+            *_fence(row),
+        ]
+        drawn += [{"header": header(time_ns, MAP), "ns": name, "id": i, **part} for i, part in enumerate(parts)]
+    return {"markers": drawn}
+
+
+def place_in_map(row: Row) -> FloatArray | None:
+    """(3,) metres east, north, up; None where the position is not known."""
+    if row["position_ne"] is None:
+        return None
+    return home_in_map(row) + enu_of_ned(np.array([*row["position_ne"], -(row["height_m"] or 0.0)]))
+
+
+def home_in_map(row: Row) -> FloatArray:
+    """(3,) metres to the drone's home; zeros where that is not known."""
+    return enu_of_ned(np.array([*(row["home_ne"] or (0.0, 0.0)), 0.0]))
+
+
+def _body(name: str, row: Row, place: FloatArray, colour: tuple[float, ...]) -> Iterable[Tree]:
+    """A disc, its nose, and its name."""
+    gone = row["state"] in {GONE, QUIET}
+    R = attitude_in_ros(attitude_of_angles(*(row[f"{angle}_deg"] or 0.0 for angle in ("roll", "pitch", "yaw"))))
+    pose = {"position": vector(place), "orientation": turn(R)}
+    tint = _tint(colour, 0.4 if gone else 1.0)
+    yield {"type": _CYLINDER, "pose": pose, "scale": vector((0.5, 0.5, 0.12)), "color": tint}
+    yield {"type": _ARROW, "pose": pose, "scale": vector((0.6, 0.06, 0.16)), "color": tint}
+    text = name if row["state"] == "normal" else f"{name}: {row['state']}"
+    above = {"position": vector(place + _ABOVE), "orientation": LEVEL_TURN}
+    yield {"type": _TEXT, "pose": above, "scale": vector((0.0, 0.0, 0.3)), "color": _tint(_LABEL), "text": text}
+
+
+def _course(row: Row, place: FloatArray, colour: tuple[float, ...]) -> Iterable[Tree]:
+    """The own estimate, thick; what the flock law asks for, thin; and the goal."""
+    for velocity, alpha, thickness_m in ((row["velocity_ned"], 1.0, 0.08), (row["command_ne"], 0.5, 0.03)):
+        if velocity is not None:
+            end = place + COURSE_S * enu_of_ned(np.array([*velocity, 0.0][:3]))
+            yield _lines(_LINE_STRIP, [place, end], _tint(colour, alpha), thickness_m)
+    if row["goal_ne"] is not None:
+        goal = home_in_map(row) + enu_of_ned(np.array([*row["goal_ne"], 0.0]))
+        goal[2] = place[2] if row["goal_height_m"] is None else row["goal_height_m"]
+        yield _sphere(goal, 0.5, _tint(colour, 0.6))
+
+
+def _neighbours(row: Row, place: FloatArray, colour: tuple[float, ...]) -> Iterable[Tree]:
+    """Where it believes others to be: a sphere of one standard deviation at the end of a line."""
+    for one in (one for one in row["sees"] if one["ned"] is not None):
+        there = place + enu_of_ned(np.array(one["ned"]))
+        tint = _tint(colour, 0.6 if one["confirmed"] else 0.25)
+        yield _sphere(there, max(0.3, 2.0 * (one["sigma_m"] or 0.0)), tint)
+        yield _lines(_LINE_STRIP, [place, there], tint, 0.02)
+
+
+def _obstacles(row: Row, place: FloatArray) -> Iterable[Tree]:
+    """A piece of a circle in each direction in which something is near, at the drone's height."""
+    ranges = row["obstacles_m"] or ()
+    half = math.pi / max(len(ranges), 1)
+    points = [
+        place + range_m * np.array([math.sin(azimuth), math.cos(azimuth), 0.0])
+        for sector, range_m in enumerate(ranges)
+        if range_m is not None
+        for azimuth in ((2 * sector - 1) * half, (2 * sector + 1) * half)
+    ]
+    if points:
+        yield _lines(_LINE_LIST, points, _tint(_OBSTACLE), 0.15)
+
+
+def _fence(row: Row) -> Iterable[Tree]:
+    """On the ground."""
+    fence, home = row["fence"] or {}, home_in_map(row)
+    if fence.get("radius_m"):
+        angles = np.linspace(0.0, 2 * math.pi, 73)
+        circle = [home + fence["radius_m"] * np.array([math.cos(angle), math.sin(angle), 0.0]) for angle in angles]
+        yield _lines(_LINE_STRIP, circle, _tint(_FENCE, 0.8), 0.1)
+    if fence.get("corners_m"):
+        corners = [home + enu_of_ned(np.array([*corner, 0.0])) for corner in fence["corners_m"]]
+        yield _lines(_LINE_STRIP, [*corners, corners[0]], _tint(_FENCE, 0.8), 0.1)
+
+
+def _lines(kind: int, points: Iterable[FloatArray], tint: Tree, thickness_m: float) -> Tree:
+    pose: dict[str, Any] = {"position": vector((0.0, 0.0, 0.0)), "orientation": LEVEL_TURN}
+    scale = vector((thickness_m, 0.0, 0.0))
+    return {"type": kind, "pose": pose, "scale": scale, "color": tint, "points": [vector(one) for one in points]}
+
+
+def _sphere(place: FloatArray, diameter_m: float, tint: Tree) -> Tree:
+    pose = {"position": vector(place), "orientation": LEVEL_TURN}
+    return {"type": _SPHERE, "pose": pose, "scale": vector([diameter_m] * 3), "color": tint}
+
+
+def _tint(colour: tuple[float, ...], alpha: float = 1.0) -> Tree:
+    return dict(zip("rgba", (*colour, alpha), strict=True))

@@ -1,0 +1,291 @@
+"""ROS 2's standard messages as trees of plain values, built from flockd's. Pure: neither a clock nor ROS is needed.
+
+A tree is a mapping from a message's fields to numbers, text, bytes, arrays, trees and lists of trees. Adapters make of
+it a message of `rclpy` for the air (`ros_node.py`), or one of `rosbags` for a bag. Arguments are in flockd's axes, and
+what comes out is in those of REP 103.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flockd.core.config.rig import CameraConfig
+from flockd.core.messages import FloatArray
+from flockd.core.ros_frames import (
+    CENTRE_PX,
+    attitude_in_ros,
+    attitude_of_angles,
+    enu_of_ned,
+    flu_of_frd,
+    quaternion_of,
+    scan_order,
+)
+from flockd.onboard.telemetry.topics import NeighbourMessage, ObstaclesMessage, StateMessage
+
+Tree = dict[str, Any]
+"""One message."""
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+POSE_ARRAY = "geometry_msgs/msg/PoseArray"
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+LASER_SCAN = "sensor_msgs/msg/LaserScan"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+DIAGNOSTIC = "diagnostic_msgs/msg/DiagnosticStatus"
+MARKERS = "visualization_msgs/msg/MarkerArray"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+TWIST = "geometry_msgs/msg/TwistStamped"
+POSE = "geometry_msgs/msg/PoseStamped"
+TEXT = "std_msgs/msg/String"
+"""Names of the types, as ROS 2 writes them."""
+OK, WARN, ERROR, STALE = range(4)
+"""Levels of a DiagnosticStatus."""
+LEVEL_TURN: Tree = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+_NS = 1_000_000_000
+_FLOAT64, _UINT32, _UINT8 = 8, 6, 2  # of sensor_msgs/msg/PointField
+
+
+class Names(NamedTuple):
+    """REP 105's frames of one drone, each `DRONE/...`."""
+
+    drone: str
+
+    @property
+    def odom(self) -> str:
+        """East, north and up from the drone's home, as its autopilot has it."""
+        return f"{self.drone}/odom"
+
+    @property
+    def base_link(self) -> str:
+        """The body: forward, left, up."""
+        return f"{self.drone}/base_link"
+
+    @property
+    def level(self) -> str:
+        """East, north and up from the drone: in it are neighbours and obstacles."""
+        return f"{self.drone}/level"
+
+    def optical(self, camera: str) -> str:
+        """A camera: right, down, forward."""
+        return f"{self.drone}/{camera}_optical"
+
+
+def header(time_ns: int, frame: str) -> Tree:
+    """``time_ns``: since 1970."""
+    return {"stamp": {"sec": time_ns // _NS, "nanosec": time_ns % _NS}, "frame_id": frame}
+
+
+def vector(values: Iterable[float]) -> Tree:
+    """A Vector3 or a Point."""
+    x, y, z = map(float, values)
+    return {"x": x, "y": y, "z": z}
+
+
+def turn(R: FloatArray) -> Tree:
+    """A Quaternion."""
+    return dict(zip("xyzw", quaternion_of(R).tolist(), strict=True))
+
+
+def odometry(
+    time_ns: int, names: Names, position_ned: FloatArray, R_ned_frd: FloatArray, velocity_ned: FloatArray | None
+) -> Tree:
+    """Where the body is from home, and its velocity in its own axes, as the message's definition asks for.
+
+    Covariances are zero, which says that they are not known; so is a velocity that is not known, with a variance of -1
+    to tell it from a standstill.
+    """
+    known = velocity_ned is not None
+    body = R_ned_frd.T @ velocity_ned if velocity_ned is not None else np.zeros(3)
+    return {
+        "header": header(time_ns, names.odom),
+        "child_frame_id": names.base_link,
+        "pose": {
+            "pose": {"position": vector(enu_of_ned(position_ned)), "orientation": turn(attitude_in_ros(R_ned_frd))},
+            "covariance": np.zeros(36),
+        },
+        "twist": {
+            "twist": {"linear": vector(flu_of_frd(body)), "angular": vector((0.0, 0.0, 0.0))},
+            "covariance": np.zeros(36) if known else np.concatenate([[-1.0], np.zeros(35)]),
+        },
+    }
+
+
+def state_odometry(time_ns: int, names: Names, state: StateMessage) -> Tree | None:
+    """Of telemetry's `state`; None where the drone does not know its position."""
+    place, velocity = _known(state["position_ne"], 2), _known(state["velocity_ned"], 3)
+    if place is None or not _finite(state["height_m"]):
+        return None
+    position_ned = np.array([*place, -state["height_m"]])
+    return odometry(time_ns, names, position_ned, attitude_of_state(state), velocity)
+
+
+def attitude_of_state(state: StateMessage) -> FloatArray:
+    """R_ned_frd (3, 3); level and to the north where it is not known."""
+    return attitude_of_angles(*(state[key] or 0.0 for key in ("roll_deg", "pitch_deg", "yaw_deg")))
+
+
+TRACK_FIELDS = (
+    *((name, _FLOAT64) for name in ("x", "y", "z", "vx", "vy", "vz", "position_variance", "velocity_variance")),
+    *((name, _FLOAT64) for name in ("age", "unseen")),
+    ("track", _UINT32),
+    ("confirmed", _UINT8),
+)
+"""Fields of a point of `tracks`: metres and m/s over ground in east, north, up; the variance of each axis; seconds."""
+_POINT = np.dtype([(name, {_FLOAT64: "<f8", _UINT32: "<u4", _UINT8: "u1"}[kind]) for name, kind in TRACK_FIELDS])
+
+
+def neighbour_poses(time_ns: int, names: Names, neighbours: Sequence[NeighbourMessage]) -> Tree:
+    """Where each neighbour is from the drone, in the order of `tracks`. Which way it faces is not known."""
+    positions = [enu_of_ned(np.array(one["position_ned"])) for one in usable(neighbours)]
+    return {
+        "header": header(time_ns, names.level),
+        "poses": [{"position": vector(position), "orientation": LEVEL_TURN} for position in positions],
+    }
+
+
+def tracks(time_ns: int, names: Names, neighbours: Sequence[NeighbourMessage]) -> Tree:
+    """A PointCloud2 with a point a neighbour, of `TRACK_FIELDS`: with covariance, velocity and track number."""
+    used = usable(neighbours)
+    points = np.zeros(len(used), _POINT)
+    for point, one in zip(points, used, strict=True):
+        place, velocity = (enu_of_ned(np.array(one[key])) for key in ("position_ned", "velocity_ned"))
+        point["x"], point["y"], point["z"] = place
+        point["vx"], point["vy"], point["vz"] = velocity
+        point["position_variance"] = one["position_sigma_m"] ** 2
+        point["velocity_variance"] = one["velocity_sigma_m_s"] ** 2
+        point["age"], point["unseen"] = one["age_s"], one["unseen_s"]
+        point["track"], point["confirmed"] = one["track"] % 2**32, one["confirmed"]
+    fields = [
+        {"name": name, "offset": _POINT.fields[name][1], "datatype": kind, "count": 1}  # type: ignore[index]
+        for name, kind in TRACK_FIELDS
+    ]
+    return {
+        "header": header(time_ns, names.level),
+        "height": 1,
+        "width": len(used),
+        "fields": fields,
+        "is_bigendian": False,
+        "point_step": _POINT.itemsize,
+        "row_step": _POINT.itemsize * len(used),
+        "data": points.tobytes(),
+        "is_dense": True,
+    }
+
+
+def usable(neighbours: Sequence[NeighbourMessage]) -> list[NeighbourMessage]:
+    """Those whose numbers are all there: a peer may have sent none."""
+    numbers = ("position_sigma_m", "velocity_sigma_m_s", "age_s", "unseen_s")
+    return [
+        one
+        for one in neighbours
+        if _known(one["position_ned"], 3) is not None
+        and _known(one["velocity_ned"], 3) is not None
+        and all(_finite(one[key]) for key in numbers)  # type: ignore[literal-required]
+    ]
+
+
+def scan(time_ns: int, names: Names, obstacles: ObstaclesMessage) -> Tree | None:
+    """Ranges counter-clockwise from west, by REP 117: infinite is free as far as ``range_max``, NaN is not known.
+
+    A direction that is known to be free but not as far is NaN, so that nobody clears what was not seen; how far it is
+    known stands in ``intensities``, in metres. None where the sectors cannot be turned into a scan.
+    """
+    count = len(obstacles["range_m"])
+    if count == 0 or count % 4 or len(obstacles["seen_m"]) != count:
+        return None
+    order = scan_order(count)
+    ranges, seen = (
+        np.array([math.nan if one is None else one for one in obstacles[key]], np.float64)[order]
+        for key in ("range_m", "seen_m")
+    )
+    seen = np.nan_to_num(seen)
+    measured = np.isfinite(ranges)
+    farthest = float(max(seen.max(), ranges[measured].max(initial=0.0)))
+    free = np.where(seen >= farthest, math.inf, math.nan)
+    step = 2 * math.pi / count
+    return {
+        "header": header(time_ns, names.level),
+        "angle_min": -math.pi,
+        "angle_max": -math.pi + (count - 1) * step,
+        "angle_increment": step,
+        "time_increment": 0.0,
+        "scan_time": 0.0,
+        "range_min": 0.0,
+        "range_max": farthest,
+        "ranges": np.where(measured, ranges, free).astype(np.float32),
+        "intensities": seen.astype(np.float32),
+    }
+
+
+def compressed_image(time_ns: int, frame: str, data: bytes, kind: str) -> Tree:
+    """``kind``: `jpeg` or `png`."""
+    return {"header": header(time_ns, frame), "format": kind, "data": data}
+
+
+def camera_info(time_ns: int, frame: str, camera: CameraConfig, size_px: tuple[int, int]) -> Tree:
+    """Of an image of this width and height, which is the camera's or scaled from it."""
+    lens, scale = camera.intrinsics, size_px[0] / camera.size_px[0]
+    fx, fy = scale * lens.fx, scale * lens.fy
+    cx, cy = scale * lens.cx - CENTRE_PX, scale * lens.cy - CENTRE_PX
+    pinhole = lens.model == "pinhole"
+    return {
+        "header": header(time_ns, frame),
+        "height": size_px[1],
+        "width": size_px[0],
+        "distortion_model": "plumb_bob" if pinhole else "equidistant",
+        "d": np.array(lens.distortion or (0.0,) * (5 if pinhole else 4)),
+        "k": np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
+        "r": np.eye(3).ravel(),
+        "p": np.array([fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
+        "binning_x": 0,
+        "binning_y": 0,
+        "roi": {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False},
+    }
+
+
+def diagnostics(time_ns: int, statuses: Sequence[Tree]) -> Tree:
+    """A DiagnosticArray."""
+    return {"header": header(time_ns, ""), "status": list(statuses)}
+
+
+def diagnostic(name: str, level: int, sentence: str, values: Mapping[str, object]) -> Tree:
+    """A DiagnosticStatus; what is not known is left out of its values."""
+    known = [{"key": key, "value": _written(value)} for key, value in values.items() if value is not None]
+    return {"level": level, "name": name, "message": sentence, "hardware_id": name.partition(":")[0], "values": known}
+
+
+def twist(time_ns: int, frame: str, velocity_ned: FloatArray) -> Tree:
+    """A TwistStamped in a frame of east, north, up."""
+    motion = {"linear": vector(enu_of_ned(velocity_ned)), "angular": vector((0.0, 0.0, 0.0))}
+    return {"header": header(time_ns, frame), "twist": motion}
+
+
+def transform(time_ns: int, parent: str, child: str, place: FloatArray, R_parent_child: FloatArray) -> Tree:
+    """A TransformStamped; ``place`` (3,) and the rotation are in the axes of ROS."""
+    return {
+        "header": header(time_ns, parent),
+        "child_frame_id": child,
+        "transform": {"translation": vector(place), "rotation": turn(R_parent_child)},
+    }
+
+
+def _written(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _known(values: object, size: int) -> FloatArray | None:
+    """A list of a peer's; None where a number is missing."""
+    if not isinstance(values, list) or len(values) != size or not all(map(_finite, values)):
+        return None
+    return np.array(values, np.float64)
+
+
+def _finite(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

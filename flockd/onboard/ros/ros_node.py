@@ -1,0 +1,207 @@
+"""The one adapter to rclpy, ROS 2's client library: a node that publishes, subscribes and serves trees of plain values.
+
+rclpy comes with a ROS 2 that is sourced, or from PyPI with the extra `ros`. Callbacks run on threads of the node's own.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import threading
+from array import array
+from collections.abc import Callable, Mapping
+from enum import Enum, auto
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from flockd.core.errors import UnavailableError
+from flockd.onboard.ros.message_trees import Tree
+
+HERE_ONLY = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+"""Environment of a node that only this computer's find: ROS 2 has no rule of its own about who may publish."""
+NOT_INSTALLED = "there is no rclpy; source a ROS 2, or, with Python 3.11 on x86-64 Linux, pip install 'flockd[ros]'"
+_THREADS = 8
+_TRIGGER = "std_srvs/srv/Trigger"
+_ELEMENT = re.compile(r"(?:sequence<)?([a-z0-9_]+/\w+)(?:, \d+)?>?(?:\[\d*\])?")
+
+
+class Delivery(Enum):
+    """How messages of a topic are handed over: what the ecosystem calls its QoS."""
+
+    SENSOR = auto()
+    """Best effort, the newest five: as sensors publish."""
+    STATE = auto()
+    """Reliable, and the newest is kept for whoever comes later (transient local)."""
+    EVENT = auto()
+    """Reliable, the newest ten."""
+
+
+class Answer(NamedTuple):
+    """To a Trigger service."""
+
+    accepted: bool
+    sentence: str
+
+
+class RosNode:
+    """A node between ``__enter__`` and ``__exit__``. Raises UnavailableError where there is no ROS 2."""
+
+    def __init__(self, name: str, *, here_only: bool) -> None:
+        """``here_only``: other computers do not find it, unless the environment already says who may."""
+        if here_only and "ROS_LOCALHOST_ONLY" not in os.environ:
+            for key, value in HERE_ONLY.items():
+                os.environ.setdefault(key, value)
+        rclpy = _rclpy()
+        self._context = rclpy.Context()
+        try:
+            rclpy.init(context=self._context, signal_handler_options=_no_signals())
+            self._node = rclpy.create_node(name, context=self._context)
+        except Exception as error:  # of pybind11's own types: RCLError and others
+            raise UnavailableError(
+                f"ROS 2 cannot start ({str(error).splitlines()[0]}); check its environment"
+            ) from error
+        from rclpy.callback_groups import ReentrantCallbackGroup  # noqa: PLC0415 - of an extra
+        from rclpy.executors import MultiThreadedExecutor  # noqa: PLC0415
+
+        self._group = ReentrantCallbackGroup()
+        self._executor = MultiThreadedExecutor(num_threads=_THREADS, context=self._context)
+        self._executor.add_node(self._node)
+        self._publishers: dict[str, Any] = {}
+        self._lock = threading.Lock()
+        self._thread = threading.Thread(target=self._spin, name="ROS 2", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown(timeout_sec=1.0)
+        self._context.try_shutdown()
+        self._thread.join(5.0)
+
+    def now_ns(self) -> int:
+        """Since 1970, or of a simulator's clock where `use_sim_time` is set."""
+        return int(self._node.get_clock().now().nanoseconds)
+
+    def advertise(self, topic: str, kind: str, delivery: Delivery) -> None:
+        """Makes a topic's publisher, if there is none yet."""
+        with self._lock:
+            if topic not in self._publishers:
+                self._publishers[topic] = self._node.create_publisher(_type(kind), topic, _profile(delivery))
+
+    def publish(self, topic: str, kind: str, tree: Tree, delivery: Delivery) -> None:
+        """Publishes one message; makes the publisher first."""
+        self.advertise(topic, kind, delivery)
+        self._publishers[topic].publish(_message(_type(kind), tree))
+
+    def is_read(self, topic: str) -> bool:
+        """Whether an advertised topic has a subscriber."""
+        return bool(self._publishers[topic].get_subscription_count())
+
+    def subscribe(self, topic: str, kind: str, take: Callable[[Tree], None], delivery: Delivery) -> None:
+        """Calls ``take`` with each message, on a thread of the node's."""
+        self._node.create_subscription(
+            _type(kind), topic, lambda message: take(_tree(message)), _profile(delivery), callback_group=self._group
+        )
+
+    def serve(self, name: str, answer: Callable[[], Answer]) -> None:
+        """A Trigger service. ``answer`` may wait; it runs on a thread of the node's."""
+
+        def respond(_: Any, response: Any) -> Any:
+            response.success, response.message = answer()
+            return response
+
+        self._node.create_service(_type(_TRIGGER), name, respond, callback_group=self._group)
+
+    def _spin(self) -> None:
+        from rclpy.executors import ExternalShutdownException  # noqa: PLC0415
+
+        try:
+            self._executor.spin()
+        except ExternalShutdownException:
+            return
+
+
+def has_type(kind: str) -> bool:
+    """Whether this ROS 2 has a message type: those of PyPI lack a few."""
+    try:
+        _type(kind)
+    except UnavailableError:
+        return False
+    return True
+
+
+def _rclpy() -> Any:
+    """Raises UnavailableError without any, and for that of another Python."""
+    try:
+        import rclpy  # noqa: PLC0415 - of an extra, or of a ROS 2 that is sourced
+    except ImportError as error:
+        if getattr(error, "name", None) == "rclpy":
+            raise UnavailableError(NOT_INSTALLED) from error
+        reason = str(error).splitlines()[0]
+        raise UnavailableError(
+            f"rclpy cannot be loaded ({reason}); run flockd with the Python of a whole ROS 2"
+        ) from error
+    return rclpy
+
+
+def _no_signals() -> Any:
+    from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415
+
+    return SignalHandlerOptions.NO
+
+
+def _profile(delivery: Delivery) -> Any:
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: PLC0415
+
+    match delivery:
+        case Delivery.SENSOR:
+            return QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+        case Delivery.STATE:
+            return QoSProfile(
+                depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+            )
+        case Delivery.EVENT:
+            return QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+
+
+def _type(kind: str) -> Any:
+    """The class of `package/msg/Name`."""
+    package, _, name = kind.partition("/")
+    folder, _, name = name.rpartition("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.{folder or 'msg'}"), name)
+    except ImportError as error:
+        raise UnavailableError(f"this ROS 2 has no {package}; install it beside rclpy") from error
+
+
+def _message(kind: Any, tree: Mapping[str, Any]) -> Any:
+    """A message of rclpy."""
+    message, types = kind(), kind.get_fields_and_field_types()
+    for name, value in tree.items():
+        setattr(message, name, _field(types[name], value))
+    return message
+
+
+def _field(kind: str, value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return _message(_type(kind), value)
+    if kind == "octet":
+        return bytes([value])
+    if isinstance(value, bytes):
+        return array("B", value)
+    if isinstance(value, np.ndarray) and kind.startswith("sequence"):
+        return array(value.dtype.char, value.tobytes())
+    if isinstance(value, list) and (element := _ELEMENT.fullmatch(kind)) is not None:
+        return [_message(_type(element[1]), one) for one in value]
+    return value
+
+
+def _tree(message: Any) -> Tree:
+    """Of a message of rclpy with messages and single values only."""
+    values = {name: getattr(message, name) for name in message.get_fields_and_field_types()}
+    return {
+        name: _tree(value) if hasattr(value, "get_fields_and_field_types") else value for name, value in values.items()
+    }

@@ -1,0 +1,119 @@
+"""One camera behind topics of ROS 2: Image or CompressedImage with CameraInfo, fetched by a process of its own."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from flockd.core.config.rig import IntrinsicsConfig
+from flockd.core.config.source import CameraDeviceParameters
+from flockd.core.ros_frames import CENTRE_PX
+from flockd.onboard.ros.cdr_images import RosCameraInfo, read_camera_info, read_compressed_image, read_image
+from flockd.onboard.sources import ros_child
+from flockd.onboard.sources.child_device import ChildDevice, ChildMessage
+from flockd.onboard.sources.devices import CameraError, CapturedBuffer
+from flockd.onboard.sources.image_formats import ImageFormat, MjpegFormat, PackedFormat
+from flockd.onboard.sources.ros_child import COMPRESSED, IMAGE, INFO
+
+CHILD = (sys.executable, "-P", str(Path(ros_child.__file__)))
+"""Without its folder on Python's path, where its neighbours' names would hide those of other packages."""
+ENCODINGS: Mapping[str, str] = {
+    "rgb8": "RGB",
+    "bgr8": "BGR",
+    "rgba8": "RGBA",
+    "bgra8": "BGRA",
+    "8UC3": "BGR",
+    "mono8": "GRAY8",
+    "8UC1": "GRAY8",
+    "yuv422_yuy2": "YUY2",
+    "yuyv": "YUY2",
+    "yuv422": "UYVY",
+    "uyvy": "UYVY",
+}
+"""What is read of `sensor_msgs/image_encodings`, by GStreamer's name."""
+LENS_TOLERANCE = 0.03
+"""By so much of the focal length a driver's CameraInfo and the rig may be apart: two calibrations of one camera are."""
+
+
+def info_topic_of(topic: str) -> str:
+    """Where a camera's CameraInfo is by the ecosystem's custom: beside the images, whatever transport carries them."""
+    base = topic.removesuffix("/compressed")
+    return f"{base.rpartition('/')[0]}/camera_info"
+
+
+class RosDevice(ChildDevice):
+    """A ``CameraDevice`` of a topic. Its time stamps are the messages' own, carried over to CLOCK_MONOTONIC."""
+
+    _what, _kinds = "its topic", (IMAGE, COMPRESSED, INFO)
+
+    def __init__(
+        self,
+        camera: CameraDeviceParameters,
+        size: tuple[int, int],
+        lens: IntrinsicsConfig | None = None,
+        command: Sequence[str] = CHILD,
+    ) -> None:
+        """Starts the process; ``lens``: of the rig, which a CameraInfo must not contradict. Raises CameraError."""
+        self._topic, self._size, self._lens = camera.topic, size, lens
+        self._format: ImageFormat | None = None
+        self._info_topic = camera.camera_info or info_topic_of(camera.topic)
+        super().__init__(camera.name, camera.rate_hz, [*command, camera.topic, self._info_topic, camera.stamps])
+
+    def image_format(self) -> ImageFormat:
+        """See ``CameraDevice``."""
+        assert self._format is not None
+        return self._format
+
+    def _taken(self, message: ChildMessage) -> CapturedBuffer | None:
+        try:
+            if message.kind == INFO:
+                self._compare(read_camera_info(message.data))
+                return None
+            image = read_image(message.data) if message.kind == IMAGE else read_compressed_image(message.data)
+        except ValueError as error:
+            raise CameraError(f"{self._name}: {self._topic} sent what is no image ({error})") from error
+        if message.kind == IMAGE:
+            self._format = self._packed(image.encoding, image.size, image.bytes_per_line)
+        elif "jpeg" in image.encoding or "jpg" in image.encoding:
+            self._format = MjpegFormat(self._size)
+        else:
+            raise CameraError(f"{self._name}: {self._topic} sends {image.encoding[:40]!r}; let its transport send JPEG")
+        return self._captured(image.data, message)
+
+    def _packed(self, encoding: str, size: tuple[int, int] | None, bytes_per_line: int | None) -> ImageFormat:
+        if size != self._size and size is not None:
+            gives, asked = (f"{width}x{height}" for width, height in (size, self._size))
+            raise CameraError(
+                f"{self._name}: {self._topic} gives {gives}, but the rig has {asked}; correct size_px, or the driver"
+            )
+        if encoding not in ENCODINGS:
+            known = ", ".join(ENCODINGS)
+            raise CameraError(
+                f"{self._name}: {self._topic} has the encoding {encoding[:40]!r}, and not one of {known}; "
+                "convert it, as image_proc does"
+            )
+        return PackedFormat(ENCODINGS[encoding], self._size, bytes_per_line)
+
+    def _compare(self, info: RosCameraInfo) -> None:
+        """Raises CameraError where a CameraInfo says something else than the rig. One without a calibration may."""
+        if self._lens is None or info.fx == 0:
+            return
+        if info.size != self._size:
+            gives, asked = (f"{width}x{height}" for width, height in (info.size, self._size))
+            raise CameraError(f"{self._name}: {self._info_topic} is of {gives}, but the rig has {asked}; correct one")
+        found = {"fx": info.fx, "fy": info.fy, "cx": info.cx + CENTRE_PX, "cy": info.cy + CENTRE_PX}
+        for key, value in found.items():
+            expected = getattr(self._lens, key)
+            if not abs(value - expected) <= LENS_TOLERANCE * self._lens.fx:
+                raise CameraError(
+                    f"{self._name}: {self._info_topic} has {key} {value:.1f}, but the rig {expected:.1f}; correct one"
+                )
+
+    def _failed(self, reason: str) -> CameraError:
+        if reason == ros_child.NO_ROS:
+            return CameraError(
+                f"{self._name}: {reason}; source a ROS 2, or, with Python 3.11 on x86-64, pip install 'flockd[ros]'"
+            )
+        hint = "name a topic of Image or CompressedImage" if reason.startswith("is of") else "check its environment"
+        return CameraError(f"{self._name}: {self._topic} {reason}; {hint}")
