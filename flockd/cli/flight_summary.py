@@ -57,7 +57,8 @@ def _key_figures(summary: Mapping[str, Any]) -> dict[str, str]:
         "flown": f"{summary['duration_s']:g} s",
         "speed": _number(summary["realtime_factor"], "x real time", 2),
         "closest two drones": _number(flock["min_distance_m"], "m", 2),
-        "slowed by safety gates": "" if summary["gated"] is None else _slowed(summary["slowed_share"]),
+        "slowed by safety gates": _slowed(summary),
+        "asked for Hold": _held(summary["handed_over"]),
         "order at the end": _order(flock),
         "union at the end": _number(flock["union_tail"], "of 1", 2),
         "mission": _mission(summary["mission"]),
@@ -76,8 +77,31 @@ def _order(flock: Mapping[str, Any]) -> str:
     return _number(flock["order_tail"], "of 1", 3)
 
 
-def _slowed(share: float | None) -> str:
-    return "flown without gates" if share is None else f"{100 * share:.1f} % of the time"
+_CAUSES = {
+    "neighbour": "neighbours",
+    "uncertainty": "their uncertainty",
+    "false_detection": "false detections",
+    "obstacle": "obstacles",
+    "fence": "the fence",
+    "wind": "wind",
+    "other": "other limits",
+}
+
+
+def _slowed(summary: Mapping[str, Any]) -> str:
+    """For how long, and by what; a moment may have several causes."""
+    share = summary["slowed_share"]
+    if share is None:
+        return "" if summary["gated"] is None else "flown without gates"
+    causes = ", ".join(f"{_CAUSES[cause]} {100 * part:.1f} %" for cause, part in summary["slowed_by"].items())
+    return f"{100 * share:.1f} % of the time" + (f": {causes}" if causes else "")
+
+
+def _held(handed_over: Mapping[str, Any]) -> str:
+    """Of how many drones the supervisors did, and why."""
+    if not handed_over["drones"]:
+        return ""
+    return f"{handed_over['drones']} drones, the first at {handed_over['first_s']:.1f} s: {handed_over['reasons'][0]}"
 
 
 def _mission(mission: Mapping[str, Any]) -> str:

@@ -60,6 +60,15 @@ class FleetMetadata(BaseModel):
     notes: list[str]
 
 
+class HandedOver(BaseModel):
+    """That a simulated drone's supervisor asked for Hold."""
+
+    model_config = _FROZEN
+
+    time_s: float
+    reason: str
+
+
 class MissionMetadata(BaseModel):
     """Where the drones of a flight wanted to go."""
 
@@ -126,6 +135,10 @@ class FlightMetadata(BaseModel):
     """Share of their time in which gates let drones fly otherwise than their pilots asked for; None: not known."""
     settings: dict[str, str] = {}
     """What the command line set otherwise than the scenario's file, by option."""
+    slowed_by: dict[str, float] = {}
+    """The same by cause (`flockd.sim.slowing.Cause`); a moment may have several."""
+    handed_over: dict[int, HandedOver] = {}
+    """By the number of a simulated drone, from 0: when and why it did not fly on."""
     interrupted: bool = False
     """It was ended before its time; `duration_s` is what was flown."""
     mission: MissionMetadata

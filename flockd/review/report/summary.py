@@ -36,10 +36,12 @@ def summarise(log: FlightLog) -> Json:
     steps too (`closest_distances`), and `safety` at all steps; order (null of a flock that hovers), union and
     connectivity are horizontal means over the last 10 s, with the law's observation distance as interaction distance.
     `neighbours`: the share of all drones within 10 m, at all steps, of which there was a confirmed track, and new
-    false tracks; of drones and steps that were recorded. A flight whose perception is "truth" has no perception: its
-    `neighbours` are null and it is itself Table 3's "truth". Of a recording without truth (`has_truth`) all of these
-    are null. `mission` is `mission_figures`, `obstacles` is `obstacle_figures`. `own_account` needs no truth: the
-    recorded drones' own estimates. `gated` and `slowed_share` are as in `FlightMetadata`. `autopilot` names what real
+    false tracks; of drones and steps that were recorded. A flight whose perception is "truth" has no perception:
+    its `neighbours` are null and it is itself Table 3's "truth". Of a recording without truth (`has_truth`) all of
+    these are null. `mission` is `mission_figures`, `obstacles` is `obstacle_figures`. `own_account` needs no truth:
+    the recorded drones' own estimates. `gated`, `slowed_share` and `slowed_by` are as in `FlightMetadata`.
+    `handed_over` says how many simulated drones' supervisors asked for Hold, since when, how near two drones came
+    of which flockd flew at least one, and how often one that it flew hit an obstacle. `autopilot` names what real
     daemons flew, and `fleet` holds their figures; null where the simulator ran the pilots.
     """
     metadata, value = log.metadata, log.metadata.model_dump()
@@ -52,6 +54,7 @@ def summarise(log: FlightLog) -> Json:
         "flock": _flock(log),
         "mission": mission_figures(log),
         "obstacles": obstacle_figures(log),
+        "handed_over": _handed_over(log),
         "neighbours": _neighbours(log),
         "own_account": _own_account(log),
         "stages_ms": {
@@ -64,7 +67,7 @@ def summarise(log: FlightLog) -> Json:
 
 _FROM_METADATA = (
     "scenario", "perception", "flow", "scale", "drones", "duration_s", "step_s", "seed", "wall_s", "circle_until_s",
-    "desired_distance_m", "gated", "slowed_share",
+    "desired_distance_m", "gated", "slowed_share", "slowed_by",
     "settings", "recorded", "began", "version", "interrupted", "autopilot", "fleet",
 )  # fmt: skip
 
@@ -143,14 +146,39 @@ def obstacle_figures(log: FlightLog) -> Json:
     again. `min_clearance_m` is the smallest distance from that sphere to an obstacle, inside negative, and
     `time_within_1m_s` how long it was below 1 m, summed over the drones.
     """
-    if not len(log.clearance) or log.metadata.drone_radius_m is None:
+    contacts = _contacts(log)
+    if contacts is None or log.metadata.drone_radius_m is None:
         return dict.fromkeys(("collisions", "min_clearance_m", "time_within_1m_s"))
     free_m = log.clearance - log.metadata.drone_radius_m
-    touching = np.vstack([np.zeros((1, free_m.shape[1]), dtype=bool), free_m < 0])
     return {
-        "collisions": int((touching[1:] & ~touching[:-1]).sum()),
+        "collisions": int(contacts.sum()),
         "min_clearance_m": float(free_m.min()),
         "time_within_1m_s": float((free_m < NEAR_M).sum() * log.metadata.step_s),
+    }
+
+
+def _contacts(log: FlightLog) -> BoolArray | None:
+    """(S, N): in which steps which drones' contacts with obstacles begin; None without obstacles."""
+    if not len(log.clearance) or log.metadata.drone_radius_m is None:
+        return None
+    touching = np.vstack([np.zeros((1, log.clearance.shape[1]), bool), log.clearance < log.metadata.drone_radius_m])
+    return np.asarray(touching[1:] & ~touching[:-1])
+
+
+def _handed_over(log: FlightLog) -> Json:
+    if not log.has_truth:
+        return dict.fromkeys(("drones", "first_s", "reasons", "min_distance_flown_m", "collisions_flown"))
+    held = log.metadata.handed_over
+    since_s = np.array([held[i].time_s if i in held else np.inf for i in range(log.position.shape[1])])
+    flown = log.time_s[:, None] < since_s
+    i, j = np.triu_indices(log.position.shape[1], 1)
+    nearest = closest_distances(log.position)[:, i, j]
+    return {
+        "drones": len(held),
+        "first_s": _finite(since_s.min()),
+        "reasons": sorted({one.reason for one in held.values()}),
+        "min_distance_flown_m": _finite(nearest[flown[:, i] | flown[:, j]].min(initial=np.inf)),
+        "collisions_flown": None if (contacts := _contacts(log)) is None else int((contacts & flown).sum()),
     }
 
 
