@@ -215,6 +215,8 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
             not inputs.loop_lag_s <= p.max_loop_lag_s,
             f"the event loop is {inputs.loop_lag_s:.2f} s late",
         ),
+        (Event.FOREIGN_SETPOINTS, inputs.foreign_setpoints is not None, f"{inputs.foreign_setpoints}"),
+        (Event.PARAMETER_CHANGED, inputs.parameter_fault is not None, f"{inputs.parameter_fault}"),
         (
             Event.GUSTS_STRONG,
             p.degraded_gusts_m_s < inputs.gusts_m_s <= p.max_gusts_m_s,
@@ -246,8 +248,6 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
             f"setpoints ended: {inputs.stream_fault}",
         ),
         (Event.AUTOPILOT_FAILSAFE, inputs.autopilot_failsafe, _FAILSAFE),
-        (Event.FOREIGN_SETPOINTS, inputs.foreign_setpoints is not None, f"{inputs.foreign_setpoints}"),
-        (Event.PARAMETER_CHANGED, inputs.parameter_fault is not None, f"{inputs.parameter_fault}"),
         (Event.NOT_OFFBOARD, inputs.flight_mode != OFFBOARD, f"the flight mode is {inputs.flight_mode or 'not known'}"),
         (Event.NOT_ARMED, not inputs.armed, "not armed"),
         (Event.NOT_IN_AIR, not inputs.in_air, "not in the air"),

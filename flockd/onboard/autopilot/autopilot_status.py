@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,7 +14,27 @@ FlightMode = Literal[
     "other", "unknown"
 ]  # fmt: skip
 """PX4's flight modes as flockd tells them apart; unknown: not heard yet."""
+MODES: Mapping[tuple[int, int], FlightMode] = {
+    (1, 0): "manual",
+    (2, 0): "altitude",
+    (3, 0): "position",
+    (4, 2): "take-off",
+    (4, 3): "hold",
+    (4, 4): "mission",
+    (4, 5): "return",
+    (4, 6): "land",
+    (5, 0): "acro",
+    (6, 0): "offboard",
+    (7, 0): "stabilized",
+}
+"""PX4's main and sub mode."""
 LandedState = Literal["unknown", "ground", "air", "taking off", "landing"]
+
+
+def mode_of(custom_mode: float) -> FlightMode:
+    """By PX4's number of it in MAVLink; one that is not in `MODES` is `other`."""
+    number = int(custom_mode)
+    return MODES.get((number >> 16 & 0xFF, number >> 24 & 0xFF), "other")
 
 
 class AutopilotError(UnavailableError):

@@ -17,7 +17,7 @@ import numpy as np
 from flockd.core import services
 from flockd.core.messages import FloatArray, RangeReading, VehicleState
 from flockd.flight.geometry import rotation_from_quaternion
-from flockd.onboard.autopilot.autopilot_status import AutopilotStatus, FlightMode, LandedState
+from flockd.onboard.autopilot.autopilot_status import AutopilotStatus, FlightMode, LandedState, mode_of
 from flockd.onboard.autopilot.clock_sync import ClockSync
 from flockd.onboard.autopilot.refusals import CheckEvents, Refusal, refusals
 from flockd.onboard.autopilot.setpoint_watch import SetpointWatch
@@ -31,20 +31,6 @@ GPS_FIX_3D = 3
 ESTIMATOR_ATTITUDE, ESTIMATOR_VELOCITY_HORIZONTAL = 1, 2
 ESTIMATOR_POSITION_RELATIVE, ESTIMATOR_POSITION_ABSOLUTE, ESTIMATOR_HEIGHT = 8, 16, 32
 
-MODES: Mapping[tuple[int, int], FlightMode] = {
-    (1, 0): "manual",
-    (2, 0): "altitude",
-    (3, 0): "position",
-    (4, 2): "take-off",
-    (4, 3): "hold",
-    (4, 4): "mission",
-    (4, 5): "return",
-    (4, 6): "land",
-    (5, 0): "acro",
-    (6, 0): "offboard",
-    (7, 0): "stabilized",
-}
-"""PX4's main and sub mode."""
 LANDED_STATES: tuple[LandedState, ...] = ("unknown", "ground", "air", "taking off", "landing")
 """By MAV_LANDED_STATE."""
 RESULTS = (
@@ -338,12 +324,12 @@ class ReceivedMessages:
         reports = [self._newest[name] for name in ("HEARTBEAT", "CURRENT_MODE") if name in self._newest]
         if not reports:
             return "unknown"
-        return _mode(max(reports, key=lambda message: message.time_s).fields["custom_mode"])
+        return mode_of(max(reports, key=lambda message: message.time_s).fields["custom_mode"])
 
     def _would_return(self) -> bool:
         """It was asked for offboard and flies another mode: it would be back in offboard with the next setpoint."""
         asked = self._fields("CURRENT_MODE").get("intended_custom_mode") or 0
-        return _mode(asked) == "offboard" and self.flight_mode() != "offboard"
+        return mode_of(asked) == "offboard" and self.flight_mode() != "offboard"
 
     def _fields(self, name: str) -> Fields:
         message = self._newest.get(name)
@@ -416,11 +402,6 @@ class StatusText:
 def result_text(result: int) -> str:
     """What a MAV_RESULT means, for people."""
     return RESULTS[result] if 0 <= result < len(RESULTS) else f"answered with the unknown result {result}"
-
-
-def _mode(custom_mode: float) -> FlightMode:
-    number = int(custom_mode)
-    return MODES.get((number >> 16 & 0xFF, number >> 24 & 0xFF), "other")
 
 
 def _range_reading(fields: Fields, time_s: float) -> RangeReading:

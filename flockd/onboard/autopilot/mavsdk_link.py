@@ -29,9 +29,9 @@ from mavsdk.system import System
 from flockd.core import services
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.messages import RangeReading, Setpoint, VehicleState
-from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware, FlightMode
+from flockd.onboard.autopilot.autopilot_status import MODES, AutopilotError, AutopilotStatus, Firmware, FlightMode
 from flockd.onboard.autopilot.clock_sync import ClockEstimate
-from flockd.onboard.autopilot.mavlink_messages import MODES, Fields, ReceivedMessages, result_text
+from flockd.onboard.autopilot.mavlink_messages import Fields, ReceivedMessages, result_text
 from flockd.onboard.autopilot.refusal_reasons import REMEDIES_OF_RESULTS
 from flockd.onboard.autopilot.refusals import Refusal
 from flockd.onboard.autopilot.throttled_log import ThrottledLog
@@ -50,8 +50,6 @@ COMMAND_SET_MODE = 176
 COMMAND_SET_MESSAGE_INTERVAL = 511
 COMMAND_REQUEST_MESSAGE = 512
 COMMAND_RUN_CHECKS = 401
-STARTS = frozenset({COMMAND_ARM_DISARM, COMMAND_SET_MODE})
-"""Commands that the autopilot's checks may refuse."""
 STREAMS_HZ = {
     "ATTITUDE_QUATERNION": (31, services.VEHICLE_STATE.rate_hz),
     "LOCAL_POSITION_NED": (32, 30.0),
@@ -74,7 +72,7 @@ MOST_OPEN = 20
 TEXT_MEMORY_S = 2.0
 REASON_S = 0.5
 """For how long a refusal waits for the autopilot's text, which comes after it."""
-ATTEND_S, ANNOUNCE_S, PARAMETER_S = 0.1, 1.0, 1.0
+ATTEND_S, ANNOUNCE_S, PARAMETER_S = 0.1, 1.0, 0.5
 """Between two requests for events that are missing; two announcements; and two readings of a parameter."""
 ANNOUNCEMENT = {
     "type": 6, "autopilot": 8, "base_mode": 0, "custom_mode": 0, "system_status": 4, "mavlink_version": 3
@@ -305,7 +303,7 @@ class AutopilotLink:
 
     async def arm(self) -> None:
         """Starts the motors. Raises AutopilotError when refused."""
-        await self._command("to arm", COMMAND_ARM_DISARM, 1)
+        await self._command("to arm", COMMAND_ARM_DISARM, 1, refused="to arm")
 
     async def take_off(self) -> None:
         """Climbs to its own take-off height (MIS_TAKEOFF_ALT), once armed. Raises AutopilotError when refused."""
@@ -353,7 +351,7 @@ class AutopilotLink:
 
     async def _set_mode(self, mode: FlightMode) -> None:
         main, sub = next(numbers for numbers, name in MODES.items() if name == mode)
-        await self._command(f"for {mode}", COMMAND_SET_MODE, 1, main, sub)
+        await self._command(f"for {mode}", COMMAND_SET_MODE, 1, main, sub, refused=mode)
 
     async def _leave_offboard(self) -> None:
         """PX4 goes back to the last mode it was asked for after landing, and cannot be armed if that was offboard."""
@@ -367,8 +365,11 @@ class AutopilotLink:
             except AutopilotError as error:  # an older firmware may lack one; whatever needs it then says so
                 _log.warning("%s", error)
 
-    async def _command(self, what: str, command: int, *values: float) -> None:
-        """Sends a command until it is acknowledged. Raises AutopilotError when refused or never answered."""
+    async def _command(self, what: str, command: int, *values: float, refused: str | None = None) -> None:
+        """Sends a command until it is acknowledged. Raises AutopilotError when refused or never answered.
+
+        ``refused``: what its checks may refuse with it, as in `Refusal.refused`; None: nothing.
+        """
         loop = asyncio.get_running_loop()
         answer: asyncio.Future[tuple[MavlinkDirectResult, str]] = loop.create_future()
 
@@ -383,22 +384,23 @@ class AutopilotLink:
             raise AutopilotError(f"the autopilot was asked {what} and did not respond ({result.name.lower()})")
         verdict = int(json.loads(ack)["result"])
         if verdict != 0:
-            why = await self._why(verdict) if command in STARTS else ""
+            why = "" if refused is None else await self._why(verdict, refused)
             raise AutopilotError(f"the autopilot was asked {what}, which was {result_text(verdict)}{why}")
 
-    async def _why(self, verdict: int) -> str:
+    async def _why(self, verdict: int, refused: str) -> str:
         """What is known of a refusal, once the autopilot has had time to tell, with what to do."""
         deadline = self._clock() + REASON_S
-        while not (known := self._known_reasons()) and self._clock() < deadline:
+        while not (known := self._known_reasons(refused)) and self._clock() < deadline:
             await asyncio.sleep(0.02)
         if known:
             return f": {'; '.join(known)}"
         remedy = f"; {REMEDIES_OF_RESULTS[verdict]}" if verdict in REMEDIES_OF_RESULTS else ""
         return f" without a reason{remedy}"
 
-    def _known_reasons(self) -> list[str]:
+    def _known_reasons(self, refused: str) -> list[str]:
         said = self._received.recent_texts(self._clock(), TEXT_MEMORY_S)
-        return [*said, *(f"{refusal.what}; {refusal.remedy}" for refusal in self.refusals())]
+        checks = [refusal for refusal in self.refusals() if refusal.refused in {refused, ""}]
+        return [*said, *(f"{refusal.what}; {refusal.remedy}" for refusal in checks)]
 
     def _message(self, name: str, fields: Fields) -> MavlinkMessage:
         target = {"target_system": self._system_id, "target_component": AUTOPILOT_COMPONENT}

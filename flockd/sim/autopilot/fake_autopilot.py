@@ -49,6 +49,8 @@ ARRIVED_M = 0.3
 STICKS_FRESH_S = 0.5
 OFFBOARD_LOSS_MODES: dict[int, Mode] = {0: "RTL", 3: "RTL", 4: "LAND", 5: "LOITER"}
 """By COM_OBL_RC_ACT, no others; 0 would be position mode, which needs a remote control, which there is none of."""
+NOT_ARMED_IN: dict[Mode, str] = {"LAND": "check_modes_cannot_takeoff", "ACRO": "check_modes_manual_control"}
+"""The checks that refuse to arm in a mode."""
 HOME_DEG = (47.3977, 8.5456)
 MAX_SETPOINTS_KEPT = 100_000
 SO_TIMESTAMPNS = 35
@@ -272,7 +274,7 @@ class FakeAutopilot:
             asked_s = self._clock()
             self._socket.settimeout(max(deadline - asked_s, 0.0) / self._speed_factor)
             try:
-                data, ancillary, _, _ = self._socket.recvmsg(4096, 64)
+                data, ancillary, _, sender = self._socket.recvmsg(4096, 64)
             except (TimeoutError, BlockingIOError):
                 self._heard_s = asked_s
                 return
@@ -281,7 +283,7 @@ class FakeAutopilot:
             arrived_s = max(self._clock() - self._speed_factor * _age(ancillary), self._heard_s)
             with self._lock:
                 for message in self._mav.parse_buffer(data) or ():
-                    self._handle(message, arrived_s)
+                    self._handle(message, arrived_s, on_link=sender == self._link)
 
     # Rules
 
@@ -297,16 +299,19 @@ class FakeAutopilot:
         mode = OFFBOARD_LOSS_MODES[int(self.parameters["COM_OBL_RC_ACT"])] if lost else self._intended
         if mode == self._mode:
             return
+        if lost:
+            self.checks.say("Failsafe activated", self._clock())
         self._mode = mode
         self._hold_down_m = float(self._state.position[2])
         R = self._state.R_ned_body
         self._hold_yaw_rad = math.atan2(R[1, 0], R[0, 0])
 
-    def _select(self, mode: Mode) -> bool:
-        """A mode requested over MAVLink: while armed, only one that can run."""
-        if mode == "OFFBOARD" and self._armed and not self._signal():
-            self.checks.say("Offboard not possible: no offboard signal", self._clock())
-            self.checks.deny("commander_modeswitch_not_avail", custom_mode(mode))
+    def _select(self, mode: Mode, component: int) -> bool:
+        """A mode requested over MAVLink: while armed, only one that can run. It tells ground stations alone of that."""
+        if self._armed and (mode == "ACRO" or (mode == "OFFBOARD" and not self._signal())):
+            if component == mavlink.MAV_COMP_ID_MISSIONPLANNER:
+                self.checks.say(f"Switching to {mode.title()} is currently not available", self._clock())
+                self.checks.deny("commander_modeswitch_not_avail", custom_mode(mode))
             return False
         self.pilot_selects(mode)
         return True
@@ -326,6 +331,8 @@ class FakeAutopilot:
     def _failing(self) -> set[str]:
         """The checks that fail now."""
         missing = set() if self._signal() else {NO_SETPOINTS}
+        if not self._armed:
+            missing |= {NOT_ARMED_IN[self._intended]} if self._intended in NOT_ARMED_IN else set()
         return missing | self.failing | (set() if self.estimate_ok else {"check_estimator_hor_pos_not_stable"})
 
     def _disarm(self) -> None:
@@ -378,7 +385,7 @@ class FakeAutopilot:
 
     # MAVLink, in
 
-    def _handle(self, message: Any, arrived_s: float) -> None:
+    def _handle(self, message: Any, arrived_s: float, *, on_link: bool) -> None:
         if getattr(message, "target_system", self._mav.srcSystem) != self._mav.srcSystem:
             return
         match message.get_type():
@@ -401,7 +408,7 @@ class FakeAutopilot:
                 self._send_parameter(message.param_id)
             case "PARAM_SET":
                 self._set_parameter(message.param_id, message.param_value)
-            case "HEARTBEAT" if message.type == mavlink.MAV_TYPE_GCS:
+            case "HEARTBEAT" if on_link and message.type == mavlink.MAV_TYPE_GCS:
                 self.checks.hear_ground_station(self._clock())
             case "UNKNOWN_412":  # REQUEST_EVENT, which pymavlink does not have
                 self.checks.send_again(*struct.unpack("<HH", bytes(message.get_msgbuf())[10:14]))
@@ -423,7 +430,7 @@ class FakeAutopilot:
                 mode = mode_by_number(int(message.param2), int(message.param3))
                 if mode is None:
                     return int(mavlink.MAV_RESULT_UNSUPPORTED)
-                done = self._select(mode)
+                done = self._select(mode, message.get_srcComponent())
             case mavlink.MAV_CMD_COMPONENT_ARM_DISARM if message.param1 == 1:
                 done = self._arm()
             case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
@@ -431,7 +438,7 @@ class FakeAutopilot:
                 if done:
                     self._streams.intervals_s[int(message.param1)] = message.param2 * 1e-6
             case mavlink.MAV_CMD_RUN_PREARM_CHECKS:
-                self.checks.tell(self._failing())
+                self.checks.tell(() if self.wordless else self._failing())
                 done = True
             case mavlink.MAV_CMD_REQUEST_MESSAGE if message.param1 == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
                 self._streams.send_version()

@@ -18,7 +18,7 @@ from flockd.flight.geometry import quaternion_from_rotation
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.sim.autopilot.fake_vehicle import MotionState
 
-Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "RTL", "OFFBOARD"]
+Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "RTL", "ACRO", "OFFBOARD"]
 """PX4's modes by the names pymavlink gives them; LOITER is Hold."""
 
 DEFAULT_STREAMS_S = {
@@ -255,5 +255,5 @@ def custom_mode(mode: Mode) -> int:
 
 def mode_by_number(main: int, sub: int) -> Mode | None:
     """The mode of PX4's numbers; None for one that the fake does not fly."""
-    modes: tuple[Mode, ...] = ("POSCTL", "LOITER", "TAKEOFF", "LAND", "RTL", "OFFBOARD")
+    modes: tuple[Mode, ...] = ("POSCTL", "LOITER", "TAKEOFF", "LAND", "RTL", "ACRO", "OFFBOARD")
     return next((mode for mode in modes if mavutil.px4_map[mode][1:] == (main, sub)), None)
