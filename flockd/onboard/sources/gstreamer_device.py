@@ -18,9 +18,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flockd.core.config.source import CameraDeviceParameters
+from flockd.core.secrets import masked
 from flockd.onboard.sources import gstreamer_child
 from flockd.onboard.sources.devices import CameraDevice, CameraError, CapturedBuffer
-from flockd.onboard.sources.gstreamer_child import CAPS, DAMAGED, END, ERROR, HEADER, IMAGE
+from flockd.onboard.sources.gstreamer_child import CAPS, DAMAGED, END, ERROR, HEADER, IMAGE, packed_text
 from flockd.onboard.sources.gstreamer_formats import caps, format_of
 from flockd.onboard.sources.image_formats import ImageFormat
 
@@ -50,14 +51,14 @@ class GstreamerDevice(CameraDevice):
     start_s = 10.0
 
     def __init__(self, camera: CameraDeviceParameters, size: tuple[int, int], command: Sequence[str] = CHILD) -> None:
-        """Starts the process, whose ``command`` gets the pipeline and what is asked of it; raises CameraError."""
+        """Starts the process: ``command``, with what is asked of the pipeline. Raises CameraError."""
         self._name, self._size, self._rate_hz = camera.name, size, camera.rate_hz
         self._format: ImageFormat | None = None
         self._last_s: float | None = None
         self._sequence = 0
         try:
             self._process = subprocess.Popen(
-                [*command, camera.pipeline, caps(size, camera.rate_hz)],
+                [*command, caps(size, camera.rate_hz)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 bufsize=0,
@@ -67,7 +68,10 @@ class GstreamerDevice(CameraDevice):
             raise CameraError(
                 f"{camera.name}: the process of its pipeline cannot be started ({error.strerror})"
             ) from error
-        assert self._process.stdout is not None
+        assert self._process.stdin is not None and self._process.stdout is not None
+        with contextlib.suppress(BrokenPipeError):  # it has ended, which `read` says
+            # Not as an argument: every user of the computer may read those, and a pipeline may hold a password.
+            self._process.stdin.write(packed_text(camera.pipeline))
         self._stream = _Stream(self._process.stdout.fileno())
 
     def read(self, timeout_s: float) -> CapturedBuffer | None:
@@ -122,7 +126,7 @@ class GstreamerDevice(CameraDevice):
     def _set_format(self, text: str) -> None:
         found = format_of(text)
         if found is None:
-            raise CameraError(f"{self._name}: its pipeline gives {text[:80]}; end it with `videoconvert`")
+            raise CameraError(f"{self._name}: its pipeline gives {masked(text)[:80]}; end it with `videoconvert`")
         self._format, size = found
         if size != self._size:
             gives, asked = (f"{width}x{height}" for width, height in (size, self._size))
@@ -134,7 +138,9 @@ class GstreamerDevice(CameraDevice):
     def _failed(self, reason: str) -> CameraError:
         if reason == gstreamer_child.NOT_INSTALLED:
             return CameraError(f"{self._name}: {reason}; install {PACKAGES}")
-        return CameraError(f"{self._name}: its pipeline {reason}; try it with `gst-launch-1.0 PIPELINE ! fakesink`")
+        return CameraError(
+            f"{self._name}: its pipeline {masked(reason)}; try it with `gst-launch-1.0 PIPELINE ! fakesink`"
+        )
 
     def _ended(self) -> CameraError:
         try:
