@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
 from flockd.cli import sim_fleet
+from flockd.cli.endpoint_options import ENDPOINT
 from flockd.cli.flight_summary import report_flight
 from flockd.cli.output import Phases, complain
 from flockd.cli.parser import Commands, positive_count, positive_number, seed
@@ -111,6 +112,10 @@ def add(commands: Commands) -> None:
     parser.add_argument("--force", action="store_true", help="overwrite an earlier flight in that folder")
     parser.add_argument("--telemetry", action="store_true", help="publish over zenoh while flying")
     parser.add_argument(
+        "--telemetry-at", metavar="ENDPOINT",
+        help=f"where --telemetry listens, or where the daemons of --autopilot connect to (default: {ENDPOINT})",
+    )  # fmt: skip
+    parser.add_argument(
         "--record",
         action="store_true",
         help="write a recording of each drone to DIR/recordings, 4.5 MB a drone and simulated second",
@@ -178,7 +183,9 @@ def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespac
             from flockd.onboard.telemetry.publisher import ZenohTelemetry
             from flockd.sim.repeater import Repeater
 
-            zenoh = stack.enter_context(ZenohTelemetry(_plain(scenario.scenario)))
+            zenoh = stack.enter_context(
+                ZenohTelemetry(_plain(scenario.scenario), listen=[args.telemetry_at or ENDPOINT])
+            )
             for number in range(1, len(scenario.vehicles) + 1):
                 zenoh.show_alive(f"drone{number}")
             telemetry = stack.enter_context(Repeater(zenoh))

@@ -11,6 +11,7 @@ from typing import Any
 
 from flockd import __version__
 from flockd.core.config import DroneConfig
+from flockd.core.secrets import masked
 from flockd.flight.geometry import build_rig
 from flockd.flight.safety import Decision, Gate
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
@@ -119,7 +120,7 @@ def _open_telemetry(config: DroneConfig) -> ZenohTelemetry:
 def _about(config: DroneConfig) -> AboutMessage:
     return AboutMessage(
         version=__version__,
-        configuration=config.model_dump(mode="json"),
+        configuration=masked(config.model_dump(mode="json")),
         commands=list(config.telemetry.commands),
     )
 

@@ -22,6 +22,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.recording import RecordingConfig
 from flockd.core.config.rig import RigConfig
 from flockd.core.messages import Frame, FrameSet, MissionOrder, PilotOutput, VehicleState
+from flockd.core.secrets import masked
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.codec import to_json
 from flockd.onboard.recording.mcap_file import Entry, Inclosure, McapFile, Note, RecordingError
@@ -118,7 +119,7 @@ class Recorder:
         flight = {"drone": drone, "began": began, "images": self._settings.images, **_VERSIONS, **(facts or {})}
         head = (
             Note(MODELS_NOTE, models or {}),
-            Inclosure(CONFIGURATION, "application/json", config.model_dump_json(indent=1).encode()),
+            Inclosure(CONFIGURATION, "application/json", _without_passwords(config)),
         )
         self._parts = _Parts(path, flight, head, config.rig, self._settings, self._tell)
         self._track = _Track(config.rig)
@@ -459,6 +460,11 @@ def _compressed(frame: Frame, settings: RecordingConfig) -> bytes | None:
     if settings.images == "jpeg":
         options = [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality]
     return bytes(cv2.imencode(f".{settings.images}", bgr, options)[1])
+
+
+def _without_passwords(config: DroneConfig) -> bytes:
+    """A recording is passed on; what opens a camera is not needed to fly it again."""
+    return json.dumps(masked(config.model_dump(mode="json")), indent=1, ensure_ascii=False).encode()
 
 
 def _json_entry(stream: Any, time_s: float, sequence: int, message: object) -> Entry:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 from flockd.core.config.rig import IntrinsicsConfig
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
+from flockd.core.secrets import masked
 from flockd.onboard.sources.devices import CameraDevice, CameraError, CapturedBuffer
 from flockd.onboard.sources.frame_receiver import FrameReceiver, ReceivedFrames
 from flockd.onboard.sources.frames import Count, RawFrame
@@ -147,7 +148,7 @@ class _Camera:
             if time.monotonic() - usable_s > limit_s:
                 last = f" (the last was refused: {refused.replace('_', ' ')})" if refused else ""
                 raise CameraError(
-                    f"{self._name}: {self._parameters.place} gave no usable image for {limit_s:g} s{last}"
+                    f"{self._name}: {masked(self._parameters.place)} gave no usable image for {limit_s:g} s{last}"
                 )
 
     def _take(self, captured: CapturedBuffer, image_format: ImageFormat) -> Count | None:

@@ -186,6 +186,20 @@ def test_a_process_that_hangs_is_ended_when_its_camera_is_closed() -> None:
     assert process.poll() == -9
 
 
+def test_a_password_of_a_camera_is_in_no_process_list_and_in_no_message() -> None:
+    """Every user of a computer may read the arguments of every process."""
+    pipeline = "caps:64x48 fail:cannot_open_rtsp://anna:hunter2@10.0.0.7/stream_with_user-pw=hunter2_! stall"
+    device = GstreamerDevice(CAMERA.model_copy(update={"pipeline": pipeline}), SIZE, FAKE)
+    arguments = Path(f"/proc/{device._process.pid}/cmdline").read_bytes()
+    with pytest.raises(CameraError, match=r"cannot open rtsp://\*\*\*@10\.0\.0\.7") as caught:
+        device.read(60.0)
+    device.close()
+    assert b"64" in arguments, "the size is among them"
+    for told in (arguments, str(caught.value).encode()):
+        assert b"anna" not in told
+        assert b"hunter2" not in told
+
+
 def test_a_program_that_is_not_there_is_one_sentence() -> None:
     with pytest.raises(CameraError, match=r"^front: the process of its pipeline cannot be started \(No such file"):
         GstreamerDevice(CAMERA, SIZE, ("/nowhere/python",))
@@ -195,8 +209,8 @@ def test_the_real_process_says_so_where_gstreamer_is_not_installed(tmp_path: Pat
     text = Path(CHILD[-1]).read_text(encoding="utf-8").replace("libgstreamer-1.0.so.0", "libnowhere-1.0.so.0")
     (tmp_path / "child.py").write_text(text, encoding="utf-8")
     done = subprocess.run(
-        [sys.executable, "-I", tmp_path / "child.py", "videotestsrc", "ANY"],
-        input=b"",
+        [sys.executable, "-I", tmp_path / "child.py", "ANY"],
+        input=b"\x0c\0\0\0videotestsrc",
         capture_output=True,
         timeout=60,
         check=False,
