@@ -468,6 +468,15 @@ CATALOGUE = (
         ),
     ),
     Fault(
+        52, "timesync-lies", "TIMESYNC jumps or creeps, or somebody else answers",
+        "not used; an event; attitudes are no worse than by arrival",
+        (
+            f"{_HERE}autopilot.py::test_timesync_lies",
+            "tests/onboard/autopilot/test_clock_sync.py::test_a_lying_timesync_is_not_used_and_said",
+        ),
+        within_s=5.0,
+    ),
+    Fault(
         60, "step-exception", "an exception that nobody expected in the pilot's step",
         "caught at the step's border; one step lost with its reason; three in a row: Hold",
         (

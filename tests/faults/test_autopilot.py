@@ -264,6 +264,22 @@ async def test_messages_with_absurd_values(tmp_path: Path) -> None:
         assert "\x1b" not in process.log()
 
 
+@pytest.mark.parametrize("ahead_s", [0.9, -0.9])
+async def test_timesync_lies(ahead_s: float, tmp_path: Path, record_property: RecordProperty) -> None:
+    """Its replies jump, as somebody else's would; the stamps of attitudes stay. It is not used, and the drone flies."""
+    async with flying(tmp_path) as process:
+        await until(lambda: process.heard()["clock"].message["offset_s"] is not None, SECONDS_TO_FAIL)
+        process.fake_autopilot.clock_offset_s += ahead_s
+        fault_s = time.monotonic()
+        await process.until_event("the autopilot's clock, by TIMESYNC, is 0.9")
+        reacted(record_property, "timesync-lies", time.monotonic() - fault_s)
+        await until(lambda: process.heard()["clock"].message["offset_s"] is None, SECONDS_TO_FAIL)
+        steps = process.heard()["computer"].message["steps"]
+        await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
+        assert process.fake_autopilot.mode == "OFFBOARD"
+        await process.until_state("normal", "degraded")
+
+
 async def test_the_ground_is_reached_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:
     """The vehicle sinks whatever it is told; its barometer says zero and less. Landing is reported and recorded."""
     async with flying(tmp_path) as process:

@@ -6,7 +6,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from flockd.core import services
+from flockd.core import consistency, services
 from flockd.core.choices import AutopilotMode
 from flockd.core.config.base import Duration, Positive, Section, Share, refuse
 
@@ -107,10 +107,10 @@ class SafetyParameters(Section):
     """The same, to hover."""
     max_loop_lag_s: Annotated[float, Field(gt=0, le=10)] = 0.2
     """Lag of the event loop; above it, degraded."""
-    degraded_gusts_m_s: Positive = 0.6
+    degraded_gusts_m_s: Positive = consistency.RESPONSE_DEGRADED.limit
     """By how much wind carries the drone off its setpoints (root mean square over ten seconds, what the gate corrects
     included), to be degraded."""
-    max_gusts_m_s: Positive = 0.8
+    max_gusts_m_s: Positive = consistency.RESPONSE.limit
     """The same, to ask for Hold."""
     heartbeat_timeout_s: Annotated[float, Field(gt=0, le=10)] = services.HEARTBEAT.timeout
     """The link to the autopilot counts as lost without a heartbeat for this long, and flockd falls silent for good; two

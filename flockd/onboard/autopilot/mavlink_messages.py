@@ -18,7 +18,7 @@ from flockd.core import services
 from flockd.core.messages import FloatArray, RangeReading, VehicleState
 from flockd.flight.geometry import rotation_from_quaternion
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus, FlightMode, LandedState, mode_of
-from flockd.onboard.autopilot.clock_sync import ClockSync
+from flockd.onboard.autopilot.clock_sync import ClockEstimate, ClockSync, StampMonitor
 from flockd.onboard.autopilot.refusals import CheckEvents, Refusal, refusals
 from flockd.onboard.autopilot.setpoint_watch import SetpointWatch
 from flockd.onboard.autopilot.watched_parameters import WatchedParameters
@@ -63,7 +63,8 @@ QUATERNION_TOLERANCE = 0.1
 """How far a quaternion's norm may be from 1; one that is farther off is no attitude."""
 HOME_TOLERANCE_M = 0.5
 """A home that moves less in flight is not reported: estimators drift."""
-STAMPED = frozenset({"ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "DISTANCE_SENSOR"})
+DISTANCE_SENSOR = "DISTANCE_SENSOR"
+STAMPED = frozenset({"ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", DISTANCE_SENSOR})
 """Messages whose `time_boot_ms` says when they were true."""
 MOST_ERROR_S = 0.005
 """Largest error of a clock whose stamps are better than times of arrival."""
@@ -97,7 +98,8 @@ class ReceivedMessages:
 
     def __init__(self, report: Callable[[str], None], max_gap_s: float = services.SETPOINT.timeout) -> None:
         """``report`` is called by `add` with one sentence on the first of each unknown value, of a home that moves in
-        flight, of a landing, of a restart, of lost heartbeats, and of what the autopilot says as a warning or worse.
+        flight, of a landing, of a restart, of lost heartbeats, of a clock that lies, and of what the autopilot says as a
+        warning or worse.
         ``max_gap_s``: between setpoints, which flockd bridges.
         """
         self._report = report
@@ -127,6 +129,7 @@ class ReceivedMessages:
         self.parameters = WatchedParameters(report)
         self.check_events = CheckEvents()
         self.clock = ClockSync()
+        self._stamps = StampMonitor()
 
     def add(self, name: str, fields: Fields, time_s: float) -> None:
         """Takes a message by its name and fields, NaN as null, as MAVSDK decodes them to JSON, and when it came."""
@@ -153,8 +156,8 @@ class ReceivedMessages:
             followed = [math.nan if fields.get(key) is None else float(fields[key]) for key in ("vx", "vy")]
             self.setpoints.followed(time_s, *followed, offboard=self.flight_mode() == "offboard")
         if name in STAMPED:
-            arrived_s, time_s = time_s, self._stamped_s(fields, time_s)
-            if name == "DISTANCE_SENSOR":
+            arrived_s, time_s = time_s, self._stamped_s(name, fields, time_s)
+            if name == DISTANCE_SENSOR:
                 self._ranges.add(fields, time_s, arrived_s)
         self._newest[name] = ReceivedMessage(time_s, self._checked(name, fields))
         if name in ("HEARTBEAT", "EXTENDED_SYS_STATE"):
@@ -215,13 +218,34 @@ class ReceivedMessages:
             self._report(f"the autopilot says: {text}")
         self._texts.append((time_s, text))
 
-    def _stamped_s(self, fields: Fields, arrived_s: float) -> float:
+    def trusted_clock(self) -> ClockEstimate | None:
+        """The autopilot's clock; None while it is not known, or contradicts the stamps of its messages."""
+        return None if self._stamps.lies else self.clock.estimate
+
+    def _stamped_s(self, name: str, fields: Fields, arrived_s: float) -> float:
         """When it was true on this computer's clock: by the autopilot's stamp, else when it came."""
         clock, boot_ms = self.clock.estimate, fields.get("time_boot_ms")
-        if clock is None or boot_ms is None or clock.error_s > MOST_ERROR_S:
+        if boot_ms is None:
             return arrived_s
-        time_s = min(clock.local_s(1e-3 * (boot_ms + 0.5)), arrived_s)  # the stamp is cut to a millisecond
+        stamp_s, lied = 1e-3 * (boot_ms + 0.5), self._stamps.lies  # the stamp is cut to a millisecond
+        if name == DISTANCE_SENSOR:  # as old as its sensor is slow: it says nothing of the clock
+            believed = not lied
+        else:
+            believed = self._stamps.believes(clock, stamp_s, arrived_s)
+            self._report_clock(lied)
+        if clock is None or not believed or clock.error_s > MOST_ERROR_S:
+            return arrived_s
+        time_s = min(clock.local_s(stamp_s), arrived_s)
         return time_s if arrived_s - time_s <= LONGEST_DELAY_S else arrived_s
+
+    def _report_clock(self, lied: bool) -> None:
+        if self._stamps.lies and not lied:
+            self._report(
+                f"the autopilot's clock, by TIMESYNC, is {abs(self._stamps.delay_s):.2f} s off the stamps of its "
+                "messages; they count from when they arrive"
+            )
+        elif lied and not self._stamps.lies:
+            self._report("the autopilot's clock agrees with its messages again; their stamps are used")
 
     @property
     def home_down_m(self) -> float | None:

@@ -197,8 +197,8 @@ class AutopilotLink:
         await self._command("for its checks", COMMAND_RUN_CHECKS)
 
     def clock(self) -> ClockEstimate | None:
-        """The autopilot's clock; None while it is not known. It is measured by `synchronise`."""
-        return self._received.clock.estimate
+        """See `ReceivedMessages.trusted_clock`. It is measured by `synchronise`."""
+        return self._received.trusted_clock()
 
     async def synchronise(self) -> None:
         """Exchanges times with the autopilot until cancelled."""
