@@ -83,7 +83,12 @@ class RigConfig(Section):
     @model_validator(mode="after")
     def _names_are_unique(self) -> Self:
         names = [camera.name for camera in self.cameras]
-        doubled = {name for name in names if names.count(name) > 1}
-        if doubled:
-            raise ValueError(f"two cameras share the name {sorted(doubled)[0]!r}; give each its own")
+        refuse(
+            self,
+            {
+                ("cameras", number, "name"): f"two cameras share the name {name!r}; give each its own"
+                for number, name in enumerate(names)
+                if name in names[:number]
+            },
+        )
         return self

@@ -92,19 +92,26 @@ class SourceParameters(Section):
         for number, camera in enumerate(self.cameras):
             refuse(self, {("cameras", number, *key): text for key, text in _misplaced(camera, self.kind).items()})
             if self.set_tolerance_s * camera.rate_hz < 0.5:
-                raise ValueError(
-                    f"set_tolerance_s {self.set_tolerance_s:g} is less than half a frame period of camera "
-                    f"{camera.name!r}; write {0.5 / camera.rate_hz:.3f} or more"
+                fault = (
+                    f"{self.set_tolerance_s:g} is less than half a frame period of camera {camera.name!r}; write "
+                    f"{0.5 / camera.rate_hz:.3f} or more"
                 )
+                refuse(self, {("set_tolerance_s",): fault})
             if self.silence_s * camera.rate_hz < 2.0:
-                raise ValueError(
-                    f"silence_s {self.silence_s:g} is less than two frame periods of camera {camera.name!r}; "
-                    f"write {2.0 / camera.rate_hz:.3f} or more"
+                fault = (
+                    f"{self.silence_s:g} is less than two frame periods of camera {camera.name!r}; write "
+                    f"{2.0 / camera.rate_hz:.3f} or more"
                 )
-        devices = [place for camera in self.cameras if (place := camera.device or camera.topic)]
-        doubled = {device for device in devices if devices.count(device) > 1}
-        if doubled:
-            raise ValueError(f"two cameras share {sorted(doubled)[0]}; give each its own")
+                refuse(self, {("silence_s",): fault})
+        refuse(
+            self,
+            {
+                ("cameras", number, key): f"two cameras share {place}; give each its own {key}"
+                for number, camera in enumerate(self.cameras)
+                for key, place in (("device", camera.device), ("topic", camera.topic))
+                if place and place in {getattr(one, key) for one in self.cameras[:number]}
+            },
+        )
         return self
 
 

@@ -198,7 +198,7 @@ def test_faults_inside_a_camera_name_the_camera(tmp_path: Path) -> None:
 def test_two_cameras_of_one_name_are_refused(tmp_path: Path) -> None:
     twice = DRONE + DRONE.split("cameras:\n")[1]
     assert _drone_problems(tmp_path, twice) == [
-        "drone.yaml:1: rig: two cameras share the name 'front'; give each its own"
+        "drone.yaml:6: rig.cameras[1].name: two cameras share the name 'front'; give each its own"
     ]
 
 
@@ -488,7 +488,7 @@ def test_the_trim_that_an_error_recommends_is_taken_though_rounding_adds_up(tmp_
     limits = "flocking: {max_speed_m_s: 0.2}\nmission: {speed_m_s: 0.2}\n"
     limits += "safety: {gate: {max_speed_m_s: 0.3, degraded_speed_m_s: 0.3}}\n"
     (problem,) = _drone_problems(tmp_path, f"{DRONE}{limits}autopilot: {{max_velocity_trim_m_s: 0.2}}\n")
-    assert "write 0.1 or less for the trim" in problem
+    assert "max_velocity_trim_m_s: 0.2 and flocking.max_speed_m_s 0.2 are together above" in problem
     path = tmp_path / "drone.yaml"
     path.write_text(f"{DRONE}{limits}autopilot: {{max_velocity_trim_m_s: 0.1}}\n", encoding="utf-8")
     assert load_drone(path).autopilot is not None
@@ -533,4 +533,27 @@ def test_texts_that_have_to_look_so_say_how(tmp_path: Path) -> None:
         file.write_text(_with(text), encoding="utf-8")
         with pytest.raises(ConfigError) as refused:
             load_drone(file)
+        assert told in str(refused.value)
+
+
+def test_what_is_wrong_with_a_camera_is_told_at_its_own_line(tmp_path: Path) -> None:
+    quadrotor = (CONFIG / "quadrotor.yaml").read_text(encoding="utf-8")
+    rig, source, rest = quadrotor.partition("\nsource:")
+    line = 1 + (rig + source + rest[: rest.index("- name: back")]).count("\n")
+    twice = 1 + rig[: rig.index("- name: right")].count("\n")
+    slips = {
+        rig + source + rest.replace("- name: back", "- name: bak", 1): f"{line}: source.cameras[2].name: "
+        "bak is no camera of the rig, which has front, right, back, left",
+        rig + source + rest.replace("- name: back", "- name: left", 1): "source.cameras[3].name: left has an entry",
+        rig.replace("- name: right", "- name: front")
+        + source
+        + rest: f"{twice}: rig.cameras[1].name: two cameras share",
+        quadrotor.replace(
+            "usb-0:2:1.0", "usb-0:1:1.0"
+        ): "source.cameras[1].device: two cameras share /dev/v4l/by-path/",
+    }
+    for text, told in slips.items():
+        (tmp_path / "drone.yaml").write_text(text, encoding="utf-8")
+        with pytest.raises(ConfigError) as refused:
+            load_drone(tmp_path / "drone.yaml")
         assert told in str(refused.value)
