@@ -30,7 +30,7 @@ class GstreamerDevice(ChildDevice):
         """Starts the process, whose ``command`` gets the pipeline and what is asked of it; raises CameraError."""
         self._size = size
         self._format: ImageFormat | None = None
-        super().__init__(camera.name, camera.rate_hz, [*command, camera.pipeline, caps(size, camera.rate_hz)])
+        super().__init__(camera.name, camera.rate_hz, [*command, camera.place, caps(size, camera.rate_hz)])
 
     def image_format(self) -> ImageFormat:
         """See ``CameraDevice``."""
