@@ -47,8 +47,8 @@ def _add_perceive(commands: Commands) -> None:
         "flockd ros perceive --config my_drone.yaml",
     )
     notes = (
-        "Published are NAME/neighbours (PoseArray), NAME/neighbours/tracks (PointCloud2) and NAME/diagnostics, with NAME\n"
-        "and all cameras from the configuration. Without --vehicle it needs `perception.scale: network`."
+        "Published are NAME/neighbours (PoseArray), NAME/neighbours/tracks (PointCloud2) and NAME/diagnostics, with\n"
+        "NAME and all cameras from the configuration. Without --vehicle it needs `perception.scale: network`."
     )
     parser = commands(
         "perceive", "See drones in the images of topics, and publish them; command nothing.", examples, notes

@@ -51,7 +51,7 @@ async def test_a_goal_is_flown_and_a_strangers_is_refused(
             node.listen("/tiny/odometry", "nav_msgs/msg/Odometry")
             await ship.is_ready_in_the_air()
             await ship.flies()
-            await until(lambda: node.heard("/tiny/odometry"), SECONDS_TO_FAIL)
+            await until(lambda: bool(node.heard("/tiny/odometry")), SECONDS_TO_FAIL)
             await asyncio.sleep(2.0)  # the two ends of the answers' topic have found each other
 
             def send(frame: str, east: float, north: float, up: float) -> Callable[[], None]:

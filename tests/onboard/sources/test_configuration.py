@@ -141,7 +141,7 @@ def test_slips_inside_the_optional_section_are_reported_with_what_to_do(tmp_path
         "drone.yaml:9: source.cameras[0].controls[0].value: 1.5 is not a whole number; write a whole number",
         "drone.yaml:9: source.cameras[0].rate_hz: 0 is not greater than 0; write a number above 0 and up to 1000",
         "drone.yaml:10: source.cameras[1].device: video2 is not a text that matches ^/dev/ or nothing; "
-        "write a text that matches ^/dev/",
+        "write a text that matches ^/dev/ or nothing",
         "drone.yaml:10: source.cameras[1].pixel_format: mjpg is not known; did you mean `mjpeg`?",
     ]
 
