@@ -7,6 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -43,10 +44,9 @@ async def test_a_goal_is_flown_and_a_strangers_is_refused(
         fake_autopilot, port, tmp_path, change=lambda config: config.model_copy(update={"safety": ALONE})
     ) as ship:
         connect = ("--connect", ship.config.telemetry.listen[0])
-        running = await asyncio.to_thread(lambda: bridge(environment, *connect, "--orders").__enter__())
-        node_context = peer(environment, "planner")
-        node = await asyncio.to_thread(node_context.__enter__)
-        try:
+        with ExitStack() as stack:
+            running = await asyncio.to_thread(stack.enter_context, bridge(environment, *connect, "--orders"))
+            node = await asyncio.to_thread(stack.enter_context, peer(environment, "planner"))
             node.listen("/tiny/order_answer", "diagnostic_msgs/msg/DiagnosticStatus", "event")
             node.listen("/tiny/odometry", "nav_msgs/msg/Odometry")
             await ship.is_ready_in_the_air()
@@ -82,6 +82,3 @@ async def test_a_goal_is_flown_and_a_strangers_is_refused(
             running.kill()
             await until(lambda: str(ship.mission("sentence")).startswith("hovers"), SECONDS_TO_FAIL)
             assert fake_autopilot.mode == "OFFBOARD"
-        finally:
-            running.kill()
-            node.process.kill()

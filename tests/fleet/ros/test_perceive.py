@@ -31,6 +31,7 @@ def config_file(folder: Path, recording: Recording, **perception: Any) -> Path:
     values["source"] = {
         "kind": "ros", "cameras": cameras, "silence_s": 30.0, "set_tolerance_s": 0.25, "set_wait_s": 5.0
     }  # fmt: skip
+    values["name"] = "drone1"
     values["perception"] = {**values.get("perception", {}), **perception}
     file = folder / "drone.yaml"
     file.write_text(yaml.safe_dump(values), encoding="utf-8")
@@ -69,6 +70,7 @@ def test_images_in_neighbours_out_and_nothing_commanded(tmp_path: Path) -> None:
             lambda: [m["message"] for m in planner.heard("/drone1/neighbours") if m["message"]["poses"]], 120.0
         )
         assert poses[0]["header"]["frame_id"] == "drone1/level"
+        planner.newest("/drone1/neighbours/tracks")
         planner.do("topics")
         topics = until(lambda: planner.said("topics"))[0]["topics"]
         published = {topic for topic, nodes in topics.items() if "flockd_perceive" in nodes}
