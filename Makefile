@@ -4,9 +4,11 @@ PYTHON ?= python3
 SYSTEM ?= debian12
 VENV := .venv
 BIN := $(VENV)/bin
+# ROS 2's wheels start each Python twice, to name their libraries to the loader: an environment of their own.
+ROS_VENV := .venv-ros
 
 .DEFAULT_GOAL := help
-.PHONY: help demo docs lint test test-all browser coverage mutate mutate-all references deb lock sbom clean
+.PHONY: help demo docs lint test test-all browser coverage ros mutate mutate-all references deb lock sbom clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -28,6 +30,10 @@ test: lint ## lint and all tests but the slow ones, on two cores in under 7 minu
 
 test-all: lint ## lint and all tests, those too that take minutes each
 	$(BIN)/python -m pytest -n 2
+
+ros: $(ROS_VENV)/ros.installed ## what needs ROS 2: nodes in processes of their own, cameras by topic; with the times it takes
+	$(ROS_VENV)/bin/python -m tools.release.licences --extra ros --extra bags
+	$(ROS_VENV)/bin/python -m pytest -m ros -rP tests/fleet/ros tests/onboard/sources
 
 browser: $(VENV)/test.installed ## the fleet page in a headless Chromium: /usr/bin/chromium, or what CHROMIUM names
 	$(BIN)/python -m pytest -m browser -rP tests/fleet/page
@@ -57,11 +63,17 @@ sbom: $(VENV)/test.installed ## write the software bill of materials to out/floc
 	$(BIN)/python -m tools.release.sbom
 
 clean: ## delete the virtual environment and what was built
-	rm -rf $(VENV) build dist *.egg-info
+	rm -rf $(VENV) $(ROS_VENV) build dist *.egg-info
 
 # The extra of this name, installed; again only when what it installs has changed.
 $(VENV)/%.installed: pyproject.toml setup.py | $(BIN)/pip
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$*]'
+	touch $@
+
+$(ROS_VENV)/ros.installed: pyproject.toml setup.py
+	$(PYTHON) -m venv $(ROS_VENV)
+	$(ROS_VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[ros,bags,sim,fleet]' \
+		'pytest>=8' 'packaging>=24'
 	touch $@
 
 $(BIN)/pip:

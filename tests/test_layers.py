@@ -159,6 +159,7 @@ ZENOH_READERS = {
         ("joblib", {"campaign/process_engine.py"}),
         ("ray", {"campaign/ray_engine.py"}),
         ("foxglove", {"fleet/foxglove"}),
+        ("rosbags", {"onboard/recording/ros_bag.py", "cli/record.py"}),
         ("rclpy", {"onboard/ros/ros_node.py", "onboard/sources/ros_child.py"}),
         ("rerun", {"review/view/flock_file.py", "review/view/rerun_file.py"}),
     ],

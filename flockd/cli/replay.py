@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+from flockd.cli.config import loaded as loaded_drone
 from flockd.cli.output import complain, progress, say, say_json
 from flockd.cli.parser import Commands
 from flockd.cli.recording_options import add_stretch, opened, refuse_existing, stretch
@@ -29,6 +32,7 @@ def add(commands: Commands) -> None:
         "flockd replay drone1.mcap --diff --reference drone1.expected --tolerance command=1e-6",
         "flockd replay drone1.mcap --reference drone1.expected --update-reference",
         "flockd replay rgbd_folder --depth recorded --stride 3 --trajectory path.txt",
+        "flockd replay flight_bag --config my_drone.yaml --vehicle /mavros/local_position/odom",
         "flockd replay clip.mp4 --calibration K.txt --flow dis --json",
     )
     description = "Run the pilot on a recorded flight again: the same frames and vehicle states, the same code."
@@ -52,6 +56,12 @@ def add(commands: Commands) -> None:
         help="numbers of this field, such as command.velocity, may differ by X; may be given again",
     )
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    group = parser.add_argument_group(
+        "bags of ROS 2", "a bag folder as RECORDING; with --config if it is not of flockd"
+    )
+    group.add_argument(
+        "--vehicle", metavar="TOPIC", help="odometry, pose or IMU of the drone (default: the only one there is)"
+    )
     add_dataset_options(parser)
     parser.set_defaults(run=_run)
 
@@ -79,15 +89,48 @@ def _tolerance(text: str) -> tuple[str, float]:
 
 def _run(args: argparse.Namespace) -> int:
     from flockd.ground.datasets import is_dataset
+    from flockd.onboard.recording.ros_bag import is_bag
 
-    if is_dataset(args.recording):
+    if is_dataset(args.recording) and not is_bag(args.recording):
         return run_dataset(args)
     refuse_dataset_options(args)
     _check_options(args)
+    with _recording(args) as recording:
+        return _replay(args, recording)
+
+
+@contextmanager
+def _recording(args: argparse.Namespace) -> Iterator[Recording]:
+    """What is replayed; of a bag of somebody else's a recording in a temporary folder."""
+    from flockd.onboard.recording.bag_export import is_own
+    from flockd.onboard.recording.ros_bag import Bag, is_bag
+
+    if args.vehicle is not None and not is_bag(args.recording):
+        raise UsageError("--vehicle is for bags of ROS 2, and this is none; leave it out")
+    if not is_bag(args.recording):
+        yield opened(args.recording)
+        return
+    with Bag(args.recording) as bag, TemporaryDirectory(prefix="flockd-bag-") as folder:
+        if is_own(bag):
+            yield opened(args.recording)
+            return
+        from flockd.review.replay.bag_flight import recording_of_bag
+
+        config = loaded_drone(args.config)
+        if config is None:
+            raise UsageError(
+                f"{args.recording}: is a bag of ROS 2, but none of flockd; name a drone with --config whose "
+                "source.kind is `ros` and whose cameras name their topics"
+            )
+        target = Path(folder) / f"{args.recording.resolve().name}.mcap"
+        recording_of_bag(bag, config, args.vehicle, target)
+        yield opened(target)
+
+
+def _replay(args: argparse.Namespace, recording: Recording) -> int:
     from flockd.review.replay.fidelity import damage_warnings, replay_warnings
     from flockd.review.replay.recorded_flight import compare_replay, replay_flight, replay_result
 
-    recording = opened(args.recording)
     config = _config(args, recording)
     start_s, end_s = stretch(recording, args)
     warnings = [*damage_warnings(recording), *replay_warnings(recording, config, start_s)]
@@ -131,10 +174,8 @@ def _config(args: argparse.Namespace, recording: Recording) -> DroneConfig:
     """The settings to fly with: the recorded ones, or those of --config, for the same cameras."""
     if args.config is None:
         return recording.config
-    from flockd.core.config import ScenarioConfig, load
-
-    loaded = load(args.config)
-    config = loaded.drone if isinstance(loaded, ScenarioConfig) else loaded
+    config = loaded_drone(args.config)
+    assert config is not None
     recorded = {camera.name: camera.size_px for camera in recording.config.rig.cameras}
     for camera in config.rig.cameras:
         if recorded.get(camera.name) != camera.size_px:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from contextlib import ExitStack, suppress
+from pathlib import Path
 
 from flockd.cli.endpoint_options import add_endpoint_options, add_operator_option, endpoints
 from flockd.cli.output import complain, say
@@ -25,7 +26,7 @@ def add(commands: Commands) -> None:
     )
     what = "Show the fleet to ROS 2, and take orders from there; with `perceive`: only see drones, for another stack."
     parser = commands("ros", what, examples, _NOTES)
-    add_commands(parser, ())
+    add_commands(parser, (_add_perceive,))
     add_endpoint_options(parser, "--drones-at")
     parser.add_argument(
         "--orders", action="store_true", help="offer services and topics that order drones (default: watch only)"
@@ -39,6 +40,43 @@ def _add_network(parser: Parser) -> None:
     parser.add_argument(
         "--network", action="store_true", help="let other computers find it in ROS 2 (default: this computer alone)"
     )
+
+
+def _add_perceive(commands: Commands) -> None:
+    examples = (
+        "flockd ros perceive --config my_drone.yaml --vehicle /mavros/local_position/odom",
+        "flockd ros perceive --config my_drone.yaml",
+    )
+    notes = (
+        "Published are NAME/neighbours (PoseArray), NAME/neighbours/tracks (PointCloud2) and NAME/diagnostics, with\n"
+        "NAME and all cameras from the configuration. Without --vehicle it needs `perception.scale: network`."
+    )
+    parser = commands(
+        "perceive", "See drones in the images of topics, and publish them; command nothing.", examples, notes
+    )
+    parser.add_argument("--config", metavar="FILE", type=Path, required=True, help="a drone's, with its source")
+    parser.add_argument("--vehicle", metavar="TOPIC", help="odometry, pose or IMU of the vehicle, in REP 103's axes")
+    _add_network(parser)
+    parser.set_defaults(run=_perceive)
+
+
+def _perceive(args: argparse.Namespace) -> int:
+    """Until Ctrl-C."""
+    from flockd.core.config import load_drone
+    from flockd.fleet.ros.perceive import PerceptionNode, check
+    from flockd.onboard.ros.ros_node import RosNode
+    from flockd.onboard.sources import open_source
+
+    config = load_drone(args.config)
+    check(config, args.vehicle)
+    source = open_source(config, str(args.config))
+    with ExitStack() as stack, suppress(KeyboardInterrupt):
+        node = stack.enter_context(RosNode("flockd_perceive", here_only=not args.network))
+        perception = PerceptionNode(config, node, args.vehicle)
+        say(f"drones that {config.name} sees are published; Ctrl-C ends it")
+        sys.stdout.flush()
+        perception.run(source)
+    return ExitCode.DONE
 
 
 def _run(args: argparse.Namespace) -> int:

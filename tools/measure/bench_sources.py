@@ -1,6 +1,7 @@
 """Compare cameras: rate, jitter, age and what is lost of each, with the processor's time that an image takes.
 
 python -m tools.measure.bench_sources --device /dev/video0 --pipeline "v4l2src device=/dev/video2" [--json]
+python -m tools.measure.bench_sources --topic /bench/image_raw     # which `tools.measure.ros_test_images` publishes
 
 `python -m tools.checks.check_pipelines` tries what can go wrong with pipelines, `tools/checks/check_device.py` with
 both.
@@ -34,16 +35,18 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--device", action="append", default=[], help="of a V4L2 camera; may be repeated")
     parser.add_argument("--pipeline", action="append", default=[], help="of GStreamer; may be repeated")
+    parser.add_argument("--topic", action="append", default=[], help="of ROS 2; may be repeated")
     parser.add_argument("--rate", type=float, default=30.0, help="of the cameras, images a second")
     parser.add_argument("--format", choices=("mjpeg", "yuyv"), default="mjpeg", help="of the V4L2 cameras")
     arguments = parser.parse_args()
-    if not arguments.device and not arguments.pipeline:
-        parser.error("give --device, --pipeline or both")
+    if not (arguments.device or arguments.pipeline or arguments.topic):
+        parser.error("give --device, --pipeline or --topic")
     cv2.setNumThreads(1)
     size: Size = (arguments.size[0], arguments.size[1])
     cameras = [
         *({"device": device, "pixel_format": arguments.format} for device in arguments.device),
         *({"pipeline": pipeline} for pipeline in arguments.pipeline),
+        *({"topic": topic} for topic in arguments.topic),
     ]
     rows = []
     for camera in cameras:

@@ -1,19 +1,22 @@
 """Check the licences of what is installed with flockd at run time: only those of the list, none unknown.
 
-python -m tools.release.licences          # a table; exit code 1 if a licence is refused
+python -m tools.release.licences                            # a table; exit code 1 if a licence is refused
+python -m tools.release.licences --extra ros --extra bags   # of extras too, which have to be installed
 
-Licences are what the installed packages' metadata say: an SPDX expression, else the classifiers, else the free text.
+Licences are what the installed packages' metadata say: an SPDX expression, else the classifiers, else the free text,
+else the package.xml that packages of ROS bring.
 Libraries that a wheel carries inside (OpenCV's brings FFmpeg, LGPL-2.1) do not stand there.
 """
 
 from __future__ import annotations
 
+import argparse
 import re
 import sys
 import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, metadata, requires
+from importlib.metadata import PackageNotFoundError, files, metadata, requires
 from pathlib import Path
 
 from packaging.requirements import Requirement
@@ -29,6 +32,9 @@ ALLOWED = frozenset(
 )
 """SPDX names. Each lets flockd, Apache-2.0, be used and passed on with the package; GPL and AGPL would not."""
 STATED = {
+    "apsw": ("Zlib", "its LICENSE file: the terms of zlib, or any licence that OSI approves"),
+    "ros-fastdds": ("Apache-2.0", "its LICENSE file"),
+    "ros-fastcdr": ("Apache-2.0", "its LICENSE file"),
     "eclipse-zenoh": ("EPL-2.0 OR Apache-2.0", "its LICENSE file: two classifiers do not say whether both or either"),
 }
 """Where metadata leave the licence open: what it is, and where that stands."""
@@ -36,6 +42,10 @@ NAMES = {
     "apache software license": "Apache-2.0",
     "apache 2.0": "Apache-2.0",
     "apache-2.0": "Apache-2.0",
+    "apache license 2.0": "Apache-2.0",
+    "apache license, version 2.0": "Apache-2.0",
+    "zlib license": "Zlib",
+    "bsd": "BSD-3-Clause",
     "bsd license": "BSD-3-Clause",
     "bsd-3-clause": "BSD-3-Clause",
     "3-clause bsd license": "BSD-3-Clause",
@@ -46,6 +56,7 @@ NAMES = {
 }
 """SPDX names of what classifiers and free texts say."""
 UNKNOWN = ""
+_LICENSE = re.compile(r"<license[^>]*>([^<]+)</license>")
 _CLASSIFIER = re.compile(r"License ::(?: OSI Approved ::)? (.+)")
 
 
@@ -120,10 +131,15 @@ def expression_of(package: str, expression: str | None, classifiers: Iterable[st
 def licence_of(package: str) -> Licence:
     """Raises PackageNotFoundError where it is not installed."""
     facts = metadata(package)
-    expression = expression_of(
-        package, facts["License-Expression"], facts.get_all("Classifier") or (), facts["License"]
-    )
+    classifiers = facts.get_all("Classifier") or _classifiers_of_ros(package)
+    expression = expression_of(package, facts["License-Expression"], classifiers, facts["License"])
     return Licence(package, facts["Version"], expression)
+
+
+def _classifiers_of_ros(package: str) -> list[str]:
+    """What the package.xml of a wheel of ROS says, as classifiers would."""
+    found = [one for one in files(package) or () if one.name == "package.xml"]
+    return [f"License :: {text}" for one in found for text in _LICENSE.findall(one.read_text())]
 
 
 def needed_by(package: str) -> tuple[str, ...]:
@@ -134,15 +150,17 @@ def needed_by(package: str) -> tuple[str, ...]:
     )
 
 
-def declared_packages() -> tuple[str, ...]:
-    """What pyproject.toml names for run time."""
+def declared_packages(extras: Sequence[str] = ()) -> tuple[str, ...]:
+    """What pyproject.toml names for run time, and for extras on this Python and computer."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    return tuple(canonicalize_name(Requirement(one).name) for one in project["dependencies"])
+    named = [*project["dependencies"], *(one for extra in extras for one in project["optional-dependencies"][extra])]
+    wanted = [Requirement(one) for one in named]
+    return tuple(canonicalize_name(one.name) for one in wanted if one.marker is None or one.marker.evaluate())
 
 
-def runtime_packages() -> tuple[str, ...]:
-    """What flockd needs at run time, and what that needs, by name. Raises PackageNotFoundError."""
-    waiting: list[str] = list(declared_packages())
+def runtime_packages(extras: Sequence[str] = ()) -> tuple[str, ...]:
+    """What flockd and these extras need at run time, and what that needs, by name. Raises PackageNotFoundError."""
+    waiting: list[str] = list(declared_packages(extras))
     found: set[str] = set()
     while waiting:
         package = waiting.pop()
@@ -154,8 +172,11 @@ def runtime_packages() -> tuple[str, ...]:
 
 def main() -> int:
     """Command line."""
+    parser = argparse.ArgumentParser(description="Check the licences of what is installed with flockd.")
+    parser.add_argument("--extra", action="append", default=[], help="of pyproject.toml; may be given again")
+    extras = parser.parse_args().extra
     try:
-        licences = [licence_of(package) for package in runtime_packages()]
+        licences = [licence_of(package) for package in runtime_packages(extras)]
     except PackageNotFoundError as error:
         print(f"licences: {error.name} is not installed; `pip install .`", file=sys.stderr)
         return 69

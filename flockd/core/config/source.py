@@ -28,13 +28,15 @@ class CameraDeviceParameters(Section):
 
     name: PlainName
     """The camera's name in the rig."""
-    device: Annotated[str, text(r"^/dev/", "a device, as in `/dev/video0` or an entry of `/dev/v4l/by-path`")] = ""
+    device: (
+        Annotated[str, text(r"^/dev/", "a device, as in `/dev/video0` or an entry of `/dev/v4l/by-path`")] | None
+    ) = None
     """For kind `v4l2`: its path, best one of /dev/v4l/by-path."""
-    pipeline: Annotated[str, Field(min_length=1)] = ""
+    pipeline: Annotated[str, Field(min_length=1)] | None = None
     """For kind `gstreamer`: elements as `gst-launch-1.0` takes them, without a sink."""
-    topic: Annotated[str, Field(pattern=_TOPIC)] = ""
+    topic: Annotated[str, Field(pattern=_TOPIC)] | None = None
     """For kind `ros`: of sensor_msgs/Image or CompressedImage, as in `/front/image_raw`."""
-    camera_info: Annotated[str, Field(pattern=_TOPIC)] = ""
+    camera_info: Annotated[str, Field(pattern=_TOPIC)] | None = None
     """For kind `ros`: of its CameraInfo, which is compared with the rig; by default `camera_info` beside the images."""
     stamps: Literal["system", "simulator"] = "system"
     """For kind `ros`: what the images' stamps are of, this computer's clock or that of a simulator in `/clock`, which
@@ -48,7 +50,7 @@ class CameraDeviceParameters(Section):
     @property
     def place(self) -> str:
         """Where its images come from: the device, the pipeline or the topic."""
-        return self.device or self.pipeline or self.topic
+        return self.device or self.pipeline or self.topic or ""
 
 
 class SharedMemoryParameters(Section):
@@ -134,7 +136,7 @@ def _misplaced(camera: CameraDeviceParameters, kind: str) -> dict[tuple[str, ...
         (key,): f"is of a source of kind `{other}`; delete it, or write `kind: {other}`"
         for other, keys in _KEYS.items()
         for key in keys
-        if other != kind and key in camera.model_fields_set
+        if other != kind and getattr(camera, key) != type(camera).model_fields[key].default
     }
     if not faults and kind in _KEYS and not getattr(camera, _KEYS[kind][0]):
         faults[()] = _LACKS[kind]

@@ -1,14 +1,8 @@
-"""Names of drones as parts of topics: ROS 2 takes letters, digits and `_`, and no digit first."""
+"""Each drone's namespace."""
 
 from __future__ import annotations
 
-import re
-
-
-def ros_name(name: str) -> str:
-    """The nearest name that ROS 2 takes."""
-    plain = re.sub(r"_+", "_", re.sub(r"[^A-Za-z0-9]", "_", name))
-    return f"d{plain}" if plain[:1].isdigit() else plain or "drone"
+from flockd.onboard.ros.message_trees import ros_name
 
 
 class DroneNames:

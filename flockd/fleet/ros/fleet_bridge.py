@@ -16,13 +16,13 @@ from flockd.fleet.camera_rigs import cameras_of
 from flockd.fleet.fleet_status import GONE, QUIET
 from flockd.fleet.page.drone_rows import Known, Row
 from flockd.fleet.page.fleet_source import FleetSource
-from flockd.fleet.ros.drone_names import DroneNames, ros_name
+from flockd.fleet.ros.drone_names import DroneNames
 from flockd.fleet.ros.fleet_markers import home_in_map, markers
 from flockd.fleet.ros.order_requests import Whereabouts, goal_of, velocity_of
 from flockd.fleet.watcher import Watched
 from flockd.onboard.ros import message_trees as trees
-from flockd.onboard.ros.message_trees import Names, Tree
-from flockd.onboard.ros.ros_node import Answer, Delivery, RosNode, has_type
+from flockd.onboard.ros.message_trees import Names, Tree, ros_name
+from flockd.onboard.ros.ros_node import Answer, Delivery, RosNode, has_type, tree_of
 from flockd.onboard.telemetry.topics import (
     AboutMessage,
     NeighboursMessage,
@@ -199,11 +199,11 @@ class FleetBridge:
         self._node.advertise(f"/{name}/order_answer", trees.DIAGNOSTIC, Delivery.EVENT)
 
     def _order(
-        self, key: str, name: str, command: str, parse: Callable[[Tree, Whereabouts], OrderMessage], message: Tree
+        self, key: str, name: str, command: str, parse: Callable[[Tree, Whereabouts], OrderMessage], message: Any
     ) -> None:
         """On a thread of the node's; what became of it is published, as a topic has no reply."""
         try:
-            answer = self._ask(key, command, parse(message, self._whereabouts(key, name)))
+            answer = self._ask(key, command, parse(tree_of(message), self._whereabouts(key, name)))
         except ValueError as error:
             answer = Answer(accepted=False, sentence=str(error))
         level = trees.OK if answer.accepted else trees.ERROR

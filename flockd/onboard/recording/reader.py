@@ -18,7 +18,9 @@ from flockd.core.image_header import cost_fault
 from flockd.core.messages import Frame, FrameSet, MissionOrder, UInt8Array, VehicleState
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.codec import from_json, parsed
-from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, Note, Record, RecordingError, read_records
+from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, Note, Record, RecordingError
+from flockd.onboard.recording.record_source import records_of
+from flockd.onboard.recording.ros_bag import is_bag
 from flockd.onboard.recording.streams import (
     CONFIGURATION,
     END_NOTE,
@@ -32,12 +34,13 @@ from flockd.onboard.recording.streams import (
     TRUTH,
     VEHICLE,
     StepFrames,
+    is_image,
     part_path,
 )
 from flockd.onboard.recording.truth import Truth
 
 _WHAT_TO_DO = "`flockd record recover` makes a recording without it"
-_IMAGE_SUFFIX, _CALIBRATION_SUFFIX = "/image", "/calibration"
+_CALIBRATION_SUFFIX = "/calibration"
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +151,7 @@ class Recording:
         """
         number, messages = -1, dict[str, bytes]()
         for path in self.contents.paths:
-            for record in read_records(path):
+            for record in records_of(path):
                 if isinstance(record, Entry) and makes_steps(record.stream.topic):
                     if record.sequence != number:
                         yield from self._built(number, messages, start_s, end_s)
@@ -188,7 +191,7 @@ def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
     Raises RecordingError where the file is not a recording of flockd or ends before all three, and OSError.
     """
     flight, models, configuration = None, None, None
-    for record in read_records(path):
+    for record in records_of(path):
         match record:
             case Note(name) if name == FLIGHT_NOTE:
                 flight = record
@@ -212,7 +215,7 @@ def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
 
 def check(path: Path) -> None:
     """Raises RecordingError when there is no file to read at all."""
-    if not path.is_file():
+    if not path.is_file() and not is_bag(path):
         fault = "is a folder; name a recording in it" if path.is_dir() else "does not exist; check the path"
         raise RecordingError(f"{path}: {fault}")
 
@@ -224,7 +227,7 @@ def _survey(first: Path, progress: Callable[[int, int], None]) -> Contents:
     found.paths = tuple(_all_parts(first, flight))
     total, done = sum(path.stat().st_size for path in found.paths), 0
     for path in found.paths:
-        for record in read_records(path):
+        for record in records_of(path):
             if isinstance(record, Entry):
                 done += len(record.data)
                 progress(done, total)
@@ -294,11 +297,6 @@ def _config(path: Path, contents: Contents) -> DroneConfig:
             f"{path}: the configuration in it is not one of this flockd ({key}: {first['msg']}); "
             f"use the flockd that wrote it, {version}"
         ) from error
-
-
-def is_image(topic: str) -> bool:
-    """Whether this stream holds a camera's images."""
-    return topic.endswith(_IMAGE_SUFFIX)
 
 
 def is_calibration(topic: str) -> bool:

@@ -60,6 +60,11 @@ TABLE = {key: _json_stream(f"/{key}", topic.type) for key, topic in TOPICS.items
 """The telemetry that the table of topics marks as recorded."""
 
 
+def is_image(topic: str) -> bool:
+    """Whether this stream holds a camera's images."""
+    return topic.endswith("/image")
+
+
 def part_path(first: Path, number: int) -> Path:
     """Path of the recording's file with this number; the first is number 0."""
     return first.with_name(f"{first.stem}.{number}{first.suffix}") if number else first

@@ -8,6 +8,7 @@ what comes out is in those of REP 103.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -41,6 +42,7 @@ MARKERS = "visualization_msgs/msg/MarkerArray"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 TWIST = "geometry_msgs/msg/TwistStamped"
 POSE = "geometry_msgs/msg/PoseStamped"
+IMU = "sensor_msgs/msg/Imu"
 TEXT = "std_msgs/msg/String"
 """Names of the types, as ROS 2 writes them."""
 OK, WARN, ERROR, STALE = range(4)
@@ -48,6 +50,12 @@ OK, WARN, ERROR, STALE = range(4)
 LEVEL_TURN: Tree = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
 _NS = 1_000_000_000
 _FLOAT64, _UINT32, _UINT8 = 8, 6, 2  # of sensor_msgs/msg/PointField
+
+
+def ros_name(name: str) -> str:
+    """The nearest name that ROS 2 takes as a part of a topic: letters, digits and `_`, and no digit first."""
+    plain = re.sub(r"_+", "_", re.sub(r"[^A-Za-z0-9]", "_", name))
+    return f"d{plain}" if plain[:1].isdigit() else plain or "drone"
 
 
 class Names(NamedTuple):
@@ -112,6 +120,21 @@ def odometry(
             "twist": {"linear": vector(flu_of_frd(body)), "angular": vector((0.0, 0.0, 0.0))},
             "covariance": np.zeros(36) if known else np.concatenate([[-1.0], np.zeros(35)]),
         },
+    }
+
+
+def imu(time_ns: int, names: Names, R_ned_frd: FloatArray) -> Tree:
+    """The attitude alone: -1 says that rates and accelerations are not known."""
+    unknown = np.concatenate([[-1.0], np.zeros(8)])
+    nothing = vector((0.0, 0.0, 0.0))
+    return {
+        "header": header(time_ns, names.base_link),
+        "orientation": turn(attitude_in_ros(R_ned_frd)),
+        "orientation_covariance": np.zeros(9),
+        "angular_velocity": nothing,
+        "angular_velocity_covariance": unknown,
+        "linear_acceleration": nothing,
+        "linear_acceleration_covariance": unknown,
     }
 
 

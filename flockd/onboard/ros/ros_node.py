@@ -100,11 +100,13 @@ class RosNode:
         """Whether an advertised topic has a subscriber."""
         return bool(self._publishers[topic].get_subscription_count())
 
-    def subscribe(self, topic: str, kind: str, take: Callable[[Tree], None], delivery: Delivery) -> None:
-        """Calls ``take`` with each message, on a thread of the node's."""
-        self._node.create_subscription(
-            _type(kind), topic, lambda message: take(_tree(message)), _profile(delivery), callback_group=self._group
-        )
+    def kinds(self, topic: str) -> list[str]:
+        """Types of what is published there now."""
+        return sorted({one.topic_type for one in self._node.get_publishers_info_by_topic(topic)})
+
+    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None], delivery: Delivery) -> None:
+        """Calls ``take`` with each message of rclpy, on a thread of the node's; `tree_of` makes a tree of it."""
+        self._node.create_subscription(_type(kind), topic, take, _profile(delivery), callback_group=self._group)
 
     def serve(self, name: str, answer: Callable[[], Answer]) -> None:
         """A Trigger service. ``answer`` may wait; it runs on a thread of the node's."""
@@ -199,9 +201,10 @@ def _field(kind: str, value: Any) -> Any:
     return value
 
 
-def _tree(message: Any) -> Tree:
-    """Of a message of rclpy with messages and single values only."""
+def tree_of(message: Any) -> Tree:
+    """The tree of a message of rclpy with messages and single values only."""
     values = {name: getattr(message, name) for name in message.get_fields_and_field_types()}
     return {
-        name: _tree(value) if hasattr(value, "get_fields_and_field_types") else value for name, value in values.items()
+        name: tree_of(value) if hasattr(value, "get_fields_and_field_types") else value
+        for name, value in values.items()
     }

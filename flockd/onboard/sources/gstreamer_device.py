@@ -32,7 +32,7 @@ class GstreamerDevice(ChildDevice):
         self._size = size
         self._format: ImageFormat | None = None
         wanted = [*command, caps(size, camera.rate_hz)]
-        super().__init__(camera.name, camera.rate_hz, wanted, told=packed_text(camera.pipeline))
+        super().__init__(camera.name, camera.rate_hz, wanted, told=packed_text(camera.place))
 
     def image_format(self) -> ImageFormat:
         """See ``CameraDevice``."""

@@ -55,10 +55,10 @@ class RosDevice(ChildDevice):
         command: Sequence[str] = CHILD,
     ) -> None:
         """Starts the process; ``lens``: of the rig, which a CameraInfo must not contradict. Raises CameraError."""
-        self._topic, self._size, self._lens = camera.topic, size, lens
+        self._topic, self._size, self._lens = camera.place, size, lens
         self._format: ImageFormat | None = None
-        self._info_topic = camera.camera_info or info_topic_of(camera.topic)
-        super().__init__(camera.name, camera.rate_hz, [*command, camera.topic, self._info_topic, camera.stamps])
+        self._info_topic = camera.camera_info or info_topic_of(camera.place)
+        super().__init__(camera.name, camera.rate_hz, [*command, camera.place, self._info_topic, camera.stamps])
 
     def image_format(self) -> ImageFormat:
         """See ``CameraDevice``."""

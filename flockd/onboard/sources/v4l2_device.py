@@ -68,7 +68,7 @@ class V4l2Device(CameraDevice):
         self._maps: list[mmap.mmap] = []
         self._bytes_per_line = 0
         with self._telling("cannot be opened"):
-            self._descriptor = self._kernel.open(camera.device)
+            self._descriptor = self._kernel.open(camera.place)
         try:
             self._check_capabilities()
             self._set_format(size, camera.pixel_format)

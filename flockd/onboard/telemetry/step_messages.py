@@ -55,11 +55,12 @@ def _state(vehicle: VehicleState, output: PilotOutput) -> StateMessage:
 
 def _neighbours(output: PilotOutput) -> NeighboursMessage:
     return NeighboursMessage(
-        time_s=output.time_s, neighbours=[_neighbour(neighbour) for neighbour in output.neighbours]
+        time_s=output.time_s, neighbours=[neighbour_message(neighbour) for neighbour in output.neighbours]
     )
 
 
-def _neighbour(neighbour: Neighbour) -> NeighbourMessage:
+def neighbour_message(neighbour: Neighbour) -> NeighbourMessage:
+    """One neighbour, as telemetry has it."""
     return NeighbourMessage(
         track=neighbour.track,
         position_ned=neighbour.position.tolist(),

@@ -14,8 +14,9 @@ from flockd.flight.mission.circle_then_tangent import desired_of
 from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.onboard.recording import RecordingError
 from flockd.onboard.recording.codec import from_json, parsed, to_json
-from flockd.onboard.recording.mcap_file import Entry, read_records
+from flockd.onboard.recording.mcap_file import Entry
 from flockd.onboard.recording.reader import Recording, head_of
+from flockd.onboard.recording.record_source import records_of
 from flockd.onboard.recording.truth import Truth
 from flockd.review.flight_log.builder import FlightLogBuilder
 from flockd.review.flight_log.capture import capture, key_frame_steps
@@ -111,7 +112,7 @@ def autopilot_clock(recording: Recording) -> tuple[FloatArray, FloatArray] | Non
 
     (n,) times on the drone's computer, and (n,) seconds by which the autopilot's clock was ahead then.
     """
-    entries = (record for path in recording.contents.paths for record in read_records(path))
+    entries = (record for path in recording.contents.paths for record in records_of(path))
     messages = [parsed(one.data) for one in entries if isinstance(one, Entry) and one.stream.topic == CLOCK_TOPIC]
     known = [
         (float(message["time_s"]), float(message["offset_s"]))

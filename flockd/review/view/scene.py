@@ -14,9 +14,10 @@ from flockd.flight.perception import Observation
 from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.flight.pilot.motions import background_pairs, neighbour_pairs
 from flockd.onboard.recording.codec import Json, from_json, to_json
-from flockd.onboard.recording.mcap_file import Entry, read_records
+from flockd.onboard.recording.mcap_file import Entry
 from flockd.onboard.recording.own_path import OwnPath
 from flockd.onboard.recording.reader import RecordedStep, Recording
+from flockd.onboard.recording.record_source import records_of
 from flockd.onboard.recording.streams import TABLE
 
 _MAX_PAIRS = 800
@@ -144,7 +145,7 @@ class Scenes:
 def texts(recording: Recording, start_s: float, end_s: float) -> Iterator[tuple[float, str]]:
     """Events in words, with the time of the recording's clock."""
     for path in recording.contents.paths:
-        for record in read_records(path):
+        for record in records_of(path):
             if isinstance(record, Entry) and record.stream.topic == TABLE["events"].topic:
                 message = json.loads(record.data)
                 if start_s <= message["time_s"] <= end_s:

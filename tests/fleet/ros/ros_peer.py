@@ -5,6 +5,7 @@ ros_peer.py NAME. It reads lines of JSON from its standard input, each one order
 - `{"do": "listen", "topic": T, "type": "nav_msgs/msg/Odometry", "qos": "sensor" | "state" | "event"}`
 - `{"do": "call", "service": S}`: a Trigger
 - `{"do": "publish", "topic": T, "type": ..., "fields": {"header.frame_id": "map", "pose.position.x": 1.0}}`
+- `{"do": "topics"}`: who publishes what
 
 and writes `{"heard": T, "at": monotonic seconds, "message": {...}}`, `{"answer": S, "at": ..., "found": ...}`. Bytes
 are written as hexadecimal digits, long arrays as their length.
@@ -102,7 +103,12 @@ def publish(node: Any, topic: str, kind: str, fields: dict[str, Any]) -> None:
     say(published=topic, at=time.monotonic())
 
 
-DO: dict[str, Callable[..., None]] = {"listen": listen, "call": call, "publish": publish}
+def topics(node: Any) -> None:
+    names = [topic for topic, _ in node.get_topic_names_and_types()]
+    say(topics={name: [one.node_name for one in node.get_publishers_info_by_topic(name)] for name in names})
+
+
+DO: dict[str, Callable[..., None]] = {"listen": listen, "call": call, "publish": publish, "topics": topics}
 
 
 def main() -> None:

@@ -24,7 +24,8 @@ from flockd.onboard.recording.codec import to_json
 from flockd.onboard.recording.editing import cut, recover
 from flockd.onboard.recording.export import export_images, export_tables
 from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, McapFile, Note, Record, read_records
-from flockd.onboard.recording.reader import Recording, is_image
+from flockd.onboard.recording.reader import Recording
+from flockd.onboard.recording.streams import is_image
 from tests.onboard.recording.made_up import record, rewritten
 
 ROOT = Path(__file__).parents[3]

@@ -2,7 +2,8 @@
 
 ros_cameras.py FILE. The file is an npz: `stamps` (seconds, when each set was taken), and for each camera of `names`
 `images_NAME` (n, h, w, 3) RGB and `k_NAME` (9,). It waits until each camera has a reader, then publishes each set as
-long after the first as it was taken after that, stamped by this computer's clock, and prints the first stamp in ns.
+long after the first as it was taken after that, stamped by this computer's clock. With a second argument it waits for a
+line before each set, so that none comes before somebody has taken the last.
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ def main() -> None:
         executor.spin_once(timeout_sec=0.05)
     time.sleep(0.5)  # the other side learns of it a moment later
     first_ns = time.time_ns()
-    sys.stdout.write(f"{first_ns}\n")
-    sys.stdout.flush()
     for number, stamp_s in enumerate(flight["stamps"]):
         stamp_ns = first_ns + round(1e9 * float(stamp_s - flight["stamps"][0]))
+        if sys.argv[2:]:
+            sys.stdin.readline()
         time.sleep(max(0.0, (stamp_ns - time.time_ns()) / 1e9))
         for name in names:
             publish(images[name], lenses[name], flight[f"images_{name}"][number], flight[f"k_{name}"], stamp_ns)

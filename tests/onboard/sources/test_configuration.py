@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from flockd.core.config import load_drone
+from flockd.core.config import DroneConfig, load_drone
 from flockd.core.errors import ConfigError
 from flockd.onboard.sources import open_source
 from flockd.onboard.sources.device_source import DeviceSource
@@ -54,6 +54,39 @@ def test_the_quadrotors_file_is_four_wide_usb_cameras() -> None:
     assert isinstance(open_source(config, "quadrotor.yaml"), DeviceSource)
 
 
+TOPICS = """\
+  cameras:
+    - {name: front, topic: /front/image_raw}
+    - {name: back, topic: /back/image_raw/compressed, camera_info: /back/info, stamps: simulator}
+"""
+
+
+def test_frames_may_come_from_topics_of_ros(tmp_path: Path) -> None:
+    path = tmp_path / "drone.yaml"
+    path.write_text(RIG + "source:\n  kind: ros\n" + TOPICS, encoding="utf-8")
+    config = load_drone(path)
+    assert config.source is not None
+    assert [camera.place for camera in config.source.cameras] == ["/front/image_raw", "/back/image_raw/compressed"]
+    assert isinstance(open_source(config, str(path)), DeviceSource)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "source:\n  kind: v4l2\n" + TWO,
+        "source:\n  kind: gstreamer\n" + PIPELINES,
+        "source:\n  kind: ros\n" + TOPICS,
+        "source: {kind: shared_memory}\n",
+    ],
+)
+def test_a_recorded_configuration_can_be_read_again(tmp_path: Path, source: str) -> None:
+    """A recording holds every key, those too that are of another kind of source and empty."""
+    path = tmp_path / "drone.yaml"
+    path.write_text(RIG + source, encoding="utf-8")
+    config = load_drone(path)
+    assert DroneConfig.model_validate_json(config.model_dump_json()) == config
+
+
 def test_frames_may_come_from_another_program(tmp_path: Path) -> None:
     path = tmp_path / "drone.yaml"
     path.write_text(RIG + "source: {kind: shared_memory, shared_memory: {drone: '3'}}\n", encoding="utf-8")
@@ -83,7 +116,7 @@ def test_the_pipelines_of_the_documentation_check(tmp_path: Path) -> None:
     path.write_text(rig + example, encoding="utf-8")
     source = load_drone(path).source
     assert source is not None
-    assert [camera.pipeline.split()[0] for camera in source.cameras] == [
+    assert [camera.place.split()[0] for camera in source.cameras] == [
         "nvarguscamerasrc", "libcamerasrc", "rtspsrc", "v4l2src",
     ]  # fmt: skip
 
@@ -140,6 +173,10 @@ def test_slips_inside_the_optional_section_are_reported_with_what_to_do(tmp_path
             "source:\n  kind: v4l2\n" + PIPELINES.replace("back, pipeline", "back, device").replace("lib", "/dev/"),
             "drone.yaml:8: source.cameras[0].pipeline: is of a source of kind `gstreamer`; delete it, or write "
             "`kind: gstreamer`",
+        ),
+        (
+            "source:\n  kind: ros\n" + TOPICS.replace("topic: /front/image_raw", "rate_hz: 20"),
+            "drone.yaml:8: source.cameras[0]: has no `topic`; write that of its images, as `ros2 topic list` shows it",
         ),
         (
             "source:\n  kind: gstreamer\n" + PIPELINES.replace("libcamerasrc", "libcamerasrc, pixel_format: yuyv"),

@@ -24,7 +24,7 @@ from tests.fleet.ros.peers import ended, own_domain
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
 FLIGHT = Path(__file__).parents[2] / "review" / "replay" / "crossing.mcap"
-STEPS = 12
+STEPS = 10
 
 
 def through_ros(folder: Path, recording: Recording, steps: list[RecordedStep]) -> Iterator[tuple[FrameSet, float]]:
@@ -42,10 +42,13 @@ def through_ros(folder: Path, recording: Recording, steps: list[RecordedStep]) -
     parameters = SourceParameters(kind="ros", cameras=cameras, silence_s=60.0, set_tolerance_s=0.25, set_wait_s=5.0)
     source = open_source(recording.config.model_copy(update={"source": parameters}), "drone.yaml")
     source.start()
-    command = [sys.executable, str(Path(__file__).with_name("ros_cameras.py")), str(file)]
+    command = [sys.executable, str(Path(__file__).with_name("ros_cameras.py")), str(file), "on request"]
     try:
-        with ended(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)):
+        with ended(subprocess.Popen(command, stdin=subprocess.PIPE, text=True)) as driver:
+            assert driver.stdin is not None
             for step in steps:
+                driver.stdin.write("\n")
+                driver.stdin.flush()
                 frames = source.newest(60.0)
                 assert frames is not None, source.status()
                 yield frames, frames.time_s - step.frames.time_s

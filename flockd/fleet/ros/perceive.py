@@ -1,0 +1,121 @@
+"""Perception alone, for other people's stacks: images in, neighbours out. Nothing is commanded."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from flockd.core.config import DroneConfig
+from flockd.core.errors import UsageError
+from flockd.core.messages import PilotOutput, VehicleState
+from flockd.flight.pilot import FlockPilot
+from flockd.onboard.ros import message_trees as trees
+from flockd.onboard.ros.message_trees import Names, ros_name
+from flockd.onboard.ros.ros_node import Delivery, RosNode
+from flockd.onboard.ros.vehicle_states import STATES, NearestState, stamp_ns, vehicle_state
+from flockd.onboard.sources import FrameSource
+from flockd.onboard.telemetry.step_messages import neighbour_message
+
+_LOOK_S = 0.2
+_TELL_S = 1.0
+
+
+def check(config: DroneConfig, vehicle_topic: str | None) -> None:
+    """Raises UsageError where the configuration needs a height that nobody tells."""
+    if vehicle_topic is None and config.perception.scale == "height":
+        raise UsageError(
+            "perception.scale: is `height`, which nobody tells here; name odometry or a pose with --vehicle, or "
+            "write `scale: network`"
+        )
+
+
+class PerceptionNode:
+    """Sees drones in the images of a source, and publishes them, until it is told to end.
+
+    Without the vehicle's state it takes the drone for level, and its nose for north: y of `DRONE/level` is then ahead,
+    and x to the right. `check` comes first.
+    """
+
+    def __init__(self, config: DroneConfig, node: RosNode, vehicle_topic: str | None) -> None:
+        """``node`` stays its owner's. Raises ModelError."""
+        self._config, self._node, self._vehicle_topic = config, node, vehicle_topic
+        self._names = Names(ros_name(config.name))
+        self._pilot = FlockPilot(config, stopwatch=time.perf_counter)
+        self._states = NearestState()
+        self._kind: str | None = None
+        self._last_s, self._told_s = -np.inf, -np.inf
+        self._over = threading.Event()
+
+    def stop(self) -> None:
+        """From any thread."""
+        self._over.set()
+
+    def run(self, source: FrameSource) -> None:
+        """Between the source's start and its end."""
+        source.start()
+        try:
+            while not self._over.is_set():
+                self._listen()
+                frames = source.newest(_LOOK_S)
+                if frames is not None and frames.time_s >= self._last_s + self._config.step_s - self._slack_s():
+                    vehicle = self._vehicle(frames.time_s)
+                    if vehicle is None:
+                        self._tell(source, ["no state of the vehicle is near the images' time; check --vehicle"])
+                        continue
+                    self._last_s = frames.time_s
+                    output = self._pilot.step(frames, vehicle)
+                    self._publish(output)
+                    self._tell(source, [reason.text for reason in output.reasons])
+                else:
+                    self._tell(source, [] if frames else None)
+        finally:
+            source.stop()
+
+    def _slack_s(self) -> float:
+        """Frames that come a little before a step is due are those of the step."""
+        return 0.0 if self._config.source is None else self._config.source.set_tolerance_s
+
+    def _listen(self) -> None:
+        """As soon as the topic of the vehicle's state is there, whose kind is known only then."""
+        if self._vehicle_topic is None or self._kind is not None:
+            return
+        kinds = [kind for kind in self._node.kinds(self._vehicle_topic) if kind in STATES]
+        if kinds:
+            self._kind = kind = kinds[0]
+            self._node.subscribe(self._vehicle_topic, kind, self._take_state, Delivery.SENSOR)
+
+    def _take_state(self, message: Any) -> None:
+        """On a thread of the node's."""
+        assert self._kind is not None
+        time_s = 1e-9 * (stamp_ns(message) + time.monotonic_ns() - time.time_ns())
+        self._states.add(vehicle_state(self._kind, message, time_s))
+
+    def _vehicle(self, time_s: float) -> VehicleState | None:
+        if self._vehicle_topic is None:
+            return VehicleState(time_s, np.eye(3), 0.0)
+        return self._states.at(time_s + self._config.rig.time_offset_s)
+
+    def _publish(self, output: PilotOutput) -> None:
+        """Stamped as the images were."""
+        time_ns = round(1e9 * output.time_s) + time.time_ns() - time.monotonic_ns()
+        seen, space = [neighbour_message(one) for one in output.neighbours], f"/{self._names.drone}"
+        poses, tracks = (make(time_ns, self._names, seen) for make in (trees.neighbour_poses, trees.tracks))
+        self._node.publish(f"{space}/neighbours", trees.POSE_ARRAY, poses, Delivery.SENSOR)
+        self._node.publish(f"{space}/neighbours/tracks", trees.POINT_CLOUD, tracks, Delivery.SENSOR)
+
+    def _tell(self, source: FrameSource, reasons: Sequence[str] | None) -> None:
+        """Once a second, what is the matter. ``reasons``: None while no images come."""
+        now_s = time.monotonic()
+        if now_s - self._told_s < _TELL_S:
+            return
+        self._told_s = now_s
+        faults = [status.fault for status in source.status().values() if status.fault]
+        matters = [*faults, *(["no images have come yet"] if reasons is None and not faults else reasons or [])]
+        level = trees.ERROR if reasons is None and self._last_s == -np.inf else trees.WARN if matters else trees.OK
+        status = trees.diagnostic(f"{self._names.drone}: perception", level, "; ".join(matters) or "sees", {})
+        tree = trees.diagnostics(time.time_ns(), [status])
+        self._node.publish(f"/{self._names.drone}/diagnostics", trees.DIAGNOSTICS, tree, Delivery.STATE)

@@ -1,0 +1,218 @@
+"""A bag of somebody else's stack becomes a recording that can be replayed: its images, with odometry or an IMU."""
+
+from __future__ import annotations
+
+import json
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from flockd.core.choices import ImageFormat
+from flockd.core.config import DroneConfig
+from flockd.core.errors import UsageError
+from flockd.core.messages import UInt8Array, VehicleState
+from flockd.flight.inference.hashes import model_hashes
+from flockd.onboard.recording import RecordingError, foxglove
+from flockd.onboard.recording.codec import to_json
+from flockd.onboard.recording.mcap_file import Entry, Inclosure, McapFile, Note
+from flockd.onboard.recording.ros_bag import Bag, BagMessage
+from flockd.onboard.recording.streams import (
+    CONFIGURATION,
+    END_NOTE,
+    FLIGHT_NOTE,
+    FORMAT,
+    FRAMES,
+    MODELS_NOTE,
+    VEHICLE,
+    FrameEntry,
+    StepFrames,
+    nanoseconds,
+)
+from flockd.onboard.ros.cdr_images import RosImage, read_compressed_image, read_image
+from flockd.onboard.ros.message_trees import COMPRESSED_IMAGE, IMU
+from flockd.onboard.ros.vehicle_states import LONGEST_GAP_S, STATES, NearestState, stamp_ns, vehicle_state
+from flockd.onboard.sources.assembler import Assembler, RawFrameSet
+from flockd.onboard.sources.frames import RawFrame
+from flockd.onboard.sources.image_formats import CorruptImageError, PackedFormat
+from flockd.onboard.sources.ros_device import ENCODINGS
+
+IMAGE = "sensor_msgs/msg/Image"
+
+
+def recording_of_bag(bag: Bag, config: DroneConfig, vehicle_topic: str | None, target: Path) -> int:
+    """Writes a recording of the bag's frame sets, a step every ``config.step_s``; gives their number.
+
+    Topics of the cameras are those of ``config.source``, whose kind is `ros`. Raises UsageError and RecordingError.
+    """
+    source = config.source
+    if source is None or source.kind != "ros":
+        raise UsageError(
+            f"{bag.path}: is a bag of ROS 2; replay it with --config, a drone's whose source.kind is `ros` and whose "
+            "cameras name their topics"
+        )
+    topics = {camera.place: camera.name for camera in source.cameras}
+    kinds = bag.kinds()
+    for topic, camera in topics.items():
+        if kinds.get(topic) not in {IMAGE, COMPRESSED_IMAGE}:
+            there = ", ".join(name for name, kind in kinds.items() if kind in {IMAGE, COMPRESSED_IMAGE}) or "none"
+            raise UsageError(f"{bag.path}: has no images of camera {camera} in {topic}; topics with images: {there}")
+    began_ns = next((_image(bag, one).stamp_ns for one in bag.messages(topics)), 0)
+    states = _states(bag, _vehicle_topic(bag, vehicle_topic), config, began_ns)
+    steps = 0
+    with McapFile(target) as file:
+        file.write(Note(FLIGHT_NOTE, _facts(bag, config)))
+        file.write(Note(MODELS_NOTE, model_hashes(config.perception)))
+        file.write(Inclosure(CONFIGURATION, "application/json", config.model_dump_json(indent=1).encode()))
+        last_s = -np.inf
+        for frames in _sets(bag, topics, config, began_ns):
+            vehicle = states.at(frames.time_s + config.rig.time_offset_s)
+            if vehicle is None or frames.time_s < last_s + config.step_s - source.set_tolerance_s:
+                continue
+            last_s = frames.time_s
+            for entry in _entries(steps, frames, vehicle):
+                file.write(entry)
+            steps += 1
+        file.write(Note(END_NOTE, {"steps": str(steps), "lost": "0"}))
+    if steps == 0:
+        raise RecordingError(
+            f"{bag.path}: has no image with a state of the vehicle within {LONGEST_GAP_S:g} s of it; are their stamps "
+            "of one clock?"
+        )
+    return steps
+
+
+@dataclass(frozen=True, eq=False)
+class _Packed:
+    """An image as a recording has it."""
+
+    data: bytes
+    form: ImageFormat
+
+
+def _sets(bag: Bag, topics: Mapping[str, str], config: DroneConfig, began_ns: int) -> Iterator[RawFrameSet]:
+    """Frames by their stamps, as a drone puts them together; the clock begins with the first one's."""
+    assert config.source is not None
+    sizes = {camera.name: camera.size_px for camera in config.rig.cameras}
+    assembler = Assembler(tuple(sizes), config.source)
+    rates = {camera.name: camera.rate_hz for camera in config.source.cameras}
+    last: dict[str, RawFrame] = {}
+    for message in bag.messages(topics):
+        camera = topics[message.topic]
+        image = _image(bag, message)
+        time_s = _time_s(image.stamp_ns, began_ns)
+        before = last.get(camera)
+        missing = 0 if before is None else max(round((time_s - before.time_s) * rates[camera]), 1)
+        frame = RawFrame(camera, image.data, _decoder(image, sizes[camera], message), time_s, missing + _number(before))
+        if assembler.offer(frame, time_s) is None:
+            last[camera] = frame
+            if (found := assembler.take(time_s)) is not None:
+                yield found
+    if (found := assembler.take(np.inf)) is not None:
+        yield found
+
+
+def _number(frame: RawFrame | None) -> int:
+    return 0 if frame is None else frame.sequence
+
+
+def _time_s(stamp_ns: int, began_ns: int) -> float:
+    """Since the first image: since 1970, a float would hold no microseconds."""
+    return (stamp_ns - began_ns) * 1e-9
+
+
+def _image(bag: Bag, message: BagMessage) -> RosImage:
+    try:
+        return read_image(message.data) if message.kind == IMAGE else read_compressed_image(message.data)
+    except ValueError as error:
+        raise RecordingError(f"{bag.path}: an image of {message.topic} cannot be read ({error})") from error
+
+
+def _decoder(image: RosImage, size: tuple[int, int], message: BagMessage) -> Callable[[bytes], UInt8Array]:
+    """Raises RecordingError for an image that is not the camera's."""
+    if image.size is None:
+        return lambda data: _decoded(data, size)
+    if image.size != size or image.encoding not in ENCODINGS:
+        raise RecordingError(
+            f"{message.topic}: has images of {image.size[0]}x{image.size[1]} in {image.encoding[:40]!r}; the rig has "
+            f"{size[0]}x{size[1]}, and encodings that can be read are {', '.join(ENCODINGS)}"
+        )
+    return PackedFormat(ENCODINGS[image.encoding], size, image.bytes_per_line).decode
+
+
+def _decoded(data: bytes, size: tuple[int, int]) -> UInt8Array:
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        image = None
+    if image is None or image.shape[1::-1] != size:
+        raise CorruptImageError("does not decode into an image of the rig's size")
+    return np.asarray(image, np.uint8)
+
+
+def _states(bag: Bag, topic: str, config: DroneConfig, began_ns: int) -> NearestState:
+    """All of the bag."""
+    if bag.kinds()[topic] == IMU and config.perception.scale == "height":
+        raise UsageError(
+            f"{bag.path}: {topic} has an attitude and no height; set perception.scale to `network`, or name "
+            "odometry with --vehicle"
+        )
+    states = NearestState(kept=None)
+    for message in bag.messages([topic]):
+        content = bag.read(message)
+        states.add(vehicle_state(message.kind, content, _time_s(stamp_ns(content), began_ns)))
+    return states
+
+
+def _vehicle_topic(bag: Bag, wanted: str | None) -> str:
+    """The topic that is named, or the only one of the best kind there is. Raises UsageError."""
+    kinds = bag.kinds()
+    if wanted is not None:
+        if kinds.get(wanted) not in STATES:
+            raise UsageError(
+                f"{bag.path}: {wanted} is {kinds.get(wanted, 'not in it')}; name one of {', '.join(STATES)}"
+            )
+        return wanted
+    for kind in STATES:
+        topics = sorted(topic for topic, its in kinds.items() if its == kind)
+        if len(topics) == 1:
+            return topics[0]
+        if topics:
+            raise UsageError(f"{bag.path}: has several topics of {kind}; name one with --vehicle: {', '.join(topics)}")
+    raise UsageError(f"{bag.path}: has no odometry, pose or IMU, from which the drone's attitude is known")
+
+
+def _facts(bag: Bag, config: DroneConfig) -> dict[str, str]:
+    facts = {"format": FORMAT, "drone": config.name, "images": "png", "recording": uuid.uuid4().hex, "part": "0"}
+    return {**facts, "from_bag": bag.path.name}
+
+
+def _entries(step: int, frames: RawFrameSet, vehicle: VehicleState) -> Iterator[Entry]:
+    """Images that do not decode are left out, as a drone does."""
+    kept = []
+    for camera, frame in frames.frames.items():
+        try:
+            packed = _packed(frame)
+        except CorruptImageError:
+            continue
+        kept.append(FrameEntry(camera, frame.time_s, frame.sequence))
+        stamp = nanoseconds(frame.time_s)
+        yield Entry(foxglove.image_stream(camera), stamp, step, foxglove.image(stamp, camera, packed.data, packed.form))
+    stamp = nanoseconds(frames.time_s)
+    yield Entry(FRAMES, stamp, step, _json(StepFrames(step, frames.time_s, tuple(kept))))
+    yield Entry(VEHICLE, stamp, step, _json(vehicle))
+
+
+def _json(message: object) -> bytes:
+    return json.dumps(to_json(message), allow_nan=False).encode()
+
+
+def _packed(frame: RawFrame) -> _Packed:
+    """Compressed as it came where it came so; else PNG. Raises CorruptImageError."""
+    image = frame.decode(frame.data)
+    if frame.data[:2] == b"\xff\xd8":
+        return _Packed(frame.data, "jpeg")
+    return _Packed(bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]), "png")
