@@ -105,6 +105,7 @@ def rules(p: SafetyParameters) -> dict[Event, Rule]:
         Event.COMMAND_REFUSED: Rule(Barrier.NONE, Reaction.DEGRADE),
         Event.FENCE_LEFT: Rule(Barrier.WAIT, Reaction.DEGRADE, p.outside_s, Reaction.HOLD),
         Event.HEIGHTS_LEFT: Rule(Barrier.WAIT, Reaction.DEGRADE, p.outside_s, Reaction.HOLD),
+        Event.MOTION_UNKNOWN: Rule(Barrier.WAIT, Reaction.HOVER),
         Event.LINK_LOST: Rule(Barrier.LATCH, Reaction.SILENCE),
         Event.NOT_OFFBOARD: Rule(Barrier.NONE, Reaction.SILENCE),
         Event.NOT_ARMED: Rule(Barrier.WAIT, Reaction.SILENCE),

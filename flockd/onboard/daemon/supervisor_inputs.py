@@ -82,6 +82,7 @@ class InputCollector:
             refused_commands=self._refused() - self._refused_before,
             outside_fence=outside_fence(self._config.safety.gate, position),
             outside_heights=vehicle is None or outside_heights(self._config.safety.gate, vehicle.height_m),
+            motion_age_s=math.inf if vehicle is None else now - vehicle.time_s,
             heartbeat_age_s=status.heartbeat_age_s,
             flight_mode=None if status.flight_mode == "unknown" else status.flight_mode,
             armed=None if math.isinf(status.heartbeat_age_s) else status.armed,

@@ -70,6 +70,22 @@ _FROM_METADATA = (
 )  # fmt: skip
 
 
+_CAUSES = {
+    "neighbour": "neighbours",
+    "uncertainty": "their uncertainty",
+    "false_detection": "false detections",
+    "obstacle": "obstacles",
+    "fence": "the fence",
+    "wind": "wind",
+    "other": "other limits",
+}
+
+
+def causes_text(summary: Json) -> str:
+    """What gates slowed drones down for, and for how much of the time; a moment may have several causes."""
+    return ", ".join(f"{_CAUSES[cause]} {100 * part:.1f} %" for cause, part in summary["slowed_by"].items())
+
+
 def write_summary(summary: Json, path: Path) -> None:
     """Write strict JSON; a NaN in it raises ValueError."""
     path.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")

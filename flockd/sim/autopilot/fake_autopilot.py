@@ -98,6 +98,8 @@ class FakeAutopilot:
         self._speed_factor, self._real = speed_factor, clock
         self.battery_share = 1.0
         self.estimate_ok = True
+        self.sends_motion = True
+        """False: its position and velocity do not come any more, and all else does."""
         self.failing: set[str] = set()
         """PX4's names of further checks that fail; each refuses to arm."""
         self.silent = False
@@ -206,7 +208,13 @@ class FakeAutopilot:
 
     def _snapshot(self) -> VehicleSnapshot:
         return VehicleSnapshot(
-            self._state, self._mode, self._intended, self._armed, self.estimate_ok, self.battery_share
+            self._state,
+            self._mode,
+            self._intended,
+            self._armed,
+            self.estimate_ok,
+            self.sends_motion,
+            self.battery_share,
         )
 
     def _clock(self) -> float:

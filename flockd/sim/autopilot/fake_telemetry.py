@@ -53,6 +53,7 @@ class VehicleSnapshot:
     """The mode it was asked for; not `mode` while its failsafe is active."""
     armed: bool
     estimate_ok: bool
+    sends_motion: bool
     battery_share: float
 
     @property
@@ -134,7 +135,7 @@ class TelemetryStreams:
         self._mav.attitude_quaternion_send(self._boot_ms(), *self._attitude(), 0, 0, 0)
 
     def _send_position(self) -> None:
-        if self._vehicle.estimate_ok:
+        if self._vehicle.estimate_ok and self._vehicle.sends_motion:
             self._mav.local_position_ned_send(
                 self._boot_ms(), *self._vehicle.motion.position, *self._vehicle.motion.velocity
             )

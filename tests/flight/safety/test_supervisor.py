@@ -58,6 +58,7 @@ FAULTS = {
     Event.COMMAND_REFUSED: Fault({"refused_commands": 1}, "ready", Action.FLY_DEGRADED),
     Event.FENCE_LEFT: Fault({"outside_fence": True}, "wait", Action.FLY_DEGRADED),
     Event.HEIGHTS_LEFT: Fault({"outside_heights": True}, "wait", Action.FLY_DEGRADED),
+    Event.MOTION_UNKNOWN: Fault({"motion_age_s": 0.6}, "wait", Action.HOVER),
     Event.LINK_LOST: Fault({"heartbeat_age_s": 2.1}, "latch", Action.SILENCE),
     Event.NOT_OFFBOARD: Fault({"flight_mode": "position"}, "ready", Action.SILENCE),
     Event.NOT_ARMED: Fault({"armed": False}, "wait", Action.SILENCE),
@@ -585,6 +586,7 @@ LIMITS: list[tuple[str, float, float, Event | None, Event]] = [
     ("neighbours_age_s", 2.0, 2.001, None, Event.NEIGHBOURS_LOST),
     ("nearest_neighbour_m", 1.0, 0.999, None, Event.NEIGHBOUR_CLOSE),
     ("refused_commands", 0, 1, None, Event.COMMAND_REFUSED),
+    ("motion_age_s", 0.5, 0.501, None, Event.MOTION_UNKNOWN),
     ("heartbeat_age_s", 2.0, 2.001, None, Event.LINK_LOST),
 ]
 
