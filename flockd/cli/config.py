@@ -133,7 +133,7 @@ def _yet_to_fill_in(config: DroneConfig, places: Mapping[KeyPath, Place]) -> lis
     return [
         places["source", "cameras", number, "device"].problem(fault)
         for number, camera in enumerate(cameras)
-        if CHANGE_ME in camera.device
+        if camera.device and CHANGE_ME in camera.device
     ]
 
 

@@ -77,24 +77,14 @@ def _order(flock: Mapping[str, Any]) -> str:
     return _number(flock["order_tail"], "of 1", 3)
 
 
-_CAUSES = {
-    "neighbour": "neighbours",
-    "uncertainty": "their uncertainty",
-    "false_detection": "false detections",
-    "obstacle": "obstacles",
-    "fence": "the fence",
-    "wind": "wind",
-    "other": "other limits",
-}
-
-
 def _slowed(summary: Mapping[str, Any]) -> str:
-    """For how long, and by what; a moment may have several causes."""
+    """For how long, and by what."""
+    from flockd.review.report.summary import causes_text
+
     share = summary["slowed_share"]
     if share is None:
         return "" if summary["gated"] is None else "flown without gates"
-    causes = ", ".join(f"{_CAUSES[cause]} {100 * part:.1f} %" for cause, part in summary["slowed_by"].items())
-    return f"{100 * share:.1f} % of the time" + (f": {causes}" if causes else "")
+    return f"{100 * share:.1f} % of the time" + (f": {causes_text(summary)}" if share else "")
 
 
 def _held(handed_over: Mapping[str, Any]) -> str:

@@ -54,6 +54,7 @@ AUTOPILOT = Service("any message of the autopilot", 50.0, 2.0, "link_lost", ("sa
 POSITION_TARGET = Service("the autopilot's own setpoint", 10.0, 1.0, "it is compared with no setpoint")
 OTHER_HEARTBEAT = Service("another computer's heartbeat", 1.0, 5.0, "it counts as gone")
 VEHICLE_STATE = Service("the autopilot's state", 50.0, 2.0, "forgotten; frames of another time take the newest")
+MOTION = Service("the autopilot's position and velocity", 30.0, 0.5, "motion_unknown")
 GROUND_RANGE = Service("range to the ground", 30.0, 0.3, "it gives no scale", ("perception.range_finder.max_age_s",))
 RANGE_FINDER = Service("range finder", 30.0, 0.5, "the autopilot's own distance to bottom takes its place")
 TIME_SYNC = Service("reply to a clock exchange", 10.0, 1.0, "it is not used")

@@ -14,6 +14,7 @@ _WELL = Inputs(
     cameras={"one": _SEES}, dropped_share=0.0, estimate_age_s=0.0, ego_motion_failures=0, network_faults=0,
     inference_stuck=False, load=0.0, temperature_c=None, loop_lag_s=0.0, gusts_m_s=0.0, dead_tasks=(),
     neighbours_age_s=0.0, nearest_neighbour_m=math.inf, refused_commands=0, outside_fence=False, outside_heights=False,
+    motion_age_s=0.0,
     heartbeat_age_s=0.0, message_age_s=0.0, stream_fault=None, autopilot_failsafe=False, foreign_setpoints=None,
     parameter_fault=None, flight_mode=OFFBOARD, armed=True, in_air=True, offboard_refused=False, battery_low=False,
     position_lost=False, shutdown_asked=False, hold_asked=False, land_asked=False, resume_asked=False,

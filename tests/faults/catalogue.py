@@ -180,6 +180,7 @@ CATALOGUE = (
         "leave the flock: Hold, or as configured",
         (
             f"{_HERE}autopilot.py::test_the_battery_is_low_or_the_position_lost",
+            "tests/onboard/daemon/test_flight.py::test_a_position_and_velocity_that_come_no_more_are_not_flown_by",
             f"{_PX4}[gps_off]",
             f"{_PX4}[estimator_lost]",
             f"{_PX4}[battery_low]",

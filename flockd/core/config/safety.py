@@ -51,7 +51,8 @@ class GateParameters(Section):
     """From a neighbour's change of velocity until the own drone has begun to brake: a step of the pilot, in which the
     change is not seen, how long the step takes, and the drone's response."""
     response_s: Annotated[float, Field(gt=0, le=5)] = 0.25
-    """Time constant with which the drone's velocity follows a setpoint."""
+    """Time constant with which the drone's velocity follows a setpoint, as the report with the autopilot's log fits it.
+    Both reaction times contain it, and the dead time before it."""
     max_drift_m_s: Annotated[float, Field(ge=0, le=20)] = 2.0
     """By how much at most a setpoint is corrected for wind, which carries the drone off it; 0: not at all."""
     fence_radius_m: Annotated[float, Field(gt=0, le=100_000)] | None = 100.0
@@ -68,6 +69,9 @@ class GateParameters(Section):
             raise ValueError(
                 f"command_fresh_s {self.command_fresh_s:g} is not below command_timeout_s; write a smaller one"
             )
+        for key in ("reaction_s", "neighbour_reaction_s"):
+            if getattr(self, key) < self.response_s:
+                raise ValueError(f"{key} is below response_s {self.response_s:g}, a part of it; write a larger one")
         if self.min_height_m >= self.max_height_m:
             raise ValueError(f"min_height_m {self.min_height_m:g} is not below max_height_m; write a smaller one")
         if self.degraded_speed_m_s > self.max_speed_m_s:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
+from flockd.core import services
 from flockd.core.config.safety import SafetyParameters
 
 OFFBOARD = "offboard"
@@ -72,6 +73,8 @@ class Inputs:
     """As of `outside_fence`."""
     outside_heights: bool
     """As of `outside_heights`."""
+    motion_age_s: float
+    """Age of the autopilot's newest position and velocity; infinite before the first."""
     heartbeat_age_s: float
     """Age of the autopilot's newest heartbeat; infinite before the first."""
     message_age_s: float
@@ -129,6 +132,7 @@ class Event(StrEnum):
     COMMAND_REFUSED = "command_refused"
     FENCE_LEFT = "fence_left"
     HEIGHTS_LEFT = "heights_left"
+    MOTION_UNKNOWN = "motion_unknown"
     LINK_LOST = "link_lost"
     STREAM_ENDED = "stream_ended"
     AUTOPILOT_FAILSAFE = "autopilot_failsafe"
@@ -242,6 +246,11 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         (Event.FENCE_LEFT, inputs.outside_fence, "outside the fence"),
         (Event.HEIGHTS_LEFT, inputs.outside_heights, "above or below the heights allowed"),
         (Event.LINK_LOST, lost_link is not None, f"{lost_link}"),
+        (
+            Event.MOTION_UNKNOWN,
+            not inputs.motion_age_s <= services.MOTION.timeout,
+            f"no position and velocity from the autopilot {_since(inputs.motion_age_s)}",
+        ),
         (
             Event.STREAM_ENDED,
             inputs.stream_fault is not None and lost_link is None,

@@ -109,6 +109,7 @@ def rules(p: SafetyParameters) -> dict[Event, Rule]:
         Event.COMMAND_REFUSED: Rule(Barrier.NONE, Reaction.DEGRADE),
         Event.FENCE_LEFT: Rule(Barrier.WAIT, Reaction.DEGRADE, p.outside_s, Reaction.HOLD),
         Event.HEIGHTS_LEFT: Rule(Barrier.WAIT, Reaction.DEGRADE, p.outside_s, Reaction.HOLD),
+        Event.MOTION_UNKNOWN: Rule(Barrier.WAIT, Reaction.HOVER),
         Event.LINK_LOST: Rule(Barrier.LATCH, Reaction.SILENCE),
         Event.STREAM_ENDED: Rule(Barrier.LATCH, Reaction.SILENCE),
         Event.AUTOPILOT_FAILSAFE: Rule(Barrier.WAIT, Reaction.NOTE),

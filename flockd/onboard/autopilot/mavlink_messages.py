@@ -98,8 +98,8 @@ class ReceivedMessages:
 
     def __init__(self, report: Callable[[str], None], max_gap_s: float = services.SETPOINT.timeout) -> None:
         """``report`` is called by `add` with one sentence on the first of each unknown value, of a home that moves in
-        flight, of a landing, of a restart, of lost heartbeats, of a clock that lies, and of what the autopilot says as a
-        warning or worse.
+        flight, of a landing, of a restart, of lost heartbeats, of a clock that lies, and of what the autopilot says as
+        a warning or worse.
         ``max_gap_s``: between setpoints, which flockd bridges.
         """
         self._report = report

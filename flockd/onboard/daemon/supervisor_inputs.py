@@ -87,6 +87,7 @@ class InputCollector:
             refused_commands=self._refused() - self._refused_before,
             outside_fence=outside_fence(self._config.safety.gate, position),
             outside_heights=vehicle is None or outside_heights(self._config.safety.gate, vehicle.height_m),
+            motion_age_s=math.inf if vehicle is None else now - vehicle.time_s,
             heartbeat_age_s=status.heartbeat_age_s,
             message_age_s=status.message_age_s,
             stream_fault=stream_fault,

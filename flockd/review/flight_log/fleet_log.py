@@ -202,7 +202,7 @@ def recorded_orders(recordings: Path, drone: str, zero_s: float) -> list[tuple[f
     return [
         (record.time_ns / 1e9 - zero_s, from_json(MissionOrder, json.loads(record.data)))
         for path in sorted(recordings.glob(f"{drone}-*.mcap"))
-        for record in read_records(path)
+        for record in records_of(path)
         if isinstance(record, Entry) and record.stream.topic == ORDER.topic
     ]
 

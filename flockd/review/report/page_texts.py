@@ -13,6 +13,7 @@ from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import EXACT_STATES
 from flockd.review.report.paper_results import TABLE_2, TABLE_3
 from flockd.review.report.style import FEW
+from flockd.review.report.summary import causes_text
 
 Summary = Mapping[str, Any]
 
@@ -180,6 +181,13 @@ def _facts(summary: Summary, log: FlightLog) -> list[dict[str, str]]:
             _fact("Collisions", _number(obstacles["collisions"], 0), "with obstacles, once per contact"),
             _fact("Clearance", _number(obstacles["min_clearance_m"], 2), f"the smallest to an obstacle; {near}", "m"),
         ]
+    if summary["slowed_share"]:
+        remark = f"of the time, by safety gates: {causes_text(summary)}"
+        facts.append(_fact("Slowed", _number(100 * summary["slowed_share"], 1), remark, "%"))
+    held = summary["handed_over"]
+    if held["drones"]:
+        remark = f"drones; the first at {held['first_s']:.1f} s: {held['reasons'][0]}"
+        facts.append(_fact("Asked for Hold", _number(held["drones"], 0), remark))
     if neighbours["recall_within_10m"] is not None:
         facts += [
             _fact("Neighbours known", _number(100 * neighbours["recall_within_10m"], 1), "of those within 10 m", "%"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,22 @@ _FROM_METADATA = (
     "desired_distance_m", "gated", "slowed_share", "slowed_by",
     "settings", "recorded", "began", "version", "interrupted", "autopilot", "fleet",
 )  # fmt: skip
+
+
+_CAUSES = {
+    "neighbour": "neighbours",
+    "uncertainty": "their uncertainty",
+    "false_detection": "false detections",
+    "obstacle": "obstacles",
+    "fence": "the fence",
+    "wind": "wind",
+    "other": "other limits",
+}
+
+
+def causes_text(summary: Mapping[str, Any]) -> str:
+    """What gates slowed drones down for, and for how much of the time; a moment may have several causes."""
+    return ", ".join(f"{_CAUSES[cause]} {100 * part:.1f} %" for cause, part in summary["slowed_by"].items())
 
 
 def write_summary(summary: Json, path: Path) -> None:

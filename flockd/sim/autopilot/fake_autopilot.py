@@ -100,6 +100,8 @@ class FakeAutopilot:
         self._speed_factor, self._real = speed_factor, clock
         self.battery_share = 1.0
         self.estimate_ok = True
+        self.sends_motion = True
+        """False: its position and velocity do not come any more, and all else does."""
         self.failing: set[str] = set()
         """PX4's names of further checks that fail; each refuses to arm."""
         self.wordless = False
@@ -248,6 +250,7 @@ class FakeAutopilot:
             self._intended,
             self._armed,
             self.estimate_ok,
+            self.sends_motion,
             self.battery_share,
             self.setpoints[-1][1].velocity if self._mode == "OFFBOARD" and self.setpoints else None,
         )

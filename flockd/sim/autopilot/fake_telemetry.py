@@ -65,6 +65,7 @@ class VehicleSnapshot:
     """The mode it was asked for; not `mode` while its failsafe is active."""
     armed: bool
     estimate_ok: bool
+    sends_motion: bool
     battery_share: float
     setpoint: FloatArray | None = None
     """(2,) m/s, north and east, that it follows in offboard."""
@@ -161,7 +162,7 @@ class TelemetryStreams:
         self._mav.attitude_quaternion_send(self._boot_ms(), *self._attitude(), 0, 0, 0)
 
     def _send_position(self) -> None:
-        if self._vehicle.estimate_ok:
+        if self._vehicle.estimate_ok and self._vehicle.sends_motion:
             self._mav.local_position_ned_send(
                 self._boot_ms(), *self._vehicle.motion.position, *self._vehicle.motion.velocity
             )

@@ -43,6 +43,7 @@ QUIET = Inputs(
     refused_commands=0,
     outside_fence=False,
     outside_heights=False,
+    motion_age_s=0.03,
     heartbeat_age_s=0.5,
     message_age_s=0.1,
     stream_fault=None,

@@ -58,6 +58,7 @@ FAULTS = {
     Event.COMMAND_REFUSED: Fault({"refused_commands": 1}, "ready", Action.FLY_DEGRADED),
     Event.FENCE_LEFT: Fault({"outside_fence": True}, "wait", Action.FLY_DEGRADED),
     Event.HEIGHTS_LEFT: Fault({"outside_heights": True}, "wait", Action.FLY_DEGRADED),
+    Event.MOTION_UNKNOWN: Fault({"motion_age_s": 0.6}, "wait", Action.HOVER),
     Event.LINK_LOST: Fault({"heartbeat_age_s": 3.6}, "latch", Action.SILENCE),
     Event.STREAM_ENDED: Fault({"stream_fault": "the thread was stopped"}, "latch", Action.SILENCE),
     Event.AUTOPILOT_FAILSAFE: Fault({"autopilot_failsafe": True}, "wait", Action.FLY),
@@ -618,6 +619,7 @@ LIMITS: list[tuple[str, float, float, Event | None, Event]] = [
     ("neighbours_age_s", 2.0, 2.001, None, Event.NEIGHBOURS_LOST),
     ("nearest_neighbour_m", 1.0, 0.999, None, Event.NEIGHBOUR_CLOSE),
     ("refused_commands", 0, 1, None, Event.COMMAND_REFUSED),
+    ("motion_age_s", 0.5, 0.501, None, Event.MOTION_UNKNOWN),
     ("heartbeat_age_s", 3.5, 3.501, None, Event.LINK_LOST),
     ("message_age_s", 2.0, 2.001, None, Event.LINK_LOST),
 ]

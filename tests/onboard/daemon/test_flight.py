@@ -111,6 +111,24 @@ async def test_eyes_that_lie_about_the_own_motion_add_half_a_metre_a_second_at_m
         assert max(np.linalg.norm(sent.velocity) for sent in last) < 0.1, "standstill, but for the last drift"
 
 
+async def test_a_position_and_velocity_that_come_no_more_are_not_flown_by(
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
+) -> None:
+    """Heartbeats and attitudes still come. The newest velocity would be taken for that of now, for ever."""
+    async with aboard(fake_autopilot, port, tmp_path) as ship:
+        await ship.is_ready_in_the_air()
+        await ship.flies()
+        await ship.until_state("normal")
+        fake_autopilot.sends_motion = False
+        gone_s = clock()
+        await ship.until_event("hover: no position and velocity from the autopilot for ")
+        await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        assert 1.4 < clock() - gone_s < 3.5, "after 0.5 s, and 1 s of hovering"
+        last = [sent for at_s, sent in fake_autopilot.setpoints if at_s > gone_s + 1.2]
+        assert max(np.linalg.norm(sent.velocity) for sent in last) < 0.1
+        assert not fake_autopilot.failsafe
+
+
 async def test_one_camera_gone_is_a_slower_flight_and_all_gone_a_hover_and_then_hold(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from flockd.core.config import load_scenario
 from flockd.core.data import data_path
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.flight_log.metadata import FlightMetadata, MissionMetadata
+from flockd.review.flight_log.metadata import FlightMetadata, HandedOver, MissionMetadata
 from flockd.review.flight_log.truth_matching import match_neighbours
+from flockd.review.report.page_texts import page_texts
 from flockd.review.report.paper_results import TABLE_2, TABLE_3
-from flockd.review.report.summary import summarise, write_summary
+from flockd.review.report.summary import causes_text, summarise, write_summary
 
 Array = NDArray[np.float64]
 STEPS, DRONES = 30, 2
@@ -396,3 +397,26 @@ def test_a_contact_with_an_obstacle_counts_once_however_long_it_lasts() -> None:
         "min_clearance_m": pytest.approx(0.1 - 0.35),
         "time_within_1m_s": pytest.approx(7 * 0.5),
     }
+
+
+def test_what_happens_once_flockd_does_not_fly_any_more_counts_apart() -> None:
+    """Nearest is 0.78 m, in three dimensions, at 1 s; one drone is held since 0.9 s, then both."""
+    log, held = _hand_made(), {1: HandedOver(time_s=0.9, reason="gusts")}
+    of_one = summarise(replace(log, metadata=log.metadata.model_copy(update={"handed_over": held})))["handed_over"]
+    assert (of_one["drones"], of_one["first_s"], of_one["reasons"]) == (1, 0.9, ["gusts"])
+    assert of_one["min_distance_flown_m"] == pytest.approx(math.hypot(0.6, 0.5))
+    both = held | {0: HandedOver(time_s=0.2, reason="gusts")}
+    of_both = summarise(replace(log, metadata=log.metadata.model_copy(update={"handed_over": both})))["handed_over"]
+    assert of_both["first_s"] == 0.2
+    assert of_both["min_distance_flown_m"] > 0.78, "from 0.5 s to 1 s, in whose step both were handed over, counts"
+    of_none = summarise(log)["handed_over"]
+    assert (of_none["drones"], of_none["first_s"], of_none["collisions_flown"]) == (0, None, None)
+
+
+def test_what_gates_slowed_drones_down_for_is_told_apart() -> None:
+    log, by_cause = _hand_made(), {"neighbour": 0.011, "false_detection": 0.0009}
+    facts = {"gated": True, "slowed_share": 0.03, "slowed_by": by_cause}
+    summary = summarise(replace(log, metadata=log.metadata.model_copy(update=facts)))
+    assert causes_text(summary) == "neighbours 1.1 %, false detections 0.1 %"
+    (slowed,) = [fact for fact in page_texts(summary, log)["facts"] if fact["name"] == "Slowed"]
+    assert slowed["remark"] == "of the time, by safety gates: neighbours 1.1 %, false detections 0.1 %"
