@@ -188,7 +188,7 @@ def test_before_a_live_camera_a_person_gets_instructions(
 
 def test_a_v4l2_camera_is_read(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     kernel = FakeKernel(video7=FakeCamera(formats=((480, 360, b"MJPG"),)))
-    monkeypatch.setattr("flockd.onboard.sources.device_source.Devices", lambda: Devices(kernel))
+    monkeypatch.setattr("flockd.onboard.sources.Devices", lambda lenses: Devices(kernel, lenses=lenses))
     monkeypatch.setattr("flockd.ground.calibration.image_sources.FIRST_FRAME_S", 60.0)
     done = threading.Event()
 
@@ -203,9 +203,10 @@ def test_a_v4l2_camera_is_read(tmp_path: Path, capsys: Capture, monkeypatch: pyt
     thread = threading.Thread(target=film)
     thread.start()
     command = ("calibrate", "camera", "/dev/video7", "--size", "480x360", "--out", str(tmp_path / "a.yaml"))
-    assert main([*command, "--seconds", "3"]) == 1
+    result = main([*command, "--seconds", "3"])
     done.set()
     thread.join()
+    assert result == 1
     assert re.search(r"the board is in none of the \d+ images \(\d+ no board\)", capsys.readouterr().err)
 
 

@@ -42,7 +42,7 @@ def test_every_key_that_is_an_age_or_a_time_out_of_a_message_is_in_the_table() -
 
 def test_reactions_that_are_events_are_in_the_supervisors_table() -> None:
     named = {service.reaction for service in SERVICES if " " not in service.reaction}
-    assert named == {"camera_lost", "estimate_stale", "neighbours_lost", "link_lost"}
+    assert named == {"camera_lost", "estimate_stale", "neighbours_lost", "link_lost", "motion_unknown"}
     assert named <= {event.value for event in rules(SafetyParameters())}
 
 

@@ -16,7 +16,7 @@ from flockd.core.config.source import CameraDeviceParameters, SourceParameters
 from flockd.core.messages import FrameSet, UInt8Array
 from flockd.onboard.sources import CameraStatus
 from flockd.onboard.sources.device_source import Devices, DeviceSource
-from flockd.onboard.sources.devices import CameraError
+from flockd.onboard.sources.devices import CameraDevice, CameraError
 from flockd.onboard.sources.gstreamer_child import HEADER, Buffer
 from flockd.onboard.sources.gstreamer_device import CHILD, GstreamerDevice
 from flockd.onboard.sources.gstreamer_formats import FORMATS, caps, format_of
@@ -34,14 +34,14 @@ def start() -> Iterator[Start]:
     """Starts a source of the given pipelines, called camera0 and so on."""
     started: list[DeviceSource] = []
 
-    def begin(*pipelines: str, silence_s: float = 30.0) -> DeviceSource:
+    def begin(*pipelines: str, silence_s: float = 30.0, devices: type[Devices] = Devices) -> DeviceSource:
         names = [f"camera{number}" for number in range(len(pipelines))]
         cameras = tuple(
             CameraDeviceParameters(name=name, pipeline=pipeline, rate_hz=RATE_HZ)
             for name, pipeline in zip(names, pipelines, strict=True)
         )
         parameters = SourceParameters(kind="gstreamer", cameras=cameras, silence_s=silence_s, set_tolerance_s=5.0)
-        source = DeviceSource(dict.fromkeys(names, SIZE), parameters, Devices(command=FAKE))
+        source = DeviceSource(dict.fromkeys(names, SIZE), parameters, devices(command=FAKE))
         started.append(source)
         source.start()
         return source
@@ -71,7 +71,14 @@ def _fault(source: DeviceSource) -> str:
 
 def test_a_camera_whose_opening_fails_for_a_reason_nobody_expects_is_seen_to_fail(start: Start) -> None:
     """Its thread ended with a traceback, and its status said nothing."""
-    source = start("words\0", "caps:64x48 1000")
+
+    class Breaking(Devices):
+        def open(self, camera: CameraDeviceParameters, size: tuple[int, int]) -> CameraDevice:
+            if camera.name == "camera0":
+                raise ValueError("embedded null byte")
+            return super().open(camera, size)
+
+    source = start("words", "caps:64x48 1000", devices=Breaking)
     failed = _until(source, lambda status: status.fault is not None, "camera0")
     assert failed.fault == "camera0: cannot be run (ValueError: embedded null byte)"
     _until(source, lambda status: status.counts.get("received", 0) > 2, "camera1")
@@ -190,7 +197,7 @@ def test_a_password_of_a_camera_is_in_no_process_list_and_in_no_message() -> Non
     """Every user of a computer may read the arguments of every process."""
     pipeline = "caps:64x48 fail:cannot_open_rtsp://anna:hunter2@10.0.0.7/stream_with_user-pw=hunter2_! stall"
     device = GstreamerDevice(CAMERA.model_copy(update={"pipeline": pipeline}), SIZE, FAKE)
-    arguments = Path(f"/proc/{device._process.pid}/cmdline").read_bytes()
+    arguments = " ".join(map(str, device._process.args)).encode()  # type: ignore[arg-type]
     with pytest.raises(CameraError, match=r"cannot open rtsp://\*\*\*@10\.0\.0\.7") as caught:
         device.read(60.0)
     device.close()
