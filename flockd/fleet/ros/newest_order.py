@@ -28,10 +28,17 @@ class NewestOrder:
         self._threads.submit(self._run)
 
     def _run(self) -> None:
-        while True:
-            with self._lock:
-                if not self._waiting:
-                    self._busy = False
-                    return
-                message = self._waiting.pop()
-            self._take(message)
+        while (message := self._next()) is not None:
+            try:
+                self._take(message[0])
+            except BaseException:
+                with self._lock:
+                    self._busy = False  # the next one is passed on all the same
+                raise
+
+    def _next(self) -> list[Any] | None:
+        """What waits; with nothing, this thread has ended its work."""
+        with self._lock:
+            waiting, self._waiting = self._waiting, []
+            self._busy = bool(waiting)
+            return waiting or None
