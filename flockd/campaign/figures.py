@@ -61,6 +61,10 @@ def _of_control_level(_: FlightLog, __: dict[str, Any]) -> None:
     """Nothing: only `flockd.sim.control_level` has this figure."""
 
 
+def _of_false(summary: dict[str, Any]) -> float | None:
+    return summary["slowed_by"].get("false_detection", 0.0) if summary["gated"] else None
+
+
 MEASURES: dict[Figure, Measure] = {
     "min_distance_m": Measure("nearest distance", "m", "higher", _in("flock", "min_distance_m")),
     "min_distance_after_10s_m": Measure(
@@ -90,6 +94,18 @@ MEASURES: dict[Figure, Measure] = {
     "first_collision_s": Measure("time of the first collision", "s", "higher", _of_control_level),
     "mean_nearest_tail_m": Measure("mean distance to the nearest at the end", "m", "higher", _of_control_level),
     "rms_radius_tail_m": Measure("radius of the flock at the end, RMS", "m", "lower", _of_control_level),
+    "drones_held": Measure("drones in Hold", "", "lower", _in("handed_over", "drones")),
+    "first_hold_s": Measure("time of the first Hold", "s", "higher", _in("handed_over", "first_s")),
+    "min_distance_flown_m": Measure(
+        "nearest distance while flockd flew", "m", "higher", _in("handed_over", "min_distance_flown_m")
+    ),
+    "collisions_flown": Measure(
+        "collisions with obstacles while flockd flew", "", "lower", _in("handed_over", "collisions_flown")
+    ),
+    "slowed_share": Measure("time slowed by gates", "of 1", "lower", _in("slowed_share")),
+    "slowed_by_false_share": Measure(
+        "time slowed by false detections", "of 1", "lower", lambda _, summary: _of_false(summary)
+    ),
     "own_motion_ratio": Measure("steps with own motion", "", "higher", _in("own_account", "own_motion_ratio")),
 }
 

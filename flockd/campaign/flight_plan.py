@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import math
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -20,7 +21,7 @@ from flockd.campaign.recipe import Recipe, Values, merged
 from flockd.core.choices import ROLES
 from flockd.core.config import CampaignConfig, ScenarioConfig, load_campaign, load_with_places
 from flockd.core.config.campaign import DRONES, MAX_CONTROL_DRONES, Figure, Variation
-from flockd.core.config.document import KeyPath, Place
+from flockd.core.config.document import KeyPath, Place, key_text
 from flockd.core.config.loader import PATHS, load_perceived_errors
 from flockd.core.config.perceived import PerceivedErrors
 from flockd.core.config.scenario import MAX_DRONES
@@ -31,6 +32,7 @@ from flockd.flight.inference.hashes import model_hashes
 CASE = "case"
 """The parameter whose values are the names of `cases`."""
 MAX_CELLS = 10_000
+WIND = "vehicle.wind_m_s"
 Places = Mapping[KeyPath, Place]
 
 
@@ -95,6 +97,7 @@ class Plan:
         errors = None if config.errors is None else load_perceived_errors(path.parent / config.errors)
         plan = cls(config, scenario.model_dump(exclude_unset=True), errors)
         check.cells(plan)
+        check.wind(config)
         if idle := _idle_seeds(plan):
             raise ConfigError([places["seeds",].problem(idle)])
         if config.perception == "sight":
@@ -103,11 +106,23 @@ class Plan:
         return plan
 
     @classmethod
-    def from_json(cls, text: str) -> Self:
-        """The plan that `to_json` wrote. Raises ValueError."""
-        values = _with_tuples(json.loads(text))
-        errors = values["errors"] and PerceivedErrors.model_validate(values["errors"])
-        return cls(CampaignConfig.model_validate(values["campaign"]), values["scenario"], errors)
+    def from_values(cls, values: Any) -> Self:
+        """The plan whose `to_json` these values were read from. Raises ValueError with the reason in a few words."""
+        try:
+            values = _with_tuples(values)
+            errors = values["errors"] and PerceivedErrors.model_validate(values["errors"])
+            config = CampaignConfig.model_validate(values["campaign"])
+            ScenarioConfig.model_validate(base := values["scenario"])
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise ValueError(f"{key_text(first['loc'])}: {first['msg']}") from error
+        except KeyError as error:
+            raise ValueError(f"it has no {error}") from error
+        except (TypeError, AttributeError) as error:
+            raise ValueError("it holds something else") from error
+        if (cells := _count_of_cells(config)) > MAX_CELLS:
+            raise ValueError(f"it has {cells} cells")
+        return cls(config, base, errors)
 
     def to_json(self) -> str:
         """All of it, and the version of flockd: what has the same text has the same flights.
@@ -179,6 +194,11 @@ def values_of(variation: Variation) -> tuple[Any, ...]:
     return tuple(float(f"{value:.12g}") for value in np.linspace(low, high, steps))
 
 
+def _count_of_cells(config: CampaignConfig) -> int:
+    sizes = [len(values_of(one)) for one in config.vary.values() if not one.is_drawn]
+    return max(len(config.cases), 1) * math.prod(sizes)
+
+
 def _draw(variation: Variation, key: str, seed: int) -> float | tuple[float, ...]:
     """One flight's own value: by its seed and the key alone."""
     assert variation.low is not None and variation.high is not None
@@ -248,13 +268,22 @@ class _Check:
             for path, values in counts.items()
             if not all(isinstance(n, int) and not isinstance(n, bool) and 1 <= n <= most for n in values)
         ]
-        cells = max(len(config.cases), 1)
-        for variation in config.vary.values():
-            cells *= 1 if variation.is_drawn else len(values_of(variation))
-        if cells > MAX_CELLS:
+        if (cells := _count_of_cells(config)) > MAX_CELLS:
             section = self._places.get(("vary",), self._places[()])
             wrong.append(section.problem(f"makes {cells} cells; write fewer values, for at most {MAX_CELLS}"))
         if wrong:
+            raise ConfigError(wrong)
+
+    def wind(self, config: CampaignConfig) -> None:
+        """Raises ConfigError for a wind that no flight would notice."""
+        sections: dict[KeyPath, Mapping[str, Any]] = {("fixed",): config.fixed, ("vary",): config.vary}
+        sections |= {("cases", case): values for case, values in config.cases.items()}
+        fault = (
+            "changes nothing without images: a steady wind only tilts the drone, whose autopilot holds the velocity "
+            "over ground; write `perception: sight`, or `vehicle.gust_m_s` for wind that carries it off, or delete it"
+        )
+        wrong = [self._places[*path, WIND].problem(fault) for path, values in sections.items() if WIND in values]
+        if wrong and config.perception != "sight":
             raise ConfigError(wrong)
 
     def cells(self, plan: Plan) -> None:

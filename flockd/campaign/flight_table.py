@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,8 @@ class FlightTable:
         """Columns of what varies, with their types."""
         fields = {**_KEYS, **self.parameters, **_RESULT, **dict.fromkeys(plan.wanted, pa.float64()), **_ORIGIN}
         self.schema = pa.schema(list({**fields, **_TIMINGS}.items()))
-        self._of_flights, self._of_timings = list(fields), [*_KEYS, *_TIMINGS]
+        self.flights_schema = pa.schema(list(fields.items()))
+        self.timings_schema = pa.schema(list({**_KEYS, **_TIMINGS}.items()))
 
     def rows(self, flown: Sequence[FlownRun]) -> pa.Table:
         """A table of these flights."""
@@ -69,11 +70,11 @@ class FlightTable:
 
     def flights(self, whole: pa.Table) -> pa.Table:
         """The columns of `flights.parquet`."""
-        return whole.select(self._of_flights)
+        return whole.select(self.flights_schema.names)
 
     def timings(self, whole: pa.Table) -> pa.Table:
         """The columns of `timings.parquet`."""
-        return whole.select(self._of_timings)
+        return whole.select(self.timings_schema.names)
 
     def joined(self, flights: pa.Table, timings: pa.Table) -> pa.Table:
         """The whole table from both files, whose rows are in the same order."""
@@ -121,14 +122,24 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def read_table(path: Path, columns: Iterable[str] | None = None) -> pa.Table:
-    """Raises UnavailableError for a file that cannot be read."""
+def read_table(path: Path, schema: pa.Schema) -> pa.Table:
+    """The table, whose columns are these. Raises UnavailableError for a file that cannot be read, or has others."""
     try:
-        return pq.read_table(path, columns=None if columns is None else list(columns), partitioning=None)
-    except (pa.ArrowInvalid, OSError) as error:
-        raise UnavailableError(
-            f"{path}: cannot be read ({error}); delete it, and its flights are flown again"
-        ) from error
+        if path.exists() and not path.is_file():
+            raise _unreadable(path, "it is not an ordinary file")
+        table = pq.read_table(path, partitioning=None)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise _unreadable(path, str(error).partition("\n")[0]) from error
+    if set(table.column_names) != set(schema.names) or len(table.column_names) != len(schema.names):
+        raise _unreadable(path, "it has other columns than this campaign's flights")
+    try:
+        return table.select(schema.names).cast(schema)
+    except pa.ArrowException as error:
+        raise _unreadable(path, str(error).partition("\n")[0]) from error
+
+
+def _unreadable(path: Path, why: str) -> UnavailableError:
+    return UnavailableError(f"{path}: cannot be read ({why}); delete it, and its flights are flown again")
 
 
 def _columns(table: pa.Table) -> dict[str, Any]:

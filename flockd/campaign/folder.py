@@ -12,7 +12,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import pyarrow as pa
 
@@ -21,6 +21,7 @@ from flockd.campaign.flight_kinds import FlownRun
 from flockd.campaign.flight_plan import Plan, Run
 from flockd.campaign.flight_table import FlightTable, read_table, sync_folder, write_table
 from flockd.core.errors import UsageError
+from flockd.core.json_file import read_json
 
 PLAN_NAME = "campaign.json"
 FLIGHTS_NAME = "flights.parquet"
@@ -48,6 +49,8 @@ class CampaignFolder:
     def __enter__(self) -> Self:
         """Makes the folder, and tidies it. Raises UsageError where another process flies it."""
         (self.path / _PARTS).mkdir(parents=True, exist_ok=True)
+        if (self.path / _LOCK).exists() and not (self.path / _LOCK).is_file():
+            raise UsageError(f"{self.path / _LOCK}: is not an ordinary file; delete it")
         with ExitStack() as stack:
             lock = stack.enter_context((self.path / _LOCK).open("w", encoding="utf-8"))
             try:
@@ -73,9 +76,9 @@ class CampaignFolder:
             self.merge()
 
     def merge(self) -> None:
-        """Puts all parts into the two tables, in order of cells and seeds."""
+        """Puts all parts into the two tables, in order of cells and seeds. Raises UnavailableError for other parts."""
         parts = sorted((self.path / _PARTS).glob("*.parquet"))
-        tables = [self._whole(), *map(read_table, parts)]
+        tables = [self._whole(), *(read_table(part, self._table.schema) for part in parts)]
         whole = self._table.merged(tables)
         # Timings first: flights decide what is done, and a kill between the two leaves all parts.
         write_table(self._table.timings(whole), self.path / TIMINGS_NAME)
@@ -87,15 +90,16 @@ class CampaignFolder:
     def finished(self, figure: str | None) -> Iterator[tuple[Run, float | None]]:
         """The flights that are done, each with its value of a figure. Call it before any is added."""
         columns = ["cell", "number", *([figure] if figure else [])]
-        for row in read_table(self.path / FLIGHTS_NAME, columns).to_pylist():
+        for row in read_table(self.path / FLIGHTS_NAME, self._table.flights_schema).select(columns).to_pylist():
             yield Run(row["cell"], row["number"]), row[figure] if figure else None
 
     def _whole(self) -> pa.Table:
         """Both files joined. Between writing one and the other: the rows of the shorter one."""
         flights, timings = self.path / FLIGHTS_NAME, self.path / TIMINGS_NAME
-        if not flights.is_file():
+        if not flights.exists():
             return self._table.schema.empty_table()
-        done, times = read_table(flights), read_table(timings)
+        done = read_table(flights, self._table.flights_schema)
+        times = read_table(timings, self._table.timings_schema)
         if len(times) != len(done):
             known = pa.compute.is_in(times["run"], value_set=done["run"].combine_chunks())
             times = times.filter(known)
@@ -105,11 +109,23 @@ class CampaignFolder:
 def load_plan(path: Path) -> Plan:
     """The plan of a campaign's folder. Raises UsageError where there is none."""
     try:
-        return Plan.from_json((path / PLAN_NAME).read_text(encoding="utf-8"))
+        return Plan.from_values(_plan_values(path))
+    except ValueError as error:
+        raise _no_plan(path, error) from error
+
+
+def _plan_values(path: Path) -> Any:
+    """What the plan's file holds. Raises UsageError."""
+    try:
+        return read_json(path / PLAN_NAME)
     except FileNotFoundError as error:
         raise UsageError(f"{path}: holds no campaign, as it has no {PLAN_NAME}; name another folder") from error
-    except (ValueError, KeyError) as error:
-        raise UsageError(f"{path / PLAN_NAME}: is not a plan of this flockd ({error})") from error
+    except ValueError as error:
+        raise _no_plan(path, error) from error
+
+
+def _no_plan(path: Path, why: Exception) -> UsageError:
+    return UsageError(f"{path / PLAN_NAME}: is not a plan of this flockd ({why}); restore it, or name another folder")
 
 
 def _check(path: Path, plan: Plan) -> None:
@@ -120,11 +136,14 @@ def _check(path: Path, plan: Plan) -> None:
     others = {entry.name for entry in path.iterdir() if entry.suffix != ".part" and not entry.match("versus_*.html")}
     if others - _OURS:
         raise UsageError(f"{path}: holds other files than a campaign's; name a new or empty folder with --out")
-    if not (path / PLAN_NAME).is_file():
+    if not (path / PLAN_NAME).exists():
         return
-    old, new = json.loads((path / PLAN_NAME).read_text(encoding="utf-8")), json.loads(plan.to_json())
-    if old != new:
-        key, before, now = next(differences(old, new))
+    old, new = _plan_values(path), json.loads(plan.to_json())
+    if not isinstance(old, dict):
+        raise _no_plan(path, ValueError("it holds something else"))
+    difference = next(differences(old, new), None) if old != new else None  # NaN is no difference
+    if difference is not None:
+        key, before, now = difference
         raise UsageError(
             f"{path}: was begun with other flights, as `{key}` was {before} and is {now} now; name another folder with "
             "--out, or put the file back as it was to go on"

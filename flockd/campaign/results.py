@@ -14,7 +14,7 @@ import numpy as np
 
 from flockd.campaign.figures import MEASURES
 from flockd.campaign.flight_plan import Plan
-from flockd.campaign.flight_table import read_table
+from flockd.campaign.flight_table import FlightTable, read_table
 from flockd.campaign.folder import FLIGHTS_NAME, TIMINGS_NAME, load_plan
 from flockd.campaign.intervals import Interval, mean_interval
 from flockd.core.config.campaign import Figure
@@ -40,12 +40,13 @@ class Results:
     def load(cls, path: Path) -> Results:
         """The results in a campaign's folder. Raises UsageError where nothing is in it."""
         plan = load_plan(path)
-        if not (path / FLIGHTS_NAME).is_file():
+        table = FlightTable(plan)
+        if not (path / FLIGHTS_NAME).exists():
             raise UsageError(f"{path}: no flight is finished; run `flockd campaign` first")
-        rows = tuple(read_table(path / FLIGHTS_NAME).to_pylist())
+        rows = tuple(read_table(path / FLIGHTS_NAME, table.flights_schema).to_pylist())
         if not rows:
             raise UsageError(f"{path}: no flight is finished; run `flockd campaign` first")
-        core_s = sum(read_table(path / TIMINGS_NAME, ["wall_s"])["wall_s"].to_pylist())
+        core_s = sum(read_table(path / TIMINGS_NAME, table.timings_schema)["wall_s"].to_pylist())
         return cls(path, plan, rows, core_s)
 
     @property

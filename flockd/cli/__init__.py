@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from flockd import __version__
 from flockd.cli import (
@@ -55,6 +56,14 @@ exit codes:
   130  interrupted by Ctrl-C; a report of what was flown is written"""
 
 
+def installing(extra: str) -> str:
+    """The command that adds an extra to this flockd and leaves the rest as it is: a checkout stays one."""
+    checkout = Path(__file__).parents[2]
+    if (checkout / "pyproject.toml").is_file():
+        return f"{sys.executable} -m pip install -e '{checkout}[{extra}]'"
+    return f"{sys.executable} -m pip install 'flockd[{extra}]'"
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit code; an expected error is one sentence on stderr."""
     parser = _parser()
@@ -75,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         extra = EXTRAS.get((error.name or "").partition(".")[0])
         if extra is None:
             raise
-        missing = UnavailableError(f"{error.name} is not installed; run: pip install 'flockd[{extra}]'")
+        missing = UnavailableError(f"{error.name} is not installed; run: {installing(extra)}")
         return _failed(str(missing), missing.exit_code)
     except BrokenPipeError:  # the reader of our output has gone; Python would complain once more at its end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.output import Phases, complain, say, say_json
 from flockd.cli.parser import Commands, add_commands, positive_count
+from flockd.cli.recording_options import require
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ def _add_rerun(commands: Commands) -> None:
     parser.add_argument("--out", metavar="DIR", type=Path, help="default: FOLDER/reruns/NAME")
     parser.add_argument("--force", action="store_true", help="overwrite an earlier flight in that folder")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
-    parser.set_defaults(run=_rerun, quiet=False, verbose=False)
+    parser.set_defaults(run=_rerun, quiet=False, verbose=False, settings={})
 
 
 def _add_report(commands: Commands) -> None:
@@ -180,6 +181,7 @@ def _rerun(args: argparse.Namespace) -> int:
 
 
 def _report(args: argparse.Namespace) -> int:
+    require(*(path for path in (args.folder, args.other) if path is not None))
     from flockd.campaign.campaign_page import write_campaign_page, write_comparison_page
     from flockd.campaign.folder import REPORT_NAME
     from flockd.campaign.results import Results

@@ -14,7 +14,10 @@ from flockd.cli.real_drone import add_force, permit
 from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, ModelError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from flockd.core.config import DroneConfig
+    from flockd.core.config.document import KeyPath, Place
 
 
 def add(commands: Commands) -> None:
@@ -30,8 +33,8 @@ def add(commands: Commands) -> None:
 
 def _add_check(commands: Commands) -> None:
     examples = ("flockd config check my_flight.yaml", "flockd config check --json config/*.yaml")
-    parser = commands("check", "Report all errors in drone and scenario files.", examples)
-    parser.add_argument("files", nargs="+", metavar="FILE", type=Path, help="of drones or scenarios")
+    parser = commands("check", "Report all errors in files of drones, scenarios and campaigns.", examples)
+    parser.add_argument("files", nargs="+", metavar="FILE", type=Path, help="of drones, scenarios or campaigns")
     parser.add_argument("--json", action="store_true", help="print the problems as JSON")
     add_force(parser)
     parser.set_defaults(run=_check)
@@ -75,14 +78,18 @@ def _check(args: argparse.Namespace) -> int:
 
 
 def _check_file(file: Path, *, force: bool) -> None:
-    """Raises ConfigError for what is wrong with the file, and for models that it names and that are not there.
+    """Raises ConfigError for what is wrong with the file, and for models and devices that are yet to be named.
 
     Of a real drone also for what is outside the proven envelope, unless that is forced.
     """
-    from flockd.core.config import ScenarioConfig, load_with_places, outside_envelope
-    from flockd.core.config.document import KeyPath
-    from flockd.flight.inference.manifest_file import find_manifests, manifest_path, models_folder, read_manifest
+    from flockd.core.config import ScenarioConfig, kind_of, load_with_places, outside_envelope
+    from flockd.flight.inference.manifest_file import manifest_path, models_folder, models_for, read_manifest
 
+    if kind_of(file) == "campaign":
+        from flockd.campaign.flight_plan import Plan
+
+        Plan.load(file)
+        return
     config, places = load_with_places(file)
     section: KeyPath = ("drone", "perception") if isinstance(config, ScenarioConfig) else ("perception",)
     perception = config.drone.perception if isinstance(config, ScenarioConfig) else config.perception
@@ -102,17 +109,32 @@ def _check_file(file: Path, *, force: bool) -> None:
         path = manifest_path(folder, name)
         try:
             if not path.is_file():
-                known = [found.stem for found in find_manifests(folder) if role in read_manifest(found).manifest.roles]
+                known = models_for(role, folder)
                 hint = f"write one of {', '.join(known)}" if known else "name another"
                 problems.append(problem(role, f"{name} is not a known model, as {path} is missing; {hint}"))
             elif role not in (roles := read_manifest(path).manifest.roles):
                 problems.append(problem(role, f"{name} is for {', '.join(roles)}, not for {role}; name another"))
         except ModelError as error:
             problems.append(problem(role, f"names a model that cannot be used: {error}"))
+    if not isinstance(config, ScenarioConfig):
+        problems += _yet_to_fill_in(config, places)
     if problems:
         raise ConfigError(problems)
     if not isinstance(config, ScenarioConfig):
         permit(outside_envelope(config, places), force=force)
+
+
+def _yet_to_fill_in(config: DroneConfig, places: Mapping[KeyPath, Place]) -> list[ConfigProblem]:
+    """The devices that `flockd config new drone` could not know."""
+    from flockd.core.config.new_files import CHANGE_ME
+
+    fault = f"is yet to be filled in ({CHANGE_ME}); `flockd cameras --write FILE` writes what is plugged in"
+    cameras = () if config.source is None else config.source.cameras
+    return [
+        places["source", "cameras", number, "device"].problem(fault)
+        for number, camera in enumerate(cameras)
+        if camera.device and CHANGE_ME in camera.device
+    ]
 
 
 def _show(args: argparse.Namespace) -> int:

@@ -77,7 +77,7 @@ class _Question:
 
 def _drone_questions() -> tuple[_Question, ...]:
     return (
-        _Question("name", "its name in telemetry and recordings", "name of the drone", "drone1", metavar="NAME"),
+        _Question("name", "its name in telemetry and recordings", "name of the drone", "drone1", _name, "NAME"),
         _Question(
             "number",
             "its number in the flock, from 1: the layer of its first flights",
@@ -110,9 +110,10 @@ def _drone_questions() -> tuple[_Question, ...]:
             "serial:///dev/NAME:BAUD or udpin://0.0.0.0:PORT",
             "address of the autopilot",
             "serial:///dev/ttyAMA0:921600",
-            metavar="ADDRESS",
+            _address,
+            "ADDRESS",
         ),
-        _Question("fleet", "the fleet's name in telemetry", "name of the fleet", "fleet", metavar="NAME"),
+        _Question("fleet", "the fleet's name in telemetry", "name of the fleet", "fleet", _name, "NAME"),
         _Question("mission", "kind of mission", "mission", "hover", choices=MISSIONS),
     )
 
@@ -129,7 +130,8 @@ def _scenario_questions(name: str = "", drone_file: str = "") -> tuple[_Question
             "the drones' configuration (default: that of the simulated drone that comes with flockd)",
             "file of the drones",
             drone_file,
-            metavar="FILE",
+            _drone_file,
+            "FILE",
         ),
     )
 
@@ -145,7 +147,7 @@ def _add_drone(commands: Commands) -> None:
 def _add_scenario(commands: Commands) -> None:
     examples = (
         "flockd config new scenario my_flight.yaml",
-        "flockd config new scenario my_flight.yaml --drones 3 --duration 30 --mission waypoints --defaults",
+        "flockd config new scenario my_flight.yaml --drones 3 --duration 60 --mission waypoints --defaults",
     )
     parser = commands("scenario", "Write the configuration of a simulated flight.", examples)
     _add_new(parser, _scenario_questions(), _new_scenario)
@@ -188,6 +190,38 @@ def _new_scenario(args: argparse.Namespace) -> int:
     values = answers | {"duration": f"{answers['duration']:g}", "vehicles": start_positions(answers["drones"])}
     write_checked(args.file, new_file("scenario", values, (answers["mission"], answers["obstacles"])))
     return ExitCode.DONE
+
+
+def _name(text: str) -> str:
+    from flockd.core.config import DroneConfig
+
+    return _valid(DroneConfig, "name", text)
+
+
+def _address(text: str) -> str:
+    from flockd.core.config.autopilot import AutopilotParameters
+
+    return _valid(AutopilotParameters, "address", text)
+
+
+def _valid(section: type[Any], key: str, text: str) -> str:
+    """Raises ArgumentTypeError for a value that the file could not have, so that it is asked for again."""
+    from flockd.core.config.loader import fault_of
+
+    fault = fault_of(section, key, text)
+    if fault is not None:
+        raise argparse.ArgumentTypeError(fault)
+    return text
+
+
+def _drone_file(text: str) -> str:
+    from flockd.core.config import load_drone
+
+    try:
+        load_drone(text)
+    except ConfigError as error:
+        raise argparse.ArgumentTypeError(str(error.problems[0])) from error
+    return text
 
 
 def _camera_count(text: str) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
 NOTES = """\
 Larger pictures are resized to 1280 pixels for the networks; boxes are in pixels of the picture.
 --labels: a drone is found when the centre of a detection lies in its box, each box once; any other detection is false.
-A picture or a label file that cannot be read ends the command with exit code 1, before anything is printed."""
+A picture that cannot be read is reported and left out, and the exit code is 1. A label file that cannot be read ends
+the command with exit code 1."""
 
 
 def add(commands: Commands) -> None:
@@ -76,6 +78,7 @@ class _Detected:
 
 
 def _run(args: argparse.Namespace) -> int:
+    from flockd.ground.datasets.errors import DatasetError
     from flockd.ground.pictures import PictureDetector, find_pictures, read_labels
     from flockd.ground.pictures.copies import Copies
 
@@ -91,8 +94,11 @@ def _run(args: argparse.Namespace) -> int:
         if args.out is not None:
             copies = stack.enter_context(Copies(args.out, pictures, args.every, overwrite=args.force))
         detector = PictureDetector(config)
-        detected = list(_detected(args, pictures, labels, detector, cameras, copies))
-    result = _result(detected, measure=labels is not None)
+        left_out: list[str] = []
+        detected = list(_detected(args, pictures, labels, detector, cameras, copies, left_out))
+    if left_out and not detected:
+        raise DatasetError("\n".join(left_out))
+    result = {**_result(detected, measure=labels is not None), "left_out": left_out}
     if args.json:
         say_json(result)
     else:
@@ -100,9 +106,11 @@ def _run(args: argparse.Namespace) -> int:
     unlabelled = 0 if labels is None else sum(one.labels is None for one in detected)
     if unlabelled:
         complain(f"{args.labels}: does not list {unlabelled} of the {len(detected)} pictures; they are not measured")
-    if args.out is not None:
-        complain(f"written: {len(pictures)} {'copies' if len(pictures) > 1 else 'copy'} in {args.out}")
-    return ExitCode.DONE
+    if copies is not None:
+        complain(f"written: {copies.written} {'copy' if copies.written == 1 else 'copies'} in {args.out}")
+    for fault in left_out:
+        complain(f"left out: {fault}")
+    return ExitCode.CHECK_FAILED if left_out else ExitCode.DONE
 
 
 def _detected(
@@ -112,7 +120,10 @@ def _detected(
     detector: PictureDetector,
     cameras: PictureCameras,
     copies: Copies | None,
+    left_out: list[str],
 ) -> Iterator[_Detected]:
+    """In order; what cannot be read is skipped, and why appended to ``left_out``."""
+    from flockd.ground.datasets.errors import DatasetError
     from flockd.ground.pictures.coco_labels import check_size
     from flockd.ground.pictures.drawing import annotated
 
@@ -121,7 +132,15 @@ def _detected(
         done = 0
         for picture in pictures:
             known = None if labels is None else labels.get(picture)
-            for name, image in picture.images(args.every):
+            images = picture.images(args.every)
+            while True:
+                try:
+                    name, image = next(images)
+                except StopIteration:
+                    break
+                except DatasetError as error:
+                    left_out.append(str(error))
+                    break
                 size = (image.shape[1], image.shape[0])
                 if known is not None:
                     check_size(args.labels, name, known, size)
@@ -171,17 +190,18 @@ def _say(detected: Sequence[_Detected], result: Mapping[str, Any]) -> None:
     from rich.table import Table
 
     console = tables_console()
+    names = _short_names([one.name for one in detected])
     table = Table("picture", "box, px", "probability", "range, m", "size, m", box=None, pad_edge=False)
     for one in detected:
         for found in one.detections:
             box = " ".join(f"{value:.0f}" for value in found.box)
             range_m, size_m = (f"{v:.2f} +- {s:.2f}" for v, s in _values(found))
-            table.add_row(one.name, box, f"{found.probability:.2f}", range_m, size_m)
+            table.add_row(names[one.name], box, f"{found.probability:.2f}", range_m, size_m)
     if table.row_count:
         console.print(table)
     drones = sum(len(one.detections) for one in detected)
     cost = f"{result['proposals_per_image']:g} proposals and {result['ms_per_image']:g} ms a picture"
-    say(f"{drones} detections in {result['images']} pictures; {cost}")
+    say(f"{drones} {'detection' if drones == 1 else 'detections'} in {_pictures(result['images'])}; {cost}")
     if "boxes" not in result:
         return
     widths = Table("box width, px", "boxes", "found", "found, IoU 0.3", box=None, pad_edge=False)
@@ -189,7 +209,27 @@ def _say(detected: Sequence[_Detected], result: Mapping[str, Any]) -> None:
         widths.add_row(width, str(counts["boxes"]), *(_share(counts, key) for key in ("found", "found_iou30")))
     console.print(widths)
     ap50 = "unknown" if result["ap50"] is None else f"{100 * result['ap50']:.1f} %"
-    say(f"{result['boxes']} boxes; AP50 {ap50}; {result['false_per_500_images']:g} false detections in 500 pictures")
+    say(f"{result['boxes']} boxes; AP50 {ap50}; {_false(result)}")
+
+
+def _short_names(names: Sequence[str]) -> dict[str, str]:
+    """Each picture's name from the folder on that all are in."""
+    common = os.path.commonpath([Path(name).parent for name in names]) if names else ""
+    return {name: os.path.relpath(name, common or ".") for name in names}
+
+
+def _false(result: Mapping[str, Any]) -> str:
+    """The rate with what it rests on: few pictures without a false detection prove little."""
+    count, pictures = result["false"], result["measured"]
+    told = f"{count} false {'detection' if count == 1 else 'detections'} in {_pictures(pictures)}"
+    if not pictures:
+        return told
+    low, high = result["false_per_picture_95"]
+    return f"{told}: {result['false_per_picture']:.2g} a picture (95 % interval: {low:.2g} to {high:.2g})"
+
+
+def _pictures(count: int) -> str:
+    return f"{count} {'picture' if count == 1 else 'pictures'}"
 
 
 def _values(found: DetectedDrone) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -64,6 +64,7 @@ def _run(args: argparse.Namespace) -> int:
         raise UsageError(f"{args.unit}: is no file; name the unit with --unit")
     checks = plan(
         config,
+        args.config,
         recordings=args.record,
         unit=args.unit,
         seconds=args.seconds,

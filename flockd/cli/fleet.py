@@ -10,7 +10,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from flockd.cli import fleet_page
-from flockd.cli.endpoint_options import add_endpoint_options, endpoints
+from flockd.cli.endpoint_options import add_endpoint_options, add_operator_option, endpoints
 from flockd.cli.output import complain, say, say_json
 from flockd.cli.parser import Commands, Parser, add_commands, positive_number
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
@@ -36,7 +36,7 @@ def add(commands: Commands) -> None:
     examples = (
         "flockd fleet",
         "flockd fleet --connect tcp/10.0.0.11:7447 --connect tcp/10.0.0.12:7447",
-        "flockd fleet --recordings out/paper-flight-learned-seed1/recordings",
+        "flockd fleet --recordings out/paper_flight-learned-seed1/recordings",
         "flockd fleet goto all 20 -5 --height 4",
         "flockd fleet velocity drone1 0.5 0 --seconds 10",
         "flockd fleet hold all",
@@ -110,6 +110,7 @@ def _add_drones(parser: Parser) -> None:
 
 def _add_connection(parser: Parser) -> None:
     add_endpoint_options(parser)
+    add_operator_option(parser)
     parser.add_argument("--json", action="store_true", help="print the replies as JSON, by drone")
 
 
@@ -153,12 +154,12 @@ def _ask(args: argparse.Namespace, command: str, order: MissionOrder | None, rep
     with FleetWatcher(args.fleet, listen=listen, connect=connect, settings=args.zenoh_config) as watcher:
         drones = _drones(watcher, args.drones, ", ".join([*listen, *connect]))
         began_s = time.monotonic()
-        answers = _answers(watcher, drones, command, order)
+        answers = _answers(watcher, drones, command, order, args.operator)
         _show(answers, as_json=args.json)
         with suppress(KeyboardInterrupt):
             while time.monotonic() + REPEAT_S <= began_s + repeat_s:
                 time.sleep(REPEAT_S)
-                before, answers = answers, _answers(watcher, drones, command, order)
+                before, answers = answers, _answers(watcher, drones, command, order, args.operator)
                 _show(
                     {drone: answer for drone, answer in answers.items() if answer != before[drone]}, as_json=args.json
                 )
@@ -183,13 +184,13 @@ def _drones(watcher: FleetWatcher, wanted: str, places: str) -> tuple[str, ...]:
 
 
 def _answers(
-    watcher: FleetWatcher, drones: tuple[str, ...], command: str, order: MissionOrder | None
+    watcher: FleetWatcher, drones: tuple[str, ...], command: str, order: MissionOrder | None, operator: str
 ) -> dict[str, dict[str, object]]:
     from flockd.onboard.telemetry.order_messages import order_message
 
     answers: dict[str, dict[str, object]] = {}
     for drone in drones:
-        answer = watcher.queries.ask(drone, command, None if order is None else order_message(order))
+        answer = watcher.ask(drone, command, operator, None if order is None else {**order_message(order)})
         answers[drone] = {"accepted": False, "sentence": NO_ANSWER} if answer is None else {**answer}
     return answers
 

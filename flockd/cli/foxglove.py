@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import re
 from contextlib import ExitStack, suppress
 
 from flockd.cli.fleet_source import add_server_options, announce, open_source
+from flockd.cli.output import complain
 from flockd.cli.parser import Commands
 from flockd.core.errors import ExitCode
 
@@ -21,11 +23,21 @@ def add(commands: Commands) -> None:
     examples = (
         "flockd foxglove",
         "flockd foxglove --connect tcp/10.0.0.11:7447 --connect tcp/10.0.0.12:7447",
-        "flockd foxglove --recordings out/paper-flight-learned-seed1/recordings",
+        "flockd foxglove --recordings out/paper_flight-learned-seed1/recordings",
     )
     parser = commands("foxglove", "Serve the fleet to Foxglove's app: live, or from recordings.", examples, _NOTES)
     add_server_options(parser, PORT)
+    parser.add_argument(
+        "--allow-origin", metavar="ORIGIN", type=_origin, action="append", default=[],
+        help="whose web pages may connect too, such as http://localhost:8080; Foxglove's own app may, others may not",
+    )  # fmt: skip
     parser.set_defaults(run=_run)
+
+
+def _origin(text: str) -> str:
+    if re.fullmatch(r"[a-z][a-z0-9+.-]*://[^/?#\s]+", text) is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is no origin such as https://example.org or http://localhost:8080")
+    return text
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -34,7 +46,9 @@ def _run(args: argparse.Namespace) -> int:
 
     with ExitStack() as stack, suppress(KeyboardInterrupt):
         source = open_source(args, stack)
-        server = stack.enter_context(FoxgloveServer(source, args.server_address, args.port))
+        server = stack.enter_context(
+            FoxgloveServer(source, args.server_address, args.port, origins=args.allow_origin, on_refusal=complain)
+        )
         announce(
             args,
             f"Foxglove finds the fleet at ws://{{host}}:{server.port}",

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flockd.cli.output import progress, say, say_json, tables_console
+from flockd.cli.output import noted_table, progress, say, say_json, tables_console
 from flockd.cli.parser import Commands, Parser, add_commands, positive_count
 from flockd.core.choices import PROVIDERS, Provider
 from flockd.core.errors import ExitCode, ModelError, UnavailableError
@@ -90,8 +90,6 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _list(args: argparse.Namespace) -> int:
-    from rich.table import Table
-
     from flockd.flight.inference import load_manifest
     from flockd.flight.perception.requirements import check_roles
 
@@ -99,11 +97,14 @@ def _list(args: argparse.Namespace) -> int:
     if args.json:
         say_json([model.model_dump(mode="json") for model, _ in models])
         return ExitCode.DONE
-    table = Table("model", "roles", "MB", "sha256", "licence", "what it is", box=None, pad_edge=False)
-    for model, file in models:
-        size_mb = f"{file.stat().st_size / 1e6:.1f}"
-        table.add_row(model.name, ", ".join(model.roles), size_mb, model.sha256[:12], model.licence, model.description)
-    tables_console().print(table)
+    rows = [
+        (
+            (model.name, ", ".join(model.roles), f"{file.stat().st_size / 1e6:.1f}", model.sha256[:12], model.licence),
+            [model.description],
+        )
+        for model, file in models
+    ]
+    tables_console().print(noted_table(("model", "roles", "MB", "sha256", "licence"), rows))
     return ExitCode.DONE
 
 

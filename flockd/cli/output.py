@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from time import monotonic
 from typing import Self
@@ -20,6 +20,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.text import Text
 
 from flockd.core.printable import printable
 
@@ -32,6 +33,20 @@ PIPED_COLUMNS = 1000
 def tables_console() -> Console:
     """Where tables are printed. Not on a terminal there is no width to fit; rich would assume 80 columns and cut."""
     return Console(markup=False, highlight=False, width=None if sys.stdout.isatty() else PIPED_COLUMNS)
+
+
+def noted_table(heads: Sequence[str], rows: Sequence[tuple[Sequence[str], Sequence[str]]]) -> Text:
+    """Rows of short cells, each with sentences in full width below it: nothing is squeezed into a narrow column."""
+    cells = [heads, *(cells for cells, _ in rows)]
+    widths = [max(len(row[column]) for row in cells) for column in range(len(heads))]
+    text = Text(no_wrap=False)
+    for row, notes in [(heads, ()), *rows]:
+        line = "  ".join(one.ljust(width) for one, width in zip(row, widths, strict=True)).rstrip()
+        text.append(f"{line}\n", style="bold" if row is heads else "")
+        for note in notes:
+            text.append(f"    {note}\n")
+    text.right_crop(1)
+    return text
 
 
 def say(text: str) -> None:

@@ -8,10 +8,17 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.output import progress
 from flockd.cli.parser import Parser, positive_number
-from flockd.core.errors import UsageError
+from flockd.core.errors import FlockdError, UsageError
 
 if TYPE_CHECKING:
     from flockd.onboard.recording.reader import Recording
+
+
+def require(*paths: Path) -> None:
+    """Raises FlockdError for what is not there, before anything is imported that takes seconds."""
+    for path in paths:
+        if not path.exists():
+            raise FlockdError(f"{path}: does not exist; check the path")
 
 
 def add_stretch(parser: Parser) -> None:

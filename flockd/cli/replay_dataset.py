@@ -91,11 +91,6 @@ def _refuse(args: argparse.Namespace, names: Sequence[str], why: str) -> None:
 def _check(dataset: Dataset, stride: int, depth: str) -> None:
     if depth == "recorded" and not dataset.has_depth:
         raise UsageError(f"{dataset.path}: has no recorded depth; replay it with --depth network")
-    if depth == "recorded" and dataset.camera.intrinsics.model != "pinhole":
-        raise UsageError(
-            f"{dataset.path}: recorded depth is along the optical axis, which a wide-angle camera does not use; "
-            "replay it with --depth network"
-        )
     if stride >= len(dataset):
         raise UsageError(f"{dataset.path}: has {len(dataset)} frames, and none {stride} after another; lower --stride")
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
 
 from flockd.cli.flight_summary import show_summary
-from flockd.cli.output import complain, progress, say_json, tables_console
+from flockd.cli.output import complain, progress, say, say_json, tables_console
 from flockd.cli.parser import Commands
-from flockd.cli.recording_options import opened
+from flockd.cli.recording_options import opened, require
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def add(commands: Commands) -> None:
     """Adds the command."""
     examples = (
         "flockd report out/paper_flight-learned-seed0",
-        "flockd report out/short/recordings",
+        "flockd report recordings",
         "flockd report kestrel-20261120T101500Z.mcap --out reports/kestrel",
         "flockd report drone1.mcap --without-pictures --json",
         "flockd report drone1.mcap --ulog log_12_2026-11-20-10-15-00.ulg",
@@ -41,7 +41,7 @@ def add(commands: Commands) -> None:
         "flight",
         metavar="RECORDING",
         type=Path,
-        help="a recording, a folder of one flight's, or what `flockd sim` wrote",
+        help="a recording, a folder of them (each drone's newest), or what `flockd sim` wrote",
     )
     parser.add_argument(
         "other",
@@ -50,8 +50,10 @@ def add(commands: Commands) -> None:
         type=Path,
         help="another flight: the key figures of both are printed, and nothing is written",
     )
-    parser.add_argument("--force", action="store_true", help="overwrite a flight in --out")
-    parser.add_argument("--out", metavar="DIR", type=Path, help=f"of a recording's report; default: NAME{SUFFIX}")
+    parser.add_argument("--force", action="store_true", help="overwrite an earlier report, or a flight in --out")
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, help=f"of a recording's report; default: NAME{SUFFIX} beside it"
+    )
     parser.add_argument(
         "--without-pictures",
         action="store_true",
@@ -72,6 +74,7 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
+    require(*(path for path in (args.flight, args.other, args.ulog) if path is not None))
     from flockd.review.report.flight_folder import LOG_NAME, check_report_folder, prepare_report_folder, save_flight
 
     if args.other is not None:
@@ -84,7 +87,8 @@ def _run(args: argparse.Namespace) -> int:
     if (args.flight / LOG_NAME).is_file():
         return _again(args, ulog)
     paths = _recordings(args.flight)
-    directory = args.out or args.flight.with_name(args.flight.resolve().name.removesuffix(".mcap") + SUFFIX)
+    named = paths[0] if len(paths) == 1 else args.flight
+    directory = args.out or named.with_name(named.resolve().name.removesuffix(".mcap") + SUFFIX)
     check_report_folder(directory, force=args.force)
     log, pictures = _flight(paths, pictured=not args.without_pictures)
     prepare_report_folder(directory, force=args.force)
@@ -125,16 +129,21 @@ def _save_beside(directory: Path, log: FlightLog, recordings: Sequence[Path], ul
 
 def _again(args: argparse.Namespace, ulog: Any | None) -> int:
     """The report of a flight whose folder has its log."""
-    for option in ("out", "without_pictures", "force"):
+    for option in ("out", "without_pictures"):
         if getattr(args, option):
             raise UsageError(
                 f"--{option.replace('_', '-')} is for recordings, and {args.flight} is a flight's folder, whose report "
                 "is written into it; drop it"
             )
+    from flockd.review.report.flight_folder import RECORDINGS, REPORT_NAME
+    from flockd.review.report.summary import summarise
+
     log = _log_in(args.flight)
+    if (args.flight / REPORT_NAME).is_file() and ulog is None and not args.force:
+        complain(f"{args.flight / REPORT_NAME}: is left as it was; --force writes it again")
+        return show_summary(args.flight, summarise(log), as_json=args.json)
     if ulog is not None:
         from flockd.review.flight_log.from_recordings import recordings_in
-        from flockd.review.report.flight_folder import RECORDINGS
 
         _save_beside(args.flight, log, recordings_in(args.flight / RECORDINGS), ulog, args.ulog)
     return _write(args.flight, log, args)
@@ -170,7 +179,9 @@ def _compare(args: argparse.Namespace) -> int:
         return ExitCode.DONE
     from rich.table import Table
 
-    table = Table("", *(str(flight) for flight in flights), "difference", box=None, pad_edge=False)
+    for name, flight in zip(("first", "second"), flights, strict=True):
+        say(f"{name}: {flight}")
+    table = Table("figure", "first", "second", "difference", box=None, pad_edge=False)
     for row in rows:
         table.add_row(row.name, *row.cells)
     tables_console().print(table)
@@ -198,14 +209,19 @@ def _log_in(folder: Path) -> FlightLog:
 
 
 def _recordings(path: Path) -> tuple[Path, ...]:
-    """The recording that was named, or all in the folder that was."""
+    """The recording that was named, or each drone's newest in the folder that was."""
     from flockd.review.report.flight_folder import LOG_NAME
 
     if not path.is_dir():
         return (path,)
-    from flockd.review.flight_log.from_recordings import recordings_in
+    from flockd.review.flight_log.from_recordings import newest_recordings
 
-    found = recordings_in(path)
+    found, older = newest_recordings(path)
+    if older:
+        newest = ", ".join(one.name for one in found)
+        complain(
+            f"{path}: also holds {older} of earlier flights; this is of the newest, {newest}; name another for its own"
+        )
     if not found:
         raise UsageError(f"{path}: holds neither a flight's {LOG_NAME} nor recordings; name another folder")
     return found

@@ -7,7 +7,7 @@ import sys
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from flockd.cli.endpoint_options import add_endpoint_options, endpoints
+from flockd.cli.endpoint_options import add_endpoint_options, add_operator_option, endpoints
 from flockd.cli.output import complain, say
 from flockd.cli.parser import Commands, Parser, add_commands
 from flockd.core.errors import ExitCode
@@ -31,6 +31,7 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--orders", action="store_true", help="offer services and topics that order drones (default: watch only)"
     )
+    add_operator_option(parser)
     _add_network(parser)
     parser.set_defaults(run=_run)
 
@@ -90,7 +91,7 @@ def _run(args: argparse.Namespace) -> int:
         watcher = FleetWatcher(args.fleet, listen=listen, connect=connect, settings=args.zenoh_config)
         source = stack.enter_context(LiveFleet(stack.enter_context(watcher)))
         node = stack.enter_context(RosNode("flockd", here_only=not args.network))
-        bridge = stack.enter_context(FleetBridge(source, node, may_command=args.orders))
+        bridge = stack.enter_context(FleetBridge(source, node, may_command=args.orders, operator=args.operator))
         if not bridge.has_transforms:
             complain("this ROS 2 has no tf2_msgs, so there is no /tf; the markers for RViz are in `map` and need none")
         if args.orders and args.network:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
 from flockd.cli import sim_fleet
+from flockd.cli.endpoint_options import ENDPOINT
 from flockd.cli.flight_summary import report_flight
 from flockd.cli.output import Phases, complain
 from flockd.cli.parser import Commands, positive_count, positive_number, seed
@@ -111,6 +112,10 @@ def add(commands: Commands) -> None:
     parser.add_argument("--force", action="store_true", help="overwrite an earlier flight in that folder")
     parser.add_argument("--telemetry", action="store_true", help="publish over zenoh while flying")
     parser.add_argument(
+        "--telemetry-at", metavar="ENDPOINT",
+        help=f"where --telemetry listens, or where the daemons of --autopilot connect to (default: {ENDPOINT})",
+    )  # fmt: skip
+    parser.add_argument(
         "--record",
         action="store_true",
         help="write a recording of each drone to DIR/recordings, 4.5 MB a drone and simulated second",
@@ -151,6 +156,7 @@ def _roles(text: str) -> frozenset[str]:
 
 def _run(args: argparse.Namespace) -> int:
     _check_options(args)
+    args.settings = _settings_of(args)
     scenario = _scenario(args)
     directory = _folder(scenario, args)
     try:
@@ -177,7 +183,9 @@ def _fly_into(directory: Path, scenario: ScenarioConfig, args: argparse.Namespac
             from flockd.onboard.telemetry.publisher import ZenohTelemetry
             from flockd.sim.repeater import Repeater
 
-            zenoh = stack.enter_context(ZenohTelemetry(_plain(scenario.scenario)))
+            zenoh = stack.enter_context(
+                ZenohTelemetry(_plain(scenario.scenario), listen=[args.telemetry_at or ENDPOINT])
+            )
             for number in range(1, len(scenario.vehicles) + 1):
                 zenoh.show_alive(f"drone{number}")
             telemetry = stack.enter_context(Repeater(zenoh))
@@ -297,9 +305,27 @@ def _folder(scenario: ScenarioConfig, args: argparse.Namespace) -> Path:
 
 
 def _folder_name(scenario: ScenarioConfig, args: argparse.Namespace) -> str:
-    swapped = "".join(f"-true-{role}" for role in sorted(args.swap))
-    flown = args.autopilot or f"{args.perception}{swapped}"
-    return f"{_plain(scenario.scenario)}-{flown}-seed{scenario.seed}"
+    set_otherwise = "".join(
+        f"-{option}" if value == "yes" else f"-{option}_{re.sub('[^A-Za-z0-9_.,+-]+', '-', Path(value).name)}"
+        for option, value in args.settings.items()
+        if option != "seed"
+    )
+    return f"{_plain(scenario.scenario)}-{args.autopilot or args.perception}{set_otherwise}-seed{scenario.seed}"
+
+
+def _settings_of(args: argparse.Namespace) -> dict[str, str]:
+    """What options set otherwise than the scenario's file, as text; what differs between two flights of it."""
+    values = {option: getattr(args, option) for option in (*OPTIONS, "drones")}
+    settings = {option: _as_text(value) for option, value in values.items() if value is not None}
+    if args.swap:
+        settings["swap"] = ",".join(sorted(args.swap))
+    return settings if args.gated else {**settings, "no-gate": "yes"}
+
+
+def _as_text(value: object) -> str:
+    if isinstance(value, tuple):
+        return ",".join(_as_text(part) for part in value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _plain(name: str) -> str:

@@ -30,6 +30,8 @@ def check_options(args: argparse.Namespace) -> None:
     if args.autopilot is None:
         if args.speed_factor is not None:
             raise UsageError("--speed-factor is for real daemons; drop it, or name their --autopilot")
+        if args.telemetry_at is not None and not args.telemetry:
+            raise UsageError("--telemetry-at is for --telemetry and for --autopilot; add one of them, or drop it")
         return
     slowest, fastest = SPEED_FACTORS
     if args.speed_factor is not None and not slowest <= args.speed_factor <= fastest:
@@ -51,9 +53,13 @@ def fly(args: argparse.Namespace, scenario: ScenarioConfig, directory: Path) -> 
         stack.enter_context(_ended_in_order())
         phases = stack.enter_context(Phases(quiet=args.quiet, verbose=args.verbose))
         phases.say("starting autopilots and daemons, and taking off")
+        sitl = load_drone(data_path("config") / SITL)
+        if args.telemetry_at is not None:
+            telemetry = sitl.telemetry.model_copy(update={"connect": (args.telemetry_at,)})
+            sitl = sitl.model_copy(update={"telemetry": telemetry})
         flight = fly_fleet(
             scenario,
-            load_drone(data_path("config") / SITL),
+            sitl,
             kind=args.autopilot,
             speed_factor=args.speed_factor or DEFAULT_SPEED_FACTOR,
             logs=directory / FLEET_LOGS,

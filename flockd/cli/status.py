@@ -10,12 +10,12 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from flockd.cli.endpoint_options import add_endpoint_options, endpoints
-from flockd.cli.output import cell, say_json, tables_console
+from flockd.cli.output import cell, noted_table, say_json, tables_console
 from flockd.cli.parser import Commands, positive_number
 from flockd.core.errors import ExitCode, UnavailableError
 
 if TYPE_CHECKING:
-    from rich.table import Table
+    from rich.text import Text
 
     from flockd.fleet.watcher import Watched
 
@@ -67,37 +67,28 @@ def _run(args: argparse.Namespace) -> int:
     return ExitCode.DONE
 
 
-def _table(rows: list[dict[str, Any]]) -> Table:
-    from rich.table import Table
+def _table(rows: list[dict[str, Any]]) -> Text:
+    heads = ("drone", "state", "mode", "height", "battery", "sees", "load", "clock")
+    return noted_table(heads, [(_cells(row), _notes(row)) for row in rows])
 
-    table = Table(
-        "drone",
-        "state",
-        "mode",
-        "height",
-        "battery",
-        "sees",
-        "load",
-        "clock",
-        "mission",
-        "what is the matter",
-        box=None,
-        pad_edge=False,
+
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    return (
+        cell(f"{row['fleet']}/{row['drone']}"),
+        row["state"],
+        cell(row["flight_mode"] or ""),
+        _number(row["height_m"], ".1f", " m"),
+        _number(row["battery_share"], ".0%", ""),
+        _number(row["neighbours"], "d", ""),
+        _number(row["load"], ".0%", ""),
+        _number(None if row["clock_error_s"] is None else 1e3 * row["clock_error_s"], ".1f", " ms"),
     )
-    for row in rows:
-        table.add_row(
-            cell(f"{row['fleet']}/{row['drone']}"),
-            row["state"],
-            cell(row["flight_mode"] or ""),
-            _number(row["height_m"], ".1f", " m"),
-            _number(row["battery_share"], ".0%", ""),
-            _number(row["neighbours"], "d", ""),
-            _number(row["load"], ".0%", ""),
-            _number(None if row["clock_error_s"] is None else 1e3 * row["clock_error_s"], ".1f", " ms"),
-            cell(row["mission"] or ""),
-            cell("; ".join(row["matters"])),
-        )
-    return table
+
+
+def _notes(row: dict[str, Any]) -> list[str]:
+    """Its mission, and each thing that is the matter."""
+    mission = [f"mission: {cell(row['mission'])}"] if row["mission"] else []
+    return [*mission, *(cell(matter) for matter in row["matters"])]
 
 
 def _number(value: float | None, form: str, unit: str) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 
 from flockd.cli.output import complain, progress, say, say_json
 from flockd.cli.parser import Commands
-from flockd.cli.recording_options import add_stretch, opened, refuse_existing, stretch
+from flockd.cli.recording_options import add_stretch, opened, refuse_existing, require, stretch
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 
@@ -45,6 +45,7 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
+    require(args.recording)
     import flockd.review.view.rerun_file  # noqa: F401 - so that nothing is computed when the extra is missing
 
     if args.json and args.save is None:

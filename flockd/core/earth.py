@@ -15,3 +15,8 @@ def metres_a_degree(latitude_deg: float) -> tuple[float, float]:
     north = math.radians(EQUATOR_M * (1.0 - SQUARED_ECCENTRICITY) / flattened**1.5)
     east = math.radians(EQUATOR_M * math.cos(latitude) / math.sqrt(flattened))
     return north, east
+
+
+def degrees_apart(longitude_deg: float, other_deg: float) -> float:
+    """How far east one longitude is of another, the shorter way around the Earth: from -180 to 180."""
+    return (longitude_deg - other_deg + 180.0) % 360.0 - 180.0

@@ -1,4 +1,4 @@
-"""How large an image claims to be, from its header, before any memory is taken for its pixels."""
+"""What an image would cost to decode, from its bytes, before memory or time is spent on its pixels."""
 
 from __future__ import annotations
 
@@ -7,6 +7,11 @@ from typing import Literal
 
 MAX_IMAGE_PIXELS = 1 << 26
 """8192 x 8192: more than any camera of a drone has."""
+MAX_SCANS = 100
+"""Of a JPEG: encoders write 10 or so, and libjpeg-turbo's own tools call more than 500 an attack."""
+MAX_SCANNED_PIXELS = 1 << 30
+"""Pixels times scans: each scan of a progressive JPEG goes over all pixels, however few bytes it has. A second or
+two."""
 _STANDALONE = frozenset({0x01, *range(0xD0, 0xD8)})
 _FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _SCAN = 0xDA
@@ -16,14 +21,29 @@ _BMP_SIZES = {12: 2, 40: 4, 52: 4, 56: 4, 64: 4, 108: 4, 124: 4}
 _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
 _TIFF_TYPES = {3: 2, 4: 4}
 """Bytes of SHORT and LONG."""
+_JPEG = b"\xff\xd8"
 _PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def cost_fault(data: bytes) -> str | None:
+    """Why an image is not to be decoded, as it would take too much memory or time; None: it may be.
+
+    Says nothing of an image whose size `image_size` does not find.
+    """
+    width, height = image_size(data) or (0, 0)
+    if width * height > MAX_IMAGE_PIXELS:
+        return f"claims to be {width} x {height} pixels, more than any camera has"
+    scans = data.count(b"\xff\xda") if data.startswith(_JPEG) else 0
+    if scans > MAX_SCANS or scans * width * height > MAX_SCANNED_PIXELS:
+        return f"has {scans} scans of {width} x {height} pixels, more than any camera writes"
+    return None
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
     """Width and height of a JPEG, PNG, BMP, PGM, PPM or TIFF; None for others and for a header that is cut off."""
     if data.startswith(_PNG) and len(data) >= 24:
         return int.from_bytes(data[16:20]), int.from_bytes(data[20:24])
-    if data.startswith(b"\xff\xd8"):
+    if data.startswith(_JPEG):
         return jpeg_size(data)
     if data.startswith(b"BM"):
         return _bmp_size(data)

@@ -46,12 +46,15 @@ SETPOINT_STREAM = Service("`Setpoint` before it", 20.0, 0.5, "offboard counts as
 HEARTBEAT = Service(
     "the autopilot's heartbeat",
     1.0,
-    2.0,
-    "link_lost",  # and the streamer's own end, on its thread
-    ("safety.heartbeat_timeout_s", "autopilot.max_heartbeat_age_s"),
+    3.5,  # two may be lost
+    "link_lost",  # and the streamer's own end, on its thread, by the same judgement; so the next
+    ("safety.heartbeat_timeout_s",),
 )
+AUTOPILOT = Service("any message of the autopilot", 50.0, 2.0, "link_lost", ("safety.link_timeout_s",))
+POSITION_TARGET = Service("the autopilot's own setpoint", 10.0, 1.0, "it is compared with no setpoint")
 OTHER_HEARTBEAT = Service("another computer's heartbeat", 1.0, 5.0, "it counts as gone")
 VEHICLE_STATE = Service("the autopilot's state", 50.0, 2.0, "forgotten; frames of another time take the newest")
+MOTION = Service("the autopilot's position and velocity", 30.0, 0.5, "motion_unknown")
 GROUND_RANGE = Service("range to the ground", 30.0, 0.3, "it gives no scale", ("perception.range_finder.max_age_s",))
 RANGE_FINDER = Service("range finder", 30.0, 0.5, "the autopilot's own distance to bottom takes its place")
 TIME_SYNC = Service("reply to a clock exchange", 10.0, 1.0, "it is not used")

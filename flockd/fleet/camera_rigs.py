@@ -22,6 +22,6 @@ def cameras_of(about: AboutMessage | None) -> dict[str, DroneCamera]:
     try:
         config = RigConfig.model_validate_json(json.dumps((about or {"configuration": {}})["configuration"].get("rig")))
         mounted = build_rig(config).cameras
-    except ValueError:  # of a peer of another version
+    except (ValueError, ArithmeticError, RecursionError):  # of a peer of another version, or a hostile one
         return {}
     return {camera.name: DroneCamera(camera, mounted[camera.name]) for camera in config.cameras}

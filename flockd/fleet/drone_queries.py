@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import secrets
 import time
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import zenoh
 
-from flockd.onboard.telemetry.schema import fault
-from flockd.onboard.telemetry.topics import PREFIX, AboutMessage, AnswerMessage, TimeMessage
+from flockd.core.image_header import jpeg_size
+from flockd.onboard.telemetry.schema import completed, fault
+from flockd.onboard.telemetry.topics import PREFIX, AboutMessage, AnswerMessage, AskMessage, TimeMessage
 
 ANSWER_S = 3.0
+PICTURE_S = 1.5
+MAX_REPLY_BYTES = 1 << 16
+"""Ten times what a drone flies with, and twice a small picture."""
+MAX_PICTURE_PX = 1024
 
 
 class ClockReading(NamedTuple):
@@ -30,15 +37,33 @@ class DroneQueries:
     Every call waits for the reply, up to ``ANSWER_S``: not for an event loop.
     """
 
-    def __init__(self, session: zenoh.Session) -> None:
-        """``session``: stays its owner's."""
-        self._session = session
+    def __init__(self, session: zenoh.Session, orders: zenoh.Session) -> None:
+        """``orders``: another connection, or the same; nothing else goes over it. Both stay their owner's."""
+        self._session, self._orders = session, orders
+        self._name, self._numbers = secrets.token_hex(8), itertools.count(1)
 
-    def ask(self, drone: str, command: str, message: Mapping[str, object] | None = None) -> AnswerMessage | None:
-        """The answer to an operator's command."""
-        payload = b"" if message is None else json.dumps(message, allow_nan=False).encode()
-        answer: AnswerMessage | None = self._message(f"{drone}/ask/{command}", AnswerMessage, payload)
-        return answer
+    def ask(
+        self, drone: str, identity: str, command: str, operator: str, order: Mapping[str, object] | None = None
+    ) -> AnswerMessage | None:
+        """The answer to an operator's command. ``identity``: that of its liveliness token."""
+        for session in dict.fromkeys((self._orders, self._session)):  # one may not be connected yet
+            now: TimeMessage | None = self._message(f"{drone}/time", TimeMessage, session=session)
+            if now is None:
+                continue
+            ask = AskMessage(
+                identity=identity,
+                operator=operator,
+                session=self._name,
+                sequence=next(self._numbers),
+                time_s=now["time_s"],
+                order=None if order is None else {**order},
+            )
+            payload = json.dumps(ask, allow_nan=False).encode()
+            answer: AnswerMessage | None = self._message(
+                f"{drone}/ask/{command}", AnswerMessage, payload, session=session
+            )
+            return answer
+        return None
 
     def about(self, drone: str) -> AboutMessage | None:
         """What a drone flies with."""
@@ -56,22 +81,30 @@ class DroneQueries:
 
     def image(self, drone: str, camera: str) -> bytes | None:
         """A small JPEG of what a camera sees."""
-        return self._reply(f"{drone}/image/{camera}")
+        image = self._reply(f"{drone}/image/{camera}", timeout_s=PICTURE_S)
+        size_px = jpeg_size(image) if image is not None and image.startswith(b"\xff\xd8") else None
+        return image if size_px is not None and max(size_px) <= MAX_PICTURE_PX else None
 
-    def _message(self, key: str, kind: type, payload: bytes = b"") -> Any:
+    def _message(self, key: str, kind: type, payload: bytes = b"", *, session: zenoh.Session | None = None) -> Any:
         """A reply that is a message of this kind."""
-        raw = self._reply(key, payload)
+        raw = self._reply(key, payload, session=session)
         if raw is None:
             return None
         try:
-            message = json.loads(raw)
+            message = completed(json.loads(raw), kind)
         except (ValueError, RecursionError):
             return None
         return None if fault(message, kind) else message
 
-    def _reply(self, key: str, payload: bytes = b"") -> bytes | None:
-        for reply in self._session.get(f"{PREFIX}/{key}", payload=payload, timeout=ANSWER_S):
-            if reply.ok is not None:
+    def _reply(
+        self, key: str, payload: bytes = b"", *, timeout_s: float = ANSWER_S, session: zenoh.Session | None = None
+    ) -> bytes | None:
+        """The first, of those that are not too long. What is asked over the connection for orders goes first."""
+        priority = zenoh.Priority.DATA_LOW if session is None else zenoh.Priority.REAL_TIME
+        for reply in (session or self._session).get(
+            f"{PREFIX}/{key}", payload=payload, timeout=timeout_s, priority=priority
+        ):
+            if reply.ok is not None and len(reply.ok.payload) <= MAX_REPLY_BYTES:
                 data: bytes = reply.ok.payload.to_bytes()
                 return data
         return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from flockd.fleet.watcher import Watched
+from flockd.fleet.watcher import Watched, ambiguity
 
 GONE, QUIET = "gone", "quiet"
 """Instead of a state: its process has ended or cannot be reached; it is there, and publishes nothing."""
@@ -13,9 +13,13 @@ WORST_FIRST = (GONE, QUIET, "asking", "hover", "silent", "degraded", "idle", "re
 
 
 def status_rows(drones: Iterable[Watched], now_s: float) -> list[dict[str, Any]]:
-    """One row for each drone, as JSON, the worst first; ``now_s`` on the watcher's clock."""
-    rows = [_row(drone, now_s) for drone in drones]
-    return sorted(rows, key=lambda row: (WORST_FIRST.index(row["state"]), row["fleet"], row["drone"]))
+    """One row for each drone, as JSON, the worst first, and names that no drone stands behind last.
+
+    ``now_s``: on the watcher's clock.
+    """
+    rows = [(drone.announced or drone.alive, _row(drone, now_s)) for drone in drones]
+    rows.sort(key=lambda one: (not one[0], WORST_FIRST.index(one[1]["state"]), one[1]["fleet"], one[1]["drone"]))
+    return [row for _, row in rows]
 
 
 def _row(drone: Watched, now_s: float) -> dict[str, Any]:
@@ -32,9 +36,11 @@ def _row(drone: Watched, now_s: float) -> dict[str, Any]:
     starting = drone.alive and not drone.topics and not drone.malformed
     malformed = [f"its message `{topic}` is malformed: {_told(why)}" for topic, why in sorted(drone.malformed.items())]
     blind = [camera["fault"] for camera in computer.get("cameras", {}).values() if camera["fault"]]
+    orders = flight.get("orders") or []
     return {
         "fleet": drone.fleet,
         "drone": drone.drone,
+        "identities": sorted(drone.identities),
         "state": state if state in WORST_FIRST else QUIET,
         "flight_mode": "simulated" if simulated else flight.get("flight_mode"),
         "height_m": pilot.get("height_m") if simulated else flight.get("height_m"),
@@ -47,12 +53,23 @@ def _row(drone: Watched, now_s: float) -> dict[str, Any]:
         "clock_error_s": clock.get("error_s"),
         "clock_jitter_s": clock.get("jitter_s"),
         "mission": (drone.message("mission", now_s) or {}).get("sentence"),
-        "matters": malformed
+        "orders": orders,
+        "orders_refused": flight.get("orders_refused"),
+        "matters": [sentence for sentence in (ambiguity(drone), _operators(orders)) if sentence]
+        + malformed
         + (["it has published nothing yet: it starts, or loads its networks"] if starting else [])
         + [reason["sentence"] for reason in flight.get("reasons", ())]
         + [str(reason) for reason in (health.get("reasons", ()) if simulated else ())]
         + blind,
     }
+
+
+def _operators(orders: list[dict[str, Any]]) -> str | None:
+    """That several operators command it, and what they asked."""
+    if len(orders) < 2:
+        return None
+    told = ", ".join(f"{order['operator']:.80} ({order['command']:.20})" for order in orders)
+    return f"{len(orders)} operators commanded it within a minute, the last one first: {told}; agree on one"
 
 
 def _told(why: str) -> str:

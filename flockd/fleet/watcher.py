@@ -15,15 +15,18 @@ import zenoh
 
 from flockd.fleet.drone_queries import DroneQueries
 from flockd.onboard.telemetry.schema import completed, fault
-from flockd.onboard.telemetry.topics import PREFIX, TOPICS, checked_name, is_name
-from flockd.onboard.telemetry.zenoh_session import SessionOwner, open_session
+from flockd.onboard.telemetry.topics import PREFIX, TOPICS, AnswerMessage, checked_name, is_name
+from flockd.onboard.telemetry.zenoh_session import SessionOwner, close_session, open_session
 
-MAX_BYTES = 1 << 20
-"""The largest message; one with every field at its longest has a hundredth of it."""
-MAX_DRONES = 1000
+MAX_BYTES = 1 << 15
+"""The largest message: that of a drone which sees a hundred others."""
+MAX_DRONES = 200
 """The most drones that are remembered, on a bus on which somebody invents drones."""
-MAX_EVENTS = 500
-"""So many of the newest are remembered."""
+FORGOTTEN_AT_ONCE = 20
+MAX_EVENTS, MAX_EVENTS_OF_ONE = 500, 100
+"""So many of the newest are remembered: of all, and of one drone."""
+MAX_LINK_BYTES = 1 << 20
+"""Of one message on its way, before anything of flockd's sees it."""
 _PERIOD_SHARE = 0.2
 """Weight of the newest period in the mean."""
 _SLOWEST = 10.0
@@ -76,6 +79,13 @@ class Watched:
     """What is wrong with the newest message of a topic, by topic; one that is well formed again is not here."""
     seen: bool = False
     """Something of it was well formed, or its token was there: it is a drone."""
+    identities: frozenset[str] = frozenset()
+    """Of the tokens that are there: several where several drones have this one name. Empty text: of a drone of an
+    earlier version."""
+    announced: bool = False
+    """Its token is there, or was."""
+    messages: int = 0
+    """That were well formed."""
 
     def message(self, topic: str, now_s: float) -> Mapping[str, Any] | None:
         """The newest of a topic; None where there is none, or one too old to say anything of now."""
@@ -113,15 +123,49 @@ class FleetWatcher(SessionOwner):
         self._drones: dict[tuple[str, str], Watched] = {}
         self.malformed = 0
         """Messages that are none, and those of drones that cannot be."""
+        self.forgotten = 0
+        """Names that made room for others."""
         self._events: deque[HeardEvent] = deque(maxlen=MAX_EVENTS)
-        self._session = open_session("telemetry", listen, connect, settings=settings)
-        self.queries = DroneQueries(self._session)
+        self._session = open_session("telemetry", listen, connect, settings=settings, max_message_bytes=MAX_LINK_BYTES)
+        # Drones that connect here have one connection; to those that this computer connects to, orders have their own.
+        own = bool(connect) and not listen
+        self._orders = (
+            open_session("orders", [], connect, settings=settings, max_message_bytes=MAX_LINK_BYTES)
+            if own
+            else self._session
+        )
+        self.queries = DroneQueries(self._session, self._orders)
         """To the same drones."""
         drones = f"{PREFIX}/{'*' if fleet is None else checked_name(fleet)}/*"
         self._subscribers = [
             self._session.declare_subscriber(f"{drones}/{topic}", self._take_message) for topic in TOPICS
         ]
-        self._tokens = self._session.liveliness().declare_subscriber(f"{drones}/alive", self._take_token, history=True)
+        self._tokens = self._session.liveliness().declare_subscriber(
+            f"{drones}/alive/**", self._take_token, history=True
+        )
+
+    def close(self) -> None:
+        """Ends both connections."""
+        if self._orders is not self._session:
+            close_session(self._orders)
+        super().close()
+
+    def ask(
+        self, drone: str, command: str, operator: str, order: Mapping[str, object] | None = None
+    ) -> AnswerMessage | None:
+        """A drone's answer to an operator's command, by its key `fleet/drone`; None where none comes.
+
+        Refused here where it is not clear which drone would get it.
+        """
+        fleet, _, name = drone.partition("/")
+        with self._lock:
+            watched = self._drones.get((fleet, name))
+        if watched is None or not watched.seen:
+            return AnswerMessage(accepted=False, sentence="no drone of this name was heard")
+        if len(watched.identities) > 1:
+            return AnswerMessage(accepted=False, sentence=f"nothing was sent: {ambiguity(watched)}")
+        identity = next(iter(watched.identities), "")
+        return self.queries.ask(drone, identity, command, operator, order)
 
     def drones(self) -> tuple[Watched, ...]:
         """All that were ever heard of."""
@@ -142,40 +186,81 @@ class FleetWatcher(SessionOwner):
         fleet, drone, topic = str(sample.key_expr).split("/")[2:5]
         message, wrong = _parsed(sample.payload, topic)
         with self._lock:
-            watched = self._watched(fleet, drone)
-            if watched is None or wrong is not None:
-                self.malformed += 1
-            if watched is None:
-                return
             if wrong is not None:
-                malformed = {**watched.malformed, topic: wrong}
-                self._drones[fleet, drone] = replace(watched, malformed=malformed)
+                self.malformed += 1
+                known = self._drones.get((fleet, drone))
+                if known is not None:
+                    self._drones[fleet, drone] = replace(known, malformed={**known.malformed, topic: wrong})
+                return
+            watched = self._watched(fleet, drone)
+            if watched is None:
                 return
             heard = _heard(watched.topics.get(topic), self._clock(), message)
             if topic == "events":
-                self._events.append(HeardEvent(heard.time_s, fleet, drone, message["event"]))
-            malformed = {name: why for name, why in watched.malformed.items() if name != topic}
+                self._remember(HeardEvent(heard.time_s, fleet, drone, message["event"]))
             self._drones[fleet, drone] = replace(
-                watched, topics={**watched.topics, topic: heard}, malformed=malformed, seen=True
+                watched,
+                topics={**watched.topics, topic: heard},
+                malformed={name: why for name, why in watched.malformed.items() if name != topic},
+                seen=True,
+                messages=watched.messages + 1,
             )
 
     def _take_token(self, sample: zenoh.Sample) -> None:
-        fleet, drone = str(sample.key_expr).split("/")[2:4]
+        fleet, drone, _, *identity = str(sample.key_expr).split("/")[2:]
         with self._lock:
             watched = self._watched(fleet, drone)
             if watched is None:
-                self.malformed += 1
                 return
-            self._drones[fleet, drone] = replace(watched, alive=sample.kind == zenoh.SampleKind.PUT, seen=True)
+            one = frozenset({identity[0] if identity else ""})
+            there = sample.kind == zenoh.SampleKind.PUT
+            identities = watched.identities | one if there else watched.identities - one
+            self._drones[fleet, drone] = replace(
+                watched, alive=bool(identities), identities=identities, announced=True, seen=True
+            )
 
     def _watched(self, fleet: str, drone: str) -> Watched | None:
-        """What is known of a drone so far; None for one that cannot be, or is one too many."""
+        """What is known of a drone so far; None for one that cannot be."""
         known = self._drones.get((fleet, drone))
         if known is not None:
             return known
-        if len(self._drones) >= MAX_DRONES or not (is_name(fleet) and is_name(drone)):
+        if not (is_name(fleet) and is_name(drone)):
+            self.malformed += 1
             return None
+        if len(self._drones) >= MAX_DRONES:
+            self._forget()
         return Watched(fleet, drone)
+
+    def _forget(self) -> None:
+        """Those of which least is known: who invents names says little under each."""
+        ranked = sorted(self._drones, key=lambda key: _standing(self._drones[key]))
+        for key in ranked[:FORGOTTEN_AT_ONCE]:
+            del self._drones[key]
+        self.forgotten += FORGOTTEN_AT_ONCE
+
+    def _remember(self, event: HeardEvent) -> None:
+        """However much one drone says, what the others said stays."""
+        of_one = [old for old in self._events if (old.fleet, old.drone) == (event.fleet, event.drone)]
+        if len(of_one) >= MAX_EVENTS_OF_ONE:
+            self._events.remove(of_one[0])
+        self._events.append(event)
+
+
+def ambiguity(drone: Watched) -> str | None:
+    """What is wrong where several drones have one name; None where it is one's."""
+    if len(drone.identities) < 2:
+        return None
+    identities = ", ".join(sorted(identity or "of an earlier version" for identity in drone.identities))
+    return (
+        f"{len(drone.identities)} drones call themselves {drone.drone} ({identities:.80}), and what they tell is "
+        "mixed; give each its own `name` in its configuration"
+    )
+
+
+def _standing(drone: Watched) -> tuple[bool, bool, int, float]:
+    """The less, the sooner it is forgotten."""
+    last_s = max((heard.time_s for heard in drone.topics.values()), default=0.0)
+    return drone.alive, drone.announced, drone.messages, last_s
 
 
 def _parsed(payload: zenoh.ZBytes, topic: str) -> tuple[dict[str, Any], str | None]:

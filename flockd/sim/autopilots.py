@@ -95,6 +95,7 @@ class SimulatedAutopilots:
         """``ground``: of the world, which range finders measure to."""
         self._scenario, self._speed_factor, self._ground = scenario, speed_factor, ground
         self.ports = tuple(Ports(free_port(), free_port()) for _ in scenario.vehicles)
+        self.fakes: list[FakeAutopilot] = []
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -121,7 +122,7 @@ class SimulatedAutopilots:
             fake.parameters["MIS_TAKEOFF_ALT"] = -float(position[2])
             fake.parameters["MPC_VEL_MANUAL"] = FULL_STICK_M_S
             fake.parameters["MAN_DEADZONE"] = 0.0
-            self._stack.enter_context(fake)
+            self.fakes.append(self._stack.enter_context(fake))
 
     def programs(self) -> Sequence[Program]:
         """See `Autopilots`."""

@@ -11,12 +11,12 @@ import numpy as np
 
 from flockd.core.config.mission import MissionParameters
 from flockd.core.config.scenario import ScenarioConfig
-from flockd.core.errors import UsageError
 from flockd.core.messages import FloatArray, Frame, FrameSet, UInt8Array
-from flockd.flight.geometry import PinholeCamera, build_rig
+from flockd.flight.geometry import build_rig
 from flockd.flight.mission import Moment, Navigator
 from flockd.sim.camera_faults import CameraFaults
 from flockd.sim.drone_models import FAMILIES, drone_model
+from flockd.sim.lens_views import lens_view
 from flockd.sim.renderer import Renderer, View
 from flockd.sim.truth_perception import RenderTruth
 from flockd.sim.vehicles import REFERENCE_DEG
@@ -40,17 +40,8 @@ class CameraSimulator:
     """The world of a scenario, the models of its drones, and their cameras."""
 
     def __init__(self, scenario: ScenarioConfig, threads: int | None = None) -> None:
-        """Draws a drone's images on ``threads``; 0: on the calling one; None: as many as there are processors.
-
-        Raises UsageError for a camera model that cannot be rendered.
-        """
+        """Draws a drone's images on ``threads``; 0: on the calling one; None: as many as there are processors."""
         self.rig = build_rig(scenario.drone.rig)
-        for name, mounted in self.rig.cameras.items():
-            if not isinstance(mounted.camera, PinholeCamera) or any(mounted.camera.distortion):
-                raise UsageError(
-                    f"drone.rig: camera {name!r}: the renderer supports only pinhole cameras without distortion; "
-                    "change its intrinsics for simulated flights"
-                )
         obstacles = obstacles_of(scenario)
         field, path = scenario.world.obstacles, planned_path(scenario)
         clearance_m = scenario.world.clearance_m + _spread(scenario)
@@ -88,11 +79,13 @@ class CameraSimulator:
         places = {name: position + R_ned_body @ mounted.T_body_camera.translation for name, mounted in cameras.items()}
 
         def view(name: str) -> View:
-            camera = cameras[name].camera
-            return self._renderer.render(
-                camera.matrix, camera.size, turns[name], places[name],
-                drone_rotations=vehicles.R_ned_body, drone_positions=vehicles.position, shown=others,
-            )  # fmt: skip
+            def draw(matrix: FloatArray, size: tuple[int, int], R_lens_part: FloatArray) -> View:
+                return self._renderer.render(
+                    matrix, size, turns[name] @ R_lens_part, places[name],
+                    drone_rotations=vehicles.R_ned_body, drone_positions=vehicles.position, shown=others,
+                )  # fmt: skip
+
+            return lens_view(cameras[name].camera, draw)
 
         # Side by side; noise and faults are drawn in the cameras' order, so that the images do not depend on that.
         drawn = map(view, cameras) if self._executor is None else self._executor.map(view, cameras)

@@ -7,21 +7,21 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flockd.core.config.safety import GateParameters
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.messages import FloatArray, Setpoint, Wanted
 from flockd.flight.obstacles import nearest_points
-from flockd.flight.safety import Action, Gate, Permission, Request
+from flockd.flight.safety import Gate, Permission, Request, State, Surroundings, Verdict
 from flockd.flight.safety.surroundings import surroundings
+from flockd.review.flight_log.metadata import HandedOver
 from flockd.sim.commands import Commands
 from flockd.sim.handover import Handover
+from flockd.sim.slowing import Cause, SlowedTime, causes_of, is_slowed, which_are_drones
+from flockd.sim.supervision import WindSupervisor
 from flockd.sim.vehicles import Vehicles
 
 PERIOD_S = 0.05
 """Between two setpoints, as `autopilot.setpoint_rate_hz` is by default."""
-_SLOWED = 0.05
-"""A velocity that differs from the one asked for by a smaller share of it counts as the same."""
-
-
 _SAME_TIME_S = 1e-9
 
 
@@ -36,60 +36,86 @@ class _Order(NamedTuple):
     height_m: FloatArray
 
 
+class _Drone(NamedTuple):
+    """What of its daemon's control loop each gated drone has."""
+
+    gate: Gate
+    supervisor: WindSupervisor
+    parameters: GateParameters
+
+
 class ControlLoop:
     """Flies all drones of a flight from one step of their pilots to the next.
 
-    A person's drone, and one whose autopilot has taken over, fly without a gate.
+    Each has a gate, and a supervisor that knows of wind, fence and heights: it flies slower, or asks for Hold. A
+    person's drone, and one whose autopilot has taken over, fly without them.
     """
 
     def __init__(self, scenario: ScenarioConfig, *, gated: bool = True) -> None:
         """Not `gated`: setpoints are what the pilots ask for."""
         self._step_s, self._sigmas = scenario.drone.step_s, scenario.drone.obstacles.sigmas
         self._handover = Handover(scenario)
-        self._gates = {
-            i: Gate(scenario.drone_of(i).safety.gate)
+        self._drones = {
+            i: _Drone(Gate(safety.gate), WindSupervisor(safety), safety.gate)
             for i, vehicle in enumerate(scenario.vehicles)
+            for safety in [scenario.drone_of(i).safety]
             if gated and not vehicle.by_hand
         }
         self._start_m = [-vehicle.position_m[2] for vehicle in scenario.vehicles]
         self._latency_s = scenario.detections.latency_s if scenario.detections is not None else 0.0
         self._in_force: _Order | None = None
-        self._flown_s = self._slowed_s = 0.0
-
-    @property
-    def slowed_share(self) -> float | None:
-        """Share of time in which gates let drones fly otherwise than their pilots asked for; None: no gates."""
-        return self._slowed_s / self._flown_s if self._flown_s else None
+        self.slowed = SlowedTime()
+        """How long gates let drones fly otherwise than their pilots asked for."""
+        self.handed_over: dict[int, HandedOver] = {}
+        """By the drone's number, from 0."""
 
     def fly(self, time_s: float, vehicles: Vehicles, commands: Commands) -> None:
         """From `time_s` one step on."""
         velocity, height_m = self._handover.applied(
             commands.takeovers, vehicles.position, commands.velocity, commands.height_m
         )
-        gates = {i: gate for i, gate in self._gates.items() if i not in self._handover.taken}
         coming = _Order(time_s, vehicles.position, commands, velocity, height_m)
         order = self._in_force or coming
-        periods = max(round(self._step_s / PERIOD_S), 1) if gates or self._latency_s else 1
+        periods = max(round(self._step_s / PERIOD_S), 1) if self._drones or self._latency_s else 1
         period_s = self._step_s / periods
         for period in range(periods):
             now_s = time_s + period * period_s
             if now_s - time_s >= self._latency_s - _SAME_TIME_S:
                 order = coming
             setpoints, heights = order.velocity.copy(), order.height_m.copy()
-            for i, gate in gates.items():
-                setpoint = self._setpoint(i, gate, now_s, vehicles, order)
+            for i in self._drones.keys() - self._handover.taken:
+                setpoint = self._setpoint(i, now_s, period_s, vehicles, order)
                 setpoints[i] = setpoint.velocity
                 if math.isfinite(order.height_m[i]):
                     heights[i] = setpoint.height_m
-                asked = order.velocity[i]
-                off_m_s = math.hypot(*(setpoint.velocity + gate.drift - asked))
-                self._slowed_s += period_s * (off_m_s > _SLOWED * math.hypot(*asked))
-                self._flown_s += period_s
+            for i, (back, held_m) in self._handover.holding(vehicles.position).items():
+                setpoints[i], heights[i] = back, held_m
             vehicles.step(setpoints, order.commands.yaw_rad, period_s, heights)
         self._in_force = coming
 
-    def _setpoint(self, i: int, gate: Gate, now_s: float, vehicles: Vehicles, order: _Order) -> Setpoint:
-        here, height_m, commands = vehicles.position[i], float(order.commands.height_m[i]), order.commands
+    def _setpoint(self, i: int, now_s: float, period_s: float, vehicles: Vehicles, order: _Order) -> Setpoint:
+        """What the gate of a drone makes of its order now; its supervisor may hand it over instead."""
+        drone, here = self._drones[i], vehicles.position[i]
+        decision = drone.supervisor.step(now_s, drone.gate.gusts_m_s, here)
+        if decision.state is State.ASKING:
+            self._handover.hold(i, here, vehicles.velocity[i])
+            self.handed_over[i] = HandedOver(time_s=now_s, reason=decision.reasons[0].sentence)
+        request = self._request(i, Permission(decision.action, now_s), vehicles, order)
+        verdict = drone.gate.step(now_s, request)
+        assert verdict.setpoint is not None, "all that it is told is finite and of now"
+        if decision.state is not State.ASKING:
+            slowed = is_slowed(request, verdict, drone.gate.drift)
+            self.slowed.add(period_s, self._causes(i, request, verdict, vehicles) if slowed else frozenset())
+        return verdict.setpoint
+
+    def _causes(self, i: int, request: Request, verdict: Verdict, vehicles: Vehicles) -> frozenset[Cause]:
+        truth = _truth(i, vehicles)
+        is_drone = which_are_drones(request.around.neighbours, truth.neighbours)
+        return causes_of(self._drones[i].parameters, request, verdict, truth, is_drone)
+
+    def _request(self, i: int, permission: Permission, vehicles: Vehicles, order: _Order) -> Request:
+        now_s, here = permission.time_s, vehicles.position[i]
+        height_m, commands = float(order.commands.height_m[i]), order.commands
         ranges = commands.obstacles[i]
         around = surroundings(
             commands.neighbours[i],
@@ -103,7 +129,17 @@ class ControlLoop:
         )
         wanted = Wanted(commands.velocity[i], commands.acceleration[i], float(commands.yaw_rad[i]))
         held_m = height_m if math.isfinite(height_m) else self._start_m[i]
-        request = Request(Permission(Action.FLY, now_s), wanted, order.time_s, held_m, around)
-        setpoint = gate.step(now_s, request).setpoint
-        assert setpoint is not None, "all that it is told is finite and of now"
-        return setpoint
+        return Request(permission, wanted, order.time_s, held_m, around)
+
+
+def _truth(i: int, vehicles: Vehicles) -> Surroundings:
+    """Where the other drones truly are."""
+    others = np.arange(len(vehicles.position)) != i
+    return Surroundings(
+        position=vehicles.position[i, :2],
+        velocity=vehicles.velocity[i, :2],
+        yaw_rad=0.0,
+        neighbours=vehicles.position[others] - vehicles.position[i],
+        neighbour_velocities=vehicles.velocity[others, :2],
+        height_m=float(-vehicles.position[i, 2]),
+    )

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from flockd.core.config.scenario import ScenarioConfig
-from flockd.core.messages import FloatArray, MissionStatus, Neighbour, ObstacleRanges
+from flockd.core.messages import FloatArray, MissionOrder, MissionStatus, Neighbour, ObstacleRanges
 from flockd.flight.flocking import FlockingLaw
 from flockd.flight.mission import Moment, Navigator
 from flockd.flight.mission.navigator import middle_of
@@ -19,6 +20,9 @@ from flockd.sim.vehicles import REFERENCE_DEG, Vehicles
 from flockd.sim.worlds.obstacle_worlds import obstacles_of
 from flockd.sim.worlds.obstacles import true_ranges
 
+Orders = Mapping[int, Sequence[tuple[float, MissionOrder]]]
+"""What operators ordered of a flight's drones, by the drone's number from 0, and when, s; in order of time."""
+
 
 class ExactFlock:
     """The flocking law and each drone's mission on the states of all drones, and exact ranges to obstacles.
@@ -26,8 +30,9 @@ class ExactFlock:
     The states are exact, or tracked from made-up detections where the scenario has `detections`.
     """
 
-    def __init__(self, scenario: ScenarioConfig) -> None:
+    def __init__(self, scenario: ScenarioConfig, orders: Orders | None = None) -> None:
         drone = scenario.drone
+        self._orders = {i: list(of_drone) for i, of_drone in (orders or {}).items()}
         self._law, self._step_s = FlockingLaw(drone.flocking), drone.step_s
         self._pilots = [
             HandPilot(scenario, i) if vehicle.by_hand else Navigator(scenario.drone_of(i).mission, drone.safety.gate)
@@ -64,7 +69,8 @@ class ExactFlock:
         seen = [one for one in known if one.confirmed]
         places = np.reshape([one.position for one in seen], (len(seen), 3))
         others = np.reshape([one.velocity for one in seen], (len(seen), 3))[:, :2]
-        guidance = pilot.step(Moment(time_s, here[i], middle_of(places[:, :2]), np.array(REFERENCE_DEG)))
+        order = self._newest_order(i, time_s)
+        guidance = pilot.step(Moment(time_s, here[i], middle_of(places[:, :2]), np.array(REFERENCE_DEG), order=order))
         desired = pilot.pull(guidance)
         if ranges is None or not self._avoids:
             command, acceleration = self._law.command(moving[i], places[:, :2], others, desired, self._step_s)
@@ -73,6 +79,13 @@ class ExactFlock:
         yaw_rad = float(self._yaw_rad[i]) if guidance.course_rad is None else guidance.course_rad
         height_m = np.nan if guidance.height_m is None else guidance.height_m
         return command, acceleration, yaw_rad, height_m, pilot.status(guidance), desired
+
+    def _newest_order(self, i: int, time_s: float) -> MissionOrder | None:
+        """The last one until now that was not flown yet."""
+        waiting, newest = self._orders.get(i, []), None
+        while waiting and waiting[0][0] <= time_s:
+            newest = waiting.pop(0)[1]
+        return newest
 
     def _neighbours(
         self, i: int, time_s: float, positions: FloatArray, velocities: FloatArray
@@ -123,14 +136,18 @@ def start_yaw(scenario: ScenarioConfig) -> float:
     return Navigator(mission, scenario.drone.safety.gate).step(moment).course_rad or 0.0
 
 
-def fly_exact_states(scenario: ScenarioConfig, *, gated: bool = True) -> tuple[FloatArray, FloatArray, FloatArray]:
+def fly_exact_states(
+    scenario: ScenarioConfig, *, gated: bool = True, orders: Orders | None = None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Times (S,) s, positions (S, N, 3) m and velocities (S, N, 3) m/s in NED, as each step begins.
+
+    `orders` are flown at the first step after them.
 
     The paper's "UAV flocking based on ground truth cluster state": each vehicle gets what the flocking law commands on
     the true positions and velocities of all.
     """
     times = step_times(scenario)
-    flock, loop = ExactFlock(scenario), ControlLoop(scenario, gated=gated)
+    flock, loop = ExactFlock(scenario, orders), ControlLoop(scenario, gated=gated)
     vehicles = Vehicles(scenario.vehicles, scenario.vehicle, yaw_rad=start_yaw(scenario), seed=scenario.seed)
     positions, velocities = [], []
     for time_s in times:
@@ -140,9 +157,11 @@ def fly_exact_states(scenario: ScenarioConfig, *, gated: bool = True) -> tuple[F
     return times, np.array(positions), np.array(velocities)
 
 
-def exact_states_at(times: FloatArray, scenario: ScenarioConfig) -> tuple[FloatArray, FloatArray]:
+def exact_states_at(
+    times: FloatArray, scenario: ScenarioConfig, orders: Orders | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Positions (S, N, 3) m and velocities (S, N, 3) m/s of `fly_exact_states`, interpolated at ``times`` (S,) s."""
-    steps_s, position, velocity = fly_exact_states(scenario)
+    steps_s, position, velocity = fly_exact_states(scenario, orders=orders)
     flat = [values.reshape(len(steps_s), -1) for values in (position, velocity)]
     at = [np.stack([np.interp(times, steps_s, column) for column in values.T], axis=1) for values in flat]
     shape = (len(times), *position.shape[1:])

@@ -18,7 +18,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.scenario import ScenarioConfig
 from flockd.core.errors import UnavailableError
 from flockd.onboard.sources import clock_at
-from flockd.review.flight_log.fleet_log import FleetFrame, FleetRun, fleet_key_frames, fleet_log
+from flockd.review.flight_log.fleet_log import FleetFrame, FleetRun, fleet_key_frames, fleet_log, recorded_orders
 from flockd.sim.autopilots import Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.clearances import with_obstacles
@@ -104,7 +104,11 @@ def fly_fleet(
         run = fleet.fly(progress)
         fleet.land(run)
         times = np.array([frame.time_s - run.frames[0].time_s for frame in run.frames])
-        companion = exact_states_at(times, scenario)
+        orders = {
+            i: recorded_orders(recorded, config.name, run.frames[0].time_s)
+            for i, config in zip(fleet.drones, configs, strict=True)
+        }
+        companion = exact_states_at(times, scenario, orders)
         log = fleet_log(scenario, configs, run, recorded, speed_factor, companion)
         return Flight(with_obstacles(log, scenario), fleet_key_frames(recorded, run))
 
@@ -120,7 +124,7 @@ class _Fleet:
         self._autopilots, self._station, self._server, self._daemons = autopilots, station, server, daemons
         self._all = range(len(scenario.vehicles))
         self._hands = {i: HandPilot(scenario, i) for i in self._all if scenario.vehicles[i].by_hand}
-        self._drones = [i for i in self._all if i not in self._hands]
+        self.drones = [i for i in self._all if i not in self._hands]
         """Those with a daemon, in the order of the daemons."""
         self._needed: Sequence[Program] = ()
         """Programs that have to run now; `_poll` raises when one has ended."""
@@ -143,10 +147,10 @@ class _Fleet:
         self._daemons.start()
         self._needed = (*self._autopilots.programs(), *self._daemons.programs())
         self._wait_for(
-            lambda i: self._daemons.is_ready(self._drones.index(i)),
+            lambda i: self._daemons.is_ready(self.drones.index(i)),
             DAEMON_START_S * self._speed_factor,
             lambda i: f"the daemon of drone{i + 1} was not ready after {DAEMON_START_S:g} s ({self._last_messages(i)})",
-            of=self._drones,
+            of=self.drones,
         )
 
     def take_off(self) -> None:
@@ -158,7 +162,7 @@ class _Fleet:
             lambda i: self._status(i).startswith("ready") and station.mode_is(i, "LOITER"),
             READY_S,
             lambda i: f"flockd was not ready to fly drone{i + 1} after {READY_S:g} s ({self._last_messages(i)})",
-            of=self._drones,
+            of=self.drones,
         )
         modes: dict[int, Mode] = {i: "POSCTL" if i in self._hands else "OFFBOARD" for i in self._all}
         self._request(
@@ -216,7 +220,7 @@ class _Fleet:
 
     def _status(self, i: int) -> str:
         """What a drone's daemon said of itself last."""
-        return self._daemons.status(self._drones.index(i))
+        return self._daemons.status(self.drones.index(i))
 
     def _fly_by_hand(self, flying_s: float | None) -> None:
         """Moves the sticks of who is flown by hand: along their missions, or, before the flight, not at all."""
@@ -235,7 +239,7 @@ class _Fleet:
 
         The reason is read when its daemon and its autopilot have had time to tell it.
         """
-        for i, program in zip(self._drones, self._daemons.programs(), strict=True):
+        for i, program in zip(self.drones, self._daemons.programs(), strict=True):
             if program.name in run.handed_over:
                 continue
             if program.ended is None and not self._autopilot_ended(i) and self._station.mode_is(i, "OFFBOARD"):
@@ -279,8 +283,8 @@ class _Fleet:
     def _last_messages(self, i: int) -> str:
         """The last messages of a drone's daemon and autopilot."""
         messages = []
-        if i in self._drones:
-            output = self._daemons.programs()[self._drones.index(i)].last_output
+        if i in self.drones:
+            output = self._daemons.programs()[self.drones.index(i)].last_output
             messages.append(f"flockd: {self._status(i) or output()}")
         if self._station.last_text(i):
             messages.append(f"autopilot: {self._station.last_text(i)}")

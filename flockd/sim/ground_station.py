@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import select
 import socket
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -29,7 +30,7 @@ from flockd.sim.autopilot.sticks import stick_curve
 from flockd.sim.leftovers import described, user_of_port
 from flockd.sim.vehicles import REFERENCE_DEG
 
-Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "OFFBOARD"]
+Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "ACRO", "OFFBOARD"]
 """By pymavlink's names; LOITER is Hold."""
 
 SYSTEM_ID = 255
@@ -207,6 +208,23 @@ class GroundStation:
         vehicle = self._vehicles[number]
         with self._lock:
             vehicle.mav.manual_control_send(vehicle.number + 1, forward, 0, 500, 0, 0)
+
+    def set_parameter(self, number: int, name: str, value: int | float) -> None:
+        """Sends a parameter: an int for an INT32, a float for a REAL32."""
+        vehicle = self._vehicles[number]
+        kind = mavlink.MAV_PARAM_TYPE_INT32 if isinstance(value, int) else mavlink.MAV_PARAM_TYPE_REAL32
+        # PX4 takes an integer's bytes where MAVLink has a float.
+        wire = struct.unpack("<f", struct.pack("<i", value))[0] if isinstance(value, int) else value
+        with self._lock:
+            vehicle.mav.param_set_send(vehicle.number + 1, 1, name.encode(), wire, kind)
+
+    def send_velocity(self, number: int, velocity: FloatArray) -> None:
+        """Sends a setpoint once, as flockd does: a velocity (2,) m/s north and east, at a height of 4 m."""
+        vehicle = self._vehicles[number]
+        with self._lock:
+            vehicle.mav.set_position_target_local_ned_send(
+                0, vehicle.number + 1, 1, 1, 2531, 0, 0, -4.0, *velocity, 0, 0, 0, 0, 0, 0
+            )
 
     def _command(self, vehicle: _Vehicle, command: int, *numbers: float) -> None:
         values = (*numbers, *[0.0] * (7 - len(numbers)))

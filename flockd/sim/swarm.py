@@ -128,7 +128,9 @@ def fly(
         flow="none" if perception == "truth" else "truth" if "flow" in swap else scenario.drone.perception.flow,
         wall_s=time.perf_counter() - begin,
         gated=gated,
-        slowed_share=loop.slowed_share,
+        slowed_share=loop.slowed.share,
+        slowed_by=loop.slowed.by_cause,
+        handed_over=loop.handed_over,
     )
     key_frames = sorted((frame for frame in key_frames if frame.time_s < metadata.duration_s), key=lambda f: f.drone)
     return Flight(with_obstacles(builder.build(metadata, companion or builder.true_path), scenario), tuple(key_frames))

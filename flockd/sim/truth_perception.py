@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
-from flockd.flight.geometry import Rig, RigCamera
+from flockd.flight.geometry import Rig, RigCamera, ZMap
 from flockd.flight.perception import Crop, Instance, Networks, RangeEstimate, SceneMaps
 from flockd.sim.renderer import View, true_flow
 
@@ -69,7 +69,7 @@ class TruthPerception:
         now = _known(self._now)
         view = now.views[frame.camera]
         true = SceneMaps(
-            depth=np.where(np.isfinite(view.depth), view.depth, np.float32(_SKY_M)),
+            depth=ZMap(np.where(np.isfinite(view.depth), view.depth, np.float32(_SKY_M))),
             labels=view.ids,
             instances=tuple(self._instances(camera, now)),
         )

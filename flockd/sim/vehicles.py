@@ -11,15 +11,17 @@ from flockd.core.config.scenario import SensorConfig, StartConfig, VehicleConfig
 from flockd.core.messages import FloatArray, VehicleState
 from flockd.flight.geometry import rotation_from_euler
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, Ground, level_ground
+from flockd.sim.wind import GustField
 
 GRAVITY_M_S2 = 9.81
+MAX_LEAN_M_S2 = GRAVITY_M_S2 * math.tan(math.radians(45.0))
+"""The largest acceleration, at PX4's default of MPC_TILTMAX_AIR."""
 _MAX_SUBSTEP_S = 0.02
 _DRAG_PER_S = 0.3
 """Deceleration by the air for each m/s against it: what a multirotor leans against to hold its speed."""
 MAX_CLIMB_M_S = 1.5
 CLIMB_TIME_S = 1.0
 """From a height error to the climb that is asked for; that one is answered in a quarter of it: no overshoot."""
-_GUST_TIME_S = 2.0
 _ATTITUDE_ERROR_TIME_S = 30.0
 _VELOCITY_ERROR_TIME_S = 10.0
 _POSITION_ERROR_TIME_S = 60.0
@@ -31,20 +33,23 @@ REFERENCE_DEG = (1.0, 1.0)
 class Vehicles:
     """All vehicles of a flight.
 
-    Horizontal velocity follows a setpoint as a first-order lag of limited acceleration. Height is held, or changed as
-    by a critically damped controller of limited climb, down to the ground at z = 0. The attitude is the one whose
-    thrust gives the horizontal acceleration. The arrays are replaced by `step`, never changed in place: `position` (n,
-    3) m and `velocity` (n, 3) m/s in NED, `R_ned_body` (n, 3, 3).
+    Horizontal velocity follows a setpoint as a first-order lag of limited acceleration. With the same time constant it
+    comes back from what gusts add, as hard as the vehicle can lean: an autopilot limits what it does for a setpoint,
+    and leans against wind as far as need be. Height is held, or changed as by a critically damped controller of limited
+    climb, down to the ground at z = 0. The attitude is the one whose thrust gives the horizontal acceleration. The
+    arrays are replaced by `step`, never changed in place: `position` (n, 3) m and `velocity` (n, 3) m/s in NED,
+    `R_ned_body` (n, 3, 3).
     """
 
     def __init__(self, starts: Sequence[StartConfig], config: VehicleConfig, *, yaw_rad: float = 0.0, seed: int = 0):
         """Start in level flight at the configured velocities, all heading `yaw_rad`; `seed` rules the gusts."""
         n = len(starts)
         self._config = config
-        self._random = np.random.default_rng(seed)
+        self._gusts, self._time_s = GustField.of(config, seed), 0.0
+        self._blown = np.zeros((n, 2))
+        """What of the velocity gusts added, m/s."""
         self._wind = np.array(config.wind_m_s)
         self._yaw = np.full(n, yaw_rad)
-        self._gust = self._gust_sigma * self._random.normal(size=(n, 2))
         self.position = np.array([start.position_m for start in starts])
         self.velocity = np.array([[*start.velocity_m_s, 0.0] for start in starts])
         self._thrust = self._drag(self.velocity[:, :2])
@@ -69,17 +74,16 @@ class Vehicles:
         config = self._config
         velocity = self.velocity[:, :2]
         # The exact mean acceleration of a first-order lag over dt, then its limit.
-        wanted = (setpoints - velocity) * (-math.expm1(-dt / config.velocity_time_constant_s) / dt)
-        norms = np.linalg.norm(wanted, axis=1, keepdims=True)
-        steered = wanted * np.minimum(1.0, config.max_acceleration_m_s2 / np.maximum(norms, 1e-12))
-        acceleration = steered + self._gust
+        answer_per_s = -math.expm1(-dt / config.velocity_time_constant_s) / dt
+        followed = limit_norms((setpoints - (velocity - self._blown)) * answer_per_s, config.max_acceleration_m_s2)
+        steered = limit_norms(followed - self._blown * answer_per_s, MAX_LEAN_M_S2)
+        push = self._gusts.push(self._time_s, self.position)
+        self._blown = self._blown + (steered - followed + push) * dt
+        acceleration = steered + push
+        self._time_s += dt
         self.position = self.position.copy()
         self.position[:, :2] += velocity * dt + acceleration * (dt**2 / 2)
         self.velocity = np.column_stack([velocity + acceleration * dt, self.velocity[:, 2]])
-
-        keep = math.exp(-dt / _GUST_TIME_S)
-        kick = self._random.normal(size=self._gust.shape)
-        self._gust = keep * self._gust + math.sqrt(1 - keep**2) * self._gust_sigma * kick
 
         lean = 1.0 if config.tilt_time_constant_s == 0 else -math.expm1(-dt / config.tilt_time_constant_s)
         self._thrust = self._thrust + lean * (steered + self._drag(self.velocity[:, :2]) - self._thrust)
@@ -100,15 +104,6 @@ class Vehicles:
     def _is_level(self) -> bool:
         """Whether all fly level, off the ground."""
         return bool((self.velocity[:, 2] == 0.0).all() and (self.position[:, 2] < 0.0).all())
-
-    @property
-    def _gust_sigma(self) -> float:
-        """The gusts' acceleration, m/s^2, an Ornstein-Uhlenbeck process: such that velocity's deviation is `gust_m_s`.
-
-        The lag, of time constant tau, passes tau^2 T / (T + tau) of the variance of a process of time constant T.
-        """
-        tau = self._config.velocity_time_constant_s
-        return self._config.gust_m_s / tau * math.sqrt((_GUST_TIME_S + tau) / _GUST_TIME_S)
 
     def _drag(self, velocity: FloatArray) -> FloatArray:
         """(n, 2) m/s^2 of thrust that the air takes up, with wind."""
@@ -169,6 +164,12 @@ class SimulatedAutopilot:
         """A Gauss-Markov process after `elapsed_s`."""
         keep = math.exp(-elapsed_s / time_constant_s)
         return keep * error + math.sqrt(1 - keep**2) * sigma * self._random.normal(size=error.shape)
+
+
+def limit_norms(vectors: FloatArray, most: float) -> FloatArray:
+    """(n, 2), each shorter where it is longer than `most`."""
+    norms = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors * np.minimum(1.0, most / np.maximum(norms, 1e-12)), dtype=float)
 
 
 def attitude(thrust: FloatArray, yaw: FloatArray) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -35,21 +36,24 @@ vary:
   drones: {values: [2, 7]}
 cases:
   calm: {}
-  windy: {vehicle.wind_m_s: [4, -1]}
+  windy: {vehicle.gust_m_s: 0.4}
 """
     plan = Plan.load(campaign_file(tmp_path, text))
     assert [tuple(cell.parameters.values()) for cell in plan.cells] == [
         (case, cohesion, drones) for case in ("calm", "windy") for cohesion in (0.1, 0.2, 0.3) for drones in (2, 7)
     ]
     last = plan.recipe(plan.cells[-1], 4).scenario()
-    assert (last.drone.flocking.cohesion, len(last.vehicles), last.vehicle.wind_m_s) == (0.3, 7, (4, -1))
+    assert (last.drone.flocking.cohesion, len(last.vehicles), last.vehicle.gust_m_s) == (0.3, 7, 0.4)
     assert last.seed == 4
     first = plan.recipe(plan.cells[0], 0).scenario()
-    assert (first.vehicle.wind_m_s, first.drone.flocking.separation) == ((0.0, 0.0), 10.0)
+    assert (first.vehicle.gust_m_s, first.drone.flocking.separation) == (0.0, 10.0)
 
 
 def test_a_flight_draws_its_own_values_from_its_seed_alone(tmp_path: Path) -> None:
-    text = "vary:\n  vehicle.gust_m_s: {low: 0.1, high: 0.5}\n  vehicle.wind_m_s: {low: [0, -2], high: [3, 0]}\n"
+    text = (
+        "perception: sight\n"
+        "vary:\n  vehicle.gust_m_s: {low: 0.1, high: 0.5}\n  vehicle.wind_m_s: {low: [0, -2], high: [3, 0]}\n"
+    )
     plan = Plan.load(campaign_file(tmp_path, text))
     flights = [plan.recipe(plan.cells[0], number).scenario() for number in range(6)]
     gusts = [flight.vehicle.gust_m_s for flight in flights]
@@ -67,11 +71,11 @@ def test_a_flight_draws_its_own_values_from_its_seed_alone(tmp_path: Path) -> No
 def test_a_plan_is_its_own_copy(tmp_path: Path) -> None:
     """What is rerun months later needs no file but the folder's."""
     text = (
-        "fixed: {vehicle.wind_m_s: [1, 2]}\ncases: {new: {}, before: {drones: 3}}\n"
+        "perception: sight\nfixed: {vehicle.wind_m_s: [1, 2]}\ncases: {new: {}, before: {drones: 3}}\n"
         "vary: {drone.flocking.separation: {values: [9.0]}, drone.flocking.cohesion: {values: [0.1, 0.2]}}\n"
     )
     plan = Plan.load(campaign_file(tmp_path, text))
-    again = Plan.from_json(plan.to_json())
+    again = Plan.from_values(json.loads(plan.to_json()))
     assert again.to_json() == plan.to_json()
     assert again.cells == plan.cells  # neither cases nor keys are in the order of the alphabet
     assert again.recipe(again.cells[1], 5).scenario() == plan.recipe(plan.cells[1], 5).scenario()
@@ -134,6 +138,23 @@ def test_seeds_that_change_nothing_are_refused(tmp_path: Path) -> None:
     (problem,) = problems(tmp_path, "", head)
     assert problem.startswith("FILE:3: seeds: are all the same flight")
     Plan.load(campaign_file(tmp_path, "fixed: {vehicle.gust_m_s: 0.2}\n", head))
+
+
+@pytest.mark.parametrize("perception", ["truth", "control"])
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("fixed: {vehicle.wind_m_s: [4, -2]}\n", "FILE:6: fixed.vehicle.wind_m_s: "),
+        ("cases:\n  calm: {}\n  wind: {vehicle.wind_m_s: [4, -2]}\n", "FILE:8: cases.wind.vehicle.wind_m_s: "),
+        ("vary:\n  vehicle.wind_m_s: {low: [0, 0], high: [3, 0]}\n", "FILE:7: vary.vehicle.wind_m_s: "),
+    ],
+)
+def test_a_wind_that_no_flight_would_notice_is_refused(text: str, line: str, perception: str, tmp_path: Path) -> None:
+    """It tilts the drone and its cameras, and without images nothing follows from that."""
+    (problem,) = problems(tmp_path, f"perception: {perception}\n{text}")
+    assert problem.startswith(f"{line}changes nothing without images")
+    assert "vehicle.gust_m_s" in problem
+    Plan.load(campaign_file(tmp_path, f"perception: sight\n{text}"))
 
 
 def test_a_drones_file_is_no_scenario(tmp_path: Path) -> None:

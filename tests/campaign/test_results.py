@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import fcntl
+import os
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -13,11 +15,12 @@ from flockd.campaign.campaign_figures import parameter_curves
 from flockd.campaign.campaign_page import write_campaign_page, write_comparison_page
 from flockd.campaign.flight_kinds import FLIGHT_KINDS, FlightKind
 from flockd.campaign.flight_plan import Plan
-from flockd.campaign.flight_table import write_table
+from flockd.campaign.flight_table import FlightTable, write_table
 from flockd.campaign.folder import CampaignFolder
 from flockd.campaign.results import Results
 from flockd.campaign.verdicts import compare
-from flockd.core.errors import UsageError
+from flockd.cli import main
+from flockd.core.errors import UnavailableError, UsageError
 from tests.campaign.flights import HEAD, Shuffled, campaign_file, flown, made_up
 from tools.docs.docs_campaign import table
 
@@ -120,6 +123,84 @@ def test_another_campaign_is_refused(plan: Plan, tmp_path: Path) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(UsageError, match="another process is flying this campaign"):
             flown(plan, tmp_path / "out", Shuffled(1))
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"{garbled", "Expecting property name"),
+        (b"[" * 100_000, "it is nested more than 50 levels deep"),
+        (b'{"campaign": ' + b"[" * 200 + b"]" * 200 + b"}", "it is nested more than 50 levels deep"),
+        (b"\xff{}", "it is not UTF-8 text"),
+        (b"[]", "it holds something else"),
+        (b"{}", "it has no 'errors'"),
+        (b'{"errors": null, "campaign": {"campaign": "x"}, "scenario": {}}', "scenario: Field required"),
+        (None, "it is not an ordinary file"),
+    ],
+)
+def test_a_plan_that_is_none_is_one_sentence(
+    content: bytes | None, why: str, plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whether it is reported, flown again, or gone on with."""
+    folder = tmp_path / "out"
+    flown(plan, folder, Shuffled(1))
+    path = folder / "campaign.json"
+    path.unlink()
+    if content is None:
+        os.mkfifo(path)
+    else:
+        path.write_bytes(content)
+    for command in (["report", str(folder)], ["rerun", str(folder / "c0-s0")]):
+        assert main(["campaign", *command]) == 2
+        told = capsys.readouterr().err
+        assert told.startswith(f"{path}: is not a plan of this flockd (")
+        assert why in told
+        assert told.count("\n") == 1
+    with pytest.raises(UsageError) as refused:
+        flown(plan, folder, Shuffled(1))
+    assert "\n" not in str(refused.value)
+
+
+def test_a_plan_with_a_number_that_is_none_is_gone_on_with_or_refused_but_never_a_traceback(
+    plan: Plan, tmp_path: Path
+) -> None:
+    """JSON as Python writes it has NaN, which differs from itself."""
+    flown(plan, tmp_path / "out", Shuffled(1))
+    path = tmp_path / "out" / "campaign.json"
+    path.write_text(path.read_text(encoding="utf-8").replace('"seeds": 6', '"seeds": NaN'), encoding="utf-8")
+    with pytest.raises(UsageError, match=r"`campaign\.seeds` was NaN and is 6 now"):
+        flown(plan, tmp_path / "out", Shuffled(1))
+    nan = Plan(plan.config, {**plan.base, "x": float("nan")})
+    with CampaignFolder(tmp_path / "nan", nan):
+        pass
+    with CampaignFolder(tmp_path / "nan", nan):
+        pass
+
+
+@pytest.mark.parametrize("damage", ["other columns", "other types", "no table", "pipe"])
+@pytest.mark.parametrize("name", ["parts/c0-s0.parquet", "flights.parquet", "timings.parquet"])
+def test_a_table_that_is_another_campaigns_is_one_sentence(damage: str, name: str, plan: Plan, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    flown(plan, folder, Shuffled(1))
+    path = folder / name
+    own = pq.read_table(folder / "timings.parquet")
+    path.unlink(missing_ok=True)
+    match damage:
+        case "other columns":
+            pq.write_table(own.rename_columns([f"x{k}" for k in range(own.num_columns)]), path)
+        case "other types":
+            columns = {"flights": FlightTable(plan).flights_schema, "timings": FlightTable(plan).timings_schema}
+            names = columns.get(path.stem, FlightTable(plan).schema).names
+            pq.write_table(pa.table(dict.fromkeys(names, pa.array(["word"] * len(own)))), path)
+        case "no table":
+            path.write_bytes(b"PAR1 and nothing more")
+        case _:
+            os.mkfifo(path)
+    with pytest.raises(UnavailableError) as refused:
+        flown(plan, folder, Shuffled(1))
+    assert str(refused.value).startswith(f"{path}: cannot be read (")
+    assert str(refused.value).endswith("; delete it, and its flights are flown again")
+    assert "\n" not in str(refused.value)
 
 
 def test_the_report_says_what_was_flown(plan: Plan, tmp_path: Path) -> None:

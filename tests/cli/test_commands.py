@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from flockd.cli import _parser, main
+from flockd.cli import _parser, installing, main
 from flockd.core.errors import ModelError
 
 ROOT = Path(__file__).parents[2]
@@ -147,7 +147,7 @@ def test_config_check_finds_models_that_are_not_there(scenario: Path, capsys: py
     assert main(["config", "check", str(scenario)]) == 78
     error = capsys.readouterr().err
     assert error.startswith(f"{drone}:23: perception.flow: flow_in8 is not a known model, as ")
-    assert error.endswith("is missing; write one of flow, flow_int8\n")
+    assert error.endswith("is missing; write one of flow, flow_int8, dis\n")
     drone.write_text(SIMULATOR.replace("flow: flow_int8", "flow: distance_int8"), encoding="utf-8")
     assert main(["config", "check", str(drone)]) == 78
     assert capsys.readouterr().err == (
@@ -250,7 +250,7 @@ def test_a_shell_completes_commands_and_options() -> None:
 @pytest.mark.parametrize(
     ("error", "code", "told"),
     [
-        (ModuleNotFoundError("", name="numba"), 69, "numba is not installed; run: pip install 'flockd[sim]'"),
+        (ModuleNotFoundError("", name="numba"), 69, f"numba is not installed; run: {installing('sim')}"),
         (
             ModelError("models/flow.yaml: sha256: differs; restore it"),
             78,
@@ -268,6 +268,11 @@ def test_what_a_flight_lacks_is_one_sentence(
     monkeypatch.setattr("flockd.cli.sim._scenario", fails)
     assert main(["sim"]) == code
     assert capsys.readouterr().err == f"{told}\n"
+
+
+def test_an_extra_is_added_to_a_checkout_without_freezing_it() -> None:
+    checkout = Path(__file__).parents[2]
+    assert installing("view") == f"{sys.executable} -m pip install -e '{checkout}[view]'"
 
 
 def test_models_in_an_empty_folder_are_unavailable(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -326,9 +331,20 @@ def test_each_flight_has_its_own_folder(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("flockd.review.report.flight_folder.write_report", lambda folder, progress, processes: folder)
+    short = ["sim", "--perception", "truth", "--duration", "2", "--quiet"]
     for expected in ("", "-2", "-3"):
-        assert main(["sim", "--perception", "truth", "--duration", "2", "--quiet"]) == 0
-        assert capsys.readouterr().out == f"out/paper_flight-truth-seed0{expected}/report.html\n"
+        assert main(short) == 0
+        assert capsys.readouterr().out == f"out/paper_flight-truth-duration_2-seed0{expected}/report.html\n"
+    windy = [*short, "--wind", "3,-1.5", "--drones", "3", "--no-gate"]
+    assert main(windy) == 0
+    folder = "out/paper_flight-truth-duration_2-wind_3,-1.5-drones_3-no-gate-seed0"
+    assert capsys.readouterr().out == f"{folder}/report.html\n"
+    assert main(["report", "out/paper_flight-truth-duration_2-seed0", folder]) == 0
+    first, second, heads, *rows = capsys.readouterr().out.splitlines()
+    assert (first, second) == ("first: out/paper_flight-truth-duration_2-seed0", f"second: {folder}")
+    assert heads.split() == ["figure", "first", "second", "difference"]
+    assert "--wind 3,-1.5 differs" in [" ".join(row.split()) for row in rows]
+    assert max(map(len, rows)) <= 80
 
 
 def test_an_interrupted_flight_leaves_its_report_and_can_be_flown_again(
@@ -390,7 +406,7 @@ def test_two_flights_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[
     rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)["rows"]}
     assert (rows["seed"]["first"], rows["seed"]["second"]) == (0, 1)
     assert (rows["flown"]["first"], rows["flown"]["second"], rows["flown"]["difference"]) == (5.0, 6.0, 1.0)
-    assert "neighbours known within 10 m" not in rows, "neither has it"
+    assert "known within 10 m" not in rows, "neither has it"
     assert main(["report", str(tmp_path / "a"), str(tmp_path / "b")]) == 0
     table = capsys.readouterr().out
     assert "+1.0 s" in table

@@ -79,6 +79,35 @@ def test_on_a_terminal_it_asks_until_the_answer_is_one(tmp_path: Path, monkeypat
     assert next(answers, None) is None
 
 
+def test_an_answer_that_the_file_could_not_have_is_asked_for_again_and_no_other_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answers = iter(["my drone", "kite", "2", "", "", "", "", "/dev/ttyAMA0", "serial:///dev/ttyAMA0:57600", "", ""])
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    monkeypatch.setattr("builtins.input", lambda _: next(answers))
+    file = tmp_path / "asked.yaml"
+    assert main(["config", "new", "drone", str(file)]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert told[0] == "'my drone' is not a name; write my_drone"
+    assert told[1].startswith("'/dev/ttyAMA0' is not an address; write an address, as in `serial:///dev/ttyAMA0:")
+    drone = load_drone(file)
+    assert (drone.name, drone.safety.first_flight_layer) == ("kite", 2)
+    assert drone.autopilot is not None
+    assert drone.autopilot.address == "serial:///dev/ttyAMA0:57600"
+    assert next(answers, None) is None
+
+
+def test_a_new_drones_devices_have_to_be_filled_in(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "new.yaml"
+    assert main(["config", "new", "drone", str(file), "--cameras", "2", "--defaults"]) == 0
+    assert main(["config", "check", str(file)]) == 78
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 2
+    assert "source.cameras[0].device: is yet to be filled in (CHANGE-ME); `flockd cameras --write FILE`" in told[0]
+    file.write_text(file.read_text(encoding="utf-8").replace("CHANGE-ME", "usb"), encoding="utf-8")
+    assert main(["config", "check", str(file)]) == 0
+
+
 def test_nothing_is_overwritten_without_force_nor_written_that_does_not_check(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -86,8 +115,9 @@ def test_nothing_is_overwritten_without_force_nor_written_that_does_not_check(
     file.write_text("mine", encoding="utf-8")
     assert main(["config", "new", "drone", str(file), "--defaults"]) == 2
     assert "exists; name another file, or overwrite it with --force" in capsys.readouterr().err
-    assert main(["config", "new", "drone", str(file), "--defaults", "--force", "--autopilot", "nowhere"]) == 2
-    assert "was not written, as it would not check (autopilot.address" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["config", "new", "drone", str(file), "--defaults", "--force", "--autopilot", "nowhere"])
+    assert "argument --autopilot: 'nowhere' is not an address; write an address, as in" in capsys.readouterr().err
     assert file.read_text(encoding="utf-8") == "mine"
     assert [path.name for path in tmp_path.iterdir()] == ["mine.yaml"]
     assert main(["config", "new", "drone", str(file), "--defaults", "--force"]) == 0

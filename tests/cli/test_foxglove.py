@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from flockd.cli import main
+from flockd.cli import installing, main
 
 
 def test_without_its_extra_it_says_what_to_install(
@@ -19,7 +19,7 @@ def test_without_its_extra_it_says_what_to_install(
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "foxglove", None)
     assert main(["foxglove", "--recordings", "nowhere"]) == 69
-    assert capsys.readouterr().err == "foxglove is not installed; run: pip install 'flockd[foxglove]'\n"
+    assert capsys.readouterr().err == f"foxglove is not installed; run: {installing('foxglove')}\n"
 
 
 def test_a_taken_port_is_reported_in_one_sentence() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from flockd.cli import main
+from flockd.cli import installing, main
 from tests.onboard.recording.made_up import MODELS, record
 
 
@@ -90,7 +90,7 @@ def test_export_writes_tables_and_images(
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     code = main(["record", "export", str(path), "--out", str(tmp_path / "p"), "--format", "parquet"])
     assert code == 69
-    assert capsys.readouterr().err == "pyarrow is not installed; run: pip install 'flockd[parquet]'\n"
+    assert capsys.readouterr().err == f"pyarrow is not installed; run: {installing('parquet')}\n"
     assert not (tmp_path / "p").exists()
 
 

@@ -19,10 +19,11 @@ NOW_S = 1000.0
 def _drone(name: str, state: str, *, alive: bool = True, age_s: float = 0.3, **more: Any) -> Watched:
     flight = FlightMessage(
         time_s=5.0, state=state, reasons=[], flight_mode="offboard", armed=True, in_air=True, heartbeat_age_s=0.1,
+        heartbeats_lost=0,
         battery_share=0.5, height_m=4.0, velocity_trim=[0.0, 0.0], gusts_m_s=0.1, silence=None, setpoints_sent=1,
-        setpoints_missed=0,
+        setpoints_missed=0, orders=[], orders_refused=0,
     )  # fmt: skip
-    return Watched("meadow", name, alive, {"flight": Heard(NOW_S - age_s, {**flight, **more})})
+    return Watched("meadow", name, alive, {"flight": Heard(NOW_S - age_s, {**flight, **more})}, announced=True)
 
 
 def test_the_worst_stands_first() -> None:
@@ -147,6 +148,6 @@ def test_a_piped_table_is_not_cut_at_80_columns(capsys: pytest.CaptureFixture[st
     sentence = "no heartbeat from the autopilot for 12.5 s, and more words than a line of 80 columns has room for"
     drone = _drone("a", "degraded", reasons=[{"event": "link_lost", "sentence": sentence}])
     tables_console().print(_table(status_rows([drone], NOW_S)))
-    _, row = capsys.readouterr().out.splitlines()
+    _, _, row = capsys.readouterr().out.splitlines()
     assert row.rstrip().endswith(sentence)
     assert row == row.rstrip(), "no padding to the width of a terminal that is not there"

@@ -46,8 +46,8 @@ def test_reactions_that_are_events_are_in_the_supervisors_table() -> None:
     assert named <= {event.value for event in rules(SafetyParameters())}
 
 
-def test_the_streamer_and_the_supervisor_lose_the_link_at_the_same_age() -> None:
-    assert set(HEARTBEAT.keys) == {"safety.heartbeat_timeout_s", "autopilot.max_heartbeat_age_s"}
+def test_two_heartbeats_may_be_lost_and_the_next_be_late() -> None:
+    assert HEARTBEAT.timeout >= 3.4 * HEARTBEAT.period_s
 
 
 def test_what_stalls_is_silent_within_half_a_second() -> None:

@@ -49,7 +49,9 @@ def fault_named(name: str) -> Fault:
 
 _HERE = "tests/faults/test_"
 _PX4 = "tests/sitl/test_px4_modes.py::test_px4_ends_in_the_mode_that_its_parameters_promise"
-"""With PX4 alone: skipped where FLOCKD_PX4 names none."""
+"""With PX4 alone: skipped where FLOCKD_PX4 names none. So the next with `px4`."""
+_CONTRACT = "tests/sitl/test_autopilot_contract.py::test_flockd_sees_what_px4_1_18_shows"
+_LINK = "tests/onboard/autopilot/test_link.py"
 
 # fmt: off
 CATALOGUE = (
@@ -178,6 +180,7 @@ CATALOGUE = (
         "leave the flock: Hold, or as configured",
         (
             f"{_HERE}autopilot.py::test_the_battery_is_low_or_the_position_lost",
+            "tests/onboard/daemon/test_flight.py::test_a_position_and_velocity_that_come_no_more_are_not_flown_by",
             f"{_PX4}[gps_off]",
             f"{_PX4}[estimator_lost]",
             f"{_PX4}[battery_low]",
@@ -466,12 +469,80 @@ CATALOGUE = (
         ),
     ),
     Fault(
+        52, "timesync-lies", "TIMESYNC jumps or creeps, or somebody else answers",
+        "not used; an event; attitudes are no worse than by arrival",
+        (
+            f"{_HERE}autopilot.py::test_timesync_lies",
+            "tests/onboard/autopilot/test_clock_sync.py::test_a_lying_timesync_is_not_used_and_said",
+        ),
+        within_s=5.0,
+    ),
+    Fault(
         60, "step-exception", "an exception that nobody expected in the pilot's step",
         "caught at the step's border; one step lost with its reason; three in a row: Hold",
         (
             f"{_HERE}computer.py::test_a_step_ends_in_an_error_that_nobody_expects",
         ),
         within_s=5.0,
+    ),
+    Fault(
+        61, "heartbeats-lost", "one or two heartbeats of the autopilot are lost, everything else arrives",
+        "flown on, counted",
+        (
+            f"{_HERE}autopilot.py::test_forty_heartbeats_are_lost_one_at_a_time_and_no_flight_ends",
+            f"{_LINK}::test_one_lost_heartbeat_loses_no_link_and_is_counted",
+            f"{_CONTRACT}[px4]",
+        ),
+        within_s=2.5,
+    ),
+    Fault(
+        62, "failsafe-then-resume", "the autopilot's own failsafe has acted, and flockd is asked to resume",
+        "not ready while nothing is offered; says what the pilot has to select",
+        (
+            f"{_HERE}autopilot.py::test_after_the_autopilots_failsafe_it_says_what_to_select_and_is_not_ready_before",
+            f"{_CONTRACT}[px4]",
+        ),
+        within_s=2.0,
+    ),
+    Fault(
+        63, "others-interfere", "a second sender of setpoints, a parameter changed in flight",
+        "an event with what was seen, then Hold",
+        (
+            f"{_HERE}autopilot.py::test_setpoints_of_another_program_are_told_and_end_in_hold",
+            f"{_HERE}autopilot.py::test_a_parameter_of_the_failsafe_that_is_changed_in_flight_is_told_and_ends_in_hold",
+            f"{_CONTRACT}[px4]",
+        ),
+        within_s=2.0,
+    ),
+    Fault(
+        64, "silent-autopilot",
+        "an autopilot that sends texts to ground stations only, refuses without a word, restarts, or loses events",
+        "the reason is in status and log, or `without a reason`",
+        (
+            f"{_HERE}autopilot.py::test_an_autopilot_that_refuses_without_a_word_is_told_as_such",
+            f"{_LINK}::test_an_autopilot_that_acts_on_the_loss_of_its_ground_station_hears_none_and_sends_no_texts",
+            f"{_LINK}::test_events_that_are_lost_are_requested_and_come",
+            f"{_LINK}::test_an_autopilot_that_has_started_anew_is_asked_for_its_streams_again",
+            f"{_CONTRACT}[px4]",
+        ),
+        within_s=2.0,
+    ),
+    Fault(
+        65, "landed-after-an-order", "landed and disarmed after an operator's land or hold",
+        "ready for the next flight",
+        (
+            f"{_HERE}autopilot.py::test_landed_and_disarmed_after_an_operators_order_the_next_flight_may_begin",
+        ),
+        within_s=2.0,
+    ),
+    Fault(
+        66, "own-stall", "the daemon's own stall, then Hold", "status says the cause first",
+        (
+            f"{_HERE}autopilot.py::test_after_the_autopilots_failsafe_it_says_what_to_select_and_is_not_ready_before",
+            "tests/onboard/autopilot/test_streamer.py::"
+            "test_a_stall_stays_the_cause_though_the_autopilot_has_left_offboard_meanwhile",
+        ),
+        within_s=2.0,
     ),
 )
 # fmt: on

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from flockd.core.config import DroneConfig
+from flockd.onboard.daemon.take_off import ARM_RETRY_S
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_telemetry import Mode
 from flockd.sim.autopilot.fake_vehicle import Demand
@@ -19,8 +20,8 @@ from tests.calm import clock
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import flying
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
-from tests.onboard.autopilot.flight import until
-from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, aboard
+from tests.onboard.autopilot.flight import Foreigner, until
+from tests.onboard.daemon.aboard import SECONDS_TO_FAIL, Watched, aboard
 
 pytestmark = pytest.mark.slow
 QUIET_S = 1.5
@@ -32,7 +33,7 @@ async def test_the_link_is_lost_and_comes_back(tmp_path: Path, record_property: 
     async with flying(tmp_path) as process:
         process.fake_autopilot.silent = True
         fault_s = time.monotonic()
-        await process.until_event("silent: no heartbeat from the autopilot for ")
+        await process.until_event("silent: no message from the autopilot for ")
         reacted(record_property, "link-lost", time.monotonic() - fault_s)
         await until(lambda: process.fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
         assert process.fake_autopilot.failsafe
@@ -64,9 +65,9 @@ class _Refuses(FakeAutopilot):
 
     asked_s = math.inf
 
-    def _select(self, mode: Mode) -> bool:
+    def _select(self, mode: Mode, component: int) -> bool:
         if mode != "OFFBOARD":
-            return super()._select(mode)
+            return super()._select(mode, component)
         self.asked_s = min(self.asked_s, clock())
         for number in range(2):
             part = REASON[50 * number : 50 * number + 50].encode()
@@ -122,6 +123,121 @@ async def test_the_battery_is_low_or_the_position_lost(
         assert len(process.fake_autopilot.setpoints) == sent
 
 
+async def test_forty_heartbeats_are_lost_one_at_a_time_and_no_flight_ends(
+    tmp_path: Path, port: int, record_property: RecordProperty
+) -> None:
+    """Of PX4's, one a second; each of the forty could end a flight."""
+    with FakeAutopilot(port, height_m=HOVER_M, clock=clock) as autopilot:
+        async with aboard(autopilot, port, tmp_path, change=_never_alone) as ship:
+            await ship.is_ready_in_the_air()
+            await ship.flies()
+            slowest_s = 0.0
+            for number in range(1, 41):
+                lost_s = clock()
+                autopilot.lose_heartbeats(1)
+                await until(lambda n=number: _heartbeats_lost(ship) >= n, SECONDS_TO_FAIL)  # type: ignore[misc]
+                slowest_s = max(slowest_s, clock() - lost_s)
+                assert autopilot.mode == "OFFBOARD"
+                assert ship.state() in {"normal", "degraded"}
+            reacted(record_property, "heartbeats-lost", slowest_s - 1.0)
+            assert _heartbeats_lost(ship) == 40
+            assert sum(event.startswith("the autopilot's heartbeat did not come") for event in ship.events) <= 1
+
+
+def _heartbeats_lost(ship: Watched) -> int:
+    return int(ship.heard()["flight"].message["heartbeats_lost"])
+
+
+def _never_alone(config: DroneConfig) -> DroneConfig:
+    return config.model_copy(update={"safety": config.safety.model_copy(update={"alone_s": None})})
+
+
+async def test_after_the_autopilots_failsafe_it_says_what_to_select_and_is_not_ready_before(
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, record_property: RecordProperty
+) -> None:
+    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
+        await ship.is_ready_in_the_air()
+        await ship.flies()
+        time.sleep(2.0)  # the loop is stuck, and the autopilot's failsafe acts
+        awake_s = clock()
+        await ship.until_event("silent: setpoints ended: the control loop is late, for more than 0.5 s")
+        reacted(record_property, "own-stall", clock() - awake_s)
+        await until(lambda: ship.heard()["flight"].message["state"] == "silent", SECONDS_TO_FAIL)
+        reasons = [reason["event"] for reason in ship.heard()["flight"].message["reasons"]]
+        assert reasons.index("stream_ended") == 0
+        assert "not_offboard" in reasons, "the consequence stands beside the cause"
+        assert (await ship.ask("ask/resume"))["accepted"] is True
+        resumed_s, sent = clock(), len(fake_autopilot.setpoints)
+        await until(lambda: ship.state() == "idle" and "autopilot_failsafe" in ship.matters(), SECONDS_TO_FAIL)
+        reacted(record_property, "failsafe-then-resume", clock() - resumed_s)
+        await asyncio.sleep(QUIET_S)
+        assert (ship.state(), len(fake_autopilot.setpoints)) == ("idle", sent)
+        fake_autopilot.pilot_selects("LOITER")
+        await ship.until_state("ready")
+        await ship.flies()
+
+
+async def test_setpoints_of_another_program_are_told_and_end_in_hold(
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, record_property: RecordProperty
+) -> None:
+    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
+        await ship.is_ready_in_the_air()
+        await ship.flies()
+        began_s = clock()
+        with Foreigner(fake_autopilot, north_m_s=0.0, east_m_s=3.0):
+            await until(lambda: "foreign_setpoints" in ship.matters(), SECONDS_TO_FAIL)
+            reacted(record_property, "others-interfere", clock() - began_s)
+            await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        assert not fake_autopilot.failsafe
+        await ship.until_event("asking: another program sends setpoints: the autopilot follows ")
+
+
+async def test_a_parameter_of_the_failsafe_that_is_changed_in_flight_is_told_and_ends_in_hold(
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, record_property: RecordProperty
+) -> None:
+    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
+        await ship.is_ready_in_the_air()
+        await ship.flies()
+        await asyncio.sleep(2.0)  # all have been read
+        changed_s, fake_autopilot.parameters["COM_OBL_RC_ACT"] = clock(), -1
+        await ship.until_event("the autopilot's COM_OBL_RC_ACT was changed in flight from 5 to -1")
+        reacted(record_property, "others-interfere", clock() - changed_s)
+        await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        await ship.until_event(
+            "asking: COM_OBL_RC_ACT was changed in flight from 5 to -1: the autopilot would not stop"
+        )
+
+
+async def test_an_autopilot_that_refuses_without_a_word_is_told_as_such(
+    tmp_path: Path, port: int, record_property: RecordProperty
+) -> None:
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as autopilot:
+        autopilot.wordless, autopilot.failing = True, {"check_gyro_not_calibrated"}
+        async with aboard(autopilot, port, tmp_path, arm_and_take_off=True) as ship:
+            await until(lambda: bool(ship.session.info.peers_zid()), SECONDS_TO_FAIL)  # it receives events
+            sentence = "the autopilot was asked to arm, which was refused for now without a reason; wait a few seconds"
+            asked_s = clock()
+            await ship.until_event(sentence)
+            reacted(record_property, "silent-autopilot", max(0.0, clock() - asked_s - ARM_RETRY_S))
+
+
+async def test_landed_and_disarmed_after_an_operators_order_the_next_flight_may_begin(
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot, record_property: RecordProperty
+) -> None:
+    async with aboard(fake_autopilot, port, tmp_path, change=_never_alone) as ship:
+        await ship.is_ready_in_the_air()
+        await ship.flies()
+        assert (await ship.ask("ask/land"))["accepted"] is True
+        await until(lambda: not fake_autopilot.armed, SECONDS_TO_FAIL)
+        disarmed_s = clock()
+        await until(lambda: "not_armed" in ship.matters() and "land_asked" not in ship.matters(), SECONDS_TO_FAIL)
+        reacted(record_property, "landed-after-an-order", clock() - disarmed_s)
+        fake_autopilot.pilot_arms()
+        fake_autopilot.pilot_selects("TAKEOFF")
+        await ship.until_state("ready")
+        await ship.flies()
+
+
 async def test_messages_with_absurd_values(tmp_path: Path) -> None:
     """None of them ends a task, and the drone flies on."""
     async with flying(tmp_path) as process:
@@ -146,6 +262,22 @@ async def test_messages_with_absurd_values(tmp_path: Path) -> None:
         assert process.program.ended is None
         assert "landed_state = 5" in process.log(), "counted and logged"
         assert "\x1b" not in process.log()
+
+
+@pytest.mark.parametrize("ahead_s", [0.9, -0.9])
+async def test_timesync_lies(ahead_s: float, tmp_path: Path, record_property: RecordProperty) -> None:
+    """Its replies jump, as somebody else's would; the stamps of attitudes stay. It is not used, and the drone flies."""
+    async with flying(tmp_path) as process:
+        await until(lambda: process.heard()["clock"].message["offset_s"] is not None, SECONDS_TO_FAIL)
+        process.fake_autopilot.clock_offset_s += ahead_s
+        fault_s = time.monotonic()
+        await process.until_event("the autopilot's clock, by TIMESYNC, is 0.9")
+        reacted(record_property, "timesync-lies", time.monotonic() - fault_s)
+        await until(lambda: process.heard()["clock"].message["offset_s"] is None, SECONDS_TO_FAIL)
+        steps = process.heard()["computer"].message["steps"]
+        await until(lambda: process.heard()["computer"].message["steps"] > steps + 4, SECONDS_TO_FAIL)
+        assert process.fake_autopilot.mode == "OFFBOARD"
+        await process.until_state("normal", "degraded")
 
 
 async def test_the_ground_is_reached_in_flight(tmp_path: Path, record_property: RecordProperty) -> None:

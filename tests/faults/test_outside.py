@@ -87,7 +87,7 @@ def test_status_shows_a_peer_that_publishes_nonsense() -> None:
     session = open_session("a test", [endpoint], [])
     texts = {"flight_mode": "\x1b[2J\x9b31m", "reasons": [{"event": "x", "sentence": "\x1b]0;owned\x07" + "y" * 5000}]}
     published = {
-        "hostile/flight": {**FLIGHT, **texts, "height_m": 1e300},
+        "hostile/flight": {**FLIGHT, **texts, "height_m": 1e6},
         "wrong/flight": {**FLIGHT, "battery_share": "full", "reasons": None},
         "right/flight": FLIGHT,
         "right/neighbours": {"time_s": 1.0, "neighbours": {"confirmed": 3}},

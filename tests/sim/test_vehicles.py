@@ -133,15 +133,15 @@ def test_it_leans_into_the_air_that_comes_against_it() -> None:
 
 
 def test_gusts_add_the_velocity_they_are_configured_for() -> None:
-    vehicles = Vehicles([START] * 300, VehicleConfig(gust_m_s=0.3), seed=2)
-    setpoints, yaw = np.ones((300, 2)), np.zeros(300)
     spread = []
-    for k in range(12):
-        vehicles.step(setpoints, yaw, 1.0)
-        if k >= 4:
-            spread.append(vehicles.velocity[:, :2] - 1.0)
+    for seed in range(100):
+        vehicles = Vehicles([START], VehicleConfig(gust_m_s=0.3), seed=seed)
+        for k in range(12):
+            vehicles.step(np.ones((1, 2)), np.zeros(1), 1.0)
+            if k >= 4:
+                spread.append(vehicles.velocity[0, :2] - 1.0)
     assert np.std(spread) == pytest.approx(0.3, rel=0.06)
-    assert abs(np.mean(spread)) < 0.02
+    assert abs(np.mean(spread)) < 0.03
 
 
 def test_gusts_depend_on_the_seed_alone() -> None:

@@ -133,7 +133,7 @@ PROVOCATIONS = (
     _set("SYS_HAS_NUM_DIST", "3", "0", "check_distance_sensor_missing", "range_finder_missing"),
     _set("SYS_HAS_NUM_OF", "1", "0", "check_optical_sensor_missing", "optical_flow_missing"),
     _set("COM_CPU_MAX", "1", "95", "check_cpuload_too_high", "processor_busy"),
-    _set("COM_PARACHUTE", "1", "0", "check_parachute_missing", "parachute_missing"),
+    _set("COM_PARACHUTE", "2", "0", "check_parachute_missing", "parachute_missing"),
     _set("COM_ARM_ODID", "2", "0", "check_open_drone_id_missing", "remote_id_missing"),
     _set("COM_ARM_TRAFF", "2", "0", "check_traffic_avoidance_missing", "traffic_missing"),
     _fail("gps", "check_modes_local_pos"),

@@ -24,7 +24,7 @@ import sys
 import tempfile
 import time
 from array import array
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -36,7 +36,6 @@ from flockd.core.data import data_path
 from flockd.core.messages import FloatArray, Frame, FrameSet, VehicleState
 from flockd.fleet.watcher import FleetWatcher
 from flockd.flight.pilot import FlockPilot
-from flockd.onboard.telemetry.zenoh_session import close_session, open_session
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.camera_simulator import CameraSimulator
 from flockd.sim.daemons import Daemons
@@ -245,7 +244,7 @@ def soak_daemon(minutes: float) -> dict[str, array[float]]:
             daemons.start()
             _wait_for(daemons, server)
             with FleetWatcher(None, listen=(), connect=(telemetry_at,)) as watcher:
-                return _watched(daemons, autopilot, watcher, telemetry_at, 60.0 * minutes)
+                return _watched(daemons, autopilot, watcher, 60.0 * minutes)
 
 
 def daemon_config(port: int, frames_at: str, telemetry_at: str) -> DroneConfig:
@@ -267,26 +266,22 @@ def _wait_for(daemons: Daemons, server: FrameServer) -> None:
 
 
 def _watched(
-    daemons: Daemons, autopilot: FakeAutopilot, watcher: FleetWatcher, endpoint: str, seconds: float
+    daemons: Daemons, autopilot: FakeAutopilot, watcher: FleetWatcher, seconds: float
 ) -> dict[str, array[float]]:
     samples: dict[str, array[float]] = {}
     program, until_s = daemons.programs()[0], time.monotonic() + seconds
-    resumed, session = 0, open_session("soak", (), (endpoint,))
-    resume = f"flockd/v1/*/{program.name}/ask/resume"
-    try:
-        while time.monotonic() < until_s:
-            if autopilot.mode != "OFFBOARD":  # the first time; and again when this computer was too busy to fly
-                resumed += _fly(autopilot, watcher, lambda: session.get(resume, timeout=1.0))
-            time.sleep(SAMPLE_S)
-            if program.ended is not None:
-                raise SystemExit(f"soak: the daemon has ended: {program.last_output()}")
-            _add(samples, {**process_facts(program.process.pid), **_told(watcher), "offboard selected": float(resumed)})
-    finally:
-        close_session(session)
+    resumed = 0
+    while time.monotonic() < until_s:
+        if autopilot.mode != "OFFBOARD":  # the first time; and again when this computer was too busy to fly
+            resumed += _fly(autopilot, watcher)
+        time.sleep(SAMPLE_S)
+        if program.ended is not None:
+            raise SystemExit(f"soak: the daemon has ended: {program.last_output()}")
+        _add(samples, {**process_facts(program.process.pid), **_told(watcher), "offboard selected": float(resumed)})
     return samples
 
 
-def _fly(autopilot: FakeAutopilot, watcher: FleetWatcher, resume: Callable[[], Iterable[object]]) -> bool:
+def _fly(autopilot: FakeAutopilot, watcher: FleetWatcher) -> bool:
     """As people do it: in Hold until the drone is ready, and offboard then; whether that was selected.
 
     With the switch left at offboard the autopilot stays in its failsafe, into which flockd sends nothing.
@@ -295,8 +290,8 @@ def _fly(autopilot: FakeAutopilot, watcher: FleetWatcher, resume: Callable[[], I
     flight = (drones[0].message("flight", time.monotonic()) if drones else None) or {}
     ready = flight.get("state") == "ready" and flight.get("flight_mode") == "hold"
     autopilot.pilot_selects("OFFBOARD" if ready else "LOITER")
-    if not ready:
-        list(resume())
+    if drones and not ready:
+        watcher.ask(f"{drones[0].fleet}/{drones[0].drone}", "resume", "soak")
     return ready
 
 

@@ -19,6 +19,7 @@ from typing import Any
 from flockd.cli import _parser
 from flockd.core.config import schema_of
 from flockd.core.config.safety import SafetyParameters
+from flockd.core.consistency import CHECKS
 from flockd.core.services import SERVICES
 from flockd.flight.safety.policy import Barrier, Reaction, rules
 from flockd.onboard.autopilot.refusal_reasons import REASONS
@@ -377,6 +378,20 @@ def faults_page() -> str:
         reaction = f"`{one.reaction}`" if one.reaction in events else one.reaction
         keys = ", ".join(f"`{key}`" for key in one.keys)
         lines.append(f"| {one.message} | {one.rate_hz:g} | {one.timeout:g} {one.unit} | {reaction} | {keys} |")
+    lines += [
+        "",
+        "## Consistency of sensors",
+        "",
+        "What one source says is compared with what the others lead to expect, as an extended Kalman filter does with",
+        "its innovations. SD: standard deviations of what is expected.",
+        "",
+        "| compared | limit | beyond it | where the limit comes from | begins with this default |",
+        "|---|---|---|---|---|",
+    ]
+    for check in CHECKS:
+        reaction = f"`{check.reaction}`" if check.reaction in events else check.reaction
+        keys = ", ".join(f"`{key}`" for key in check.keys)
+        lines.append(f"| {check.compared} | {check.limit:g} {check.unit} | {reaction} | {check.source} | {keys} |")
     return "\n".join(lines) + "\n"
 
 

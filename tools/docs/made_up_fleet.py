@@ -31,7 +31,7 @@ from flockd.core.messages import (
     VehicleState,
     Wanted,
 )
-from flockd.onboard.daemon.operator_commands import OperatorRequests, command_handler
+from flockd.onboard.daemon.operator_commands import OperatorCommands, OperatorRequests
 from flockd.onboard.telemetry import publish_step
 from flockd.onboard.telemetry.publisher import DEFAULT_ENDPOINT, ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, CameraMessage, ComputerMessage, FlightMessage, ReasonMessage
@@ -112,8 +112,10 @@ class MadeUpDrone:
         self._was = ""
         config = load_drone(data_path("config") / "simulator.yaml")
         about = AboutMessage(version=__version__, configuration=config.model_dump(mode="json"), commands=commands)
-        handle = command_handler(commands, self._requests, self, loop, self._event)
-        telemetry.announce(self.name, about, handle, self._image)
+        self._commands = OperatorCommands(
+            commands, self._requests, self, loop, self._event, identity=telemetry.identity
+        )
+        telemetry.announce(self.name, about, self._commands.handle, self._image)
 
     def fault(self, order: MissionOrder) -> str | None:
         """Takes every order, and flies none."""
@@ -171,10 +173,10 @@ class MadeUpDrone:
             time_s=time_s,
             state="degraded" if tired else "normal" if wanted == "offboard" else "asking",
             reasons=[] if sentence is None else [ReasonMessage(event="made_up", sentence=sentence)],
-            flight_mode=wanted, armed=True, in_air=True, heartbeat_age_s=0.1,
+            flight_mode=wanted, armed=True, in_air=True, heartbeat_age_s=0.1, heartbeats_lost=0,
             battery_share=max(0.1, 0.9 - 0.02 * self._number - time_s / 3000), height_m=height_m,
             velocity_trim=[0.0, 0.0], gusts_m_s=0.1, silence=None, setpoints_sent=20 * self._steps,
-            setpoints_missed=self._number,
+            setpoints_missed=self._number, orders=self._commands.recent(), orders_refused=self._commands.refused,
         )  # fmt: skip
 
     def _computer(self, time_s: float) -> ComputerMessage:

@@ -150,7 +150,7 @@ class _Clips:
 
 
 def _print_table(results: dict[str, dict[str, object]]) -> None:
-    table = Table("set", "images", *(f"{w} px" for w in WIDTH_CLASSES), "AP50", "false in 500", "proposals", "ms")
+    table = Table("set", "images", *(f"{w} px" for w in WIDTH_CLASSES), "AP50", "false, pictures", "proposals", "ms")
     for name, all_of in results.items():
         rows = {"": all_of, **{f" p >= {p}": one for p, one in all_of["at_probability"].items()}}  # type: ignore[attr-defined]
         for note, one in rows.items():
@@ -160,7 +160,7 @@ def _print_table(results: dict[str, dict[str, object]]) -> None:
             ]
             table.add_row(
                 name + note, str(all_of["images"]), *cells, "" if one["ap50"] is None else f"{one['ap50']:.3f}",
-                str(one["false_per_500_images"]), str(all_of["proposals_per_image"]), str(all_of["ms_per_image"]),
+                f"{one['false']} in {one['measured']}", str(all_of["proposals_per_image"]), str(all_of["ms_per_image"]),
             )  # fmt: skip
     Console(width=200).print(table)
 

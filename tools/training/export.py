@@ -84,7 +84,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
             "first_margin": 0.95,
             "cut_margin": 1.4,
             "mirror_scale": 0.9,
-            "min_half_angle_deg": 1.0,
+            "min_half_width_px": 4.0,  # as `samples.py` draws them
             "max_half_angle_deg": 35.0,
             "max_resize": 1.7,
             "max_crops": 4,

@@ -5,6 +5,7 @@ from flockd.core.config.drone import DroneConfig
 from flockd.core.config.envelope import outside_envelope
 from flockd.core.config.loader import (
     Overrides,
+    kind_of,
     load,
     load_campaign,
     load_drone,
@@ -20,6 +21,7 @@ __all__ = [
     "DroneConfig",
     "Overrides",
     "ScenarioConfig",
+    "kind_of",
     "load",
     "load_campaign",
     "load_drone",

@@ -7,13 +7,19 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from flockd.core import services
-from flockd.core.config.base import Distance, Section, Share, Speed
+from flockd.core.config.base import Distance, Section, Share, Speed, text
 
 
 class AutopilotParameters(Section):
     """How flockd reaches this drone's autopilot, and what it may ask of it."""
 
-    address: Annotated[str, Field(pattern=r"^(udpin|udpout|tcpin|tcpout|serial)://.+:\d+$")] = "udpin://127.0.0.1:14540"
+    address: Annotated[
+        str,
+        text(
+            r"^((udpin|udpout|tcpin|tcpout)://[^/]+|serial:///.+):\d+$",
+            "an address, as in `serial:///dev/ttyAMA0:921600` for a cable and its baud rate, or `udpin://0.0.0.0:14540`",
+        ),
+    ] = "udpin://127.0.0.1:14540"
     """`udpin://` waits for an autopilot that sends to this address; `serial:///dev/ttyS1:921600` is a cable."""
     system_id: Annotated[int, Field(ge=1, le=255)] | None = None
     """The autopilot's MAV_SYS_ID; other systems are ignored. By default that of the first heartbeat received."""
@@ -25,8 +31,6 @@ class AutopilotParameters(Section):
     max_gap_s: Annotated[float, Field(gt=0, le=0.9)] = services.SETPOINT.timeout
     """A longer gap between setpoints in offboard flight ends the stream until it is begun anew. Keep it below PX4's
     COM_OF_LOSS_T: PX4 returns to offboard by itself when setpoints come back."""
-    max_heartbeat_age_s: Annotated[float, Field(gt=0, le=10)] = services.HEARTBEAT.timeout
-    """The link counts as lost when no heartbeat has arrived for this long."""
     on_failure: Literal["hold", "land"] = "hold"
     """The mode that flockd requests from the autopilot when it cannot go on."""
     arm_and_take_off: bool = False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -18,6 +18,24 @@ Speed = Annotated[float, Field(ge=0, le=50)]
 """m/s; faster than any of these vehicles."""
 Share = Annotated[float, Field(ge=0, le=1)]
 Vector3 = tuple[float, float, float]
+
+
+def text(pattern: str, words: str) -> Any:
+    """The field of a text that has to match; ``words`` say how it looks, to people: what it is, then a comma."""
+    return Field(pattern=pattern, json_schema_extra={WORDS: words})
+
+
+WORDS = "words"
+"""The key of a JSON schema that holds what `text` was given."""
+Name = Annotated[str, text(r"^[A-Za-z0-9_.-]+$", "a name, of letters, digits, `_`, `.` and `-`")]
+PlainName = Annotated[str, text(r"^[a-z0-9_-]+$", "a name, of small letters, digits, `_` and `-`")]
+Endpoint = Annotated[
+    str,
+    text(
+        r"^((tcp|udp|tls|quic|ws)/.+:\d+([?#].*)?|(serial|vsock|unixpipe|unixsock-stream)/.+)$",
+        "a zenoh endpoint, as in `tcp/0.0.0.0:7447`",
+    ),
+]
 
 
 class Section(BaseModel):

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from flockd.core.config.base import NonNegative, Positive, Section, refuse
+from flockd.core.config.base import Name, NonNegative, Positive, Section, refuse
 
 FlightKindName = Literal["truth", "sight", "control"]
 """How the flights of a campaign are flown."""
@@ -31,6 +31,12 @@ Figure = Literal[
     "distance_error_median_m",
     "distance_error_p95_m",
     "own_motion_ratio",
+    "drones_held",
+    "first_hold_s",
+    "min_distance_flown_m",
+    "collisions_flown",
+    "slowed_share",
+    "slowed_by_false_share",
     "min_distance_tail_m",
     "min_level_distance_m",
     "drone_collisions",
@@ -46,7 +52,7 @@ MAX_CONTROL_DRONES = 10_000
 """The most drones in a flight at control level."""
 MAX_VALUES = 1000
 MAX_SEEDS = 1_000_000
-_Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$", max_length=60)]
+_Name = Annotated[Name, Field(max_length=60)]
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Bound = _Number | Annotated[tuple[_Number, ...], Field(min_length=1, max_length=16)]
 

@@ -179,6 +179,8 @@ class _Builder:
     def _scalar(self, event: yaml.ScalarEvent, path: KeyPath, line: int) -> Value:
         if event.style is not None:  # quoted, or a block of text
             self._remember(path, line, f"'{_shortened(event.value)}'")
+            if (odd := _UNUSABLE.search(event.value)) is not None:
+                self._spoil(path, line, f"holds the character {ord(odd[0]):#06x}, which no program takes; delete it")
             return event.value
         value = core_scalar(event.value)
         self._remember(path, line, _shortened(event.value))
@@ -205,6 +207,8 @@ def _line(event: yaml.Event) -> int:
     return event.start_mark.line + 1
 
 
+_UNUSABLE = re.compile("[\0\ud800-\udfff]")
+"""Ends a text for the system's calls, or cannot be written in UTF-8; in quotes YAML has escapes for both."""
 _INT = re.compile(r"[-+]?[0-9]+")
 _OCTAL = re.compile(r"0o[0-7]+")
 _HEX = re.compile(r"0x[0-9a-fA-F]+")

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from flockd.core.choices import OwnVelocitySource
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.avoidance import ObstacleParameters
-from flockd.core.config.base import Section, refuse
+from flockd.core.config.base import Name, Section, refuse
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.config.geometry import GeometryParameters
 from flockd.core.config.mission import MissionParameters, mission_faults
@@ -30,7 +30,7 @@ from flockd.core.config.tracking import TrackingParameters
 class DroneConfig(Section):
     """Everything one drone's pilot needs."""
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")] = "drone"
+    name: Name = "drone"
     """By which it is known in telemetry and recordings; different for each drone of a fleet."""
     step_s: Annotated[float, Field(gt=0, le=60)] = 0.5
     rig: RigConfig
@@ -56,10 +56,11 @@ class DroneConfig(Section):
     @model_validator(mode="after")
     def _the_gate_lets_the_law_through(self) -> Self:
         if self.flocking.max_speed_m_s > self.safety.gate.max_speed_m_s:
-            raise ValueError(
-                f"flocking.max_speed_m_s {self.flocking.max_speed_m_s:g} is above safety.gate.max_speed_m_s, which "
-                f"would refuse it; write {self.safety.gate.max_speed_m_s:g} or less"
+            fault = (
+                f"{self.flocking.max_speed_m_s:g} is above safety.gate.max_speed_m_s, which would refuse it; write "
+                f"{self.safety.gate.max_speed_m_s:g} or less"
             )
+            refuse(self, {("flocking", "max_speed_m_s"): fault})
         return self
 
     recording: RecordingConfig = RecordingConfig()
@@ -77,18 +78,18 @@ class DroneConfig(Section):
         gate_m_s, law_m_s = self.safety.gate.max_speed_m_s, self.flocking.max_speed_m_s
         trim_m_s = 0.0 if self.autopilot is None else self.autopilot.max_velocity_trim_m_s
         if law_m_s + trim_m_s > gate_m_s and not math.isclose(law_m_s + trim_m_s, gate_m_s):
-            raise ValueError(
-                f"flocking.max_speed_m_s {law_m_s:g} and autopilot.max_velocity_trim_m_s {trim_m_s:g} are above "
-                f"safety.gate.max_speed_m_s, which would refuse them; write {gate_m_s - law_m_s:g} or less for the trim"
+            fault = (
+                f"{trim_m_s:g} and flocking.max_speed_m_s {law_m_s:g} are together above safety.gate.max_speed_m_s, "
+                f"which would refuse them; write {gate_m_s - law_m_s:g} or less"
             )
+            refuse(self, {("autopilot", "max_velocity_trim_m_s"): fault})
         return self
 
     @model_validator(mode="after")
     def _only_simulated_time_is_slow(self) -> Self:
         if self.speed_factor != 1.0 and self.autopilot is not None and self.autopilot.address.startswith("serial:"):
-            raise ValueError(
-                "source.shared_memory.speed_factor is for simulations, and an autopilot on a cable is none; delete it"
-            )
+            fault = "is for simulations, and an autopilot on a cable is none; delete it"
+            refuse(self, {("source", "shared_memory", "speed_factor"): fault})
         return self
 
     @model_validator(mode="after")
@@ -97,9 +98,18 @@ class DroneConfig(Section):
             return self
         rig = [camera.name for camera in self.rig.cameras]
         devices = [camera.name for camera in self.source.cameras]
-        if sorted(rig) != sorted(devices):
-            raise ValueError(
-                f"source.cameras names {', '.join(devices) or 'none'}, but the rig has {', '.join(rig)}; "
-                "give each camera of the rig one entry of the same name"
+        faults: dict[tuple[str | int, ...], str] = {}
+        for number, name in enumerate(devices):
+            if name not in rig:
+                faults["source", "cameras", number, "name"] = (
+                    f"{name} is no camera of the rig, which has {', '.join(rig)}"
+                )
+            elif name in devices[:number]:
+                faults["source", "cameras", number, "name"] = f"{name} has an entry already; keep one"
+        missing = [name for name in rig if name not in devices]
+        if missing and not faults:
+            faults["source", "cameras"] = (
+                f"has no entry of the name {missing[0]}, which is a camera of the rig; add one"
             )
+        refuse(self, faults)
         return self

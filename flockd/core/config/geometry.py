@@ -6,6 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
+from flockd.core import consistency
 from flockd.core.config.base import Distance, Positive, Section
 
 
@@ -21,7 +22,7 @@ class GeometryParameters(Section):
     background_stride_px: Annotated[int, Field(ge=1, le=256)] = 16
     max_depth_m: Distance = 40.0
     """Background farther away says little of the translation and is left out."""
-    max_acceleration_m_s2: Positive = 6.0
+    max_acceleration_m_s2: Positive = consistency.EGO_MOTION.limit
     """An ego-motion that would need more than this since the last one is refused, twice in a row at most."""
     max_refused_ego_motions: Annotated[int, Field(ge=0)] = 2
     """In a row: after these, it is the last velocity that is doubted."""

@@ -71,10 +71,16 @@ def load(path: Path | str) -> DroneConfig | ScenarioConfig:
     return load_with_places(path)[0]
 
 
+def kind_of(path: Path | str) -> FileKind:
+    """Whose file it is, by its keys. Raises ConfigError where nothing can be read from it."""
+    return _kind(read_document(Path(path)))
+
+
 def load_with_places(path: Path | str) -> tuple[DroneConfig | ScenarioConfig, Mapping[KeyPath, Place]]:
     """The same, with the place of each value in the file, for checks of more than the file. Raises ConfigError."""
     path = Path(path)
-    if _kind(read_document(path)) == "drone":
+    kind = kind_of(path)
+    if kind == "drone":
         document = _drone_document(path, {})
         return validated(DroneConfig, document), document.places
     document = _scenario_document(path, {})
@@ -84,7 +90,21 @@ def load_with_places(path: Path | str) -> tuple[DroneConfig | ScenarioConfig, Ma
 def load_campaign(path: Path | str) -> tuple[CampaignConfig, Mapping[KeyPath, Place]]:
     """A campaign's file, and the place of each value in it; of its scenario only the path. Raises ConfigError."""
     document = read_document(Path(path), "campaign")
+    if "campaign" not in document.values and (kind := _kind(document)) != "campaign":
+        fault = f"is {_KINDS[kind]}, and a campaign is needed here; name one with the keys `campaign` and `scenario`"
+        raise ConfigError.at(path, fault)
     return validated(CampaignConfig, document), document.places
+
+
+def fault_of(model: type[BaseModel], key: str, value: Value) -> str | None:
+    """What is wrong with one value of a section, whatever its other keys are; None: nothing."""
+    places: dict[KeyPath, Place] = {(): Place("", 0, "", ""), (key,): Place("", 0, key, "")}
+    try:
+        model.model_validate({key: value})
+    except ValidationError as error:
+        of_key = [detail for detail in error.errors() if detail["loc"][:1] == (key,)]
+        return next((problem.message for problem in problems_of(of_key, model, places)), None)
+    return None
 
 
 def schema_of(kind: FileKind) -> dict[str, Any]:
@@ -101,15 +121,26 @@ def schema_of(kind: FileKind) -> dict[str, Any]:
     return schema
 
 
-def _kind(document: Document) -> Literal["drone", "scenario"]:
-    """Whichever the keys belong to."""
-    keys = document.values.keys()
-    is_drone = len(keys & DroneConfig.model_fields.keys()) > len(keys & ScenarioConfig.model_fields.keys())
-    return "drone" if is_drone else "scenario"
+def _kind(document: Document) -> FileKind:
+    """Whichever the keys belong to; a scenario, where that is not clear."""
+    kinds: dict[FileKind, type[BaseModel]] = {
+        "scenario": ScenarioConfig, "drone": DroneConfig, "campaign": CampaignConfig,
+    }  # fmt: skip
+    return max(kinds, key=lambda kind: len(document.values.keys() & kinds[kind].model_fields.keys()))
+
+
+_KINDS: Mapping[FileKind, str] = {"drone": "a drone's own file", "scenario": "a scenario", "campaign": "a campaign"}
+
+
+def _refuse_campaign(document: Document, wanted: FileKind) -> None:
+    if "campaign" in document.values and _kind(document) == "campaign":
+        fault = f"is a campaign, and {_KINDS[wanted]} is needed here; `flockd campaign` flies it"
+        raise ConfigError.at(document.file, fault)
 
 
 def _drone_document(path: Path, overrides: Overrides) -> Document:
     document = read_document(path)
+    _refuse_campaign(document, "drone")
     if document.values.keys() & {"scenario", "vehicles"} and _kind(document) == "scenario":
         drone = document.values.get("drone")
         hint = f"{path.parent / drone}" if isinstance(drone, str) else "one with the key `rig`"
@@ -121,6 +152,7 @@ def _drone_document(path: Path, overrides: Overrides) -> Document:
 
 def _scenario_document(path: Path, overrides: Overrides) -> Document:
     document = read_document(path)
+    _refuse_campaign(document, "scenario")
     if "rig" in document.values and _kind(document) == "drone":
         fault = "is a drone's own file, and a scenario is needed here; name one with the keys `vehicles` and `drone`"
         raise ConfigError.at(path, fault)
@@ -164,6 +196,9 @@ def _merge_drone(document: Document, folder: Path) -> None:
 def _merge_section(document: Document, key: str) -> None:
     """Puts a scenario's section in place of its drone's, with its places: one drone's file flies many missions."""
     drone = document.values.get("drone")
+    if ("drone",) in document.spoiled:
+        document.values.pop(key, None)  # what it would be put into is not known, which is told already
+        return
     if not isinstance(drone, dict) or key not in document.values:
         return
     section = document.values.pop(key)

@@ -16,10 +16,12 @@ LEAST_RADIUS_M = 3.0
 LAYERS_M = (4.5, 3.5, 5.0, 3.0, 4.0)
 """Heights in turn, so that no two neighbours on the ring are at one."""
 
+CHANGE_ME = "CHANGE-ME"
+"""Stands for what only its owner knows."""
 _SOURCE_CAMERA = {
     "v4l2": """\
     - name: {name}
-      device: /dev/v4l/by-path/CHANGE-ME-{number}-video-index0
+      device: /dev/v4l/by-path/{change_me}-{number}-video-index0
       pixel_format: mjpeg
       rate_hz: 30""",
     "gstreamer": "    - {{name: {name}, pipeline: nvarguscamerasrc sensor-id={number} ! nvvidconv, rate_hz: 30}}",
@@ -59,7 +61,9 @@ def rig_cameras(sizes: Mapping[str, tuple[int, int]], field_of_view_deg: float) 
 
 def source_cameras(kind: str, names: Sequence[str]) -> str:
     """The list `source.cameras` for cameras that are yet to be named by their sockets."""
-    return "\n".join(_SOURCE_CAMERA[kind].format(name=name, number=number) for number, name in enumerate(names))
+    return "\n".join(
+        _SOURCE_CAMERA[kind].format(name=name, number=number, change_me=CHANGE_ME) for number, name in enumerate(names)
+    )
 
 
 def start_positions(drones: int) -> str:

@@ -6,7 +6,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from flockd.core import services
+from flockd.core import consistency, services
 from flockd.core.choices import ROLES, FlowRefinement, HeightSource, Provider, Role, ScaleSource
 from flockd.core.config.base import Distance, NonNegative, Positive, Section, Share, refuse
 
@@ -91,13 +91,13 @@ class RangeFinderParameters(Section):
     """Standard deviation of a range, as a share of it."""
     bridge_s: Annotated[float, Field(ge=0, le=10)] = 2.0
     """So long after the last good reading the ground is expected where it was, with its slope and the own motion."""
-    gate_sigma: Positive = 4.0
+    gate_sigma: Positive = consistency.RANGE_GROUND.limit
     """A reading farther from the expected ground, in standard deviations, is that of something else: a crate, another
     drone, a hole. The second in a row is believed, if it does not contradict the height as the next three say."""
-    max_slope: Annotated[float, Field(ge=0, le=2)] = 0.25
+    max_slope: Annotated[float, Field(ge=0, le=2)] = consistency.RANGE_SLOPE.limit
     """Between two places of the last `compare_s`, the ground rises by no more than this for each metre between them,
     ..."""
-    tolerance_m: Annotated[float, Field(gt=0, le=100)] = 1.0
+    tolerance_m: Annotated[float, Field(gt=0, le=100)] = consistency.RANGE_BAROMETER.limit
     """... this for a step in it and the barometer's drift, and `gate_sigma` of the range. Where ranges and the
     barometer's height say that it does, the range finder is not believed."""
     compare_s: Annotated[float, Field(gt=0, le=120)] = 15.0

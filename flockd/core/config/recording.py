@@ -21,7 +21,8 @@ class RecordingConfig(Section):
     file_mb: Positive = 2000.0
     """Then the recording goes on in a new file."""
     quota_mb: Positive = 20000.0
-    """Limit for all recordings of the drone in one folder together: the oldest are deleted to make room."""
+    """Limit for all recordings of the drone in one folder together: the oldest are deleted to make room. Those of the
+    flight before stay, and do not count."""
 
     @model_validator(mode="after")
     def _a_file_fits(self) -> Self:

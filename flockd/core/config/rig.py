@@ -7,13 +7,13 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from flockd.core.choices import LensModel
-from flockd.core.config.base import NonNegative, Positive, Section, Vector3, refuse
+from flockd.core.config.base import NonNegative, PlainName, Positive, Section, Vector3, refuse, text
 
 
 class MeasurementConfig(Section):
     """Where calibrated numbers come from: for people, nothing flies by it. `flockd calibrate` writes it."""
 
-    date: Annotated[str, Field(pattern=r"^\d{4}-\d{2}-\d{2}$")]
+    date: Annotated[str, text(r"^\d{4}-\d{2}-\d{2}$", "a date, as in `2026-11-24`")]
     camera: str
     """Its serial number, or what else identifies it."""
     source: str
@@ -52,7 +52,7 @@ class ExtrinsicsConfig(Section):
 class CameraConfig(Section):
     """One camera of the rig."""
 
-    name: Annotated[str, Field(pattern=r"^[a-z0-9_-]+$")]
+    name: PlainName
     size_px: tuple[Annotated[int, Field(ge=32, le=8192)], Annotated[int, Field(ge=32, le=8192)]]
     """Width, height."""
     intrinsics: IntrinsicsConfig
@@ -83,7 +83,12 @@ class RigConfig(Section):
     @model_validator(mode="after")
     def _names_are_unique(self) -> Self:
         names = [camera.name for camera in self.cameras]
-        doubled = {name for name in names if names.count(name) > 1}
-        if doubled:
-            raise ValueError(f"two cameras share the name {sorted(doubled)[0]!r}; give each its own")
+        refuse(
+            self,
+            {
+                ("cameras", number, "name"): f"two cameras share the name {name!r}; give each its own"
+                for number, name in enumerate(names)
+                if name in names[:number]
+            },
+        )
         return self

@@ -6,7 +6,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from flockd.core import services
+from flockd.core import consistency, services
 from flockd.core.choices import AutopilotMode
 from flockd.core.config.base import Duration, Positive, Section, Share, refuse
 
@@ -51,7 +51,8 @@ class GateParameters(Section):
     """From a neighbour's change of velocity until the own drone has begun to brake: a step of the pilot, in which the
     change is not seen, how long the step takes, and the drone's response."""
     response_s: Annotated[float, Field(gt=0, le=5)] = 0.25
-    """Time constant with which the drone's velocity follows a setpoint."""
+    """Time constant with which the drone's velocity follows a setpoint, as the report with the autopilot's log fits it.
+    Both reaction times contain it, and the dead time before it."""
     max_drift_m_s: Annotated[float, Field(ge=0, le=20)] = 2.0
     """By how much at most a setpoint is corrected for wind, which carries the drone off it; 0: not at all."""
     fence_radius_m: Annotated[float, Field(gt=0, le=100_000)] | None = 100.0
@@ -68,6 +69,9 @@ class GateParameters(Section):
             raise ValueError(
                 f"command_fresh_s {self.command_fresh_s:g} is not below command_timeout_s; write a smaller one"
             )
+        for key in ("reaction_s", "neighbour_reaction_s"):
+            if getattr(self, key) < self.response_s:
+                raise ValueError(f"{key} is below response_s {self.response_s:g}, a part of it; write a larger one")
         if self.min_height_m >= self.max_height_m:
             raise ValueError(f"min_height_m {self.min_height_m:g} is not below max_height_m; write a smaller one")
         if self.degraded_speed_m_s > self.max_speed_m_s:
@@ -107,13 +111,16 @@ class SafetyParameters(Section):
     """The same, to hover."""
     max_loop_lag_s: Annotated[float, Field(gt=0, le=10)] = 0.2
     """Lag of the event loop; above it, degraded."""
-    degraded_gusts_m_s: Positive = 0.6
+    degraded_gusts_m_s: Positive = consistency.RESPONSE_DEGRADED.limit
     """By how much wind carries the drone off its setpoints (root mean square over ten seconds, what the gate corrects
     included), to be degraded."""
-    max_gusts_m_s: Positive = 0.8
+    max_gusts_m_s: Positive = consistency.RESPONSE.limit
     """The same, to ask for Hold."""
     heartbeat_timeout_s: Annotated[float, Field(gt=0, le=10)] = services.HEARTBEAT.timeout
-    """The link to the autopilot counts as lost, and flockd falls silent for good."""
+    """The link to the autopilot counts as lost without a heartbeat for this long, and flockd falls silent for good; two
+    of them may be lost while other messages arrive."""
+    link_timeout_s: Annotated[float, Field(gt=0, le=10)] = services.AUTOPILOT.timeout
+    """The same, without any message of the autopilot."""
     neighbours_timeout_s: Annotated[float, Field(gt=0, le=60)] = services.NEIGHBOUR.timeout
     """No confirmed neighbour seen for this long: the drone is alone."""
     alone_s: Duration | None = 10.0

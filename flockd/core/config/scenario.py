@@ -51,6 +51,9 @@ class VehicleConfig(Section):
     gust_m_s: NonNegative = 0.0
     """Standard deviation of the velocity that gusts add, each axis, to that of a drone whose setpoint stays the same.
     The flocking law begins its setpoint at the own velocity: there drones are carried farther."""
+    gust_length_m: Annotated[float, Field(ge=1, le=1000)] = 36.6
+    """Length of gusts: drones that are much nearer to each other are pushed alike. By default that of MIL-F-8785C at a
+    height of 5 m over open ground; it is less among trees and houses."""
     radius_m: Annotated[float, Field(gt=0, le=5)] = 0.35
     """Radius of the sphere around its centre that holds the whole drone: nearer to an obstacle it collides."""
 

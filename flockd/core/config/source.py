@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from flockd.core import services
 from flockd.core.choices import PixelFormat
-from flockd.core.config.base import Section, refuse
+from flockd.core.config.base import Endpoint, Name, PlainName, Section, refuse, text
 
 _TOPIC = r"^(/[A-Za-z_][A-Za-z0-9_]*)+$"
 """A whole name of ROS 2."""
@@ -17,7 +17,7 @@ _TOPIC = r"^(/[A-Za-z_][A-Za-z0-9_]*)+$"
 class ControlParameters(Section):
     """One setting of a camera's driver."""
 
-    name: Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
+    name: Annotated[str, text(r"^[a-z0-9_]+$", "a control's name, of small letters, digits and `_`")]
     """As `v4l2-ctl --list-ctrls` prints it."""
     value: int
     """A menu's entry by its number; a switch as 0 or 1."""
@@ -26,9 +26,11 @@ class ControlParameters(Section):
 class CameraDeviceParameters(Section):
     """Where one camera of the rig is plugged in, and how it is run. Its image has the size the rig says."""
 
-    name: Annotated[str, Field(pattern=r"^[a-z0-9_-]+$")]
+    name: PlainName
     """The camera's name in the rig."""
-    device: Annotated[str, Field(pattern=r"^/dev/")] | None = None
+    device: (
+        Annotated[str, text(r"^/dev/", "a device, as in `/dev/video0` or an entry of `/dev/v4l/by-path`")] | None
+    ) = None
     """For kind `v4l2`: its path, best one of /dev/v4l/by-path."""
     pipeline: Annotated[str, Field(min_length=1)] | None = None
     """For kind `gstreamer`: elements as `gst-launch-1.0` takes them, without a sink."""
@@ -54,9 +56,9 @@ class CameraDeviceParameters(Section):
 class SharedMemoryParameters(Section):
     """Where frames come from when another program on this computer takes or draws them."""
 
-    drone: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")] = "drone"
+    drone: Name = "drone"
     """Whose frames: the name under which they are published."""
-    connect: Annotated[tuple[str, ...], Field(min_length=1)] = ("tcp/127.0.0.1:7448",)
+    connect: Annotated[tuple[Endpoint, ...], Field(min_length=1)] = ("tcp/127.0.0.1:7448",)
     """zenoh endpoints of the program that publishes them."""
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
     """How often each camera's frames come; `safety.camera_timeout_periods` counts in these."""
@@ -92,19 +94,26 @@ class SourceParameters(Section):
         for number, camera in enumerate(self.cameras):
             refuse(self, {("cameras", number, *key): text for key, text in _misplaced(camera, self.kind).items()})
             if self.set_tolerance_s * camera.rate_hz < 0.5:
-                raise ValueError(
-                    f"set_tolerance_s {self.set_tolerance_s:g} is less than half a frame period of camera "
-                    f"{camera.name!r}; write {0.5 / camera.rate_hz:.3f} or more"
+                fault = (
+                    f"{self.set_tolerance_s:g} is less than half a frame period of camera {camera.name!r}; write "
+                    f"{0.5 / camera.rate_hz:.3f} or more"
                 )
+                refuse(self, {("set_tolerance_s",): fault})
             if self.silence_s * camera.rate_hz < 2.0:
-                raise ValueError(
-                    f"silence_s {self.silence_s:g} is less than two frame periods of camera {camera.name!r}; "
-                    f"write {2.0 / camera.rate_hz:.3f} or more"
+                fault = (
+                    f"{self.silence_s:g} is less than two frame periods of camera {camera.name!r}; write "
+                    f"{2.0 / camera.rate_hz:.3f} or more"
                 )
-        devices = [place for camera in self.cameras if (place := camera.device or camera.topic)]
-        doubled = {device for device in devices if devices.count(device) > 1}
-        if doubled:
-            raise ValueError(f"two cameras share {sorted(doubled)[0]}; give each its own")
+                refuse(self, {("silence_s",): fault})
+        refuse(
+            self,
+            {
+                ("cameras", number, key): f"two cameras share {place}; give each its own {key}"
+                for number, camera in enumerate(self.cameras)
+                for key, place in (("device", camera.device), ("topic", camera.topic))
+                if place and place in {getattr(one, key) for one in self.cameras[:number]}
+            },
+        )
         return self
 
 

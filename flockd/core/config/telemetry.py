@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import Field
-
-from flockd.core.config.base import Section
+from flockd.core.config.base import Endpoint, Name, Section
 
 OperatorCommand = Literal["hold", "land", "resume", "goto", "velocity"]
 
@@ -14,10 +12,10 @@ OperatorCommand = Literal["hold", "land", "resume", "goto", "velocity"]
 class TelemetryParameters(Section):
     """Who may watch this drone, and what they may ask of it."""
 
-    fleet: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")] = "fleet"
-    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    fleet: Name = "fleet"
+    listen: tuple[Endpoint, ...] = ("tcp/127.0.0.1:7447",)
     """zenoh endpoints at which watchers find this drone, as in `tcp/0.0.0.0:7447`."""
-    connect: tuple[str, ...] = ()
+    connect: tuple[Endpoint, ...] = ()
     """zenoh endpoints, of a router or of `flockd status --listen`, that this drone tries to reach for ever."""
     zenoh_config: str | None = None
     """A file of zenoh's own settings to begin with, for TLS and access control; see `config/zenoh_tls.json5`. A

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
+from flockd.core.config.base import WORDS
 from flockd.core.config.document import KeyPath, Place, core_scalar
 from flockd.core.errors import MAX_PROBLEMS_TOLD, ConfigProblem
 
@@ -146,6 +148,10 @@ def _mend(value: object, schema: Schema, wanted: str) -> str:
         return "write false"
     if schema.get("type") == "string" and isinstance(value, int | float):
         return "put it in quotes"
+    if "pattern" in schema and isinstance(value, str):
+        without_blanks = "_".join(value.split())
+        if re.search(schema["pattern"], without_blanks):
+            return f"write {without_blanks}"
     return f"write {wanted}"
 
 
@@ -178,8 +184,7 @@ def _wanted(root: Schema, schema: Schema, unit: str) -> str:
         case "boolean":
             return "true or false"
         case "string":
-            pattern = schema.get("pattern")
-            return f"a text that matches {pattern}" if pattern else "a text"
+            return str(schema.get(WORDS, "a text"))
         case "null":
             return "nothing"
         case "array":

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import foxglove.channels as fc
 import foxglove.messages as fm
@@ -42,6 +42,12 @@ _THREADS = 8
 _CALIBRATION = partial(Channel, schema=fm.CameraCalibration.get_schema(), message_encoding="protobuf")
 
 
+class _CameraChannels(NamedTuple):
+    image: Any
+    tracks: Any
+    calibration: Any
+
+
 class FleetPublisher:
     """`update` publishes what is new. All on one thread, but for the pictures, which wait on threads of their own."""
 
@@ -66,7 +72,10 @@ class FleetPublisher:
             self._forget()
             for topic in SCENE_TOPICS:
                 self._channel(topic, fc.SceneUpdateChannel).log(empty_scene(), log_time=self._ns(time_s))
-        watched, rows = self._source.drones(time_s), self._source.rows(time_s)
+        rows = self._source.rows(time_s)
+        watched = [drone for drone in self._source.drones(time_s) if f"{drone.fleet}/{drone.drone}" in rows]
+        if self._source.span_s is None:
+            self._close_channels(rows)
         for key in sorted(rows):  # its own name, with its fleet where another fleet has one of this name
             short = key.partition("/")[2]
             self._names.setdefault(key, key if short in self._names.values() else short)
@@ -96,6 +105,18 @@ class FleetPublisher:
             self._channels[topic] = kind(topic, context=self._context)
         return self._channels[topic]
 
+    def _close_channels(self, rows: Mapping[str, Row]) -> None:
+        """Of drones that are forgotten: names that somebody invents leave nothing."""
+        for key in self._names.keys() - rows.keys():
+            beginning = f"/{self._names.pop(key)}/"
+            self._places.pop(key, None)
+            self._told.pop(key, None)
+            for frame in [frame for frame in self._asked if f"/{frame}/".startswith(beginning)]:
+                del self._asked[frame]
+            for topic in [topic for topic in self._channels if topic.startswith(beginning)]:
+                self._channels.pop(topic).close()
+                self._sent.pop(topic, None)
+
     def _publish_message(self, key: str, topic: str, heard_s: float, message: Mapping[str, Any]) -> None:
         """A message of telemetry that is new to whoever subscribed."""
         name = f"/{self._names[key]}/{topic}"
@@ -119,7 +140,8 @@ class FleetPublisher:
                 self._tell(time_s, fm.LogLevel.Error if row["state"] == GONE else level, key, told)
 
     def _tell(self, time_s: float, level: fm.LogLevel, key: str, sentence: str) -> None:
-        entry = fm.Log(timestamp=self._stamp(time_s), level=level, message=sentence, name=self._names[key])
+        name = self._names.get(key, key)  # by its key where it is forgotten
+        entry = fm.Log(timestamp=self._stamp(time_s), level=level, message=sentence, name=name)
         self._channel(LOG, fc.LogChannel).log(entry, log_time=self._ns(time_s))
 
     def _publish_scene(self, rows: Mapping[str, Row], time_s: float) -> None:
@@ -154,28 +176,31 @@ class FleetPublisher:
     def _ask_for_picture(self, key: str, row: Row, camera: str, time_s: float) -> None:
         """Once a second while somebody has subscribed to the camera, whose three channels are made here."""
         frame = frame_of(self._names[key], camera)
-        images = self._channel(f"/{frame}/image", fc.CompressedImageChannel)
-        self._channel(f"/{frame}/tracks", fc.ImageAnnotationsChannel)
-        self._channel(f"/{frame}/calibration", _CALIBRATION)
+        channels = _CameraChannels(
+            self._channel(f"/{frame}/image", fc.CompressedImageChannel),
+            self._channel(f"/{frame}/tracks", fc.ImageAnnotationsChannel),
+            self._channel(f"/{frame}/calibration", _CALIBRATION),
+        )
         at_s, asked = self._asked.get(frame, (-EVERY_S, None))
         if asked is not None and asked.done():
             asked.result()  # raises what it met
-        if images.has_sinks() and abs(time_s - at_s) >= EVERY_S and (asked is None or asked.done()):
-            self._asked[frame] = time_s, self._threads.submit(self._publish_picture, key, row, camera, time_s)
+        if channels.image.has_sinks() and abs(time_s - at_s) >= EVERY_S and (asked is None or asked.done()):
+            job = self._threads.submit(self._publish_picture, key, row, camera, time_s, frame, channels)
+            self._asked[frame] = time_s, job
 
-    def _publish_picture(self, key: str, row: Row, name: str, time_s: float) -> None:
+    def _publish_picture(
+        self, key: str, row: Row, name: str, time_s: float, frame: str, channels: _CameraChannels
+    ) -> None:
         """On a thread of its own: the drone may take seconds to answer."""
         picture = self._source.image(key, name, time_s)
         if picture is None:
             return
-        frame, stamp, now_ns = frame_of(self._names[key], name), self._stamp(time_s), self._ns(time_s)
+        stamp, now_ns = self._stamp(time_s), self._ns(time_s)
         size_px, camera = jpeg_size(picture), cameras_of(self._source.known().get(key, Known()).about).get(name)
         if size_px is not None and camera is not None:
-            self._channels[f"/{frame}/calibration"].log(
-                calibration(now_ns, frame, camera.config, size_px), log_time=now_ns
-            )
-            self._channels[f"/{frame}/tracks"].log(tracks(stamp, camera, size_px, row), log_time=now_ns)
-        self._channels[f"/{frame}/image"].log(image(stamp, frame, picture), log_time=now_ns)
+            channels.calibration.log(calibration(now_ns, frame, camera.config, size_px), log_time=now_ns)
+            channels.tracks.log(tracks(stamp, camera, size_px, row), log_time=now_ns)
+        channels.image.log(image(stamp, frame, picture), log_time=now_ns)
 
     def _ns(self, time_s: float) -> int:
         return round(1e9 * self._source.wall_s(time_s))

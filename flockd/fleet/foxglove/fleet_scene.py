@@ -11,7 +11,7 @@ import foxglove.messages as fm
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flockd.core.earth import metres_a_degree
+from flockd.core.earth import degrees_apart, metres_a_degree
 from flockd.core.messages import FloatArray
 from flockd.fleet.fleet_status import GONE, QUIET
 from flockd.fleet.page.drone_rows import Row
@@ -88,7 +88,7 @@ def location_fix(stamp: fm.Timestamp, drone: str, row: Row) -> fm.LocationFix | 
     a_degree = metres_a_degree(home[0])
     latitude, longitude = (home[i] + position[i] / a_degree[i] for i in range(2))
     # The height above the ellipsoid is not known: 0, as the schema has no other way.
-    return fm.LocationFix(timestamp=stamp, frame_id=drone, latitude=latitude, longitude=longitude)
+    return fm.LocationFix(timestamp=stamp, frame_id=drone, latitude=latitude, longitude=degrees_apart(longitude, 0.0))
 
 
 def scene_update(topic: str, drones: Iterable[SceneDrone], stamp: fm.Timestamp) -> fm.SceneUpdate:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from typing import Self
 
@@ -11,6 +12,7 @@ from foxglove.websocket import Capability, PlaybackStatus, WebSocketServer
 
 from flockd.core.errors import UnavailableError
 from flockd.fleet.foxglove.fleet_publisher import FleetPublisher
+from flockd.fleet.foxglove.origin_guard import APP, OriginGuard, hidden_address
 from flockd.fleet.foxglove.playback import Playback
 from flockd.fleet.page.fleet_source import FleetSource
 
@@ -20,23 +22,47 @@ UPDATE_EVERY_S = 0.25
 class FoxgloveServer:
     """Publishes between ``__enter__`` and ``__exit__``, on a thread of its own."""
 
-    def __init__(self, source: FleetSource, address: str, port: int) -> None:
-        """``source``: stays its owner's. ``port``: 0 for any. Raises UnavailableError where it cannot listen."""
+    def __init__(
+        self,
+        source: FleetSource,
+        address: str,
+        port: int,
+        *,
+        origins: Collection[str] = (),
+        on_refusal: Callable[[str], None] = lambda sentence: None,
+    ) -> None:
+        """Raises UnavailableError where it cannot listen.
+
+        Args:
+            source: of the fleet; stays its owner's.
+            address: where it listens.
+            port: the same; 0 for any.
+            origins: of web pages that may connect, beside Foxglove's own.
+            on_refusal: called with one sentence when another one tries to.
+        """
         context = foxglove.Context()
         self._playback = None if source.span_s is None else Playback(source)
-        self._server = _listening(context, address, port, self._playback)
-        self.port = self._server.port
+        hidden = hidden_address()
+        self._server = _listening(context, hidden, 0, self._playback)
+        try:
+            self._guard = OriginGuard(address, port, (hidden, self._server.port), {APP, *origins}, on_refusal)
+        except UnavailableError:
+            self._server.stop()
+            raise
+        self.port = self._guard.port
         self._source, self._publisher = source, FleetPublisher(source, context)
         self._over = threading.Event()
         self._thread = ThreadPoolExecutor(1, "Foxglove server")
 
     def __enter__(self) -> Self:
+        self._guard.__enter__()
         self._publishing = self._thread.submit(self._publish)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._over.set()
         self._thread.shutdown()
+        self._guard.__exit__()
         self._server.stop()
         self._publisher.close()
 

@@ -7,10 +7,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from flockd.core.earth import metres_a_degree
+from flockd.core.earth import degrees_apart, metres_a_degree
 from flockd.fleet.fleet_status import GONE, QUIET, status_rows
 from flockd.fleet.watcher import Heard, Watched
-from flockd.onboard.telemetry.topics import AboutMessage
+from flockd.onboard.telemetry.topics import AboutMessage, is_name
 
 Row = dict[str, Any]
 HISTORY_COLUMNS = (
@@ -20,6 +20,9 @@ HISTORY_COLUMNS = (
 second, milliseconds, seconds."""
 MAX_CORNERS = 200
 """The most corners of a fence that is drawn."""
+MAX_CAMERAS = 16
+"""The most of one drone whose pictures are offered."""
+_FARTHEST_M = 1e6
 
 
 @dataclass(frozen=True)
@@ -95,7 +98,7 @@ def _row(drone: Watched, status: Mapping[str, Any], known: Known, now_s: float) 
         "recording": computer.get("recording"),
         "delay_ms": None if known.delay_s is None else _rounded(1e3 * known.delay_s, 1),
         "clock_s": _rounded(known.clock_s, 3),
-        "cameras": {name: camera["fault"] for name, camera in computer.get("cameras", {}).items()},
+        "cameras": _cameras(computer),
         "version": None if about is None else about["version"],
         "commands": None if about is None else about["commands"],
         "fence": _fence(configuration),
@@ -138,12 +141,18 @@ def _seen(neighbour: Mapping[str, Any]) -> Row:
     }
 
 
+def _cameras(computer: Mapping[str, Any]) -> dict[str, str | None]:
+    """What is wrong with each; those that can be asked for a picture."""
+    cameras = [(name, camera["fault"]) for name, camera in computer.get("cameras", {}).items() if is_name(name)]
+    return dict(cameras[:MAX_CAMERAS])
+
+
 def _vector(values: object, digits: int = 2, *, size: int = 2) -> list[float] | None:
     """The first of a list from a peer; None where one of them is missing."""
     if not isinstance(values, list) or len(values) < size:
         return None
     first = values[:size]
-    if not all(isinstance(value, int | float) and math.isfinite(value) for value in first):
+    if not all(isinstance(value, int | float) and abs(value) <= _FARTHEST_M for value in first):  # false for NaN too
         return None
     return [round(float(value), digits) for value in first]
 
@@ -161,7 +170,11 @@ def _offset(origin: list[float] | tuple[float, float] | None, home_deg: list[flo
     """(2,) metres from the map's origin to a drone's home; None where the home is not known."""
     if origin is None or home_deg is None:
         return None
-    return [round((home_deg[i] - origin[i]) * a_degree, 2) for i, a_degree in enumerate(metres_a_degree(origin[0]))]
+    north_m, east_m = metres_a_degree(origin[0])
+    return [
+        round((home_deg[0] - origin[0]) * north_m, 2),
+        round(degrees_apart(home_deg[1], origin[1]) * east_m, 2),
+    ]
 
 
 def _fence(configuration: Mapping[str, Any]) -> Row | None:
@@ -173,6 +186,6 @@ def _fence(configuration: Mapping[str, Any]) -> Row | None:
     radius, corners = gate.get("fence_radius_m"), gate.get("fence_corners_m")
     known = [_vector(corner) for corner in corners[:MAX_CORNERS]] if isinstance(corners, list) else []
     return {
-        "radius_m": radius if isinstance(radius, int | float) and 0 < radius < math.inf else None,
+        "radius_m": radius if isinstance(radius, int | float) and 0 < radius <= _FARTHEST_M else None,
         "corners_m": [corner for corner in known if corner is not None],
     }

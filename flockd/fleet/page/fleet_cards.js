@@ -2,6 +2,8 @@
 import { STATES, colourOf, nameOf, put, state, written } from "./fleet_state.js";
 
 const PICTURES_EVERY_MS = 1000;
+const PICTURES_AT_ONCE = 2;
+const PICTURE_MS = 3000;
 const VALUES = [
   ["mode", (row) => row.flight_mode || "–"],
   ["motors", (row) => (row.armed === null ? "–" : row.armed ? (row.in_air ? "in the air" : "armed") : "disarmed")],
@@ -33,6 +35,15 @@ function apart(seconds) {
   return much < 1 ? `${sign}${(1000 * much).toFixed(0)} ms` : `${sign}${much.toFixed(1)} s`;
 }
 
+// The last order, whose it was and how old, and how many were refused.
+function ordered({ orders, orders_refused: refused }) {
+  const parts = [];
+  const [last] = orders;
+  if (last) parts.push(`last order: ${last.command}, by ${last.operator} (order ${last.sequence}), ${Math.round(last.age_s)} s ago`);
+  if (refused) parts.push(`${refused} orders refused`);
+  return parts.join(" · ");
+}
+
 export class FleetCards {
   constructor(section, choose, commands) {
     [this.section, this.choose, this.commands] = [section, choose, commands];
@@ -40,6 +51,8 @@ export class FleetCards {
     this.cards = new Map();
     this.parts = new WeakMap();
     this.order = "";
+    this.wanted = new Map();
+    this.loading = 0;
     setInterval(() => this.look(), PICTURES_EVERY_MS);
   }
 
@@ -90,7 +103,7 @@ export class FleetCards {
     const one = (name) => card.querySelector(name);
     this.parts.set(card, {
       name: one(".name span"), state: one(".state"), meaning: one(".meaning"), why: one(".why"), look: one(".look"),
-      refusal: one(".refusal"), pictures: one(".pictures"), values: [...list.querySelectorAll("dd")],
+      refusal: one(".refusal"), orders: one(".orders"), identity: one(".identity"), pictures: one(".pictures"), values: [...list.querySelectorAll("dd")],
       buttons: [...card.querySelectorAll("[data-command]")],
     });
   }
@@ -123,15 +136,31 @@ export class FleetCards {
     const blind = !Object.keys(row.cameras).length;
     if (parts.look.disabled !== blind) parts.look.disabled = blind;
     put(parts.refusal, this.commands.refusal(key));
+    put(parts.orders, ordered(row));
+    put(parts.identity, row.identities.length > 1 ? `${row.identities.length} drones` : row.identities.join(""));
   }
 
-  // New pictures for the cards that show theirs, one request at a time for each camera.
+  // New pictures for the cards that show theirs, a few at a time: a browser has six connections to a server, and orders
+  // need one.
   look() {
     for (const [key, card] of this.cards) {
       const { pictures } = this.parts.get(card);
       if (pictures.hidden || document.hidden) continue;
-      for (const camera of Object.keys(state.rows.get(key).cameras)) this.fetch(key, camera, pictures);
+      for (const camera of Object.keys(state.rows.get(key).cameras)) {
+        const name = JSON.stringify([key, camera]);
+        if (!this.wanted.has(name)) this.wanted.set(name, () => this.fetch(key, camera, pictures));
+      }
     }
+    while (this.loading < PICTURES_AT_ONCE && this.wanted.size) this.loadNext();
+  }
+
+  async loadNext() {
+    const [[name, load]] = this.wanted;
+    this.wanted.delete(name);
+    this.loading += 1;
+    await load();
+    this.loading -= 1;
+    if (this.wanted.size) this.loadNext();
   }
 
   async fetch(key, camera, pictures) {
@@ -143,20 +172,18 @@ export class FleetCards {
       figure.firstChild.alt = `what the camera ${camera} sees`;
       pictures.append(figure);
     }
-    if (figure.dataset.waits) return;
-    figure.dataset.waits = "1";
     const [drone, image] = [key.split("/").map(encodeURIComponent).join("/"), figure.firstChild];
     try {
-      const reply = await fetch(`image/${drone}/${encodeURIComponent(camera)}?at=${state.now}`);
+      const address = `image/${drone}/${encodeURIComponent(camera)}?at=${state.now}`;
+      const reply = await fetch(address, { priority: "low", signal: AbortSignal.timeout(PICTURE_MS) });
       put(figure.lastChild, reply.ok ? camera : `${camera}: ${await reply.text()}`);
       if (reply.ok) {
-        const address = URL.createObjectURL(await reply.blob());
+        const picture = URL.createObjectURL(await reply.blob());
         URL.revokeObjectURL(image.src);
-        image.src = address;
+        image.src = picture;
       }
     } catch {
       put(figure.lastChild, `${camera}: the server cannot be reached`);
     }
-    delete figure.dataset.waits;
   }
 }

@@ -74,6 +74,7 @@ export class FleetCommands {
     try {
       const reply = await fetch("ask", {
         method: "POST",
+        priority: "high",
         headers: { "Content-Type": "application/json", "X-Flockd-Token": this.token },
         body: JSON.stringify({ drones, command, order }),
       });

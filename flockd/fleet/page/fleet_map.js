@@ -2,7 +2,12 @@
 import { colourOf, lastPlaceOf, nameOf, placeOf, recent, state } from "./fleet_state.js";
 
 const [TRAIL_S, SHORT_TRAIL_S] = [60, 20];
+const FAR_M = 20000; // from the middle of the flock
 const FEW = 10; // up to so many drones show their neighbours all at once
+
+function median(values) {
+  return [...values].sort((a, b) => a - b)[values.length >> 1] ?? 0;
+}
 
 export class FleetMap {
   constructor(section, choose) {
@@ -128,9 +133,13 @@ export class FleetMap {
         : "";
   }
 
+  // The flock; one that says it is far from the others, which may be nonsense, does not move it out of sight.
   fit() {
-    const points = [...this.places.values()];
-    for (const key of this.places.keys()) points.push(...this.seenBy(key).map((one) => one.place));
+    const middle = [0, 1].map((axis) => median([...this.places.values()].map((place) => place[axis])));
+    const near = (place) => Math.hypot(place[0] - middle[0], place[1] - middle[1]) < FAR_M;
+    const keys = [...this.places.keys()].filter((key) => near(this.places.get(key)));
+    const points = keys.map((key) => this.places.get(key));
+    for (const key of keys) points.push(...this.seenBy(key).map((one) => one.place).filter(near));
     if (!points.length) return;
     const reach = (axis) => [Math.min(...points.map((p) => p[axis])), Math.max(...points.map((p) => p[axis]))];
     const [norths, easts] = [reach(0), reach(1)];

@@ -8,6 +8,8 @@ import { STATES, nameOf, put, state, take } from "./fleet_state.js";
 
 const token = document.querySelector("meta[name=token]").content;
 const AGAIN_MS = 1000;
+const AGAIN_SLOWLY_MS = 5000;
+const OTHER_KEY = "The server was started again with another key: open the address that it printed. Started with --key-file FILE it keeps its key, and open pages go on by themselves.";
 const SILENT_MS = 5000;
 const EVENTS_SHOWN = 200;
 
@@ -17,6 +19,7 @@ const cards = new FleetCards(document.getElementById("cards"), choose, commands)
 const curves = new FleetCurves(document.getElementById("curves"));
 const summary = document.getElementById("summary");
 const trouble = document.getElementById("trouble");
+const notes = document.getElementById("notes");
 let [socket, heard, lastEvent, told] = [null, 0, "", ""];
 const replay = new ReplayControls(document.getElementById("replay"), (at) => {
   if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ at }));
@@ -38,11 +41,24 @@ async function connect() {
     if (message.kind === "hello") await greeted(message);
     else show(message);
   };
-  socket.onclose = ({ code }) => {
-    const ended = code === 4403;
-    complain(ended ? "The server was started again: open the address that it printed." : "The server cannot be reached: what is shown is old.");
-    if (!ended) setTimeout(connect, AGAIN_MS);
-  };
+  socket.onclose = () => lost();
+}
+
+// Tries again for ever: the page goes on by itself as soon as the server is back and knows its key.
+async function lost() {
+  const [sentence, wait] = await whyLost();
+  complain(sentence);
+  setTimeout(connect, wait);
+}
+
+async function whyLost() {
+  try {
+    const reply = await fetch("fleet_page.css", { method: "HEAD" });
+    if (reply.status === 403) return [OTHER_KEY, AGAIN_SLOWLY_MS];
+    return ["The server closed the connection, and is asked again: too many pages may be open. What is shown is old.", AGAIN_MS];
+  } catch {
+    return ["The server cannot be reached, and is asked again every second: what is shown is old. If it was stopped, start it again.", AGAIN_MS];
+  }
 }
 
 async function greeted(hello) {
@@ -68,6 +84,7 @@ function show(message) {
   replay.shown(state.now);
   showSummary();
   showEvents(message);
+  put(notes, message.notes.join(" "));
   if (first) curves.draw();
 }
 
@@ -103,7 +120,8 @@ function showEvents({ events, all_events: all }) {
 
 // What a drone says again and again, such as an order that is repeated, is one line with a count.
 function showEvent(list, event) {
-  const [line, newest, said] = [eventLine(event), list.firstChild, JSON.stringify(event.slice(1))];
+  const said = `${event[1]} ${event[2].replace(/order \d+/, "order")}`;
+  const [line, newest] = [eventLine(event), list.firstChild];
   line.dataset.said = said;
   if (newest && newest.dataset.said === said) {
     line.dataset.times = Number(newest.dataset.times || 1) + 1;
@@ -130,7 +148,8 @@ function complain(sentence) {
 }
 
 setInterval(() => {
+  if (socket.readyState !== WebSocket.OPEN) return;
   if (state.live && heard && performance.now() - heard > SILENT_MS) complain("Nothing came from the server for seconds: what is shown is old.");
-  else if (socket.readyState === WebSocket.OPEN && heard) complain("");
+  else if (heard) complain("");
 }, AGAIN_MS);
 connect();

@@ -41,7 +41,10 @@ class FleetSource(Protocol):
     def history(self) -> Mapping[str, list[list[float | None]]]:
         """For each drone, by its key: rows of `HISTORY_COLUMNS` in order of time."""
 
-    def ask(self, drone: str, command: str, order: Mapping[str, object] | None) -> AnswerMessage:
+    def notes(self) -> list[str]:
+        """What is the matter beside the drones: with who else sends."""
+
+    def ask(self, drone: str, command: str, order: Mapping[str, object] | None, operator: str) -> AnswerMessage:
         """A drone's answer to a command. Waits; called on a thread of its own."""
 
     def image(self, drone: str, camera: str, time_s: float) -> bytes | None:

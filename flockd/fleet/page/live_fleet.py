@@ -14,16 +14,22 @@ from flockd.fleet.drone_queries import ClockReading
 from flockd.fleet.page.drone_rows import Known, Row, drone_rows, history_row
 from flockd.fleet.page.fleet_source import Event
 from flockd.fleet.watcher import FleetWatcher, Watched
-from flockd.onboard.telemetry.topics import AnswerMessage
+from flockd.onboard.telemetry.topics import AnswerMessage, is_name
 
 ASK_EVERY_S = 5.0
 """Each drone for its clocks, and for what it flies with until it has told."""
+ASK_SILENT_S = 60.0
+"""The longest until one that never answers is asked again."""
 LOOK_EVERY_S = 0.5
 """For drones that are new, and at what belongs into the history."""
 HISTORY_S = 300.0
+MANY = 100
+"""Malformed messages that a fault or two may bring."""
 CLOCK_READINGS = 8
 """The one with the least delay among the last so many says how far the clocks are apart."""
-_ASKING_THREADS = 4
+ROWS_S = 0.1
+"""So long rows are the same for all that ask."""
+_ASKING_THREADS = 16
 
 
 class LiveFleet:
@@ -37,7 +43,12 @@ class LiveFleet:
         self._lock = threading.Lock()
         self._known: dict[str, Known] = {}
         self._readings: dict[str, deque[ClockReading]] = {}
-        self._asked_s: dict[str, float] = {}
+        self._due_s: dict[str, float] = {}
+        """When each is asked next."""
+        self._waits_s: dict[str, float] = {}
+        """How long those wait that did not answer."""
+        self._asking: set[str] = set()
+        self._rows: tuple[float, dict[str, Row]] = -math.inf, {}
         self._history: dict[str, deque[list[float | None]]] = {}
         self._over = threading.Event()
         self._pool = ThreadPoolExecutor(_ASKING_THREADS, "fleet page queries")
@@ -71,7 +82,21 @@ class LiveFleet:
 
     def rows(self, time_s: float) -> dict[str, Row]:
         """Rows of all drones that were ever heard."""
-        return drone_rows(self.drones(time_s), self.known(), time_s)
+        made_s, rows = self._rows
+        if not 0.0 <= time_s - made_s < ROWS_S:
+            rows = drone_rows(self.drones(time_s), self.known(), time_s)
+            self._rows = time_s, rows
+        return rows
+
+    def notes(self) -> list[str]:
+        """Where somebody sends what no drone does."""
+        malformed, forgotten = self._watcher.malformed, self._watcher.forgotten
+        notes = []
+        if malformed > MANY:
+            notes.append(f"more than {_rounded(malformed)} malformed messages have come")
+        if forgotten:
+            notes.append(f"more names are heard than a fleet has drones: {_rounded(forgotten)} were forgotten")
+        return [f"{note}; see who else reaches these endpoints" for note in notes]
 
     def events(self, time_s: float) -> list[Event]:
         """All that are remembered."""
@@ -82,53 +107,76 @@ class LiveFleet:
         with self._lock:
             return {key: list(rows) for key, rows in self._history.items()}
 
-    def ask(self, drone: str, command: str, order: Mapping[str, object] | None) -> AnswerMessage:
+    def ask(self, drone: str, command: str, order: Mapping[str, object] | None, operator: str) -> AnswerMessage:
         """Asks the drone itself, which decides."""
-        if drone not in {f"{one.fleet}/{one.drone}" for one in self._watcher.drones()}:
-            return AnswerMessage(accepted=False, sentence="no drone of this name was heard")
-        answer = self._watcher.queries.ask(drone, command, order)
+        answer = self._watcher.ask(drone, command, operator, order)
         return answer or AnswerMessage(accepted=False, sentence="did not answer, or this computer may not command it")
 
     def image(self, drone: str, camera: str, time_s: float) -> bytes | None:
         """Asks the drone itself."""
-        return self._watcher.queries.image(drone, camera)
+        return self._watcher.queries.image(drone, camera) if self._is_there(drone) and is_name(camera) else None
+
+    def _is_there(self, drone: str) -> bool:
+        return any(one.alive and f"{one.fleet}/{one.drone}" == drone for one in self._watcher.drones())
 
     def _run(self) -> None:
         """Keeps the history, and asks each drone that is alive as soon as it appears, then now and again."""
         while not self._over.wait(LOOK_EVERY_S):
-            now_s = time.monotonic()
+            now_s, drones = time.monotonic(), self._watcher.drones()
             self._keep(now_s)
-            for drone in self._watcher.drones():
-                key = f"{drone.fleet}/{drone.drone}"
-                if not drone.alive:
-                    self._forget(key)
-                elif now_s - self._asked_s.get(key, -math.inf) >= ASK_EVERY_S:
-                    self._asked_s[key] = now_s
-                    self._pool.submit(self._ask_one, key)
+            alive = {f"{drone.fleet}/{drone.drone}": drone for drone in drones if drone.alive}
+            for key in (self._due_s.keys() | self.known().keys()) - alive.keys():
+                self._forget(key)
+            due = [key for key in alive if now_s >= self._due_s.get(key, -math.inf) and key not in self._asking]
+            due.sort(key=lambda key: (self._waits_s.get(key, 0.0), -alive[key].messages))  # silent ones last
+            for key in due[: _ASKING_THREADS - len(self._asking)]:
+                self._asking.add(key)
+                self._pool.submit(self._ask_one, key)
 
     def _keep(self, now_s: float) -> None:
         rows = self.rows(now_s)
         with self._lock:
+            for key in self._history.keys() - rows.keys():
+                del self._history[key]
             for key, row in rows.items():
                 kept = self._history.setdefault(key, deque(maxlen=round(HISTORY_S / LOOK_EVERY_S)))
                 kept.append(history_row(row, now_s))
 
     def _forget(self, key: str) -> None:
         """When it comes back, it may fly with something else."""
-        self._asked_s.pop(key, None)
+        self._due_s.pop(key, None)
+        self._waits_s.pop(key, None)
         with self._lock:
             self._known.pop(key, None)
             self._readings.pop(key, None)
 
     def _ask_one(self, key: str) -> None:
+        """On a thread of its own."""
+        answered = False
+        try:
+            answered = self._learn(key)
+        finally:
+            before_s = self._waits_s.get(key, 0.0) or ASK_EVERY_S / 2
+            self._waits_s[key] = 0.0 if answered else min(2.0 * before_s, ASK_SILENT_S)
+            self._due_s[key] = time.monotonic() + (self._waits_s[key] or ASK_EVERY_S)
+            self._asking.discard(key)
+
+    def _learn(self, key: str) -> bool:
+        """Whether it answered."""
         with self._lock:
             about = self._known.get(key, Known()).about
         about = about or self._watcher.queries.about(key)
-        reading = self._watcher.queries.clock(key)
+        reading = None if about is None else self._watcher.queries.clock(key)
         with self._lock:
             readings = self._readings.setdefault(key, deque(maxlen=CLOCK_READINGS))
             if reading is None:
                 self._known[key] = Known(about)
-                return
+                return False
             readings.append(reading)
             self._known[key] = Known(about, reading.delay_s, min(readings).ahead_s)
+            return True
+
+
+def _rounded(count: int) -> int:
+    """To one digit, so that a note changes seldom."""
+    return int(float(f"{count:.0e}"))

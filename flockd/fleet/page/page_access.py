@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 import hmac
 import ipaddress
+import os
+import re
 import secrets
 import socket
+import stat
 from collections.abc import Mapping
+from pathlib import Path
 from urllib.parse import urlsplit
+
+from flockd.core.errors import UnavailableError
 
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
@@ -19,35 +26,84 @@ HEADERS = {
     "Cache-Control": "no-store",
 }
 """Headers of every reply: nothing comes from elsewhere, and nobody else may embed or read it."""
-MAX_SESSIONS = 1000
+_KEY = re.compile(r"[A-Za-z0-9_-]{16,200}")
+_KEY_BYTES = 1024
 
 
 class PageAccess:
-    """Sessions of one server. The key opens the page; a session's token, which only its page knows, commands."""
+    """Sessions of one key. The key opens the page; a session's token, which only its page knows, commands.
 
-    def __init__(self) -> None:
-        self.key = secrets.token_urlsafe(18)
+    All follows from the key: a server that is started again with the same one knows the sessions of the last.
+    """
+
+    def __init__(self, key: str | None = None) -> None:
+        """``key``: None for one of this start alone."""
+        self.key = key or _new_key()
         """Part of the address that the server prints."""
-        self._tokens: dict[str, str] = {}
+        self.cookie = f"flockd_{self._code('cookie', '')[:8]}"
+        """Browsers do not tell ports apart: another server has another name."""
 
     def open_session(self, key: str) -> str | None:
         """A new session's name for a cookie; None for a wrong key."""
-        if not hmac.compare_digest(key.encode(), self.key.encode()):
+        if not _same(key, self.key):
             return None
-        while len(self._tokens) >= MAX_SESSIONS:
-            self._tokens.pop(next(iter(self._tokens)))
-        session = secrets.token_urlsafe(32)
-        self._tokens[session] = secrets.token_urlsafe(32)
-        return session
+        name = secrets.token_hex(16)
+        return f"{name}.{self._code('session', name)}"
 
     def token_of(self, session: str | None) -> str | None:
         """The token of a session; None where there is no such session."""
-        return None if session is None else self._tokens.get(session)
+        name, _, code = (session or "").partition(".")
+        return self._code("token", name) if _same(code, self._code("session", name)) else None
 
     def is_token(self, session: str | None, token: object) -> bool:
         """Whether this is the token of this session."""
         known = self.token_of(session)
-        return known is not None and isinstance(token, str) and hmac.compare_digest(known.encode(), token.encode())
+        return known is not None and isinstance(token, str) and _same(known, token)
+
+    def _code(self, purpose: str, name: str) -> str:
+        text = f"{purpose} {name}".encode("utf-8", "replace")
+        return hmac.new(self.key.encode(), text, hashlib.sha256).hexdigest()
+
+
+def lasting_key(path: Path) -> str:
+    """The key in a file that its owner alone may read, which is made where there is none.
+
+    Raises UnavailableError for one that cannot be read, that others may read, or that holds no key.
+    """
+    key = _new_key()
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(descriptor, "w", encoding="ascii") as file:
+            file.write(f"{key}\n")
+    except FileExistsError:
+        return _read_key(path)
+    except OSError as error:
+        raise UnavailableError(f"{path} cannot be made ({error.strerror}); name another --key-file") from error
+    return key
+
+
+def _read_key(path: Path) -> str:
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+        with os.fdopen(descriptor, "rb") as file:
+            mode = os.fstat(descriptor).st_mode
+            text = file.read(_KEY_BYTES) if stat.S_ISREG(mode) else b""
+    except OSError as error:
+        raise UnavailableError(f"{path} cannot be read ({error.strerror}); name another --key-file") from error
+    if mode & 0o077:
+        raise UnavailableError(f"{path} may be read or written by others; `chmod 600 {path}`, or delete it")
+    key = text.decode("ascii", "replace").strip()
+    if _KEY.fullmatch(key) is None:
+        raise UnavailableError(f"{path} holds no key; name a file that is not there yet, and it is made")
+    return key
+
+
+def _new_key() -> str:
+    return secrets.token_urlsafe(18)
+
+
+def _same(one: str, other: str) -> bool:
+    return hmac.compare_digest(one.encode("utf-8", "replace"), other.encode("utf-8", "replace"))
 
 
 def is_own_host(host: str) -> bool:

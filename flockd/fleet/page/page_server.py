@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import gzip
 import json
-import secrets
+import math
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from importlib.resources import files
@@ -16,9 +16,11 @@ from typing import Any
 
 from aiohttp import WSMsgType, web
 
-from flockd.fleet.page.drone_rows import HISTORY_COLUMNS, Row
+from flockd.fleet.page.drone_rows import HISTORY_COLUMNS, Known, Row
 from flockd.fleet.page.fleet_source import Event, FleetSource, events_after
 from flockd.fleet.page.page_access import HEADERS, PageAccess, is_own_host, is_own_origin
+from flockd.fleet.page.page_pictures import PagePictures
+from flockd.fleet.watcher import MAX_DRONES
 from flockd.onboard.telemetry.order_messages import parse_order
 from flockd.onboard.telemetry.topics import AnswerMessage
 
@@ -28,7 +30,11 @@ COMMANDS = ("hold", "land", "resume", "goto")
 """What the page may ask of drones."""
 _FOLDER = Path(__file__).parent
 _TYPES = {".js": "text/javascript", ".css": "text/css"}
-_THREADS = 16
+MAX_PAGES = 32
+"""Open at once."""
+HELLO_S = 5.0
+"""For a page to say its token."""
+_ORDER_THREADS = 64
 _TOKEN = "@TOKEN@"
 """In the page, for the session's."""
 
@@ -36,12 +42,22 @@ _TOKEN = "@TOKEN@"
 class PageServer:
     """The application of one fleet. `application` gives what aiohttp serves."""
 
-    def __init__(self, source: FleetSource, access: PageAccess, *, may_command: bool) -> None:
-        """``may_command``: whether this page passes commands on at all; each drone decides too."""
-        self._source, self._access, self._may_command = source, access, may_command
-        self._cookie = f"flockd_{secrets.token_hex(4)}"
-        """One a server: browsers do not tell ports apart."""
-        self._threads = ThreadPoolExecutor(_THREADS, "fleet page")
+    def __init__(self, source: FleetSource, access: PageAccess, *, may_command: bool, operator: str = "page") -> None:
+        """For one event loop.
+
+        Args:
+            source: of the fleet.
+            access: who may see it.
+            may_command: whether this page passes commands on at all; each drone decides too.
+            operator: who gives commands here, as drones are told; the page and where it is open are added.
+        """
+        self._source, self._access, self._may_command, self._operator = source, access, may_command, operator
+        self._order_threads = ThreadPoolExecutor(_ORDER_THREADS, "orders of the fleet page")
+        """Nothing else waits on them."""
+        self._pictures = PagePictures(source.image)
+        self._pages = 0
+        self.trusted: set[object] = set()
+        """Connections over which a page with the key has asked for something."""
         self._plotly: bytes | None = None
 
     def application(self) -> web.Application:
@@ -79,8 +95,9 @@ class PageServer:
             return _text(403, "the page is served under this computer's address or name only")
         if request.path == "/" and "key" in request.query:
             return self._entered(request.query["key"])
-        if self._access.token_of(request.cookies.get(self._cookie)) is None:
+        if self._access.token_of(request.cookies.get(self._access.cookie)) is None:
             return _text(403, "open the page with the whole address that `flockd fleet` printed, with its key")
+        self.trusted.add(request.protocol)
         return None
 
     def _entered(self, key: str) -> web.Response:
@@ -89,11 +106,11 @@ class PageServer:
         if session is None:
             return _text(403, "the key in the address is not this server's; use the address that it printed")
         response = web.Response(status=303, headers={"Location": "/"})
-        response.set_cookie(self._cookie, session, httponly=True, samesite="Strict")
+        response.set_cookie(self._access.cookie, session, httponly=True, samesite="Strict")
         return response
 
     async def _page(self, request: web.Request) -> web.Response:
-        token = self._access.token_of(request.cookies.get(self._cookie)) or ""
+        token = self._access.token_of(request.cookies.get(self._access.cookie)) or ""
         page = (_FOLDER / "fleet.html").read_text(encoding="utf-8").replace(_TOKEN, token)
         return web.Response(text=page, content_type="text/html")
 
@@ -115,16 +132,18 @@ class PageServer:
         return web.json_response({"columns": HISTORY_COLUMNS, "drones": self._source.history()}, dumps=_json)
 
     async def _image(self, request: web.Request) -> web.Response:
-        drone = f"{request.match_info['fleet']}/{request.match_info['drone']}"
-        time_s = _number(request.query.get("at"))
-        image = await self._on_thread(self._source.image, drone, request.match_info["camera"], time_s)
+        drone, camera = f"{request.match_info['fleet']}/{request.match_info['drone']}", request.match_info["camera"]
+        if self._source.span_s is None:
+            image = await self._pictures.newest(drone, camera)
+        else:
+            image = await self._pictures.recorded(drone, camera, _number(request.query.get("at")))
         if image is None:
-            return _text(404, "the camera has no picture, or this computer may not see it")
+            return _text(404, "no picture has come: the camera has none, or this computer may not see it")
         return web.Response(body=image, content_type="image/jpeg")
 
     async def _ask(self, request: web.Request) -> web.Response:
         """A command to drones, one answer a drone. Only from this server's own page."""
-        session = request.cookies.get(self._cookie)
+        session = request.cookies.get(self._access.cookie)
         if not is_own_origin(request.headers) or not self._access.is_token(
             session, request.headers.get("X-Flockd-Token")
         ):
@@ -132,12 +151,19 @@ class PageServer:
         if not self._may_command:
             return _text(403, "this page shows, and commands nothing: `flockd fleet` was started so")
         try:
-            drones, command, order = _asked(await request.json())
+            drones, command, order = _asked(_object(await request.read()))
         except ValueError as error:
             return _text(400, str(error))
+        operator = self._operator_of(request, session)
+        loop, known = asyncio.get_running_loop(), self._source.known()
+        # Those that never answer come last, where there are more than threads.
+        drones.sort(key=lambda drone: known.get(drone, Known()).delay_s is None)
         answers = await asyncio.gather(
-            *(self._on_thread(self._source.ask, drone, command, order) for drone in drones)
-        )  # fmt: skip
+            *(
+                loop.run_in_executor(self._order_threads, self._source.ask, drone, command, order, operator)
+                for drone in drones
+            )
+        )
         told: dict[str, AnswerMessage] = dict(zip(drones, answers, strict=True))
         return web.json_response(told, dumps=_json)
 
@@ -145,21 +171,36 @@ class PageServer:
         """Rows as they change. The page's first message has to carry its session's token."""
         if not is_own_origin(request.headers):
             return _text(403, "live data goes to this server's own page only")
+        if self._pages >= MAX_PAGES:
+            return _text(503, f"{MAX_PAGES} pages are open; close some")
         socket = web.WebSocketResponse(heartbeat=10.0, max_msg_size=MAX_REQUEST_BYTES)
         await socket.prepare(request)
-        first = await socket.receive()
-        hello = _object(first.data if first.type == WSMsgType.TEXT else "")
-        if not self._access.is_token(request.cookies.get(self._cookie), hello.get("token")):
-            await socket.close(code=4403, message=b"load the page again")
-            return socket
-        feed = _Feed(self._source, socket)
-        await feed.greet(may_command=self._may_command)
-        with suppress(ConnectionError):  # the page was closed while something was sent to it
-            await (feed.push() if self._source.span_s is None else feed.follow())
+        self._pages += 1
+        try:
+            with suppress(ConnectionError):  # the page was closed while something was sent to it
+                await self._feed(request, socket)
+        finally:
+            self._pages -= 1
         return socket
 
-    async def _on_thread(self, job: Callable[..., Any], *arguments: object) -> Any:
-        return await asyncio.get_running_loop().run_in_executor(self._threads, job, *arguments)
+    async def _feed(self, request: web.Request, socket: web.WebSocketResponse) -> None:
+        """Until the page is closed."""
+        try:
+            first = await socket.receive(timeout=HELLO_S)
+            hello = _object(first.data) if first.type == WSMsgType.TEXT else {}
+        except TimeoutError:
+            hello = {}
+        if not self._access.is_token(request.cookies.get(self._access.cookie), hello.get("token")):
+            await socket.close(code=4403, message=b"load the page again")
+            return
+        feed = _Feed(self._source, socket)
+        await feed.greet(may_command=self._may_command)
+        await (feed.push() if self._source.span_s is None else feed.follow())
+
+    def _operator_of(self, request: web.Request, session: str | None) -> str:
+        """Whose page it is that commands: of one computer, each has a number."""
+        elsewhere = request.remote not in {None, "127.0.0.1", "::1"}
+        return f"{self._operator}, page {(session or '')[:4]}{f' at {request.remote}' if elsewhere else ''}"
 
 
 class _Feed:
@@ -190,9 +231,9 @@ class _Feed:
     async def follow(self) -> None:
         """Sends what the recordings hold at each time that the page asks for."""
         async for message in self._socket:
-            asked = _object(message.data if message.type == WSMsgType.TEXT else "")
+            asked = _object(message.data) if message.type == WSMsgType.TEXT else {}
             at = asked.get("at")
-            if isinstance(at, int | float):
+            if isinstance(at, int | float) and abs(at) < 1e12:  # false for NaN too
                 await self._snapshot(float(at))
 
     async def _wait_for_end(self) -> None:
@@ -215,6 +256,7 @@ class _Feed:
                 "rows": changed,
                 "events": new,
                 "all_events": replay,
+                "notes": self._source.notes(),
             }
         )
 
@@ -222,22 +264,25 @@ class _Feed:
         await self._socket.send_str(_json(message))
 
 
-def _asked(body: object) -> tuple[list[str], str, dict[str, object] | None]:
+def _asked(body: Mapping[str, Any]) -> tuple[list[str], str, dict[str, object] | None]:
     """Drones, command and order of a request. Raises ValueError for what is none."""
-    if not isinstance(body, dict):
-        raise ValueError("a command is a JSON object")  # noqa: TRY004 - of the request, not of the caller
+    if not body:
+        raise ValueError("a command is a JSON object")
     drones, command, order = body.get("drones"), body.get("command"), body.get("order")
     if not isinstance(drones, list) or not drones or not all(isinstance(drone, str) for drone in drones):
         raise ValueError("a command names its drones")
+    if len(drones) > MAX_DRONES:
+        raise ValueError(f"a command goes to {MAX_DRONES} drones at most")
     if command not in COMMANDS:
         raise ValueError(f"the page's commands are {', '.join(COMMANDS)}")
     if command != "goto":
         return list(dict.fromkeys(drones)), command, None
-    parse_order(command, json.dumps(order).encode())
+    parse_order(command, order)
     return list(dict.fromkeys(drones)), command, order
 
 
-def _object(text: str) -> dict[str, Any]:
+def _object(text: str | bytes) -> dict[str, Any]:
+    """The JSON object of a text in UTF-8; an empty one for what is none."""
     try:
         value = json.loads(text)
     except (ValueError, RecursionError):
@@ -257,4 +302,16 @@ def _text(status: int, sentence: str) -> web.Response:
 
 
 def _json(value: object) -> str:
-    return json.dumps(value, separators=(",", ":"), allow_nan=False)
+    """With null for numbers that JSON cannot say: whatever one drone tells, the others are shown."""
+    try:
+        return json.dumps(value, separators=(",", ":"), allow_nan=False)
+    except ValueError:
+        return json.dumps(_finite(value), separators=(",", ":"), allow_nan=False)
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, Mapping):
+        return {name: _finite(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -73,7 +73,7 @@ class _Story:
                 topics[topic] = Heard(heard_s, self.messages[topic][index], 1.0, period_s, heard_s)
         begin_s, end_s = self.span_s
         alive = time_s <= end_s + self.about_step_s()
-        return Watched(self.fleet, self.drone, alive=alive, topics=topics, seen=time_s >= begin_s)
+        return Watched(self.fleet, self.drone, alive=alive, topics=topics, seen=time_s >= begin_s, announced=True)
 
     def about_step_s(self) -> float:
         """Two steps: the last one's messages are good until then."""
@@ -151,7 +151,11 @@ class RecordedFleet:
             time_s += HISTORY_EVERY_S
         return history
 
-    def ask(self, drone: str, command: str, order: Mapping[str, object] | None) -> AnswerMessage:
+    def notes(self) -> list[str]:
+        """None."""
+        return []
+
+    def ask(self, drone: str, command: str, order: Mapping[str, object] | None, operator: str) -> AnswerMessage:
         """Refused."""
         return AnswerMessage(accepted=False, sentence="this is a recording, which takes no commands")
 

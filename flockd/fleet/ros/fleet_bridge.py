@@ -57,9 +57,10 @@ _VALUES = (
 class FleetBridge:
     """Publishes between ``__enter__`` and ``__exit__`` on a thread of its own."""
 
-    def __init__(self, source: FleetSource, node: RosNode, *, may_command: bool) -> None:
-        """``source`` and ``node`` stay their owner's. ``may_command``: whether orders are passed on at all."""
-        self._source, self._node, self._may_command = source, node, may_command
+    def __init__(self, source: FleetSource, node: RosNode, *, may_command: bool, operator: str) -> None:
+        """``source`` and ``node`` stay their owner's. ``may_command``: whether orders are passed on at all, and in the
+        name of which ``operator``."""
+        self._source, self._node, self._may_command, self._operator = source, node, may_command, operator
         self._names = DroneNames()
         self._has_transforms = has_type(trees.TRANSFORMS)
         self._sent: dict[tuple[str, str], float] = {}
@@ -214,7 +215,7 @@ class FleetBridge:
 
     def _ask(self, key: str, command: str, order: OrderMessage | None) -> Answer:
         """Asks the drone itself, which decides."""
-        answer = self._source.ask(key, command, cast("Mapping[str, object] | None", order))
+        answer = self._source.ask(key, command, cast("Mapping[str, object] | None", order), self._operator)
         return Answer(answer["accepted"], answer["sentence"])
 
     def _whereabouts(self, key: str, name: str) -> Whereabouts:

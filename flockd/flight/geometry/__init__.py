@@ -2,6 +2,7 @@
 
 from flockd.flight.geometry.cameras import Camera, PinholeCamera, WideAngleCamera
 from flockd.flight.geometry.closest_approach import closest_approach, share_at_closest
+from flockd.flight.geometry.depth_maps import RangeMap, ZMap, blind_pixels, range_map, z_map
 from flockd.flight.geometry.ego_motion import estimate_ego_motion
 from flockd.flight.geometry.ego_motion_refinement import refine_ego_motion
 from flockd.flight.geometry.ground import ground_inverse_depth
@@ -23,7 +24,7 @@ from flockd.flight.geometry.rotations import (
     vector_from_rotation,
 )
 from flockd.flight.geometry.transform import RigidTransform
-from flockd.flight.geometry.triangulation import inverse_depths, inverse_depths_of_rays
+from flockd.flight.geometry.triangulation import inverse_ranges, inverse_ranges_of_rays
 from flockd.flight.geometry.virtual_camera import VirtualCrop, virtual_crop
 
 __all__ = [
@@ -33,12 +34,15 @@ __all__ = [
     "GroundSamples",
     "PinholeCamera",
     "PointPairs",
+    "RangeMap",
     "RansacResult",
     "Rig",
     "RigCamera",
     "RigidTransform",
     "VirtualCrop",
     "WideAngleCamera",
+    "ZMap",
+    "blind_pixels",
     "build_rig",
     "closest_approach",
     "estimate_ego_motion",
@@ -48,14 +52,15 @@ __all__ = [
     "fit_rigid",
     "grid_pixels",
     "ground_inverse_depth",
-    "inverse_depths",
-    "inverse_depths_of_rays",
+    "inverse_ranges",
+    "inverse_ranges_of_rays",
     "label_pixels",
     "lift_matches",
     "log_polar",
     "log_polar_covariance",
     "log_polar_residual",
     "quaternion_from_rotation",
+    "range_map",
     "ransac_rigid",
     "refine_ego_motion",
     "rotation_angle_deg",
@@ -66,4 +71,5 @@ __all__ = [
     "share_at_closest",
     "vector_from_rotation",
     "virtual_crop",
+    "z_map",
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
 
@@ -28,8 +28,6 @@ class Camera(ABC):
     size: tuple[int, int]
     distortion: tuple[float, ...] = ()
 
-    depth_kind: ClassVar[Literal["z", "range"]]
-    """What `unproject` takes: metres along the optical axis, or metres along the ray."""
     _coefficient_counts: ClassVar[tuple[int, ...]]
 
     def __post_init__(self) -> None:
@@ -61,8 +59,16 @@ class Camera(ABC):
         """Unit vectors (n, 3) towards what pixels (n, 2) show; NaN rows where no direction is imaged there."""
 
     @abstractmethod
-    def unproject(self, pixels: FloatArray, depth: FloatArray) -> FloatArray:
-        """Points (n, 3) at ``depth`` (n,) metres, of this camera's `depth_kind`, behind pixels (n, 2)."""
+    def pixel_angle(self, rays: FloatArray) -> FloatArray:
+        """(n,) radians that a pixel spans along unit vectors (n, 3), in the direction in which it spans more.
+
+        Of the lens without its distortion, which changes it little.
+        """
+
+    def unproject(self, pixels: FloatArray, range_m: FloatArray) -> FloatArray:
+        """Points (n, 3) at ``range_m`` (n,) metres along the rays of pixels (n, 2) (Eq. 6); NaN where `rays` is."""
+        points: FloatArray = self.rays(pixels) * np.asarray(range_m, dtype=np.float64)[:, None]
+        return points
 
     def in_image(self, pixels: FloatArray) -> BoolArray:
         """Mask (n,): which pixels (n, 2) lie inside the image; NaN does not."""
@@ -91,12 +97,11 @@ class Camera(ABC):
 
 @dataclass(frozen=True, eq=False)
 class PinholeCamera(Camera):
-    """The pinhole (Eq. 1-6), distorted by OpenCV's k1 k2 p1 p2 [k3]. Depth is z, along the optical axis.
+    """The pinhole (Eq. 1-6), distorted by OpenCV's k1 k2 p1 p2 [k3].
 
     A point behind the camera, or so far out that the distortion polynomial folds back into the image, has NaN pixels.
     """
 
-    depth_kind = "z"
     _coefficient_counts = (0, 4, 5)
 
     def project(self, points: FloatArray) -> FloatArray:
@@ -128,19 +133,19 @@ class PinholeCamera(Camera):
 
     def rays(self, pixels: FloatArray) -> FloatArray:
         """Unit vectors (n, 3)."""
-        points = self.unproject(pixels, np.ones(len(pixels)))
-        unit: FloatArray = points / np.linalg.norm(points, axis=1, keepdims=True)
-        return unit
-
-    def unproject(self, pixels: FloatArray, depth: FloatArray) -> FloatArray:
-        """Points (n, 3) at ``depth`` (n,) metres along the optical axis (Eq. 6)."""
         normalised = self._from_pixels(pixels)
         if self.distortion:
             normalised = self._undistort(normalised)
-        depth = np.asarray(depth, dtype=np.float64)
-        points = np.empty((len(normalised), 3))
-        points[:, 0], points[:, 1], points[:, 2] = normalised[:, 0] * depth, normalised[:, 1] * depth, depth
-        return points
+        unit = np.empty((len(normalised), 3))
+        np.divide(1.0, np.sqrt(np.einsum("ij,ij->i", normalised, normalised) + 1.0), out=unit[:, 2])
+        np.multiply(normalised[:, 0], unit[:, 2], out=unit[:, 0])
+        np.multiply(normalised[:, 1], unit[:, 2], out=unit[:, 1])
+        return unit
+
+    def pixel_angle(self, rays: FloatArray) -> FloatArray:
+        """(n,) radians: most across the direction to the axis, where it falls with the cosine."""
+        angle: FloatArray = rays[:, 2] / self.focal_px
+        return angle
 
     def _coefficients(self) -> tuple[float, float, float, float, float]:
         k1, k2, p1, p2 = self.distortion[:4]
@@ -199,10 +204,9 @@ class WideAngleCamera(Camera):
     """The equidistant fisheye (Kannala-Brandt k1..k4), also beyond 180 degrees.
 
     The image radius is ``f theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)`` at ``theta`` off the
-    optical axis. Depth is the range along the ray, because z vanishes at 90 degrees.
+    optical axis.
     """
 
-    depth_kind = "range"
     _coefficient_counts = (0, 4)
 
     def project(self, points: FloatArray) -> FloatArray:
@@ -244,10 +248,9 @@ class WideAngleCamera(Camera):
             sideways = np.where(radius > 0.0, np.sin(theta) / radius, 1.0)
         return np.concatenate([normalised * sideways[:, None], np.cos(theta)[:, None]], axis=1)
 
-    def unproject(self, pixels: FloatArray, depth: FloatArray) -> FloatArray:
-        """Points (n, 3) at ``depth`` (n,) metres along the ray."""
-        points: FloatArray = self.rays(pixels) * np.asarray(depth, dtype=np.float64)[:, None]
-        return points
+    def pixel_angle(self, rays: FloatArray) -> FloatArray:
+        """(n,) radians: most towards the axis, where it is the same everywhere."""
+        return np.full(len(rays), 1.0 / self.focal_px)
 
     def _theta_limit(self) -> float:
         return min(math.pi, _first_turning_point(self.distortion)) if self.distortion else math.pi

@@ -20,8 +20,8 @@ def ground_inverse_depth(
 ) -> Float32Array:
     """(h, w) inverse depth, 1/m, of plane ground ``height_m`` straight below the body's origin; 0 where there is none.
 
-    ``slope`` is the plane's rise for each metre to the north and to the east. Depth is of the camera's kind: z for a
-    pinhole, range for a wide-angle camera. With ``stride`` the map is (h / stride, w / stride), and each of its pixels
+    ``slope`` is the plane's rise for each metre to the north and to the east. Depth is z, along the optical axis, as
+    networks take and give it. With ``stride`` the map is (h / stride, w / stride), and each of its pixels
     stands for the centre of a block. Raises ValueError where the camera is not above the ground or ``stride`` does not
     divide the image.
     """
@@ -30,7 +30,7 @@ def ground_inverse_depth(
     if not camera_height_m > 0.0:
         raise ValueError(f"camera {camera.name!r} is not above the ground: its height is {camera_height_m:.2f} m")
     towards_camera = normal @ (R_ned_body @ camera.T_body_camera.rotation)
-    # A point at depth d is d times its ray, and on the ground where d (ray . n) is the camera's height.
+    # A point at z = d is d times its ray, and on the ground where d (ray . n) is the camera's height.
     inverse_depth = _rays_of_unit_depth(camera, stride) @ (towards_camera / camera_height_m).astype(np.float32)
     # NaN, outside a lens's image circle, is no ground either.
     return np.where(inverse_depth > 0.0, inverse_depth, np.float32(0.0))
@@ -38,10 +38,11 @@ def ground_inverse_depth(
 
 @lru_cache(maxsize=32)
 def _rays_of_unit_depth(camera: RigCamera, stride: int) -> Float32Array:
-    """(h / stride, w / stride, 3) optical-frame points at depth 1 behind the blocks' centres."""
+    """(h / stride, w / stride, 3) optical-frame points at z = 1 behind the blocks' centres; NaN where there is none."""
     width, height = camera.camera.size
     if stride < 1 or width % stride or height % stride:
         raise ValueError(f"a stride of {stride} does not divide an image of {width}x{height}")
     u, v = np.meshgrid(np.arange(0, width, stride) + stride / 2.0, np.arange(0, height, stride) + stride / 2.0)
-    points = camera.camera.unproject(np.stack([u.ravel(), v.ravel()], axis=1), np.ones(u.size))
+    rays = camera.camera.rays(np.stack([u.ravel(), v.ravel()], axis=1))
+    points = rays / np.where(rays[:, 2:] > 0.0, rays[:, 2:], np.nan)
     return points.reshape(*u.shape, 3).astype(np.float32)

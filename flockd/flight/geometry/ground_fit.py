@@ -1,4 +1,4 @@
-"""The ground as a plane, fitted to the depth of what is seen of it around the drone."""
+"""The ground as a plane, fitted to the ranges of what is seen of it around the drone."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from flockd.flight.geometry.robust.kernels import Kernel, Tukey
 from flockd.flight.geometry.robust.reweighting import reweighted
 
 RELIEF = 0.03
-"""Standard deviation of what the ground departs from its plane, as a share of the depth, straight below; it grows with
+"""Standard deviation of what the ground departs from its plane, as a share of the range, straight below; it grows with
 the distance from there."""
 NEAR_EXPECTED = 0.35
-"""What is seen counts as ground when its inverse depth is within this share of the expected plane's."""
+"""What is seen counts as ground when its inverse range is within this share of the expected plane's."""
 REACH = 3.0
 """How far from the point below the drone the ground is used, in heights."""
 MIN_POINTS = 60
@@ -27,14 +27,14 @@ MEDIAN_DEVIATIONS = 6.0
 
 @dataclass(frozen=True, eq=False)
 class GroundSamples:
-    """Points seen, by their direction and inverse depth, with level axes at the drone's place."""
+    """Points seen, by their direction and inverse range, with level axes at the drone's place."""
 
     rays: FloatArray
-    """(n, 3) NED, to a point at depth 1."""
+    """(n, 3) NED unit vectors."""
     inverse: FloatArray
-    """(n,) one over the depth."""
+    """(n,) one over the range."""
     offsets: FloatArray
-    """(n, 3) NED, of the camera from the body's origin, in the same unit as the depth."""
+    """(n, 3) NED, of the camera from the body's origin, in the same unit as the range."""
     sigma: FloatArray
     """(n,) standard deviation of `inverse`."""
 
@@ -89,7 +89,7 @@ def fit_ground(samples: GroundSamples, height: float, slope: FloatArray) -> Fitt
 
 
 def _fitted(ground: GroundSamples, weights: FloatArray, spread: FloatArray) -> FloatArray:
-    """(3,) height and slope. A point at inverse depth w is on the plane where ``n . (ray + w offset) = w height``."""
+    """(3,) height and slope. A point at inverse range w is on the plane where ``n . (ray + w offset) = w height``."""
     at = ground.rays + ground.inverse[:, None] * ground.offsets
     rows = np.column_stack([ground.inverse, -at[:, :2]])
     root: FloatArray = np.sqrt(weights) / spread
@@ -98,7 +98,7 @@ def _fitted(ground: GroundSamples, weights: FloatArray, spread: FloatArray) -> F
 
 
 def _residuals(ground: GroundSamples, plane: FloatArray) -> FloatArray:
-    """(n,) of the inverse depth."""
+    """(n,) of the inverse range."""
     normal = np.array([plane[1], plane[2], 1.0])
     left: FloatArray = ground.inverse - ground.rays @ normal / (plane[0] - ground.offsets @ normal)
     return left

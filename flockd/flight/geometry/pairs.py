@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, IntArray
+from flockd.flight.geometry.depth_maps import RangeMap
 from flockd.flight.geometry.rig import RigCamera
 
 BACKGROUND_LABEL = 0
@@ -74,8 +75,8 @@ def lift_matches(
     camera: RigCamera,
     pixels: FloatArray,
     flow: Float32Array,
-    depth_previous: Float32Array,
-    depth_current: Float32Array,
+    depth_previous: RangeMap,
+    depth_current: RangeMap,
     labels_previous: NDArray[np.integer],
     labels_current: NDArray[np.integer],
     *,
@@ -84,7 +85,7 @@ def lift_matches(
     """Matches ``p -> p + flow(p)`` of one camera as pairs of points in the body frame (Eq. 6, then the extrinsics).
 
     ``pixels`` (n, 2) of the previous image; all maps have the camera's size: ``flow`` (h, w, 2) pixels, depths (h, w)
-    metres of the camera's depth kind, labels (h, w) integers. A pair is dropped where an end lies outside the image,
+    metres along the ray, labels (h, w) integers. A pair is dropped where an end lies outside the image,
     its depth is not finite, not positive or above ``max_depth_m``, or the labels of both ends differ. Raises
     ValueError for a map of another size.
     """
@@ -98,14 +99,15 @@ def lift_matches(
     inside = camera.camera.in_image(pixels_current)
     pixels_previous, pixels_current = pixels_previous[inside], pixels_current[inside]
     labels = _nearest(labels_previous, pixels_previous)
-    z_previous = _sample_depth(depth_previous, pixels_previous)
-    z_current = _sample_depth(depth_current, pixels_current)
+    range_previous = _sample_depth(depth_previous, pixels_previous)
+    range_current = _sample_depth(depth_current, pixels_current)
     # A comparison with NaN is false, so depths that are not finite go too.
-    kept = (z_previous > 0.0) & (z_previous <= max_depth_m) & (z_current > 0.0) & (z_current <= max_depth_m)
+    kept = (range_previous > 0.0) & (range_previous <= max_depth_m)
+    kept &= (range_current > 0.0) & (range_current <= max_depth_m)
     kept &= labels == _nearest(labels_current, pixels_current)
     pixels_previous, pixels_current = pixels_previous[kept], pixels_current[kept]
-    previous = camera.camera.unproject(pixels_previous, z_previous[kept])
-    current = camera.camera.unproject(pixels_current, z_current[kept])
+    previous = camera.camera.unproject(pixels_previous, range_previous[kept])
+    current = camera.camera.unproject(pixels_current, range_current[kept])
     imaged = np.isfinite(previous[:, 0]) & np.isfinite(
         current[:, 0]
     )  # outside a fisheye's image circle there is no ray
@@ -129,7 +131,7 @@ def _nearest(values: NDArray[_Value], pixels: FloatArray) -> NDArray[_Value]:
     return found
 
 
-def _sample_depth(depth: Float32Array, pixels: FloatArray) -> FloatArray:
+def _sample_depth(depth: RangeMap, pixels: FloatArray) -> FloatArray:
     """(n,) depth between pixel centres: bilinear where the four around agree, else that of the nearest pixel."""
     height, width = depth.shape
     # Pixel index i has its centre at i + 0.5; at the border the outermost centres are held.
@@ -142,7 +144,7 @@ def _sample_depth(depth: Float32Array, pixels: FloatArray) -> FloatArray:
     shares = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
     nearest = depth[pixels[:, 1].astype(np.int64), pixels[:, 0].astype(np.int64)].astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # A plane's inverse depth, not its depth, is linear in the image.
+        # A plane's inverse range, not its range, is nearly linear from one pixel to the next.
         blended = 1.0 / (shares / corners).sum(axis=0)
         low, high = corners.min(axis=0), corners.max(axis=0)
         agree = (low > 0.0) & (high - low <= _DEPTH_AGREEMENT * low)

@@ -70,7 +70,7 @@ class VirtualCrop:
     def _maps(self, images: Mapping[str, UInt8Array], range_m: float | None) -> dict[str, Float32Array]:
         """For each camera that is needed, u and v (2, size, size) of what it fills the crop with; NaN elsewhere."""
         pixel_centres = _pixel_centres(self.camera.size)
-        directions = self.camera.unproject(pixel_centres, np.ones(len(pixel_centres))) @ self.T_body_virtual.rotation.T
+        directions = self.camera.rays(pixel_centres) @ self.T_body_virtual.rotation.T
         maps: dict[str, FloatArray] = {}
         missing = np.ones(len(directions), dtype=np.bool_)
         if self.main in images:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from flockd.core.choices import Provider
-from flockd.core.config.base import Positive, Section
+from flockd.core.config.base import PlainName, Positive, Section, text
 from flockd.core.errors import ModelError
 from flockd.core.messages import Float32Array
 
@@ -135,7 +135,8 @@ class OutputSpec(TensorSpec):
 class CropSpec(Section):
     """How a model wants to see an object: in the middle of a square crop, at a certain size.
 
-    Widths of a crop are angles seen from the camera, so that the same numbers serve lenses of any kind.
+    The same numbers serve lenses of any kind and length: the greatest width is an angle, the least is in pixels of the
+    camera's image, whose sharpness it is about.
     """
 
     fill: Positive
@@ -147,32 +148,24 @@ class CropSpec(Section):
     mirror_scale: Positive
     """Width of the last crop, over the width that suits the object. It enters mirrored: the model errs on it in another
     way, and so the mean of both errs less."""
-    min_half_angle_deg: Annotated[float, Field(gt=0, lt=90)]
+    min_half_width_px: Positive
+    """Half of a crop's width is at least this, in pixels of the camera's image: smaller objects stay small in it."""
     max_half_angle_deg: Annotated[float, Field(gt=0, lt=90)]
-    """Half of a crop's width is at least and at most this."""
+    """And at most this, seen from the camera."""
     max_resize: Annotated[float, Field(gt=1)]
     """A further crop is at most this many times as wide as the one before it, and at least as much narrower."""
     max_crops: Annotated[int, Field(ge=2)]
     """How often an object is cropped anew before the mirrored crop, at most: the first crop and the refined ones."""
 
-    @model_validator(mode="after")
-    def _limits_are_in_order(self) -> Self:
-        if self.min_half_angle_deg >= self.max_half_angle_deg:
-            raise ValueError(
-                f"min_half_angle_deg {self.min_half_angle_deg:g} is not below max_half_angle_deg "
-                f"{self.max_half_angle_deg:g}; write a smaller one"
-            )
-        return self
-
 
 class Manifest(Section):
     """All that is known about one model."""
 
-    name: Annotated[str, Field(pattern=r"^[a-z0-9_-]+$")]
+    name: PlainName
     roles: Annotated[tuple[str, ...], Field(min_length=1)]
     """What it can be used for; who uses it knows what each role needs."""
     file: Annotated[str, Field(min_length=1)]
-    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    sha256: Annotated[str, text(r"^[0-9a-f]{64}$", "a SHA-256, 64 hexadecimal digits in small letters")]
     description: str
     image_scale: Positive = 1.0
     """The images are resized by this factor before they enter. A model of fixed size takes them as large as fits."""

@@ -10,8 +10,9 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from flockd.core.choices import Role
 from flockd.core.config.document import Place, key_text, read_document
-from flockd.core.config.perception import PerceptionConfig
+from flockd.core.config.perception import DIS, NO_MODEL, PerceptionConfig
 from flockd.core.config.validation_messages import problems_of
 from flockd.core.data import data_path
 from flockd.core.errors import ConfigError, ConfigProblem, ModelError, shortage_of
@@ -122,6 +123,21 @@ def manifests_of(config: PerceptionConfig) -> tuple[Path, ...]:
     """The manifests of all models that a configuration names, each once. Raises ModelError for a missing folder."""
     folder = models_folder(config)
     return tuple(dict.fromkeys(manifest_path(folder, name) for name in config.networks.values()))
+
+
+def models_for(role: Role, folder: Path) -> tuple[str, ...]:
+    """Names of the models in a folder that fill a role, and what may stand in place of one, for people."""
+    found = []
+    for path in find_manifests(folder):
+        try:
+            if role in read_manifest(path).manifest.roles:
+                found.append(path.stem)
+        except ModelError:
+            continue  # whoever names it is told why it cannot be read
+    return (*found, *_WITHOUT_MODEL.get(role, ()))
+
+
+_WITHOUT_MODEL: Mapping[str, tuple[str, ...]] = {"flow": (DIS,), "distance": (NO_MODEL,), "verification": (NO_MODEL,)}
 
 
 def find_manifests(folder: Path) -> tuple[Path, ...]:

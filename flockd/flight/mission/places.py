@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flockd.core.config.mission import WaypointParameters
-from flockd.core.earth import metres_a_degree
+from flockd.core.earth import degrees_apart, metres_a_degree
 from flockd.core.messages import FloatArray, MissionOrder
 
 
@@ -32,6 +32,6 @@ def _from_degrees(place_deg: FloatArray, home_deg: FloatArray | None) -> FloatAr
     """Level metres near home; within 10 km they are right to a few metres, within 1 km to centimetres."""
     if home_deg is None:
         return None
-    across_deg = (place_deg[1] - home_deg[1] + 180.0) % 360.0 - 180.0  # the shorter way round
+    across_deg = degrees_apart(float(place_deg[1]), float(home_deg[1]))
     north_m, east_m = metres_a_degree(float(place_deg[0] + home_deg[0]) / 2)
     return np.array([(place_deg[0] - home_deg[0]) * north_m, across_deg * east_m])

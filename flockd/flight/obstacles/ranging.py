@@ -21,7 +21,7 @@ from flockd.core.messages import (
     ObstacleRanges,
     UInt8Array,
 )
-from flockd.flight.geometry import Rig, RigCamera, RigidTransform, grid_pixels, inverse_depths_of_rays
+from flockd.flight.geometry import Rig, RigCamera, RigidTransform, grid_pixels, inverse_ranges_of_rays
 from flockd.flight.perception.observation import CameraObservation, Observation
 
 _STRIDE_PX = 4
@@ -43,7 +43,7 @@ _MIN_BASELINE_M = 0.05
 """Across the line of sight: with less between two images, their flow shows no depth."""
 _FLOW_SIGMA_PX = 1.0
 _CERTAIN_SIGMAS = 5.0
-"""A point by flow counts where its inverse depth is so many standard deviations from that of the sky."""
+"""A point by flow counts where its inverse range is so many standard deviations from that of the sky."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,9 +170,9 @@ def _is_level(north: Float32Array, east: Float32Array, down: Float32Array) -> Bo
 
 
 def _body_rays(camera: RigCamera) -> Float32Array:
-    """(3, n): what has to be multiplied by the depth of each pixel that is taken, in body axes."""
+    """(3, n) unit vectors of the pixels that are taken, in body axes."""
     pixels = grid_pixels(camera.camera.size, _STRIDE_PX)
-    rays: FloatArray = camera.T_body_camera.rotation @ camera.camera.unproject(pixels, np.ones(len(pixels))).T
+    rays: FloatArray = camera.T_body_camera.rotation @ camera.camera.rays(pixels).T
     return rays.astype(np.float32)
 
 
@@ -203,7 +203,7 @@ class _Triangulation:
     def points(self, ego: EgoMotion, before: Observation, now: CameraObservation) -> _Points:
         """From the flow and the drone's own motion, in body axes, without the camera's own place.
 
-        Where a pixel's inverse depth is not well above that of the sky, it is left out.
+        Where a pixel's inverse range is not well above that of the sky, it is left out.
         """
         assert now.flow is not None
         mounted, lens = self._camera.T_body_camera, self._camera.camera
@@ -217,10 +217,10 @@ class _Triangulation:
         column, row = end.astype(np.int64).T
         background = now.labels[row, column] == 0
         end, p = end[background], p[background]
-        ray = lens.unproject(end, np.ones(len(end)))
-        inverse, baseline = inverse_depths_of_rays(p, ray, between)
+        ray = lens.rays(end)
+        inverse, baseline = inverse_ranges_of_rays(p, ray, between)
         with np.errstate(divide="ignore", invalid="ignore"):
-            sigma = _FLOW_SIGMA_PX / lens.focal_px / baseline
+            sigma = _FLOW_SIGMA_PX * lens.pixel_angle(ray) / baseline
             certain = (baseline > _MIN_BASELINE_M) & (inverse > _CERTAIN_SIGMAS * sigma)
         places = mounted.rotation @ (ray[certain] / inverse[certain, None]).T
         relative = (sigma / inverse)[certain].astype(np.float32)

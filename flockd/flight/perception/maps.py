@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, UInt8Array
-from flockd.flight.geometry import PinholeCamera, RigidTransform
+from flockd.flight.geometry import PinholeCamera, RigidTransform, ZMap
 from flockd.flight.perception.detection.instances import Instance
 
 
@@ -15,7 +15,7 @@ class OpenDepth:
     """Depth that a network knows up to its scale."""
 
     inverse: Float32Array
-    """(h, w): a factor makes 1/m of it."""
+    """(h, w): a factor makes 1/m along the optical axis of it."""
     shift: bool
     """Whether something has to be added as well: the inverse depth is known up to scale and shift."""
 
@@ -24,7 +24,7 @@ class OpenDepth:
 class SceneMaps:
     """What the networks say of one image."""
 
-    depth: Float32Array | OpenDepth
+    depth: ZMap | OpenDepth
     """(h, w) metres along the optical axis, the sky very far; or what ground of known height gives its scale."""
     labels: UInt8Array
     """(h, w) 0 for background, then one value a drone."""

@@ -1,10 +1,11 @@
-"""The metric scale of depth that a network leaves open, from flat ground as far below as the height says."""
+"""From what a network says of depth to metric ranges, with the scale that flat ground gives where it is left open."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from flockd.core.messages import Float32Array
+from flockd.flight.geometry import Camera, RangeMap, ZMap, range_map
 from flockd.flight.geometry.robust.line import ransac_line
 from flockd.flight.perception.maps import OpenDepth, SceneMaps
 
@@ -19,21 +20,22 @@ _MAX_DEPTH_M = 1e3
 """Farther is as far: the sky's inverse depth is about 0, or less."""
 
 
-def metric_depth(maps: SceneMaps, ground: Float32Array | None) -> Float32Array:
-    """(h, w) metres: the network's own, or with the scale that flat ground gives.
+def metric_depth(maps: SceneMaps, ground: Float32Array | None, camera: Camera) -> RangeMap:
+    """(h, w) metres along the ray: the network's own, or with the scale that flat ground gives.
 
     That scale, ``inverse depth = factor * open + shift``, is the one that brings most of the image's lower part onto
     the ground, by RANSAC: what stands on the ground does not count.
 
     Args:
-        maps: what the networks say of the image.
-        ground: (h/stride, w/stride) inverse depth of flat ground, 1/m, 0 where there is none; None: nothing is known of
-            the ground.
+        maps: what the networks say of the image, along the optical axis.
+        ground: (h/stride, w/stride) inverse depth of flat ground, 1/m along that axis, 0 where there is none; None:
+            nothing is known of the ground.
+        camera: of the image. Where its lens images nothing, the range is NaN.
 
     Raises ValueError where too little of the image is ground.
     """
     if not isinstance(maps.depth, OpenDepth):
-        return maps.depth
+        return range_map(maps.depth, camera)
     if ground is None:
         raise ValueError("the network gives its depth no scale")
     (height, width), stride = ground.shape, maps.labels.shape[0] // ground.shape[0]
@@ -48,4 +50,5 @@ def metric_depth(maps: SceneMaps, ground: Float32Array | None) -> Float32Array:
     if scale is None:
         raise ValueError("too little flat ground is in view to fix the scale of depth")
     inverse = np.float32(scale.slope) * maps.depth.inverse + np.float32(scale.intercept)
-    return np.asarray(1.0 / np.maximum(inverse, np.float32(1.0 / _MAX_DEPTH_M)), np.float32)
+    z = ZMap(np.asarray(1.0 / np.maximum(inverse, np.float32(1.0 / _MAX_DEPTH_M)), np.float32))
+    return range_map(z, camera)

@@ -13,6 +13,7 @@ from flockd.core.messages import (
     UInt8Array,
     VehicleState,
 )
+from flockd.flight.geometry import RangeMap
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,8 +22,10 @@ class CameraObservation:
 
     image: UInt8Array
     """(h, w, 3) RGB."""
-    depth: Float32Array | None
-    """(h, w) metres, as `Camera.unproject` takes it; drones at their detections' ranges. None: it has no scale."""
+    depth: RangeMap | None
+    """(h, w) metres along the ray, drones at their detections' ranges; NaN where the lens images nothing.
+
+    None: it has no scale."""
     labels: UInt8Array
     """(h, w) 0 background, k the detection with label k, 255 not to be used."""
     flow: Float32Array | None

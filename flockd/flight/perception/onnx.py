@@ -14,11 +14,11 @@ from flockd.core.choices import Role
 from flockd.core.config.perception import NO_MODEL, PerceptionConfig
 from flockd.core.errors import ModelError
 from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
-from flockd.flight.geometry import RigCamera
+from flockd.flight.geometry import RigCamera, ZMap, blind_pixels
 from flockd.flight.inference.checks import Deadline, no_deadline
 from flockd.flight.inference.fitting import fit
 from flockd.flight.inference.manifest import Unknown
-from flockd.flight.inference.manifest_file import manifest_path, models_folder
+from flockd.flight.inference.manifest_file import manifest_path, models_folder, models_for
 from flockd.flight.inference.providers import engines_folder
 from flockd.flight.inference.session import OnnxModel
 from flockd.flight.perception.detection.instances import group_instances
@@ -31,6 +31,8 @@ CROPS_PER_RUN = 24
 """Crops in one run of a network, so that an image full of false proposals does not take more memory."""
 _MIN_DEPTH_M, _MAX_DEPTH_M = 1e-3, 1e3
 """Where a reciprocal of depth is taken: nearer than the lens, and where flow and height measure nothing any more."""
+_NO_DRONE_LOGIT = np.float32(-50.0)
+"""Where the lens images nothing."""
 _MIN_RAY_Z = 0.1
 """Least z of a unit ray, for its tangents to stay finite: 84 degrees off the optical axis."""
 
@@ -84,6 +86,9 @@ class OnnxNetworks:
         if self._segmentation is not self._depth:
             maps = self._run(self._segmentation, frame.image, planes)
         logit = self._at_map_stride(maps["drone"], (width, height))[0]
+        blind = blind_pixels(camera.camera, self.map_stride)
+        if blind.any():
+            logit = np.where(blind, _NO_DRONE_LOGIT, logit)
         offset = self._at_map_stride(maps["offset"], (width, height))
         # A second stage weeds out false proposals, so that the first may propose more.
         threshold = self._segmentation.manifest.threshold
@@ -166,7 +171,7 @@ class OnnxNetworks:
             resized *= np.array([width / maps.shape[2], height / maps.shape[1]], np.float32)[:, None, None]
         return np.asarray(resized, dtype=np.float32)
 
-    def _depth_of(self, depth: Float32Array, camera: RigCamera) -> Float32Array | OpenDepth:
+    def _depth_of(self, depth: Float32Array, camera: RigCamera) -> ZMap | OpenDepth:
         """Metres where the depth network knows them, else what it leaves open; from its output, resized."""
         meaning = self._depth.manifest.results["depth"].depth
         is_inverse = meaning.quantity == "inverse_depth"
@@ -176,7 +181,7 @@ class OnnxNetworks:
             depth = depth / longer if is_inverse else depth * longer
         if self._unknown == "nothing":
             metres = 1.0 / np.maximum(depth, 1.0 / _MAX_DEPTH_M) if is_inverse else depth
-            return np.asarray(metres, np.float32)
+            return ZMap(np.asarray(metres, np.float32))
         inverse = depth if is_inverse else 1.0 / np.maximum(depth, _MIN_DEPTH_M)
         return OpenDepth(np.asarray(inverse, np.float32), shift=self._unknown == "scale_and_shift")
 
@@ -228,7 +233,7 @@ class _Models:
         if role not in model.manifest.roles:
             raise ModelError(
                 f"perception.{role}: model {name!r} fills {', '.join(model.manifest.roles)} and not {role}; "
-                "choose another"
+                f"{_one_of(role, self._folder)}"
             )
         return model
 
@@ -243,8 +248,12 @@ def _what_to_name_instead(name: str, role: Role, path: Path, folder: Path) -> st
         return f"{name} is a model's ONNX file; name the manifest beside it, {Path(name).with_suffix('.yaml')}"
     if "/" in name and not name.endswith(".yaml"):
         return f"{name!r} is no model's name, and no manifest; name the manifest, as in {Path(name) / role}.yaml"
-    at_hand = ", ".join(sorted(p.stem for p in folder.glob("*.yaml"))) or "none at hand"
-    return f"there is no model {name!r} ({path} is missing); choose one of {at_hand}"
+    return f"there is no model {name!r} ({path} is missing); {_one_of(role, folder)}"
+
+
+def _one_of(role: Role, folder: Path) -> str:
+    known = models_for(role, folder)
+    return f"choose one of {', '.join(known)}" if known else "name another"
 
 
 def _in_batches(model: OnnxModel, images: Sequence[UInt8Array]) -> dict[str, Float32Array]:
@@ -294,5 +303,6 @@ def _ray_tangents(camera: RigCamera, stride: int) -> Float32Array:
     width, height = camera.camera.size
     u, v = np.meshgrid(np.arange(stride / 2, width, stride), np.arange(stride / 2, height, stride))
     rays = camera.camera.rays(np.stack([u.ravel(), v.ravel()], 1))
+    rays[np.isnan(rays[:, 0])] = 0.0  # where the lens images nothing
     tangents = rays[:, :2] / np.maximum(rays[:, 2:], _MIN_RAY_Z)
     return np.ascontiguousarray(tangents.T.reshape(2, *u.shape), dtype=np.float32)

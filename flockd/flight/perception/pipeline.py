@@ -9,7 +9,7 @@ import cv2
 
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.messages import Float32Array, Frame, FrameSet, GroundEstimate, Reason, ReasonKind, VehicleState
-from flockd.flight.geometry import Rig, ground_inverse_depth
+from flockd.flight.geometry import RangeMap, Rig, ground_inverse_depth
 from flockd.flight.perception.continuity import ContinuityMonitor
 from flockd.flight.perception.detection.detector import DetectionTrace, Detector
 from flockd.flight.perception.detection.masks import depth_of_drones, without_borders
@@ -102,7 +102,7 @@ class Perception:
 
     def _scenes(
         self, frames: Mapping[str, Frame], vehicle: VehicleState, ground: GroundEstimate | None
-    ) -> tuple[dict[str, SceneMaps], dict[str, Float32Array], Reasons]:
+    ) -> tuple[dict[str, SceneMaps], dict[str, RangeMap], Reasons]:
         """The networks' maps of every camera, and the metres of those that have any."""
         scenes, depths, reasons = {}, {}, []
         for name, frame in frames.items():
@@ -110,7 +110,7 @@ class Perception:
                 plane = self._plane(name, vehicle, ground)
                 scene = self._networks.scene(frame, self._rig.cameras[name], plane)
                 if plane is not None or not self._needs_ground:
-                    depths[name] = metric_depth(scene, plane)
+                    depths[name] = metric_depth(scene, plane, self._rig.cameras[name].camera)
                 scenes[name] = scene
             except CAMERA_FAULTS as error:  # an output that is not finite; a height below the ground
                 reasons.append(_of_camera(name, str(error)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from flockd.core.config.safety import GateParameters, SafetyParameters
-from flockd.flight.safety.events import OFFBOARD, CameraHealth, Event, Inputs, MissionEnd
+from flockd.flight.safety.events import OFFBOARD, CameraHealth, Event, Inputs, MissionEnd, link_lost
 from flockd.flight.safety.fence import outside_fence, outside_heights
 from flockd.flight.safety.gate import (
     Gate,
@@ -36,6 +36,7 @@ __all__ = [
     "Supervisor",
     "Surroundings",
     "Verdict",
+    "link_lost",
     "outside_fence",
     "outside_heights",
 ]

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
+from flockd.core import services
 from flockd.core.config.safety import SafetyParameters
 
 OFFBOARD = "offboard"
@@ -72,8 +73,20 @@ class Inputs:
     """As of `outside_fence`."""
     outside_heights: bool
     """As of `outside_heights`."""
+    motion_age_s: float
+    """Age of the autopilot's newest position and velocity; infinite before the first."""
     heartbeat_age_s: float
     """Age of the autopilot's newest heartbeat; infinite before the first."""
+    message_age_s: float
+    """The same of its newest message of any kind."""
+    stream_fault: str | None
+    """Why the streamer has ended offboard flight by itself, until the supervisor has silenced it; None: it has not."""
+    autopilot_failsafe: bool
+    """The autopilot flies by its own failsafe, and not as it was asked."""
+    foreign_setpoints: str | None
+    """What was seen of setpoints of another sender; None: nothing."""
+    parameter_fault: str | None
+    """What is wrong with a parameter of the autopilot that was changed in flight; None: nothing."""
     flight_mode: str | None
     """The autopilot's; `OFFBOARD` or any other word. None: not known yet, as for the next two."""
     armed: bool | None
@@ -119,7 +132,12 @@ class Event(StrEnum):
     COMMAND_REFUSED = "command_refused"
     FENCE_LEFT = "fence_left"
     HEIGHTS_LEFT = "heights_left"
+    MOTION_UNKNOWN = "motion_unknown"
     LINK_LOST = "link_lost"
+    STREAM_ENDED = "stream_ended"
+    AUTOPILOT_FAILSAFE = "autopilot_failsafe"
+    FOREIGN_SETPOINTS = "foreign_setpoints"
+    PARAMETER_CHANGED = "parameter_changed"
     NOT_OFFBOARD = "not_offboard"
     NOT_ARMED = "not_armed"
     NOT_IN_AIR = "not_in_air"
@@ -136,12 +154,25 @@ class Event(StrEnum):
     NO_ANSWER = "no_answer"
 
 
+def link_lost(heartbeat_age_s: float, message_age_s: float, p: SafetyParameters) -> str | None:
+    """Why the link to the autopilot counts as lost, by the ages of its newest heartbeat and message; None: it does not.
+
+    The supervisor's judgement and the streamer's.
+    """
+    if not message_age_s <= p.link_timeout_s:
+        return f"no message from the autopilot {_since(message_age_s)}"
+    if not heartbeat_age_s <= p.heartbeat_timeout_s:
+        return f"no heartbeat from the autopilot {_since(heartbeat_age_s)}"
+    return None
+
+
 def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
     """What is the matter, each with one short sentence for people; empty in a quiet flight."""
     lost = [f"{name} {fault}" for name, camera in inputs.cameras.items() if (fault := _fault(camera, p))]
     sightless = len(lost) == len(inputs.cameras) or len(lost) > p.max_lost_cameras
     failures = inputs.ego_motion_failures
     temperature = inputs.temperature_c
+    lost_link = link_lost(inputs.heartbeat_age_s, inputs.message_age_s, p)
     table = (
         (Event.SIGHT_LOST, sightless, f"too few cameras deliver images: {', '.join(lost) or 'there are none'}"),
         (Event.CAMERA_LOST, len(lost) > 0 and not sightless, f"a camera is lost: {', '.join(lost)}"),
@@ -188,6 +219,8 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
             not inputs.loop_lag_s <= p.max_loop_lag_s,
             f"the event loop is {inputs.loop_lag_s:.2f} s late",
         ),
+        (Event.FOREIGN_SETPOINTS, inputs.foreign_setpoints is not None, f"{inputs.foreign_setpoints}"),
+        (Event.PARAMETER_CHANGED, inputs.parameter_fault is not None, f"{inputs.parameter_fault}"),
         (
             Event.GUSTS_STRONG,
             p.degraded_gusts_m_s < inputs.gusts_m_s <= p.max_gusts_m_s,
@@ -212,11 +245,18 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         (Event.COMMAND_REFUSED, inputs.refused_commands > 0, "a command was not finite or far too large"),
         (Event.FENCE_LEFT, inputs.outside_fence, "outside the fence"),
         (Event.HEIGHTS_LEFT, inputs.outside_heights, "above or below the heights allowed"),
+        (Event.LINK_LOST, lost_link is not None, f"{lost_link}"),
         (
-            Event.LINK_LOST,
-            not inputs.heartbeat_age_s <= p.heartbeat_timeout_s,
-            f"no heartbeat from the autopilot {_since(inputs.heartbeat_age_s)}",
+            Event.MOTION_UNKNOWN,
+            not inputs.motion_age_s <= services.MOTION.timeout,
+            f"no position and velocity from the autopilot {_since(inputs.motion_age_s)}",
         ),
+        (
+            Event.STREAM_ENDED,
+            inputs.stream_fault is not None and lost_link is None,
+            f"setpoints ended: {inputs.stream_fault}",
+        ),
+        (Event.AUTOPILOT_FAILSAFE, inputs.autopilot_failsafe, _FAILSAFE),
         (Event.NOT_OFFBOARD, inputs.flight_mode != OFFBOARD, f"the flight mode is {inputs.flight_mode or 'not known'}"),
         (Event.NOT_ARMED, not inputs.armed, "not armed"),
         (Event.NOT_IN_AIR, not inputs.in_air, "not in the air"),
@@ -230,6 +270,12 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         (Event.MISSION_RETURNS, inputs.mission_over is MissionEnd.RETURN, "the mission is over and ends with Return"),
     )
     return {event: sentence for event, holds, sentence in table if holds}
+
+
+_FAILSAFE = (
+    "the autopilot is in its failsafe, and would take up any setpoint by itself; select Hold or Position, and offboard "
+    "once flockd is ready"
+)
 
 
 def _since(age_s: float) -> str:

@@ -78,6 +78,10 @@ class Rule:
         return self.later if lasted_s >= self.after_s else self.reaction
 
 
+FOREIGN_S = 0.5
+"""For how long somebody else may interfere before Hold is asked for."""
+
+
 def rules(p: SafetyParameters) -> dict[Event, Rule]:
     """The rule of every event that can be noticed."""
     on_battery_low = Reaction[p.on_battery_low.upper()]
@@ -105,7 +109,12 @@ def rules(p: SafetyParameters) -> dict[Event, Rule]:
         Event.COMMAND_REFUSED: Rule(Barrier.NONE, Reaction.DEGRADE),
         Event.FENCE_LEFT: Rule(Barrier.WAIT, Reaction.DEGRADE, p.outside_s, Reaction.HOLD),
         Event.HEIGHTS_LEFT: Rule(Barrier.WAIT, Reaction.DEGRADE, p.outside_s, Reaction.HOLD),
+        Event.MOTION_UNKNOWN: Rule(Barrier.WAIT, Reaction.HOVER),
         Event.LINK_LOST: Rule(Barrier.LATCH, Reaction.SILENCE),
+        Event.STREAM_ENDED: Rule(Barrier.LATCH, Reaction.SILENCE),
+        Event.AUTOPILOT_FAILSAFE: Rule(Barrier.WAIT, Reaction.NOTE),
+        Event.FOREIGN_SETPOINTS: Rule(Barrier.NONE, Reaction.DEGRADE, FOREIGN_S, Reaction.HOLD),
+        Event.PARAMETER_CHANGED: Rule(Barrier.WAIT, Reaction.DEGRADE, FOREIGN_S, Reaction.HOLD),
         Event.NOT_OFFBOARD: Rule(Barrier.NONE, Reaction.SILENCE),
         Event.NOT_ARMED: Rule(Barrier.WAIT, Reaction.SILENCE),
         Event.NOT_IN_AIR: Rule(Barrier.WAIT, Reaction.NOTE),

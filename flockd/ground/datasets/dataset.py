@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flockd.core.config.rig import CameraConfig
-from flockd.core.messages import Float32Array, UInt8Array
-from flockd.flight.geometry import RigidTransform
+from flockd.core.messages import UInt8Array
+from flockd.flight.geometry import RigidTransform, ZMap
 from flockd.ground.datasets.errors import DatasetError
 from flockd.ground.datasets.image_files import read_depth, read_image
 
@@ -32,7 +32,7 @@ class DatasetFrame:
     moment: Moment
     image: UInt8Array
     """(h, w, 3) RGB."""
-    depth: Float32Array | None
+    depth: ZMap | None
     """(h, w) metres along the optical axis, NaN where there is none; None where it was not asked for."""
 
 
@@ -78,6 +78,6 @@ class FileDataset:
         """All frames in order, read one by one. Raises DatasetError at one that is missing or damaged."""
         size = self.camera.size_px
         for index, entry in enumerate(self.entries):
-            depth = read_depth(entry.depth, size, self.depth_units_per_m) if with_depth and entry.depth else None
+            depth = ZMap(read_depth(entry.depth, size, self.depth_units_per_m)) if with_depth and entry.depth else None
             image = read_image(entry.image, size)
             yield DatasetFrame(Moment(index, entry.name, entry.time_s, entry.T_world_camera), image, depth)

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from flockd.core.image_header import MAX_IMAGE_PIXELS, image_size
+from flockd.core.image_header import cost_fault, image_size
 from flockd.core.messages import Float32Array, UInt8Array
 from flockd.ground.datasets.errors import DatasetError
 
@@ -75,11 +75,10 @@ def _fault(data: bytes) -> str | None:
     """What is wrong with a file before it is decoded, and memory taken for what it claims to hold."""
     if not data:
         return "is empty"
-    size = image_size(data)
-    if size is None:
+    if image_size(data) is None:
         return "is no image"
-    if size[0] * size[1] > MAX_IMAGE_PIXELS:
-        return f"claims to be {size[0]} x {size[1]} pixels, more than any camera has"
+    if (costs := cost_fault(data)) is not None:
+        return costs
     if data.startswith(_PNG):
         return _png_fault(data)
     if data.startswith(_JPEG) and _JPEG_END not in data[-64:]:

@@ -9,9 +9,16 @@ import numpy as np
 from flockd.core.messages import FloatArray
 from flockd.ground.datasets.errors import DatasetError
 
+MAX_TABLE_BYTES = 1 << 28
+"""Hours of poses at 200 Hz."""
+
 
 def read_lines(file: Path) -> list[tuple[int, str]]:
     """Line number from 1 and text of each line that is neither empty nor a comment. Raises DatasetError."""
+    if file.exists() and not file.is_file():
+        raise DatasetError(f"{file}: is not an ordinary file; restore it")
+    if file.exists() and file.stat().st_size > MAX_TABLE_BYTES:
+        raise DatasetError(f"{file}: is larger than {MAX_TABLE_BYTES >> 20} MiB, which no table is; restore it")
     try:
         text = file.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:

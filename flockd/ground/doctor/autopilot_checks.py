@@ -9,6 +9,7 @@ from contextlib import suppress
 from flockd.core.config import DroneConfig
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.safety import GateParameters
+from flockd.flight.safety import link_lost
 from flockd.ground.doctor.finding import Finding, Level, failed, failed_from_error, passed, warned
 from flockd.ground.doctor.range_checks import WATCHED_S, judge_range_finder
 from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware
@@ -41,15 +42,15 @@ async def _ask(config: DroneConfig, parameters: AutopilotParameters, heard_s: fl
     try:
         heard = link.status()
         firmware = await _firmware(link)
-        found = [judge_heartbeat(link.system_id, heard, parameters)]
-        signing = judge_signing(isinstance(firmware, Firmware), link.status().heartbeat_age_s, parameters)
+        found = [judge_heartbeat(link.system_id, heard, config)]
+        signing = judge_signing(isinstance(firmware, Firmware), silent=_is_silent(link.status(), config))
         if isinstance(firmware, Firmware):
             found += [judge_firmware(firmware), signing, *await _parameters(link, config, parameters)]
         elif signing.level is Level.FAILURE:
             found += [failed_from_error("firmware", str(firmware)), signing]
         else:
             found += [failed_from_error("firmware", str(firmware)), *await _parameters(link, config, parameters)]
-        if link.status().heartbeat_age_s <= parameters.max_heartbeat_age_s:
+        if not _is_silent(link.status(), config):
             found += judge_refusals(await _refusals(link))
             found.append(judge_clock(await _clock(link)))
             found += await _range_finder(link, config)
@@ -99,29 +100,34 @@ async def _parameters(link: AutopilotLink, config: DroneConfig, parameters: Auto
         except AutopilotError as error:
             fix = f"check whether this firmware has {name}, and whether the link loses messages"
             found.append(failed(name, str(error), fix))
-            if link.status().heartbeat_age_s > parameters.max_heartbeat_age_s:
-                found.append(judge_heartbeat(link.system_id, link.status(), parameters))
+            if _is_silent(link.status(), config):
+                found.append(judge_heartbeat(link.system_id, link.status(), config))
                 break
         else:
             found.append(JUDGES[name](value, config))
     return found
 
 
-def judge_heartbeat(system_id: int, status: AutopilotStatus, parameters: AutopilotParameters) -> Finding:
+def _is_silent(status: AutopilotStatus, config: DroneConfig) -> bool:
+    return link_lost(status.heartbeat_age_s, status.message_age_s, config.safety) is not None
+
+
+def judge_heartbeat(system_id: int, status: AutopilotStatus, config: DroneConfig) -> Finding:
     """Heard, and at rest."""
-    measured = f"system {system_id} at {parameters.address}, heard {status.heartbeat_age_s:.1f} s ago"
-    if status.heartbeat_age_s > parameters.max_heartbeat_age_s:
+    address = "" if config.autopilot is None else f" at {config.autopilot.address}"
+    measured = f"system {system_id}{address}, heard {status.heartbeat_age_s:.1f} s ago"
+    if _is_silent(status, config):
         return failed("heartbeat", f"{measured} and not since", "check the cable, its baud rate, and what else uses it")
     if status.armed:
         return warned("heartbeat", f"{measured}, and armed", "disarm it on the ground before you examine it")
     return passed("heartbeat", f"{measured}, disarmed, in flight mode {status.flight_mode}")
 
 
-def judge_signing(responds: bool, heartbeat_age_s: float, parameters: AutopilotParameters) -> Finding:
+def judge_signing(responds: bool, *, silent: bool) -> Finding:
     """Whether it accepts messages that are not signed (MAVLink 2): flockd's are not, and others' need not be either."""
     if responds:
         return passed("signing", "it accepts unsigned messages of any sender: keep all others off its link")
-    if heartbeat_age_s > parameters.max_heartbeat_age_s:
+    if silent:
         return warned("signing", "not known: it is not heard any more", "repair the link first")
     measured = "it is heard and does not respond: nothing reaches it, or it accepts signed messages only"
     return failed("signing", measured, "check the cable's other direction; remove the signing key from its SD card")

@@ -22,6 +22,7 @@ CHECKS = (
     "temperature",
     "clock",
     "unit",
+    "secrets",
     "zenoh",
     "autopilot",
     "cameras",
@@ -32,6 +33,7 @@ CHECKS = (
 
 def plan(
     config: DroneConfig,
+    file: Path,
     *,
     recordings: Path | None,
     unit: Path | None,
@@ -43,6 +45,7 @@ def plan(
 
     Args:
         config: the drone's.
+        file: its path.
         recordings: where flights are recorded; None: in the service's folder, where there is one.
         unit: the systemd unit to judge; None: the installed one, else the one that comes with flockd.
         seconds: how long the cameras are watched.
@@ -58,6 +61,7 @@ def plan(
         "temperature": ("computer_checks.check_temperature", (config,), 10.0),
         "clock": ("computer_checks.check_clock", (), 10.0),
         "unit": ("service_checks.check_unit", (unit,), 30.0),
+        "secrets": ("secret_checks.check_secrets", (config, file), 5.0),
         "zenoh": ("telemetry_checks.check_fleet", (config,), 20.0),
         "autopilot": ("autopilot_checks.check_autopilot", (config,), 60.0),
         "cameras": ("camera_checks.check_cameras", (config, seconds), seconds + 20.0),

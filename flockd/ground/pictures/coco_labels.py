@@ -95,6 +95,8 @@ def check_size(path: Path, name: str, labels: PictureLabels, size: tuple[int, in
 
 
 def _parsed(path: Path) -> _Coco:
+    if path.exists() and not path.is_file():
+        raise DatasetError(f"{path}: is not an ordinary file; name a COCO file with --labels")
     try:
         coco = _Coco.model_validate_json(path.read_bytes())
     except OSError as error:

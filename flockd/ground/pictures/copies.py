@@ -23,6 +23,8 @@ class Copies:
         self._every = every
         self._targets: dict[PictureFile, Path] = {}
         self._video: _VideoCopy | None = None
+        self.written = 0
+        """Copies that are there; a video counts from its first image on."""
         sources = {picture.path.resolve() for picture in pictures}
         if folder.exists() and not folder.is_dir():
             raise UsageError(f"{folder}: is no folder; name one with --out")
@@ -51,6 +53,7 @@ class Copies:
         if self._video is not None and self._video.target != target:
             self._end_video(whole=True)
         target.parent.mkdir(parents=True, exist_ok=True)
+        self.written += self._video is None
         if picture.is_video:
             if self._video is None:
                 self._video = _VideoCopy(target, picture.rate_hz() / self._every, (image.shape[1], image.shape[0]))

@@ -66,7 +66,7 @@ def find_pictures(paths: Sequence[Path], but_not: Path | None = None) -> list[Pi
 
     Files whose name begins with a dot are other programs' notes, and count only where they are named. Nor
     does what lies in ``but_not``, a folder of copies inside one that is named.
-    Raises UsageError for what is not there, is neither, or is a folder without any.
+    Raises UsageError for what is not there, is no file, is neither, or is a folder without any.
     """
     endings = image_files.SUFFIXES | video.SUFFIXES
     copies = None if but_not is None else but_not.resolve()
@@ -82,6 +82,8 @@ def find_pictures(paths: Sequence[Path], but_not: Path | None = None) -> list[Pi
                 found.setdefault(one.resolve(), PictureFile(one, path))
         elif not path.exists():
             raise UsageError(f"{path}: does not exist; name an image, a video or a folder")
+        elif not path.is_file():
+            raise UsageError(f"{path}: is not an ordinary file; name an image, a video or a folder")
         elif path.suffix.lower() not in endings:
             raise UsageError(
                 f"{path}: is no image or video by its name; its name ends in one of {', '.join(sorted(endings))}"

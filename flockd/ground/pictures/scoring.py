@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from flockd.ground.pictures.single_frame import Box, DetectedDrone
 
 WIDTHS_PX = (0, 6, 12, 30, 80)
 """Where the classes of box width begin; the last one is open."""
 WIDTH_CLASSES = tuple(f"{a}-{b}" for a, b in zip(WIDTHS_PX, [*map(str, WIDTHS_PX[1:]), ""], strict=True))
-PER_IMAGES = 500
 FOUND_IOU, AP_IOU = 0.3, 0.5
 """Least intersection over union with a box of ``found_iou30`` and ``ap50``."""
 
@@ -104,7 +104,8 @@ def summary(pictures: Sequence[Labelled], min_probability: float = 0.0) -> dict[
     """The summary of one set of labelled pictures, counting detections that are at least so probable.
 
     ``boxes``; ``by_width``: by the box's width in pixels the boxes, those ``found`` (a detection's centre lies in the
-    box) and those ``found_iou30``; ``ap50``; ``false_per_500_images``: detections that found no box.
+    box) and those ``found_iou30``; ``ap50``; ``measured``: how many pictures; ``false``: detections that found no box;
+    ``false_per_picture`` and its 95 % confidence interval ``false_per_picture_95``.
     """
     counts = {name: {"boxes": 0, "found": 0, "found_iou30": 0} for name in WIDTH_CLASSES}
     false = 0
@@ -127,5 +128,18 @@ def summary(pictures: Sequence[Labelled], min_probability: float = 0.0) -> dict[
         "boxes": boxes,
         "by_width": counts,
         "ap50": None if ap50 is None else round(ap50, 4),
-        "false_per_500_images": round(PER_IMAGES * false / max(len(pictures), 1), 1),
+        "measured": len(pictures),
+        "false": false,
+        "false_per_picture": false / len(pictures) if pictures else None,
+        "false_per_picture_95": [count / len(pictures) for count in count_interval(false)] if pictures else None,
     }
+
+
+def count_interval(count: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Between which numbers the expected one lies, with this confidence, where ``count`` independent events were seen.
+
+    Exact for Poisson counts: F. Garwood, "Fiducial limits for the Poisson distribution", 1936. False detections of one
+    picture are not quite independent, so the true interval is somewhat wider.
+    """
+    beside = (1 - confidence) / 2
+    return float(gammaincinv(count, beside)) if count else 0.0, float(gammaincinv(count + 1, 1 - beside))

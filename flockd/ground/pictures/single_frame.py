@@ -25,6 +25,7 @@ _R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _MAX_INSTANCE = 2.0
 """An instance's longer side over the drone's apparent size, for it to be of this drone alone: masks of soft pictures
 lack thin arms and propellers, which the first stage has, but it may take several drones for one."""
+_ANY_RANGE_M = 1e4
 _UNKNOWN_HEIGHT_M = 5.0
 """Not used: the networks give the scale. A vehicle state has to hold some height."""
 
@@ -69,11 +70,14 @@ class PictureDetector:
     """Single-frame detection. May be used for pictures of several sizes."""
 
     def __init__(self, config: PerceptionConfig | None = None, networks: Networks | None = None) -> None:
-        """``config``: by default flockd's own networks; whatever it says, the scale is the networks', without flow.
+        """``config``: by default flockd's own networks; whatever it says, the scale is the networks', without flow,
+        and a drone is found at any range: what a picture shows does not depend on how long the lens is.
 
         ``networks`` may be shared; None: those that the configuration names. Raises ModelError.
         """
-        self._config = (config or PerceptionConfig()).model_copy(update={"flow": DIS, "scale": "network"})
+        given = config or PerceptionConfig()
+        any_range = given.detection.model_copy(update={"max_range_m": _ANY_RANGE_M})
+        self._config = given.model_copy(update={"flow": DIS, "scale": "network", "detection": any_range})
         self._networks = networks or load_networks(self._config)
         self._mounted: RigCamera | None = None
 

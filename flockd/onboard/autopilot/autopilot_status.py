@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,10 +10,31 @@ from flockd.core.errors import UnavailableError
 from flockd.core.messages import FloatArray
 
 FlightMode = Literal[
-    "manual", "altitude", "position", "hold", "mission", "return", "land", "take-off", "offboard", "other", "unknown"
-]
+    "manual", "stabilized", "acro", "altitude", "position", "hold", "mission", "return", "land", "take-off", "offboard",
+    "other", "unknown"
+]  # fmt: skip
 """PX4's flight modes as flockd tells them apart; unknown: not heard yet."""
+MODES: Mapping[tuple[int, int], FlightMode] = {
+    (1, 0): "manual",
+    (2, 0): "altitude",
+    (3, 0): "position",
+    (4, 2): "take-off",
+    (4, 3): "hold",
+    (4, 4): "mission",
+    (4, 5): "return",
+    (4, 6): "land",
+    (5, 0): "acro",
+    (6, 0): "offboard",
+    (7, 0): "stabilized",
+}
+"""PX4's main and sub mode."""
 LandedState = Literal["unknown", "ground", "air", "taking off", "landing"]
+
+
+def mode_of(custom_mode: float) -> FlightMode:
+    """By PX4's number of it in MAVLink; one that is not in `MODES` is `other`."""
+    number = int(custom_mode)
+    return MODES.get((number >> 16 & 0xFF, number >> 24 & 0xFF), "other")
 
 
 class AutopilotError(UnavailableError):
@@ -26,6 +48,8 @@ class AutopilotStatus:
     time_s: float
     heartbeat_age_s: float
     """Since the last heartbeat; infinite before the first."""
+    message_age_s: float
+    """Since its last message of any kind."""
     flight_mode: FlightMode
     armed: bool
     failsafe: bool
@@ -42,6 +66,10 @@ class AutopilotStatus:
     """(3,) metres from the estimator's origin, which is not home."""
     home_ned: FloatArray | None
     """(3,) metres, likewise."""
+    foreign_setpoints: str | None = None
+    """What was seen of setpoints that flockd did not send."""
+    parameter_fault: str | None = None
+    """What is wrong with a parameter that was changed since it was armed."""
 
     @property
     def in_air(self) -> bool:

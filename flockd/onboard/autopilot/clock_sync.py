@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flockd.core import services
+from flockd.core.consistency import STAMP
 from flockd.core.messages import FloatArray
 
 WINDOW_S = 30.0
@@ -23,6 +24,14 @@ DRIFT = 5e-5
 JUMP_S = 0.01
 JUMPS = 3
 """So many round trips in a row that contradict the estimate by `JUMP_S` and half their duration begin a new one."""
+RECENT_S = 2.0
+COMPARED_S = 1.0
+"""Messages that are compared with the clock: at 50 Hz enough for one that nothing has held up, ..."""
+LEAST_MESSAGES = 10
+"""... and at any rate so many."""
+LIES_AFTER_S = 1.5
+"""Longer than an autopilot that has started again contradicts its old clock."""
+BELIEVED_AGAIN_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -39,11 +48,54 @@ class ClockEstimate:
     """Robust standard deviation of single round trips' offsets."""
     round_trip_s: float
     """The shortest of the last seconds."""
+    recent_round_trip_s: float
+    """The shortest of the last `RECENT_S`."""
     samples: int
 
     def local_s(self, autopilot_s: float) -> float:
         """When on this computer's clock the autopilot's showed that."""
         return autopilot_s - self.offset_s
+
+
+class StampMonitor:
+    """Whether the clock that round trips give is that of the stamps in other messages: TIMESYNC may lie.
+
+    A message cannot arrive before it was stamped, and the quickest of a second takes no longer on its one way than the
+    quickest round trip takes on both. A clock that jumps, that creeps, or that is somebody else's breaks one of the
+    two, whatever a busy computer delays: that delays round trips too. The limits are `consistency.STAMP`'s.
+    """
+
+    def __init__(self) -> None:
+        self._differences: deque[tuple[float, float]] = deque()
+        """Of the last `COMPARED_S`: when a message arrived, and that less its stamp."""
+        self._begun_s: float | None = None
+        """Since when stamps contradict the clock; None: they do not."""
+        self._last_s = -np.inf
+        """When they last did."""
+        self.lies = False
+        """It has contradicted for long enough to say so, and has not agreed again for long enough."""
+        self.delay_s = 0.0
+        """On the way, the quickest message by this clock."""
+
+    def believes(self, clock: ClockEstimate | None, stamp_s: float, arrived_s: float) -> bool:
+        """Whether a message's stamp, on the autopilot's clock, may be used with that clock."""
+        self._differences.append((arrived_s, arrived_s - stamp_s))
+        while len(self._differences) > LEAST_MESSAGES and arrived_s - self._differences[0][0] > COMPARED_S:
+            self._differences.popleft()
+        if clock is None:
+            return False
+        if len(self._differences) < LEAST_MESSAGES:
+            return not self.lies
+        self.delay_s = min(difference for _, difference in self._differences) + clock.offset_s
+        unsure_s = STAMP.limit + clock.error_s
+        if -unsure_s <= self.delay_s <= clock.recent_round_trip_s + unsure_s:
+            self._begun_s = None
+            self.lies = self.lies and arrived_s - self._last_s < BELIEVED_AGAIN_S
+            return not self.lies
+        self._last_s = arrived_s
+        self._begun_s = arrived_s if self._begun_s is None else self._begun_s
+        self.lies = self.lies or arrived_s - self._begun_s >= LIES_AFTER_S
+        return False
 
 
 class ClockSync:
@@ -92,5 +144,6 @@ def _overlap(samples: FloatArray) -> ClockEstimate:
         error_s=float(0.5 * abs(most_s - least_s)),
         jitter_s=1.4826 * float(np.median(np.abs(offset_s - np.median(offset_s)))),
         round_trip_s=float(duration_s.min()),
+        recent_round_trip_s=float(duration_s[time_s >= time_s[-1] - RECENT_S].min()),
         samples=len(samples),
     )

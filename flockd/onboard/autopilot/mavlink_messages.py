@@ -17,9 +17,11 @@ import numpy as np
 from flockd.core import services
 from flockd.core.messages import FloatArray, RangeReading, VehicleState
 from flockd.flight.geometry import rotation_from_quaternion
-from flockd.onboard.autopilot.autopilot_status import AutopilotStatus, FlightMode, LandedState
-from flockd.onboard.autopilot.clock_sync import ClockSync
+from flockd.onboard.autopilot.autopilot_status import AutopilotStatus, FlightMode, LandedState, mode_of
+from flockd.onboard.autopilot.clock_sync import ClockEstimate, ClockSync, StampMonitor
 from flockd.onboard.autopilot.refusals import CheckEvents, Refusal, refusals
+from flockd.onboard.autopilot.setpoint_watch import SetpointWatch
+from flockd.onboard.autopilot.watched_parameters import WatchedParameters
 
 Fields = Mapping[str, Any]
 
@@ -29,19 +31,6 @@ GPS_FIX_3D = 3
 ESTIMATOR_ATTITUDE, ESTIMATOR_VELOCITY_HORIZONTAL = 1, 2
 ESTIMATOR_POSITION_RELATIVE, ESTIMATOR_POSITION_ABSOLUTE, ESTIMATOR_HEIGHT = 8, 16, 32
 
-MODES: Mapping[tuple[int, int], FlightMode] = {
-    (1, 0): "manual",
-    (2, 0): "altitude",
-    (3, 0): "position",
-    (4, 2): "take-off",
-    (4, 3): "hold",
-    (4, 4): "mission",
-    (4, 5): "return",
-    (4, 6): "land",
-    (6, 0): "offboard",
-    (7, 0): "manual",
-}
-"""PX4's main and sub mode."""
 LANDED_STATES: tuple[LandedState, ...] = ("unknown", "ground", "air", "taking off", "landing")
 """By MAV_LANDED_STATE."""
 RESULTS = (
@@ -74,17 +63,24 @@ QUATERNION_TOLERANCE = 0.1
 """How far a quaternion's norm may be from 1; one that is farther off is no attitude."""
 HOME_TOLERANCE_M = 0.5
 """A home that moves less in flight is not reported: estimators drift."""
-STAMPED = frozenset({"ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "DISTANCE_SENSOR"})
+DISTANCE_SENSOR = "DISTANCE_SENSOR"
+STAMPED = frozenset({"ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", DISTANCE_SENSOR})
 """Messages whose `time_boot_ms` says when they were true."""
 MOST_ERROR_S = 0.005
 """Largest error of a clock whose stamps are better than times of arrival."""
 LONGEST_DELAY_S = 1.0
 """A stamp that is older at its arrival is not believed."""
+RESTARTED_MS = 1000
+"""A stamp that is so much older than the one before comes from a clock that began anew."""
 MAV_SEVERITY_WARNING = 4
 TEXTS_KEPT = 20
 TEXT_MEMORY_S = 10.0
 """For how long a text counts as a reason for a refusal; nor is it reported again meanwhile."""
 MAV_TYPE_ONBOARD_CONTROLLER = 18
+SETTLED_S = 2.0
+"""After its first heartbeat: by then an autopilot that has checks to tell has told them."""
+CHUNKS_S = 0.2
+"""Within which all chunks of a text come."""
 TEXT_CHUNK = 50
 """Characters of a STATUSTEXT; one with fewer is the last of its text."""
 
@@ -100,9 +96,12 @@ class ReceivedMessage:
 class ReceivedMessages:
     """The newest message of each kind. `add` is for one thread, everything else for any."""
 
-    def __init__(self, report: Callable[[str], None]) -> None:
+    def __init__(self, report: Callable[[str], None], max_gap_s: float = services.SETPOINT.timeout) -> None:
         """``report`` is called by `add` with one sentence on the first of each unknown value, of a home that moves in
-        flight, of a landing, and of what the autopilot says as a warning or worse."""
+        flight, of a landing, of a restart, of lost heartbeats, of a clock that lies, and of what the autopilot says as
+        a warning or worse.
+        ``max_gap_s``: between setpoints, which flockd bridges.
+        """
         self._report = report
         self._newest: dict[str, ReceivedMessage] = {}
         self._unknown_values: Counter[str] = Counter()
@@ -112,17 +111,34 @@ class ReceivedMessages:
         """In the air, or seen there and not disarmed since: a landed state alone does not end a flight."""
         self._home_moved = False
         self._landed = False
-        self._text = StatusText()
+        self._text, self._text_s = StatusText(), -math.inf
+        self._begun_fields: Fields = {}
         self._texts: deque[tuple[float, str]] = deque(maxlen=TEXTS_KEPT)
         """Warnings and worse, with their times."""
         self._ranges = RangeMessages()
         self._other_computer_s = -math.inf
+        self._first_s, self._heard_s = math.inf, -math.inf
+        """When its first heartbeat came, and its newest message."""
+        self._max_gap_s = max_gap_s
+        self._boot_ms = 0
+        self.restarts = 0
+        """How often the autopilot has begun anew since flockd listens."""
+        self.heartbeats_lost = 0
+        """Heartbeats that did not come while other messages did."""
+        self.setpoints = SetpointWatch()
+        self.parameters = WatchedParameters(report)
         self.check_events = CheckEvents()
         self.clock = ClockSync()
+        self._stamps = StampMonitor()
 
     def add(self, name: str, fields: Fields, time_s: float) -> None:
         """Takes a message by its name and fields, NaN as null, as MAVSDK decodes them to JSON, and when it came."""
+        self._heard_s = time_s
+        if self._text.begun is not None and name != "STATUSTEXT" and time_s - self._text_s > CHUNKS_S:
+            self.add("STATUSTEXT", {**self._begun_fields, "chunk_seq": 1, "text": ""}, time_s)  # it does not go on
         if name == "STATUSTEXT":
+            self._begun_fields = fields
+            self._text_s = time_s
             whole = self._text.joined(fields)
             if whole is None:
                 return
@@ -130,9 +146,18 @@ class ReceivedMessages:
             self._take_text(whole.strip(), int(fields.get("severity") or 0), time_s)
         if name == "EVENT":
             self.check_events.add(fields, time_s)
+        elif name == "CURRENT_EVENT_SEQUENCE":
+            self.check_events.announce(fields)
+        elif name == "HEARTBEAT":
+            self._count_heartbeats(time_s)
+        elif name == "ATTITUDE_QUATERNION":
+            self._notice_restart(int(fields.get("time_boot_ms") or 0))
+        elif name == "POSITION_TARGET_LOCAL_NED":
+            followed = [math.nan if fields.get(key) is None else float(fields[key]) for key in ("vx", "vy")]
+            self.setpoints.followed(time_s, *followed, offboard=self.flight_mode() == "offboard")
         if name in STAMPED:
-            arrived_s, time_s = time_s, self._stamped_s(fields, time_s)
-            if name == "DISTANCE_SENSOR":
+            arrived_s, time_s = time_s, self._stamped_s(name, fields, time_s)
+            if name == DISTANCE_SENSOR:
                 self._ranges.add(fields, time_s, arrived_s)
         self._newest[name] = ReceivedMessage(time_s, self._checked(name, fields))
         if name in ("HEARTBEAT", "EXTENDED_SYS_STATE"):
@@ -161,7 +186,30 @@ class ReceivedMessages:
             self.recent_texts(now_s, TEXT_MEMORY_S),
             now_s - self._other_computer_s < services.OTHER_HEARTBEAT.timeout,
             streams=streams,
+            settled=now_s - self._first_s >= SETTLED_S,
         )
+
+    def _count_heartbeats(self, time_s: float) -> None:
+        before = self._newest.get("HEARTBEAT")
+        if before is None:
+            self._first_s = time_s
+            return
+        lost = round((time_s - before.time_s) * services.HEARTBEAT.rate_hz) - 1
+        if lost > 0:
+            if self.heartbeats_lost == 0:
+                self._report(
+                    f"the autopilot's heartbeat did not come for {time_s - before.time_s:.1f} s; further ones that are "
+                    "lost are counted (`heartbeats_lost`)"
+                )
+            self.heartbeats_lost += lost
+
+    def _notice_restart(self, boot_ms: int) -> None:
+        """Its clock begins anew, and with it the numbers of its events; of its checks nothing is known."""
+        if boot_ms < self._boot_ms - RESTARTED_MS:
+            self.restarts += 1
+            self.check_events, self.clock = CheckEvents(), ClockSync()
+            self._report("the autopilot has started anew")
+        self._boot_ms = boot_ms
 
     def _take_text(self, text: str, severity: int, time_s: float) -> None:
         if severity > MAV_SEVERITY_WARNING:
@@ -170,13 +218,34 @@ class ReceivedMessages:
             self._report(f"the autopilot says: {text}")
         self._texts.append((time_s, text))
 
-    def _stamped_s(self, fields: Fields, arrived_s: float) -> float:
+    def trusted_clock(self) -> ClockEstimate | None:
+        """The autopilot's clock; None while it is not known, or contradicts the stamps of its messages."""
+        return None if self._stamps.lies else self.clock.estimate
+
+    def _stamped_s(self, name: str, fields: Fields, arrived_s: float) -> float:
         """When it was true on this computer's clock: by the autopilot's stamp, else when it came."""
         clock, boot_ms = self.clock.estimate, fields.get("time_boot_ms")
-        if clock is None or boot_ms is None or clock.error_s > MOST_ERROR_S:
+        if boot_ms is None:
             return arrived_s
-        time_s = min(clock.local_s(1e-3 * (boot_ms + 0.5)), arrived_s)  # the stamp is cut to a millisecond
+        stamp_s, lied = 1e-3 * (boot_ms + 0.5), self._stamps.lies  # the stamp is cut to a millisecond
+        if name == DISTANCE_SENSOR:  # as old as its sensor is slow: it says nothing of the clock
+            believed = not lied
+        else:
+            believed = self._stamps.believes(clock, stamp_s, arrived_s)
+            self._report_clock(lied)
+        if clock is None or not believed or clock.error_s > MOST_ERROR_S:
+            return arrived_s
+        time_s = min(clock.local_s(stamp_s), arrived_s)
         return time_s if arrived_s - time_s <= LONGEST_DELAY_S else arrived_s
+
+    def _report_clock(self, lied: bool) -> None:
+        if self._stamps.lies and not lied:
+            self._report(
+                f"the autopilot's clock, by TIMESYNC, is {abs(self._stamps.delay_s):.2f} s off the stamps of its "
+                "messages; they count from when they arrive"
+            )
+        elif lied and not self._stamps.lies:
+            self._report("the autopilot's clock agrees with its messages again; their stamps are used")
 
     @property
     def home_down_m(self) -> float | None:
@@ -220,9 +289,10 @@ class ReceivedMessages:
         return AutopilotStatus(
             time_s=now_s,
             heartbeat_age_s=now_s - heartbeat.time_s,
+            message_age_s=now_s - self._heard_s,
             flight_mode=self.flight_mode(),
             armed=bool(heartbeat.fields.get("base_mode", 0) & MAV_MODE_FLAG_SAFETY_ARMED),
-            failsafe=heartbeat.fields.get("system_status") == MAV_STATE_CRITICAL,
+            failsafe=heartbeat.fields.get("system_status") == MAV_STATE_CRITICAL or self._would_return(),
             landed_state="unknown" if landed_state is None else LANDED_STATES[landed_state],
             battery_share=_known(system.get("battery_remaining", -1), scale=0.01),
             battery_v=_known(system.get("voltage_battery", 0), scale=0.001, unknown=(0, 65535)),
@@ -230,6 +300,8 @@ class ReceivedMessages:
             gps_ok=None if fix_type is None else fix_type >= GPS_FIX_3D,
             position_ned=_vector(self._fields("LOCAL_POSITION_NED"), "x", "y", "z"),
             home_ned=self._home,
+            foreign_setpoints=self.setpoints.seen,
+            parameter_fault=self.parameters.fault(self._max_gap_s),
         )
 
     def vehicle_state(self) -> VehicleState | None:
@@ -276,8 +348,12 @@ class ReceivedMessages:
         reports = [self._newest[name] for name in ("HEARTBEAT", "CURRENT_MODE") if name in self._newest]
         if not reports:
             return "unknown"
-        mode = int(max(reports, key=lambda message: message.time_s).fields["custom_mode"])
-        return MODES.get((mode >> 16 & 0xFF, mode >> 24 & 0xFF), "other")
+        return mode_of(max(reports, key=lambda message: message.time_s).fields["custom_mode"])
+
+    def _would_return(self) -> bool:
+        """It was asked for offboard and flies another mode: it would be back in offboard with the next setpoint."""
+        asked = self._fields("CURRENT_MODE").get("intended_custom_mode") or 0
+        return mode_of(asked) == "offboard" and self.flight_mode() != "offboard"
 
     def _fields(self, name: str) -> Fields:
         message = self._newest.get(name)
@@ -322,16 +398,22 @@ class RangeMessages:
 
 
 class StatusText:
-    """Joins the chunks of a STATUSTEXT, which carry an id and number themselves from 0."""
+    """Joins the chunks of a STATUSTEXT, which carry an id and number themselves from 0.
+
+    An id of 0 is for texts that have one chunk; but PX4 begins with it, so that one with a full chunk may go on.
+    """
 
     def __init__(self) -> None:
         self._id, self._chunks = 0, [""]
+        self.begun: str | None = None
+        """A text of id 0 that may go on."""
 
     def joined(self, fields: Fields) -> str | None:
         """The whole text with its last chunk, None before; where a chunk was lost, dots stand for it."""
         text = str(fields.get("text") or "").partition("\0")[0]
         number, chunk = fields.get("id") or 0, fields.get("chunk_seq") or 0
-        if number == 0:
+        self.begun = text if number == chunk == 0 and len(text) >= TEXT_CHUNK else None
+        if number == chunk == 0 and self.begun is None:
             return text
         if number != self._id or chunk == 0:
             self._id, self._chunks = number, []

@@ -29,12 +29,13 @@ from mavsdk.system import System
 from flockd.core import services
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.messages import RangeReading, Setpoint, VehicleState
-from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus, Firmware, FlightMode
+from flockd.onboard.autopilot.autopilot_status import MODES, AutopilotError, AutopilotStatus, Firmware, FlightMode
 from flockd.onboard.autopilot.clock_sync import ClockEstimate
-from flockd.onboard.autopilot.mavlink_messages import MODES, Fields, ReceivedMessages, result_text
+from flockd.onboard.autopilot.mavlink_messages import Fields, ReceivedMessages, result_text
 from flockd.onboard.autopilot.refusal_reasons import REMEDIES_OF_RESULTS
 from flockd.onboard.autopilot.refusals import Refusal
 from flockd.onboard.autopilot.throttled_log import ThrottledLog
+from flockd.onboard.autopilot.watched_parameters import GROUND_STATION_LOSS, KINDS
 
 T = TypeVar("T")
 Clock = Callable[[], float]
@@ -49,8 +50,6 @@ COMMAND_SET_MODE = 176
 COMMAND_SET_MESSAGE_INTERVAL = 511
 COMMAND_REQUEST_MESSAGE = 512
 COMMAND_RUN_CHECKS = 401
-STARTS = frozenset({COMMAND_ARM_DISARM, COMMAND_SET_MODE})
-"""Commands that the autopilot's checks may refuse."""
 STREAMS_HZ = {
     "ATTITUDE_QUATERNION": (31, services.VEHICLE_STATE.rate_hz),
     "LOCAL_POSITION_NED": (32, 30.0),
@@ -62,14 +61,23 @@ STREAMS_HZ = {
     "CURRENT_MODE": (436, 20.0),
     "DISTANCE_SENSOR": (132, services.RANGE_FINDER.rate_hz),
     "ALTITUDE": (141, 10.0),
+    "POSITION_TARGET_LOCAL_NED": (85, services.POSITION_TARGET.rate_hz),
 }
 """What is asked for, by message number and rate. PX4 sends CURRENT_MODE at once when the mode changes, at this rate at
 most; its heartbeat comes once a second whatever one asks."""
-RECEIVED = (*STREAMS_HZ, "HEARTBEAT", "AUTOPILOT_VERSION", "STATUSTEXT", "EVENT")
+RECEIVED = (*STREAMS_HZ, "HEARTBEAT", "AUTOPILOT_VERSION", "STATUSTEXT", "EVENT", "CURRENT_EVENT_SEQUENCE")
 TIME_SYNC = "TIMESYNC"
 MOST_OPEN = 20
 """Exchanges whose reply is waited for; older ones are lost."""
 TEXT_MEMORY_S = 2.0
+REASON_S = 0.5
+"""For how long a refusal waits for the autopilot's text, which comes after it."""
+ATTEND_S, ANNOUNCE_S, PARAMETER_S = 0.1, 1.0, 0.5
+"""Between two requests for events that are missing; two announcements; and two readings of a parameter."""
+ANNOUNCEMENT = {
+    "type": 6, "autopilot": 8, "base_mode": 0, "custom_mode": 0, "system_status": 4, "mavlink_version": 3
+}  # fmt: skip
+"""A HEARTBEAT of MAV_TYPE_GCS: PX4 sends its texts on no link on which it hears no ground station."""
 MOST_REPORTS = 100
 
 _log = logging.getLogger(__name__)
@@ -86,20 +94,24 @@ _LOG_LEVELS = {
 class AutopilotLink:
     """One autopilot. Everything that is not a coroutine may be called from any thread and returns at once."""
 
-    def __init__(self, mavsdk: Mavsdk, system: System, executor: ThreadPoolExecutor, clock: Clock) -> None:
+    def __init__(
+        self, mavsdk: Mavsdk, system: System, executor: ThreadPoolExecutor, clock: Clock, max_gap_s: float
+    ) -> None:
         """Use `connect`."""
         self._mavsdk = mavsdk
         self._executor = executor
         self._clock = clock
         self._system_id = int(system.get_system_id())
         self._reports: deque[str] = deque(maxlen=MOST_REPORTS)
-        self._received = ReceivedMessages(self._reports.append)
+        self._received = ReceivedMessages(self._reports.append, max_gap_s)
         self._sent_s = -math.inf
         """When the last setpoint was sent."""
         self._param = Param(system)
         self._direct = MavlinkDirect(system)
         self._time_syncs: deque[int] = deque(maxlen=MOST_OPEN)
         """This computer's times in nanoseconds of exchanges that were not answered yet."""
+        self._missing: deque[tuple[int, int]] = deque(maxlen=MOST_OPEN)
+        """First and last numbers of events to request."""
         for name in (*RECEIVED, TIME_SYNC):
             self._direct.subscribe_message(name, self._receive)
 
@@ -124,10 +136,9 @@ class AutopilotLink:
             deadline = clock() + timeout_s
             await _open(mavsdk, parameters.address, executor)
             system = await _find_system(mavsdk, parameters, deadline, timeout_s, clock)
-            link = cls(mavsdk, system, executor, clock)
+            link = cls(mavsdk, system, executor, clock, parameters.max_gap_s)
             await link._wait_for("HEARTBEAT", deadline)
-            for name, (number, rate_hz) in STREAMS_HZ.items():
-                await link._request_stream(name, number, rate_hz)
+            await link._request_streams()
         except BaseException:
             executor.submit(mavsdk.destroy)  # after a call of it that still runs, which would end the process
             executor.shutdown(wait=False)
@@ -164,6 +175,14 @@ class AutopilotLink:
         """See `ReceivedMessages.unknown_values`."""
         return self._received.unknown_values()
 
+    def parameters(self) -> Mapping[str, float]:
+        """The newest values of those that flockd relies on; see `attend`."""
+        return dict(self._received.parameters.values)
+
+    def heartbeats_lost(self) -> int:
+        """How many did not come while other messages did."""
+        return self._received.heartbeats_lost
+
     def refusals(self) -> tuple[Refusal, ...]:
         """Why it would refuse to arm or to fly offboard now, the cause first."""
         now = self._clock()
@@ -178,8 +197,8 @@ class AutopilotLink:
         await self._command("for its checks", COMMAND_RUN_CHECKS)
 
     def clock(self) -> ClockEstimate | None:
-        """The autopilot's clock; None while it is not known. It is measured by `synchronise`."""
-        return self._received.clock.estimate
+        """See `ReceivedMessages.trusted_clock`. It is measured by `synchronise`."""
+        return self._received.trusted_clock()
 
     async def synchronise(self) -> None:
         """Exchanges times with the autopilot until cancelled."""
@@ -189,6 +208,53 @@ class AutopilotLink:
             with suppress(MavlinkDirectError):  # a link that cannot send says so where setpoints are sent
                 self._direct.send_message(self._message(TIME_SYNC, {"tc1": 0, "ts1": sent_ns}))
             await asyncio.sleep(services.TIME_SYNC.period_s)
+
+    async def attend(self) -> None:
+        """Keeps all coming that an autopilot sends on request only, until cancelled.
+
+        So it announces flockd as a ground station, for the autopilot's texts; requests events that are missing;
+        requests all streams anew of an autopilot that has started anew; and reads the parameters that flockd relies on.
+        """
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._announce())
+            group.create_task(self._request_what_is_missing())
+            group.create_task(self._read_parameters())
+
+    async def _announce(self) -> None:
+        while True:
+            if self.announces():
+                with suppress(MavlinkDirectError):
+                    self._direct.send_message(self._message("HEARTBEAT", ANNOUNCEMENT))
+            await asyncio.sleep(ANNOUNCE_S)
+
+    def announces(self) -> bool:
+        """Whether it may pass for a ground station: never where PX4 acts on the loss of one, which that would hide.
+
+        That is with NAV_DLL_ACT other than 0, or at the end of a mission.
+        """
+        acts = self._received.parameters.values.get(GROUND_STATION_LOSS)
+        return acts == 0 and self._received.flight_mode() != "mission"
+
+    async def _request_what_is_missing(self) -> None:
+        restarts = self._received.restarts
+        while True:
+            while self._missing:
+                first, last = self._missing.popleft()
+                with suppress(MavlinkDirectError):
+                    fields = {"first_sequence": first, "last_sequence": last}
+                    self._direct.send_message(self._message("REQUEST_EVENT", fields))
+            if self._received.restarts != restarts:
+                restarts = self._received.restarts
+                await self._request_streams()
+            await asyncio.sleep(ATTEND_S)
+
+    async def _read_parameters(self) -> None:
+        while True:
+            for name, kind in KINDS.items():
+                with suppress(AutopilotError):  # an older firmware may lack one, and one that is lost says so elsewhere
+                    value = await self.parameter(name, kind)
+                    self._received.parameters.take(name, float(value), armed=self.status().armed)
+                await asyncio.sleep(PARAMETER_S)
 
     def take_reports(self) -> list[str]:
         """What happened to the messages since the last call that people should know, each in one sentence."""
@@ -215,6 +281,7 @@ class AutopilotLink:
         except MavlinkDirectError as error:
             raise AutopilotError(f"MAVSDK could not send a setpoint ({error.result.name.lower()})") from error
         self._sent_s = self._clock()
+        self._received.setpoints.sent(self._sent_s, north, east)
 
     async def request_offboard(self) -> None:
         """Asks for offboard flight; setpoints must be streaming by then. Raises AutopilotError when refused."""
@@ -236,7 +303,7 @@ class AutopilotLink:
 
     async def arm(self) -> None:
         """Starts the motors. Raises AutopilotError when refused."""
-        await self._command("to arm", COMMAND_ARM_DISARM, 1)
+        await self._command("to arm", COMMAND_ARM_DISARM, 1, refused="to arm")
 
     async def take_off(self) -> None:
         """Climbs to its own take-off height (MIS_TAKEOFF_ALT), once armed. Raises AutopilotError when refused."""
@@ -271,6 +338,9 @@ class AutopilotLink:
             self._take_time(json.loads(message.fields_json), now)
         else:
             self._received.add(message.message_name, json.loads(message.fields_json), now)
+            missing = self._received.check_events.missing(now)
+            if missing is not None:
+                self._missing.append(missing)
 
     def _take_time(self, fields: Fields, now: float) -> None:
         """Takes the reply to an exchange of ours; the autopilot asks in the same message, which is left to others."""
@@ -281,21 +351,25 @@ class AutopilotLink:
 
     async def _set_mode(self, mode: FlightMode) -> None:
         main, sub = next(numbers for numbers, name in MODES.items() if name == mode)
-        await self._command(f"for {mode}", COMMAND_SET_MODE, 1, main, sub)
+        await self._command(f"for {mode}", COMMAND_SET_MODE, 1, main, sub, refused=mode)
 
     async def _leave_offboard(self) -> None:
         """PX4 goes back to the last mode it was asked for after landing, and cannot be armed if that was offboard."""
         if self._received.flight_mode() == "offboard":
             await self.hold()
 
-    async def _request_stream(self, name: str, number: int, rate_hz: float) -> None:
-        try:
-            await self._command(f"for {name}", COMMAND_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz)
-        except AutopilotError as error:  # an older firmware may lack one; whatever needs it then says so
-            _log.warning("%s", error)
+    async def _request_streams(self) -> None:
+        for name, (number, rate_hz) in STREAMS_HZ.items():
+            try:
+                await self._command(f"for {name}", COMMAND_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz)
+            except AutopilotError as error:  # an older firmware may lack one; whatever needs it then says so
+                _log.warning("%s", error)
 
-    async def _command(self, what: str, command: int, *values: float) -> None:
-        """Sends a command until it is acknowledged. Raises AutopilotError when refused or never answered."""
+    async def _command(self, what: str, command: int, *values: float, refused: str | None = None) -> None:
+        """Sends a command until it is acknowledged. Raises AutopilotError when refused or never answered.
+
+        ``refused``: what its checks may refuse with it, as in `Refusal.refused`; None: nothing.
+        """
         loop = asyncio.get_running_loop()
         answer: asyncio.Future[tuple[MavlinkDirectResult, str]] = loop.create_future()
 
@@ -310,22 +384,27 @@ class AutopilotLink:
             raise AutopilotError(f"the autopilot was asked {what} and did not respond ({result.name.lower()})")
         verdict = int(json.loads(ack)["result"])
         if verdict != 0:
-            raise AutopilotError(
-                f"the autopilot was asked {what}, which was {result_text(verdict)}{self._why(command, verdict)}"
-            )
+            why = "" if refused is None else await self._why(verdict, refused)
+            raise AutopilotError(f"the autopilot was asked {what}, which was {result_text(verdict)}{why}")
 
-    def _why(self, command: int, verdict: int) -> str:
-        """What is known of a refusal, with what to do."""
-        said = self._received.recent_texts(self._clock(), TEXT_MEMORY_S)
-        checks = self.refusals() if command in STARTS else ()
-        known = [*said, *(f"{refusal.what}; {refusal.remedy}" for refusal in checks)]
+    async def _why(self, verdict: int, refused: str) -> str:
+        """What is known of a refusal, once the autopilot has had time to tell, with what to do."""
+        deadline = self._clock() + REASON_S
+        while not (known := self._known_reasons(refused)) and self._clock() < deadline:
+            await asyncio.sleep(0.02)
         if known:
             return f": {'; '.join(known)}"
-        return f"; {REMEDIES_OF_RESULTS[verdict]}" if verdict in REMEDIES_OF_RESULTS else ""
+        remedy = f"; {REMEDIES_OF_RESULTS[verdict]}" if verdict in REMEDIES_OF_RESULTS else ""
+        return f" without a reason{remedy}"
+
+    def _known_reasons(self, refused: str) -> list[str]:
+        said = self._received.recent_texts(self._clock(), TEXT_MEMORY_S)
+        checks = [refusal for refusal in self.refusals() if refusal.refused in {refused, ""}]
+        return [*said, *(f"{refusal.what}; {refusal.remedy}" for refusal in checks)]
 
     def _message(self, name: str, fields: Fields) -> MavlinkMessage:
         target = {"target_system": self._system_id, "target_component": AUTOPILOT_COMPONENT}
-        text = json.dumps({**target, **fields}, allow_nan=False)
+        text = json.dumps(fields if name == "HEARTBEAT" else {**target, **fields}, allow_nan=False)
         return MavlinkMessage(name, 0, 0, self._system_id, AUTOPILOT_COMPONENT, text)
 
     async def _wait_for(self, name: str, deadline: float) -> Fields:

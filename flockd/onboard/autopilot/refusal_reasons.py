@@ -19,6 +19,7 @@ SEVERAL_SENDERS = "several_senders"
 UNHEALTHY = "unhealthy"
 UNKNOWN_CHECK = "unknown_check"
 SAID = "said"
+NOT_TOLD = "not_told"
 OF_STATE: Mapping[int, str] = {1: "boots", 2: "calibrates", 7: "powers_off", 8: "terminated"}
 """By the heartbeat's MAV_STATE."""
 
@@ -265,6 +266,7 @@ _TABLE: Mapping[str, Mapping[str, str]] = {
         CHECKS_FAIL: "its checks before the flight fail",
         UNKNOWN_CHECK: "a check fails that flockd has no words for",
         SAID: "it says why",
+        NOT_TOLD: "it gives no reason",
     },
 }
 
@@ -330,6 +332,8 @@ TEXTS: tuple[tuple[tuple[str, ...], str], ...] = (
 
 NAVIGATION_STATES: Mapping[FlightMode, int] = {
     "manual": 0,
+    "stabilized": 15,
+    "acro": 10,
     "altitude": 1,
     "position": 2,
     "mission": 3,

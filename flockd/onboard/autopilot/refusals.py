@@ -7,16 +7,19 @@ each check, and a second summary at the end. A firmware without events tells les
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
+from flockd.onboard.autopilot.autopilot_status import AutopilotStatus, FlightMode, mode_of
+from flockd.onboard.autopilot.event_order import EventOrder
 from flockd.onboard.autopilot.refusal_reasons import (
     CHECKS_FAIL,
     NAMES,
     NAVIGATION_STATES,
     NO_SETPOINTS,
     NOT_STREAMING,
+    NOT_TOLD,
     OF_STATE,
     RANK,
     REASONS,
@@ -40,13 +43,13 @@ DENIALS = frozenset(
     )
 )
 MODE_DENIED = event_number("commander_modeswitch_not_avail")
-OFFBOARD_MAIN_MODE = 6
-"""Main mode in PX4's custom mode."""
 ALL_MODES = 0xFFFFFFFF
 ERROR, WARNING = 3, 4
 """PX4's log levels, which are worse the smaller."""
 MOST_CHECKS = 300
 """That a report may name as failed: PX4 has fewer."""
+SEQUENCE_RESET = 1
+"""MAV_EVENT_CURRENT_SEQUENCE_FLAGS."""
 PREARM_CHECK = 1 << 28
 """Bit of MAV_SYS_STATUS_SENSOR."""
 QUIET_ERRORS = frozenset({"check_system_safety_button", "check_modes_mission"})
@@ -56,7 +59,7 @@ REMEMBERED_S = 15.0
 MOST_TOLD = 5
 """Reasons at once; further ones are counted."""
 STICKS = "check_modes_manual_control"
-MANUAL_MODES = frozenset({"manual", "altitude", "position"})
+MANUAL_MODES = frozenset({"manual", "stabilized", "acro", "altitude", "position"})
 
 
 class Refusal(NamedTuple):
@@ -107,22 +110,40 @@ class CheckEvents:
         """There is none yet, or events were lost since."""
         self.denied: tuple[float, str] | None = None
         """When a request was last refused, and why: a switch to offboard, for want of setpoints."""
-        self._sequence: int | None = None
+        self.denied_mode: tuple[float, FlightMode] | None = None
+        """When a ground station was last refused another mode, and which; PX4 tells of no other request."""
+        self._order = EventOrder()
         self._begun: tuple[int, int] | None = None
         self._failed: list[FailedCheck] = []
 
     def add(self, fields: Mapping[str, Any], time_s: float) -> None:
         """Takes an EVENT; one that is none is ignored."""
+        gaps = self._order.gaps
+        self._take_all(self._order.add(fields), gaps, time_s)
+
+    def announce(self, fields: Mapping[str, Any]) -> None:
+        """Takes a CURRENT_EVENT_SEQUENCE; one that is none is ignored."""
+        with suppress(KeyError, TypeError, ValueError, OverflowError):
+            self._order.announce(int(fields["sequence"]) & 0xFFFF, reset=bool(int(fields["flags"]) & SEQUENCE_RESET))
+
+    def missing(self, now_s: float) -> tuple[int, int] | None:
+        """First and last number of events to request now; None: none. After a second without them they are given up."""
+        gaps = self._order.gaps
+        self._take_all(self._order.give_up(), gaps, now_s)
+        return self._order.missing(now_s)
+
+    def _take_all(self, events: Sequence[Mapping[str, Any]], gaps: int, time_s: float) -> None:
+        if self._order.gaps != gaps:
+            self._begun, self.incomplete = None, True
+        for event in events:
+            self._take(event, time_s)
+
+    def _take(self, fields: Mapping[str, Any], time_s: float) -> None:
         try:
-            number, sequence = int(fields["id"]), int(fields["sequence"])
+            number = int(fields["id"])
             arguments, level = bytes(fields["arguments"]), int(fields["log_levels"]) & 0xF
         except (KeyError, TypeError, ValueError, OverflowError):
             return
-        if self._sequence is not None and sequence == self._sequence:
-            return
-        if self._sequence is not None and sequence != (self._sequence + 1) & 0xFFFF:
-            self._begun, self.incomplete = None, True
-        self._sequence = sequence
         if number == BEGINS:
             self._begun, self._failed = (_word(arguments, 9), _word(arguments, 13)), []
         elif number == ENDS:
@@ -133,8 +154,11 @@ class CheckEvents:
         elif number in DENIALS:
             self.denied = time_s, NAMES[number]
         elif number == MODE_DENIED:
-            if _word(arguments, 0) >> 16 & 0xFF == OFFBOARD_MAIN_MODE:
+            mode = mode_of(_word(arguments, 0))
+            if mode == "offboard":
                 self.denied = time_s, NO_SETPOINTS
+            else:
+                self.denied_mode = time_s, mode
         elif self._begun is not None and len(self._failed) < MOST_CHECKS:
             self._failed.append(FailedCheck(number, _word(arguments, 0), level))
 
@@ -147,6 +171,7 @@ def refusals(
     other_computers: bool,
     *,
     streams: bool,
+    settled: bool,
 ) -> tuple[Refusal, ...]:
     """Why it would refuse now, the cause first; empty in offboard flight and where nothing is known against it.
 
@@ -157,6 +182,7 @@ def refusals(
         texts: STATUSTEXT of warning or worse of the last seconds.
         other_computers: one more onboard computer is heard.
         streams: flockd sends setpoints.
+        settled: an autopilot that tells its checks by events would have done so by now.
     """
     found = [_refusal(SEVERAL_SENDERS, "")] if other_computers else []
     if not (status.armed and status.flight_mode == "offboard"):
@@ -164,9 +190,10 @@ def refusals(
         report = events.report
         if report is not None:
             found += _of_report(report, status, streams=streams, asked=_asked(events, status.time_s))
-        elif not status.armed:
+        elif not status.armed and settled:
             found += _of_flags(status, messages, texts)
         found += _of_denial(events, status, found)
+        found += _of_mode(events, status.time_s)
     return _few({refusal.reason: refusal for refusal in reversed(found)})
 
 
@@ -252,6 +279,17 @@ def _of_denial(events: CheckEvents, status: AutopilotStatus, found: Sequence[Ref
     name = events.denied[1]
     if name != NO_SETPOINTS and not (name == CHECKS_FAIL and (found or events.report is not None)):
         yield _refusal(name, "to arm")
+
+
+def _of_mode(events: CheckEvents, now_s: float) -> list[Refusal]:
+    """Why a ground station was refused a flight mode a moment ago."""
+    if events.denied_mode is None or now_s - events.denied_mode[0] >= REMEMBERED_S:
+        return []
+    mode = events.denied_mode[1]
+    state = NAVIGATION_STATES.get(mode)
+    failed = () if events.report is None or state is None else events.report.failed
+    told = [_named(c, mode, streams=True) for c in failed if c.modes >> (state or 0) & 1 and c.modes != ALL_MODES]
+    return told or [_refusal(NOT_TOLD, mode)]
 
 
 def _named(check: FailedCheck, refused: str, *, streams: bool) -> Refusal:

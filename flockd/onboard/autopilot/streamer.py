@@ -14,8 +14,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from flockd.core.config.autopilot import AutopilotParameters
+from flockd.core.config.safety import SafetyParameters
 from flockd.core.messages import Setpoint
-from flockd.flight.safety import Request, Verdict
+from flockd.flight.safety import Request, Verdict, link_lost
 from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus
 
 Send = Callable[[Setpoint], None]
@@ -36,6 +37,8 @@ class StreamReport:
     """This stream has seen the autopilot in offboard."""
     silence: str | None
     """Why nothing was sent at the last deadline; None: a setpoint was."""
+    fault: str | None
+    """Why the stream ended by itself, unless it was because the autopilot left offboard; None after `end`."""
     sent: int
     refused: Mapping[str, int]
     """Deadlines at which nothing was sent, by reason."""
@@ -58,14 +61,16 @@ class SetpointStreamer:
         status: Callable[[], AutopilotStatus],
         gate: Gate,
         parameters: AutopilotParameters,
+        safety: SafetyParameters,
         *,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`status` is asked before each setpoint; `clock` is the one that requests are dated by."""
+        """`status` is asked before each setpoint; `clock` is the one that requests are dated by; `safety` says when the
+        link counts as lost."""
         self._send = send
         self._status = status
         self._gate = gate
-        self._parameters = parameters
+        self._parameters, self._safety = parameters, safety
         self._clock = clock
         self._request: Request | None = None
         self._beat_s = float("-inf")
@@ -95,8 +100,9 @@ class SetpointStreamer:
         self._stream = _Stream(begun_s=self._clock())
 
     def end(self, reason: str) -> None:
-        """Silence until `begin`; `reason` is reported unless the stream had ended before."""
+        """Silence until `begin`; `reason` is reported unless the stream had ended before. Its fault counts as known."""
         self._stream.end(reason)
+        self._stream.fault = None
 
     def offer(self, request: Request) -> None:
         """What to ask the gate for from now on, until a newer request is offered or this one is too old."""
@@ -109,10 +115,12 @@ class SetpointStreamer:
     def report(self) -> StreamReport:
         """What has been done so far."""
         stream = self._stream
+        self._end_after_a_gap(stream)
         return StreamReport(
             streaming=stream.ended is None,
             offboard=stream.offboard,
             silence=stream.ended or self._silence,
+            fault=stream.fault,
             sent=self._sent,
             refused=dict(self._refused),
             missed=self._missed,
@@ -123,19 +131,25 @@ class SetpointStreamer:
         stream = self._stream
         if stream.ended is not None:
             return
-        silence = self._watch(stream) or self._send_one(stream)
+        self._end_after_a_gap(stream)  # before looking at the autopilot, whose failsafe is what follows from the gap
+        silence = stream.ended or self._watch(stream) or self._send_one(stream)
         self._silence = silence
         if silence is not None:
             self._refused[silence] += 1
-            gap_s = self._clock() - stream.last_sent_s
-            if stream.offboard and gap_s > self._parameters.max_gap_s:
-                stream.end(f"{silence}, for more than {self._parameters.max_gap_s:g} s in offboard flight")
+
+    def _end_after_a_gap(self, stream: _Stream) -> None:
+        """Ends a stream whose last setpoint in offboard flight was sent too long ago."""
+        limit_s = self._parameters.max_gap_s
+        if stream.offboard and self._clock() - stream.last_sent_s > limit_s:
+            why = self._silence or "the thread was stopped"  # SIGSTOP, or a machine that slept
+            stream.fail(f"{why}, for more than {limit_s:g} s in offboard flight")
 
     def _watch(self, stream: _Stream) -> str | None:
         """Why the autopilot's state forbids sending; ends the stream where that is final."""
         status = self._status()
-        if status.heartbeat_age_s > self._parameters.max_heartbeat_age_s:
-            stream.end("the autopilot's heartbeat is lost")
+        lost = link_lost(status.heartbeat_age_s, status.message_age_s, self._safety)
+        if lost is not None:
+            stream.fail(lost)
         elif status.flight_mode == "offboard":
             stream.offboard = True
         elif stream.offboard:
@@ -154,8 +168,6 @@ class SetpointStreamer:
             return "no setpoint yet"
         if not 0.0 <= now - request.permission.time_s <= self._parameters.max_setpoint_age_s:
             return "the setpoint is not fresh"
-        if now - stream.last_sent_s > self._parameters.max_gap_s and stream.offboard:
-            return "the thread was stopped"  # between two deadlines: SIGSTOP, or a machine that slept
         allowed = self._gate(now, request).setpoint
         if allowed is None:
             return "the gate refused"
@@ -177,7 +189,7 @@ class SetpointStreamer:
             try:
                 self.step()
             except Exception as error:  # noqa: BLE001 - the thread's last line: silence, and the reason is reported
-                self._stream.end(f"the streamer failed: {error!r}")
+                self._stream.fail(f"the streamer failed: {error!r}")
             deadline += period_s
             late = int((time.monotonic() - deadline) / period_s)
             if late > 0:
@@ -191,6 +203,7 @@ class _Stream:
 
     begun_s: float
     ended: str | None = None
+    fault: str | None = None
     offboard: bool = False
     last_sent_s: float = field(init=False)
 
@@ -200,3 +213,7 @@ class _Stream:
     def end(self, reason: str) -> None:
         if self.ended is None:
             self.ended = reason
+
+    def fail(self, reason: str) -> None:
+        if self.ended is None:
+            self.fault = self.ended = reason

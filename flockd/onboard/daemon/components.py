@@ -12,6 +12,7 @@ from flockd.onboard.daemon.autopilot_requests import AutopilotRequests
 from flockd.onboard.daemon.control import Control
 from flockd.onboard.daemon.host_monitors import LoopLag, Thermometer, WallClock
 from flockd.onboard.daemon.message_sinks import MessageSinks
+from flockd.onboard.daemon.operator_commands import OperatorCommands
 from flockd.onboard.daemon.pilot_loop import PilotLoop
 from flockd.onboard.daemon.refusal_watch import RefusalWatch
 from flockd.onboard.daemon.take_off import TakeOff
@@ -36,6 +37,7 @@ class Components:
     take_off: TakeOff
     sinks: MessageSinks
     telemetry: ZenohTelemetry
+    commands: OperatorCommands
     lag: LoopLag
     thermometer: Thermometer
     wall_clock: WallClock

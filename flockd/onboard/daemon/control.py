@@ -85,7 +85,9 @@ class Control:
         status, vehicle = self._link.status(), self._link.vehicle_state()
         if vehicle is not None:
             self._history.add(vehicle)
-        inputs = self._input_collector.collect(status, vehicle, self._operator, self._mission_over())
+        inputs = self._input_collector.collect(
+            status, vehicle, self._operator, self._mission_over(), self._streamer.report().fault
+        )
         before, now = self.decision, self._clock()
         self.decision = self._supervisor.step(now, inputs)
         self._begin_or_end_flight(before, vehicle)
@@ -142,17 +144,16 @@ class Control:
         return result.output.command, result.time_s
 
     def _around(self, now: float, status: AutopilotStatus, vehicle: VehicleState | None) -> Surroundings:
-        known = vehicle is not None and vehicle.velocity_ned is not None
-        velocity = vehicle.velocity_ned if vehicle is not None and known else np.full(3, np.nan)
-        assert velocity is not None
+        known = vehicle is not None and now - vehicle.time_s <= services.MOTION.timeout
+        velocity = vehicle.velocity_ned if vehicle is not None and known else None
         result = self._pilot_loop.newest
         ranges = None if result is None else result.output.obstacles
         return surroundings(
             () if result is None else result.output.neighbours,
             0.0 if result is None else now - result.time_s,
             moved=np.zeros(3) if result is None else self._history.moved_since(result.time_s),
-            position=position_from_home(status),
-            velocity=velocity,
+            position=position_from_home(status) if known else np.full(2, np.nan),
+            velocity=np.full(3, np.nan) if velocity is None else velocity,
             yaw_rad=math.nan if vehicle is None else _yaw(vehicle),
             height_m=math.nan if vehicle is None else vehicle.height_m,
             obstacles=np.empty((0, 2)) if ranges is None else nearest_points(ranges, self._sigmas),

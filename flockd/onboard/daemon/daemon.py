@@ -161,6 +161,7 @@ class Daemon:
             "requests": components.requests.run,
             "refusals": components.refusals.run,
             "autopilot clock": components.link.synchronise,
+            "autopilot link": components.link.attend,
             "pilot": components.pilot_loop.run,
             "loop lag": components.lag.run,
             "thermometer": components.thermometer.run,

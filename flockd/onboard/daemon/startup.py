@@ -11,6 +11,7 @@ from typing import Any
 
 from flockd import __version__
 from flockd.core.config import DroneConfig
+from flockd.core.secrets import masked
 from flockd.flight.geometry import build_rig
 from flockd.flight.safety import Decision, Gate
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
@@ -21,7 +22,7 @@ from flockd.onboard.daemon.control import Control
 from flockd.onboard.daemon.host_monitors import LoopLag, Thermometer, WallClock
 from flockd.onboard.daemon.message_sinks import MessageSinks
 from flockd.onboard.daemon.mission_orders import MissionOrders
-from flockd.onboard.daemon.operator_commands import OperatorRequests, command_handler
+from flockd.onboard.daemon.operator_commands import OperatorCommands, OperatorRequests
 from flockd.onboard.daemon.pilot_loop import PilotLoop
 from flockd.onboard.daemon.refusal_watch import RefusalWatch
 from flockd.onboard.daemon.supervisor_inputs import InputCollector
@@ -73,7 +74,9 @@ async def open_components(
     )
     stack.push_async_callback(_close_async, link.close)
     gate = Gate(config.safety.gate)
-    streamer = SetpointStreamer(link.send_setpoint, link.status, gate.step, config.autopilot, clock=clock)
+    streamer = SetpointStreamer(
+        link.send_setpoint, link.status, gate.step, config.autopilot, config.safety, clock=clock
+    )
     streamer.start()
     stack.callback(streamer.close)
     history, lag, thermometer = VehicleHistory(), LoopLag(clock), Thermometer()
@@ -88,14 +91,16 @@ async def open_components(
     take_off = TakeOff(link, streamer, operator, lambda: control.decision, sinks.event)
     missions = MissionOrders(config, pilot_loop, link.vehicle_state, lambda: control.decision.state)
     loop = asyncio.get_running_loop()
-    handle = command_handler(config.telemetry.commands, operator, missions, loop, sinks.event)
+    commands = OperatorCommands(
+        config.telemetry.commands, operator, missions, loop, sinks.event, identity=telemetry.identity
+    )
     previews = Previews(build_rig(config.rig), lambda: (pilot_loop.frames, pilot_loop.stepped))
-    telemetry.announce(config.name, _about(config), handle, previews.picture)
+    telemetry.announce(config.name, _about(config), commands.handle, previews.picture)
     return Components(
         link=link, gate=gate, streamer=streamer, source=source, pilot_loop=pilot_loop, networks=networks,
         control=control,
         requests=requests, refusals=RefusalWatch(link, sinks.event, clock), take_off=take_off, sinks=sinks,
-        telemetry=telemetry, lag=lag, thermometer=thermometer,
+        telemetry=telemetry, commands=commands, lag=lag, thermometer=thermometer,
         wall_clock=WallClock(sinks.event, time.monotonic), dead_tasks=dead_tasks,
     )  # fmt: skip
 
@@ -115,7 +120,7 @@ def _open_telemetry(config: DroneConfig) -> ZenohTelemetry:
 def _about(config: DroneConfig) -> AboutMessage:
     return AboutMessage(
         version=__version__,
-        configuration=config.model_dump(mode="json"),
+        configuration=masked(config.model_dump(mode="json")),
         commands=list(config.telemetry.commands),
     )
 

@@ -89,6 +89,7 @@ def _flight_message(components: Components, now: float) -> FlightMessage:
         armed=None if math.isinf(status.heartbeat_age_s) else status.armed,
         in_air=None if status.landed_state == "unknown" else status.in_air,
         heartbeat_age_s=status.heartbeat_age_s,
+        heartbeats_lost=components.link.heartbeats_lost(),
         battery_share=status.battery_share,
         height_m=None if vehicle is None else vehicle.height_m,
         velocity_trim=_velocity_trim(components),
@@ -96,6 +97,8 @@ def _flight_message(components: Components, now: float) -> FlightMessage:
         silence=stream.silence,
         setpoints_sent=stream.sent,
         setpoints_missed=stream.missed,
+        orders=components.commands.recent(),
+        orders_refused=components.commands.refused,
     )
 
 

@@ -48,6 +48,7 @@ class InputCollector:
         self._faults_before = 0
         self._refused_before = 0
         self._had_satellites = False
+        self._was_armed = False
 
     def collect(
         self,
@@ -55,8 +56,9 @@ class InputCollector:
         vehicle: VehicleState | None,
         operator: OperatorRequests,
         mission_over: MissionEnd | None,
+        stream_fault: str | None,
     ) -> Inputs:
-        """All inputs as of now; requests that count once are reset in ``operator``."""
+        """All inputs as of now; requests that count once, or for a flight that is over, are reset in ``operator``."""
         now = self._clock()
         pilot_loop, result = self._pilot_loop, self._pilot_loop.newest
         neighbours = result.output.neighbours if result else ()
@@ -65,6 +67,9 @@ class InputCollector:
         summary = self._camera_monitor.update(now, self._source.status(), noisy, pilot_loop.noisy_images.total())
         position = position_from_home(status)
         self._had_satellites = self._had_satellites or status.gps_ok is True
+        if self._was_armed and not status.armed and status.landed_state == "ground":
+            operator.hold = operator.land = False  # they were for the flight that is over
+        self._was_armed = status.armed
         inputs = Inputs(
             cameras=summary.cameras,
             dropped_share=summary.dropped_share,
@@ -82,7 +87,13 @@ class InputCollector:
             refused_commands=self._refused() - self._refused_before,
             outside_fence=outside_fence(self._config.safety.gate, position),
             outside_heights=vehicle is None or outside_heights(self._config.safety.gate, vehicle.height_m),
+            motion_age_s=math.inf if vehicle is None else now - vehicle.time_s,
             heartbeat_age_s=status.heartbeat_age_s,
+            message_age_s=status.message_age_s,
+            stream_fault=stream_fault,
+            autopilot_failsafe=status.armed and status.failsafe,
+            foreign_setpoints=status.foreign_setpoints,
+            parameter_fault=status.parameter_fault,
             flight_mode=None if status.flight_mode == "unknown" else status.flight_mode,
             armed=None if math.isinf(status.heartbeat_age_s) else status.armed,
             in_air=None if status.landed_state == "unknown" else status.in_air,

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from flockd.core.config import DroneConfig
-from flockd.core.image_header import MAX_IMAGE_PIXELS, image_size
+from flockd.core.image_header import cost_fault
 from flockd.core.messages import Frame, FrameSet, MissionOrder, UInt8Array, VehicleState
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.codec import from_json, parsed
@@ -312,9 +312,8 @@ def makes_steps(topic: str) -> bool:
 def decoded_image(message: bytes) -> UInt8Array:
     """(h, w, 3) RGB of an image's message. Raises ValueError and RecordingError."""
     data, kind = foxglove.image_data(message)
-    width, height = image_size(data) or (0, 0)
-    if width * height > MAX_IMAGE_PIXELS:
-        raise ValueError(f"a {kind} image claims {width}x{height} pixels")
+    if (fault := cost_fault(data)) is not None:
+        raise ValueError(f"a {kind} image {fault}")
     try:
         bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
     except cv2.error:

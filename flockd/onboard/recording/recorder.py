@@ -22,6 +22,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.recording import RecordingConfig
 from flockd.core.config.rig import RigConfig
 from flockd.core.messages import Frame, FrameSet, MissionOrder, PilotOutput, VehicleState
+from flockd.core.secrets import masked
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.codec import to_json
 from flockd.onboard.recording.mcap_file import Entry, Inclosure, McapFile, Note, RecordingError
@@ -118,7 +119,7 @@ class Recorder:
         flight = {"drone": drone, "began": began, "images": self._settings.images, **_VERSIONS, **(facts or {})}
         head = (
             Note(MODELS_NOTE, models or {}),
-            Inclosure(CONFIGURATION, "application/json", config.model_dump_json(indent=1).encode()),
+            Inclosure(CONFIGURATION, "application/json", _without_passwords(config)),
         )
         self._parts = _Parts(path, flight, head, config.rig, self._settings, self._tell)
         self._track = _Track(config.rig)
@@ -392,10 +393,17 @@ class _Parts:
     def _make_room(self) -> None:
         """Deletes this drone's oldest recordings in the folder until a whole file more stays within the quota.
 
-        Only what a recorder wrote: what someone cut or recovered from it stays and does not count.
+        Only what a recorder wrote: what someone cut or recovered from it stays and does not count. So does the flight
+        before this one: somebody may want to know how it ended.
         """
-        others = [path for path in self._first.parent.glob("*.mcap") if path != self.path and self._may_delete(path)]
-        others.sort(key=lambda path: path.stat().st_mtime)
+        flights = {
+            path: facts.get("recording")
+            for path in self._first.parent.glob("*.mcap")
+            if path != self.path and (facts := self._written_by_a_recorder(path))
+        }
+        others = sorted(flights, key=lambda path: path.stat().st_mtime)
+        earlier = [flights[path] for path in others if flights[path] != self._flight["recording"]]
+        others = [path for path in others if flights[path] not in earlier[-1:]]
         room = (self._settings.quota_mb - self._settings.file_mb) * _MB - sum(path.stat().st_size for path in others)
         for path in others:
             if room >= 0:
@@ -404,8 +412,8 @@ class _Parts:
             path.unlink()
             self._tell(f"recording: {path} was deleted, as all recordings may take {self._settings.quota_mb:g} MB")
 
-    def _may_delete(self, path: Path) -> bool:
-        """Whether a recorder of this drone wrote the file; what is no readable file is reported once and left alone."""
+    def _written_by_a_recorder(self, path: Path) -> Mapping[str, str] | None:
+        """What is known of a file that a recorder of this drone wrote; what is no readable file is reported once."""
         try:
             facts = head_of(path)[0].facts if path.is_file() else None  # a pipe would wait for ever to be opened
             why = "is not a file"
@@ -415,8 +423,8 @@ class _Parts:
             if path not in self._skipped:
                 self._skipped.add(path)
                 self._tell(f"recording: {path} was skipped and does not count for the quota: it {why}")
-            return False
-        return facts.get("drone") == self._flight["drone"] and not facts.keys() & EDITED
+            return None
+        return facts if facts.get("drone") == self._flight["drone"] and not facts.keys() & EDITED else None
 
 
 def _step_entries(
@@ -452,6 +460,11 @@ def _compressed(frame: Frame, settings: RecordingConfig) -> bytes | None:
     if settings.images == "jpeg":
         options = [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality]
     return bytes(cv2.imencode(f".{settings.images}", bgr, options)[1])
+
+
+def _without_passwords(config: DroneConfig) -> bytes:
+    """A recording is passed on; what opens a camera is not needed to fly it again."""
+    return json.dumps(masked(config.model_dump(mode="json")), indent=1, ensure_ascii=False).encode()
 
 
 def _json_entry(stream: Any, time_s: float, sequence: int, message: object) -> Entry:

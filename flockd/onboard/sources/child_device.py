@@ -50,9 +50,17 @@ class ChildDevice(CameraDevice):
     """Messages beside errors and the end."""
 
     def __init__(
-        self, name: str, rate_hz: float, command: Sequence[str], environment: Mapping[str, str] | None = None
+        self,
+        name: str,
+        rate_hz: float,
+        command: Sequence[str],
+        environment: Mapping[str, str] | None = None,
+        told: bytes = b"",
     ) -> None:
-        """Starts the process; raises CameraError."""
+        """Starts the process, and writes ``told`` to its standard input. Raises CameraError.
+
+        Every user of the computer can read arguments, and what is told may hold a password.
+        """
         self._name, self._rate_hz = name, rate_hz
         self._last_s: float | None = None
         self._sequence = 0
@@ -67,7 +75,9 @@ class ChildDevice(CameraDevice):
             )
         except OSError as error:
             raise CameraError(f"{name}: the process of {self._what} cannot be started ({error.strerror})") from error
-        assert self._process.stdout is not None
+        assert self._process.stdin is not None and self._process.stdout is not None
+        with contextlib.suppress(BrokenPipeError):  # it has ended, which `read` says
+            self._process.stdin.write(told)
         self._stream = _Stream(self._process.stdout.fileno(), {*self._kinds, ERROR, END})
 
     def read(self, timeout_s: float) -> CapturedBuffer | None:

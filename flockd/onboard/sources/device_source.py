@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 from flockd.core.config.rig import IntrinsicsConfig
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
+from flockd.core.secrets import masked
 from flockd.onboard.sources.devices import CameraDevice, CameraError, CapturedBuffer
 from flockd.onboard.sources.frame_receiver import FrameReceiver, ReceivedFrames
 from flockd.onboard.sources.frames import Count, RawFrame
@@ -124,6 +125,8 @@ class _Camera:
                     self._capture(device)
             except CameraError as error:
                 self._receiver.fault(self._name, str(error))
+            except Exception as error:  # noqa: BLE001 - the thread's border: a camera that fails so is seen, too
+                self._receiver.fault(self._name, f"{self._name}: cannot be run ({type(error).__name__}: {error})")
             pause_s = _FIRST_PAUSE_S if self._delivered else pause_s
             self._stopping.wait(pause_s)
             pause_s = min(2.0 * pause_s, _LONGEST_PAUSE_S)
@@ -145,7 +148,7 @@ class _Camera:
             if time.monotonic() - usable_s > limit_s:
                 last = f" (the last was refused: {refused.replace('_', ' ')})" if refused else ""
                 raise CameraError(
-                    f"{self._name}: {self._parameters.place} gave no usable image for {limit_s:g} s{last}"
+                    f"{self._name}: {masked(self._parameters.place)} gave no usable image for {limit_s:g} s{last}"
                 )
 
     def _take(self, captured: CapturedBuffer, image_format: ImageFormat) -> Count | None:

@@ -1,9 +1,10 @@
 """Runs one GStreamer pipeline and writes its images to standard output; a process of its own, started by this file.
 
-gstreamer_child.py PIPELINE CAPS
+gstreamer_child.py CAPS
 
-It calls the libraries of GStreamer by their C interface, needs nothing of Python but what Python brings, and ends when
-its standard input is closed. What it writes is a row of messages, each a header and its data:
+The pipeline comes over standard input, as its length and UTF-8. It calls the libraries of GStreamer by their C
+interface, needs nothing of Python but what Python brings, and ends when its standard input is closed. What it
+writes is a row of messages, each a header and its data:
 
 - `caps`: what the images are from now on, as GStreamer writes it; a text.
 - `image`: one image, its time in nanoseconds of CLOCK_MONOTONIC (-1: the buffer has none), and whether it is damaged.
@@ -26,6 +27,7 @@ from typing import Any, ClassVar
 HEADER = struct.Struct("<4sIqI4x")
 """Kind, flags, time in ns, length of the data."""
 CAPS, IMAGE, ERROR, END = b"caps", b"imag", b"fail", b"end\0"
+LENGTH = struct.Struct("<I")
 DAMAGED = 1
 """A flag of an image."""
 NO_TIME = -1
@@ -79,15 +81,36 @@ def main() -> None:
     output = os.dup(1)
     os.dup2(2, 1)  # some drivers print, and this is no place for it
     stopping = threading.Event()
+    pipeline = read_text()
     threading.Thread(target=_await_end, args=(stopping,), daemon=True).start()
     try:
         try:
-            run(sys.argv[1], sys.argv[2], output, stopping)
+            run(pipeline, sys.argv[1], output, stopping)
         except _PipelineError as error:
             send(output, ERROR, data=str(error).encode())
     except BrokenPipeError:
         pass  # the other side has gone
     os._exit(0)  # threads of drivers may hang
+
+
+def packed_text(text: str) -> bytes:
+    """As `read_text` takes it."""
+    data = text.encode()
+    return LENGTH.pack(len(data)) + data
+
+
+def read_text() -> str:
+    """The pipeline; empty where the other side has gone."""
+    with open(0, "rb", buffering=0, closefd=False) as source:
+        header = _exactly(source, LENGTH.size)
+        return _exactly(source, LENGTH.unpack(header)[0] if len(header) == LENGTH.size else 0).decode()
+
+
+def _exactly(source: Any, size: int) -> bytes:
+    data = b""
+    while len(data) < size and (more := source.read(size - len(data))):
+        data += more
+    return data
 
 
 def _await_end(stopping: threading.Event) -> None:

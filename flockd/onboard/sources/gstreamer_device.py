@@ -10,10 +10,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flockd.core.config.source import CameraDeviceParameters
+from flockd.core.secrets import masked
 from flockd.onboard.sources import gstreamer_child
 from flockd.onboard.sources.child_device import ChildDevice, ChildMessage
 from flockd.onboard.sources.devices import CameraError, CapturedBuffer
-from flockd.onboard.sources.gstreamer_child import CAPS, IMAGE
+from flockd.onboard.sources.gstreamer_child import CAPS, IMAGE, packed_text
 from flockd.onboard.sources.gstreamer_formats import caps, format_of
 from flockd.onboard.sources.image_formats import ImageFormat
 
@@ -27,10 +28,11 @@ class GstreamerDevice(ChildDevice):
     _what, _kinds = "its pipeline", (CAPS, IMAGE)
 
     def __init__(self, camera: CameraDeviceParameters, size: tuple[int, int], command: Sequence[str] = CHILD) -> None:
-        """Starts the process, whose ``command`` gets the pipeline and what is asked of it; raises CameraError."""
+        """Starts the process: ``command``, with what is asked of the pipeline. Raises CameraError."""
         self._size = size
         self._format: ImageFormat | None = None
-        super().__init__(camera.name, camera.rate_hz, [*command, camera.place, caps(size, camera.rate_hz)])
+        wanted = [*command, caps(size, camera.rate_hz)]
+        super().__init__(camera.name, camera.rate_hz, wanted, told=packed_text(camera.place))
 
     def image_format(self) -> ImageFormat:
         """See ``CameraDevice``."""
@@ -48,7 +50,7 @@ class GstreamerDevice(ChildDevice):
     def _set_format(self, text: str) -> None:
         found = format_of(text)
         if found is None:
-            raise CameraError(f"{self._name}: its pipeline gives {text[:80]}; end it with `videoconvert`")
+            raise CameraError(f"{self._name}: its pipeline gives {masked(text)[:80]}; end it with `videoconvert`")
         self._format, size = found
         if size != self._size:
             gives, asked = (f"{width}x{height}" for width, height in (size, self._size))
@@ -60,4 +62,6 @@ class GstreamerDevice(ChildDevice):
     def _failed(self, reason: str) -> CameraError:
         if reason == gstreamer_child.NOT_INSTALLED:
             return CameraError(f"{self._name}: {reason}; install {PACKAGES}")
-        return CameraError(f"{self._name}: its pipeline {reason}; try it with `gst-launch-1.0 PIPELINE ! fakesink`")
+        return CameraError(
+            f"{self._name}: its pipeline {masked(reason)}; try it with `gst-launch-1.0 PIPELINE ! fakesink`"
+        )

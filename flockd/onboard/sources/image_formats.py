@@ -9,7 +9,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from flockd.core.image_header import jpeg_size
+from flockd.core.image_header import cost_fault, jpeg_size
 from flockd.core.messages import UInt8Array
 
 Decoder = Callable[[bytes], UInt8Array]
@@ -68,6 +68,8 @@ class MjpegFormat:
         if found != self.size:
             shown = "no size" if found is None else f"{found[0]}x{found[1]}"
             raise CorruptImageError(f"JPEG has {shown} instead of {self.size[0]}x{self.size[1]}")
+        if (fault := cost_fault(data)) is not None:
+            raise CorruptImageError(f"JPEG {fault}")
 
     def decode(self, data: bytes) -> UInt8Array:
         """See ``ImageFormat``."""

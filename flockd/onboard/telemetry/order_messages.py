@@ -1,26 +1,47 @@
-"""Orders to a drone's mission, as they travel in queries."""
+"""Operators' commands, and orders to a drone's mission, as they travel in queries."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from flockd.core.messages import FloatArray, MissionOrder
-from flockd.onboard.telemetry.topics import OrderMessage
+from flockd.core.printable import printable
+from flockd.onboard.telemetry.schema import fault
+from flockd.onboard.telemetry.topics import AskMessage, OrderMessage
 
 _OF_GOTO = frozenset({"north_m", "east_m", "latitude_deg", "longitude_deg", "height_m", "speed_m_s"})
 _OF_VELOCITY = frozenset({"velocity_ne", "height_m"})
 _LONGEST = 4096
+LONGEST_NAME = 80
+"""Of an operator and of a session."""
 
 
-def parse_order(command: str, payload: bytes) -> MissionOrder:
-    """The order in a query for `goto` or `velocity`.
+def parse_ask(payload: bytes) -> AskMessage:
+    """What a query for a command carries. Raises ValueError, with a sentence for its sender, for what is none."""
+    message: Any = _object(payload)
+    wrong = fault(message, AskMessage)
+    if wrong is not None:
+        raise ValueError(f"an order has to say who gives it, its number and its time ({wrong}); see docs/telemetry.md")
+    ask: AskMessage = message
+    names = ask["operator"], ask["session"]
+    if not all(name and len(name) <= LONGEST_NAME and printable(name, lines=False) == name for name in names):
+        raise ValueError(
+            f"an order's operator and session have to be texts of 1 to {LONGEST_NAME} printable characters"
+        )
+    return ask
+
+
+def parse_order(command: str, message: Mapping[str, object] | None) -> MissionOrder:
+    """The order of a `goto` or `velocity`.
 
     Raises ValueError, with a sentence for its sender, for what is none; whether it may be flown is not checked here.
     """
-    message = _object(payload)
+    if not isinstance(message, Mapping):
+        raise ValueError(f"{command} needs an order, a JSON object")  # noqa: TRY004 - of the message, not of the caller
     allowed = _OF_GOTO if command == "goto" else _OF_VELOCITY
     unknown = sorted(message.keys() - allowed)
     if unknown:
@@ -71,11 +92,11 @@ def _object(payload: bytes) -> dict[str, Any]:
     return message
 
 
-def _pair(message: dict[str, Any], one: str, other: str) -> FloatArray:
+def _pair(message: Mapping[str, object], one: str, other: str) -> FloatArray:
     return np.array([_number(message, one), _number(message, other)])
 
 
-def _number(message: dict[str, Any], key: str) -> float:
+def _number(message: Mapping[str, object], key: str) -> float:
     value = message[key]
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:  # false for NaN too
         raise ValueError(f"{key} has to be a number, and is {str(value)[:40]!r}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -42,6 +43,8 @@ class ZenohTelemetry(SessionOwner):
         self._publishers: dict[tuple[str, str], zenoh.Publisher] = {}
         self._kept: list[object] = []
         self._lost = 0
+        self.identity = secrets.token_hex(4)
+        """Of this process's drones, beside their names, which two drones may share by mistake."""
         self._session = open_session("telemetry", listen, connect, settings=settings)
 
     @property
@@ -64,8 +67,8 @@ class ZenohTelemetry(SessionOwner):
         """Publishes that a drone is alive for as long as this session is, and tells its clocks; no daemon to ask."""
         key = f"{self._prefix}/{checked_name(drone)}"
         self._kept += [
-            self._session.liveliness().declare_token(f"{key}/alive"),
-            self._session.declare_queryable(f"{key}/time", _tell_time),
+            self._session.liveliness().declare_token(f"{key}/alive/{self.identity}"),
+            self._session.declare_queryable(f"{key}/time", self._tell_time),
         ]
 
     def announce(self, drone: str, about: AboutMessage, ask: Ask, newest_image: NewestImage) -> None:
@@ -83,6 +86,9 @@ class ZenohTelemetry(SessionOwner):
             ),
             self._session.declare_queryable(f"{key}/image/*", lambda query: _send_image(query, newest_image)),
         ]
+
+    def _tell_time(self, query: zenoh.Query) -> None:
+        _reply(query, TimeMessage(time_s=time.monotonic(), wall_s=time.time(), identity=self.identity))
 
     def _publisher(self, drone: str, topic: str) -> zenoh.Publisher:
         publisher = self._publishers.get((drone, topic))
@@ -106,10 +112,6 @@ def _payload(query: zenoh.Query) -> bytes:
 def _reply(query: zenoh.Query, message: Mapping[str, object]) -> None:
     """Replies under the key of the query; a query for several at once, as with `*`, gets one reply."""
     query.reply(query.key_expr, json.dumps(_finite(message), allow_nan=False), encoding=zenoh.Encoding.APPLICATION_JSON)
-
-
-def _tell_time(query: zenoh.Query) -> None:
-    _reply(query, TimeMessage(time_s=time.monotonic(), wall_s=time.time()))
 
 
 def _send_image(query: zenoh.Query, newest_image: NewestImage) -> None:

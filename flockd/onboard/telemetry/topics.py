@@ -4,10 +4,10 @@ A key is `flockd/v1/<fleet>/<drone>/<topic>`; a message is a JSON object in UTF-
 Vectors are lists: NED is north, east, down. Times are seconds on the drone's monotonic clock.
 
 `state` to `timings` follow from each step of the pilot; `flight` to `clock` come from the daemon, at all times. Beside
-the topics, a drone's daemon has a liveliness token `.../alive`. It replies to a query for `.../about` with an
-`AboutMessage`, and for `.../time` with a `TimeMessage`. It replies to one for `.../ask/hold`, `land`, `resume`, `goto`
-or `velocity` with an `AnswerMessage`, and one for `.../image/<camera>` with a small JPEG of what that camera sees. A
-query for `goto` or `velocity` carries an `OrderMessage`.
+the topics, a drone's daemon has a liveliness token `.../alive/<identity>`, whose identity no other process has. It
+replies to a query for `.../about` with an `AboutMessage`, for `.../time` with a `TimeMessage`, and for
+`.../image/<camera>` with a small JPEG of what that camera sees. A query for `.../ask/hold`, `land`, `resume`, `goto` or
+`velocity` carries an `AskMessage`; the reply is an `AnswerMessage`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import TypedDict
 from flockd.core import services
 
 PREFIX = "flockd/v1"
-_NAME = re.compile(r"[A-Za-z0-9_.-]+")
+_NAME = re.compile(r"[A-Za-z0-9_.-]{1,200}")
 
 
 def is_name(name: str) -> bool:
@@ -147,6 +147,15 @@ class ReasonMessage(TypedDict):
     """For people."""
 
 
+class TakenOrderMessage(TypedDict):
+    """The last order that one operator gave and the drone took."""
+
+    operator: str
+    command: str
+    sequence: int
+    age_s: float
+
+
 class FlightMessage(TypedDict):
     """Who flies the drone, and why."""
 
@@ -161,6 +170,8 @@ class FlightMessage(TypedDict):
     in_air: bool | None
     heartbeat_age_s: float | None
     """Age of the autopilot's newest heartbeat; null before the first."""
+    heartbeats_lost: int
+    """Of the autopilot's, since the start, while its other messages came."""
     battery_share: float | None
     """0 to 1."""
     height_m: float | None
@@ -174,6 +185,10 @@ class FlightMessage(TypedDict):
     setpoints_sent: int
     setpoints_missed: int
     """Deadlines that this computer was too busy to keep."""
+    orders: list[TakenOrderMessage] | None
+    """Of the last minute, one of each operator, the newest first."""
+    orders_refused: int | None
+    """Since the start."""
 
 
 class ClockMessage(TypedDict):
@@ -240,6 +255,8 @@ class TimeMessage(TypedDict):
     """Monotonic."""
     wall_s: float
     """Seconds since 1970, UTC."""
+    identity: str | None
+    """As in the liveliness token."""
 
 
 class OrderMessage(TypedDict, total=False):
@@ -256,6 +273,23 @@ class OrderMessage(TypedDict, total=False):
     """Above the ground at home."""
     speed_m_s: float
     """On the way to a goal."""
+
+
+class AskMessage(TypedDict):
+    """An operator's command. A drone takes each once, in order and while it is new."""
+
+    identity: str
+    """The drone's, of its liveliness token: another drone of the same name refuses it."""
+    operator: str
+    """Who asks, for people; who may ask is decided by the access rules of the network."""
+    session: str
+    """Of the program that asks, from its start to its end."""
+    sequence: int
+    """Counts up within the session."""
+    time_s: float
+    """The drone's own clock, as its reply to `time` had it just before."""
+    order: dict[str, object] | None
+    """An `OrderMessage` for `goto` and `velocity`; else null."""
 
 
 class AnswerMessage(TypedDict):

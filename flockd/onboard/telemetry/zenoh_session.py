@@ -27,6 +27,7 @@ def open_session(
     *,
     settings: Path | None = None,
     shared_memory: bool | None = None,
+    max_message_bytes: int | None = None,
 ) -> zenoh.Session:
     """A session that listens on and connects to these endpoints only, for ever where nobody is there yet.
 
@@ -36,16 +37,30 @@ def open_session(
         connect: zenoh endpoints.
         settings: a file of zenoh's own to begin with: for TLS and access control.
         shared_memory: whether large messages go through it; None: as zenoh or the settings have it.
+        max_message_bytes: longer ones are not received; None: as zenoh or the settings have it.
 
     Raises SessionError.
     """
     try:
-        return zenoh.open(_config(listen, connect, settings, shared_memory))
+        config = _config(listen, connect, settings, shared_memory)
+        if max_message_bytes is not None:
+            config.insert_json5("transport/link/rx/max_message_size", json.dumps(max_message_bytes))
+        return zenoh.open(config)
     except zenoh.ZError as error:
         endpoints = ", ".join([*listen, *connect]) or "no endpoint"
         with_settings = f" with the settings of {settings}" if settings else ""
         reason = str(error).split(" at ")[0].split(": [")[0]
         raise SessionError(purpose, f"{endpoints}{with_settings}", reason) from error
+
+
+def private_keys(settings: Path) -> tuple[Path, ...]:
+    """The files of the private keys that zenoh's settings name. Raises SessionError where these cannot be read."""
+    try:
+        tls = json.loads(zenoh.Config.from_file(str(settings)).get_json("transport/link/tls"))
+    except zenoh.ZError as error:
+        raise SessionError("telemetry", f"the settings of {settings}", str(error).split(" at ")[0]) from error
+    names = [str(tls[name]) for name in tls if name.endswith("private_key") and tls[name]]
+    return tuple(Path(name) for name in dict.fromkeys(names))
 
 
 def close_session(session: zenoh.Session) -> None:

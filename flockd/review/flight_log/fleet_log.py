@@ -13,7 +13,7 @@ from flockd import __version__
 from flockd.core.config import DroneConfig
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.config.scenario import ScenarioConfig
-from flockd.core.messages import NO_STATUS, FloatArray, MissionStatus, PilotOutput
+from flockd.core.messages import NO_STATUS, FloatArray, MissionOrder, MissionStatus, PilotOutput
 from flockd.flight.flocking.metrics import order, union
 from flockd.flight.mission.circle_then_tangent import desired_of
 from flockd.flight.perception import load_networks
@@ -22,7 +22,7 @@ from flockd.onboard.recording.codec import from_json
 from flockd.onboard.recording.mcap_file import Entry
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.record_source import records_of
-from flockd.onboard.recording.streams import OUTPUT, VEHICLE
+from flockd.onboard.recording.streams import ORDER, OUTPUT, VEHICLE
 from flockd.review.flight_log.builder import FlightLogBuilder
 from flockd.review.flight_log.capture import capture, key_frame_steps
 from flockd.review.flight_log.key_frames import KeyFrame
@@ -195,6 +195,16 @@ def _outputs(recordings: Path, drone: str) -> Iterator[tuple[PilotOutput, FloatA
             elif isinstance(record, Entry) and record.stream.topic == VEHICLE.topic:
                 attitudes[record.sequence] = np.reshape(json.loads(record.data)["R_ned_body"], (3, 3))
         yield from ((outputs[step], attitudes[step]) for step in sorted(outputs.keys() & attitudes.keys()))
+
+
+def recorded_orders(recordings: Path, drone: str, zero_s: float) -> list[tuple[float, MissionOrder]]:
+    """What operators ordered of a drone in flight, and when, in seconds from `zero_s` of the recording's clock."""
+    return [
+        (record.time_ns / 1e9 - zero_s, from_json(MissionOrder, json.loads(record.data)))
+        for path in sorted(recordings.glob(f"{drone}-*.mcap"))
+        for record in records_of(path)
+        if isinstance(record, Entry) and record.stream.topic == ORDER.topic
+    ]
 
 
 def fleet_key_frames(recordings: Path, run: FleetRun) -> tuple[KeyFrame, ...]:

@@ -36,6 +36,20 @@ def recordings_in(folder: Path) -> tuple[Path, ...]:
     return tuple(path for path in paths if head_of(path)[0].facts.get("part", "0") == "0")
 
 
+def newest_recordings(folder: Path) -> tuple[tuple[Path, ...], int]:
+    """Each drone's newest recording in a folder, by when it began, and how many older ones the folder holds.
+
+    Raises RecordingError for other MCAP files.
+    """
+    found = recordings_in(folder)
+    newest: dict[str, tuple[str, Path]] = {}
+    for path in found:
+        facts = head_of(path)[0].facts
+        one = (facts.get("began", ""), path)
+        newest[facts["drone"]] = max(newest.get(facts["drone"], one), one)
+    return tuple(sorted(path for _, path in newest.values())), len(found) - len(newest)
+
+
 @dataclass
 class _Step:
     """One step, from all recordings that hold it."""

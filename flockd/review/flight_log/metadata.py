@@ -12,6 +12,8 @@ from flockd.core.config.scenario import ScenarioConfig
 EXACT_STATES: Final = "truth"
 """`FlightMetadata.perception` of a flight whose drones were given the others' true states."""
 
+_WITH_GOALS = ("waypoints", "operator")
+"""Kinds of missions that lead to places."""
 
 _FROZEN = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="constants")
 
@@ -58,6 +60,15 @@ class FleetMetadata(BaseModel):
     notes: list[str]
 
 
+class HandedOver(BaseModel):
+    """That a simulated drone's supervisor asked for Hold."""
+
+    model_config = _FROZEN
+
+    time_s: float
+    reason: str
+
+
 class MissionMetadata(BaseModel):
     """Where the drones of a flight wanted to go."""
 
@@ -66,7 +77,9 @@ class MissionMetadata(BaseModel):
     kind: str
     """Kinds of the missions, by name, each once."""
     reached_m: float
-    """How near to a goal the flock's middle has to come."""
+    """How near to a goal the flock's middle, or the drone that leads it by hand, has to come."""
+    led_by: int | None = None
+    """The number from 0 of the drone whose goals these are, where only one that is flown by hand has any."""
 
     @classmethod
     def of(cls, scenario: ScenarioConfig) -> Self:
@@ -76,7 +89,9 @@ class MissionMetadata(BaseModel):
             f"{scenario.drone_of(i).mission.kind}{' by hand' if scenario.vehicles[i].by_hand else ''}" for i in vehicles
         ]
         reached_m = max(scenario.drone_of(i).mission.reached_m for i in vehicles)
-        return cls(kind=", ".join(dict.fromkeys(kinds)), reached_m=reached_m)
+        with_goals = [i for i in vehicles if scenario.drone_of(i).mission.kind in _WITH_GOALS]
+        led_by = next((i for i in with_goals if all(scenario.vehicles[j].by_hand for j in with_goals)), None)
+        return cls(kind=", ".join(dict.fromkeys(kinds)), reached_m=reached_m, led_by=led_by)
 
 
 class FlightMetadata(BaseModel):
@@ -118,6 +133,12 @@ class FlightMetadata(BaseModel):
     """Whether simulated drones flew through their gates; None where that is not known."""
     slowed_share: float | None = None
     """Share of their time in which gates let drones fly otherwise than their pilots asked for; None: not known."""
+    settings: dict[str, str] = {}
+    """What the command line set otherwise than the scenario's file, by option."""
+    slowed_by: dict[str, float] = {}
+    """The same by cause (`flockd.sim.slowing.Cause`); a moment may have several."""
+    handed_over: dict[int, HandedOver] = {}
+    """By the number of a simulated drone, from 0: when and why it did not fly on."""
     interrupted: bool = False
     """It was ended before its time; `duration_s` is what was flown."""
     mission: MissionMetadata

@@ -1,22 +1,19 @@
-"""Reads PX4's ULog files, and lays them on a flight's time. The one file that knows pyulog."""
+"""PX4's ULog files, laid on a flight's time."""
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pyulog import ULog
-from pyulog.exceptions import ULogException
 
-from flockd.core.errors import UsageError
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.onboard.recording.reader import Recording
 from flockd.review.flight_log.autopilot_log import AutopilotLog, Said, Span
 from flockd.review.flight_log.log import FlightLog
+from flockd.review.flight_log.ulog_file import PATIENCE_S, UlogContents, read_contents, unusable
 
 SETPOINTS, POSITIONS, STATUS, HOME = "trajectory_setpoint", "vehicle_local_position", "vehicle_status", "home_position"
 NEEDED = {
@@ -49,6 +46,8 @@ WARNING = 4
 BEFORE_S, AFTER_S = 10.0, 20.0
 """How much of the log is shown before and after the flight."""
 GRID_S = 0.05
+LONGEST_S = 86_400.0
+"""Of a log that is laid on a flight."""
 LEAST_SHARE = 0.6
 """Least share of the commands' squares that the log's setpoints explain where they are laid on each other."""
 LEAST_MOTION_M_S = 0.1
@@ -60,31 +59,26 @@ Clock = tuple[FloatArray, FloatArray]
 """(n,) times on the drone's computer, and (n,) how far the autopilot's clock was ahead of it then."""
 
 
-def read_ulog(path: Path) -> ULog:
-    """A ULog file. Raises UsageError for what is none, or too damaged, and OSError."""
-    with path.open("rb") as file:
-        begins = file.read(len(ULog.HEADER_BYTES))
-    if begins != ULog.HEADER_BYTES:
-        raise _unusable(path, "does not begin as one")
-    try:
-        ulog = ULog(str(path), [*NEEDED, HOME])
-    except (ULogException, struct.error, OSError, ValueError, IndexError, KeyError, TypeError, AttributeError) as error:
-        raise _unusable(path, f"cannot be read: {error or type(error).__name__}") from error
+def read_ulog(path: Path, patience_s: float = PATIENCE_S) -> UlogContents:
+    """A ULog file. Raises UsageError for what is none, or too damaged, or takes too long, and OSError."""
+    ulog = read_contents(path, [*NEEDED, HOME], patience_s)
     for topic, names in NEEDED.items():
-        data = _topic(ulog, topic)
+        data = ulog.topics.get(topic, {})
         missing = [name for name in ("timestamp", *names) if name not in data or not len(data[name])]
         if missing:
-            raise _unusable(path, f"holds no {topic}.{missing[0]}")
+            raise unusable(path, f"holds no {topic}.{missing[0]}")
     return ulog
 
 
-def system_id(ulog: ULog) -> int | None:
+def system_id(ulog: UlogContents) -> int | None:
     """System id of the autopilot that wrote it; None where it does not say."""
-    number = ulog.initial_parameters.get("MAV_SYS_ID")
+    number = ulog.parameters.get("MAV_SYS_ID")
     return None if number is None else int(number)
 
 
-def drone_of(ulog: ULog, path: Path, log: FlightLog, recordings: Sequence[Recording]) -> tuple[int, Recording | None]:
+def drone_of(
+    ulog: UlogContents, path: Path, log: FlightLog, recordings: Sequence[Recording]
+) -> tuple[int, Recording | None]:
     """The number of the drone whose autopilot wrote it, and that drone's recording, if it is one of these.
 
     Of several by `autopilot.system_id`; in a simulated fleet autopilots count from 1 as the drones do. Raises
@@ -100,11 +94,11 @@ def drone_of(ulog: ULog, path: Path, log: FlightLog, recordings: Sequence[Record
     drones = log.command_velocity.shape[1]
     drone = 0 if drones == 1 else -1 if number is None else number - 1
     if not 0 <= drone < drones:
-        raise _unusable(path, f"is of the autopilot with MAV_SYS_ID {number}, which no drone of this flight has")
+        raise unusable(path, f"is of the autopilot with MAV_SYS_ID {number}, which no drone of this flight has")
     return drone, recording
 
 
-def autopilot_log(ulog: ULog, path: Path, log: FlightLog, drone: int, clock: Clock | None) -> AutopilotLog:
+def autopilot_log(ulog: UlogContents, path: Path, log: FlightLog, drone: int, clock: Clock | None) -> AutopilotLog:
     """What it holds of a drone's flight, on the flight's time.
 
     Args:
@@ -121,12 +115,12 @@ def autopilot_log(ulog: ULog, path: Path, log: FlightLog, drone: int, clock: Clo
     else:
         placed_by, to_flight = "its setpoints, which are those of the flight", _by_setpoints(ulog, path, log, drone)
     end_s = float(log.time_s[-1])
-    setpoints, positions, status = (_topic(ulog, topic) for topic in NEEDED)
+    setpoints, positions, status = (ulog.topics[topic] for topic in NEEDED)
     home_down_m = _home_down_m(ulog)
     asked_s, flown_s, state_s = (to_flight(1e-6 * topic["timestamp"]) for topic in (setpoints, positions, status))
     if flown_s[-1] < 0.0 or flown_s[0] > end_s:
         covers = f"{flown_s[0]:.0f} to {flown_s[-1]:.0f} s of this one's time"
-        raise _unusable(path, f"is of another flight: it covers {covers}")
+        raise unusable(path, f"is of another flight: it covers {covers}")
     asked, flown, changes = (_around(times, end_s) for times in (asked_s, flown_s, state_s))
     names = [MODES.get(int(state), f"mode {int(state)}") for state in status["nav_state"]]
     failing = ["failsafe" if failing else "" for failing in status["failsafe"]]
@@ -146,22 +140,13 @@ def autopilot_log(ulog: ULog, path: Path, log: FlightLog, drone: int, clock: Clo
     )
 
 
-def _unusable(path: Path, why: str) -> UsageError:
-    return UsageError(f"{path}: {why}; name a ULog file of this flight, as from the log folder of PX4's SD card")
-
-
-def _topic(ulog: ULog, name: str) -> Mapping[str, Any]:
-    """Its first instance's fields, empty where it was not logged."""
-    return next((found.data for found in ulog.data_list if found.name == name and found.multi_id == 0), {})
-
-
 def _columns(topic: Mapping[str, Any], *names: str) -> FloatArray:
     return np.column_stack([np.asarray(topic[name], float) for name in names])
 
 
-def _home_down_m(ulog: ULog) -> float:
+def _home_down_m(ulog: UlogContents) -> float:
     """Down from the estimator's origin, at the end; 0 where home was not logged."""
-    down = _topic(ulog, HOME).get("z", ())
+    down = ulog.topics.get(HOME, {}).get("z", ())
     return float(down[-1]) if len(down) and np.isfinite(down[-1]) else 0.0
 
 
@@ -178,14 +163,12 @@ def _spans(times_s: FloatArray, what: Sequence[str]) -> tuple[Span, ...]:
     )
 
 
-def _said(ulog: ULog, to_flight: Callable[[FloatArray], FloatArray], end_s: float) -> tuple[Said, ...]:
-    said = [one for one in ulog.logged_messages if one.log_level & 0xF <= WARNING]  # the level is a digit in ASCII
-    times_s = to_flight(np.array([1e-6 * one.timestamp for one in said]))
+def _said(ulog: UlogContents, to_flight: Callable[[FloatArray], FloatArray], end_s: float) -> tuple[Said, ...]:
+    said = [one for one in ulog.texts if one.level <= WARNING]
+    times_s = to_flight(np.array([1e-6 * one.time_us for one in said]))
     inside = _around(times_s, end_s)
     return tuple(
-        Said(float(time_s), one.message.strip())
-        for time_s, one, kept in zip(times_s, said, inside, strict=True)
-        if kept
+        Said(float(time_s), one.text.strip()) for time_s, one, kept in zip(times_s, said, inside, strict=True) if kept
     )
 
 
@@ -203,9 +186,9 @@ def _by_clock(clock: Clock, log: FlightLog) -> Callable[[FloatArray], FloatArray
     return to_flight
 
 
-def _by_setpoints(ulog: ULog, path: Path, log: FlightLog, drone: int) -> Callable[[FloatArray], FloatArray]:
+def _by_setpoints(ulog: UlogContents, path: Path, log: FlightLog, drone: int) -> Callable[[FloatArray], FloatArray]:
     """The same where the clock is not known: the shift at which both records of the commands agree best."""
-    setpoints = _topic(ulog, SETPOINTS)
+    setpoints = ulog.topics[SETPOINTS]
     logged_s, logged = 1e-6 * np.asarray(setpoints["timestamp"], float), _columns(setpoints, *NEEDED[SETPOINTS][:2])
     known = np.isfinite(logged).all(axis=1)
     logged_s, logged = logged_s[known], logged[known]
@@ -213,14 +196,16 @@ def _by_setpoints(ulog: ULog, path: Path, log: FlightLog, drone: int) -> Callabl
     command_s, command = log.time_s[flown], log.command_velocity[flown, drone]
     refusal = "cannot be laid on the flight's time, as the recording holds no clock of the autopilot and "
     if len(logged_s) < 2 or len(command_s) < 2 or float(np.std(command, axis=0).max()) < LEAST_MOTION_M_S:
-        raise _unusable(path, f"{refusal}too little was commanded to tell by")
+        raise unusable(path, f"{refusal}too little was commanded to tell by")
+    if not 0.0 <= logged_s[-1] - logged_s[0] <= LONGEST_S:
+        raise unusable(path, f"{refusal}its times are damaged: they span more than a day, or run backwards")
     times_s = np.arange(command_s[0], command_s[-1], GRID_S)
     held = command[np.searchsorted(command_s, times_s, side="right") - 1]
     shifts_s = np.arange(logged_s[0] - times_s[-1], logged_s[-1] - times_s[0], GRID_S)
     fits = np.array([_fit(times_s + shift_s, held, logged_s, logged) for shift_s in shifts_s])
     shares, differences = fits.T if len(fits) else np.zeros((2, 1))
     if shares.max() < LEAST_SHARE:
-        raise _unusable(path, f"{refusal}its setpoints are not those of the flight")
+        raise unusable(path, f"{refusal}its setpoints are not those of the flight")
     # Steady flight explains as much at many shifts; of those the one that differs least, as commands change there.
     shift_s = float(shifts_s[np.where(shares > NEARLY * shares.max(), differences, np.inf).argmin()])
     return lambda autopilot_s: autopilot_s - shift_s

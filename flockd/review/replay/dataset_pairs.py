@@ -19,7 +19,7 @@ from flockd.core.messages import (
     UInt8Array,
     VehicleState,
 )
-from flockd.flight.geometry import RigCamera, RigidTransform, build_rig, rotation_angle_deg
+from flockd.flight.geometry import RigCamera, RigidTransform, ZMap, build_rig, rotation_angle_deg
 from flockd.flight.perception import Crop, Networks, RangeEstimate, SceneMaps
 from flockd.flight.pilot import FlockPilot
 from flockd.ground.datasets import Dataset, DatasetFrame
@@ -68,9 +68,9 @@ class RecordedDepth:
         self.second_stage = learned.second_stage
         self.map_stride = learned.map_stride
         self._learned = learned
-        self._depth: Float32Array | None = None
+        self._depth: ZMap | None = None
 
-    def show(self, depth: Float32Array | None) -> None:
+    def show(self, depth: ZMap | None) -> None:
         """The depth of the next step's image; None: what is learned."""
         self._depth = depth
 

@@ -98,5 +98,6 @@ def _response_text(autopilot: AutopilotLog) -> str:
     return (
         f"The velocity followed its setpoints with a time constant of {fitted.time_constant_s:.2f} s after a dead time "
         f"of {fitted.dead_time_s:.2f} s (root mean square error {fitted.error_m_s:.2f} m/s): set "
-        "safety.gate.response_s to the time constant."
+        "safety.gate.response_s to the time constant, and reaction_s and neighbour_reaction_s to no less than both "
+        "together."
     )

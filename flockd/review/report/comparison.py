@@ -8,19 +8,19 @@ from typing import Any
 
 Summary = Mapping[str, Any]
 
-_SETTINGS = ("scenario", "drones", "perception", "flow", "scale", "seed", "began", "version")
+_SETTINGS = ("scenario", "drones", "perception", "flow", "scale", "gated", "seed", "version")
 _FIGURES = (
     ("flown", ("duration_s",), "s", 1),
-    ("closest two drones in 3D", ("flock", "min_distance_m"), "m", 2),
-    ("closest in 3D after 10 s", ("flock", "min_distance_after_10s_m"), "m", 2),
+    ("closest two drones", ("flock", "min_distance_m"), "m", 2),
+    ("closest after 10 s", ("flock", "min_distance_after_10s_m"), "m", 2),
     ("order at the end", ("flock", "order_tail"), "", 3),
     ("union at the end", ("flock", "union_tail"), "", 2),
-    ("neighbours known within 10 m", ("neighbours", "recall_within_10m"), "", 3),
-    ("false neighbours a drone and minute", ("neighbours", "false_per_drone_minute"), "", 2),
-    ("own motion, 95th percentile of x, on the circle", ("table2", "before", "translation_x_m", "p95"), "m", 4),
-    ("own motion, 95th percentile of y, on the circle", ("table2", "before", "translation_y_m", "p95"), "m", 4),
-    ("distance, 95th percentile, on the circle", ("table2", "before", "distance_m", "p95"), "m", 4),
-    ("simulation, times real time", ("realtime_factor",), "", 3),
+    ("known within 10 m", ("neighbours", "recall_within_10m"), "", 3),
+    ("false, drone and minute", ("neighbours", "false_per_drone_minute"), "", 2),
+    ("own motion x, p95", ("table2", "before", "translation_x_m", "p95"), "m", 4),
+    ("own motion y, p95", ("table2", "before", "translation_y_m", "p95"), "m", 4),
+    ("distance error, p95", ("table2", "before", "distance_m", "p95"), "m", 4),
+    ("times real time", ("realtime_factor",), "", 3),
 )
 """Name, keys of the summary, unit, digits."""
 
@@ -41,6 +41,8 @@ class Row:
     @property
     def cells(self) -> tuple[str, str, str]:
         """Both values and their difference, for people."""
+        if self.digits is None:
+            return self._text(self.first), self._text(self.second), "differs" if self.first != self.second else ""
         return self._text(self.first), self._text(self.second), self._text(self.difference, sign="+")
 
     def _text(self, value: Any, sign: str = "") -> str:
@@ -54,6 +56,10 @@ class Row:
 def compare(first: Summary, second: Summary) -> tuple[Row, ...]:
     """Rows for two flights by their summaries, without those that neither has a value for."""
     rows = [Row(name, "", None, first[name], second[name], None) for name in _SETTINGS]
+    options = dict.fromkeys((*first["settings"], *second["settings"]))
+    rows += [
+        Row(f"--{one}", "", None, first["settings"].get(one), second["settings"].get(one), None) for one in options
+    ]
     for name, keys, unit, digits in _FIGURES:
         one, other = _value(first, keys), _value(second, keys)
         difference = None if one is None or other is None else other - one

@@ -76,12 +76,12 @@ def prepare_folder(directory: Path, *, force: bool = False) -> Path | None:
 def check_report_folder(directory: Path, *, force: bool = False) -> None:
     """Raises UsageError when a folder cannot take a report of recordings: see `prepare_report_folder`."""
     _check_no_other_files(directory)
-    if _holds_something(directory) and not force and not _is_of_recordings(directory):
+    if _holds_something(directory) and not force:
         raise _in_the_way(directory)
 
 
 def prepare_report_folder(directory: Path, *, force: bool = False) -> None:
-    """Makes the folder for a report of recordings; an earlier one, which can be made again, is removed."""
+    """Makes the folder for a report of recordings; a flight or report that is there is removed with ``force`` only."""
     check_report_folder(directory, force=force)
     if _holds_something(directory):
         _remove_flight(directory)
@@ -105,14 +105,6 @@ def _check_no_other_files(directory: Path) -> None:
 
 def _in_the_way(directory: Path) -> UsageError:
     return UsageError(f"{directory}: holds a flight; name another folder with --out, or overwrite it with --force")
-
-
-def _is_of_recordings(directory: Path) -> bool:
-    """Whether the log there was made of recordings, which still hold all of it."""
-    try:
-        return FlightLog.load(directory / LOG_NAME).metadata.recorded is not None
-    except (OSError, ValueError, EOFError, BadZipFile):
-        return False
 
 
 def save_flight(directory: Path, log: FlightLog, key_frames: Sequence[KeyFrame]) -> None:

@@ -190,18 +190,18 @@ class _Plate:
 
 
 def _tiles(moment: Moment) -> UInt8Array:
-    """All images, in reading order of a turn to the right; as high together as the map."""
+    """All images, in reading order of a turn to the right, with gaps; as high together as the map."""
     cameras = sorted(moment.images, key=lambda name: RIG_ORDER.index(name) if name in RIG_ORDER else len(RIG_ORDER))
     if not cameras:
         return np.full((_MAP_PX, _MAP_PX, 3), _rgb(_PANEL), np.uint8)
     across = math.ceil(math.sqrt(len(cameras)))
     down = math.ceil(len(cameras) / across)
-    height = _MAP_PX // down
+    height = (_MAP_PX - (down - 1) * _GAP_PX) // down
     tiles = [_tile(moment.images[name], name, moment.outlines, height) for name in cameras]
     width = max(tile.shape[1] for tile in tiles)
-    image = np.full((_MAP_PX, across * width, 3), _rgb(_PANEL), np.uint8)
+    image = np.full((_MAP_PX, across * (width + _GAP_PX) - _GAP_PX, 3), _rgb(_PLATE), np.uint8)
     for number, tile in enumerate(tiles):
-        top, left = number // across * height, number % across * width
+        top, left = number // across * (height + _GAP_PX), number % across * (width + _GAP_PX)
         image[top : top + height, left : left + tile.shape[1]] = tile
     return image
 

@@ -13,6 +13,7 @@ from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import EXACT_STATES
 from flockd.review.report.paper_results import TABLE_2, TABLE_3
 from flockd.review.report.style import FEW
+from flockd.review.report.summary import causes_text
 
 Summary = Mapping[str, Any]
 
@@ -152,7 +153,11 @@ def _facts(summary: Summary, log: FlightLog) -> list[dict[str, str]]:
     if summary["drones"] > 1 and summary["has_truth"]:
         facts += [
             _fact("Closest two drones", _number(flock["min_distance_m"], 2), f"in 3D, {_closest(log)}", "m"),
-            _fact("Order", _number(flock["order_tail"], 3), "1 is all flying one way"),
+            _fact(
+                "Order",
+                _number(flock["order_tail"], 3),
+                "the flock hovers" if flock["order_tail"] is None else "1 is all flying one way",
+            ),
             _fact("Union", _number(flock["union_tail"], 2), "1 is one connected flock"),
         ]
     if summary["has_truth"]:
@@ -162,7 +167,12 @@ def _facts(summary: Summary, log: FlightLog) -> list[dict[str, str]]:
     if mission["arrived"] is not None:
         when = "never reached" if mission["time_s"] is None else f"reached at {mission['time_s']:g} s"
         facts.append(
-            _fact("From the last goal", _number(mission["final_error_m"], 2), f"the middle, at the end; {when}", "m")
+            _fact(
+                "From the last goal",
+                _number(mission["final_error_m"], 2),
+                f"{mission['who'].rstrip(',')}, at the end; {when}",
+                "m",
+            )
         )
     obstacles = summary["obstacles"]
     if obstacles["collisions"] is not None:
@@ -171,6 +181,13 @@ def _facts(summary: Summary, log: FlightLog) -> list[dict[str, str]]:
             _fact("Collisions", _number(obstacles["collisions"], 0), "with obstacles, once per contact"),
             _fact("Clearance", _number(obstacles["min_clearance_m"], 2), f"the smallest to an obstacle; {near}", "m"),
         ]
+    if summary["slowed_share"]:
+        remark = f"of the time, by safety gates: {causes_text(summary)}"
+        facts.append(_fact("Slowed", _number(100 * summary["slowed_share"], 1), remark, "%"))
+    held = summary["handed_over"]
+    if held["drones"]:
+        remark = f"drones; the first at {held['first_s']:.1f} s: {held['reasons'][0]}"
+        facts.append(_fact("Asked for Hold", _number(held["drones"], 0), remark))
     if neighbours["recall_within_10m"] is not None:
         facts += [
             _fact("Neighbours known", _number(100 * neighbours["recall_within_10m"], 1), "of those within 10 m", "%"),
@@ -358,7 +375,11 @@ _DEFINITIONS = (
         "of the flight with exact states.",
     ),
     ("closest", "Distances are between the drones’ middles, in three dimensions."),
-    ("order", "Mean cosine between the velocities of all pairs over the last 10 s: 1 is all flying one way."),
+    (
+        "order",
+        "Mean cosine between the velocities of all pairs over the last 10 s: 1 is all flying one way. A flock that "
+        "hovers, slower than 0.1 m/s on the mean, has none.",
+    ),
     ("union", "(N − groups) / (N − 1) over the last 10 s, linked within the observation distance: 1 is one flock."),
     (
         "connectivity",

@@ -56,6 +56,25 @@ for (const player of document.querySelectorAll(".player")) {
     return least;
   };
 
+  // Beside each drone, or a line higher or lower where another's label or the drone itself would be under it.
+  const label = (pen, pixels, places, ink, width) => {
+    const [wide, line, radius] = [92, 14, 7];
+    const taken = [];
+    const isFree = (i, left, middle) =>
+      taken.every(([l, m]) => Math.abs(m - middle) >= line || Math.abs(l - left) >= wide) &&
+      pixels.every(([u, v], j) => j === i || Math.abs(v - middle) >= radius + line / 2 || u < left - radius || u > left + wide + radius);
+    pen.fillStyle = ink;
+    for (const i of pixels.map((_, i) => i).sort((a, b) => pixels[a][1] - pixels[b][1])) {
+      const [u, v] = pixels[i];
+      const isLeft = u > width - 90;
+      const left = isLeft ? u - 11 - wide : u + 11;
+      const aside = [0, -1, 1, -2, 2, -3, 3].map((n) => n * line).find((shift) => isFree(i, left, v + shift)) ?? 0;
+      taken.push([left, v + aside]);
+      pen.textAlign = isLeft ? "right" : "left";
+      pen.fillText(`${flight.names[i]}, ${places[i][2].toFixed(1)} m`, u + (isLeft ? -11 : 11), v + aside);
+    }
+  };
+
   const draw = () => {
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
     const dense = window.devicePixelRatio || 1;
@@ -125,12 +144,8 @@ for (const player of document.querySelectorAll(".player")) {
       pen.beginPath();
       pen.arc(x(place), y(place), 7, 0, 2 * Math.PI);
       pen.fill();
-      if (places.length > 12) return;
-      pen.fillStyle = colour("--ink");
-      pen.textAlign = x(place) > width - 90 ? "right" : "left";
-      const aside = pen.textAlign === "left" ? 11 : -11;
-      pen.fillText(`${flight.names[i]}, ${place[2].toFixed(1)} m`, x(place) + aside, y(place));
     });
+    if (places.length <= 12) label(pen, places.map((place) => [x(place), y(place)]), places, colour("--ink"), width);
     pen.textAlign = "left";
     pen.fillStyle = colour("--muted");
     pen.fillText(`north up, lines every ${spacing} m`, 8, height - 12);

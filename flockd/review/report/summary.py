@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ TAIL_S = 10.0
 CONVERGENCE_BAND = {"obj1": 0.05, "obj2": 0.2}
 """How near to its tail mean a sum must stay to have converged."""
 RECALL_RANGE_M = 10.0
+HOVERS_M_S = 0.1
+"""Slower on the mean, a flock has no direction of flight that its drones could share."""
 SAME_GOAL_M = 1e-6
 NEAR_M = 1.0
 """To an obstacle."""
@@ -31,14 +34,16 @@ def summarise(log: FlightLog) -> Json:
     `table2`: absolute errors over all drones, steps and seen neighbours, before and from `circle_until_s`. `table3`:
     convergence of the companion with exact states ("truth") and of this flight ("vision"), null unless the flight goes
     on for 10 s after the circle. `flock`: the smallest distances between drone centres in three dimensions, between
-    steps too (`closest_distances`), and `safety` at all steps; order, union and connectivity are horizontal means over
-    the last 10 s, with the law's observation distance as interaction distance. `neighbours`: the share of all drones
-    within 10 m, at all steps, of which there was a confirmed track, and new false tracks; of drones and steps that were
-    recorded. A flight whose perception is "truth" has no perception: its `neighbours` are null and it is itself Table
-    3's "truth". Of a recording without truth (`has_truth`) all of these are null. `mission` is `mission_figures`,
-    `obstacles` is `obstacle_figures`. `own_account` needs no truth: the recorded drones' own estimates. `gated` and
-    `slowed_share` are as in `FlightMetadata`. `autopilot` names what real daemons flew, and `fleet` holds their
-    figures; null where the simulator ran the pilots.
+    steps too (`closest_distances`), and `safety` at all steps; order (null of a flock that hovers), union and
+    connectivity are horizontal means over the last 10 s, with the law's observation distance as interaction distance.
+    `neighbours`: the share of all drones within 10 m, at all steps, of which there was a confirmed track, and new
+    false tracks; of drones and steps that were recorded. A flight whose perception is "truth" has no perception:
+    its `neighbours` are null and it is itself Table 3's "truth". Of a recording without truth (`has_truth`) all of
+    these are null. `mission` is `mission_figures`, `obstacles` is `obstacle_figures`. `own_account` needs no truth:
+    the recorded drones' own estimates. `gated`, `slowed_share` and `slowed_by` are as in `FlightMetadata`.
+    `handed_over` says how many simulated drones' supervisors asked for Hold, since when, how near two drones came
+    of which flockd flew at least one, and how often one that it flew hit an obstacle. `autopilot` names what real
+    daemons flew, and `fleet` holds their figures; null where the simulator ran the pilots.
     """
     metadata, value = log.metadata, log.metadata.model_dump()
     return {
@@ -50,6 +55,7 @@ def summarise(log: FlightLog) -> Json:
         "flock": _flock(log),
         "mission": mission_figures(log),
         "obstacles": obstacle_figures(log),
+        "handed_over": _handed_over(log),
         "neighbours": _neighbours(log),
         "own_account": _own_account(log),
         "stages_ms": {
@@ -62,9 +68,25 @@ def summarise(log: FlightLog) -> Json:
 
 _FROM_METADATA = (
     "scenario", "perception", "flow", "scale", "drones", "duration_s", "step_s", "seed", "wall_s", "circle_until_s",
-    "desired_distance_m", "gated", "slowed_share",
-    "recorded", "began", "version", "interrupted", "autopilot", "fleet",
+    "desired_distance_m", "gated", "slowed_share", "slowed_by",
+    "settings", "recorded", "began", "version", "interrupted", "autopilot", "fleet",
 )  # fmt: skip
+
+
+_CAUSES = {
+    "neighbour": "neighbours",
+    "uncertainty": "their uncertainty",
+    "false_detection": "false detections",
+    "obstacle": "obstacles",
+    "fence": "the fence",
+    "wind": "wind",
+    "other": "other limits",
+}
+
+
+def causes_text(summary: Mapping[str, Any]) -> str:
+    """What gates slowed drones down for, and for how much of the time; a moment may have several causes."""
+    return ", ".join(f"{_CAUSES[cause]} {100 * part:.1f} %" for cause, part in summary["slowed_by"].items())
 
 
 def write_summary(summary: Json, path: Path) -> None:
@@ -109,19 +131,22 @@ def objective_sums(log: FlightLog, position: FloatArray, velocity: FloatArray) -
 def mission_figures(log: FlightLog) -> Json:
     """Whether the flock's true middle is at its last goal at the end, since when, and how far away; null without one.
 
-    The end is that of the mission, where the autopilots land or return then, else that of the flight. `time_s`: the
-    first time that it was there, once that goal was the one to fly to.
+    `who`: the flock's middle, or the drone that leads it by hand, where only that has goals. The end is that of the
+    mission, where the autopilots land or return then, else that of the flight. `time_s`: the first time that it was
+    there, once that goal was the one to fly to.
     """
     mission = log.metadata.mission
-    figures: Json = {"kind": mission.kind, "arrived": None, "time_s": None}
+    who = "the middle" if mission.led_by is None else f"drone{mission.led_by + 1}, by hand,"
+    figures: Json = {"kind": mission.kind, "who": who, "arrived": None, "time_s": None}
     goals = np.flatnonzero(np.isfinite(log.goal).all(axis=1))
     if not len(goals) or not log.has_truth:
         return {**figures, "final_error_m": None}
     last = log.goal[goals[-1]]
-    away_m = np.linalg.norm(log.position[..., :2].mean(axis=1) - last, axis=1)
+    level = log.position[..., :2]
+    away_m = np.linalg.norm((level.mean(axis=1) if mission.led_by is None else level[:, mission.led_by]) - last, axis=1)
     same = np.linalg.norm(log.goal - last, axis=1) <= SAME_GOAL_M
     others = goals[~same[goals]]
-    since = others[-1] + 1 if len(others) else 0
+    since = goals[goals > (others[-1] if len(others) else -1)][0]
     there = np.flatnonzero((away_m <= mission.reached_m) & (np.arange(len(away_m)) >= since))
     return {
         **figures,
@@ -138,14 +163,39 @@ def obstacle_figures(log: FlightLog) -> Json:
     again. `min_clearance_m` is the smallest distance from that sphere to an obstacle, inside negative, and
     `time_within_1m_s` how long it was below 1 m, summed over the drones.
     """
-    if not len(log.clearance) or log.metadata.drone_radius_m is None:
+    contacts = _contacts(log)
+    if contacts is None or log.metadata.drone_radius_m is None:
         return dict.fromkeys(("collisions", "min_clearance_m", "time_within_1m_s"))
     free_m = log.clearance - log.metadata.drone_radius_m
-    touching = np.vstack([np.zeros((1, free_m.shape[1]), dtype=bool), free_m < 0])
     return {
-        "collisions": int((touching[1:] & ~touching[:-1]).sum()),
+        "collisions": int(contacts.sum()),
         "min_clearance_m": float(free_m.min()),
         "time_within_1m_s": float((free_m < NEAR_M).sum() * log.metadata.step_s),
+    }
+
+
+def _contacts(log: FlightLog) -> BoolArray | None:
+    """(S, N): in which steps which drones' contacts with obstacles begin; None without obstacles."""
+    if not len(log.clearance) or log.metadata.drone_radius_m is None:
+        return None
+    touching = np.vstack([np.zeros((1, log.clearance.shape[1]), bool), log.clearance < log.metadata.drone_radius_m])
+    return np.asarray(touching[1:] & ~touching[:-1])
+
+
+def _handed_over(log: FlightLog) -> Json:
+    if not log.has_truth:
+        return dict.fromkeys(("drones", "first_s", "reasons", "min_distance_flown_m", "collisions_flown"))
+    held = log.metadata.handed_over
+    since_s = np.array([held[i].time_s if i in held else np.inf for i in range(log.position.shape[1])])
+    flown = log.time_s[:, None] < since_s
+    i, j = np.triu_indices(log.position.shape[1], 1)
+    nearest = closest_distances(log.position)[:, i, j]
+    return {
+        "drones": len(held),
+        "first_s": _finite(since_s.min()),
+        "reasons": sorted({one.reason for one in held.values()}),
+        "min_distance_flown_m": _finite(nearest[flown[:, i] | flown[:, j]].min(initial=np.inf)),
+        "collisions_flown": None if (contacts := _contacts(log)) is None else int((contacts & flown).sum()),
     }
 
 
@@ -215,10 +265,11 @@ def _flock(log: FlightLog) -> Json:
     nearest = closest_distances(log.position)[:, *pairs].min(axis=1, initial=np.inf)
     tail = np.flatnonzero(_tail(log))
     reach_m = log.metadata.observation_distance_m
+    hovers = np.linalg.norm(log.velocity[tail, :, :2], axis=-1).mean() < HOVERS_M_S
     return {
         "min_distance_m": _finite(nearest.min(initial=np.inf)),
         "min_distance_after_10s_m": _finite(nearest[log.time_s >= 10.0].min(initial=np.inf)),
-        "order_tail": _mean([order(log.velocity[s, :, :2]) for s in tail]),
+        "order_tail": None if hovers else _mean([order(log.velocity[s, :, :2]) for s in tail]),
         "union_tail": _mean([union(log.position[s, :, :2], reach_m) for s in tail]),
         "connectivity_tail": _mean([connectivity(log.position[s, :, :2], reach_m) for s in tail]),
         "safety": _mean([safety(log.position[s]) for s in steps]),

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flockd.core.messages import EgoMotion, Float32Array, FloatArray, PilotOutput, UInt8Array
-from flockd.flight.geometry import PointPairs, Rig, build_rig
+from flockd.flight.geometry import PointPairs, Rig, build_rig, z_map
 from flockd.flight.perception import Observation
 from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.flight.pilot.motions import background_pairs, neighbour_pairs
@@ -113,7 +113,11 @@ class Scenes:
             return None
         pairs = self._pairs(trace.observation, output.ego_motion, places)
         cameras = trace.observation.cameras
-        depth = {name: camera.depth for name, camera in cameras.items() if camera.depth is not None}
+        depth: dict[str, Float32Array] = {
+            name: z_map(camera.depth, self.rig.cameras[name].camera)  # as Rerun has it
+            for name, camera in cameras.items()
+            if camera.depth is not None
+        }
         return Maps({name: camera.labels for name, camera in cameras.items()}, depth, pairs)
 
     def _pairs(

@@ -16,7 +16,7 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, Self
 
@@ -49,6 +49,8 @@ ARRIVED_M = 0.3
 STICKS_FRESH_S = 0.5
 OFFBOARD_LOSS_MODES: dict[int, Mode] = {0: "RTL", 3: "RTL", 4: "LAND", 5: "LOITER"}
 """By COM_OBL_RC_ACT, no others; 0 would be position mode, which needs a remote control, which there is none of."""
+NOT_ARMED_IN: dict[Mode, str] = {"LAND": "check_modes_cannot_takeoff", "ACRO": "check_modes_manual_control"}
+"""The checks that refuse to arm in a mode."""
 HOME_DEG = (47.3977, 8.5456)
 MAX_SETPOINTS_KEPT = 100_000
 SO_TIMESTAMPNS = 35
@@ -98,14 +100,19 @@ class FakeAutopilot:
         self._speed_factor, self._real = speed_factor, clock
         self.battery_share = 1.0
         self.estimate_ok = True
+        self.sends_motion = True
+        """False: its position and velocity do not come any more, and all else does."""
         self.failing: set[str] = set()
         """PX4's names of further checks that fail; each refuses to arm."""
+        self.wordless = False
+        """True: it refuses without a text or an event."""
         self.silent = False
         """True: as if the cable were cut, in both directions."""
         self.parameters: dict[str, float | int] = {
             "COM_OF_LOSS_T": 1.0,
             "COM_OBL_RC_ACT": 5,
             "COM_LOW_BAT_ACT": 0,
+            "NAV_DLL_ACT": 0,
             "GF_ACTION": 2,
             "GF_MAX_HOR_DIST": 0.0,
             "GF_MAX_VER_DIST": 0.0,
@@ -139,7 +146,12 @@ class FakeAutopilot:
         """When a person last moved them, and forward and right from -1 to 1."""
         self.clock_offset_s = clock_ahead_s - self._clock()
         """Its own clock, of its stamps and of TIMESYNC, less ``clock`` times the speed factor."""
-        self._streams = TelemetryStreams(self._mav, truth, heartbeat_s, home_deg, -self.clock_offset_s, range_finder)
+
+        def streams() -> TelemetryStreams:
+            return TelemetryStreams(self._mav, truth, heartbeat_s, home_deg, -self.clock_offset_s, range_finder)
+
+        self._new_streams = streams
+        self._streams = streams()
         self._heard_s = -math.inf
         """When no packet waited any more: what is taken later came later, whatever the wall clock says."""
         self._lock = threading.RLock()
@@ -181,6 +193,11 @@ class FakeAutopilot:
         return self._mode != self._intended
 
     @property
+    def has_ground_station(self) -> bool:
+        """It hears one on its link, and sends its texts there."""
+        return self.checks.has_ground_station(self._clock())
+
+    @property
     def state(self) -> MotionState:
         """The truth."""
         return self._state
@@ -196,6 +213,28 @@ class FakeAutopilot:
             self._intended = mode
             self._update_mode()
 
+    @property
+    def stream_intervals_s(self) -> Mapping[int, float]:
+        """Seconds between two messages of each kind, by number."""
+        return self._streams.intervals_s
+
+    def lose_heartbeats(self, count: int) -> None:
+        """So many of the next heartbeats do not arrive, while all else does."""
+        self._streams.heartbeats_to_lose = count
+
+    def restart(self) -> None:
+        """It starts anew, on the ground: its clock, its events and the streams it sends begin as at first."""
+        with self._lock:
+            self._disarm()
+            self.clock_offset_s = -self._clock()
+            self.checks = FakeChecks(self._mav)
+            self._streams = self._new_streams()
+
+    def send_from_elsewhere(self, data: bytes) -> None:
+        """It receives a packet of another program, as one on another of its links."""
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.sendto(data, self._socket.getsockname())
+
     def write(self, data: bytes) -> None:
         """Takes what pymavlink has packed."""
         if self.silent:
@@ -206,7 +245,14 @@ class FakeAutopilot:
 
     def _snapshot(self) -> VehicleSnapshot:
         return VehicleSnapshot(
-            self._state, self._mode, self._intended, self._armed, self.estimate_ok, self.battery_share
+            self._state,
+            self._mode,
+            self._intended,
+            self._armed,
+            self.estimate_ok,
+            self.sends_motion,
+            self.battery_share,
+            self.setpoints[-1][1].velocity if self._mode == "OFFBOARD" and self.setpoints else None,
         )
 
     def _clock(self) -> float:
@@ -220,7 +266,9 @@ class FakeAutopilot:
                 now = self._clock()
                 self._fly(min(now - flown_s, MAX_STEP_S))
                 self._streams.send_due(now, self._snapshot())
-                self.checks.tell_changes(self._failing())
+                if not self.wordless:
+                    self.checks.tell_changes(self._failing())
+                self.checks.announce(now)
             flown_s = now
 
     def _receive_until(self, deadline: float) -> None:
@@ -229,7 +277,7 @@ class FakeAutopilot:
             asked_s = self._clock()
             self._socket.settimeout(max(deadline - asked_s, 0.0) / self._speed_factor)
             try:
-                data, ancillary, _, _ = self._socket.recvmsg(4096, 64)
+                data, ancillary, _, sender = self._socket.recvmsg(4096, 64)
             except (TimeoutError, BlockingIOError):
                 self._heard_s = asked_s
                 return
@@ -238,7 +286,7 @@ class FakeAutopilot:
             arrived_s = max(self._clock() - self._speed_factor * _age(ancillary), self._heard_s)
             with self._lock:
                 for message in self._mav.parse_buffer(data) or ():
-                    self._handle(message, arrived_s)
+                    self._handle(message, arrived_s, on_link=sender == self._link)
 
     # Rules
 
@@ -254,27 +302,31 @@ class FakeAutopilot:
         mode = OFFBOARD_LOSS_MODES[int(self.parameters["COM_OBL_RC_ACT"])] if lost else self._intended
         if mode == self._mode:
             return
+        if lost:
+            self.checks.say("Failsafe activated", self._clock())
         self._mode = mode
         self._hold_down_m = float(self._state.position[2])
         R = self._state.R_ned_body
         self._hold_yaw_rad = math.atan2(R[1, 0], R[0, 0])
 
-    def _select(self, mode: Mode) -> bool:
-        """A mode requested over MAVLink: while armed, only one that can run."""
-        if mode == "OFFBOARD" and self._armed and not self._signal():
-            self.checks.say("Offboard not possible: no offboard signal")
-            self.checks.deny("commander_modeswitch_not_avail", custom_mode(mode))
+    def _select(self, mode: Mode, component: int) -> bool:
+        """A mode requested over MAVLink: while armed, only one that can run. It tells ground stations alone of that."""
+        if self._armed and (mode == "ACRO" or (mode == "OFFBOARD" and not self._signal())):
+            if component == mavlink.MAV_COMP_ID_MISSIONPLANNER:
+                self.checks.say(f"Switching to {mode.title()} is currently not available", self._clock())
+                self.checks.deny("commander_modeswitch_not_avail", custom_mode(mode))
             return False
         self.pilot_selects(mode)
         return True
 
     def _arm(self) -> bool:
         if self._intended == "OFFBOARD" and not self._signal():
-            self.checks.say("Arming denied: no offboard signal")
+            self.checks.say("Arming denied: no offboard signal", self._clock())
             return False
         if self._failing() - {NO_SETPOINTS}:
-            self.checks.say("Arming denied: Resolve system health failures first")
-            self.checks.deny(CHECKS_FAIL)
+            if not self.wordless:
+                self.checks.say("Arming denied: Resolve system health failures first", self._clock())
+                self.checks.deny(CHECKS_FAIL)
             return False
         self._armed, self._landed_s = True, None
         return True
@@ -282,6 +334,8 @@ class FakeAutopilot:
     def _failing(self) -> set[str]:
         """The checks that fail now."""
         missing = set() if self._signal() else {NO_SETPOINTS}
+        if not self._armed:
+            missing |= {NOT_ARMED_IN[self._intended]} if self._intended in NOT_ARMED_IN else set()
         return missing | self.failing | (set() if self.estimate_ok else {"check_estimator_hor_pos_not_stable"})
 
     def _disarm(self) -> None:
@@ -334,7 +388,7 @@ class FakeAutopilot:
 
     # MAVLink, in
 
-    def _handle(self, message: Any, arrived_s: float) -> None:
+    def _handle(self, message: Any, arrived_s: float, *, on_link: bool) -> None:
         if getattr(message, "target_system", self._mav.srcSystem) != self._mav.srcSystem:
             return
         match message.get_type():
@@ -355,6 +409,12 @@ class FakeAutopilot:
                 self._mav.timesync_send(own_ns, message.ts1)
             case "PARAM_REQUEST_READ":
                 self._send_parameter(message.param_id)
+            case "PARAM_SET":
+                self._set_parameter(message.param_id, message.param_value)
+            case "HEARTBEAT" if on_link and message.type == mavlink.MAV_TYPE_GCS:
+                self.checks.hear_ground_station(self._clock())
+            case "UNKNOWN_412":  # REQUEST_EVENT, which pymavlink does not have
+                self.checks.send_again(*struct.unpack("<HH", bytes(message.get_msgbuf())[10:14]))
             case _:
                 pass
 
@@ -373,7 +433,7 @@ class FakeAutopilot:
                 mode = mode_by_number(int(message.param2), int(message.param3))
                 if mode is None:
                     return int(mavlink.MAV_RESULT_UNSUPPORTED)
-                done = self._select(mode)
+                done = self._select(mode, message.get_srcComponent())
             case mavlink.MAV_CMD_COMPONENT_ARM_DISARM if message.param1 == 1:
                 done = self._arm()
             case mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
@@ -381,7 +441,7 @@ class FakeAutopilot:
                 if done:
                     self._streams.intervals_s[int(message.param1)] = message.param2 * 1e-6
             case mavlink.MAV_CMD_RUN_PREARM_CHECKS:
-                self.checks.tell(self._failing())
+                self.checks.tell(() if self.wordless else self._failing())
                 done = True
             case mavlink.MAV_CMD_REQUEST_MESSAGE if message.param1 == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
                 self._streams.send_version()
@@ -389,6 +449,13 @@ class FakeAutopilot:
             case _:
                 return int(mavlink.MAV_RESULT_UNSUPPORTED)
         return int(mavlink.MAV_RESULT_ACCEPTED if done else mavlink.MAV_RESULT_TEMPORARILY_REJECTED)
+
+    def _set_parameter(self, name: str, wire: float) -> None:
+        """Takes it from whoever sends it, and tells the new value."""
+        value = self.parameters.get(name)
+        if value is not None:
+            self.parameters[name] = struct.unpack("<i", struct.pack("<f", wire))[0] if isinstance(value, int) else wire
+            self._send_parameter(name)
 
     def _send_parameter(self, name: str) -> None:
         value = self.parameters.get(name)

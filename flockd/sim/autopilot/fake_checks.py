@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import struct
+from collections import deque
 from collections.abc import Iterable
 
 from pymavlink.dialects.v20 import development as mavlink
@@ -15,6 +17,12 @@ PROTOCOL = 8
 """PX4's log level of summaries."""
 TEXT_CHUNK = 50
 """Characters of a STATUSTEXT."""
+GROUND_STATION_S = 2.5
+"""PX4 sends texts for so long after a ground station's heartbeat."""
+EVENTS_KEPT = 20
+"""PX4 sends no older ones again."""
+SEQUENCE_S = 1.0
+"""Between two messages that name the newest event."""
 BOOT_MS = 0
 """Events of the fake carry no time."""
 
@@ -25,7 +33,32 @@ class FakeChecks:
     def __init__(self, link: mavlink.MAVLink) -> None:
         self._mav = link
         self._sequence = self._texts = 0
+        self._kept: deque[tuple[int, _Event]] = deque(maxlen=EVENTS_KEPT)
+        self._ground_station_s = -math.inf
+        self._announced_s = -math.inf
+        self.events_to_lose = 0
+        """So many of the next are lost on their way."""
         self._told: frozenset[str] | None = None
+
+    def hear_ground_station(self, now_s: float) -> None:
+        """A ground station's heartbeat came; before it no text is sent."""
+        self._ground_station_s = now_s
+
+    def has_ground_station(self, now_s: float) -> bool:
+        """One was heard a moment ago."""
+        return now_s - self._ground_station_s <= GROUND_STATION_S
+
+    def send_again(self, first: int, last: int) -> None:
+        """Sends the events of these numbers that it has still."""
+        for number, event in self._kept:
+            if (number - first) & 0xFFFF <= (last - first) & 0xFFFF:
+                self._mav.send(event)
+
+    def announce(self, now_s: float) -> None:
+        """Names the newest event's number, once a second."""
+        if now_s - self._announced_s >= SEQUENCE_S:
+            self._announced_s = now_s
+            self._mav.send(_EventSequence(self._sequence, reset=not self._kept))
 
     def tell_changes(self, failing: Iterable[str]) -> None:
         """Sends the list if it is not the one sent last."""
@@ -47,28 +80,48 @@ class FakeChecks:
         """Sends the event of a refused request, by its name."""
         self._send(event_number(what), ERROR, struct.pack(f"<{len(arguments)}I", *arguments))
 
-    def say(self, text: str) -> None:
-        """Sends a critical STATUSTEXT, in chunks."""
-        self._texts += 1
-        for chunk, start in enumerate(range(0, len(text) + 1, TEXT_CHUNK)):
+    def say(self, text: str, now_s: float) -> None:
+        """Sends a critical STATUSTEXT, in chunks, where a ground station listens."""
+        if not self.has_ground_station(now_s):
+            return
+        for chunk, start in enumerate(range(0, len(text), TEXT_CHUNK)):
             part = text[start : start + TEXT_CHUNK].encode()
             self._mav.statustext_send(mavlink.MAV_SEVERITY_CRITICAL, part, self._texts, chunk)
+        self._texts += 1  # the first has the id 0, as PX4's
 
     def _send(self, number: int, level: int, arguments: bytes) -> None:
         self._sequence = (self._sequence + 1) & 0xFFFF
-        self._mav.send(_Event(number, self._sequence, level << 4 | level, arguments))
+        event = _Event(number, self._sequence, level << 4 | level, arguments)
+        self._kept.append((self._sequence, event))
+        if self.events_to_lose > 0:
+            self.events_to_lose -= 1
+        else:
+            self._mav.send(event)
 
 
-class _Event:
-    """MAVLink's EVENT, which pymavlink does not have."""
+class _Raw:
+    """A message that pymavlink does not have."""
 
-    ID, CRC_EXTRA = 410, 160
-    LAYOUT = struct.Struct("<IIHBBB40s")
-
-    def __init__(self, number: int, sequence: int, log_levels: int, arguments: bytes) -> None:
-        self._data = self.LAYOUT.pack(number, BOOT_MS, sequence, 0, 0, log_levels, arguments)
+    def __init__(self, number: int, name: str, crc_extra: int, data: bytes) -> None:
+        self._number, self._name, self._crc_extra, self._data = number, name, crc_extra, data
 
     def pack(self, mav: mavlink.MAVLink, force_mavlink1: bool = False) -> bytes:
         """The whole message as it goes over the link."""
-        message = mavlink.MAVLink_message(self.ID, "EVENT")
-        return bytes(message._pack(mav, self.CRC_EXTRA, self._data, force_mavlink1=force_mavlink1))
+        message = mavlink.MAVLink_message(self._number, self._name)
+        return bytes(message._pack(mav, self._crc_extra, self._data, force_mavlink1=force_mavlink1))
+
+
+class _Event(_Raw):
+    """MAVLink's EVENT."""
+
+    def __init__(self, number: int, sequence: int, log_levels: int, arguments: bytes) -> None:
+        super().__init__(
+            410, "EVENT", 160, struct.pack("<IIHBBB40s", number, BOOT_MS, sequence, 0, 0, log_levels, arguments)
+        )
+
+
+class _EventSequence(_Raw):
+    """MAVLink's CURRENT_EVENT_SEQUENCE."""
+
+    def __init__(self, sequence: int, *, reset: bool) -> None:
+        super().__init__(411, "CURRENT_EVENT_SEQUENCE", 106, struct.pack("<HB", sequence, int(reset)))

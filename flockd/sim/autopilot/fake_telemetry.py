@@ -18,10 +18,22 @@ from flockd.flight.geometry import quaternion_from_rotation
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder
 from flockd.sim.autopilot.fake_vehicle import MotionState
 
-Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "RTL", "OFFBOARD"]
+Mode = Literal["POSCTL", "LOITER", "TAKEOFF", "LAND", "RTL", "ACRO", "OFFBOARD"]
 """PX4's modes by the names pymavlink gives them; LOITER is Hold."""
 
-DEFAULT_STREAMS_S = {31: 0.1, 32: 0.1, 245: 1.0, 1: 1.0, 24: 1.0, 230: 1.0, 242: 1.0, 436: 2.0, 132: 0.1, 141: 0.1}
+DEFAULT_STREAMS_S = {
+    31: 0.1,
+    32: 0.1,
+    245: 1.0,
+    1: 1.0,
+    24: 1.0,
+    230: 1.0,
+    242: 1.0,
+    436: 2.0,
+    132: 0.1,
+    141: 0.1,
+    85: 0.1,
+}
 """Message number and seconds between two, until another rate is requested."""
 TRUTH_S = 0.04
 ON_GROUND_M = 0.05
@@ -53,7 +65,10 @@ class VehicleSnapshot:
     """The mode it was asked for; not `mode` while its failsafe is active."""
     armed: bool
     estimate_ok: bool
+    sends_motion: bool
     battery_share: float
+    setpoint: FloatArray | None = None
+    """(2,) m/s, north and east, that it follows in offboard."""
 
     @property
     def failsafe(self) -> bool:
@@ -79,8 +94,10 @@ class TelemetryStreams:
         self._heartbeat_s, self._home_deg, self._started_s = heartbeat_s, home_deg, started_s
         self.intervals_s = dict(DEFAULT_STREAMS_S)
         """Seconds between two messages, by message number."""
+        self.heartbeats_to_lose = 0
+        """So many of the next are lost on their way."""
         self._due_s: dict[int, float] = {}
-        self._sent_mode: Mode | None = None
+        self._sent_modes: tuple[Mode, Mode] | None = None
         self._now_s = started_s
         self._vehicle: VehicleSnapshot
 
@@ -98,11 +115,12 @@ class TelemetryStreams:
             242: self._send_home,
             132: self._send_range,
             141: self._send_altitude,
+            85: self._send_setpoint,
         }
         for number, sender in senders.items():
             self._send_if_due(now, number, self.intervals_s[number], sender)
         self._send_if_due(now, 115, TRUTH_S, self._send_truth)
-        if self._vehicle.mode != self._sent_mode:
+        if (vehicle.mode, vehicle.intended_mode) != self._sent_modes:
             self._send_if_due(now, 436, self.intervals_s[436], self._send_mode)
 
     def _send_if_due(self, now: float, number: int, interval_s: float, sender: Callable[[], None]) -> None:
@@ -114,6 +132,9 @@ class TelemetryStreams:
         return int((self._now_s - self._started_s) * 1000)
 
     def _send_heartbeat(self) -> None:
+        if self.heartbeats_to_lose > 0:
+            self.heartbeats_to_lose -= 1
+            return
         state = mavlink.MAV_STATE_STANDBY
         if self._vehicle.armed:
             state = mavlink.MAV_STATE_CRITICAL if self._vehicle.failsafe else mavlink.MAV_STATE_ACTIVE
@@ -127,14 +148,21 @@ class TelemetryStreams:
         )
 
     def _send_mode(self) -> None:
-        self._sent_mode = self._vehicle.mode
+        self._sent_modes = self._vehicle.mode, self._vehicle.intended_mode
         self._mav.current_mode_send(0, custom_mode(self._vehicle.mode), custom_mode(self._vehicle.intended_mode))
+
+    def _send_setpoint(self) -> None:
+        """Only in offboard: of its other modes' setpoints nothing is simulated."""
+        if self._vehicle.setpoint is not None:
+            nothing = [math.nan] * 3
+            speeds = [*self._vehicle.setpoint, math.nan]
+            self._mav.position_target_local_ned_send(self._boot_ms(), 1, 0, *nothing, *speeds, *nothing, math.nan, 0.0)
 
     def _send_attitude(self) -> None:
         self._mav.attitude_quaternion_send(self._boot_ms(), *self._attitude(), 0, 0, 0)
 
     def _send_position(self) -> None:
-        if self._vehicle.estimate_ok:
+        if self._vehicle.estimate_ok and self._vehicle.sends_motion:
             self._mav.local_position_ned_send(
                 self._boot_ms(), *self._vehicle.motion.position, *self._vehicle.motion.velocity
             )
@@ -228,5 +256,5 @@ def custom_mode(mode: Mode) -> int:
 
 def mode_by_number(main: int, sub: int) -> Mode | None:
     """The mode of PX4's numbers; None for one that the fake does not fly."""
-    modes: tuple[Mode, ...] = ("POSCTL", "LOITER", "TAKEOFF", "LAND", "RTL", "OFFBOARD")
+    modes: tuple[Mode, ...] = ("POSCTL", "LOITER", "TAKEOFF", "LAND", "RTL", "ACRO", "OFFBOARD")
     return next((mode for mode in modes if mavutil.px4_map[mode][1:] == (main, sub)), None)

@@ -51,13 +51,13 @@ class FlightCode:
         return self._avoidances[i].command(self._law, velocity, seen.offsets, level, desired, ranges)[0]
 
     def fly_gated(
-        self, i: int, begin_s: float, states: FloatArray, commands: FloatArray, heights: FloatArray, gusts: FloatArray,
-        seen: Seen, ranges: ObstacleRanges | None,
+        self, i: int, begin_s: float, states: FloatArray, blown: FloatArray, commands: FloatArray, heights: FloatArray,
+        gusts: FloatArray, seen: Seen, ranges: ObstacleRanges | None,
     ) -> None:  # fmt: skip
         """Moves drone `i` on by one step from `begin_s`, at the rate of setpoints, as its gate lets it.
 
         Of all drones: `states` (6, drones) in place, towards `commands` (2, drones) m/s and `heights` (drones,) m, NaN:
-        as high as now; `gusts` as of `motion.fly`. Neighbours go on as they flew when they were `seen`.
+        as high as now; `blown` and `gusts` as of `motion.fly`. Neighbours go on as they flew when they were `seen`.
         """
         points = np.empty((0, 2)) if ranges is None else nearest_points(ranges, self._drone.obstacles.sigmas)
         wanted = Wanted(commands[:, i].copy(), np.zeros(2), 0.0)
@@ -81,8 +81,7 @@ class FlightCode:
             setpoint = self._gates[i].step(now_s, request).setpoint
             assert setpoint is not None, "all that it is told is finite and of now"
             self._sent[:, i] = setpoint.velocity
-            of_tick = gusts[tick * self._substeps.times : (tick + 1) * self._substeps.times]
-            motion.fly(i, i + 1, states, self._sent, of_tick, self._substeps)
+            motion.fly(i, i + 1, now_s, states, blown, self._sent, gusts, self._substeps)
             if not holds:
                 self._height_m[i] = setpoint.height_m
                 motion.climb(i, i + 1, states, self._height_m, self._substeps)

@@ -19,6 +19,7 @@ from flockd.sim.control_level.flight_code import FlightCode, Seen
 from flockd.sim.control_level.flock_figures import FlightFigures
 from flockd.sim.control_level.many_missions import ManyMissions
 from flockd.sim.control_level.many_obstacles import FIGURES, ManyObstacles
+from flockd.sim.wind import GustField
 
 Figures = dict[str, float | int | bool | None]
 _Errors = tuple[FloatArray, FloatArray, IntArray]
@@ -88,7 +89,8 @@ class FlockFlights:
         self._code = FlightCode(drone, vehicle, f * n) if gated or self._avoids else None
         of_step = motion.Substeps.of(vehicle, drone.step_s)
         self._substeps = self._code.substeps if gated and self._code is not None else of_step
-        self._gusts = [motion.Gusts(vehicle, n, seed) for seed in seeds] if vehicle.gust_m_s else []
+        self._blown = np.zeros((2, f * n))
+        self._gusts = np.stack([GustField.of(vehicle, seed).waves for seed in seeds])
         self._figures = FlightFigures(f, n, self._times, drone.step_s, vehicle.radius_m)
         self._arrival_s, self._away_m = np.full(f, np.nan), np.full(f, np.nan)
         self._by_slot = np.empty((6, f, n))
@@ -110,9 +112,9 @@ class FlockFlights:
         drones = _parts(f * n, threads, _LEAST_DRONES)
         self.perceive(step, pool, threads)
         self._measure(step, pool, threads)
-        desired, height_m = self._missions.step(float(self._times[step]), self.states[:2], self._middles)
+        begin_s = float(self._times[step])
+        desired, height_m = self._missions.step(begin_s, self.states[:2], self._middles)
         self._note_goal(step)
-        gusts = self._next_gusts()
         climbs = bool(np.isfinite(height_m).any())
         states, heights = self.states.reshape(6, -1), height_m.reshape(-1)
         own = states[3:5] if self._errors is None else self._own.reshape(2, -1)
@@ -126,18 +128,18 @@ class FlockFlights:
             )  # fmt: skip
 
         def fly(a: int, b: int) -> None:
-            motion.fly(a, b, states, commands, gusts, self._substeps)
+            motion.fly(a, b, begin_s, states, self._blown, commands, self._gusts, self._substeps)
             if climbs:
                 motion.climb(a, b, states, heights, self._substeps)
 
         _run(pool, drones, ask)
         if self._code is not None:
-            self._fly_by_code(self._code, step, desired.reshape(2, -1), own.copy(), heights, gusts)
+            self._fly_by_code(self._code, step, desired.reshape(2, -1), own.copy(), heights)
         if not self._gated:
             _run(pool, drones, fly)
 
     def _fly_by_code(
-        self, code: FlightCode, step: int, desired: FloatArray, own: FloatArray, heights: FloatArray, gusts: FloatArray
+        self, code: FlightCode, step: int, desired: FloatArray, own: FloatArray, heights: FloatArray
     ) -> None:
         """Lets each drone's own code turn its command aside from obstacles, and its gate, if any, fly it."""
         f, n = self._shape
@@ -156,7 +158,7 @@ class FlockFlights:
             if ranges is not None:
                 commands[:, drone] = code.around(drone, own[:, drone], seen, desired[:, drone], ranges)
             if self._gated:
-                code.fly_gated(drone, time_s, states, commands, heights, gusts, seen, ranges)
+                code.fly_gated(drone, time_s, states, self._blown, commands, heights, self._gusts, seen, ranges)
 
     def _seen(self, step: int, flight: int, slot: int, states: FloatArray) -> Seen:
         """What the drone of a slot knows of the others, of the flights' `states` as the step begins."""
@@ -216,12 +218,6 @@ class FlockFlights:
             unions, reach = np.empty(f), self._drone.flocking.observation_distance_m
             _run(pool, flights, lambda a, b: flock_figures.unions(a, b, *cells, reach, unions))
             self._figures.add_tail(self.states, unions)
-
-    def _next_gusts(self) -> FloatArray:
-        """(substeps, 2, flights * n) m/s^2."""
-        if not self._gusts:
-            return np.empty((0, 2, 0))
-        return np.concatenate([gusts.step(self._substeps) for gusts in self._gusts], axis=2)
 
     def _note_goal(self, step: int) -> None:
         """When each flock's true middle first was at the last goal, once that was the one to fly to."""

@@ -9,14 +9,12 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numpy as np
 from numba import njit
 
 from flockd.core.config.scenario import VehicleConfig
-from flockd.core.messages import FloatArray
+from flockd.sim.vehicles import MAX_LEAN_M_S2
 
 MAX_SUBSTEP_S = 0.02
-GUST_TIME_S = 2.0
 MAX_CLIMB_M_S = 1.5
 CLIMB_TIME_S = 1.0
 _BLOCK = 128
@@ -68,30 +66,52 @@ def commands(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def fly(begin: int, end: int, states: Any, setpoints: Any, gusts: Any, substeps: Any) -> None:
+def fly(
+    begin: int, end: int, begin_s: float, states: Any, blown: Any, setpoints: Any, gusts: Any, substeps: Any
+) -> None:  # fmt: skip
     """Moves drones on by one step: `states` (6, flights * n) in place, towards `setpoints` (2, flights * n) m/s.
 
-    `gusts` (substeps, 2, flights * n) m/s^2, or (0, 2, 0) for none.
+    `blown` (2, flights * n) m/s, in place, is what of the velocities gusts added, and `gusts` (flights, m, 8) are the
+    waves of each flight's `GustField`.
     """
     count, dt, answer, most = substeps
-    x, y, vx, vy = states[0], states[1], states[3], states[4]
-    gusty = gusts.shape[0] > 0
+    x, y, z, vx, vy, bx, by = states[0], states[1], states[2], states[3], states[4], blown[0], blown[1]
+    n = states.shape[1] // gusts.shape[0]
+    gusty = gusts.shape[1] > 0
     for a in range(begin, end, _BLOCK):
         b = min(a + _BLOCK, end)
         for s in range(count):
             for i in range(a, b):
-                an = (setpoints[0, i] - vx[i]) * answer
-                ae = (setpoints[1, i] - vy[i]) * answer
+                an = (setpoints[0, i] - (vx[i] - bx[i])) * answer
+                ae = (setpoints[1, i] - (vy[i] - by[i])) * answer
                 share = min(1.0, most / max(math.sqrt(an * an + ae * ae), 1e-12))
                 an *= share
                 ae *= share
                 if gusty:
-                    an += gusts[s, 0, i]
-                    ae += gusts[s, 1, i]
+                    ln = an - bx[i] * answer
+                    le = ae - by[i] * answer
+                    share = min(1.0, MAX_LEAN_M_S2 / max(math.sqrt(ln * ln + le * le), 1e-12))
+                    push_n, push_e = _push(gusts[i // n], x[i], y[i], z[i], begin_s + s * dt)
+                    bx[i] += (share * ln - an + push_n) * dt
+                    by[i] += (share * le - ae + push_e) * dt
+                    an = share * ln + push_n
+                    ae = share * le + push_e
                 x[i] += vx[i] * dt + an * (dt * dt / 2)
                 y[i] += vy[i] * dt + ae * (dt * dt / 2)
                 vx[i] += an * dt
                 vy[i] += ae * dt
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _push(waves: Any, north: float, east: float, down: float, time_s: float) -> tuple[float, float]:
+    """As `GustField.push`, of one place, m NED."""
+    push_n = push_e = 0.0
+    for w in range(waves.shape[0]):
+        phase = waves[w, 0] * north + waves[w, 1] * east + waves[w, 2] * down - waves[w, 3] * time_s
+        cos, sin = math.cos(phase), math.sin(phase)
+        push_n += waves[w, 4] * cos + waves[w, 6] * sin
+        push_e += waves[w, 5] * cos + waves[w, 7] * sin
+    return push_n, push_e
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -109,23 +129,3 @@ def climb(begin: int, end: int, states: Any, heights: Any, substeps: Any) -> Non
             if down[i] >= 0.0:
                 sink[i] = min(sink[i], 0.0)
                 down[i] = 0.0
-
-
-class Gusts:
-    """One flight's gusts, drawn as `flockd.sim.vehicles.Vehicles` draws them."""
-
-    def __init__(self, vehicle: VehicleConfig, drones: int, seed: int) -> None:
-        tau = vehicle.velocity_time_constant_s
-        self._sigma = vehicle.gust_m_s / tau * math.sqrt((GUST_TIME_S + tau) / GUST_TIME_S)
-        self._random = np.random.default_rng(seed)
-        self._now = self._sigma * self._random.normal(size=(drones, 2))
-
-    def step(self, substeps: Substeps) -> FloatArray:
-        """Accelerations (substeps, 2, n) m/s^2 of one step."""
-        keep = math.exp(-substeps.dt_s / GUST_TIME_S)
-        out = np.empty((substeps.times, 2, len(self._now)))
-        for s in range(substeps.times):
-            out[s] = self._now.T
-            kick = math.sqrt(1 - keep**2) * self._sigma * self._random.normal(size=self._now.shape)
-            self._now = keep * self._now + kick
-        return out

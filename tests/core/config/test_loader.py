@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from flockd.core.config import Overrides, load_drone, load_scenario, schema_of
+from flockd.core.config import Overrides, load_campaign, load_drone, load_scenario, schema_of
 from flockd.core.config.document import core_scalar
 from flockd.core.errors import ConfigError, ConfigProblem, ModelError
 from flockd.flight.perception import load_networks
@@ -162,6 +163,19 @@ def test_an_alias_is_refused_once_and_not_also_for_its_value(tmp_path: Path) -> 
     ]
 
 
+@pytest.mark.parametrize(("escape", "shown"), [("\\0", "0x0000"), ("\\ud800", "0xd800")])
+def test_a_text_that_no_program_takes_is_refused(escape: str, shown: str, tmp_path: Path) -> None:
+    """In a pipeline it killed the camera's thread, after the check had passed it."""
+    source = f"""\
+source:
+  kind: gstreamer
+  cameras:
+    - {{name: front, pipeline: "videotestsrc{escape} ! videoconvert"}}"""
+    assert _drone_problems(tmp_path, _with(source)) == [
+        f"drone.yaml:9: source.cameras[0].pipeline: holds the character {shown}, which no program takes; delete it"
+    ]
+
+
 def test_a_rig_without_cameras_is_refused(tmp_path: Path) -> None:
     assert _drone_problems(tmp_path, "rig:\n  cameras: []\n") == [
         "drone.yaml:2: rig.cameras: has 0 entries; write a list of at least 1 entry"
@@ -184,7 +198,7 @@ def test_faults_inside_a_camera_name_the_camera(tmp_path: Path) -> None:
 def test_two_cameras_of_one_name_are_refused(tmp_path: Path) -> None:
     twice = DRONE + DRONE.split("cameras:\n")[1]
     assert _drone_problems(tmp_path, twice) == [
-        "drone.yaml:1: rig: two cameras share the name 'front'; give each its own"
+        "drone.yaml:6: rig.cameras[1].name: two cameras share the name 'front'; give each its own"
     ]
 
 
@@ -474,7 +488,72 @@ def test_the_trim_that_an_error_recommends_is_taken_though_rounding_adds_up(tmp_
     limits = "flocking: {max_speed_m_s: 0.2}\nmission: {speed_m_s: 0.2}\n"
     limits += "safety: {gate: {max_speed_m_s: 0.3, degraded_speed_m_s: 0.3}}\n"
     (problem,) = _drone_problems(tmp_path, f"{DRONE}{limits}autopilot: {{max_velocity_trim_m_s: 0.2}}\n")
-    assert "write 0.1 or less for the trim" in problem
+    assert "max_velocity_trim_m_s: 0.2 and flocking.max_speed_m_s 0.2 are together above" in problem
     path = tmp_path / "drone.yaml"
     path.write_text(f"{DRONE}{limits}autopilot: {{max_velocity_trim_m_s: 0.1}}\n", encoding="utf-8")
     assert load_drone(path).autopilot is not None
+
+
+def test_a_scenario_without_its_drones_file_has_one_fault_and_no_false_ones(tmp_path: Path) -> None:
+    scenario = tmp_path / "square.yaml"
+    scenario.write_text((CONFIG / "square.yaml").read_text(encoding="utf-8"), encoding="utf-8")
+    with pytest.raises(ConfigError) as refused:
+        load_scenario(scenario)
+    assert str(refused.value).splitlines() == [
+        f"{tmp_path}/simulator.yaml: does not exist; check the path",
+        f"{scenario}:5: drone: names simulator.yaml, which cannot be used; correct it or name another",
+    ]
+
+
+def test_files_of_another_kind_are_refused_by_what_they_are() -> None:
+    campaign = CONFIG / "campaigns" / "nightly.yaml"
+    refusals: tuple[tuple[Callable[[Path], object], Path, str], ...] = (
+        (load_drone, campaign, "is a campaign, and a drone's own file is needed here; `flockd campaign` flies it"),
+        (load_scenario, campaign, "is a campaign, and a scenario is needed here; `flockd campaign` flies it"),
+        (load_campaign, CONFIG / "square.yaml", "is a scenario, and a campaign is needed here; name one with the keys"),
+        (load_campaign, CONFIG / "quadrotor.yaml", "is a drone's own file, and a campaign is needed here; name one"),
+    )
+    for load_file, file, fault in refusals:
+        with pytest.raises(ConfigError) as refused:
+            load_file(file)
+        assert str(refused.value).startswith(f"{file}: {fault}")
+
+
+def test_texts_that_have_to_look_so_say_how(tmp_path: Path) -> None:
+    slips = {
+        "autopilot: {address: /dev/ttyAMA0}": "autopilot.address: /dev/ttyAMA0 is not an address; write an address, "
+        "as in `serial:///dev/ttyAMA0:921600` for a cable and its baud rate, or `udpin://0.0.0.0:14540`",
+        "autopilot: {address: 'serial://ttyAMA0:921600'}": "autopilot.address: 'serial://ttyAMA0:921600' is not an",
+        "telemetry: {listen: ['0.0.0.0:7447']}": "telemetry.listen[0]: '0.0.0.0:7447' is not a zenoh endpoint; write a "
+        "zenoh endpoint, as in `tcp/0.0.0.0:7447`",
+        "name: my drone": "name: my drone is not a name; write my_drone",
+    }
+    for text, told in slips.items():
+        file = tmp_path / "drone.yaml"
+        file.write_text(_with(text), encoding="utf-8")
+        with pytest.raises(ConfigError) as refused:
+            load_drone(file)
+        assert told in str(refused.value)
+
+
+def test_what_is_wrong_with_a_camera_is_told_at_its_own_line(tmp_path: Path) -> None:
+    quadrotor = (CONFIG / "quadrotor.yaml").read_text(encoding="utf-8")
+    rig, source, rest = quadrotor.partition("\nsource:")
+    line = 1 + (rig + source + rest[: rest.index("- name: back")]).count("\n")
+    twice = 1 + rig[: rig.index("- name: right")].count("\n")
+    slips = {
+        rig + source + rest.replace("- name: back", "- name: bak", 1): f"{line}: source.cameras[2].name: "
+        "bak is no camera of the rig, which has front, right, back, left",
+        rig + source + rest.replace("- name: back", "- name: left", 1): "source.cameras[3].name: left has an entry",
+        rig.replace("- name: right", "- name: front")
+        + source
+        + rest: f"{twice}: rig.cameras[1].name: two cameras share",
+        quadrotor.replace(
+            "usb-0:2:1.0", "usb-0:1:1.0"
+        ): "source.cameras[1].device: two cameras share /dev/v4l/by-path/",
+    }
+    for text, told in slips.items():
+        (tmp_path / "drone.yaml").write_text(text, encoding="utf-8")
+        with pytest.raises(ConfigError) as refused:
+            load_drone(tmp_path / "drone.yaml")
+        assert told in str(refused.value)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import socket
 from collections.abc import AsyncIterator, Mapping
@@ -13,9 +14,10 @@ import pytest
 from aiohttp import WSMsgType, web
 from aiohttp.test_utils import TestClient, TestServer
 
+from flockd.core.errors import UnavailableError
 from flockd.fleet.page.drone_rows import Known, Row
 from flockd.fleet.page.fleet_source import Event
-from flockd.fleet.page.page_access import MAX_SESSIONS, PageAccess, is_own_host
+from flockd.fleet.page.page_access import PageAccess, is_own_host, lasting_key
 from flockd.fleet.page.page_server import PageServer
 from flockd.fleet.watcher import Watched
 from flockd.onboard.telemetry.topics import AnswerMessage
@@ -31,6 +33,7 @@ class Asked:
 
     def __init__(self) -> None:
         self.commands: list[tuple[str, str, object]] = []
+        self.operators: set[str] = set()
 
     def now_s(self) -> float:
         return 1.0
@@ -53,7 +56,11 @@ class Asked:
     def history(self) -> Mapping[str, list[list[float | None]]]:
         return {}
 
-    def ask(self, drone: str, command: str, order: Mapping[str, object] | None) -> AnswerMessage:
+    def notes(self) -> list[str]:
+        return []
+
+    def ask(self, drone: str, command: str, order: Mapping[str, object] | None, operator: str) -> AnswerMessage:
+        self.operators.add(operator)
         self.commands.append((drone, command, order))
         return AnswerMessage(accepted=True, sentence="tried")
 
@@ -62,9 +69,11 @@ class Asked:
 
 
 @asynccontextmanager
-async def served(*, may_command: bool = True) -> AsyncIterator[tuple[Client, PageAccess, Asked]]:
+async def served(
+    *, may_command: bool = True, fleet: Asked | None = None
+) -> AsyncIterator[tuple[Client, PageAccess, Asked]]:
     """A server, and a browser without a page."""
-    access, fleet = PageAccess(), Asked()
+    access, fleet = PageAccess(), fleet or Asked()
     server = TestServer(PageServer(fleet, access, may_command=may_command).application(), host="127.0.0.1")
     async with TestClient(server) as client:
         yield client, access, fleet
@@ -130,6 +139,8 @@ async def test_a_command_needs_the_sessions_token_and_the_pages_own_origin() -> 
         reply = await client.post("/ask", json=HOLD, headers=other)
         assert await reply.json() == {"f/one": {"accepted": True, "sentence": "tried"}}
         assert fleet.commands == [("f/one", "hold", None)]
+        await client.post("/ask", json=HOLD, headers=await opened(client, access))
+        assert len(fleet.operators) == 2, "each page is an operator of its own"
 
 
 async def test_a_name_that_was_made_to_lead_here_gets_nothing() -> None:
@@ -207,6 +218,9 @@ async def test_a_page_that_only_watches_commands_nothing() -> None:
     [
         (b"{", ""),
         (b"[]", "JSON object"),
+        (b"[" * 10_000, "JSON object"),
+        (b"\xff\xfe{", "JSON object"),
+        (json.dumps({**HOLD, "drones": ["f/one"] * 1000}).encode(), "to 200 drones at most"),
         (json.dumps({**HOLD, "drones": []}).encode(), "names its drones"),
         (json.dumps({**HOLD, "drones": [1]}).encode(), "names its drones"),
         (json.dumps({**HOLD, "command": "about"}).encode(), "hold, land, resume, goto"),
@@ -222,6 +236,13 @@ async def test_what_is_no_command_is_refused_in_one_sentence(body: bytes, told: 
         assert fleet.commands == []
 
 
+async def test_a_command_in_an_unknown_charset_is_read_as_what_it_is() -> None:
+    async with served() as (client, access, fleet):
+        headers = {**await opened(client, access), "Content-Type": "application/json; charset=nonsense"}
+        assert (await client.post("/ask", data=json.dumps(HOLD).encode(), headers=headers)).status == 200
+        assert fleet.commands == [("f/one", "hold", None)]
+
+
 async def test_an_order_reaches_every_drone_once() -> None:
     async with served() as (client, access, fleet):
         order = {"north_m": 3, "east_m": -2.5}
@@ -230,13 +251,39 @@ async def test_an_order_reaches_every_drone_once() -> None:
         assert sorted(fleet.commands) == [("f/one", "goto", order), ("f/two", "goto", order)]
 
 
-def test_the_oldest_session_ends_where_there_are_too_many() -> None:
-    access = PageAccess()
-    first = access.open_session(access.key)
-    for _ in range(MAX_SESSIONS):
-        newest = access.open_session(access.key)
-    assert access.token_of(first) is None
-    assert access.token_of(newest) is not None
+async def test_with_a_key_that_lasts_an_open_page_goes_on_after_a_new_start(tmp_path: Path) -> None:
+    """Its cookie and its token are good for the new server; with another key they are not, and the page is told so."""
+    first = PageAccess(lasting_key(tmp_path / "key"))
+    session = first.open_session(first.key)
+    token = first.token_of(session)
+    second = PageAccess(lasting_key(tmp_path / "key"))
+    assert (second.key, second.cookie) == (first.key, first.cookie)
+    assert second.is_token(session, token)
+    other = PageAccess()
+    assert other.cookie != first.cookie
+    assert other.token_of(session) is None
+    assert second.token_of(f"{session}0") is None
+    assert second.token_of("\udcff.\udcff") is None
+
+
+def test_a_key_is_for_its_owner_alone(tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    key = lasting_key(path)
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert lasting_key(path) == key
+    path.chmod(0o640)
+    with pytest.raises(UnavailableError, match="may be read or written by others; `chmod 600"):
+        lasting_key(path)
+    path.chmod(0o600)
+    for content in ("", "short", "x" * 5000, "with spaces in it, as no key has"):
+        path.write_text(content, encoding="ascii")
+        with pytest.raises(UnavailableError, match="holds no key"):
+            lasting_key(path)
+    with pytest.raises(UnavailableError, match="cannot be made"):
+        lasting_key(tmp_path / "none" / "key")
+    os.mkfifo(tmp_path / "pipe", 0o600)
+    with pytest.raises(UnavailableError, match="holds no key"):
+        lasting_key(tmp_path / "pipe")
 
 
 def test_the_page_names_no_place_outside_the_computer() -> None:

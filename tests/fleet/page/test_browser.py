@@ -6,6 +6,7 @@ The times that it takes are printed, not checked: the computer may be busy.
 from __future__ import annotations
 
 import os
+import re
 import sys
 import time
 from collections.abc import Iterator
@@ -95,7 +96,8 @@ def test_a_hold_is_confirmed_by_the_drone_and_resumed(flock: Flock) -> None:
     for _ in range(2):
         page.locator(f"{of} [data-command=hold]").click()
         page.locator("#confirm .send").click()
-    expect(page.locator("#events")).to_contain_text("an operator asked for hold (2 times)")
+    expect(page.locator("#events")).to_contain_text(re.compile(r"operator asked for hold: .*, order \d+ \(2 times\)"))
+    expect(page.locator(f"{of} .orders")).to_contain_text(re.compile(r"last order: hold, by \S+@\S+, page \w+"))
     page.locator(f"{of} [data-command=resume]").click()
     page.locator("#confirm .send").click()
     expect(page.locator(f"{of} .state")).to_have_text("normal")

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from flockd.fleet.page.drone_rows import HISTORY_COLUMNS, Known, drone_rows, history_row
+from flockd.fleet.page.drone_rows import HISTORY_COLUMNS, MAX_CAMERAS, Known, drone_rows, history_row
 from flockd.fleet.watcher import Heard, Watched
 from flockd.onboard.telemetry.topics import AboutMessage
 
@@ -17,9 +17,10 @@ STATE: dict[str, Any] = {
 }  # fmt: skip
 FLIGHT: dict[str, Any] = {
     "time_s": 4.0, "state": "degraded", "reasons": [{"event": "x", "sentence": "the battery is low"}],
-    "flight_mode": "offboard", "armed": True, "in_air": True, "heartbeat_age_s": 0.1, "battery_share": 0.4,
+    "flight_mode": "offboard", "armed": True, "in_air": True, "heartbeat_age_s": 0.1, "heartbeats_lost": 0,
+    "battery_share": 0.4,
     "height_m": 5.1, "velocity_trim": [0.0, 0.0], "gusts_m_s": 0.1, "silence": None, "setpoints_sent": 9,
-    "setpoints_missed": 2,
+    "setpoints_missed": 2, "orders": [], "orders_refused": 0,
 }  # fmt: skip
 
 
@@ -37,6 +38,37 @@ def test_homes_are_put_on_one_map_in_metres() -> None:
     point = dict(zip(HISTORY_COLUMNS, history_row(rows["f/b"], 7.0), strict=True))
     assert (point["north"], point["east"]) == pytest.approx((121.2, 96.1), abs=0.3)
     assert (point["time"], point["speed"], point["battery"]) == (7.0, 5.0, 0.4)
+
+
+def test_the_map_goes_on_across_the_date_line() -> None:
+    """Fiji: homes 0.002 degrees apart, of 111.32 cos 18 km each (WGS 84, to a metre), not 359.998."""
+    west, east = ({**STATE, "home_deg": [-18.0, degrees]} for degrees in (179.999, -179.999))
+    rows = drone_rows([watched("a", state=west, flight=FLIGHT), watched("b", state=east, flight=FLIGHT)], {}, 100.5)
+    assert rows["f/b"]["home_ne"] == pytest.approx([0.0, 211.8], abs=0.5)
+    rows = drone_rows([watched("a", state=east, flight=FLIGHT), watched("b", state=west, flight=FLIGHT)], {}, 100.5)
+    assert rows["f/b"]["home_ne"] == pytest.approx([0.0, -211.8], abs=0.5)
+
+
+def test_who_commands_it_is_told_and_two_at_once_are_a_matter() -> None:
+    orders = [
+        {"operator": "bert", "command": "goto", "sequence": 3, "age_s": 1.0},
+        {"operator": "anna", "command": "hold", "sequence": 9, "age_s": 20.0},
+    ]
+    (row,) = drone_rows([watched("a", state=STATE, flight={**FLIGHT, "orders": orders[:1]})], {}, 100.5).values()
+    assert (row["orders"], row["why"]) == (orders[:1], ["the battery is low"])
+    (row,) = drone_rows([watched("a", state=STATE, flight={**FLIGHT, "orders": orders})], {}, 100.5).values()
+    told = "2 operators commanded it within a minute, the last one first: bert (goto), anna (hold); agree on one"
+    assert row["why"] == [told, "the battery is low"]
+
+
+def test_only_cameras_that_can_be_asked_are_offered() -> None:
+    cameras: dict[str, Any] = {
+        name: {"age_s": 0.1, "fault": None, "counts": {}} for name in ("front", "*", "a/b", "x" * 300)
+    }
+    many = {f"c{number}": cameras["front"] for number in range(100)}
+    computer = {"time_s": 4.0, "cameras": {**cameras, **many}, "load": 0.1}
+    (row,) = drone_rows([watched("a", computer=computer)], {}, 100.5).values()
+    assert list(row["cameras"]) == ["front", *(f"c{number}" for number in range(MAX_CAMERAS - 1))]
 
 
 def test_a_drone_says_what_is_wrong_with_it() -> None:

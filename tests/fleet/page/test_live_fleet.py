@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
 
+import cv2
+import numpy as np
 import pytest
 
 from flockd.fleet.page.live_fleet import LiveFleet
@@ -13,6 +16,7 @@ from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import AboutMessage, AnswerMessage
 from flockd.sim.free_ports import free_endpoint
 
+PICTURE = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8))[1].tobytes()
 ABOUT = AboutMessage(version="1.2.3", configuration={"safety": {"gate": {"fence_radius_m": 40.0}}}, commands=["hold"])
 
 
@@ -28,23 +32,25 @@ def test_a_drone_is_shown_with_what_queries_tell_and_answers_for_itself() -> Non
     endpoint = free_endpoint()
 
     def ask(command: str, payload: bytes) -> AnswerMessage:
-        return AnswerMessage(accepted=command == "hold", sentence=f"{command} {payload.decode()}")
+        message = json.loads(payload)
+        return AnswerMessage(accepted=command == "hold", sentence=f"{command} {message['order']}")
 
     with (
         FleetWatcher(None, listen=[endpoint], connect=[]) as watcher,
         LiveFleet(watcher) as fleet,
         ZenohTelemetry("f", listen=[], connect=[endpoint]) as drone,
     ):
-        drone.announce("d", ABOUT, ask, lambda camera: b"jpeg" if camera == "front" else None)
+        drone.announce("d", ABOUT, ask, lambda camera: PICTURE if camera == "front" else None)
         until(lambda: "f/d" in fleet.rows(fleet.now_s()) and fleet.rows(fleet.now_s())["f/d"]["delay_ms"] is not None)
         row = fleet.rows(fleet.now_s())["f/d"]
         assert (row["version"], row["commands"], row["fence"]["radius_m"]) == ("1.2.3", ["hold"], 40.0)
         assert row["state"] == "quiet", "it is there, and has published nothing"
         assert abs(row["clock_s"]) <= row["delay_ms"] / 1000 / 2 + 0.001, "both ends read the same clock"
-        assert fleet.ask("f/d", "hold", None) == {"accepted": True, "sentence": "hold "}
-        assert fleet.ask("f/d", "goto", {"north_m": 1}) == {"accepted": False, "sentence": 'goto {"north_m": 1}'}
-        assert fleet.ask("f/other", "hold", None) == {"accepted": False, "sentence": "no drone of this name was heard"}
-        assert (fleet.image("f/d", "front", 0.0), fleet.image("f/d", "back", 0.0)) == (b"jpeg", None)
+        assert fleet.ask("f/d", "hold", None, "anna") == {"accepted": True, "sentence": "hold None"}
+        assert fleet.ask("f/d", "goto", {"north_m": 1}, "anna")["sentence"] == "goto {'north_m': 1}"
+        unheard = {"accepted": False, "sentence": "no drone of this name was heard"}
+        assert fleet.ask("f/other", "hold", None, "anna") == unheard
+        assert (fleet.image("f/d", "front", 0.0), fleet.image("f/d", "back", 0.0)) == (PICTURE, None)
         for number in range(3):
             drone.publish("d", "events", {"time_s": float(number), "event": f"event {number}"})
         until(lambda: len(fleet.events(fleet.now_s())) == 3)

@@ -40,7 +40,7 @@ def test_a_recording_shows_what_its_drone_knew_at_each_time(folder: Path) -> Non
     assert fleet.rows(fleet.span_s[0] - 1.0) == {}, "before its recording begins there is no drone"
     (row,) = fleet.rows(fleet.span_s[1] + 60.0).values()
     assert row["state"] == "gone"
-    assert not fleet.ask(key, "hold", None)["accepted"]
+    assert not fleet.ask(key, "hold", None, "anna")["accepted"]
 
 
 def test_the_history_reaches_over_the_whole_flight(folder: Path) -> None:

@@ -52,11 +52,20 @@ def test_wide_angle_projects_as_opencv_does_ahead(lens: tuple[float, ...]) -> No
         *(WideAngleCamera(MATRIX, SIZE, k) for k in WIDE_LENSES),
     ],
 )
-def test_a_pinhole_lifts_to_depth_along_its_axis_and_a_wide_angle_to_range_along_the_ray(camera: Camera) -> None:
-    points, is_pinhole = points_ahead(), isinstance(camera, PinholeCamera)
-    lifted = camera.unproject(camera.project(points), points[:, 2] if is_pinhole else np.linalg.norm(points, axis=1))
+def test_every_lens_lifts_a_pixel_to_a_range_along_its_ray(camera: Camera) -> None:
+    points = points_ahead()
+    lifted = camera.unproject(camera.project(points), np.linalg.norm(points, axis=1))
     assert np.allclose(lifted, points, atol=1e-8)
-    assert camera.depth_kind == ("z" if is_pinhole else "range")
+
+
+@pytest.mark.parametrize("camera", [PinholeCamera(MATRIX, SIZE), WideAngleCamera(MATRIX, SIZE)])
+def test_the_angle_of_a_pixel_is_what_the_jacobian_says_of_its_longer_way(camera: Camera) -> None:
+    points = points_ahead()
+    rays = points / np.linalg.norm(points, axis=1, keepdims=True)
+    # Across the ray, the singular values of the derivative are pixels per radian along the ellipse's axes.
+    singular = np.linalg.svd(camera.jacobian(rays), compute_uv=False)
+    # Both focal lengths of the matrix are near, not equal; the mean of both is what is said.
+    np.testing.assert_allclose(camera.pixel_angle(rays), 1.0 / singular[:, 1], rtol=0.02)
 
 
 @pytest.mark.parametrize(

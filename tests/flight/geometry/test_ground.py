@@ -58,7 +58,7 @@ def test_a_strided_map_is_the_ground_at_the_blocks_centres() -> None:
     assert np.allclose(strided[below], blocks[below], atol=1e-6)  # linear in the image, so the mean is the centre
 
 
-def test_a_wide_angle_camera_gets_inverse_range() -> None:
+def test_a_wide_angle_camera_gets_the_inverse_of_z_too() -> None:
     matrix = np.array([[100.0, 0.0, 200.0], [0.0, 100.0, 200.0], [0.0, 0.0, 1.0]])
     front = RIG.cameras["front"]
     camera = RigCamera(
@@ -66,7 +66,7 @@ def test_a_wide_angle_camera_gets_inverse_range() -> None:
     )
     inverse = ground_inverse_depth(camera, LEVEL, 2.0)
     theta = (300.5 - 200.0) / 100.0  # equidistant, straight below the axis
-    assert inverse[300, 199:201].mean() == pytest.approx(np.sin(theta) / 2.0, rel=1e-4)
+    assert inverse[300, 199:201].mean() == pytest.approx(np.tan(theta) / 2.0, rel=1e-4)
 
 
 def test_a_camera_on_the_ground_and_a_stride_that_does_not_fit_are_refused() -> None:

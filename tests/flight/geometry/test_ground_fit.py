@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from flockd.flight.geometry import GroundSamples, RigidTransform, fit_ground, inverse_depths, scale_on_track
+from flockd.flight.geometry import GroundSamples, RigidTransform, fit_ground, inverse_ranges, scale_on_track
 
 from .synthetic_world import four_camera_rig
 
@@ -45,12 +45,16 @@ def _seen(points: Array, scale: float, noise_px: float, rng: np.random.Generator
         )
         both = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
         start, end = first[both], second[both] + noise_px * rng.standard_normal((both.sum(), 2))
-        inverse, baseline = inverse_depths(camera, motion, start, end)
+        inverse, baseline = inverse_ranges(camera, motion, start, end)
         R_ned_camera = now.as_matrix() @ camera.T_body_camera.rotation
-        rays = np.column_stack([(end - [240.0, 320.0]) / 222.0, np.ones(len(end))]) @ R_ned_camera.T
+        rays = np.column_stack([(end - [240.0, 320.0]) / 222.0, np.ones(len(end))])
+        share = 1.0 / np.linalg.norm(rays, axis=1)  # of z in the range
+        rays = share[:, None] * rays @ R_ned_camera.T
         offsets = np.tile(now.apply(camera.T_body_camera.translation), (len(end), 1))
         clear = (baseline > 0.08) & (inverse > 0.0)
-        parts.append(GroundSamples(rays, inverse, offsets, 0.3 / 222.0 / np.maximum(baseline, 0.08)).select(clear))
+        parts.append(
+            GroundSamples(rays, inverse, offsets, 0.3 / 222.0 * share / np.maximum(baseline, 0.08)).select(clear)
+        )
     return GroundSamples.concatenate(parts)
 
 

@@ -26,7 +26,7 @@ from tests.flight.inference.foreign import write_model as write
 
 WIDTH, HEIGHT = SIZE
 CROP = {
-    "fill": 0.5, "first_margin": 1.0, "cut_margin": 1.5, "mirror_scale": 0.9, "min_half_angle_deg": 2.0,
+    "fill": 0.5, "first_margin": 1.0, "cut_margin": 1.5, "mirror_scale": 0.9, "min_half_width_px": 4.0,
     "max_half_angle_deg": 30.0, "max_resize": 2.0, "max_crops": 3,
 }  # fmt: skip
 
@@ -112,8 +112,8 @@ def test_an_input_that_cannot_be_is_refused_with_file_line_key_and_what_to_do(
             r"crop\.max_half_angle_deg: 90 is not less than 90; write",
         ),
         (
-            {"crop": {**CROP, "min_half_angle_deg": 31}},
-            r":\d+: crop: min_half_angle_deg 31 is not below max_half_angle_deg 30; write a smaller one",
+            {"crop": {**CROP, "min_half_width_px": 0}},
+            r":\d+: crop\.min_half_width_px: 0 is not greater than 0; write a positive number",
         ),
         ({"crop": {**CROP, "size": 24}}, r":\d+: crop\.size: is not a known key; the keys here are cut_margin, fill"),
         ({"crop": {"fill": 0.5}}, r":\d+: crop\.cut_margin: is missing; add it with a positive number"),
@@ -121,7 +121,7 @@ def test_an_input_that_cannot_be_is_refused_with_file_line_key_and_what_to_do(
         ({"thresholds": {"p": float("nan")}}, r":\d+: thresholds\.p: \.nan is not finite; write a number"),
         ({"thresholds": {"p": "high"}}, r":\d+: thresholds\.p: high is not a number; write a number"),
         ({"thresholds": [0.5]}, r":\d+: thresholds: a list is not a section; write"),
-        ({"sha256": "123"}, r":\d+: sha256: '123' is not a text that matches \^\[0-9a-f\]\{64\}\$; write"),
+        ({"sha256": "123"}, r":\d+: sha256: '123' is not a SHA-256; write a SHA-256, 64 hex"),
         ({"outputs": {}}, r":\d+: outputs: a section; write a section"),
     ],
 )

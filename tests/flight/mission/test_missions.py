@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -257,7 +256,7 @@ def config(tmp_path: Path) -> DroneConfig:
 def test_an_order_that_cannot_be_flown_is_refused_with_the_reason(
     config: DroneConfig, message: dict[str, object], command: str, refusal: str | None
 ) -> None:
-    order = parse_order(command, json.dumps(message).encode())
+    order = parse_order(command, message)
     assert order_message(order) == message
     vehicle = VehicleState(0.0, np.eye(3), 5.0, np.zeros(3), ORIGIN)
     fault = order_fault(config, order, vehicle)
@@ -295,19 +294,19 @@ def test_a_goal_that_no_mission_can_have_is_refused_without_a_fence_too(
     gate = config.safety.gate.model_copy(update={"fence_radius_m": None, "fence_corners_m": ()})
     config = config.model_copy(update={"safety": config.safety.model_copy(update={"gate": gate})})
     vehicle = VehicleState(0.0, np.eye(3), 5.0, np.zeros(3), ORIGIN, np.array([47.4, 8.5]))
-    order = parse_order("goto", json.dumps(message).encode())
+    order = parse_order("goto", message)
     assert "farther than any mission leads" in str(order_fault(config, order, vehicle))
 
 
 @pytest.mark.parametrize(
-    "payload",
-    [b"", b"[]", b"{", b'{"north_m": 1}', b'{"north_m": 1, "east_m": "2"}', b'{"north_m": NaN, "east_m": 0}',
-     b'{"north_m": true, "east_m": 0}', b'{"north_m": 1, "east_m": 0, "latitude_deg": 1}', b'{"colour": 1}',
-     b'{"velocity_ne": [1, 0]}', b'{"north_m": 1e300, "east_m": 0}', b'{"north_m": 1, "east_m": 0, "height_m": null}'],
+    "message",
+    [None, {}, {"north_m": 1}, {"north_m": 1, "east_m": "2"}, {"north_m": math.nan, "east_m": 0},
+     {"north_m": True, "east_m": 0}, {"north_m": 1, "east_m": 0, "latitude_deg": 1}, {"colour": 1},
+     {"velocity_ne": [1, 0]}, {"north_m": 1e300, "east_m": 0}, {"north_m": 1, "east_m": 0, "height_m": None}],
 )  # fmt: skip
-def test_what_is_no_order_is_refused_with_a_sentence(payload: bytes) -> None:
+def test_what_is_no_order_is_refused_with_a_sentence(message: dict[str, object] | None) -> None:
     with pytest.raises(ValueError, match=r"goto|order|has to be a number"):
-        parse_order("goto", payload)
+        parse_order("goto", message)
 
 
 @pytest.mark.parametrize(
@@ -378,6 +377,19 @@ def test_one_of_five_knows_the_goal_and_all_arrive_within_ten_metres() -> None:
     assert times[-1] == 109.5
     assert np.linalg.norm(plan[:, None] - plan, axis=-1).max() < 10.0
     assert np.linalg.norm(plan - [25.0, 10.0], axis=1).max() < 10.0
+
+
+def test_the_flight_with_exact_states_flies_orders_when_they_were_given() -> None:
+    """The paper's circle until 20 s; then all go to a goal that is not on it."""
+    scenario = load_scenario(CONFIG / "paper_flight.yaml", {"duration_s": 60.0})
+    goal = np.array([-10.0, -12.0])
+    ordered = {i: [(20.0, MissionOrder(place=goal))] for i in range(len(scenario.vehicles))}
+    times, position, _ = fly_exact_states(scenario, orders=ordered)
+    _, free, _ = fly_exact_states(scenario)
+    np.testing.assert_array_equal(position[times <= 20.0], free[times <= 20.0])
+    away_m = np.linalg.norm(position[..., :2].mean(axis=1) - goal, axis=1)
+    assert away_m[times == 20.0][0] > 5.0
+    assert away_m[-1] < 1.0
 
 
 def test_those_who_see_a_drone_that_is_flown_by_hand_go_with_it() -> None:

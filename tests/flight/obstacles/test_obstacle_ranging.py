@@ -11,7 +11,7 @@ from flockd.core.config import load_scenario
 from flockd.core.config.avoidance import ObstacleParameters
 from flockd.core.data import data_path
 from flockd.core.messages import SECTORS, UNCLASSED, EgoMotion, FloatArray, ObstacleRanges, VehicleState
-from flockd.flight.geometry import Rig, build_rig, grid_pixels
+from flockd.flight.geometry import RangeMap, Rig, build_rig, grid_pixels
 from flockd.flight.obstacles import ObstacleRanging
 from flockd.flight.perception import CameraObservation, Observation
 
@@ -58,7 +58,8 @@ def seen(
             depth = np.minimum(depth, masked)
         shape = (height, width)
         image = np.zeros((*shape, 3), np.uint8)
-        cameras[name] = CameraObservation(image, depth.reshape(shape).astype(np.float32), mask.reshape(shape), None)
+        ranges = RangeMap(depth.reshape(shape).astype(np.float32))
+        cameras[name] = CameraObservation(image, ranges, mask.reshape(shape), None)
     return RANGING.ranges(Observation(2.0, VehicleState(2.0, R_ned_body, HEIGHT_M), cameras, (), None))
 
 
@@ -119,7 +120,7 @@ def test_what_no_camera_shows_is_not_seen() -> None:
 def test_depth_without_a_scale_shows_nothing() -> None:
     shape = (640, 480)
     blank = CameraObservation(
-        np.zeros((*shape, 3), np.uint8), np.full(shape, np.nan, np.float32), np.zeros(shape, np.uint8), None
+        np.zeros((*shape, 3), np.uint8), RangeMap(np.full(shape, np.nan, np.float32)), np.zeros(shape, np.uint8), None
     )
     vehicle = VehicleState(0.0, LEVEL, HEIGHT_M)
     ranges = RANGING.ranges(Observation(0.0, vehicle, {"front": blank}, (), None))
@@ -128,7 +129,7 @@ def test_depth_without_a_scale_shows_nothing() -> None:
 
 
 def test_a_few_wrong_pixels_are_no_obstacle() -> None:
-    pixels = np.full((640, 480), SKY_M, np.float32)
+    pixels = RangeMap(np.full((640, 480), SKY_M, np.float32))
     pixels[318:330:4, 242] = 1.0  # three of those that are taken
     camera = CameraObservation(np.zeros((640, 480, 3), np.uint8), pixels, np.zeros((640, 480), np.uint8), None)
     vehicle = VehicleState(0.0, LEVEL, HEIGHT_M)
@@ -144,7 +145,7 @@ def test_what_depth_does_not_show_the_flow_does() -> None:
     for name, camera in RIG.cameras.items():
         width, height = camera.camera.size
         blank = {"image": np.zeros((height, width, 3), np.uint8), "labels": np.zeros((height, width), np.uint8)}
-        sky = np.full((height, width), SKY_M, np.float32)
+        sky = RangeMap(np.full((height, width), SKY_M, np.float32))
         pixels = grid_pixels((width, height), 1)
         turn, origin = camera.T_body_camera.rotation, camera.T_body_camera.translation
         rays = camera.camera.unproject(pixels, np.ones(len(pixels))) @ turn.T

@@ -6,7 +6,7 @@ import numpy as np
 
 from flockd.core.config.avoidance import ObstacleParameters
 from flockd.core.messages import GroundEstimate, VehicleState
-from flockd.flight.geometry import RigCamera, ground_inverse_depth
+from flockd.flight.geometry import RigCamera, ZMap, ground_inverse_depth, range_map
 from flockd.flight.obstacles.ranging import ObstacleRanging
 from flockd.flight.perception import CameraObservation, Observation
 from tests.flight.geometry.synthetic_world import four_camera_rig
@@ -19,7 +19,7 @@ def _seen(camera: RigCamera) -> CameraObservation:
     """Nothing but the hillside, under the sky."""
     inverse = ground_inverse_depth(camera, np.eye(3), HEIGHT_M, slope=SLOPE)
     nothing = np.zeros(inverse.shape, np.uint8)
-    depth = (1.0 / np.maximum(inverse, 1e-3)).astype(np.float32)
+    depth = range_map(ZMap((1.0 / np.maximum(inverse, 1e-3)).astype(np.float32)), camera.camera)
     return CameraObservation(np.zeros((*inverse.shape, 3), np.uint8), depth, nothing, None)
 
 

@@ -11,7 +11,7 @@ from flockd.core.config.perception import PerceptionConfig
 from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, RigConfig
 from flockd.core.data import data_path
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, Frame, FrameSet, UInt8Array, VehicleState
-from flockd.flight.geometry import Rig, RigCamera, build_rig, ground_inverse_depth
+from flockd.flight.geometry import Rig, RigCamera, build_rig, ground_inverse_depth, z_map
 from flockd.flight.perception import Instance, OnnxNetworks, OpenDepth, Perception, SceneMaps
 from flockd.flight.perception.metric_depth import metric_depth
 from flockd.flight.pilot.ground import level_ground
@@ -29,6 +29,12 @@ def rig_of(size: tuple[int, int] = (WIDTH, HEIGHT)) -> Rig:
 
 def camera_of(rig: Rig) -> RigCamera:
     return rig.cameras["front"]
+
+
+LENS = camera_of(rig_of()).camera
+U, V = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
+AXIAL_SHARE = 1.0 / np.sqrt(1.0 + (U**2 + V**2) / (WIDTH / 2) ** 2)
+"""z over range in each pixel, by Pythagoras."""
 
 
 def opened(depth: FloatArray, *, shift: bool, labels: UInt8Array | None = None) -> SceneMaps:
@@ -55,10 +61,11 @@ def depth_of_ground(height_m: float, seed: int = 0) -> tuple[FloatArray, Float32
 @pytest.mark.parametrize("shift", [False, True])
 def test_height_finds_the_ground_under_what_stands_on_it(shift: bool) -> None:
     scene, ground, bare = depth_of_ground(3.0)
-    fixed = metric_depth(opened(scene, shift=shift), ground)
-    np.testing.assert_allclose(fixed[bare], scene[bare], rtol=0.02)
+    fixed = metric_depth(opened(scene, shift=shift), ground, LENS)
+    true = scene / AXIAL_SHARE
+    np.testing.assert_allclose(fixed[bare], true[bare], rtol=0.02)
     near = scene < 20.0
-    np.testing.assert_allclose(fixed[near], scene[near], rtol=0.02)
+    np.testing.assert_allclose(fixed[near], true[near], rtol=0.02)
 
 
 def test_drones_before_the_ground_do_not_count() -> None:
@@ -67,18 +74,19 @@ def test_drones_before_the_ground_do_not_count() -> None:
     labels[HEIGHT // 2 :, : WIDTH // 3] = 1
     seen = scene.copy()
     seen[labels > 0] *= 0.2
-    fixed = metric_depth(opened(seen, shift=True, labels=labels), ground)
-    np.testing.assert_allclose(fixed[bare & (labels == 0)], scene[bare & (labels == 0)], rtol=0.02)
+    fixed = metric_depth(opened(seen, shift=True, labels=labels), ground, LENS)
+    kept = bare & (labels == 0)
+    np.testing.assert_allclose(fixed[kept], (scene / AXIAL_SHARE)[kept], rtol=0.02)
 
 
 def test_without_ground_in_view_height_says_nothing() -> None:
     wall = np.random.default_rng(0).uniform(1.0, 30.0, (HEIGHT, WIDTH))
     ground = np.zeros((HEIGHT // 2, WIDTH // 2), np.float32)
     with pytest.raises(ValueError, match="too little flat ground is in view to fix the scale of depth"):
-        metric_depth(opened(wall, shift=True), ground)
+        metric_depth(opened(wall, shift=True), ground, LENS)
     _, level, _ = depth_of_ground(3.0)
     with pytest.raises(ValueError, match="too little flat ground"):
-        metric_depth(opened(wall, shift=True), level)  # nothing in this picture looks like ground
+        metric_depth(opened(wall, shift=True), level, LENS)  # nothing in this picture looks like ground
 
 
 def test_a_foreign_relative_network_sees_metres_by_height(tmp_path: Path) -> None:
@@ -98,4 +106,5 @@ def test_a_foreign_relative_network_sees_metres_by_height(tmp_path: Path) -> Non
     rows = slice(SIZE[1] * 3 // 4, None)
     depth = observation.cameras["front"].depth
     assert depth is not None
-    np.testing.assert_allclose(depth[rows], 1.0 / inverse[rows], rtol=0.05)
+    z = z_map(depth, camera_of(rig).camera)
+    np.testing.assert_allclose(z[rows], 1.0 / inverse[rows], rtol=0.05)

@@ -69,13 +69,15 @@ def test_the_simulator_refuses_a_flipped_bit_in_one_sentence(
 
 
 def test_a_model_in_the_wrong_role_is_refused() -> None:
-    with pytest.raises(ModelError, match=r"perception\.flow: model 'distance' fills distance and not flow"):
+    with pytest.raises(
+        ModelError, match=r"model 'distance' fills distance and not flow; choose one of flow, flow_int8, dis$"
+    ):
         OnnxNetworks(PerceptionConfig(flow="distance"), MODELS)
 
 
 def test_a_model_that_is_not_there_is_refused_with_those_that_are() -> None:
     with pytest.raises(
-        ModelError, match=r"perception\.flow: there is no model 'raft'.*distance_int8, flow, flow_int8, neighbours"
+        ModelError, match=r"perception\.flow: there is no model 'raft'.*choose one of flow, flow_int8, dis$"
     ):
         OnnxNetworks(PerceptionConfig(flow="raft"), MODELS)
 

@@ -58,7 +58,12 @@ FAULTS = {
     Event.COMMAND_REFUSED: Fault({"refused_commands": 1}, "ready", Action.FLY_DEGRADED),
     Event.FENCE_LEFT: Fault({"outside_fence": True}, "wait", Action.FLY_DEGRADED),
     Event.HEIGHTS_LEFT: Fault({"outside_heights": True}, "wait", Action.FLY_DEGRADED),
-    Event.LINK_LOST: Fault({"heartbeat_age_s": 2.1}, "latch", Action.SILENCE),
+    Event.MOTION_UNKNOWN: Fault({"motion_age_s": 0.6}, "wait", Action.HOVER),
+    Event.LINK_LOST: Fault({"heartbeat_age_s": 3.6}, "latch", Action.SILENCE),
+    Event.STREAM_ENDED: Fault({"stream_fault": "the thread was stopped"}, "latch", Action.SILENCE),
+    Event.AUTOPILOT_FAILSAFE: Fault({"autopilot_failsafe": True}, "wait", Action.FLY),
+    Event.FOREIGN_SETPOINTS: Fault({"foreign_setpoints": "3 m/s north"}, "ready", Action.FLY_DEGRADED),
+    Event.PARAMETER_CHANGED: Fault({"parameter_fault": "COM_OF_LOSS_T is 20"}, "wait", Action.FLY_DEGRADED),
     Event.NOT_OFFBOARD: Fault({"flight_mode": "position"}, "ready", Action.SILENCE),
     Event.NOT_ARMED: Fault({"armed": False}, "wait", Action.SILENCE),
     Event.NOT_IN_AIR: Fault({"in_air": False}, "wait", Action.FLY),
@@ -217,6 +222,8 @@ def test_of_two_events_the_worse_wins_and_is_reported_first(event: Event) -> Non
     for other, fault in FAULTS.items():
         if fault.changes.keys() & FAULTS[event].changes.keys():
             continue  # two values of one number
+        if {event, other} == {Event.LINK_LOST, Event.STREAM_ENDED}:
+            continue  # the one is the cause of the other, and told alone
         flight = flying().step(**FAULTS[event].changes, **fault.changes)
         expected = worst(fault.action, FAULTS[event].action)
         assert flight.action is expected, other
@@ -269,7 +276,7 @@ def test_only_a_vehicle_known_to_be_disarmed_and_on_the_ground_makes_a_new_start
 
 
 def test_what_was_true_before_the_link_was_lost_makes_no_new_start() -> None:
-    flight = Flight().step(armed=False, in_air=False, heartbeat_age_s=2.5).step(armed=True, in_air=True)
+    flight = Flight().step(armed=False, in_air=False, heartbeat_age_s=4.0).step(armed=True, in_air=True)
     assert flight.step(heartbeat_age_s=0.1).state is State.IDLE
 
 
@@ -301,9 +308,9 @@ def test_after_landing_and_disarming_a_new_flight_may_begin() -> None:
 
 
 def test_link_lost_and_regained_does_not_restart_offboard_by_itself() -> None:
-    flight = flying().run(5.0).run(1.5, heartbeat_age_s=1.9)
+    flight = flying().run(5.0).run(1.5, heartbeat_age_s=3.4)
     assert (flight.state, flight.action) == (State.NORMAL, Action.FLY)
-    flight.step(heartbeat_age_s=2.05)
+    flight.step(heartbeat_age_s=3.6)
     assert (flight.state, flight.action) == (State.SILENT, Action.SILENCE)
     flight.run(30.0, heartbeat_age_s=0.2)
     assert (flight.state, flight.action) == (State.SILENT, Action.SILENCE)
@@ -312,15 +319,42 @@ def test_link_lost_and_regained_does_not_restart_offboard_by_itself() -> None:
     assert flight.action is Action.SILENCE
 
 
+def test_flockds_own_stall_is_told_before_the_mode_that_followed_from_it() -> None:
+    flight = flying().step(stream_fault="the thread was stopped", flight_mode="hold").step(stream_fault=None)
+    assert flight.events == [Event.STREAM_ENDED, Event.NOT_OFFBOARD]
+    assert flight.sentence(Event.STREAM_ENDED) == "setpoints ended: the thread was stopped"
+
+
+def test_a_stream_that_ended_with_the_link_is_told_once() -> None:
+    flight = flying().step(stream_fault="no heartbeat", heartbeat_age_s=3.6)
+    assert flight.events == [Event.LINK_LOST]
+
+
+def test_after_the_autopilots_failsafe_it_is_ready_when_the_pilot_has_selected_another_mode() -> None:
+    flight = flying().step(flight_mode="hold", autopilot_failsafe=True).step(resume_asked=True).step(resume_asked=False)
+    assert (flight.state, flight.action) == (State.IDLE, Action.SILENCE)
+    assert flight.events[0] is Event.AUTOPILOT_FAILSAFE
+    flight.step(autopilot_failsafe=False)
+    assert (flight.state, flight.action) == (State.READY, Action.OFFER)
+
+
+@pytest.mark.parametrize("what", ["foreign_setpoints", "parameter_fault"])
+def test_somebody_who_interferes_for_half_a_second_makes_it_ask_for_hold(what: str) -> None:
+    flight = flying().step(**{what: "seen"})
+    assert flight.action is Action.FLY_DEGRADED
+    assert flight.run(0.375).action is Action.FLY_DEGRADED
+    assert flight.run(0.1875).action is Action.ASK_HOLD
+
+
 def test_link_lost_while_ready_needs_a_new_start_too() -> None:
-    flight = ready().step(heartbeat_age_s=2.05).step(heartbeat_age_s=0.2)
+    flight = ready().step(heartbeat_age_s=3.6).step(heartbeat_age_s=0.2)
     assert (flight.state, flight.action) == (State.IDLE, Action.SILENCE)
     flight.step(resume_asked=True)
     assert (flight.state, flight.action) == (State.READY, Action.OFFER)
 
 
 def test_resume_does_not_help_while_the_link_is_lost() -> None:
-    flight = flying().step(heartbeat_age_s=3.0).step(resume_asked=True).step(resume_asked=False)
+    flight = flying().step(heartbeat_age_s=4.0).step(resume_asked=True).step(resume_asked=False)
     assert flight.step(heartbeat_age_s=0.2).state is State.SILENT
 
 
@@ -585,7 +619,9 @@ LIMITS: list[tuple[str, float, float, Event | None, Event]] = [
     ("neighbours_age_s", 2.0, 2.001, None, Event.NEIGHBOURS_LOST),
     ("nearest_neighbour_m", 1.0, 0.999, None, Event.NEIGHBOUR_CLOSE),
     ("refused_commands", 0, 1, None, Event.COMMAND_REFUSED),
-    ("heartbeat_age_s", 2.0, 2.001, None, Event.LINK_LOST),
+    ("motion_age_s", 0.5, 0.501, None, Event.MOTION_UNKNOWN),
+    ("heartbeat_age_s", 3.5, 3.501, None, Event.LINK_LOST),
+    ("message_age_s", 2.0, 2.001, None, Event.LINK_LOST),
 ]
 
 
@@ -621,8 +657,13 @@ def test_a_computer_without_a_thermal_zone_is_not_hot() -> None:
         ({"dead_tasks": ("pilot", "camera")}, "pilot, camera"),
         ({"neighbours_age_s": 2.5}, "2.5 s"),
         ({"nearest_neighbour_m": 0.8}, "0.8 m"),
-        ({"heartbeat_age_s": 2.1}, "for 2.1 s"),
-        ({"heartbeat_age_s": NEVER}, "yet"),
+        ({"heartbeat_age_s": 3.6}, "no heartbeat from the autopilot for 3.6 s"),
+        ({"message_age_s": 2.1}, "no message from the autopilot for 2.1 s"),
+        ({"message_age_s": NEVER}, "no message from the autopilot yet"),
+        ({"stream_fault": "the thread was stopped"}, "setpoints ended: the thread was stopped"),
+        ({"autopilot_failsafe": True}, "select Hold or Position, and offboard once flockd is ready"),
+        ({"foreign_setpoints": "another program sends 3 m/s"}, "another program sends 3 m/s"),
+        ({"parameter_fault": "COM_OF_LOSS_T was changed"}, "COM_OF_LOSS_T was changed"),
         ({"flight_mode": "position"}, "position"),
         ({"flight_mode": None}, "not known"),
     ],

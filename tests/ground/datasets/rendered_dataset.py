@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
-from flockd.flight.geometry import RigCamera
+from flockd.flight.geometry import RigCamera, ZMap
 from flockd.flight.perception import Crop, DisFlow, RangeEstimate, SceneMaps
 from flockd.sim.renderer import Renderer
 from flockd.sim.world import World
@@ -74,7 +74,7 @@ class Onlooker:
 
     def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
         depth = np.minimum(next(self._depth), 1000.0).astype(np.float32)
-        return SceneMaps(depth, np.zeros(frame.image.shape[:2], np.uint8), ())
+        return SceneMaps(ZMap(depth), np.zeros(frame.image.shape[:2], np.uint8), ())
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         return ()

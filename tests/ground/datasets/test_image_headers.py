@@ -14,6 +14,9 @@ from flockd.cli import main
 from flockd.core.image_header import image_size
 from flockd.ground.datasets.errors import DatasetError
 from flockd.ground.datasets.image_files import read_image
+from flockd.ground.datasets.tables import read_lines
+from flockd.ground.pictures import read_labels
+from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat
 
 HUGE = 60_000
 
@@ -87,12 +90,51 @@ def test_an_ordinary_image_is_read_as_before(suffix: str, tmp_path: Path) -> Non
     np.testing.assert_array_equal(read_image(path), cv2.imread(str(path), cv2.IMREAD_COLOR_RGB))
 
 
+def _with_scans(data: bytes, scans: int) -> bytes:
+    """A progressive JPEG whose last scan comes so many times more."""
+    begin = data.rfind(b"\xff\xc4", 0, data.rfind(b"\xff\xda"))
+    return data[:-2] + data[begin:-2] * scans + data[-2:]
+
+
+@pytest.mark.parametrize(("side", "scans"), [(4096, 7_000), (4096, 80), (64, 7_000)])
+def test_a_jpeg_that_takes_long_for_its_many_scans_is_refused_before_it_is_decoded(
+    side: int, scans: int, tmp_path: Path
+) -> None:
+    """0.46 MB of 4096 x 4096 pixels take a minute and a half. Each scan goes over all pixels."""
+    plain = np.full((side, side), 128, np.uint8)
+    done, data = cv2.imencode(".jpg", plain, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])
+    assert done
+    path = tmp_path / "slow.jpg"
+    path.write_bytes(_with_scans(bytes(data), scans))
+    own = bytes(data).count(b"\xff\xda")
+    with pytest.raises(DatasetError) as refused:
+        read_image(path)
+    told = f"{path}: has {own + scans} scans of {side} x {side} pixels, more than any camera writes; "
+    assert str(refused.value).startswith(told)
+    with pytest.raises(CorruptImageError, match="scans of"):
+        MjpegFormat((side, side)).decode(path.read_bytes())
+    path.write_bytes(bytes(data))
+    assert read_image(path).shape == (side, side, 3), "as an encoder writes it, it is read"
+
+
 def test_a_pipe_is_refused_without_waiting_for_its_writer(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.png")
     with pytest.raises(DatasetError, match=r"pipe\.png: is not an ordinary file"):
         read_image(tmp_path / "pipe.png")
     with pytest.raises(DatasetError, match="is not an ordinary file"):
         read_image(Path("/dev/zero"))
+
+
+def test_a_table_or_a_list_of_labels_that_is_a_pipe_is_refused_too(tmp_path: Path) -> None:
+    pipe = tmp_path / "poses.txt"
+    os.mkfifo(pipe)
+    with pytest.raises(DatasetError, match=r"poses\.txt: is not an ordinary file"):
+        read_lines(pipe)
+    with pytest.raises(DatasetError, match=r"poses\.txt: is not an ordinary file"):
+        read_labels(pipe, [])
+    (tmp_path / "endless.txt").symlink_to("/dev/zero")
+    with pytest.raises(DatasetError, match=r"endless\.txt: is not an ordinary file"):
+        read_lines(tmp_path / "endless.txt")
 
 
 def test_a_calibration_from_such_an_image_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

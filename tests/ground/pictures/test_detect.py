@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import struct
 from pathlib import Path
@@ -41,7 +42,7 @@ def test_a_labelled_folder_is_measured(capsys: Capture) -> None:
     result = told_json(capsys, RENDERED, *FOV, "--labels", LABELS)
     assert list(result) == [
         "images", "pictures", "proposals_per_image", "ms_per_image", "boxes", "by_width", "ap50",
-        "false_per_500_images",
+         "measured", "false", "false_per_picture", "false_per_picture_95", "left_out",
     ]  # fmt: skip
     assert (result["images"], result["boxes"]) == (10, 9)
     assert result["proposals_per_image"] > 0
@@ -109,7 +110,7 @@ def test_copies_show_what_was_found_and_nothing_is_lost(capsys: Capture, tmp_pat
     out = tmp_path / "drawn"
     for force in ((), ("--force",)):  # the second time, copies of before lie in the folder
         text = told(capsys, 0, "detect", tmp_path, *FOV, "--out", out, *force)
-        assert "1 detections in 1 pictures" in text
+        assert "1 detection in 1 picture;" in text
     assert [path.name for path in out.rglob("*")] == ["a.jpg"]
     before, after = (cv2.imread(str(path)) for path in (tmp_path / "a.jpg", out / "a.jpg"))
     assert before is not None
@@ -218,6 +219,27 @@ def test_options_out_of_range_are_usage_errors(capsys: Capture, option: tuple[st
 def test_a_picture_that_cannot_be_read_ends_it(capsys: Capture, tmp_path: Path, content: bytes, sentence: str) -> None:
     (tmp_path / "a.jpg").write_bytes(content)
     assert f"{tmp_path / 'a.jpg'}: {sentence}" in told(capsys, 1, "detect", tmp_path, *FOV)
+
+
+def test_one_truncated_picture_among_others_is_left_out_and_said(capsys: Capture, tmp_path: Path) -> None:
+    """The others are searched, and copied, as without it; the exit code says that one is missing."""
+    for name in ("a.jpg", "c.jpg"):
+        shutil.copy(NEAR, tmp_path / name)
+    (tmp_path / "b.jpg").write_bytes(NEAR.read_bytes()[:9000])
+    assert main(["detect", str(tmp_path), *FOV, "--json", "--out", str(tmp_path / "drawn")]) == 1
+    captured = capsys.readouterr()
+    result = json.loads(captured.out)
+    assert [Path(picture["file"]).name for picture in result["pictures"]] == ["a.jpg", "c.jpg"]
+    fault = f"{tmp_path / 'b.jpg'}: the JPEG ends too early; restore it, or leave its frame out"
+    assert result["left_out"] == [fault]
+    assert captured.err.splitlines()[-2:] == [f"written: 2 copies in {tmp_path / 'drawn'}", f"left out: {fault}"]
+    assert sorted(path.name for path in (tmp_path / "drawn").iterdir()) == ["a.jpg", "c.jpg"]
+
+
+def test_a_pipe_is_refused_without_waiting_for_its_writer(capsys: Capture, tmp_path: Path) -> None:
+    for name in ("a.jpg", "a.mp4"):
+        os.mkfifo(tmp_path / name)
+        assert f"{name}: is not an ordinary file" in told(capsys, 2, "detect", tmp_path / name, *FOV)
 
 
 def test_a_video_that_cannot_be_decoded_ends_it(capsys: Capture, tmp_path: Path) -> None:

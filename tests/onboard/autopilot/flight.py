@@ -9,18 +9,23 @@ from __future__ import annotations
 import asyncio
 import functools
 import sys
+import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
+from pymavlink.dialects.v20 import development as mavlink
 
 from flockd.core.config.autopilot import AutopilotParameters
+from flockd.core.config.safety import SafetyParameters
 from flockd.core.messages import Setpoint, Wanted
 from flockd.flight.safety import Action, Permission, Request, Surroundings, Verdict
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
 from flockd.onboard.daemon import clock_at, event_loop_at
+from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from tests import calm
 
 CONTROL_S = 0.05
@@ -64,25 +69,64 @@ class Flight:
 
 
 @asynccontextmanager
-async def flying(port: int, wanted: Wanted = NORTH, clock: Callable[[], float] = calm.clock) -> AsyncIterator[Flight]:
-    parameters = AutopilotParameters(address=f"udpin://127.0.0.1:{port}")
-    link = await AutopilotLink.connect(parameters, clock=clock)
-    streamer = SetpointStreamer(link.send_setpoint, link.status, let_pass, parameters, clock=clock)
-    streamer.start()
-
-    async def control() -> None:
-        while True:
-            streamer.offer(request_of(wanted, clock()))
-            streamer.beat()
-            await asyncio.sleep(CONTROL_S)
-
-    task = asyncio.create_task(control())
+async def attended(port: int, clock: Callable[[], float] = calm.clock) -> AsyncIterator[AutopilotLink]:
+    """A link that keeps all coming, as the daemon's does."""
+    link = await AutopilotLink.connect(AutopilotParameters(address=f"udpin://127.0.0.1:{port}"), clock=clock)
+    attending = asyncio.create_task(link.attend())
     try:
-        yield Flight(link, streamer, task)
+        yield link
     finally:
-        task.cancel()
-        streamer.close()
+        attending.cancel()
         await link.close()
+
+
+class Foreigner:
+    """Another program that sends the same setpoint 20 times a second to a fake autopilot, until it is left."""
+
+    def __init__(self, autopilot: FakeAutopilot, *, north_m_s: float, east_m_s: float) -> None:
+        self._autopilot, self._velocity = autopilot, (north_m_s, east_m_s)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closing.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        north, east = self._velocity
+        sender = mavlink.MAVLink(self, srcSystem=255, srcComponent=190)
+        while not self._closing.wait(0.05 / calm.SPEED_FACTOR):
+            sender.set_position_target_local_ned_send(0, 1, 1, 1, 2531, 0, 0, -2.5, north, east, 0, 0, 0, 0, 0, 0)
+
+    def write(self, data: bytes) -> None:
+        """Takes what pymavlink has packed."""
+        self._autopilot.send_from_elsewhere(data)
+
+
+@asynccontextmanager
+async def flying(port: int, wanted: Wanted = NORTH, clock: Callable[[], float] = calm.clock) -> AsyncIterator[Flight]:
+    async with attended(port, clock) as link:
+        streamer = SetpointStreamer(
+            link.send_setpoint, link.status, let_pass, AutopilotParameters(), SafetyParameters(), clock=clock
+        )
+        streamer.start()
+
+        async def control() -> None:
+            while True:
+                streamer.offer(request_of(wanted, clock()))
+                streamer.beat()
+                await asyncio.sleep(CONTROL_S)
+
+        task = asyncio.create_task(control())
+        try:
+            yield Flight(link, streamer, task)
+        finally:
+            task.cancel()
+            streamer.close()
 
 
 async def main(port: int, speed_factor: float) -> None:

@@ -25,8 +25,8 @@ from flockd.sim.autopilot.fake_telemetry import TelemetryStreams
 from flockd.sim.autopilot.fake_vehicle import Demand, MotionState
 from flockd.sim.free_ports import free_port
 from tests.calm import clock
-from tests.onboard.autopilot.conftest import HEARTBEAT_S
-from tests.onboard.autopilot.flight import flying, until
+from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
+from tests.onboard.autopilot.flight import Foreigner, attended, flying, until
 
 
 def _parameters(port: int, system_id: int | None = None) -> AutopilotParameters:
@@ -115,11 +115,113 @@ async def test_firmware_and_failsafe_parameters_can_be_read(port: int, fake_auto
 async def test_offboard_without_setpoints_is_refused_and_the_reason_told(
     port: int, fake_autopilot: FakeAutopilot
 ) -> None:
-    link = await AutopilotLink.connect(_parameters(port), clock=clock)
-    with pytest.raises(AutopilotError, match=r"asked for offboard, which was refused for now: .*no offboard signal"):
-        await link.request_offboard()
-    assert fake_autopilot.mode == "LOITER"
-    await link.close()
+    async with attended(port) as link:
+        await link.ask_for_checks()
+        await until(link.knows_checks)
+        refused = r"asked for offboard, which was refused for now: it receives no setpoints, as flockd sends none yet; "
+        with pytest.raises(AutopilotError, match=refused):
+            await link.request_offboard()
+        assert fake_autopilot.mode == "LOITER"
+
+
+async def test_an_autopilot_that_acts_on_the_loss_of_its_ground_station_hears_none_and_sends_no_texts(
+    port: int, fake_autopilot: FakeAutopilot
+) -> None:
+    """Flockd's announcement would hide that loss. Its events tell the reason all the same."""
+    fake_autopilot.parameters["NAV_DLL_ACT"] = 2
+    async with attended(port) as link:
+        await until(lambda: bool(link.parameters()))
+        assert not link.announces()
+        fake_autopilot.parameters["NAV_DLL_ACT"] = 0
+        await until(lambda: fake_autopilot.has_ground_station)
+        fake_autopilot.parameters["NAV_DLL_ACT"] = 3
+        await until(lambda: not fake_autopilot.has_ground_station)
+
+
+async def test_a_refusal_without_a_word_is_told_as_such(port: int, fake_autopilot: FakeAutopilot) -> None:
+    async with attended(port) as link:
+        fake_autopilot.wordless = True
+        fake_autopilot.failing = {"check_gyro_not_calibrated"}
+        with pytest.raises(AutopilotError, match=r"which was refused for now without a reason; wait a few seconds"):
+            await link.arm()
+
+
+async def test_events_that_are_lost_are_requested_and_come(port: int) -> None:
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
+        async with attended(port) as link:
+            await _loses_events(link, fake_autopilot)
+
+
+async def _loses_events(link: AutopilotLink, fake_autopilot: FakeAutopilot) -> None:
+    await link.ask_for_checks()
+    await until(link.knows_checks)
+    fake_autopilot.checks.events_to_lose = 3
+    fake_autopilot.failing = {"check_gyro_not_calibrated"}
+    await until(lambda: [refusal.reason for refusal in link.refusals()] == ["check_gyro_not_calibrated"])
+    fake_autopilot.checks.events_to_lose = 3  # all of them: the number of the newest is what tells
+    fake_autopilot.failing = set()
+    await until(lambda: link.refusals() == ())
+    assert link.knows_checks()
+
+
+async def test_an_autopilot_that_has_started_anew_is_asked_for_its_streams_again(port: int) -> None:
+    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
+        async with attended(port) as link:
+            await asyncio.sleep(1.5)
+            rates = dict(fake_autopilot.stream_intervals_s)
+            fake_autopilot.restart()
+            assert fake_autopilot.stream_intervals_s != rates
+            await until(lambda: dict(fake_autopilot.stream_intervals_s) == rates)
+            assert "the autopilot has started anew" in link.take_reports()
+
+
+async def test_one_lost_heartbeat_loses_no_link_and_is_counted(port: int) -> None:
+    """PX4's: one a second."""
+    with FakeAutopilot(port, height_m=HOVER_M, clock=clock) as fake_autopilot:
+        async with flying(port) as flight:
+            await flight.enter_offboard()
+            for lost in range(1, 4):
+                fake_autopilot.lose_heartbeats(1)
+                await until(lambda lost=lost: flight.link.heartbeats_lost() >= lost)  # type: ignore[misc]
+                assert flight.streamer.report().silence is None
+            fake_autopilot.lose_heartbeats(2)
+            await until(lambda: flight.link.heartbeats_lost() >= 5)
+            assert fake_autopilot.mode == "OFFBOARD"
+            (told,) = flight.link.take_reports()
+            assert told.startswith("the autopilot's heartbeat did not come for ")
+
+
+async def test_setpoints_of_another_program_are_noticed_within_two_seconds(
+    port: int, fake_autopilot: FakeAutopilot
+) -> None:
+    async with flying(port) as flight:
+        await flight.enter_offboard()
+        await asyncio.sleep(2.0)
+        assert flight.link.status().foreign_setpoints is None
+        with Foreigner(fake_autopilot, north_m_s=0.0, east_m_s=3.0):
+            took_s = await until(lambda: flight.link.status().foreign_setpoints is not None)
+        assert took_s <= 2.0
+        seen = flight.link.status().foreign_setpoints
+        assert seen == (
+            "another program sends setpoints: the autopilot follows 0.0 m/s north and 3.0 m/s east, "
+            "which flockd did not send"
+        )
+        await until(lambda: flight.link.status().foreign_setpoints is None)
+
+
+async def test_a_parameter_that_is_changed_in_flight_is_noticed_within_two_seconds(
+    port: int, fake_autopilot: FakeAutopilot
+) -> None:
+    async with attended(port) as link:
+        await until(lambda: "COM_OF_LOSS_T" in link.parameters())
+        fake_autopilot.parameters["COM_OF_LOSS_T"] = 20.0
+        await until(lambda: link.status().parameter_fault is not None)
+        fault = link.status().parameter_fault
+        assert fault is not None
+        assert fault.startswith("COM_OF_LOSS_T was changed in flight from 1 to 20: ")
+        assert link.take_reports() == ["the autopilot's COM_OF_LOSS_T was changed in flight from 1 to 20"]
+        fake_autopilot.parameters["COM_OF_LOSS_T"] = 1.0
+        await until(lambda: link.status().parameter_fault is None)
 
 
 async def test_the_vehicle_follows_the_velocity_and_holds_its_own_height(

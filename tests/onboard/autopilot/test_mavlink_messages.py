@@ -148,6 +148,23 @@ def test_a_text_in_chunks_is_seen_whole_and_not_before() -> None:
     assert (newest.fields["text"], newest.time_s) == (sentence, 3.0)
 
 
+def test_the_first_text_of_px4_has_the_id_of_texts_without_chunks_and_is_seen_whole() -> None:
+    """As PX4 SITL 1.18 sends it after a start: id 0, and a tab at the end."""
+    first, second = "Arming denied: Resolve system health failures firs", "t\t"
+    received, log = _received(_text(first, 0, 0), _text(second, 0, 1))
+    assert log == ["the autopilot says: Arming denied: Resolve system health failures first"]
+    assert received.recent_texts(2.0, 10.0) == ["Arming denied: Resolve system health failures first"]
+
+
+def test_a_text_of_just_one_chunk_is_seen_when_it_does_not_go_on() -> None:
+    received, log = _received(_text("a" * 50))
+    received.add("SYS_STATUS", {"battery_remaining": 50}, 0.1)
+    assert log == []
+    received.add("SYS_STATUS", {"battery_remaining": 50}, 0.3)
+    received.add("SYS_STATUS", {"battery_remaining": 50}, 0.5)
+    assert log == [f"the autopilot says: {'a' * 50}"]
+
+
 def test_a_chunk_that_is_lost_is_marked_and_does_not_mix_texts() -> None:
     received, _ = _received(_text("a" * 50, 7, 0), _text("end", 7, 2), _text("b" * 50, 8, 0), _text("tail", 8, 1))
     newest = received.newest("STATUSTEXT")

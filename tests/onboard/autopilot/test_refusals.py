@@ -7,14 +7,12 @@ from typing import Any
 
 import pytest
 
-from flockd.core.config.autopilot import AutopilotParameters
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavlink_messages import ReceivedMessages
-from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.refusal_reasons import NAMES, REASONS, event_number
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from tests.calm import clock
-from tests.onboard.autopilot.flight import flying, until
+from tests.onboard.autopilot.flight import attended, flying, until
 
 HOLD, POSITION, LAND, OFFBOARD = (4 << 16 | 3 << 24), 3 << 16, (4 << 16 | 6 << 24), 6 << 16
 ARMED = 128
@@ -125,10 +123,45 @@ def test_a_list_with_a_lost_event_is_not_believed_and_asked_for_anew() -> None:
     story.event(SUMMARY, struct.pack("<BIIII", 0, 0, 0, ALL_MODES, ALL_MODES), 8)
     story.lose_an_event()
     story.event(END, b"", 8)
-    assert story.received.check_events.incomplete
+    events, lost = story.received.check_events, story._sequence - 1
+    assert events.missing(story.now_s) == (lost, lost)
+    assert not events.incomplete, "it is requested first"
+    for _ in range(3):
+        assert events.missing(story.now_s + 0.1) is None, "not again at once"
+        story.now_s += 0.4
+        assert events.missing(story.now_s) == (lost, lost)
+    story.now_s += 0.4
+    assert events.missing(story.now_s) is None, "given up"
+    assert events.incomplete
     assert "the battery is low" in story.sentences()[0], "the last whole list holds"
     story.report(ALL_MODES, ALL_MODES)
     assert (story.sentences(), story.received.check_events.incomplete) == ([], False)
+
+
+def test_an_event_that_comes_when_it_is_requested_makes_the_list_whole() -> None:
+    story = Story()
+    story.report(ALL_MODES, ALL_MODES)
+    story.event(SUMMARY, struct.pack("<BIIII", 0, 0, 0, 0, 0), 8)
+    story.lose_an_event()
+    story.event(END, b"", 8)
+    assert story.sentences() == [], "the old list holds until then"
+    story._sequence -= 2
+    story.event(event_number("check_battery_low"), struct.pack("<IB", ALL_MODES, 20), 3)
+    assert "the battery is low" in story.sentences()[0]
+    assert not story.received.check_events.incomplete
+
+
+def test_the_last_events_are_missed_by_the_number_that_the_autopilot_names() -> None:
+    story = Story()
+    story.report(ALL_MODES, ALL_MODES)
+    newest = story._sequence
+    assert newest == 0xFFFF, "numbers begin again after it"
+    story.send("CURRENT_EVENT_SEQUENCE", sequence=newest, flags=0)
+    assert story.received.check_events.missing(story.now_s) is None
+    story.send("CURRENT_EVENT_SEQUENCE", sequence=1, flags=0)
+    assert story.received.check_events.missing(story.now_s) == (0, 1)
+    story.send("CURRENT_EVENT_SEQUENCE", sequence=7, flags=1)
+    assert story.received.check_events.missing(story.now_s) is None, "it counts anew"
 
 
 def test_a_check_without_words_here_is_told_by_its_number() -> None:
@@ -183,6 +216,8 @@ def test_a_firmware_without_events_is_understood_by_its_texts_and_flags() -> Non
     story = Story()
     story.send("HOME_POSITION", x=0.0, y=0.0, z=0.0)
     story.send("SYS_STATUS", onboard_control_sensors_enabled=0x10200007, onboard_control_sensors_health=0x00200003)
+    assert story.sentences() == [], "an autopilot that has a list of checks would be wronged in its first second"
+    story.now_s += 2.0
     assert story.sentences() == [
         "the autopilot refuses to arm: not healthy: the compass; check the sensor and its cable, "
         "or correct how many the autopilot's parameters SYS_HAS_... name"
@@ -202,6 +237,7 @@ def test_state_and_failed_checks_alone_are_reasons_too() -> None:
     story = Story()
     story.send("HOME_POSITION", x=0.0, y=0.0, z=0.0)
     story.send("SYS_STATUS", onboard_control_sensors_enabled=0x10000000, onboard_control_sensors_health=0)
+    story.now_s += 2.0
     assert "its checks before the flight fail; read its checks" in story.sentences()[0]
     story.send("HEARTBEAT", custom_mode=HOLD, base_mode=0, system_status=2)
     assert "a calibration is under way" in story.sentences()[0]
@@ -238,22 +274,21 @@ REFUSING = (
 
 async def test_twelve_refusals_of_the_fake_autopilot_one_by_one_through_mavsdk(port: int) -> None:
     with FakeAutopilot(port, clock=clock) as fake_autopilot:
-        link = await AutopilotLink.connect(AutopilotParameters(address=f"udpin://127.0.0.1:{port}"), clock=clock)
-        await link.ask_for_checks()
-        await until(link.knows_checks)
-        for name in REFUSING:
-            fake_autopilot.failing = {name}
-            await until(lambda name=name: [r.reason for r in link.refusals()] == [name])  # type: ignore[misc]
-        with pytest.raises(AutopilotError) as refused:
+        async with attended(port) as link:
+            await link.ask_for_checks()
+            await until(lambda: link.knows_checks() and fake_autopilot.has_ground_station)
+            for name in REFUSING:
+                fake_autopilot.failing = {name}
+                await until(lambda name=name: [r.reason for r in link.refusals()] == [name])  # type: ignore[misc]
+            with pytest.raises(AutopilotError) as refused:
+                await link.arm()
+            assert str(refused.value) == (
+                "the autopilot was asked to arm, which was refused for now: Arming denied: Resolve system health "
+                "failures first; its safety button was not pressed; press the safety button until its light stays on"
+            )
+            fake_autopilot.failing = set()
+            await until(lambda: not link.refusals())
             await link.arm()
-        assert str(refused.value) == (
-            "the autopilot was asked to arm, which was refused for now: Arming denied: Resolve system health failures "
-            "first; its safety button was not pressed; press the safety button until its light stays on"
-        )
-        fake_autopilot.failing = set()
-        await until(lambda: not link.refusals())
-        await link.arm()
-        await link.close()
 
 
 async def test_offboard_that_is_possible_is_not_refused_by_anything(port: int, fake_autopilot: FakeAutopilot) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from flockd.core.config.autopilot import AutopilotParameters
+from flockd.core.config.safety import SafetyParameters
 from flockd.core.messages import Setpoint
 from flockd.flight.safety import Request, Verdict
 from flockd.onboard.autopilot.autopilot_status import AutopilotError, AutopilotStatus
@@ -21,6 +22,7 @@ PERIOD_S = 0.05
 HOVERING = AutopilotStatus(
     time_s=0.0,
     heartbeat_age_s=0.1,
+    message_age_s=0.1,
     flight_mode="hold",
     armed=True,
     failsafe=False,
@@ -44,7 +46,12 @@ class Story:
         self.gate_says: Setpoint | str | None = "pass"
         self.cable_is_in = True
         self.streamer = SetpointStreamer(
-            self._send, lambda: self.status, self._gate, AutopilotParameters(), clock=lambda: self.now
+            self._send,
+            lambda: self.status,
+            self._gate,
+            AutopilotParameters(),
+            SafetyParameters(),
+            clock=lambda: self.now,
         )
 
     def _gate(self, now_s: float, request: Request) -> Verdict:
@@ -165,11 +172,36 @@ def test_when_the_pilot_takes_over_it_is_silent_at_once_and_for_good(in_offboard
 
 
 def test_a_lost_link_is_silence_for_good(in_offboard: Story) -> None:
-    in_offboard.autopilot(heartbeat_age_s=2.1)
+    in_offboard.autopilot(heartbeat_age_s=3.4)
+    assert in_offboard.go_on(1.0) == 20, "two heartbeats may be lost"
+    in_offboard.autopilot(heartbeat_age_s=3.6)
     assert in_offboard.go_on(1.0) == 0
     in_offboard.autopilot(heartbeat_age_s=0.1)
     assert in_offboard.go_on(1.0) == 0
-    assert in_offboard.silence == "the autopilot's heartbeat is lost"
+    assert in_offboard.silence == in_offboard.streamer.report().fault == "no heartbeat from the autopilot for 3.6 s"
+
+
+def test_a_link_without_any_message_is_lost_sooner(in_offboard: Story) -> None:
+    in_offboard.autopilot(message_age_s=2.1)
+    assert in_offboard.go_on(1.0) == 0
+    assert in_offboard.silence == "no message from the autopilot for 2.1 s"
+
+
+def test_a_stall_stays_the_cause_though_the_autopilot_has_left_offboard_meanwhile(in_offboard: Story) -> None:
+    in_offboard.now += 3.0
+    in_offboard.autopilot(flight_mode="hold")
+    stalled = "the thread was stopped, for more than 0.5 s in offboard flight"
+    assert in_offboard.streamer.report().fault == stalled, "also before its own thread has run"
+    assert in_offboard.go_on(1.0) == 0
+    assert in_offboard.silence == stalled
+    in_offboard.streamer.end("the supervisor is silent")
+    assert (in_offboard.silence, in_offboard.streamer.report().fault) == (stalled, None)
+
+
+def test_a_pilot_who_takes_over_is_no_fault(in_offboard: Story) -> None:
+    in_offboard.autopilot(flight_mode="position")
+    in_offboard.go_on(1.0)
+    assert in_offboard.streamer.report().fault is None
 
 
 def test_a_vehicle_in_its_failsafe_is_left_alone(story: Story) -> None:
@@ -220,7 +252,9 @@ def test_the_thread_keeps_its_rate_and_ends_when_the_gate_breaks() -> None:
             raise ZeroDivisionError("a bug")
         return let_pass(now_s, request)
 
-    streamer = SetpointStreamer(lambda _: sent.append(time.monotonic()), lambda: HOVERING, gate, AutopilotParameters())
+    streamer = SetpointStreamer(
+        lambda _: sent.append(time.monotonic()), lambda: HOVERING, gate, AutopilotParameters(), SafetyParameters()
+    )
 
     def offer() -> None:
         streamer.offer(request_of(NORTH, time.monotonic()))

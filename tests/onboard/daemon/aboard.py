@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,7 +28,7 @@ from flockd.core.config.source import SharedMemoryParameters, SourceParameters
 from flockd.core.config.telemetry import OperatorCommand, TelemetryParameters
 from flockd.core.messages import Float32Array, Frame, UInt8Array
 from flockd.fleet.watcher import FleetWatcher, Heard
-from flockd.flight.geometry import RigCamera
+from flockd.flight.geometry import RigCamera, ZMap
 from flockd.flight.perception import Crop, RangeEstimate, SceneMaps
 from flockd.onboard.autopilot.refusal_reasons import REASONS
 from flockd.onboard.daemon import Daemon, Ending, ServiceManager
@@ -91,7 +91,7 @@ class TinyPerceiver:
         height, width = frame.image.shape[:2]
         rows, columns = np.mgrid[0:height, 0:width]
         depth = (5.0 + 0.02 * rows + 0.01 * columns).astype(np.float32)
-        return SceneMaps(depth, np.zeros((height, width), np.uint8), ())
+        return SceneMaps(ZMap(depth), np.zeros((height, width), np.uint8), ())
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         return ()
@@ -184,6 +184,7 @@ class Watched:
     watcher: FleetWatcher
     session: zenoh.Session
     events: list[str]
+    orders: int = field(default=0, kw_only=True)
 
     def heard(self) -> dict[str, Heard]:
         return {topic: heard for drone in self.watcher.drones() for topic, heard in drone.topics.items()}
@@ -217,7 +218,14 @@ class Watched:
 
     async def ask(self, what: str) -> dict[str, Any]:
         """The answer to a query, with zenoh alone as any other program would put it."""
-        answer: dict[str, Any] = json.loads(await self._query(what))
+        payload = b""
+        if what.startswith("ask/"):
+            clock = json.loads(await self._query("time"))
+            who = {"identity": clock["identity"], "operator": "a test", "session": "of a test"}
+            self.orders += 1
+            ask = {**who, "sequence": self.orders, "time_s": clock["time_s"], "order": None}
+            payload = json.dumps(ask).encode()
+        answer: dict[str, Any] = json.loads(await self._query(what, payload))
         return answer
 
     async def fleet(self, *arguments: str) -> int:
@@ -228,10 +236,10 @@ class Watched:
     async def picture(self, camera: str) -> bytes:
         return await self._query(f"image/{camera}")
 
-    async def _query(self, what: str) -> bytes:
+    async def _query(self, what: str, payload: bytes = b"") -> bytes:
         key = f"flockd/v1/test/tiny/{what}"
         for _ in range(100):  # until the two have found each other; zenoh tries again ever less often
-            replies = await asyncio.to_thread(lambda: list(self.session.get(key, timeout=3.0)))
+            replies = await asyncio.to_thread(lambda: list(self.session.get(key, payload=payload, timeout=3.0)))
             if replies:
                 break
             await asyncio.sleep(0.1)

@@ -111,6 +111,24 @@ async def test_eyes_that_lie_about_the_own_motion_add_half_a_metre_a_second_at_m
         assert max(np.linalg.norm(sent.velocity) for sent in last) < 0.1, "standstill, but for the last drift"
 
 
+async def test_a_position_and_velocity_that_come_no_more_are_not_flown_by(
+    tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
+) -> None:
+    """Heartbeats and attitudes still come. The newest velocity would be taken for that of now, for ever."""
+    async with aboard(fake_autopilot, port, tmp_path) as ship:
+        await ship.is_ready_in_the_air()
+        await ship.flies()
+        await ship.until_state("normal")
+        fake_autopilot.sends_motion = False
+        gone_s = clock()
+        await ship.until_event("hover: no position and velocity from the autopilot for ")
+        await until(lambda: fake_autopilot.mode == "LOITER", SECONDS_TO_FAIL)
+        assert 1.4 < clock() - gone_s < 3.5, "after 0.5 s, and 1 s of hovering"
+        last = [sent for at_s, sent in fake_autopilot.setpoints if at_s > gone_s + 1.2]
+        assert max(np.linalg.norm(sent.velocity) for sent in last) < 0.1
+        assert not fake_autopilot.failsafe
+
+
 async def test_one_camera_gone_is_a_slower_flight_and_all_gone_a_hover_and_then_hold(
     tmp_path: Path, port: int, fake_autopilot: FakeAutopilot
 ) -> None:
@@ -324,6 +342,16 @@ async def test_a_blocked_event_loop_is_silence_and_the_autopilots_failsafe(
         before = len(fake_autopilot.setpoints)
         await ship.until_state("silent")
         assert len(fake_autopilot.setpoints) == before, "one more, and PX4 would be in offboard again"
+        silent = next(event for event in ship.events if event.startswith("silent: "))
+        assert silent.startswith("silent: setpoints ended: the control loop is late, for more than 0.5 s in offboard")
+        assert "; the flight mode is hold" in silent, "the consequence beside the cause, and after it"
+        assert (await ship.ask("ask/resume"))["accepted"] is True
+        await until(lambda: "autopilot_failsafe" in ship.matters(), SECONDS_TO_FAIL)
+        await asyncio.sleep(1.0)
+        assert (ship.state(), len(fake_autopilot.setpoints)) == ("idle", before), "not ready, as nothing is offered"
+        fake_autopilot.pilot_selects("LOITER")
+        await ship.until_state("ready")
+        await ship.flies()
 
 
 async def test_arming_and_taking_off_by_itself_where_configured(tmp_path: Path) -> None:
@@ -336,6 +364,11 @@ async def test_arming_and_taking_off_by_itself_where_configured(tmp_path: Path) 
             assert fake_autopilot.mode == "OFFBOARD"
             assert (await ship.ask("ask/land"))["accepted"] is True
             await until(lambda: fake_autopilot.mode == "LAND", SECONDS_TO_FAIL)
+            await until(lambda: "not_armed" in ship.matters(), SECONDS_TO_FAIL)
+            assert "land_asked" not in ship.matters(), "it was for the flight that is over"
+            fake_autopilot.pilot_arms()
+            fake_autopilot.pilot_selects("TAKEOFF")
+            await ship.until_state("ready")
 
 
 def _wrong() -> DroneConfig:

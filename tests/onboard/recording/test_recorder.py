@@ -155,6 +155,9 @@ def test_files_turn_over_and_stay_within_the_quota(tmp_path: Path) -> None:
     others = tmp_path / "drone10.mcap"
     others.write_bytes(b"another drone's")
     record(tmp_path / "yesterday.mcap", steps=5)
+    os.utime(tmp_path / "yesterday.mcap", (1.0, 1.0))
+    record(tmp_path / "crash.mcap", steps=5)
+    os.utime(tmp_path / "crash.mcap", (2.0, 2.0))
     cut(Recording(tmp_path / "yesterday.mcap"), tmp_path / "kept.mcap", 0.0, 2000.0)
     settings = RecordingConfig(file_mb=0.4, quota_mb=1.2)
     record(tmp_path / "drone1.mcap", steps=15, settings=settings)
@@ -164,6 +167,7 @@ def test_files_turn_over_and_stay_within_the_quota(tmp_path: Path) -> None:
     assert others.exists()
     assert (tmp_path / "kept.mcap").exists(), "what someone cut out is not the recorder's to delete"
     assert not (tmp_path / "yesterday.mcap").exists(), "the oldest goes first"
+    assert (tmp_path / "crash.mcap").exists(), "the flight before this one stays"
     assert not (tmp_path / "drone1.mcap").exists(), "then its own beginning"
     first = Recording(min(files, key=lambda file: int(file.suffixes[0][1:])))
     assert set(first.contents.paths) == set(files)

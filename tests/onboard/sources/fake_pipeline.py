@@ -1,6 +1,6 @@
-"""Speaks like the process of a pipeline, by the words of its argument; nothing of flockd's is imported here.
+"""Speaks like the process of a pipeline, by the words of what it reads; nothing of flockd's is imported here.
 
-fake_pipeline.py "WORD..." CAPS
+fake_pipeline.py CAPS    # and over standard input the length of the words, four bytes, and the words
 
 `caps:WxH` and `caps:text` say what the images are; `N` sends N different images of 64x48 in RGB, 20 ms apart, `same:N`
 N equal ones. `short` sends one that lacks a byte, `flagged` one the driver calls damaged, `old` one of an hour ago,
@@ -79,4 +79,5 @@ def play(words: list[str]) -> None:
             WORDS[word](text)
 
 
-play(sys.argv[1].split())
+(length,) = struct.unpack("<I", os.read(0, 4))
+play(os.read(0, length).decode().split())

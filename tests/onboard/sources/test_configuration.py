@@ -147,8 +147,8 @@ def test_slips_inside_the_optional_section_are_reported_with_what_to_do(tmp_path
         "drone.yaml:7: source.silence: is not a known key; did you mean `silence_s`?",
         "drone.yaml:9: source.cameras[0].controls[0].value: 1.5 is not a whole number; write a whole number",
         "drone.yaml:9: source.cameras[0].rate_hz: 0 is not greater than 0; write a number above 0 and up to 1000",
-        "drone.yaml:10: source.cameras[1].device: video2 is not a text that matches ^/dev/ or nothing; "
-        "write a text that matches ^/dev/ or nothing",
+        "drone.yaml:10: source.cameras[1].device: video2 is not a device; "
+        "write a device, as in `/dev/video0` or an entry of `/dev/v4l/by-path`",
         "drone.yaml:10: source.cameras[1].pixel_format: mjpg is not known; did you mean `mjpeg`?",
     ]
 
@@ -158,17 +158,15 @@ def test_slips_inside_the_optional_section_are_reported_with_what_to_do(tmp_path
     [
         (
             "source:\n  kind: v4l2\n" + TWO.replace("back", "rear"),
-            "drone.yaml:1: source.cameras names front, rear, but the rig has front, back; "
-            "give each camera of the rig one entry of the same name",
+            "drone.yaml:9: source.cameras[1].name: rear is no camera of the rig, which has front, back",
         ),
         (
             "source:\n  kind: v4l2\n",
-            "drone.yaml:1: source.cameras names none, but the rig has front, back; "
-            "give each camera of the rig one entry of the same name",
+            "drone.yaml:5: source: has no entry of the name front, which is a camera of the rig; add one",
         ),
         (
             "source:\n  kind: v4l2\n" + TWO.replace("video2", "video0"),
-            "drone.yaml:5: source: two cameras share /dev/video0; give each its own",
+            "drone.yaml:9: source.cameras[1].device: two cameras share /dev/video0; give each its own device",
         ),
         (
             "source:\n  kind: shared_memory\n" + TWO,
@@ -198,12 +196,12 @@ def test_slips_inside_the_optional_section_are_reported_with_what_to_do(tmp_path
         ),
         (
             "source:\n  kind: v4l2\n  set_tolerance_s: 0.01\n" + TWO,
-            "drone.yaml:5: source: set_tolerance_s 0.01 is less than half a frame period of camera 'front'; "
+            "drone.yaml:7: source.set_tolerance_s: 0.01 is less than half a frame period of camera 'front'; "
             "write 0.017 or more",
         ),
         (
             "source:\n  kind: v4l2\n  silence_s: 0.05\n" + TWO,
-            "drone.yaml:5: source: silence_s 0.05 is less than two frame periods of camera 'front'; "
+            "drone.yaml:7: source.silence_s: 0.05 is less than two frame periods of camera 'front'; "
             "write 0.067 or more",
         ),
     ],

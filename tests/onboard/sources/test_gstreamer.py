@@ -69,6 +69,14 @@ def _fault(source: DeviceSource) -> str:
     return str(_until(source, lambda status: status.fault is not None).fault)
 
 
+def test_a_camera_whose_opening_fails_for_a_reason_nobody_expects_is_seen_to_fail(start: Start) -> None:
+    """Its thread ended with a traceback, and its status said nothing."""
+    source = start("words\0", "caps:64x48 1000")
+    failed = _until(source, lambda status: status.fault is not None, "camera0")
+    assert failed.fault == "camera0: cannot be run (ValueError: embedded null byte)"
+    _until(source, lambda status: status.counts.get("received", 0) > 2, "camera1")
+
+
 def test_images_come_with_the_times_of_their_buffers(start: Start) -> None:
     begun_s = time.monotonic()
     source = start("caps:64x48 500 stall")
@@ -178,6 +186,20 @@ def test_a_process_that_hangs_is_ended_when_its_camera_is_closed() -> None:
     assert process.poll() == -9
 
 
+def test_a_password_of_a_camera_is_in_no_process_list_and_in_no_message() -> None:
+    """Every user of a computer may read the arguments of every process."""
+    pipeline = "caps:64x48 fail:cannot_open_rtsp://anna:hunter2@10.0.0.7/stream_with_user-pw=hunter2_! stall"
+    device = GstreamerDevice(CAMERA.model_copy(update={"pipeline": pipeline}), SIZE, FAKE)
+    arguments = Path(f"/proc/{device._process.pid}/cmdline").read_bytes()
+    with pytest.raises(CameraError, match=r"cannot open rtsp://\*\*\*@10\.0\.0\.7") as caught:
+        device.read(60.0)
+    device.close()
+    assert b"64" in arguments, "the size is among them"
+    for told in (arguments, str(caught.value).encode()):
+        assert b"anna" not in told
+        assert b"hunter2" not in told
+
+
 def test_a_program_that_is_not_there_is_one_sentence() -> None:
     with pytest.raises(CameraError, match=r"^front: the process of its pipeline cannot be started \(No such file"):
         GstreamerDevice(CAMERA, SIZE, ("/nowhere/python",))
@@ -187,8 +209,8 @@ def test_the_real_process_says_so_where_gstreamer_is_not_installed(tmp_path: Pat
     text = Path(CHILD[-1]).read_text(encoding="utf-8").replace("libgstreamer-1.0.so.0", "libnowhere-1.0.so.0")
     (tmp_path / "child.py").write_text(text, encoding="utf-8")
     done = subprocess.run(
-        [sys.executable, "-I", tmp_path / "child.py", "videotestsrc", "ANY"],
-        input=b"",
+        [sys.executable, "-I", tmp_path / "child.py", "ANY"],
+        input=b"\x0c\0\0\0videotestsrc",
         capture_output=True,
         timeout=60,
         check=False,

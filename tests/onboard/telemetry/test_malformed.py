@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -15,19 +18,37 @@ from flockd.core.config import load_drone
 from flockd.core.errors import ConfigError
 from flockd.core.printable import printable
 from flockd.fleet.fleet_status import status_rows
-from flockd.fleet.watcher import MAX_BYTES, MAX_DRONES, FleetWatcher, Watched
+from flockd.fleet.watcher import MAX_BYTES, MAX_DRONES, MAX_EVENTS_OF_ONE, FleetWatcher, Heard, Watched
+from flockd.onboard.daemon.operator_commands import OperatorCommands, OperatorRequests
+from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.schema import completed, fault
-from flockd.onboard.telemetry.topics import TOPICS, ComputerMessage, FlightMessage, NeighboursMessage, StateMessage
+from flockd.onboard.telemetry.topics import (
+    TOPICS,
+    AboutMessage,
+    ComputerMessage,
+    FlightMessage,
+    NeighboursMessage,
+    StateMessage,
+)
 from flockd.onboard.telemetry.zenoh_session import close_session, open_session
 from flockd.sim.free_ports import free_endpoint
 
 ROOT = Path(__file__).parents[3]
 FLIGHT = {
     "time_s": 5.0, "state": "normal", "reasons": [], "flight_mode": "offboard", "armed": True, "in_air": True,
-    "heartbeat_age_s": 0.1, "battery_share": 0.5, "height_m": 4.0, "velocity_trim": [0.0, 0.0], "gusts_m_s": 0.1,
+    "heartbeat_age_s": 0.1, "heartbeats_lost": 0,
+    "battery_share": 0.5, "height_m": 4.0, "velocity_trim": [0.0, 0.0], "gusts_m_s": 0.1,
     "silence": None,
-    "setpoints_sent": 1, "setpoints_missed": 0,
+    "setpoints_sent": 1, "setpoints_missed": 0, "orders": [], "orders_refused": 0,
 }  # fmt: skip
+
+
+def until(true: Callable[[], bool]) -> None:
+    """Waits for it, and fails where it does not come."""
+    end_s = time.monotonic() + 60.0
+    while not true():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
 
 
 @pytest.mark.parametrize(
@@ -38,6 +59,12 @@ FLIGHT = {
         ({"height_m": "4.0"}, "height_m is no finite number"),
         ({"height_m": True}, "height_m is no finite number"),
         ({"height_m": float("inf")}, "height_m is no finite number"),
+        ({"height_m": 1.5e308}, "height_m is beyond 1e+06"),
+        ({"velocity_trim": [0.0, -1.5e308]}, "velocity_trim[1] is beyond 1e+10"),
+        ({"state": "half \ud800"}, "state is no text"),
+        ({"silence": "x" * 5000}, "silence is no text"),
+        ({"velocity_trim": [0.0] * 1001}, "velocity_trim has more than 1000 entries"),
+        ({"orders_refused": 10**17}, "orders_refused is no whole number"),
         ({"setpoints_sent": 0.5}, "setpoints_sent is no whole number"),
         ({"setpoints_sent": 10**400}, "setpoints_sent is no whole number"),
         ({"armed": 1}, "armed is no true or false"),
@@ -61,6 +88,10 @@ def test_what_is_nested_is_looked_into() -> None:
     assert fault(computer, ComputerMessage) == "cameras.front.counts.used is no whole number"
     assert fault({**computer, "cameras": [camera]}, ComputerMessage) == "cameras is no object"
     assert fault({"time_s": 0.0, "neighbours": [3]}, NeighboursMessage) == "neighbours[0] is no object"
+    assert fault({**computer, "cameras": {"\ud800": camera}}, ComputerMessage) == "cameras has a name that is no text"
+    state = {**dict.fromkeys(StateMessage.__annotations__, 0.0), "velocity_ned": None, "position_ne": None}
+    assert fault({**state, "home_deg": [1e308, 8.0]}, StateMessage) == "home_deg[0] is beyond 360"
+    assert fault({**state, "home_deg": [47.0, -180.0]}, StateMessage) is None
     assert fault([], NeighboursMessage) == "it is no object"
 
 
@@ -92,9 +123,9 @@ def test_a_drone_is_shown_with_what_is_wrong_until_its_message_is_right_again() 
     good, malformed = json.dumps(FLIGHT).encode(), "its message `flight` is malformed: "
     published: tuple[tuple[bytes, list[str]], ...] = (
         (good, []),
-        (b"[" * 100_000, [f"{malformed}it is not JSON"]),
+        (b"[" * 10_000, [f"{malformed}it is not JSON"]),
         (json.dumps({**FLIGHT, "reasons": 7}).encode(), [f"{malformed}reasons is no list"]),
-        (b" " * (MAX_BYTES + 1), [f"{malformed}it is longer than 1024 KiB"]),
+        (b" " * (MAX_BYTES + 1), [f"{malformed}it is longer than 32 KiB"]),
         (good, []),
     )
     endpoint = free_endpoint()
@@ -111,13 +142,95 @@ def test_a_drone_is_shown_with_what_is_wrong_until_its_message_is_right_again() 
         close_session(session)
 
 
-def test_invented_drones_do_not_fill_the_memory() -> None:
+Take = Callable[[str, object], None]
+
+
+@pytest.fixture
+def take() -> Iterator[tuple[FleetWatcher, Take]]:
+    """A watcher that is connected to nobody, and what hands it a message as zenoh does."""
     with FleetWatcher(None, listen=[], connect=[]) as watcher:
-        watcher._drones.update({("fleet", f"drone{i}"): Watched("fleet", f"drone{i}") for i in range(MAX_DRONES)})
-        assert watcher._watched("fleet", "drone7") is not None
-        assert watcher._watched("fleet", "one-more") is None
-        watcher._drones.clear()
-        assert watcher._watched("fleet\x1b[2J", "drone0") is None
+
+        def message(key: str, value: object) -> None:
+            payload = SimpleNamespace(to_bytes=lambda: json.dumps(value).encode())
+            watcher._take_message(cast("Any", SimpleNamespace(key_expr=f"flockd/v1/f/{key}", payload=payload)))
+
+        yield watcher, message
+
+
+def test_ten_thousand_invented_names_hide_no_drone(take: tuple[FleetWatcher, Take]) -> None:
+    """Malformed messages are no drone; of drones that say one thing once, those are forgotten, not those that fly."""
+    watcher, message = take
+    for number in range(10_000):
+        message(f"malformed{number}/flight", {})
+    assert (watcher.drones(), watcher.malformed) == ((), 10_000)
+    for number in range(10_000):
+        message(f"invented{number}/flight", FLIGHT)
+        if number % 50 == 0:  # it came after 5,000 of them
+            message("real/flight", FLIGHT if number >= 5000 else None)
+            message("real/events", {"time_s": 1.0, "event": f"event {number}"})
+    drones = {drone.drone: drone for drone in watcher.drones()}
+    assert len(drones) <= MAX_DRONES
+    assert drones["real"].messages > 100
+    assert watcher.forgotten > 9000
+    message("fleet\x1b[2J/flight", FLIGHT)
+    assert not [drone for drone in watcher.drones() if "\x1b" in drone.drone]
+
+
+def test_who_has_announced_itself_stands_before_names_that_nobody_stands_behind() -> None:
+    invented = Watched("f", "invented", topics={"flight": Heard(0.0, FLIGHT)}, seen=True)
+    drone = Watched("f", "real", alive=True, announced=True, topics={"flight": Heard(0.0, FLIGHT)}, seen=True)
+    assert [row["drone"] for row in status_rows([invented, drone], 0.1)] == ["real", "invented"]
+
+
+def test_one_that_says_much_displaces_none_of_the_others_events(take: tuple[FleetWatcher, Take]) -> None:
+    watcher, message = take
+    message("quiet/events", {"time_s": 1.0, "event": "the pilot selected offboard"})
+    for number in range(5000):
+        message("loud/events", {"time_s": 1.0, "event": f"{number}"})
+    heard = [(event.drone, event.sentence) for event in watcher.events()]
+    assert heard[0] == ("quiet", "the pilot selected offboard")
+    assert heard[1:] == [("loud", f"{number}") for number in range(5000 - MAX_EVENTS_OF_ONE, 5000)]
+
+
+def test_two_drones_of_one_name_are_told_apart_by_identity_and_neither_gets_an_order() -> None:
+    """Each answers for itself while it is alone; the order names the identity, which the other refuses."""
+    endpoint, asked = free_endpoint(), list[str]()
+
+    def commands(telemetry: ZenohTelemetry, loop: asyncio.AbstractEventLoop) -> None:
+        requests, missions = OperatorRequests(), cast("Any", None)
+        handler = OperatorCommands(["hold"], requests, missions, loop, asked.append, identity=telemetry.identity)
+        about = AboutMessage(version="1", configuration={}, commands=["hold"])
+        telemetry.announce("d", about, handler.handle, lambda camera: None)
+
+    def identities() -> list[str]:
+        return [identity for row in status_rows(watcher.drones(), time.monotonic()) for identity in row["identities"]]
+
+    loop = asyncio.new_event_loop()
+    with (
+        FleetWatcher(None, listen=[endpoint], connect=[]) as watcher,
+        ZenohTelemetry("f", listen=[], connect=[endpoint]) as one,
+    ):
+        commands(one, loop)
+        until(lambda: identities() == [one.identity])
+        until(lambda: watcher.ask("f/d", "hold", "anna") is not None)
+        with ZenohTelemetry("f", listen=[], connect=[endpoint]) as other:
+            commands(other, loop)
+            until(lambda: identities() == sorted({one.identity, other.identity}))
+            taken = len(asked)
+            refused = watcher.ask("f/d", "hold", "anna")
+            assert refused is not None and not refused["accepted"]
+            assert refused["sentence"].startswith("nothing was sent: 2 drones call themselves d")
+            assert len(asked) == taken
+            (row,) = status_rows(watcher.drones(), time.monotonic())
+            assert row["matters"][0].endswith("give each its own `name` in its configuration")
+            # An order on its way when the second one appeared reaches both, and only whose identity it names obeys.
+            watcher.queries.ask("f/d", one.identity, "hold", "anna")
+            until(lambda: len(asked) == taken + 2)
+            assert sorted("another drone of this name" in event for event in asked[taken:]) == [False, True]
+        until(lambda: identities() == [one.identity])
+        answer = watcher.ask("f/d", "hold", "anna")
+        assert answer is not None and answer["accepted"]
+    loop.close()
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,10 @@ import numpy as np
 
 from flockd.core.config import load_scenario
 from flockd.core.data import data_path
-from flockd.review.flight_log.fleet_log import FleetFrame, FleetRun, fleet_log
-from tests.onboard.recording.made_up import drone_config, record
+from flockd.core.messages import MissionOrder
+from flockd.onboard.recording import Recorder
+from flockd.review.flight_log.fleet_log import FleetFrame, FleetRun, fleet_log, recorded_orders
+from tests.onboard.recording.made_up import MODELS, MadeUpPilot, drone_config, inputs, record
 
 
 def test_a_motion_over_a_skipped_frame_set_is_not_in_the_log(tmp_path: Path) -> None:
@@ -44,3 +46,17 @@ def test_a_motion_over_a_skipped_frame_set_is_not_in_the_log(tmp_path: Path) -> 
     assert metadata.fleet.frames_late_s.p50 == 0.02
     assert metadata.fleet.autopilot_clock_rates == [0.5]
     np.testing.assert_allclose(metadata.fleet.longest_step_s, 0.1)
+
+
+def test_orders_are_read_with_the_time_at_which_a_step_took_them(tmp_path: Path) -> None:
+    config = drone_config()
+    pilot = MadeUpPilot(config)
+    with Recorder(tmp_path / f"{config.name}-1.mcap", drone=config.name, config=config, models=MODELS) as recorder:
+        for step, (frames, vehicle) in enumerate(inputs(steps=4)):
+            order = MissionOrder(place=np.array([10.0, -2.0])) if step == 2 else None
+            recorder.step(frames, vehicle, pilot.step(frames, vehicle, order=order), order=order)
+            recorder.drain()
+    ((time_s, found),) = recorded_orders(tmp_path, config.name, zero_s=1000.0)
+    np.testing.assert_allclose(time_s, 0.2, atol=1e-5)
+    assert found.place is not None
+    assert found.place.tolist() == [10.0, -2.0]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +21,7 @@ from flockd.review.flight_log.ulog import autopilot_log, drone_of, read_ulog
 from flockd.review.report.autopilot_figure import autopilot_texts
 from flockd.review.report.flight_folder import save_flight
 from tests.onboard.recording.made_up import MadeUpPilot, drone_config, inputs
-from tests.review.flight_log.made_ulog import HEADER, Rows, write_ulog
+from tests.review.flight_log.made_ulog import HEADER, Rows, _message, write_ulog
 
 BOOT_S = 900.0
 """The autopilot's clock at the flight's start."""
@@ -145,6 +147,23 @@ def test_a_file_that_is_no_ulog_is_refused_in_one_sentence(data: bytes, words: s
     assert "\n" not in text
 
 
+def test_a_changed_byte_that_keeps_its_reader_busy_for_ever_is_one_sentence(tmp_path: Path) -> None:
+    """The length of the last definition: pyulog goes back by so many bytes, to before what it has read."""
+    path = tmp_path / "log.ulg"
+    definitions = _message("I", bytes([11]) + b"char[200] k" + b"x" * 200) * 400
+    path.write_bytes(HEADER + bytes(8) + _message("B", bytes(40)) + definitions + b"\xff\xffX" + bytes(100))
+    with pytest.raises(
+        UsageError, match=r"log\.ulg: cannot be read within \d+ s, or its memory: it is damaged; name a ULog file"
+    ):
+        read_ulog(path, patience_s=3.0)
+
+
+def test_a_pipe_is_refused_without_waiting_for_its_writer(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "log.ulg")
+    with pytest.raises(UsageError, match=r"log\.ulg: is not an ordinary file"):
+        read_ulog(tmp_path / "log.ulg")
+
+
 def test_a_log_that_ends_in_the_middle_is_used_as_far_as_it_goes(tmp_path: Path) -> None:
     path = _ulog(tmp_path / "log.ulg")
     path.write_bytes(path.read_bytes()[:-700])
@@ -170,6 +189,16 @@ def test_logs_that_cannot_be_of_the_flight_are_refused(tmp_path: Path) -> None:
     other.command_velocity[20:40] = 5.0
     with pytest.raises(UsageError, match="its setpoints are not those of the flight"):
         autopilot_log(read_ulog(path), path, other, 0, None)
+
+
+def test_times_that_a_damaged_log_claims_take_no_memory(tmp_path: Path) -> None:
+    path = _ulog(tmp_path / "log.ulg")
+    ulog = read_ulog(path)
+    setpoints = {name: np.array(values) for name, values in ulog.topics["trajectory_setpoint"].items()}
+    setpoints["timestamp"][-1] = 2**64 - 1
+    damaged = replace(ulog, topics={**ulog.topics, "trajectory_setpoint": setpoints})
+    with pytest.raises(UsageError, match="its times are damaged: they span more than a day, or run backwards"):
+        autopilot_log(damaged, path, _log(), 0, None)
 
 
 def _two_drones() -> FlightLog:

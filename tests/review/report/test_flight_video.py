@@ -88,6 +88,19 @@ def test_each_step_is_a_frame_with_the_ring_in_the_image_and_the_drones_on_the_m
     assert direction @ moved[::-1] / np.linalg.norm(moved) > 0.9, "east is right, north is up"
 
 
+def test_images_of_several_cameras_do_not_touch(tmp_path: Path) -> None:
+    log = _flight(drones=2, duration_s=0.5)
+    names = ("front", "right", "back", "left")
+    white = np.full((48, 64, 3), 250, np.uint8)
+    moment = Moment(0.0, dict.fromkeys(names, white), {}, 0.0)
+    path = tmp_path / "flight.webm"
+    write_video(path, log, 0, [moment], scale=SCALE)
+    (image,), _ = _frames(path)
+    seen = image[HEAD_PX : HEAD_PX + MAP_PX, : -MAP_PX - 6].min(axis=2) > 200
+    assert seen.any(axis=0).nonzero()[0].size < np.ptp(seen.any(axis=0).nonzero()[0]), "a gap between left and right"
+    assert seen.any(axis=1).nonzero()[0].size < np.ptp(seen.any(axis=1).nonzero()[0]), "and between above and below"
+
+
 def test_recorded_moments_have_the_recorded_detections() -> None:
     """In the recording a neighbour is 2 to 4 m before the drone, in the front camera."""
     recording = Recording(NORMAL)

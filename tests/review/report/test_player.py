@@ -145,6 +145,22 @@ def test_drones_are_drawn_with_north_up_and_true_to_scale(html: str) -> None:
     assert followed[1][0] - followed[2][0] > side_px
 
 
+def test_labels_of_drones_that_are_close_do_not_lie_on_each_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three within a few pixels of each other: a line of text is 12 px high."""
+    monkeypatch.setattr("flockd.review.report.page._embed", lambda *_, **__: Markup(""))
+    log = _flight(drones=3, duration_s=10.0)
+    position = log.position.copy()
+    position[:, :, :2] = np.array([[0.0, 0.0], [0.1, 0.2], [-0.1, 0.3]])
+    position[-1, 0, :2] += 30.0  # so that the map is large
+    page = _Browser(_report(tmp_path, replace(log, position=position)))
+    labels = page("document.querySelector('canvas').drawn.filter((one) => / m$/.test(one.text ?? '')).slice(0, 3)")
+    heights = sorted(one["y"] for one in labels)
+    assert len(heights) == 3
+    assert min(np.diff(heights)) >= 12
+
+
 def test_a_round_obstacle_is_drawn_where_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("flockd.review.report.page._embed", lambda *_, **__: Markup(""))
     log = _flight(drones=3, duration_s=10.0)

@@ -7,6 +7,7 @@ import math
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,17 +27,18 @@ from flockd.core.messages import (
     VehicleState,
     Wanted,
 )
-from flockd.flight.geometry import log_polar, log_polar_covariance
+from flockd.flight.geometry import RangeMap, log_polar, log_polar_covariance
 from flockd.flight.perception import CameraObservation, Observation
 from flockd.flight.pilot import StepTrace
 from flockd.onboard.recording import Recorder, RecordingError
 from flockd.onboard.recording.editing import cut
+from flockd.onboard.recording.mcap_file import Note, Record
 from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.truth import TrueDrone, Truth
 from flockd.review.flight_log.from_recordings import flight_log, key_frames, recordings_in
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.summary import summarise
-from tests.onboard.recording.made_up import HEIGHT, MODELS, WIDTH, MadeUpPilot, drone_config
+from tests.onboard.recording.made_up import HEIGHT, MODELS, WIDTH, MadeUpPilot, drone_config, rewritten
 from tests.review.view.test_view import shown_in
 
 NAMES = ("drone1", "drone2")
@@ -347,7 +349,7 @@ class Looking:
         cameras = {
             name: CameraObservation(
                 frame.image,
-                np.full((HEIGHT, WIDTH), 3.0, np.float32),
+                RangeMap(np.full((HEIGHT, WIDTH), 3.0, np.float32)),
                 np.zeros((HEIGHT, WIDTH), np.uint8),
                 None,
             )
@@ -376,9 +378,8 @@ def test_pictures_are_of_the_recorded_images(alone: Path, flight: Path, monkeypa
     [
         ("drone2", 1, {"seed": 4}, "drone1.mcap, drone2.mcap are not of one flight; name one recording"),
         ("drone2", 1, {"with_truth": False}, "drone1.mcap, drone2.mcap are not of one flight; name one recording"),
-        ("again", 0, {}, "holds several recordings of one drone; name one recording"),
     ],
-    ids=["several flights", "one without truth", "one drone twice"],
+    ids=["several flights", "one without truth"],
 )
 def test_recordings_that_do_not_belong_together_are_refused(
     other: str, drone: int, how: dict[str, Any], reason: str, tmp_path: Path, capsys: Capture
@@ -390,6 +391,50 @@ def test_recordings_that_do_not_belong_together_are_refused(
     _, err = told(capsys, 1, folder, "--without-pictures")
     assert err == f"{folder}: {reason}\n"
     assert [path.name for path in tmp_path.iterdir()] == ["flights"]
+
+
+def test_of_several_flights_of_a_drone_the_newest_is_told_and_an_earlier_report_stays(
+    tmp_path: Path, capsys: Capture
+) -> None:
+    """As after the second flight of a day: `flockd report recordings`."""
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    for name, began in (("kite-2", "2026-11-24T10:30:00+00:00"), ("kite-1", "2026-11-24T10:00:00+00:00")):
+        record_flight(tmp_path / "draft.mcap", name="kite", with_truth=False)
+        rewritten(tmp_path / "draft.mcap", folder / f"{name}.mcap", partial(begun, began=began))
+    out, err = told(capsys, 0, folder, "--without-pictures")
+    page = folder / "kite-2.report" / "report.html"
+    assert out.splitlines()[-1] == f"report: {page}"
+    assert f"{folder}: also holds 1 of earlier flights; this is of the newest, kite-2.mcap" in err
+    assert "begun 2026-11-24 10:30 UTC" in text_of(page)
+    written = page.read_bytes()
+    _, err = told(capsys, 2, folder, "--without-pictures")
+    assert err.splitlines()[-1].startswith(
+        f"{page.parent}: holds a flight; name another folder with --out, or overwrite"
+    )
+    assert page.read_bytes() == written
+    told(capsys, 0, folder, "--without-pictures", "--force")
+    told(capsys, 0, folder / "kite-1.mcap", "--without-pictures")
+    assert "begun 2026-11-24 10:00 UTC" in text_of(folder / "kite-1.report" / "report.html")
+
+
+def begun(record: Record, began: str) -> Record:
+    if isinstance(record, Note) and record.name == "flockd":
+        return Note(record.name, {**record.facts, "began": began})
+    return record
+
+
+def test_a_flights_folder_keeps_its_report_unless_it_is_forced(tmp_path: Path, capsys: Capture) -> None:
+    record_flight(tmp_path / "kite.mcap", name="kite", with_truth=False)
+    told(capsys, 0, tmp_path / "kite.mcap", "--without-pictures")
+    page = tmp_path / "kite.report" / "report.html"
+    page.write_text("as it was", encoding="utf-8")
+    out, err = told(capsys, 0, page.parent)
+    assert out.splitlines()[-1] == f"report: {page}"
+    assert err == f"{page}: is left as it was; --force writes it again\n"
+    assert page.read_text(encoding="utf-8") == "as it was"
+    told(capsys, 0, page.parent, "--force")
+    assert "One drone flew 6 s by sight" in text_of(page)
 
 
 def test_several_drones_without_truth_are_refused(tmp_path: Path) -> None:

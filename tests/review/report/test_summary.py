@@ -13,11 +13,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from flockd.core.config import load_scenario
+from flockd.core.data import data_path
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.flight_log.metadata import FlightMetadata, MissionMetadata
+from flockd.review.flight_log.metadata import FlightMetadata, HandedOver, MissionMetadata
 from flockd.review.flight_log.truth_matching import match_neighbours
+from flockd.review.report.page_texts import page_texts
 from flockd.review.report.paper_results import TABLE_2, TABLE_3
-from flockd.review.report.summary import summarise, write_summary
+from flockd.review.report.summary import causes_text, summarise, write_summary
 
 Array = NDArray[np.float64]
 STEPS, DRONES = 30, 2
@@ -333,6 +336,7 @@ def test_a_mission_has_arrived_where_the_middle_is_at_the_last_goal() -> None:
     figures = summarise(log)["mission"]
     assert figures == {
         "kind": "waypoints",
+        "who": "the middle",
         "arrived": False,
         "time_s": 11.0,
         "final_error_m": pytest.approx(2.5, abs=0.01),
@@ -343,9 +347,41 @@ def test_a_mission_has_arrived_where_the_middle_is_at_the_last_goal() -> None:
     assert (before["arrived"], before["time_s"]) == (False, None)
     landed = replace(log, goal=np.where(np.arange(STEPS)[:, None] < 24, goal, np.nan))  # over after 11.5 s
     over = summarise(landed)["mission"]
-    assert over == {"kind": "waypoints", "arrived": True, "time_s": 11.0, "final_error_m": pytest.approx(0.5, abs=0.01)}
+    assert (over["arrived"], over["time_s"]) == (True, 11.0)
+    assert over["final_error_m"] == pytest.approx(0.5, abs=0.01)
     nowhere = summarise(_hand_made())["mission"]
-    assert nowhere == {"kind": "circle_then_tangent", "arrived": None, "time_s": None, "final_error_m": None}
+    assert (nowhere["arrived"], nowhere["time_s"], nowhere["final_error_m"]) == (None, None, None)
+
+
+def test_a_flock_that_hovers_has_no_order() -> None:
+    """Of drones that stand still, what is left of a velocity points anywhere."""
+    log = _hand_made()
+    assert summarise(replace(log, velocity=0.099 * log.velocity))["flock"]["order_tail"] is None
+    assert summarise(replace(log, velocity=0.101 * log.velocity))["flock"]["order_tail"] == pytest.approx(1.0)
+
+
+def test_a_goal_counts_from_when_it_was_ordered() -> None:
+    """The middle was 1 m from there at 11 s already; until the order at 11.5 s there was no goal."""
+    goal = np.full((STEPS, 2), np.nan)
+    goal[23:] = [12.0, 2.0]
+    log = _hand_made()
+    mission = MissionMetadata(kind="operator", reached_m=1.2)
+    log = replace(log, goal=goal, metadata=log.metadata.model_copy(update={"mission": mission}))
+    assert summarise(log)["mission"]["time_s"] == 11.5
+
+
+def test_where_a_person_leads_it_is_the_persons_drone_that_arrives() -> None:
+    """The first drone is at the goal at the end, the flock's middle 2 m beside it."""
+    scenario = load_scenario(data_path("config") / "led_by_hand.yaml")
+    assert MissionMetadata.of(scenario).led_by == 0
+    knowing = load_scenario(data_path("config") / "one_knows.yaml")
+    assert MissionMetadata.of(knowing).led_by is None
+    log = _hand_made()
+    goal = np.tile(log.position[-1, 0, :2] + [0.1, 0.0], (STEPS, 1))
+    for led_by, arrived in ((0, True), (None, False)):
+        mission = MissionMetadata(kind="waypoints by hand, follow", reached_m=0.5, led_by=led_by)
+        flown = replace(log, goal=goal, metadata=log.metadata.model_copy(update={"mission": mission}))
+        assert summarise(flown)["mission"]["arrived"] is arrived
 
 
 def test_a_contact_with_an_obstacle_counts_once_however_long_it_lasts() -> None:
@@ -361,3 +397,26 @@ def test_a_contact_with_an_obstacle_counts_once_however_long_it_lasts() -> None:
         "min_clearance_m": pytest.approx(0.1 - 0.35),
         "time_within_1m_s": pytest.approx(7 * 0.5),
     }
+
+
+def test_what_happens_once_flockd_does_not_fly_any_more_counts_apart() -> None:
+    """Nearest is 0.78 m, in three dimensions, at 1 s; one drone is held since 0.9 s, then both."""
+    log, held = _hand_made(), {1: HandedOver(time_s=0.9, reason="gusts")}
+    of_one = summarise(replace(log, metadata=log.metadata.model_copy(update={"handed_over": held})))["handed_over"]
+    assert (of_one["drones"], of_one["first_s"], of_one["reasons"]) == (1, 0.9, ["gusts"])
+    assert of_one["min_distance_flown_m"] == pytest.approx(math.hypot(0.6, 0.5))
+    both = held | {0: HandedOver(time_s=0.2, reason="gusts")}
+    of_both = summarise(replace(log, metadata=log.metadata.model_copy(update={"handed_over": both})))["handed_over"]
+    assert of_both["first_s"] == 0.2
+    assert of_both["min_distance_flown_m"] > 0.78, "from 0.5 s to 1 s, in whose step both were handed over, counts"
+    of_none = summarise(log)["handed_over"]
+    assert (of_none["drones"], of_none["first_s"], of_none["collisions_flown"]) == (0, None, None)
+
+
+def test_what_gates_slowed_drones_down_for_is_told_apart() -> None:
+    log, by_cause = _hand_made(), {"neighbour": 0.011, "false_detection": 0.0009}
+    facts = {"gated": True, "slowed_share": 0.03, "slowed_by": by_cause}
+    summary = summarise(replace(log, metadata=log.metadata.model_copy(update=facts)))
+    assert causes_text(summary) == "neighbours 1.1 %, false detections 0.1 %"
+    (slowed,) = [fact for fact in page_texts(summary, log)["facts"] if fact["name"] == "Slowed"]
+    assert slowed["remark"] == "of the time, by safety gates: neighbours 1.1 %, false detections 0.1 %"

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from flockd.cli import main
+from flockd.cli import installing, main
 from flockd.onboard.recording.own_path import OwnPath
 from flockd.onboard.recording.reader import RecordedStep, Recording
 from tests.onboard.recording.made_up import record
@@ -56,7 +56,7 @@ def test_without_rerun_it_says_what_to_install(
     monkeypatch.delitem(sys.modules, "flockd.review.view.rerun_file", raising=False)
     monkeypatch.setitem(sys.modules, "rerun", None)
     out, err = told(capsys, 69, NORMAL, "--save", tmp_path / "x.rrd")
-    assert (out, err) == ("", "rerun is not installed; run: pip install 'flockd[view]'\n")
+    assert (out, err) == ("", f"rerun is not installed; run: {installing('view')}\n")
     assert list(tmp_path.iterdir()) == []
 
 

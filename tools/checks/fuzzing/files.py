@@ -1,4 +1,4 @@
-"""Files: configurations, manifests, recordings, data sets."""
+"""Files: configurations, manifests, recordings, data sets, images, campaigns, logs of autopilots."""
 
 from __future__ import annotations
 
@@ -6,25 +6,35 @@ import dataclasses
 import itertools
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from random import Random
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
 
+from flockd.campaign.flight_kinds import FlownRun
+from flockd.campaign.flight_plan import Plan, Run
+from flockd.campaign.flight_table import FlightTable, write_table
+from flockd.campaign.folder import FLIGHTS_NAME, PLAN_NAME, TIMINGS_NAME, CampaignFolder
+from flockd.campaign.results import Results
 from flockd.core.config import load_with_places
 from flockd.flight.geometry import build_rig
 from flockd.flight.inference import read_manifest
 from flockd.flight.perception.requirements import check_roles
 from flockd.ground.datasets import open_dataset
+from flockd.ground.datasets.image_files import read_image
 from flockd.onboard.recording.editing import recover
 from flockd.onboard.recording.export import export_images, export_tables
 from flockd.onboard.recording.info import recording_info
 from flockd.onboard.recording.mcap_file import Damage, Entry, Inclosure, McapFile, Note, Record, read_records
 from flockd.onboard.recording.reader import Recording
-from tools.checks.fuzzing.mutation import mutated_bytes, mutated_json, mutated_lines
-from tools.checks.fuzzing.target import CORPUS, ROOT, Check, Target, own_errors
+from flockd.review.flight_log.ulog import autopilot_log, read_ulog
+from tools.checks.fuzzing.mutation import any_float, mutated_bytes, mutated_json, mutated_lines, nested
+from tools.checks.fuzzing.target import CORPUS, ROOT, Check, Target, odd_file, own_errors, removed
 
 MOST_FRAMES = 50
 """Read of a mutated data set."""
@@ -39,6 +49,16 @@ def _text(random: Random, texts: Sequence[str]) -> bytes:
     return mutated_bytes(random, data) if random.random() < 0.4 else data
 
 
+def _put(random: Random, path: Path, content: Callable[[], bytes]) -> None:
+    """Now and then something else than a file, or deep nesting in one."""
+    removed(path)
+    odd = random.random()
+    if odd < 0.01:
+        odd_file(random, path)
+    else:
+        path.write_bytes(nested(random) if odd < 0.02 else content())
+
+
 def _configurations(folder: Path) -> Check:
     shutil.copytree(ROOT / "config", folder, dirs_exist_ok=True)
     small = [path.read_text(encoding="utf-8") for path in sorted(CORPUS.glob("*.yaml"))]
@@ -47,7 +67,7 @@ def _configurations(folder: Path) -> Check:
     file = folder / "mutated.yaml"
 
     def check(random: Random) -> None:
-        file.write_bytes(_text(random, texts))
+        _put(random, file, lambda: _text(random, texts))
         with own_errors():
             config, _ = load_with_places(file)
             drone = config.drone if hasattr(config, "drone") else config
@@ -63,7 +83,7 @@ def _manifests(folder: Path) -> Check:
     file = folder / "mutated.yaml"
 
     def check(random: Random) -> None:
-        file.write_bytes(_text(random, texts))
+        _put(random, file, lambda: _text(random, texts))
         with own_errors():
             read_manifest(file, check_roles).read_model()
 
@@ -77,7 +97,10 @@ def _recordings(folder: Path) -> Check:
     (tables / "csv").mkdir(parents=True)
 
     def check(random: Random) -> None:
-        if random.random() < 0.3:
+        removed(file)
+        if random.random() < 0.01:
+            odd_file(random, file)
+        elif random.random() < 0.3:
             file.write_bytes(mutated_bytes(random, whole))
         else:
             with McapFile(file) as written:
@@ -139,7 +162,7 @@ def _changed_json(random: Random, data: bytes) -> bytes:
     if random.random() < 0.1:
         return mutated_bytes(random, data)
     if random.random() < 0.02:
-        return b"[" * 100_000
+        return nested(random)
     try:
         changed = mutated_json(random, json.loads(data))
     except (ValueError, RecursionError):  # changed before
@@ -158,7 +181,10 @@ def _datasets(folder: Path) -> Check:
         for path in touched:
             original = originals[path]
             is_text = path.suffix in {".txt", ".csv", ".yaml"}
-            path.write_bytes(_text(random, [original.decode()]) if is_text else mutated_bytes(random, original))
+            if random.random() < 0.02:
+                odd_file(random, path)
+            else:
+                path.write_bytes(_text(random, [original.decode()]) if is_text else mutated_bytes(random, original))
         try:
             with own_errors():
                 dataset = open_dataset(root)
@@ -166,9 +192,147 @@ def _datasets(folder: Path) -> Check:
                     pass
         finally:
             for path in touched:
+                removed(path)
                 path.write_bytes(originals[path])
 
     return check
+
+
+# -------------------------------------------------------------------------------------------------------------- images
+
+
+def _images(folder: Path) -> Check:
+    """What a decoder would take long for, or much memory, beside what is damaged."""
+    rows, columns = np.mgrid[0:240, 0:320]
+    pixels = np.stack([rows, columns % 256, (rows * columns) % 256], axis=2).astype(np.uint8)
+    suffixes = (".jpg", ".png", ".bmp", ".ppm", ".tif")
+    written = [(suffix, cv2.imencode(suffix, pixels)[1].tobytes()) for suffix in suffixes]
+    progressive = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    sized = progressive.index(b"\xff\xc2") + 5
+
+    def check(random: Random) -> None:
+        suffix, data = random.choice((*written, (".jpg", progressive), (".jpg", progressive)))
+        if data is progressive:
+            if random.random() < 0.5:
+                side = random.choice((64, 1000, 4096, 8000, 8192, 20_000, 65_535)).to_bytes(2)
+                data = data[:sized] + side + side + data[sized + 4 :]
+            if random.random() < 0.7:
+                data = _with_scans(random, data)
+        if random.random() < 0.6:
+            data = mutated_bytes(random, data)
+        path = folder / f"image{suffix}"
+        _put(random, path, lambda: data)
+        with own_errors():
+            assert read_image(path, upright=random.random() < 0.5).shape[2] == 3
+        removed(path)
+
+    return check
+
+
+def _with_scans(random: Random, data: bytes) -> bytes:
+    """With one of its scans, and its tables, some times more."""
+    scans = [at for at in range(len(data)) if data.startswith(b"\xff\xda", at)]
+    which = random.randrange(len(scans))
+    begin = max(data.rfind(b"\xff\xc4", 0, scans[which]), 0)
+    end = scans[which + 1] if which + 1 < len(scans) else len(data) - 2
+    return data[:end] + data[begin:end] * random.choice((1, 10, 90, 500, 5_000)) + data[end:]
+
+
+# ----------------------------------------------------------------------------------------------------------- campaigns
+
+
+def _campaigns(folder: Path) -> Check:
+    file = folder / "campaign.yaml"
+    scenario = ROOT / "config" / "paper_flight.yaml"
+    vary = "vary: {drone.flocking.cohesion: {values: [0.1, 0.2]}}\nmeasure: [order_tail]\n"
+    file.write_text(f"campaign: fuzz\nscenario: {scenario}\nseeds: 2\nscatter_m: 0.5\n{vary}", encoding="utf-8")
+    plan, path = Plan.load(file), folder / "out"
+    flown = [FlownRun(Run(cell, number), {"order_tail": 0.9}) for cell in range(2) for number in range(2)]
+    with CampaignFolder(path, plan) as campaign:
+        for one in flown[:3]:
+            campaign.add([one])
+        campaign.merge()
+    originals = {one.relative_to(path): one.read_bytes() for one in path.rglob("*") if one.is_file()}
+    values = json.loads(originals[Path(PLAN_NAME)])
+
+    def check(random: Random) -> None:
+        shutil.rmtree(path)
+        (path / "parts").mkdir(parents=True)
+        for original, data in originals.items():
+            (path / original).write_bytes(data)
+        write_table(FlightTable(plan).rows(flown[3:]), path / "parts" / "c1-s1.parquet")
+        name = random.choice((PLAN_NAME, PLAN_NAME, FLIGHTS_NAME, TIMINGS_NAME, "parts/c1-s1.parquet", ".lock"))
+        if name == PLAN_NAME and random.random() < 0.7:
+            changed = json.dumps(mutated_json(random, values)).encode("utf-8", "surrogatepass")
+            _put(random, path / name, lambda: changed)
+        elif name.endswith("parquet") and random.random() < 0.4:
+            source = random.choice((FLIGHTS_NAME, TIMINGS_NAME))
+            (path / name).write_bytes(originals[Path(source)])
+        else:
+            content = (path / name).read_bytes() or b"?"
+            _put(random, path / name, lambda: mutated_bytes(random, content))
+        with own_errors():
+            results = Results.load(path)
+            for cell in results.plan.cells[:20]:
+                results.interval("order_tail", [cell.number])
+        with own_errors(), CampaignFolder(path, plan) as campaign:
+            list(campaign.finished(None))
+
+    return check
+
+
+# --------------------------------------------------------------------------------------------------- autopilots' logs
+
+
+def _ulog_files(folder: Path) -> Check:
+    whole = (CORPUS / "log.ulg").read_bytes()
+    path = folder / "log.ulg"
+
+    def check(random: Random) -> None:
+        _put(random, path, lambda: mutated_bytes(random, whole))
+        with own_errors(), suppress(FileNotFoundError):  # as the command reports by itself
+            read_ulog(path, patience_s=4.0)
+
+    return check
+
+
+def _ulog_contents(folder: Path) -> Check:
+    """Numbers of a log that can be read: laid on a flight's time, whatever they are."""
+    whole = read_ulog(CORPUS / "log.ulg")
+    times_s = 0.5 * np.arange(20)
+    command = np.stack([np.sin(times_s), np.cos(times_s)], axis=1)[:, None]
+    computer_s = np.arange(0.0, 10.0)
+    metadata = SimpleNamespace(names=["a"], clock_at_start_s=0.0)
+    log: Any = SimpleNamespace(time_s=times_s, command_velocity=command, metadata=metadata)
+
+    def check(random: Random) -> None:
+        topics = {
+            name: {field: _spoiled(random, values) for field, values in topic.items()}
+            for name, topic in whole.topics.items()
+        }
+        texts = [one._replace(time_us=int(random.choice((0, one.time_us, 2**63, 2**64 - 1)))) for one in whole.texts]
+        ulog = dataclasses.replace(whole, topics=topics, texts=texts)
+        clock = None if random.random() < 0.5 else (computer_s, np.full(10, any_float(random)))
+        with own_errors():
+            autopilot_log(ulog, Path("log.ulg"), log, 0, clock)
+
+    return check
+
+
+def _spoiled(random: Random, values: Any) -> Any:
+    """An array with some numbers that are anything."""
+    if random.random() < 0.8:
+        return values
+    changed = np.array(values)
+    for _ in range(random.choice((1, 3))):
+        at = random.randrange(len(changed))
+        if changed.dtype.kind == "f":
+            with np.errstate(over="ignore"):
+                changed[at] = any_float(random)
+        else:
+            info = np.iinfo(changed.dtype)
+            changed[at] = random.choice((info.min, info.max, 0, 1, random.randint(int(info.min), int(info.max))))
+    return changed
 
 
 def _image(path: Path, *, depth: bool = False) -> None:
@@ -219,4 +383,8 @@ TARGETS = (
     Target("manifests", 10, _manifests),
     Target("recordings", 10, _recordings),
     Target("datasets", 40, _datasets),
+    Target("images", 100, _images),
+    Target("campaigns", 6, _campaigns),
+    Target("ulog_files", 1, _ulog_files),
+    Target("ulog_contents", 30, _ulog_contents),
 )

@@ -28,6 +28,7 @@ from flockd.flight.safety import (
     Supervisor,
     Surroundings,
     Verdict,
+    link_lost,
 )
 from tools.checks.fuzzing.mutation import any_float
 from tools.checks.fuzzing.target import CORPUS, Check, Target
@@ -150,6 +151,7 @@ def assert_safe(verdict: Verdict, p: GateParameters, action: Action, around: Sur
         return
     assert action is not Action.SILENCE, "a setpoint without permission"
     assert np.isfinite([*setpoint.velocity, setpoint.height_m, setpoint.yaw_rad]).all(), "a setpoint is not finite"
+    assert abs(setpoint.yaw_rad) <= 2 * math.pi, f"a heading of {setpoint.yaw_rad}"
     assert p.min_height_m <= setpoint.height_m <= p.max_height_m, "a height outside the band"
     assert math.hypot(*setpoint.velocity) <= p.max_speed_m_s + ROUNDING, "a setpoint is too fast"
     if np.isfinite(around.position).all() and p.fence_radius_m is not None:
@@ -224,7 +226,9 @@ def _supervisor(folder: Path) -> Check:
             if moves:
                 assert inputs.flight_mode == OFFBOARD, "flies although the pilot does"
                 assert inputs.armed, "flies although it is not armed"
-                assert inputs.heartbeat_age_s <= parameters.heartbeat_timeout_s, "flies without a link"
+                assert link_lost(inputs.heartbeat_age_s, inputs.message_age_s, parameters) is None, (
+                    "flies without a link"
+                )
                 assert inputs.estimate_age_s <= parameters.estimate_timeout_s, "flies blindly"
                 assert not (inputs.shutdown_asked or inputs.hold_asked or inputs.land_asked), "flies on"
             if decision.action is not Action.SILENCE and decision.state is not State.READY:

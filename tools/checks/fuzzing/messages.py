@@ -27,7 +27,7 @@ from flockd.fleet.ros.order_requests import Whereabouts, goal_of, velocity_of
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.autopilot.mavlink_messages import ReceivedMessages
 from flockd.onboard.autopilot.mavsdk_link import RECEIVED
-from flockd.onboard.daemon.operator_commands import OperatorRequests, command_handler
+from flockd.onboard.daemon.operator_commands import OperatorCommands, OperatorRequests
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.mcap_file import RecordingError
 from flockd.onboard.recording.reader import decoded_image
@@ -38,7 +38,15 @@ from flockd.onboard.sources.ros_device import ENCODINGS
 from flockd.onboard.sources.shared_memory import SharedMemorySource
 from flockd.onboard.telemetry.order_messages import parse_order
 from flockd.onboard.telemetry.topics import TOPICS
-from tools.checks.fuzzing.mutation import ABSURD_NUMBERS, ABSURD_TEXTS, absurd, any_float, mutated_bytes, mutated_json
+from tools.checks.fuzzing.mutation import (
+    ABSURD_NUMBERS,
+    ABSURD_TEXTS,
+    absurd,
+    any_float,
+    mutated_bytes,
+    mutated_json,
+    nested,
+)
 from tools.checks.fuzzing.target import CORPUS, Check, Target, assert_readable
 
 COMMANDS = ("hold", "land", "goto", "velocity", "resume", "HOLD", "hold ", "hold/land", "__init__")
@@ -148,7 +156,7 @@ def _status(folder: Path) -> Check:
             message = mutated_json(random, examples[topic]) if random.random() < 0.9 else absurd(random)
             payload = json.dumps(message).encode("utf-8", "surrogatepass")
             if random.random() < 0.1:
-                payload = random.choice((mutated_bytes(random, payload), b"[" * 100_000, b"9" * 10_000))
+                payload = random.choice((mutated_bytes(random, payload), nested(random), b"9" * 10_000))
             key = f"flockd/v1/{random.choice(NAMES)}/{random.choice(NAMES)}/{topic}"
             watcher._take_message(_sample(key, payload))
             now_s[0] += random.choice((0.0, 0.1))
@@ -182,7 +190,8 @@ def _commands(folder: Path) -> Check:
     loop = asyncio.new_event_loop()
     allowed = ("hold", "land", "goto", "velocity")
     orders = ({"north_m": 3.0, "east_m": 1.0, "speed_m_s": 1.0}, {"velocity_ne": [1.0, 0.5], "height_m": 4.0})
-    seeds = [json.dumps(order).encode() for order in orders]
+    ask = {"identity": "d", "operator": "a", "session": "s", "sequence": 1, "time_s": 7.0}
+    seeds = [json.dumps({**ask, "order": order}).encode() for order in orders]
 
     def check(random: Random) -> None:
         said: list[str] = []
@@ -193,7 +202,8 @@ def _commands(folder: Path) -> Check:
         payload = random.choice(seeds)
         if random.random() < 0.7:
             payload = mutated_bytes(random, payload)
-        reply = command_handler(allowed, requests, missions, loop, said.append)(command, payload)
+        commands = OperatorCommands(allowed, requests, missions, loop, said.append, identity="d", clock=lambda: 8.0)
+        reply = commands.handle(command, payload)
         loop.call_soon(loop.stop)
         loop.run_forever()
         assert command in allowed or not reply["accepted"]

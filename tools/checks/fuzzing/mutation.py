@@ -13,13 +13,13 @@ Json = Any
 ABSURD_NUMBERS: tuple[int | float, ...] = (
     *(0, -1, 1, 2, 127, 128, 255, 256, -32768, 65535, 2**31 - 1, 2**31, -(2**31), 2**32, 2**53 + 1),
     *(2**63 - 1, 2**63, -(2**63) - 1, 2**64, 10**30, 10**400, 0.0, -0.0, 0.1, 1e-163, 5e-324, 1e-9, 1e9, 1e154, 1e308),
-    *(-1e308, math.inf, -math.inf, math.nan),
+    *(-1e308, 1.5e308, 1.7e308, 3.5e38, -3.5e38, 1e19, 1e300, math.inf, -math.inf, math.nan),
 )
 ABSURD_TEXTS = (
     *("", " ", "\0", "\x1b[2J\x1b[31m", "\x9b", "\u202e", "é", "\U0001f681", "a" * 5000, "nan", "inf", "null", "true"),
     *("~", "../../..", "/dev/zero", "/", "no such file", "1e999", "0x10", "1_000", "²", "12:30", "- ", "[", "{", "}"),
     *("&a", "*a", "!!python/name:os.system", "!!binary AA==", "\t", "%", "%YAML 9.9", "---", "...", '"', "'", "|", ">"),
-    *(": ", "#"),
+    *(": ", "#", "\ud800", "a\udfff", '"\\ud800"', '"a\\0b"'),
 )
 INTERESTING_BYTES = (0, 1, 9, 10, 13, 27, 32, 34, 39, 44, 45, 58, 91, 93, 123, 125, 127, 128, 192, 237, 255)
 
@@ -50,6 +50,13 @@ def mutated_bytes(random: Random, data: bytes) -> bytes:
             case 7 if random.random() < 0.2:
                 del changed[at:]
     return bytes(changed)
+
+
+def nested(random: Random) -> bytes:
+    """JSON, and nearly YAML, that is nested deeply: more than a person writes, or more than a stack takes."""
+    depth = random.choice((40, 200, 900, 5_000, 100_000))
+    opened, closed = random.choice(((b"[", b"]"), (b'{"a":', b"}"), (b'[{"a":', b"}]")))
+    return opened * depth + b"1" + closed * (depth if random.random() < 0.7 else 0)
 
 
 def mutated_lines(random: Random, text: str) -> str:
@@ -140,6 +147,8 @@ def _changed_somewhere(random: Random, value: Json) -> Json:
 def any_float(random: Random) -> float:
     """Small numbers most of the time, absurd ones now and then."""
     if random.random() < 0.15:
+        if random.random() < 0.3:  # finite, and somewhere between what is usual and the largest
+            return random.choice((-1.0, 1.0)) * math.pow(10.0, random.uniform(3.0, 308.0))
         number = random.choice(ABSURD_NUMBERS)
         return float(number) if abs(number) < 1e300 or isinstance(number, float) else math.inf
     return random.choice((0.01, 0.1, 1.0, 3.0, 10.0, 100.0)) * random.uniform(-1.0, 1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import unicodedata
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -47,3 +48,25 @@ def assert_readable(text: str) -> None:
     odd = {char for char in shown if char not in "\n\t" and unicodedata.category(char) in ("Cc", "Cf", "Cs")}
     assert not odd, f"control characters {sorted(odd)!a} reach the terminal"
     assert 0 < len(text) <= LONGEST_ERROR, f"an error has {len(text)} characters"
+
+
+def odd_file(random: Random, path: Path, *, folders: bool = True) -> None:
+    """Puts something in a file's place that is no ordinary file: who opens it may wait for ever."""
+    path.unlink(missing_ok=True)
+    match random.randrange(4 if folders else 3):
+        case 0:
+            os.mkfifo(path)
+        case 1:
+            path.symlink_to("/dev/zero")
+        case 2:
+            path.symlink_to("nowhere")
+        case _:
+            path.mkdir()
+
+
+def removed(path: Path) -> None:
+    """Removes what `odd_file` may have put there."""
+    if path.is_dir() and not path.is_symlink():
+        path.rmdir()
+    else:
+        path.unlink(missing_ok=True)

@@ -6,8 +6,8 @@ from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from flockd.core.config.perception import DetectionParameters
-from flockd.core.messages import Detection, Float32Array, Reason, UInt8Array, VehicleState
-from flockd.flight.geometry import Rig
+from flockd.core.messages import Detection, Reason, UInt8Array, VehicleState
+from flockd.flight.geometry import RangeMap, Rig
 from flockd.flight.perception.detection.from_depth import candidates_from_depth
 from flockd.flight.perception.detection.instances import Instance
 from flockd.flight.perception.detection.masks import DroneMasks, MaskRenderer, first_stage_labels
@@ -58,7 +58,7 @@ class Detector:
         self,
         images: Mapping[str, UInt8Array],
         scenes: Mapping[str, SceneMaps],
-        depths: Mapping[str, Float32Array],
+        depths: Mapping[str, RangeMap],
         vehicle: VehicleState,
         predictions: Sequence[Prediction],
         trace: DetectionTrace,
@@ -68,7 +68,7 @@ class Detector:
         Args:
             images: (h, w, 3) by camera.
             scenes: what the first stage says of each.
-            depths: (h, w) metres, of the cameras that have them.
+            depths: (h, w) metres along the ray, of the cameras that have them.
             vehicle: for the attitude.
             predictions: of tracks, where the second stage searches too.
             trace: filled.

@@ -8,8 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from flockd.core.config.perception import DetectionParameters
-from flockd.core.messages import Float32Array
-from flockd.flight.geometry import Rig, RigCamera, log_polar
+from flockd.flight.geometry import RangeMap, Rig, RigCamera, log_polar
 from flockd.flight.perception.detection.instances import Instance
 from flockd.flight.perception.detection.proposals import Proposal
 from flockd.flight.perception.detection.refinement import Candidate
@@ -23,7 +22,7 @@ _MIN_ANGLE = 1e-3
 
 
 def candidates_from_depth(
-    rig: Rig, scenes: Mapping[str, SceneMaps], depths: Mapping[str, Float32Array], parameters: DetectionParameters
+    rig: Rig, scenes: Mapping[str, SceneMaps], depths: Mapping[str, RangeMap], parameters: DetectionParameters
 ) -> list[Candidate]:
     """One an instance of the first stage: the centre of the bounding box of its points. None without depth."""
     found = []
@@ -34,7 +33,7 @@ def candidates_from_depth(
 
 
 def _candidate(
-    camera: RigCamera, scene: SceneMaps, depth: Float32Array, instance: Instance, parameters: DetectionParameters
+    camera: RigCamera, scene: SceneMaps, depth: RangeMap, instance: Instance, parameters: DetectionParameters
 ) -> Candidate | None:
     rows, columns = np.nonzero(scene.labels == instance.label)
     pixels = np.asarray(np.stack([columns, rows], 1) + 0.5, np.float64)

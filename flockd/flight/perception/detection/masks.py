@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from flockd.core.messages import UNCLASSED, Detection, Float32Array, FloatArray, UInt8Array
-from flockd.flight.geometry import RigCamera, VirtualCrop
+from flockd.flight.geometry import RangeMap, RigCamera, VirtualCrop
 from flockd.flight.perception.detection.colour_model import reweight_by_colour
 from flockd.flight.perception.detection.instances import Instance
 from flockd.flight.perception.maps import SceneMaps
@@ -170,17 +170,17 @@ def without_borders(labels: UInt8Array, border_px: int) -> UInt8Array:
 
 
 def depth_of_drones(
-    depth: Float32Array, labels: UInt8Array, camera: RigCamera, detections: Sequence[Detection]
-) -> Float32Array:
+    depth: RangeMap, labels: UInt8Array, camera: RigCamera, detections: Sequence[Detection]
+) -> RangeMap:
     """The depth map (h, w) with each drone's pixels moved to its detection's range; their relief is kept."""
-    moved = depth.copy()
+    moved = RangeMap(depth.copy())
     for detection in detections:
         if camera.name not in detection.cameras:
             continue
         mine = labels == detection.label
-        z = float(camera.T_body_camera.inverse().apply(detection.position[None])[0, 2])
-        if z <= 0 or not mine.any():
+        if not mine.any():
             continue
-        relief = depth[mine] - np.median(depth[mine])
-        moved[mine] = z + np.clip(relief, -detection.size_m / 2, detection.size_m / 2)
+        range_m = float(np.linalg.norm(detection.position - camera.T_body_camera.translation))
+        relief = depth[mine] - np.nanmedian(depth[mine])
+        moved[mine] = range_m + np.clip(relief, -detection.size_m / 2, detection.size_m / 2)
     return moved

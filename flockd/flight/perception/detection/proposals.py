@@ -16,7 +16,7 @@ from flockd.core.config.perception import DetectionParameters
 from flockd.core.messages import UNCLASSED, BoolArray, FloatArray, Reason, ReasonKind, UInt8Array, VehicleState
 from flockd.flight.geometry import Rig, log_polar
 from flockd.flight.perception.detection.instances import Instance
-from flockd.flight.perception.detection.roi import CropRules, Roi, angle_between, roi_of_instance
+from flockd.flight.perception.detection.roi import CropRules, Roi, angle_between, pixel_angle, roi_of_instance
 from flockd.flight.perception.maps import SceneMaps
 from flockd.flight.tracking import Prediction
 
@@ -55,9 +55,10 @@ def propose_instances(
 ) -> list[Proposal]:
     """What the first stage segments, of each image those of the highest score, in the order of the instances."""
     return [
-        Proposal((name,), roi_of_instance(rig.cameras[name], instance, rules), instance)
+        Proposal((name,), roi, instance)
         for name, scene in scenes.items()
         for instance in best_instances(scene, parameters.max_proposals)
+        if (roi := roi_of_instance(rig.cameras[name], instance, rules)) is not None
     ]
 
 
@@ -95,10 +96,12 @@ def propose_predictions(
             continue
         range_m = math.exp(log_range)
         covariance = R_body_ned @ prediction.covariance @ R_body_ned.T / range_m**2
-        roi = Roi(bearing, rules.half_angle(prediction.size_m, range_m))
         cameras = tuple(name for name, pixel in rig.pixels_of(place[None]).items() if np.isfinite(pixel).all())
+        if not cameras:
+            continue
+        roi = Roi(bearing, rules.half_angle(prediction.size_m, range_m, pixel_angle(rig, cameras, bearing)))
         found = any(angle_between(roi.direction, bearing) < roi.half_angle for bearing in detected)
-        if cameras and not found:
+        if not found:
             proposals.append(Proposal(cameras, roi, predicted=Predicted(bearing, log_range, covariance)))
     return proposals, reasons
 
@@ -132,7 +135,11 @@ def propose_residuals(
             camera = rig.cameras[name]
             most = min(parameters.max_residuals, parameters.max_proposals - len(proposed))
             blobs = largest_blobs(residual, most, parameters.residual_px)
-            proposals += [Proposal((name,), roi_of_instance(camera, blob, rules), blob) for blob in blobs]
+            proposals += [
+                Proposal((name,), roi, blob)
+                for blob in blobs
+                if (roi := roi_of_instance(camera, blob, rules)) is not None
+            ]
     return proposals
 
 

@@ -14,7 +14,7 @@ from flockd.core.messages import FloatArray, Reason, ReasonKind, UInt8Array
 from flockd.flight.geometry import Rig, VirtualCrop, log_polar, log_polar_covariance, log_polar_residual
 from flockd.flight.perception.detection.masks import CropMask
 from flockd.flight.perception.detection.proposals import Proposal
-from flockd.flight.perception.detection.roi import Roi, take_crop
+from flockd.flight.perception.detection.roi import Roi, pixel_angle, take_crop
 from flockd.flight.perception.detection.second_stage import SecondStage
 from flockd.flight.perception.maps import Crop, KnownSize, RangeEstimate
 
@@ -228,7 +228,8 @@ class Cascade:
         """With the drone in its middle, or where the proposal was if no camera sees that direction."""
         seen = bool(rig.covers(candidate.bearing[None])[0])
         direction = candidate.bearing if seen else stage.proposal.roi.direction
-        half_angle = self._rules.half_angle(candidate.size_m, candidate.range_m, stage.roi.half_angle)
+        finest = pixel_angle(rig, stage.proposal.cameras, direction)
+        half_angle = self._rules.half_angle(candidate.size_m, candidate.range_m, finest, stage.roi.half_angle)
         return Roi(direction, half_angle, candidate.range_m)
 
     def _would_repeat(self, roi: Roi, further: Roi) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,23 +29,27 @@ class CropRules:
     """The same where the image's border cuts the box: the drone is larger than what is seen of it."""
     mirror_scale: float
     """Width of the mirrored crop over what suits the drone."""
-    min_half_angle: float
+    min_half_width_px: float
+    """In pixels of the camera's image."""
     max_half_angle: float
     max_resize: float
     """A further crop is at most this many times as wide as the last one, and at least as much narrower."""
     max_crops: int
     """The most crops of one proposal, before the mirrored one."""
 
-    def half_angle(self, size_m: float, range_m: float, before: float | None = None) -> float:
-        """Half the angle, rad, of a crop that suits a drone of known size and range, not far from what it was."""
+    def half_angle(self, size_m: float, range_m: float, pixel_angle: float, before: float | None = None) -> float:
+        """Half the angle, rad, of a crop that suits a drone of known size and range, not far from what it was.
+
+        ``pixel_angle``: rad a pixel of the camera's image there.
+        """
         angle = math.atan(self.fill * size_m / range_m)
         if before is not None:
             angle = min(max(angle, before / self.max_resize), before * self.max_resize)
-        return self.bounded(angle)
+        return self.bounded(angle, pixel_angle)
 
-    def bounded(self, half_angle: float) -> float:
+    def bounded(self, half_angle: float, pixel_angle: float) -> float:
         """Within what the network was trained on."""
-        return min(max(half_angle, self.min_half_angle), self.max_half_angle)
+        return min(max(half_angle, self.min_half_width_px * pixel_angle), self.max_half_angle)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,18 +74,31 @@ class Roi:
         return moved < shift and resized < math.log(resize)
 
 
-def roi_of_instance(camera: RigCamera, instance: Instance, rules: CropRules) -> Roi:
-    """Around a box of the first stage."""
+def roi_of_instance(camera: RigCamera, instance: Instance, rules: CropRules) -> Roi | None:
+    """Around a box of the first stage; None where the lens images nothing there."""
     left, top, right, bottom = instance.box
     corners = np.array([[left, top], [right, top], [left, bottom], [right, bottom], instance.centre])
     rays = camera.camera.rays(corners)
     inside = camera.camera.in_image(instance.centre[None])[0] and np.isfinite(rays[4]).all()
-    centre = rays[4] if inside else rays[:4].mean(0) / np.linalg.norm(rays[:4].mean(0))
-    reach = float(np.arccos(np.clip(rays[:4] @ centre, -1, 1)).max())
+    imaged = rays[:4][np.isfinite(rays[:4, 0])]  # a corner may lie outside a fisheye's image circle
+    if not len(imaged):
+        return None
+    centre = rays[4] if inside else imaged.mean(0) / np.linalg.norm(imaged.mean(0))
+    reach = float(np.arccos(np.clip(imaged @ centre, -1, 1)).max())
     far_border = np.array(camera.camera.size) - _BORDER_PX
     cut = bool((instance.box[:2] < _BORDER_PX).any() or (instance.box[2:] > far_border).any())
-    half_angle = rules.bounded((rules.cut_margin if cut else rules.first_margin) * reach)
+    pixel_angle = float(camera.camera.pixel_angle(centre[None])[0])
+    half_angle = rules.bounded((rules.cut_margin if cut else rules.first_margin) * reach, pixel_angle)
     return Roi(camera.T_body_camera.rotation @ centre, half_angle)
+
+
+def pixel_angle(rig: Rig, cameras: Iterable[str], direction: FloatArray) -> float:
+    """rad a pixel along a body direction (3,), of the camera among these that sees the finest there."""
+    angles = [
+        float(camera.camera.pixel_angle((direction @ camera.T_body_camera.rotation)[None])[0])
+        for camera in (rig.cameras[name] for name in cameras)
+    ]
+    return min(angle for angle in angles if angle > 0.0)
 
 
 def take_crop(rig: Rig, images: Mapping[str, UInt8Array], roi: Roi, size_px: int) -> tuple[Crop, VirtualCrop]:

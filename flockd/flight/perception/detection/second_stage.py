@@ -59,7 +59,7 @@ class SecondStage:
                 first_margin=crop.first_margin,
                 cut_margin=crop.cut_margin,
                 mirror_scale=crop.mirror_scale,
-                min_half_angle=math.radians(crop.min_half_angle_deg),
+                min_half_width_px=crop.min_half_width_px,
                 max_half_angle=math.radians(crop.max_half_angle_deg),
                 max_resize=crop.max_resize,
                 max_crops=crop.max_crops,

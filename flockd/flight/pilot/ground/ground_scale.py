@@ -22,7 +22,7 @@ from flockd.flight.geometry import (
     RigidTransform,
     fit_ground,
     grid_pixels,
-    inverse_depths,
+    inverse_ranges,
     scale_on_track,
 )
 from flockd.flight.perception import CameraObservation, Observation
@@ -82,10 +82,11 @@ def _samples(
     column, row = end.astype(np.int64).T
     background = now.labels[row, column] == 0
     start, end = start[background], end[background]
-    inverse, baseline = inverse_depths(camera, RigidTransform(ego.rotation, ego.translation), start, end)
+    inverse, baseline = inverse_ranges(camera, RigidTransform(ego.rotation, ego.translation), start, end)
     R_ned_body, mount = observation.vehicle.R_ned_body, camera.T_body_camera
-    rays = camera.camera.unproject(end, np.ones(len(end))) @ (R_ned_body @ mount.rotation).T
+    seen = camera.camera.rays(end)
+    rays = seen @ (R_ned_body @ mount.rotation).T
     clear = (baseline > MIN_BASELINE_M) & (inverse > 0.0) & np.isfinite(rays).all(axis=1)  # false for NaN
     offsets = np.broadcast_to(R_ned_body @ mount.translation, rays.shape)
-    sigma = FLOW_SIGMA_PX / camera.camera.focal_px / np.maximum(baseline, MIN_BASELINE_M)
+    sigma = FLOW_SIGMA_PX * camera.camera.pixel_angle(seen) / np.maximum(baseline, MIN_BASELINE_M)
     return GroundSamples(rays, inverse, offsets, sigma).select(clear)

@@ -10,6 +10,7 @@ import pytest
 
 from flockd.core.config.perception import DetectionParameters
 from flockd.core.messages import UNCLASSED, BoolArray, Detection, UInt8Array
+from flockd.flight.geometry import ZMap
 from flockd.flight.perception import Crop, Instance, RangeEstimate, SceneMaps
 from flockd.flight.perception.detection.detector import DetectionTrace, Detector
 from flockd.flight.perception.detection.masks import DroneLogits, DroneMasks, first_stage_labels, without_borders
@@ -145,7 +146,7 @@ def test_instances_get_the_labels_of_their_detections() -> None:
     instances = tuple(Instance(k, np.zeros(2), np.zeros(4), 1.0) for k in (1, 2, 3))
     labels = np.array([[0, 1, 2, 3, 1]], np.uint8)
     uncertain = np.array([[False, False, False, False, True]])
-    scene = SceneMaps(np.ones((1, 5), np.float32), labels, instances, uncertain=uncertain)
+    scene = SceneMaps(ZMap(np.ones((1, 5), np.float32)), labels, instances, uncertain=uncertain)
     relabelled = first_stage_labels(scene, {1: 7}, rejected=[instances[1]])
     assert relabelled.tolist() == [[0, 7, 0, UNCLASSED, UNCLASSED]]
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from flockd.core.config.perception import DetectionParameters
 from flockd.core.messages import UNCLASSED
-from flockd.flight.geometry import Rig
+from flockd.flight.geometry import Rig, ZMap
 from flockd.flight.perception import Instance, SceneMaps, group_instances
 from flockd.flight.perception.detection.proposals import propose_instances, propose_residuals
 from tests.flight.perception.cameras import camera_of
@@ -29,7 +29,7 @@ def scene_of(*scores: float) -> SceneMaps:
         box = np.array([left, top, left + 8, top + 8], np.float64)
         instances.append(Instance(k + 1, box.reshape(2, 2).mean(0), box, 64.0, score))
     uncertain = np.zeros(labels.shape, np.bool_)
-    return SceneMaps(np.full(labels.shape, 5.0, np.float32), labels, tuple(instances), uncertain=uncertain)
+    return SceneMaps(ZMap(np.full(labels.shape, 5.0, np.float32)), labels, tuple(instances), uncertain=uncertain)
 
 
 def proposed(scene: SceneMaps, parameters: DetectionParameters) -> list[int]:

@@ -1,0 +1,101 @@
+"""Every check of one sensor against another: what is compared, how far apart it may be, and what is done. One table.
+
+As an extended Kalman filter's innovation checks do it: what one source says is compared with what the others lead to
+expect, and beyond the limit it is not used. The configuration's keys take their defaults from here, and all layers
+their other limits. Times and ages of messages stand in `services`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Check(NamedTuple):
+    """One check, as one of its users makes it."""
+
+    compared: str
+    """What, with what."""
+    limit: float
+    """In `unit`."""
+    unit: str
+    """`SD`: standard deviations of what is expected."""
+    reaction: str
+    """Beyond it: an event of the supervisor's, whose table says what is done, or a text."""
+    source: str
+    """Where the limit comes from."""
+    keys: tuple[str, ...] = ()
+    """Configuration keys whose default `limit` is."""
+
+
+RANGE_GROUND = Check(
+    "range to the ground, with the ground expected from the ranges before and the own motion",
+    4.0,
+    "SD",
+    "not used; the second in a row is believed, if the barometer does not contradict",
+    "PX4 1.18: EKF2_RNG_GATE 5 SD",
+    ("perception.range_finder.gate_sigma",),
+)
+RANGE_BAROMETER = Check(
+    "height of the ground by range finder and barometer, between two places of the last seconds",
+    1.0,
+    "m",
+    "the second in a row: the range finder is not used, the scale is the barometer's",
+    "steps of the ground, and a barometer's drift in 15 s; PX4's own check (EKF2_RNG_K_GATE 1 SD) needs still ground",
+    ("perception.range_finder.tolerance_m",),
+)
+RANGE_SLOPE = Check(
+    "the same, for each metre between the places",
+    0.25,
+    "m/m",
+    "as for the one above",
+    "hills of 15 % with bumps; PX4 1.18: EKF2_TERR_GRAD 0.5",
+    ("perception.range_finder.max_slope",),
+)
+RANGE_REPEATED = Check(
+    "change of the barometer's height, while eight ranges and more are the same to the last bit",
+    0.5,
+    "m",
+    "the range finder is not used before it says something else, and agrees",
+    "PX4 1.18: range_stuck_threshold 0.1 m; more, as a range in whole centimetres may repeat along a slope",
+)
+RANGE_VISION = Check(
+    "way flown by the images, whose scale is the range, with the way by the autopilot, over 5 m and more",
+    3.0,
+    "SD",
+    "the range finder is not used where the barometer's height fits better",
+    "PX4 1.18: EKF2_EVV_GATE 3 SD; its velocity wanders by 0.15 m/s for seconds (measured in its simulator)",
+)
+EGO_MOTION = Check(
+    "velocity by the images, with the one before",
+    6.0,
+    "m/s²",
+    "the ego-motion is refused, twice in a row at most; then the velocity before is doubted",
+    "what a multirotor does that leans by 30 degrees",
+    ("geometry.max_acceleration_m_s2",),
+)
+STAMP = Check(
+    "time of a message by its stamp and TIMESYNC's clock, with its arrival: between 0 and the shortest round trip",
+    0.005,
+    "s",
+    "messages count from when they arrive; after 1.5 s an event",
+    "a turn of 60 degrees a second is 0.3 degrees in it",
+)
+RESPONSE_DEGRADED = Check(
+    "velocity flown, with the one commanded (root mean square over ten seconds)",
+    0.6,
+    "m/s",
+    "gusts_strong",
+    "campaigns of gusts: no two drones touch",
+    ("safety.degraded_gusts_m_s",),
+)
+RESPONSE = Check(
+    "the same",
+    0.8,
+    "m/s",
+    "gusts_too_strong",
+    "likewise",
+    ("safety.max_gusts_m_s",),
+)
+
+CHECKS = tuple(one for one in list(globals().values()) if isinstance(one, Check))
+"""All of them, in this order."""

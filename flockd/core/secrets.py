@@ -1,0 +1,27 @@
+"""Passwords in what a configuration says: where they stand, and the same without them."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+MASK = "***"
+_OF_URL = re.compile(r"(?<=://)[^\s\"']*(?=@)")
+"""A user and a password before the host: `rtsp://user:password@camera/stream`."""
+_NAMED = re.compile(
+    r"([\w-]*(?:passw|passphrase|user-pw|proxy-pw|secret|token|private_key|cookies|extra-headers)[\w-]*\s*=\s*)"
+    r"(\"(?:[^\"\\]|\\.)*\"|'[^']*'|[^\s!;&#]+)",
+    re.IGNORECASE,
+)
+"""A property of a GStreamer element, a parameter of an address: `user-pw=password`."""
+
+
+def masked(value: Any) -> Any:
+    """The same with `***` for each password: of a text, or of the texts in lists and objects."""
+    if isinstance(value, str):
+        return _NAMED.sub(rf"\1{MASK}", _OF_URL.sub(MASK, value))
+    if isinstance(value, dict):
+        return {key: masked(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [masked(inner) for inner in value]
+    return value

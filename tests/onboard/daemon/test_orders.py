@@ -1,0 +1,178 @@
+"""Operators' orders: each counts once, while it is new and for the drone that it names, and however many come."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flockd.core.messages import MissionOrder
+from flockd.onboard.daemon.message_sinks import BACKLOG, MessageSinks
+from flockd.onboard.daemon.operator_commands import OperatorCommands, OperatorRequests
+from flockd.onboard.daemon.order_checks import LATEST_S, MOST_SESSIONS, RECENT_S
+from flockd.onboard.telemetry.topics import AnswerMessage
+from tests.onboard.daemon.aboard import config_for
+
+ALLOWED = ("hold", "land", "resume", "goto")
+GOAL = {"north_m": 3.0, "east_m": 1.0}
+
+
+class Drone:
+    """Takes every order that the checks let through; its clock is set by hand."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+        self.said: list[str] = []
+        self.goals: list[MissionOrder] = []
+        self.requests, self.loop = OperatorRequests(), asyncio.new_event_loop()
+        self.commands = OperatorCommands(
+            ALLOWED, self.requests, self, self.loop, self.said.append, identity="1f", clock=lambda: self.now_s
+        )
+
+    def fault(self, order: MissionOrder) -> None:
+        """None is refused."""
+
+    def apply(self, order: MissionOrder) -> None:
+        self.goals.append(order)
+
+    def order(self, command: str, sequence: int, **more: Any) -> AnswerMessage:
+        """An order of anna's, given now."""
+        ask = {"identity": "1f", "operator": "anna", "session": "a", "sequence": sequence, "time_s": self.now_s}
+        ask |= {"order": GOAL if command == "goto" else None, **more}
+        answer = self.commands.handle(command, json.dumps(ask).encode())
+        self.loop.call_soon(self.loop.stop)
+        self.loop.run_forever()
+        return answer
+
+
+@pytest.fixture
+def drone() -> Drone:
+    return Drone()
+
+
+def test_an_order_is_taken_once_and_says_who_gave_it(drone: Drone) -> None:
+    assert drone.order("hold", 1)["accepted"]
+    assert drone.requests.hold
+    assert drone.said == ["an operator asked for hold: anna, order 1"]
+    drone.requests.hold = False
+    answer = drone.order("hold", 1)
+    assert answer == {"accepted": False, "sentence": "order 1 or a later one of this sender has come before"}
+    assert not drone.requests.hold
+    assert not drone.order("goto", 0)["accepted"], "an earlier one that came late"
+    assert drone.order("goto", 2)["accepted"]
+    assert [goal.place.tolist() for goal in drone.goals if goal.place is not None] == [[3.0, 1.0]]
+
+
+@pytest.mark.parametrize(("age_s", "taken"), [(0.0, True), (4.9, True), (5.1, False), (-0.4, True), (-0.6, False)])
+def test_an_order_counts_while_it_is_new(drone: Drone, age_s: float, taken: bool) -> None:
+    answer = drone.order("land", 1, time_s=drone.now_s - age_s)
+    assert (answer["accepted"], drone.requests.land) == (taken, taken)
+    assert taken or f"an order counts for {LATEST_S:g} s; give it again" in answer["sentence"]
+
+
+def test_an_order_for_another_drone_of_the_same_name_is_refused(drone: Drone) -> None:
+    answer = drone.order("hold", 1, identity="2e")
+    assert answer == {
+        "accepted": False,
+        "sentence": "it is for another drone of this name, with the identity '2e'",
+    }
+    assert not drone.requests.hold
+
+
+def test_of_two_operators_the_later_one_wins_and_both_are_seen(drone: Drone) -> None:
+    """Their orders overtake each other on the way; a hold is taken all the same."""
+    given_s = drone.now_s
+    drone.now_s += 1.0
+    assert drone.order("resume", 7, operator="bert", session="b")["accepted"]
+    drone.now_s += 1.0
+    late = drone.order("goto", 1, time_s=given_s)
+    assert late == {"accepted": False, "sentence": "bert gave a later order, resume, that has come before"}
+    assert drone.goals == []
+    assert drone.order("hold", 2, time_s=given_s)["accepted"]
+    assert drone.commands.recent() == [
+        {"operator": "anna", "command": "hold", "sequence": 2, "age_s": 0.0},
+        {"operator": "bert", "command": "resume", "sequence": 7, "age_s": 1.0},
+    ]
+    drone.now_s += RECENT_S - 0.5
+    assert [order["operator"] for order in drone.commands.recent()] == ["anna"]
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"", b"{}", b"[]", b"\xff", b"[" * 4000, b"9" * 5000, json.dumps({"north_m": 1, "east_m": 2}).encode(),
+        b'{"identity":"1f","operator":"","session":"a","sequence":1,"time_s":1000.0,"order":null}',
+        b'{"identity":"1f","operator":"a\\u001b","session":"a","sequence":1,"time_s":1000.0,"order":null}',
+        b'{"identity":"1f","operator":"a","session":"a","sequence":1e3,"time_s":1000.0,"order":null}',
+        b'{"identity":"1f","operator":"a","session":"a","sequence":1,"time_s":NaN,"order":null}',
+        b'{"identity":"1f","operator":"a","session":"a","sequence":1,"time_s":1e308,"order":null}',
+        b'{"identity":"\\ud800","operator":"a","session":"a","sequence":1,"time_s":1000.0,"order":null}',
+    ],
+)  # fmt: skip
+def test_what_does_not_say_who_gives_it_is_no_order(drone: Drone, payload: bytes) -> None:
+    answer = drone.commands.handle("hold", payload)
+    assert answer["accepted"] is False
+    assert answer["sentence"].startswith("an order")
+    assert drone.commands.refused == 1
+
+
+def test_sessions_without_end_do_not_fill_the_memory(drone: Drone) -> None:
+    for number in range(3 * MOST_SESSIONS):
+        assert drone.order("hold", 1, session=f"{number}", operator=f"{number}")["accepted"]
+    assert len(drone.commands._checks._sequences) == MOST_SESSIONS
+    assert len(drone.commands.recent()) == 8
+
+
+@pytest.mark.parametrize(("per_second", "accepted"), [(2000, False), (10, False), (2000, True)])
+def test_a_hundred_thousand_orders_fill_neither_log_nor_recording_and_displace_no_telemetry(
+    tmp_path: Path, per_second: int, accepted: bool
+) -> None:
+    """The real sinks; beside the orders the drone tells its state ten times a second."""
+    told: list[Mapping[str, object]] = []
+
+    class Telemetry:
+        def publish(self, drone: str, topic: str, message: Mapping[str, object]) -> None:
+            told.append(message)
+
+    config = config_for(1, "tcp/127.0.0.1:1", "tcp/127.0.0.1:2")
+    drone = Drone()
+    sinks = MessageSinks(config, Telemetry(), {}, tmp_path, lambda: drone.now_s)
+    log = logging.getLogger("flockd.onboard.daemon.message_sinks")
+    handler = logging.FileHandler(tmp_path / "log")
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    drone.commands = OperatorCommands(
+        ALLOWED, drone.requests, drone, drone.loop, sinks.event, identity="1f", clock=lambda: drone.now_s
+    )
+    sinks.begin_recording()
+    ask = {"identity": "1f", "operator": "anna", "session": "a", "order": None}
+    states = 0
+    try:
+        for number in range(100_000):
+            drone.now_s += 1.0 / per_second
+            payload = {**ask, "sequence": number if accepted else -1, "time_s": drone.now_s}
+            answer = drone.commands.handle("hold", json.dumps(payload).encode() if accepted else b"{")
+            assert answer["accepted"] == accepted
+            if number % (per_second // 10) == 0 and states < 2000:
+                sinks.publish("clock", {"time_s": drone.now_s, "number": states})
+                states += 1
+                while sinks._worker._jobs.qsize() > BACKLOG // 2:
+                    time.sleep(0.001)  # its thread has time on a drone
+        asyncio.run(sinks.close())
+    finally:
+        log.removeHandler(handler)
+        handler.close()
+    assert sinks.lost == 0
+    assert [message["number"] for message in told if "number" in message] == list(range(states))
+    assert (tmp_path / "log").stat().st_size < 100_000
+    (recording,) = tmp_path.glob("*.mcap")
+    assert recording.stat().st_size < 1_000_000
+    said = sum("order" in str(message.get("event")) for message in told)
+    assert said < 500
+    assert drone.commands.refused == (0 if accepted else 100_000)

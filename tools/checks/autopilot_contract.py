@@ -1,0 +1,510 @@
+"""Flies the same stories with the fake autopilot and with PX4 SITL, and compares what flockd saw of each.
+
+    FLOCKD_PX4=~/PX4-Autopilot/build/px4_sitl_default python -m tools.checks.autopilot_contract
+    python -m tools.checks.autopilot_contract --autopilot fake --json
+
+Prints a table, fake beside PX4, with the messages, their order, and the seconds that they took. Exit code 1: the two
+differ where no difference is known (`KNOWN`). A relay between autopilot and flockd loses what a story wants lost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import socket
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
+from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from flockd.core.config import load_scenario
+from flockd.core.config.autopilot import AutopilotParameters
+from flockd.core.config.safety import SafetyParameters
+from flockd.core.config.scenario import ScenarioConfig
+from flockd.core.data import data_path
+from flockd.core.errors import FlockdError, UnavailableError
+from flockd.core.messages import Setpoint, Wanted
+from flockd.flight.safety import Action, Permission, Request, Surroundings, Verdict
+from flockd.onboard.autopilot.autopilot_status import AutopilotError
+from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
+from flockd.onboard.autopilot.streamer import SetpointStreamer
+from flockd.sim.autopilots import Autopilots, Px4s, SimulatedAutopilots, px4_folder
+from flockd.sim.free_ports import free_port
+from flockd.sim.ground_station import GroundStation
+from flockd.sim.start import with_drones
+
+HEIGHT_M = 4.0
+NORTH_M_S = 1.0
+START_S = 60.0
+STEP_S, POLL_S = 30.0, 0.01
+HEARTBEAT, EVENT = 0, 410
+ALIKE_S = 1.2
+"""Two reactions that differ by no more are alike: PX4 tells much by its heartbeat, once a second."""
+
+KNOWN: Mapping[str, str] = {
+    "start: checks told": "PX4's estimator takes seconds to become ready; the fake has none",
+    "arm in Land mode": "PX4 tells its checks anew every two seconds at most",
+    "two events lost": "the same",
+    "take off": "PX4's motors spin up first",
+    "restart": "PX4's program takes seconds to start",
+}
+"""Rows that differ, and why they may."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One thing that flockd saw."""
+
+    story: str
+    what: str
+    after_s: float | None = None
+    """Since what provoked it; None where time does not matter."""
+
+
+class Relay:
+    """Passes on packets between an autopilot and flockd, both ways, but for those that a story wants lost."""
+
+    def __init__(self, autopilot_port: int, flockd_port: int) -> None:
+        self.losing: Callable[[int], bool] = lambda number: False
+        """Whether to lose a packet from the autopilot, by the number of its message."""
+        self._near = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._near.bind(("127.0.0.1", autopilot_port))
+        self._far = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._far.bind(("127.0.0.1", 0))
+        self._flockd, self._autopilot = ("127.0.0.1", flockd_port), ("", 0)
+        self._closing = threading.Event()
+        self._threads = [threading.Thread(target=run, daemon=True) for run in (self._inward, self._outward)]
+
+    def __enter__(self) -> Relay:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closing.set()
+        for one in (self._near, self._far):
+            one.close()
+
+    def _inward(self) -> None:
+        while not self._closing.is_set():
+            try:
+                data, self._autopilot = self._near.recvfrom(65536)
+                kept = b"".join(packet for number, packet in _packets(data) if not self.losing(number))
+                if kept:
+                    self._far.sendto(kept, self._flockd)
+            except OSError:
+                return
+
+    def _outward(self) -> None:
+        while not self._closing.is_set():
+            try:
+                data, _ = self._far.recvfrom(65536)
+                if self._autopilot[1]:
+                    self._near.sendto(data, self._autopilot)
+            except OSError:
+                return
+
+
+def _packets(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """The MAVLink 2 packets of a datagram, with the numbers of their messages."""
+    while len(data) >= 12 and data[0] == 0xFD:
+        length = 12 + data[1] + (13 if data[2] & 1 else 0)
+        yield int.from_bytes(data[7:10], "little"), data[:length]
+        data = data[length:]
+
+
+@dataclass
+class World:
+    """One autopilot, and flockd's link to it."""
+
+    link: AutopilotLink
+    streamer: SetpointStreamer
+    station: GroundStation
+    relay: Relay
+    restart: Callable[[], None]
+    rows: list[Row] = field(default_factory=list)
+    reports: list[str] = field(default_factory=list)
+    """All that the link has reported."""
+
+    async def until(self, condition: Callable[[], bool], what: str, timeout_s: float = STEP_S) -> float:
+        """Seconds until it holds. Raises UnavailableError when it does not in time."""
+        begun = time.monotonic()
+        while not condition():
+            if time.monotonic() - begun > timeout_s:
+                raise UnavailableError(f"{what} did not come within {timeout_s:g} s")
+            await asyncio.sleep(POLL_S)
+            self.reports += self.link.take_reports()
+        return time.monotonic() - begun
+
+    async def saw(self, story: str, condition: Callable[[], bool], what: str) -> None:
+        """Adds a row once the condition holds, or one that says that it never did."""
+        try:
+            self.rows.append(Row(story, what, round(await self.until(condition, what), 2)))
+        except UnavailableError:
+            self.rows.append(Row(story, f"never: {what}"))
+
+    def texts(self) -> list[str]:
+        """What the autopilot has said since the last call."""
+        self.reports += self.link.take_reports()
+        texts = [report.removeprefix("the autopilot says: ") for report in self.reports if "says: " in report]
+        self.reports.clear()
+        return texts
+
+    async def asked(self, story: str, ask: Callable[[], Awaitable[None]]) -> None:
+        """Adds a row with the answer to a request."""
+        try:
+            await ask()
+            self.rows.append(Row(story, "accepted"))
+        except AutopilotError as error:
+            self.rows.append(Row(story, str(error).partition(", which was ")[2] or str(error)))
+
+    def mode(self, mode: str) -> Callable[[], bool]:
+        """The link shows this mode."""
+        return lambda: self.link.status().flight_mode == mode
+
+    async def offboard(self) -> None:
+        """Streams, and flies."""
+        self.streamer.begin()
+        await asyncio.sleep(0.5)
+        await self.link.request_offboard()
+        await self.until(self.mode("offboard"), "offboard")
+
+    async def hold(self) -> None:
+        """Ends the stream, and stands."""
+        self.streamer.end("by the story")
+        await self.link.hold()
+        await self.until(lambda: not self.link.status().failsafe and self.mode("hold")(), "Hold")
+
+
+async def on_the_ground(world: World) -> None:
+    """Before the flight."""
+    link = world.link
+    await world.saw("start: checks told", lambda: link.knows_checks() and not link.refusals(), "nothing against arming")
+    await world.saw("start: announced", link.announces, "flockd announces itself, so that texts come")
+    world.station.select(0, "LAND")
+    await world.until(world.mode("land"), "Land")
+    await world.saw("arm in Land mode", lambda: _refused(link, "to arm"), "the refusal is shown before it is asked")
+    await world.asked("arm in Land mode", link.arm)
+    world.texts()
+    world.station.select(0, "LOITER")
+    await world.until(world.mode("hold"), "Hold")
+    losing = iter([True, True])
+    world.relay.losing = lambda number: number == EVENT and next(losing, False)
+    world.streamer.begin()
+    checks = link._received.check_events
+    await world.saw("two events lost", lambda: _offboard_possible(link), "requested, and the list is whole")
+    world.rows.append(Row("two events lost", f"given up: {checks._order.gaps}"))
+    world.relay.losing = lambda number: False
+    world.streamer.end("by the story")
+
+
+def _offboard_possible(link: AutopilotLink) -> bool:
+    report = link._received.check_events.report
+    return report is not None and bool(report.can_run >> 14 & 1)
+
+
+async def take_off(world: World) -> None:
+    """Until it hovers."""
+    await world.asked("arm", world.link.arm)
+    await world.asked("take off", world.link.take_off)
+    await world.saw("take off", lambda: world.link.status().in_air, "in the air")
+    await world.until(lambda: _height_m(world) > HEIGHT_M - 0.5 and world.mode("hold")(), "the height", 60.0)
+
+
+def _height_m(world: World) -> float:
+    state = world.link.vehicle_state()
+    return 0.0 if state is None else state.height_m
+
+
+async def in_flight(world: World) -> None:
+    """Offboard, and what ends it."""
+    link, streamer, station = world.link, world.streamer, world.station
+    world.texts()
+    await world.asked("offboard without setpoints", link.request_offboard)
+    world.streamer.begin()
+    await asyncio.sleep(0.5)
+    await world.asked("offboard", link.request_offboard)
+    await world.saw("offboard", world.mode("offboard"), "the mode is offboard")
+    await asyncio.sleep(2.5)
+    world.rows.append(Row("offboard", f"foreign setpoints: {link.status().foreign_setpoints}"))
+    await _lose_heartbeats(world)
+    world.texts()
+    streamer.end("by the story")
+    await world.saw("setpoints stop", world.mode("hold"), "the mode is hold")
+    await world.saw("setpoints stop", lambda: link.status().failsafe, "it is in its failsafe")
+    await asyncio.sleep(1.0)
+    world.rows.append(Row("setpoints stop", f"said: {'; '.join(world.texts()) or 'nothing'}"))
+    await _setpoints_come_back(world)
+    streamer.end("by the story")
+    await world.until(world.mode("hold"), "Hold")
+    await asyncio.sleep(1.5)
+    station.select(0, "LOITER")
+    await world.saw("Hold selected in the failsafe", lambda: not link.status().failsafe, "the failsafe is over")
+    await world.asked("Acro in the air", lambda: link._command("for acro", 176, 1, 5, 0, refused="acro"))
+    world.texts()
+    station.select(0, "ACRO")
+    await world.saw("Acro for a station", lambda: _refused(link, "acro"), "the refusal is shown")
+    await asyncio.sleep(1.0)
+    world.rows.append(Row("Acro for a station", f"said: {'; '.join(world.texts()) or 'nothing'}"))
+    await world.hold()
+
+
+def _refused(link: AutopilotLink, what: str) -> bool:
+    return any(refusal.refused == what for refusal in link.refusals())
+
+
+async def _lose_heartbeats(world: World) -> None:
+    """Every third, for twelve seconds."""
+    count = [0]
+
+    def every_third(number: int) -> bool:
+        count[0] += number == HEARTBEAT
+        return number == HEARTBEAT and count[0] % 3 == 0
+
+    lost = world.link.heartbeats_lost()
+    world.relay.losing = every_third
+    await asyncio.sleep(12.0)
+    world.relay.losing = lambda number: False
+    flown = world.mode("offboard")() and world.streamer.report().silence is None
+    world.rows.append(Row("every third heartbeat lost", "flown on" if flown else f"{world.streamer.report().silence}"))
+    counted = world.link.heartbeats_lost() - lost
+    world.rows.append(Row("every third heartbeat lost", "counted" if 3 <= counted <= 5 else f"{counted} counted"))
+
+
+async def _setpoints_come_back(world: World) -> None:
+    """Sent past the streamer, which sends nothing in a failsafe: the autopilot goes back by itself."""
+    begun = time.monotonic()
+    while time.monotonic() - begun < 3.0 and not world.mode("offboard")():
+        world.link.send_setpoint(Setpoint(time.monotonic(), np.zeros(2), HEIGHT_M, 0.0))
+        await asyncio.sleep(0.05)
+    back = world.mode("offboard")()
+    what = "back in offboard by itself" if back else "stays in its failsafe"
+    world.rows.append(Row("setpoints come back", what, round(time.monotonic() - begun, 2)))
+
+
+async def others_interfere(world: World) -> None:
+    """Another program's setpoints, a changed parameter."""
+    link, station = world.link, world.station
+    await world.offboard()
+    await asyncio.sleep(2.0)
+    foreign = asyncio.create_task(_stream(station))
+    await world.saw("foreign setpoints", lambda: link.status().foreign_setpoints is not None, "noticed")
+    world.rows.append(Row("foreign setpoints", f"{link.status().foreign_setpoints}"))
+    foreign.cancel()
+    await world.saw("foreign setpoints", lambda: link.status().foreign_setpoints is None, "over")
+    station.set_parameter(0, "COM_OF_LOSS_T", 20.0)
+    await world.saw("COM_OF_LOSS_T 20", lambda: link.status().parameter_fault is not None, "noticed")
+    world.rows.append(Row("COM_OF_LOSS_T 20", f"{link.status().parameter_fault}"))
+    station.set_parameter(0, "COM_OF_LOSS_T", 1.0)
+    await world.saw("COM_OF_LOSS_T 1", lambda: link.status().parameter_fault is None, "over")
+    await world.hold()
+    station.set_parameter(0, "NAV_DLL_ACT", 2)
+    await world.saw("NAV_DLL_ACT 2", lambda: not link.announces(), "flockd does not announce itself any more")
+    station.set_parameter(0, "NAV_DLL_ACT", 0)
+    await world.saw("NAV_DLL_ACT 0", link.announces, "it does again")
+
+
+async def _stream(station: GroundStation) -> None:
+    while True:
+        station.send_velocity(0, np.array([0.0, 3.0]))
+        await asyncio.sleep(0.05)
+
+
+async def landing(world: World) -> None:
+    """The end, and a restart."""
+    link = world.link
+    await world.asked("land", link.land)
+    await world.saw("land", world.mode("land"), "the mode is land")
+    await world.until(lambda: not link.status().armed and link.status().landed_state == "ground", "landed", 60.0)
+    world.rows.append(Row("land", f"disarmed on the ground, in mode {link.status().flight_mode}"))
+    await world.hold()
+    world.texts()
+    world.restart()
+    await world.saw(
+        "restart", lambda: any("started anew" in report for report in world.reports), "noticed by its clock"
+    )
+    await world.saw("restart", lambda: _rate(world) is True, "its streams come as requested")
+
+
+def _rate(world: World) -> bool:
+    """The attitude comes at more than the 10 Hz or 50 Hz of its own accord: CURRENT_MODE was requested."""
+    return world.link._received.restarts > 0 and not world.link._received.check_events.incomplete
+
+
+STORIES = (on_the_ground, take_off, in_flight, others_interfere, landing)
+
+
+@asynccontextmanager
+async def _linked(autopilots: Autopilots, stack: ExitStack, restart: Callable[[], None]) -> AsyncIterator[World]:
+    ports, flockd_port = autopilots.ports[0], free_port()
+    relay = stack.enter_context(Relay(ports.offboard, flockd_port))
+    station = stack.enter_context(GroundStation([ports.truth], time.monotonic))
+    autopilots.start()
+    begun = time.monotonic()
+    while not station.is_connected(0):
+        if time.monotonic() - begun > START_S:
+            raise UnavailableError("the autopilot sends nothing")
+        await asyncio.sleep(0.05)
+    station.request_messages()
+    parameters = AutopilotParameters(address=f"udpin://127.0.0.1:{flockd_port}")
+    link = await AutopilotLink.connect(parameters, timeout_s=START_S)
+    streamer = SetpointStreamer(link.send_setpoint, link.status, _pass, parameters, SafetyParameters())
+    streamer.start()
+    tasks = [asyncio.create_task(run) for run in (link.attend(), link.synchronise(), _offer(streamer), _ask(link))]
+    try:
+        yield World(link, streamer, station, relay, restart)
+    finally:
+        for task in tasks:
+            task.cancel()
+        streamer.close()
+        await link.close()
+
+
+def _pass(now_s: float, request: Request) -> Verdict:
+    """A gate that allows all: these stories are about the autopilot."""
+    wanted = request.wanted
+    return Verdict(Setpoint(now_s, wanted.velocity, HEIGHT_M, 0.0), ())
+
+
+async def _offer(streamer: SetpointStreamer) -> None:
+    nowhere = Surroundings(np.zeros(2), np.zeros(2), 0.0, np.empty((0, 3)), np.empty((0, 2)), HEIGHT_M)
+    while True:
+        now, angle = time.monotonic(), 0.3 * time.monotonic()
+        wanted = Wanted(NORTH_M_S * np.array([np.cos(angle), np.sin(angle)]), np.zeros(2), 0.0, height_m=HEIGHT_M)
+        streamer.offer(Request(Permission(Action.FLY, now), wanted, now, 0.0, nowhere))
+        streamer.beat()
+        await asyncio.sleep(0.05)
+
+
+async def _ask(link: AutopilotLink) -> None:
+    """For its checks, as the daemon does while it does not know them."""
+    while True:
+        if not link.knows_checks() and not link.status().armed:
+            with suppress(AutopilotError):
+                await link.ask_for_checks()
+        await asyncio.sleep(1.0)
+
+
+async def _fly(autopilots: Autopilots, stack: ExitStack, restart: Callable[[], None]) -> list[Row]:
+    async with _linked(autopilots, stack, restart) as world:
+        for story in STORIES:
+            try:
+                await story(world)
+            except (UnavailableError, AutopilotError) as error:
+                world.rows.append(Row(story.__name__, f"ended: {error}"))
+        return world.rows
+
+
+def _scenario() -> ScenarioConfig:
+    scenario = with_drones(load_scenario(data_path("config") / "px4_flight.yaml"), 1)
+    place = scenario.vehicles[0].model_copy(update={"position_m": (0.0, 0.0, -HEIGHT_M)})
+    return scenario.model_copy(update={"vehicles": (place,)})
+
+
+@contextmanager
+def _fake() -> Iterator[tuple[Autopilots, ExitStack, Callable[[], None]]]:
+    with ExitStack() as stack:
+        fakes = stack.enter_context(SimulatedAutopilots(_scenario(), 1.0, lambda north, _: np.zeros_like(north)))
+        yield fakes, stack, lambda: fakes.fakes[0].restart()  # noqa: PLW0108 - there is none before it starts
+
+
+@contextmanager
+def _px4() -> Iterator[tuple[Autopilots, ExitStack, Callable[[], None]]]:
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="contract-")))
+        first, again = (Px4s(_scenario(), 1.0, os.environ, folder / name) for name in ("first", "again"))
+        stack.push(first.__exit__)
+        stack.push(again.__exit__)
+
+        def restart() -> None:
+            first.__exit__(None, None, None)
+            again.start()
+
+        yield first, stack, restart
+
+
+def seen(autopilot: str) -> list[Row]:
+    """What flockd sees of one of them. Raises UnavailableError."""
+    make = {"fake": _fake, "px4": _px4}[autopilot]
+    with make() as (autopilots, stack, restart):
+        return asyncio.run(_fly(autopilots, stack, restart))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A row of the table."""
+
+    story: str
+    fake: str
+    px4: str
+    alike: bool
+    known: str
+    """Why the two may differ; empty where no reason is known."""
+
+
+def compared(fake: list[Row], px4: list[Row]) -> list[Comparison]:
+    """Rows of the same story in their order, side by side."""
+    comparisons = []
+    for story in dict.fromkeys(row.story for row in (*fake, *px4)):
+        left = [row for row in fake if row.story == story]
+        right = [row for row in px4 if row.story == story]
+        for number in range(max(len(left), len(right))):
+            one = left[number] if number < len(left) else None
+            other = right[number] if number < len(right) else None
+            alike = one is not None and other is not None and _alike(one, other)
+            comparisons.append(Comparison(story, _told(one), _told(other), alike, KNOWN.get(story, "")))
+    return comparisons
+
+
+def _alike(one: Row, other: Row) -> bool:
+    times = abs((one.after_s or 0.0) - (other.after_s or 0.0)) <= ALIKE_S
+    return one.what == other.what and times
+
+
+def _told(row: Row | None) -> str:
+    if row is None:
+        return "(nothing)"
+    return row.what if row.after_s is None else f"{row.what}, after {row.after_s:.1f} s"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Prints the table, or JSON; 1 where the two differ without a known reason."""
+    parser = argparse.ArgumentParser(description="What flockd sees of the fake autopilot and of PX4 SITL.")
+    parser.add_argument("--autopilot", choices=["both", "fake", "px4"], default="both", help="which (both)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    args = parser.parse_args(arguments)
+    try:
+        if args.autopilot != "fake":
+            px4_folder(os.environ)
+        rows = {one: seen(one) for one in ("fake", "px4") if args.autopilot in {one, "both"}}
+    except FlockdError as error:
+        print(error, file=sys.stderr)
+        return int(error.exit_code)
+    if args.autopilot != "both":
+        (only,) = rows.values()
+        if args.json:
+            print(json.dumps([vars(row) for row in only], indent=2))
+        else:
+            print("\n".join(f"{row.story:32}{_told(row)}" for row in only))
+        return 0
+    comparisons = compared(rows["fake"], rows["px4"])
+    if args.json:
+        print(json.dumps([vars(one) for one in comparisons], indent=2))
+    else:
+        print("| story | with the fake | with PX4 | |\n|---|---|---|---|")
+        for one in comparisons:
+            verdict = "alike" if one.alike else f"differs: {one.known or 'NOT KNOWN WHY'}"
+            print(f"| {one.story} | {one.fake} | {one.px4} | {verdict} |")
+    return 0 if all(one.alike or one.known for one in comparisons) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
