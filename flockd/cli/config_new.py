@@ -15,7 +15,7 @@ from flockd.core.errors import ConfigError, ExitCode, UsageError
 
 MISSIONS = ("circle_then_tangent", "hover", "velocity", "waypoints", "follow", "operator")
 OBSTACLES = ("none", "forest", "village")
-SOURCES = ("v4l2", "gstreamer", "shared_memory")
+SOURCES = ("v4l2", "gstreamer", "ros", "shared_memory")
 MOST_CAMERAS = 16
 LEAST_MAX_HEIGHT_M, ABOVE_LAYER_M = 10.0, 3.0
 """The gate's limit of height in a new file: at least, and above the layer of first flights."""
@@ -100,7 +100,7 @@ def _drone_questions() -> tuple[_Question, ...]:
         ),
         _Question(
             "source",
-            "USB cameras, others through GStreamer, or frames from another program",
+            "USB cameras, others through GStreamer, topics of ROS 2, or another program's frames",
             "frames from",
             "v4l2",
             choices=SOURCES,

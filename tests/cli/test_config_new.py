@@ -59,7 +59,7 @@ def test_new_drones_of_a_flock_begin_with_first_flights_each_in_its_layer(tmp_pa
     assert load_real_drone(data_path("config") / "quadrotor.yaml")[0].mission.height_m == 3.0
 
 
-@pytest.mark.parametrize("source", ["v4l2", "gstreamer", "shared_memory"])
+@pytest.mark.parametrize("source", ["v4l2", "gstreamer", "ros", "shared_memory"])
 def test_a_drones_frames_come_from_where_is_asked(tmp_path: Path, source: str) -> None:
     file = tmp_path / "kite.yaml"
     assert main(["config", "new", "drone", str(file), "--cameras", "2", "--source", source, "--defaults"]) == 0

@@ -25,6 +25,7 @@ _SOURCE_CAMERA = {
       pixel_format: mjpeg
       rate_hz: 30""",
     "gstreamer": "    - {{name: {name}, pipeline: nvarguscamerasrc sensor-id={number} ! nvvidconv, rate_hz: 30}}",
+    "ros": "    - {{name: {name}, topic: /{name}/image_raw, rate_hz: 30}}",
     "shared_memory": "",
 }
 

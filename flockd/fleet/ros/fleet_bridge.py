@@ -18,6 +18,7 @@ from flockd.fleet.page.drone_rows import Known, Row
 from flockd.fleet.page.fleet_source import FleetSource
 from flockd.fleet.ros.drone_names import DroneNames
 from flockd.fleet.ros.fleet_markers import home_in_map, markers
+from flockd.fleet.ros.newest_order import NewestOrder
 from flockd.fleet.ros.order_requests import Whereabouts, goal_of, velocity_of
 from flockd.fleet.watcher import Watched
 from flockd.onboard.ros import message_trees as trees
@@ -38,7 +39,7 @@ STATE_EVERY_S = 1.0
 PLAIN = ("hold", "land", "resume")
 """Orders without a place, each a service."""
 _THREADS = 16
-"""That wait for pictures and answers."""
+"""That wait for pictures, and as many that wait for answers to goals and velocities."""
 _LEVELS = {
     **dict.fromkeys(("normal", "ready", "idle"), trees.OK),
     **dict.fromkeys(("degraded", "hover", "silent"), trees.WARN),
@@ -67,7 +68,8 @@ class FleetBridge:
         self._drawn: dict[str, Row] = {}
         self._served: set[str] = set()
         self._pictures: dict[str, tuple[float, Future[None]]] = {}
-        self._threads = ThreadPoolExecutor(_THREADS, "ROS 2 pictures and orders")
+        self._threads = ThreadPoolExecutor(_THREADS, "ROS 2 pictures")
+        self._order_threads = ThreadPoolExecutor(_THREADS, "ROS 2 orders")
         self._over = threading.Event()
         self._thread = ThreadPoolExecutor(1, "fleet in ROS 2")
 
@@ -84,6 +86,7 @@ class FleetBridge:
         self._over.set()
         self._thread.shutdown()
         self._threads.shutdown(cancel_futures=True)
+        self._order_threads.shutdown(cancel_futures=True)
 
     def wait(self) -> None:
         """Until it is closed. Raises what ended it before."""
@@ -194,14 +197,14 @@ class FleetBridge:
             ("goal", trees.POSE, "goto", goal_of),
             ("cmd_vel", trees.TWIST, "velocity", velocity_of),
         ):
-            take = partial(self._order, key, name, command, parse)
-            self._node.subscribe(f"/{name}/{topic}", kind, take, Delivery.EVENT)
+            orders = NewestOrder(self._order_threads, partial(self._order, key, name, command, parse))
+            self._node.subscribe(f"/{name}/{topic}", kind, orders.offer, Delivery.EVENT)
         self._node.advertise(f"/{name}/order_answer", trees.DIAGNOSTIC, Delivery.EVENT)
 
     def _order(
         self, key: str, name: str, command: str, parse: Callable[[Tree, Whereabouts], OrderMessage], message: Any
     ) -> None:
-        """On a thread of the node's; what became of it is published, as a topic has no reply."""
+        """What became of it is published, as a topic has no reply."""
         try:
             answer = self._ask(key, command, parse(tree_of(message), self._whereabouts(key, name)))
         except ValueError as error:

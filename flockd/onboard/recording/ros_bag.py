@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Final, Literal, NamedTuple, Self
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from flockd.onboard.ros.message_trees import Tree
 
 Storage = Literal["mcap", "sqlite3"]
 METADATA = "metadata.yaml"
-VERSION = 9
+VERSION: Final = 9
 """Of the metadata: ROS 2 Jazzy and later write it, and earlier ones read it too."""
 
 

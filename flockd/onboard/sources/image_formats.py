@@ -96,7 +96,11 @@ class PackedFormat:
     """None: each row is filled up to four bytes, as GStreamer does."""
 
     def check(self, data: bytes) -> None:
-        """See ``ImageFormat``: size."""
+        """See ``ImageFormat``: size, and rows that hold their pixels."""
+        depth, width = PACKED[self.name][0], self.size[0]
+        row = depth * (up_to(2, width) if depth == 2 else width)
+        if self._bytes_per_line() < row:
+            raise CorruptImageError(f"rows of {self._bytes_per_line()} bytes, where {width} pixels take {row}")
         check_length(data, self._bytes_per_line() * self.size[1])
 
     def decode(self, data: bytes) -> UInt8Array:

@@ -105,21 +105,27 @@ def test_frames_may_come_from_a_pipeline_a_camera(tmp_path: Path) -> None:
     assert isinstance(open_source(config, str(path)), DeviceSource)
 
 
-def test_the_pipelines_of_the_documentation_check(tmp_path: Path) -> None:
-    page = (QUADROTOR.parents[1] / "docs" / "cameras.md").read_text(encoding="utf-8")
-    examples = re.findall(r"```yaml\n(source:.*?)```", page, re.DOTALL)
-    (example,) = (one for one in examples if "kind: gstreamer" in one)
-    names = re.findall(r"- name: (\w+)", example)
-    rig = "".join(RIG.splitlines(keepends=True)[:2]) + "".join(
-        RIG.splitlines(keepends=True)[2].replace("front", name) for name in names
-    )
-    path = tmp_path / "drone.yaml"
-    path.write_text(rig + example, encoding="utf-8")
-    source = load_drone(path).source
-    assert source is not None
-    assert [camera.place.split()[0] for camera in source.cameras] == [
-        "nvarguscamerasrc", "libcamerasrc", "rtspsrc", "v4l2src",
-    ]  # fmt: skip
+def test_the_examples_of_the_documentation_check(tmp_path: Path) -> None:
+    """Pipelines and topics on the page of cameras, and the drone of the page on ROS 2."""
+    docs = QUADROTOR.parents[1] / "docs"
+    examples = re.findall(r"```yaml\n(source:.*?)```", (docs / "cameras.md").read_text(encoding="utf-8"), re.DOTALL)
+    path, places = tmp_path / "drone.yaml", []
+    for example in examples:
+        names = re.findall(r"- name: (\w+)", example)
+        rig = "".join(RIG.splitlines(keepends=True)[:2]) + "".join(
+            RIG.splitlines(keepends=True)[2].replace("front", name) for name in names
+        )
+        path.write_text(rig + example, encoding="utf-8")
+        source = load_drone(path).source
+        assert source is not None
+        places.append([camera.place.split()[0] for camera in source.cameras])
+    assert places == [
+        ["nvarguscamerasrc", "libcamerasrc", "rtspsrc", "v4l2src"],
+        ["/front/image_raw", "/back/image_raw/compressed"],
+    ]
+    (eyes,) = re.findall(r"```yaml\n(.*?)```", (docs / "ros.md").read_text(encoding="utf-8"), re.DOTALL)
+    path.write_text(eyes, encoding="utf-8")
+    assert load_drone(path).name == "uav1"
 
 
 def test_a_drone_without_source_can_be_simulated_but_opens_none(tmp_path: Path) -> None:

@@ -179,6 +179,7 @@ def test_numbers_count_periods_so_that_what_is_missing_shows(start: Start) -> No
     [
         (("imag", image(), 60_000), "time_stamp"),
         (("imag", image("rgb8", RGB[:40], step=192)), "corrupt"),
+        (("imag", image("rgb8", RGB[:24], step=96)), "corrupt"),
         (("jpeg", compressed("jpeg", b"\xff\xd8 nothing")), "corrupt"),
     ],
 )

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import re
 
+import pytest
+
 from tools.release.lock import ROOT
 from tools.release.wheels import SOURCES
 
 RECIPE = (ROOT / "Containerfile").read_text(encoding="utf-8")
+ROS_RECIPE = (ROOT / "packaging" / "ros" / "Containerfile").read_text(encoding="utf-8")
 
 
 def test_it_installs_the_lock_by_its_hashes_and_flockd_without_anything_else() -> None:
@@ -19,9 +22,19 @@ def test_it_installs_the_lock_by_its_hashes_and_flockd_without_anything_else() -
     assert "COPY requirements/service.txt /tmp/service.txt\n" in RECIPE
 
 
-def test_it_flies_as_nobody_special() -> None:
-    assert re.findall(r"^USER (.*)$", RECIPE, re.MULTILINE) == ["flockd"]
-    assert RECIPE.index("USER flockd") < RECIPE.index("ENTRYPOINT")
+def test_that_of_ros_installs_the_lock_too_and_then_the_extra() -> None:
+    installs = re.findall(r"/pip install (.*?)(?: \\)?$", ROS_RECIPE, re.MULTILINE)
+    assert installs == [
+        "--no-cache-dir --require-hashes -r /tmp/service.txt",
+        "--no-cache-dir '/tmp/flockd[ros]'",
+    ]
+    assert "debian:12-slim" in ROS_RECIPE, "whose Python is the wheels' 3.11"
+
+
+@pytest.mark.parametrize("recipe", [RECIPE, ROS_RECIPE])
+def test_it_flies_as_nobody_special(recipe: str) -> None:
+    assert re.findall(r"^USER (.*)$", recipe, re.MULTILINE) == ["flockd"]
+    assert recipe.index("USER flockd") < recipe.index("ENTRYPOINT")
 
 
 def test_the_ignore_list_lets_through_what_building_needs() -> None:

@@ -7,6 +7,7 @@ import io
 import json
 import math
 import struct
+from contextlib import suppress
 from pathlib import Path
 from random import Random
 from types import SimpleNamespace
@@ -22,6 +23,7 @@ from flockd.core.config import load_drone
 from flockd.core.config.source import SourceParameters
 from flockd.core.messages import MissionOrder
 from flockd.fleet.fleet_status import status_rows
+from flockd.fleet.ros.order_requests import Whereabouts, goal_of, velocity_of
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.autopilot.mavlink_messages import ReceivedMessages
 from flockd.onboard.autopilot.mavsdk_link import RECEIVED
@@ -29,8 +31,12 @@ from flockd.onboard.daemon.operator_commands import OperatorCommands, OperatorRe
 from flockd.onboard.recording import foxglove
 from flockd.onboard.recording.mcap_file import RecordingError
 from flockd.onboard.recording.reader import decoded_image
+from flockd.onboard.ros.cdr_images import RosImage, read_camera_info, read_compressed_image, read_image
+from flockd.onboard.ros.message_trees import Names
 from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat, PackedFormat
+from flockd.onboard.sources.ros_device import ENCODINGS
 from flockd.onboard.sources.shared_memory import SharedMemorySource
+from flockd.onboard.telemetry.order_messages import parse_order
 from flockd.onboard.telemetry.topics import TOPICS
 from tools.checks.fuzzing.mutation import (
     ABSURD_NUMBERS,
@@ -273,9 +279,43 @@ def _shared_memory(random: Random, config: Any, photo: Any) -> None:
         assert found.frames["front"].image.shape == photo.shape
 
 
+def _ros(folder: Path) -> Check:
+    """Images and lenses of ROS 2's topics, as they travel, and orders from there."""
+    head = b"\0\1\0\0" + struct.pack("<iII2s2x", 1_700_000_000, 5, 2, b"f")
+    pixels = bytes(range(64)) * 3
+    samples = (
+        head + struct.pack("<III5sB2xII", 8, 8, 5, b"rgb8", 0, 24, len(pixels)) + pixels,
+        head + struct.pack("<I5s3xI", 5, b"jpeg", len(pixels)) + pixels,
+        head + struct.pack("<III10s2xI", 8, 8, 10, b"plumb_bob", 0) + struct.pack("<4x9d", *range(9)),
+    )
+    drone = Whereabouts(Names("drone1"), np.zeros(2), np.zeros(2), np.eye(3))
+
+    def check(random: Random) -> None:
+        data = random.choice(samples)
+        if random.random() < 0.9:
+            data = mutated_bytes(random, data)
+        for read in (read_image, read_compressed_image, read_camera_info):
+            with suppress(ValueError):
+                found = read(data)
+                if isinstance(found, RosImage) and found.size == (8, 8) and found.encoding in ENCODINGS:
+                    PackedFormat(ENCODINGS[found.encoding], (8, 8), found.bytes_per_line).decode(found.data)
+        x, y, z = (any_float(random) for _ in range(3))
+        frame = random.choice(("map", "drone1/odom", "drone1/base_link", "", "\0"))
+        place = {"header": {"frame_id": frame}, "pose": {"position": {"x": x, "y": y, "z": z}}}
+        motion = {"linear": {"x": x, "y": y, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": random.choice((0.0, z))}}
+        for make, message in ((goal_of, place), (velocity_of, {"header": {"frame_id": frame}, "twist": motion})):
+            try:
+                parse_order("goto" if make is goal_of else "velocity", json.dumps(make(message, drone)).encode())
+            except ValueError as error:
+                assert_readable(str(error))
+
+    return check
+
+
 TARGETS = (
     Target("mavlink", 600, _mavlink),
     Target("status", 40, _status),
     Target("commands", 200, _commands),
     Target("frames", 400, _frames),
+    Target("ros", 400, _ros),
 )

@@ -1,0 +1,94 @@
+"""What `flockd ros` makes of telemetry, worked out by hand: transforms for tf, and the state with its reasons."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockd.core.messages import FloatArray
+from flockd.core.ros_frames import rotation_of
+from flockd.fleet.fleet_status import WORST_FIRST
+from flockd.fleet.page.drone_rows import Known, drone_rows
+from flockd.fleet.ros.fleet_bridge import _LEVELS, _origin, _status, _transforms
+from flockd.fleet.ros.fleet_markers import markers
+from flockd.fleet.watcher import Heard, Watched
+from flockd.onboard.ros.message_trees import Names
+from flockd.onboard.telemetry.topics import AboutMessage, StateMessage
+
+CAMERA = {
+    "name": "right", "size_px": [640, 480], "intrinsics": {"fx": 300.0, "fy": 300.0, "cx": 320.0, "cy": 240.0},
+    "extrinsics": {"position_m": [0.1, 0.05, -0.02], "yaw_deg": 90.0},
+}  # fmt: skip
+ABOUT = AboutMessage(
+    version="1", configuration={"rig": {"cameras": [CAMERA]}, "mission": {"origin_m": [3.0, -4.0]}}, commands=[]
+)
+STATE = StateMessage(
+    time_s=1.0, height_m=5.0, roll_deg=0.0, pitch_deg=0.0, yaw_deg=90.0, velocity_ned=[1.0, 0.0, 0.0],
+    position_ne=[10.0, 20.0], home_deg=[47.0, 8.0],
+)  # fmt: skip
+FLIGHT: dict[str, Any] = {
+    "state": "degraded", "reasons": [{"event": "x", "sentence": "the battery is low; land"}],
+    "flight_mode": "offboard", "armed": True, "in_air": True, "battery_share": 0.4, "height_m": 5.0, "silence": None,
+}  # fmt: skip
+
+
+def row() -> dict[str, Any]:
+    topics = {"state": Heard(0.0, {**STATE}), "flight": Heard(0.0, FLIGHT)}
+    drone = Watched("f", "drone1", alive=True, topics=topics, seen=True)
+    return drone_rows([drone], {"f/drone1": Known(ABOUT)}, 0.0)["f/drone1"]
+
+
+def moved(transform: dict[str, Any], point: list[float]) -> FloatArray:
+    """A point of the child's frame in its parent's."""
+    place = np.array(list(transform["transform"]["translation"].values()))
+    turn = np.array(list(transform["transform"]["rotation"].values()))
+    found: FloatArray = rotation_of(turn) @ np.array(point) + place
+    return found
+
+
+def test_transforms_lead_from_the_map_to_each_camera() -> None:
+    """East 20, north 10, up 5, facing east. The camera is 10 cm ahead and 5 cm to the right, and looks right."""
+    tree = _transforms(0, Names("drone1"), STATE, row(), ABOUT)
+    assert tree is not None
+    by_child = {one["child_frame_id"]: one for one in tree["transforms"]}
+    parents = {child: one["header"]["frame_id"] for child, one in by_child.items()}
+    assert parents == {
+        "drone1/odom": "map",
+        "drone1/level": "drone1/odom",
+        "drone1/base_link": "drone1/odom",
+        "drone1/right_optical": "drone1/base_link",
+    }
+    np.testing.assert_allclose(moved(by_child["drone1/base_link"], [1.0, 0.0, 0.0]), [21.0, 10.0, 5.0], atol=1e-9)
+    np.testing.assert_allclose(moved(by_child["drone1/level"], [0.0, 1.0, 0.0]), [20.0, 11.0, 5.0], atol=1e-9)
+    # 1 m before the lens, along its z: to the right of the body, which is -y.
+    np.testing.assert_allclose(moved(by_child["drone1/right_optical"], [0.0, 0.0, 1.0]), [0.1, -1.05, 0.02], atol=1e-9)
+    assert _transforms(0, Names("drone1"), {**STATE, "position_ne": None}, row(), None) is None
+
+
+def test_a_state_comes_with_its_reasons_and_its_level() -> None:
+    status = _status("drone1", row())
+    assert (status["level"], status["name"]) == (1, "drone1: flockd"), "WARN"
+    assert status["message"] == "degraded: the battery is low; land"
+    assert {"key": "battery_share", "value": "0.4"} in status["values"]
+    assert {"key": "armed", "value": "true"} in status["values"]
+    assert set(_LEVELS) == set(WORST_FIRST), "every state has a level"
+
+
+def test_markers_stand_where_the_drone_is() -> None:
+    """In `map`; the course is the own velocity over two seconds: 1 m/s to the north."""
+    first, *drawn = markers(0, "drone1", 0, row())["markers"]
+    assert first["action"] == 3, "what was drawn before is deleted"
+    assert list(drawn[0]["pose"]["position"].values()) == [20.0, 10.0, 5.0]
+    assert [list(point.values()) for point in drawn[3]["points"]] == [[20.0, 10.0, 5.0], [20.0, 12.0, 5.0]]
+    assert len({marker["id"] for marker in drawn}) == len(drawn)
+    assert len(markers(0, "drone1", 0, {**row(), "position_ne": None})["markers"]) == 1
+
+
+@pytest.mark.parametrize("mission", [None, {}, {"origin_m": [1.0]}, {"origin_m": ["a", "b"]}])
+def test_an_origin_that_a_peer_does_not_tell_is_none(mission: Any) -> None:
+    assert _origin({"mission": mission}) is None
+    found = _origin(ABOUT["configuration"])
+    assert found is not None
+    assert found.tolist() == [3.0, -4.0]
