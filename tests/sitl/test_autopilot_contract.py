@@ -17,54 +17,53 @@ NO_SETPOINTS = (
 CHANGED = "COM_OF_LOSS_T was changed in flight from 1 to 20: the autopilot's failsafe would act that long after"
 FOREIGN = "another program sends setpoints: the autopilot follows 0.0 m/s north and 3.0 m/s east, which flockd did not"
 SEEN = (
-    ("start: checks told", "nothing against arming", 20.0),
-    ("start: announced", "flockd announces itself", 2.0),
-    ("arm in Land mode", "the refusal is shown before it is asked", 4.0),
-    ("arm in Land mode", "refused for now: it cannot be armed in its flight mode; select another mode first", None),
-    ("two events lost", "requested, and the list is whole", 5.0),
-    ("two events lost", "given up: 0", None),
-    ("arm", "accepted", None),
-    ("take off", "accepted", None),
-    ("take off", "in the air", 10.0),
-    ("offboard without setpoints", f"refused for now: {NO_SETPOINTS}", None),
-    ("offboard", "accepted", None),
-    ("offboard", "the mode is offboard", 1.0),
-    ("offboard", "foreign setpoints: None", None),
-    ("every third heartbeat lost", "flown on", None),
-    ("every third heartbeat lost", "counted", None),
-    ("setpoints stop", "the mode is hold", 2.0),
-    ("setpoints stop", "it is in its failsafe", 1.5),
-    ("setpoints stop", "said: Failsafe activated", None),
-    ("setpoints come back", "back in offboard by itself", 1.0),
-    ("Hold selected in the failsafe", "the failsafe is over", 2.0),
-    ("Acro in the air", "refused for now without a reason; wait a few seconds and ask again", None),
-    ("Acro for a station", "the refusal is shown", 1.0),
-    ("Acro for a station", "said: Switching to Acro is currently not available", None),
-    ("foreign setpoints", "noticed", 2.0),
-    ("foreign setpoints", FOREIGN, None),
-    ("foreign setpoints", "over", 3.0),
-    ("COM_OF_LOSS_T 20", "noticed", 2.0),
-    ("COM_OF_LOSS_T 20", CHANGED, None),
-    ("COM_OF_LOSS_T 1", "over", 2.5),
-    ("NAV_DLL_ACT 2", "flockd does not announce itself any more", 2.5),
-    ("NAV_DLL_ACT 0", "it does again", 2.5),
-    ("land", "accepted", None),
-    ("land", "the mode is land", 1.0),
-    ("land", "disarmed on the ground, in mode hold", None),
-    ("restart", "noticed by its clock", 20.0),
-    ("restart", "its streams come as requested", 10.0),
+    ("start: checks told", "nothing against arming"),
+    ("start: announced", "flockd announces itself"),
+    ("arm in Land mode", "the refusal is shown before it is asked"),
+    ("arm in Land mode", "it cannot be armed in its flight mode; select another mode first, as Hold or Position"),
+    ("two events lost", "requested, and the list is whole"),
+    ("two events lost", "given up: 0"),
+    ("arm", "accepted"),
+    ("take off", "accepted"),
+    ("take off", "in the air"),
+    ("offboard without setpoints", f"refused for now: {NO_SETPOINTS}"),
+    ("offboard", "accepted"),
+    ("offboard", "the mode is offboard"),
+    ("offboard", "foreign setpoints: None"),
+    ("every third heartbeat lost", "flown on"),
+    ("every third heartbeat lost", "counted"),
+    ("setpoints stop", "the mode is hold"),
+    ("setpoints stop", "it is in its failsafe"),
+    ("setpoints stop", "said: Failsafe activated"),
+    ("setpoints come back", "back in offboard by itself"),
+    ("Hold selected in the failsafe", "the failsafe is over"),
+    ("Acro in the air", "refused for now without a reason; wait a few seconds and ask again"),
+    ("Acro for a station", "the refusal is shown"),
+    ("Acro for a station", "said: Switching to Acro is currently not available"),
+    ("foreign setpoints", "noticed"),
+    ("foreign setpoints", FOREIGN),
+    ("foreign setpoints", "over"),
+    ("COM_OF_LOSS_T 20", "noticed"),
+    ("COM_OF_LOSS_T 20", CHANGED),
+    ("COM_OF_LOSS_T 1", "over"),
+    ("NAV_DLL_ACT 2", "flockd does not announce itself any more"),
+    ("NAV_DLL_ACT 0", "it does again"),
+    ("land", "accepted"),
+    ("land", "the mode is land"),
+    ("land", "disarmed on the ground, in mode hold"),
+    ("restart", "noticed by its clock"),
+    ("restart", "its streams come as requested"),
 )
-"""Of PX4 1.18 (release/1.18, 83c4f4e580) on 24 November 2026: the story, what is seen, and within how many seconds."""
+"""Of PX4 1.18 (release/1.18, 83c4f4e580) on 24 November 2026: the story, and what is seen."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("autopilot", ["fake", pytest.param("px4", marks=PX4)])
 def test_flockd_sees_what_px4_1_18_shows(autopilot: str) -> None:
     rows = seen(autopilot)
-    assert [row.story for row in rows] == [story for story, _, _ in SEEN], rows
-    for row, (_, what, within_s) in zip(rows, SEEN, strict=True):
-        assert row.what.startswith(what), row
-        assert within_s is None or 0.0 <= (row.after_s or 0.0) <= within_s, row
+    assert [row.story for row in rows] == [story for story, _ in SEEN], rows
+    for row, (_, what) in zip(rows, SEEN, strict=True):
+        assert what in row.what, row
 
 
 def test_rows_of_one_story_stand_side_by_side_and_a_difference_is_one() -> None:

@@ -69,7 +69,6 @@ RECEIVED = (*STREAMS_HZ, "HEARTBEAT", "AUTOPILOT_VERSION", "STATUSTEXT", "EVENT"
 TIME_SYNC = "TIMESYNC"
 MOST_OPEN = 20
 """Exchanges whose reply is waited for; older ones are lost."""
-TEXT_MEMORY_S = 2.0
 REASON_S = 0.5
 """For how long a refusal waits for the autopilot's text, which comes after it."""
 ATTEND_S, ANNOUNCE_S, PARAMETER_S = 0.1, 1.0, 0.5
@@ -370,7 +369,7 @@ class AutopilotLink:
 
         ``refused``: what its checks may refuse with it, as in `Refusal.refused`; None: nothing.
         """
-        loop = asyncio.get_running_loop()
+        loop, asked_s = asyncio.get_running_loop(), self._clock()
         answer: asyncio.Future[tuple[MavlinkDirectResult, str]] = loop.create_future()
 
         def on_answer(result: MavlinkDirectResult, ack: MavlinkMessage, _: object) -> None:
@@ -384,23 +383,25 @@ class AutopilotLink:
             raise AutopilotError(f"the autopilot was asked {what} and did not respond ({result.name.lower()})")
         verdict = int(json.loads(ack)["result"])
         if verdict != 0:
-            why = "" if refused is None else await self._why(verdict, refused)
+            why = "" if refused is None else await self._why(verdict, refused, asked_s)
             raise AutopilotError(f"the autopilot was asked {what}, which was {result_text(verdict)}{why}")
 
-    async def _why(self, verdict: int, refused: str) -> str:
-        """What is known of a refusal, once the autopilot has had time to tell, with what to do."""
+    async def _why(self, verdict: int, refused: str, asked_s: float) -> str:
+        """What is known of a refusal, once the autopilot has had time to say it, with what to do."""
+
+        def said() -> list[str]:
+            now = self._clock()
+            return self._received.recent_texts(now, now - asked_s)
+
         deadline = self._clock() + REASON_S
-        while not (known := self._known_reasons(refused)) and self._clock() < deadline:
+        while not said() and self._clock() < deadline:
             await asyncio.sleep(0.02)
+        checks = [refusal for refusal in self.refusals() if refusal.refused in {refused, ""}]
+        known = [*said(), *(f"{refusal.what}; {refusal.remedy}" for refusal in checks)]
         if known:
             return f": {'; '.join(known)}"
         remedy = f"; {REMEDIES_OF_RESULTS[verdict]}" if verdict in REMEDIES_OF_RESULTS else ""
         return f" without a reason{remedy}"
-
-    def _known_reasons(self, refused: str) -> list[str]:
-        said = self._received.recent_texts(self._clock(), TEXT_MEMORY_S)
-        checks = [refusal for refusal in self.refusals() if refusal.refused in {refused, ""}]
-        return [*said, *(f"{refusal.what}; {refusal.remedy}" for refusal in checks)]
 
     def _message(self, name: str, fields: Fields) -> MavlinkMessage:
         target = {"target_system": self._system_id, "target_component": AUTOPILOT_COMPONENT}

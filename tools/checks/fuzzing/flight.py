@@ -210,6 +210,8 @@ def _surroundings(random: Random) -> Surroundings:
 _NUMBERS = tuple(field.name for field in dataclasses.fields(Inputs) if field.type == "float")
 _FLAGS = tuple(field.name for field in dataclasses.fields(Inputs) if field.type == "bool")
 _COUNTS = tuple(field.name for field in dataclasses.fields(Inputs) if field.type == "int")
+_SEEN = ("stream_fault", "foreign_setpoints", "parameter_fault")
+"""What was seen, in words; None: nothing."""
 
 
 def _supervisor(folder: Path) -> Check:
@@ -242,6 +244,7 @@ def _quiet() -> Inputs:
     """An undisturbed flight, on the ground or in the air by what is changed."""
     sees = CameraHealth(age_s=0.02, period_s=0.033, unplugged=False, frozen=False, noisy=False)
     fine: dict[str, Any] = dict.fromkeys(_NUMBERS, 0.01) | dict.fromkeys(_FLAGS, False) | dict.fromkeys(_COUNTS, 0)
+    fine |= dict.fromkeys(_SEEN)
     fine |= {"nearest_neighbour_m": 3.0, "cameras": {"front": sees, "back": sees}, "temperature_c": 50.0}
     return Inputs(**fine, dead_tasks=(), flight_mode=OFFBOARD, armed=True, in_air=True)
 
@@ -249,7 +252,7 @@ def _quiet() -> Inputs:
 def _changes(random: Random) -> dict[str, Any]:
     changes: dict[str, Any] = {}
     for _ in range(random.choice((0, 0, 1, 2, 5))):
-        match random.randrange(7):
+        match random.randrange(8):
             case 0:
                 changes[random.choice(_NUMBERS)] = any_float(random)
             case 1:
@@ -266,6 +269,8 @@ def _changes(random: Random) -> dict[str, Any]:
                 changes["cameras"] = {} if random.random() < 0.1 else {"front": one, "back": one}
             case 6:
                 changes |= {"armed": False, "in_air": False, "resume_asked": random.random() < 0.5}
+            case 7:
+                changes[random.choice(_SEEN)] = random.choice(("seen", None))
     return changes
 
 

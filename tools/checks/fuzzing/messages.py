@@ -66,6 +66,7 @@ def _mavlink(folder: Path) -> Check:
             now_s += random.choice((0.0, 0.02, 1.0, 3.0))
             name = random.choice(RECEIVED)
             received.add(name, {field: _value(random, kind) for field, kind in kinds[name].items()}, now_s)
+            received.check_events.missing(now_s)
             if random.random() < 0.1:
                 received.add_other_heartbeat({"type": random.choice((2, 18, None, "18", 1e300))}, now_s)
         status, state = received.status(now_s), received.vehicle_state()
@@ -85,21 +86,24 @@ def _mavlink(folder: Path) -> Check:
     return check
 
 
-_EVENT = {
-    "id": "uint32_t",
-    "event_time_boot_ms": "uint32_t",
-    "sequence": "uint16_t",
-    "destination_component": "uint8_t",
-    "destination_system": "uint8_t",
-    "log_levels": "uint8_t",
-    "arguments": "bytes",
+_NOT_IN_PYMAVLINK = {
+    "EVENT": {
+        "id": "uint32_t",
+        "event_time_boot_ms": "uint32_t",
+        "sequence": "uint16_t",
+        "destination_component": "uint8_t",
+        "destination_system": "uint8_t",
+        "log_levels": "uint8_t",
+        "arguments": "bytes",
+    },
+    "CURRENT_EVENT_SEQUENCE": {"sequence": "uint16_t", "flags": "uint8_t"},
 }
 """MAVLink's EVENT, which pymavlink does not have."""
 
 
 def _fields(name: str) -> dict[str, str]:
-    if name == "EVENT":
-        return _EVENT
+    if name in _NOT_IN_PYMAVLINK:
+        return _NOT_IN_PYMAVLINK[name]
     kind = getattr(dialect, f"MAVLink_{name.lower()}_message")
     return dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
 
