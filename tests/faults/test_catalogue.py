@@ -15,7 +15,7 @@ from tests.faults.catalogue import CATALOGUE, REACTION, Fault, fault_named, reac
 from tools.checks.faults import outcome
 
 ROOT = Path(__file__).parents[2]
-ROWS = (*range(1, 52), 60)
+ROWS = (*range(1, 52), *range(53, 58), 60)
 FAULT = fault_named("sigterm")
 
 
