@@ -22,7 +22,6 @@ from flockd.onboard.telemetry.zenoh_session import close_session, open_session
 from flockd.sim.free_ports import free_endpoint
 from tests.faults.catalogue import RecordProperty, reacted
 from tests.faults.process import Process, flying
-from tests.faults.test_outside import router
 from tests.fleet.page.test_access import opened, served
 from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import SECONDS_TO_FAIL
@@ -40,8 +39,8 @@ ABSURD: dict[str, dict[str, Any]] = {
 SILENT, CAMERAS = 2, 12
 
 
-def through(endpoint: str) -> Any:
-    """The drone's telemetry, through a router, over which strangers reach who watches."""
+def connecting(endpoint: str) -> Any:
+    """The drone connects to who watches, as strangers may."""
 
     def change(config: DroneConfig) -> DroneConfig:
         return config.model_copy(update={"telemetry": config.telemetry.model_copy(update={"connect": (endpoint,)})})
@@ -74,10 +73,9 @@ async def test_neither_absurd_peers_nor_stuck_pictures_keep_an_order_from_a_dron
     tmp_path: Path, record_property: RecordProperty
 ) -> None:
     endpoint = free_endpoint()
-    bus, _ = router(endpoint)
-    async with flying(tmp_path, change=through(endpoint)) as process:
+    async with flying(tmp_path, change=connecting(endpoint)) as process:
         with (
-            FleetWatcher("test", listen=[], connect=[endpoint]) as watcher,
+            FleetWatcher("test", listen=[endpoint], connect=[]) as watcher,
             LiveFleet(watcher) as fleet,
         ):
             hostile, silent = open_session("hostile", [], [endpoint]), open_session("silent", [], [endpoint])
@@ -117,7 +115,6 @@ async def test_neither_absurd_peers_nor_stuck_pictures_keep_an_order_from_a_dron
             del tokens
             close_session(hostile)
             close_session(silent)
-    bus.close()
 
 
 async def _answer(process: Process, command: str, **ask: object) -> dict[str, Any]:
@@ -146,7 +143,7 @@ async def test_orders_that_are_old_or_ambiguous_or_without_end(tmp_path: Path, r
             refused = await asyncio.to_thread(both.ask, key, "land", "anna")
             assert refused is not None and not refused["accepted"]
             assert process.fake_autopilot.mode == "OFFBOARD"
-            other.undeclare()
+            other.undeclare()  # type: ignore[no-untyped-call]
             await until(lambda: all(len(one.identities) == 1 for one in both.drones()), SECONDS_TO_FAIL)
         close_session(impostor)
 

@@ -33,7 +33,7 @@ async def _flies_on(process: Process) -> None:
     assert process.program.ended is None
 
 
-def router(endpoint: str) -> tuple[Any, list[str]]:
+def _router(endpoint: str) -> tuple[Any, list[str]]:
     """What a drone connects to, and the keys of what it hears."""
     config = zenoh.Config()
     config.insert_json5("mode", '"router"')
@@ -51,18 +51,18 @@ async def test_the_router_of_the_telemetry_goes_and_comes_back(tmp_path: Path) -
     def through_a_router(config: DroneConfig) -> DroneConfig:
         return config.model_copy(update={"telemetry": config.telemetry.model_copy(update={"connect": (endpoint,)})})
 
-    bus, keys = router(endpoint)
+    router, keys = _router(endpoint)
     async with flying(tmp_path, change=through_a_router) as process:
         await until(lambda: "flockd/v1/test/tiny/flight" in keys, SECONDS_TO_FAIL)
         gone_s = time.monotonic()
-        bus.close()
+        router.close()
         await _flies_on(process)
         sent = [at_s for at_s, _ in list(process.fake_autopilot.setpoints) if at_s > gone_s]
         gaps = [after - before for before, after in itertools.pairwise(sent)]
         assert max(gaps) < 0.5, "PX4 wants two setpoints a second"
-        bus, keys = router(endpoint)
+        router, keys = _router(endpoint)
         await until(lambda: "flockd/v1/test/tiny/flight" in keys, 60.0)
-        bus.close()
+        router.close()
 
 
 async def test_nonsense_on_the_telemetry_bus(tmp_path: Path) -> None:
