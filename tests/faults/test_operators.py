@@ -156,7 +156,7 @@ async def test_orders_that_are_old_or_ambiguous_or_without_end(tmp_path: Path, r
         began_s = time.monotonic()
         assert (await _answer(process, "resume", operator="bert", session="b"))["accepted"]
         await until(
-            lambda: [one["operator"] for one in process.heard()["flight"].message["orders"]] == ["bert", "anna"],
+            lambda: [one["operator"] for one in process.heard()["flight"].message["orders"]][:2] == ["bert", "anna"],
             SECONDS_TO_FAIL,
         )
         reacted(record_property, "order-replayed", time.monotonic() - began_s)
