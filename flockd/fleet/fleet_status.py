@@ -13,13 +13,16 @@ WORST_FIRST = (GONE, QUIET, "asking", "hover", "silent", "degraded", "idle", "re
 
 
 def status_rows(drones: Iterable[Watched], now_s: float) -> list[dict[str, Any]]:
-    """One row for each drone, as JSON, the worst first, and names that no drone stands behind last.
+    """One row for each drone, as JSON, the worst first: names of several drones, then states; names of none last.
 
     ``now_s``: on the watcher's clock.
     """
     rows = [(drone.announced or drone.alive, _row(drone, now_s)) for drone in drones]
-    rows.sort(key=lambda one: (not one[0], WORST_FIRST.index(one[1]["state"]), one[1]["fleet"], one[1]["drone"]))
-    return [row for _, row in rows]
+    return [row for _, row in sorted(rows, key=lambda one: (not one[0], *_worst(one[1])))]
+
+
+def _worst(row: Mapping[str, Any]) -> tuple[bool, int, str, str]:
+    return len(row["identities"]) < 2, WORST_FIRST.index(row["state"]), row["fleet"], row["drone"]
 
 
 def _row(drone: Watched, now_s: float) -> dict[str, Any]:

@@ -478,6 +478,52 @@ CATALOGUE = (
         within_s=5.0,
     ),
     Fault(
+        53, "hostile-peers", "a peer's absurd numbers, endless texts, names by the thousand",
+        "refused where it enters; drones stay visible, page and orders live on",
+        (
+            f"{_HERE}operators.py::test_neither_absurd_peers_nor_stuck_pictures_keep_an_order_from_a_drone",
+            "tests/onboard/telemetry/test_malformed.py",
+            "tests/fleet/page/test_crowded.py::test_a_drone_with_absurd_numbers_closes_no_page",
+            "tests/fleet/foxglove_server/test_strangers.py",
+        ),
+        within_s=60.0,
+    ),
+    Fault(
+        54, "stuck-pictures", "pictures of drones that do not answer, many browsers, half-open connections",
+        "an order to another drone is answered within a second",
+        (
+            f"{_HERE}operators.py::test_neither_absurd_peers_nor_stuck_pictures_keep_an_order_from_a_drone",
+            "tests/fleet/page/test_crowded.py",
+        ),
+        within_s=1.0,
+    ),
+    Fault(
+        55, "one-name-twice", "two drones of one name", "said on page and in status; no order is sent",
+        (
+            f"{_HERE}operators.py::test_orders_that_are_old_or_ambiguous_or_without_end",
+            "tests/onboard/telemetry/test_malformed.py::"
+            "test_two_drones_of_one_name_are_told_apart_by_identity_and_neither_gets_an_order",
+        ),
+        within_s=5.0,
+    ),
+    Fault(
+        56, "order-replayed", "old, replayed or reordered orders, two operators",
+        "refused, or the last one by time wins; both operators are named",
+        (
+            f"{_HERE}operators.py::test_orders_that_are_old_or_ambiguous_or_without_end",
+            "tests/onboard/daemon/test_orders.py",
+        ),
+        within_s=3.0,
+    ),
+    Fault(
+        57, "orders-without-end", "thousands of refused orders", "log and recording bounded, nothing displaced",
+        (
+            f"{_HERE}operators.py::test_orders_that_are_old_or_ambiguous_or_without_end",
+            "tests/onboard/daemon/test_orders.py",
+        ),
+        within_s=3.0,
+    ),
+    Fault(
         60, "step-exception", "an exception that nobody expected in the pilot's step",
         "caught at the step's border; one step lost with its reason; three in a row: Hold",
         (

@@ -10,6 +10,7 @@ import asyncio
 import itertools
 import math
 import os
+import threading
 from collections.abc import Sequence
 from typing import get_args
 
@@ -34,7 +35,14 @@ from flockd.core.messages import (
 from flockd.onboard.daemon.operator_commands import OperatorCommands, OperatorRequests
 from flockd.onboard.telemetry import publish_step
 from flockd.onboard.telemetry.publisher import DEFAULT_ENDPOINT, ZenohTelemetry
-from flockd.onboard.telemetry.topics import AboutMessage, CameraMessage, ComputerMessage, FlightMessage, ReasonMessage
+from flockd.onboard.telemetry.topics import (
+    AboutMessage,
+    AnswerMessage,
+    CameraMessage,
+    ComputerMessage,
+    FlightMessage,
+    ReasonMessage,
+)
 
 FLEET = "made-up"
 RADIUS_M, SPEED_M_S, HEIGHT_M, SPACING_M, SIGHT_M = 25.0, 1.5, 5.0, 3.5, 6.5
@@ -52,6 +60,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=1, help="number of the first drone")
     parser.add_argument("--rate", type=float, default=2.0, help="steps a second")
     parser.add_argument("--commands", default="", help=f"of {', '.join(get_args(OperatorCommand))}")
+    parser.add_argument("--mute", type=int, default=0, metavar="CAMERAS", help="answer nothing, with so many cameras")
     parser.add_argument("--listen", default=DEFAULT_ENDPOINT)
     parser.add_argument(
         "--connect", action="append", default=[], help="where a watcher listens, in the place of --listen"
@@ -62,17 +71,18 @@ def main() -> int:
     with ZenohTelemetry(FLEET, listen=listen, connect=args.connect) as telemetry:
         try:
             commands = [one for one in args.commands.split(",") if one]
-            asyncio.run(_publish(telemetry, numbers, args.flock or args.drones, args.rate, commands))
+            flock = args.flock or args.drones
+            asyncio.run(_publish(telemetry, numbers, flock, args.rate, commands, args.mute))
         except KeyboardInterrupt:
             return 0
     return 0
 
 
 async def _publish(
-    telemetry: ZenohTelemetry, numbers: Sequence[int], flock: int, rate_hz: float, commands: list[str]
+    telemetry: ZenohTelemetry, numbers: Sequence[int], flock: int, rate_hz: float, commands: list[str], mute: int
 ) -> None:
     loop = asyncio.get_running_loop()
-    drones = [MadeUpDrone(telemetry, number, flock, commands, loop) for number in numbers]
+    drones = [MadeUpDrone(telemetry, number, flock, commands, loop, mute) for number in numbers]
     began_s = loop.time()
     for step in itertools.count():
         time_s = step / rate_hz
@@ -101,9 +111,14 @@ class MadeUpDrone:
         flock: int,
         commands: list[str],
         loop: asyncio.AbstractEventLoop,
+        mute: int = 0,
     ) -> None:
-        """``flock``: how many there are in all, of which it sees the nearest."""
-        self._flock = flock
+        """``flock``: how many there are in all, of which it sees the nearest.
+
+        ``mute``: with so many cameras, it answers neither questions for their pictures nor commands; 0: it answers.
+        """
+        self._flock, self._mute = flock, mute
+        self._cameras = [f"camera{number}" for number in range(mute)] if mute else ["front", "back"]
         self._telemetry, self._number, self.name = telemetry, number, f"drone{number}"
         self._requests = OperatorRequests()
         self._times = itertools.count()
@@ -115,7 +130,7 @@ class MadeUpDrone:
         self._commands = OperatorCommands(
             commands, self._requests, self, loop, self._event, identity=telemetry.identity
         )
-        telemetry.announce(self.name, about, self._commands.handle, self._image)
+        telemetry.announce(self.name, about, self._command, self._image)
 
     def fault(self, order: MissionOrder) -> str | None:
         """Takes every order, and flies none."""
@@ -180,7 +195,7 @@ class MadeUpDrone:
         )  # fmt: skip
 
     def _computer(self, time_s: float) -> ComputerMessage:
-        cameras = {name: CameraMessage(age_s=0.03, fault=None, counts={}) for name in ("front", "back")}
+        cameras = {name: CameraMessage(age_s=0.03, fault=None, counts={}) for name in self._cameras}
         return ComputerMessage(
             time_s=time_s, cameras=cameras,
             load=0.5 + 0.1 * math.sin(0.2 * time_s + self._number), steps=self._steps, steps_failed=0, network_faults=0,
@@ -188,11 +203,20 @@ class MadeUpDrone:
             messages_lost=0, recording=None,
         )  # fmt: skip
 
+    def _command(self, command: str, payload: bytes) -> AnswerMessage:
+        self._wait_if_mute()
+        return self._commands.handle(command, payload)
+
+    def _wait_if_mute(self) -> None:
+        if self._mute:
+            threading.Event().wait()
+
     def _event(self, sentence: str) -> None:
         self._telemetry.publish(self.name, "events", {"time_s": self._steps / 2.0, "event": sentence})
 
     def _image(self, camera: str) -> bytes | None:
         """A picture that says whose it is."""
+        self._wait_if_mute()
         image = np.full((240, 320, 3), (140, 110, 70), np.uint8)
         image[150:] = (60, 110, 80)
         cv2.circle(image, (90 + 10 * (self._steps % 14), 120), 14, (0, 109, 255), 1, cv2.LINE_AA)

@@ -2,6 +2,7 @@
 
 python -m tools.measure.bench_fleet_page --drones 50 --seconds 20
 python -m tools.measure.bench_fleet_page --drones 5 --pictures out/pages    # and pictures of the page
+python -m tools.measure.bench_fleet_page --stuck 24    # how long a hold takes beside pictures that nobody answers
 
 Chromium is /usr/bin/chromium, or what CHROMIUM names.
 """
@@ -36,7 +37,27 @@ SAMPLER = """seconds => new Promise(done => {
   };
   requestAnimationFrame(tick);
 })"""
+HOLD = """async card => {
+  document.querySelector(`${card} [data-command=hold]`).click();
+  const answered = new Promise(done => {
+    const observer = new MutationObserver(() => {
+      if (!document.querySelector("#answers p")) return;
+      observer.disconnect();
+      done();
+    });
+    document.querySelectorAll("#answers p").forEach(one => one.remove());
+    observer.observe(document.getElementById("answers"), { childList: true });
+  });
+  const began = performance.now();
+  document.querySelector("#confirm .send").click();
+  await answered;
+  if (!document.querySelector("#answers p").textContent.includes("hold is being tried")) throw new Error("refused");
+  return performance.now() - began;
+}"""
 PATIENCE_MS = 120_000
+BROWSERS, CAMERAS = 4, 12
+HELD = "article[data-key='made-up/drone1']"
+"""The card of the drone that answers."""
 WIDE = ViewportSize(width=1440, height=900)
 NARROW = ViewportSize(width=390, height=844)
 
@@ -47,8 +68,11 @@ def main() -> int:
     parser.add_argument("--drones", type=int, default=50)
     parser.add_argument("--rate", type=float, default=2.0, help="messages a second of each topic and drone")
     parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--stuck", type=int, metavar="N", help="time a hold beside N stuck pictures and four browsers")
     parser.add_argument("--pictures", type=Path, help="a folder for pictures of the page")
     args = parser.parse_args()
+    if args.stuck is not None:
+        return _time_holds(args.stuck)
     endpoint = free_endpoint()
     options = ("--drones", str(args.drones), "--rate", str(args.rate), "--commands", "hold,land,resume,goto")
     with served_page(endpoint) as (address, server), made_up_drones(endpoint, *options), chromium() as browser:
@@ -74,6 +98,53 @@ def main() -> int:
         if args.pictures is not None:
             _take_pictures(page, browser, args.pictures)
     return 0
+
+
+def _time_holds(stuck: int) -> int:
+    """A hold on each of four pages, all of which show the cameras of drones that answer nothing; prints seconds."""
+    endpoint = free_endpoint()
+    silent = -(-stuck // CAMERAS)
+    flock = ("--flock", f"{1 + silent}", "--drones")
+    with (
+        served_page(endpoint) as (address, _),
+        made_up_drones(endpoint, *flock, "1", "--commands", "hold,resume"),
+        made_up_drones(endpoint, *flock, f"{silent}", "--first", "2", "--mute", f"{CAMERAS}"),
+        chromium() as browser,
+    ):
+        pages = [browser.new_context().new_page() for _ in range(BROWSERS)]
+        for page in pages:
+            open_page(page, address, 1 + silent)
+        free = [hold_s(page) for page in pages]
+        for page in pages:
+            look_at_silent(page, silent)
+        beside = [hold_s(page) for page in pages]
+    for what, seconds in (("no pictures", free), (f"{silent * CAMERAS} stuck pictures", beside)):
+        each = ", ".join(f"{one:.2f}" for one in seconds)
+        print(f"from the confirmed hold to the answer beside {what}, on {BROWSERS} pages: {each} s")
+    print(f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+    return 0
+
+
+def open_page(page: Page, address: str, drones: int) -> None:
+    """Until the first drone may be commanded."""
+    page.set_default_timeout(PATIENCE_MS)
+    page.goto(address)
+    expect(page.locator("article")).to_have_count(drones, timeout=PATIENCE_MS)
+    expect(page.locator(f"{HELD} [data-command=hold]")).to_be_enabled(timeout=PATIENCE_MS)
+    expect(page.locator(".plot .js-line").first).to_be_attached(timeout=PATIENCE_MS)  # the last that it loads
+
+
+def look_at_silent(page: Page, silent: int) -> None:
+    """Shows the cameras of all drones that answer nothing, until it is told so."""
+    for number in range(silent):
+        page.locator(f"article[data-key='made-up/drone{2 + number}'] .look").dispatch_event("click")
+    none = page.locator(".pictures figcaption", has_text="no picture")
+    expect(none.first).to_be_visible(timeout=PATIENCE_MS)
+
+
+def hold_s(page: Page) -> float:
+    """From the confirmed hold to the drone's answer on the page, by the browser's clock."""
+    return float(page.evaluate(HOLD, HELD)) / 1000
 
 
 @contextmanager

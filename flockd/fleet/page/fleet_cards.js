@@ -28,6 +28,10 @@ const EXPLAINED = {
   missed: "setpoints that its computer was too busy to send in time",
 };
 
+async function failure(reply) {
+  return reply.ok ? "" : reply.text();
+}
+
 function apart(seconds) {
   if (seconds === null) return "–";
   const sign = seconds < 0 ? "−" : "+";
@@ -176,8 +180,9 @@ export class FleetCards {
     try {
       const address = `image/${drone}/${encodeURIComponent(camera)}?at=${state.now}`;
       const reply = await fetch(address, { priority: "low", signal: AbortSignal.timeout(PICTURE_MS) });
-      put(figure.lastChild, reply.ok ? camera : `${camera}: ${await reply.text()}`);
-      if (reply.ok) {
+      const none = reply.status === 204 ? "no picture has come: it has none, or does not answer" : await failure(reply);
+      put(figure.lastChild, none ? `${camera}: ${none}` : camera);
+      if (!none) {
         const picture = URL.createObjectURL(await reply.blob());
         URL.revokeObjectURL(image.src);
         image.src = picture;

@@ -24,7 +24,7 @@ export class FleetCommands {
 
   allowed(command, key) {
     const row = state.rows.get(key);
-    return state.mayCommand && row.state !== "gone" && (row.commands || []).includes(command);
+    return state.mayCommand && row.state !== "gone" && row.identities.length < 2 && (row.commands || []).includes(command);
   }
 
   // Why a drone has no command; empty where it has some.

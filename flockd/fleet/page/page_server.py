@@ -138,7 +138,7 @@ class PageServer:
         else:
             image = await self._pictures.recorded(drone, camera, _number(request.query.get("at")))
         if image is None:
-            return _text(404, "no picture has come: the camera has none, or this computer may not see it")
+            return web.Response(status=204)
         return web.Response(body=image, content_type="image/jpeg")
 
     async def _ask(self, request: web.Request) -> web.Response:

@@ -16,7 +16,7 @@ from aiohttp.test_utils import TestClient, TestServer
 
 from flockd.core.errors import UnavailableError
 from flockd.fleet.page.drone_rows import Known, Row
-from flockd.fleet.page.fleet_source import Event
+from flockd.fleet.page.fleet_source import Event, FleetSource
 from flockd.fleet.page.page_access import PageAccess, is_own_host, lasting_key
 from flockd.fleet.page.page_server import PageServer
 from flockd.fleet.watcher import Watched
@@ -70,13 +70,13 @@ class Asked:
 
 @asynccontextmanager
 async def served(
-    *, may_command: bool = True, fleet: Asked | None = None
+    *, may_command: bool = True, fleet: FleetSource | None = None
 ) -> AsyncIterator[tuple[Client, PageAccess, Asked]]:
-    """A server, and a browser without a page."""
-    access, fleet = PageAccess(), fleet or Asked()
-    server = TestServer(PageServer(fleet, access, may_command=may_command).application(), host="127.0.0.1")
+    """A server, of ``fleet`` or of one that notes what is asked, and a browser without a page."""
+    access, noted = PageAccess(), Asked()
+    server = TestServer(PageServer(fleet or noted, access, may_command=may_command).application(), host="127.0.0.1")
     async with TestClient(server) as client:
-        yield client, access, fleet
+        yield client, access, noted
 
 
 async def opened(client: Client, access: PageAccess) -> dict[str, str]:

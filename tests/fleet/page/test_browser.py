@@ -7,18 +7,31 @@ from __future__ import annotations
 
 import os
 import re
+import socket
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from pathlib import Path
 from subprocess import Popen
 from typing import NamedTuple
 
 import pytest
 from playwright.sync_api import Page, expect
 
-from flockd.sim.free_ports import free_endpoint
-from tools.measure.bench_fleet_page import NARROW, PATIENCE_MS, chromium, made_up_drones, served_page
+from flockd.sim.free_ports import free_endpoint, free_port
+from tools.measure.bench_fleet_page import (
+    BROWSERS,
+    CAMERAS,
+    NARROW,
+    PATIENCE_MS,
+    chromium,
+    hold_s,
+    look_at_silent,
+    made_up_drones,
+    open_page,
+    served_page,
+)
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -128,6 +141,56 @@ def test_a_stranger_in_the_same_browser_commands_nothing(flock: Flock) -> None:
     assert sent in {0, "refused"}, "its reply cannot be read"
     stranger.close()
     expect(flock.page.locator(f"{card(flock.page, 'drone1')} .state")).to_have_text("normal")
+
+
+def opened_beside(flock: Flock) -> Page:
+    """A page of a browser of its own."""
+    browser = flock.page.context.browser
+    assert browser is not None
+    return browser.new_context().new_page()
+
+
+def test_a_hold_passes_twenty_four_pictures_that_nobody_answers_on_four_pages(flock: Flock) -> None:
+    """The drone has answered while none of the others has; how long it took is printed."""
+    endpoint = free_endpoint()
+    with (
+        served_page(endpoint) as (address, _),
+        made_up_drones(endpoint, "--drones", "1", "--flock", "3", "--commands", "hold"),
+        made_up_drones(endpoint, "--drones", "2", "--first", "2", "--flock", "3", "--mute", f"{CAMERAS}"),
+    ):
+        pages = [opened_beside(flock) for _ in range(BROWSERS)]
+        for page in pages:
+            open_page(page, address, 3)
+            look_at_silent(page, 2)
+        for page in pages:
+            told("a hold beside 24 stuck pictures", time.monotonic() - hold_s(page))
+            pictures = page.locator(".pictures img")
+            assert pictures.evaluate_all("all => all.filter(image => image.naturalWidth > 0).length") == 0
+        expect(pages[0].locator("article[data-key='made-up/drone1'] .why")).to_contain_text("4 operators commanded it")
+
+
+def test_an_open_page_goes_on_when_the_server_is_started_again(flock: Flock, tmp_path: Path) -> None:
+    """With a key that lasts by itself; with another key it says what to do."""
+    endpoint, key_file, port = free_endpoint(), tmp_path / "key", str(free_port(socket.SOCK_STREAM))
+    lasting = ("--port", port, "--key-file", str(key_file))
+    page = opened_beside(flock)
+    trouble = page.locator("#trouble")
+    with made_up_drones(endpoint, "--drones", "2", "--commands", "hold"):
+        with served_page(endpoint, *lasting) as (address, _):
+            page.goto(address)
+            expect(page.locator("article")).to_have_count(2)
+        expect(trouble).to_contain_text("The server cannot be reached, and is asked again every second")
+        with served_page(endpoint, *lasting) as (again, _):
+            assert again == address
+            expect(trouble).to_be_hidden()
+            expect(page.locator(f"{card(page, 'drone1')} [data-command=hold]")).to_be_enabled()
+            hold_s(page)
+        with served_page(endpoint, "--port", port) as (other, _):
+            assert other != address
+            expect(trouble).to_contain_text("open the address that it printed. Started with --key-file")
+        expect(trouble).to_contain_text("The server cannot be reached")
+        with served_page(endpoint, *lasting):
+            expect(trouble).to_be_hidden()
 
 
 def test_pictures_of_cameras_come_on_request(flock: Flock) -> None:

@@ -55,7 +55,7 @@ async def test_an_order_passes_pictures_and_orders_that_nobody_answers() -> None
             await asyncio.sleep(0.01)
         reply = await client.post("/ask", json={"drones": ["f/one"], "command": "hold"}, headers=own)
         assert (await reply.json())["f/one"]["accepted"]
-        assert {(await picture).status for picture in pictures} == {404}, "none waits for its drone"
+        assert {(await picture).status for picture in pictures} == {204}, "none waits for its drone"
         assert "a picture came" not in fleet.happened
         assert not stuck.done()
         assert fleet.happened.count("asked for a picture") == 8, "four of each drone, whoever looks"

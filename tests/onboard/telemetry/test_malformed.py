@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -179,7 +180,10 @@ def test_ten_thousand_invented_names_hide_no_drone(take: tuple[FleetWatcher, Tak
 def test_who_has_announced_itself_stands_before_names_that_nobody_stands_behind() -> None:
     invented = Watched("f", "invented", topics={"flight": Heard(0.0, FLIGHT)}, seen=True)
     drone = Watched("f", "real", alive=True, announced=True, topics={"flight": Heard(0.0, FLIGHT)}, seen=True)
-    assert [row["drone"] for row in status_rows([invented, drone], 0.1)] == ["real", "invented"]
+    gone = Watched("f", "gone", announced=True, seen=True)
+    two = replace(drone, drone="two", identities=frozenset({"1", "2"}))
+    shown = [row["drone"] for row in status_rows([invented, drone, gone, two], 0.1)]
+    assert shown == ["two", "gone", "real", "invented"]
 
 
 def test_one_that_says_much_displaces_none_of_the_others_events(take: tuple[FleetWatcher, Take]) -> None:

@@ -23,6 +23,7 @@ from flockd.core.config import load_drone
 from flockd.core.config.source import SourceParameters
 from flockd.core.messages import MissionOrder
 from flockd.fleet.fleet_status import status_rows
+from flockd.fleet.page.drone_rows import drone_rows, history_row
 from flockd.fleet.ros.order_requests import Whereabouts, goal_of, velocity_of
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.autopilot.mavlink_messages import ReceivedMessages
@@ -166,6 +167,9 @@ def _status(folder: Path) -> Check:
             now_s[0] += random.choice((0.0, 0.1))
         rows = status_rows(watcher.drones(), now_s[0] + random.choice((0.0, 1.0, 100.0)))
         json.dumps(rows, allow_nan=False)
+        page = drone_rows(watcher.drones(), {}, now_s[0])
+        history = [history_row(row, now_s[0]) for row in page.values()]
+        json.dumps([page, history], allow_nan=False, ensure_ascii=False).encode()
         screen = io.StringIO()
         Console(file=screen, markup=False, highlight=False, width=1000).print(_table(rows))
         assert not {char for char in screen.getvalue() if char != "\n" and not char.isprintable()}
@@ -212,7 +216,8 @@ def _commands(folder: Path) -> Check:
         loop.run_forever()
         assert command in allowed or not reply["accepted"]
         assert len(missions.orders) == (reply["accepted"] and command in ("goto", "velocity"))
-        assert (requests.hold, requests.land, requests.resume) == (command == "hold", command == "land", False)
+        taken = command if reply["accepted"] else ""
+        assert (requests.hold, requests.land, requests.resume) == (taken == "hold", taken == "land", False)
         for sentence in (*said, reply["sentence"]):
             assert_readable(sentence)
 
