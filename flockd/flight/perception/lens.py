@@ -66,7 +66,8 @@ def clarity(image: UInt8Array, ground: BoolArray) -> Clarity | None:
 def _deviations(details: Float32Array, ground: BoolArray, side: int) -> Float32Array:
     rows, columns = ground.shape
     squares = (details * details).reshape(rows, side, columns, side).mean(axis=(1, 3))
-    return np.sqrt(squares[ground])
+    deviations: Float32Array = np.sqrt(squares[ground])
+    return deviations
 
 
 @dataclass
