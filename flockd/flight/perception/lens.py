@@ -27,6 +27,8 @@ _BELOW_RAD = math.radians(10.0)
 """A block that looks down at least so steeply shows ground, over hills too."""
 _LEAST_BLOCKS = 12
 """With fewer that show ground nothing is said."""
+_QUANTILE = 0.75
+"""Of the blocks: a plain wall near by takes the contrast from some, a lens from all."""
 _FINE_PX, _COARSE_PX = 1.0, 4.0
 """Standard deviations of the blurs between which details count as fine, and as coarse."""
 _FAINTEST = 0.5
@@ -44,9 +46,9 @@ class Clarity(NamedTuple):
     """Of the ground in one image."""
 
     contrast: float
-    """Grey levels: the median block's standard deviation of coarse details."""
+    """Grey levels: standard deviation of coarse details in a block of the better ones."""
     sharpness: float
-    """Fine details over coarse ones, of the median block."""
+    """That of fine details over it."""
 
 
 def clarity(image: UInt8Array, ground: BoolArray) -> Clarity | None:
@@ -55,12 +57,14 @@ def clarity(image: UInt8Array, ground: BoolArray) -> Clarity | None:
         return None
     side = _block_px(image.shape[:2])
     cut = image[: ground.shape[0] * side, : ground.shape[1] * side]
-    grey = cv2.cvtColor(cut, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    fine_out = cv2.GaussianBlur(grey, (0, 0), _FINE_PX)
+    grey = cv2.cvtColor(cut, cv2.COLOR_RGB2GRAY)
+    if side >= 2 * _LEAST_BLOCK_PX:
+        grey, side = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), side // 2
+    fine_out = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _FINE_PX)
     coarse_out = cv2.GaussianBlur(fine_out, (0, 0), _COARSE_PX)
     fine, coarse = (_deviations(part, ground, side) for part in (grey - fine_out, fine_out - coarse_out))
-    contrast = float(np.median(coarse))
-    return Clarity(contrast, float(np.median(fine)) / max(contrast, _FAINTEST))
+    contrast = float(np.quantile(coarse, _QUANTILE))
+    return Clarity(contrast, float(np.quantile(fine, _QUANTILE)) / max(contrast, _FAINTEST))
 
 
 def _deviations(details: Float32Array, ground: BoolArray, side: int) -> Float32Array:
@@ -156,4 +160,4 @@ def _block_rays(camera: RigCamera) -> FloatArray:
 
 
 def _block_px(size: tuple[int, ...]) -> int:
-    return max(min(size) // _BLOCKS, _LEAST_BLOCK_PX)
+    return max(min(size) // _BLOCKS // 2 * 2, _LEAST_BLOCK_PX)
