@@ -32,7 +32,7 @@ RANGE_GROUND = Check(
     4.0,
     "SD",
     "not used; the second in a row is believed, if the barometer does not contradict",
-    "PX4 1.18: EKF2_RNG_GATE 5 SD",
+    "PX4's EKF2_RNG_GATE 5 SD",
     ("perception.range_finder.gate_sigma",),
 )
 RANGE_BAROMETER = Check(
@@ -40,7 +40,7 @@ RANGE_BAROMETER = Check(
     1.0,
     "m",
     "the second in a row: the range finder is not used, the scale is the barometer's",
-    "steps of the ground, and a barometer's drift in 15 s; PX4's own check (EKF2_RNG_K_GATE 1 SD) needs still ground",
+    "steps of the ground, and a barometer's drift in 15 s; PX4's EKF2_RNG_K_GATE 0.5 SD needs level ground",
     ("perception.range_finder.tolerance_m",),
 )
 RANGE_SLOPE = Check(
@@ -48,7 +48,7 @@ RANGE_SLOPE = Check(
     0.25,
     "m/m",
     "as for the one above",
-    "hills of 15 % with bumps; PX4 1.18: EKF2_TERR_GRAD 0.5",
+    "hills of 15 % with bumps; PX4's EKF2_TERR_GRAD 0.5",
     ("perception.range_finder.max_slope",),
 )
 RANGE_REPEATED = Check(
@@ -56,14 +56,14 @@ RANGE_REPEATED = Check(
     0.5,
     "m",
     "the range finder is not used before it says something else, and agrees",
-    "PX4 1.18: range_stuck_threshold 0.1 m; more, as a range in whole centimetres may repeat along a slope",
+    "PX4's range_stuck_threshold 0.1 m; more, as a range in whole centimetres may repeat along a slope",
 )
 RANGE_VISION = Check(
     "way flown by the images, whose scale is the range, with the way by the autopilot, over 5 m and more",
     3.0,
     "SD",
     "the range finder is not used where the barometer's height fits better",
-    "PX4 1.18: EKF2_EVV_GATE 3 SD; its velocity wanders by 0.15 m/s for seconds (measured in its simulator)",
+    "PX4's EKF2_EVV_GATE 3 SD; its velocity wanders by 0.15 m/s for seconds (measured in its simulator)",
 )
 EGO_MOTION = Check(
     "velocity by the images, with the one before",
@@ -85,7 +85,7 @@ RESPONSE_DEGRADED = Check(
     0.6,
     "m/s",
     "gusts_strong",
-    "campaigns of gusts: no two drones touch",
+    "config/campaigns/gusts.yaml: where no two drones touch",
     ("safety.degraded_gusts_m_s",),
 )
 RESPONSE = Check(

@@ -43,6 +43,8 @@ class ReasonKind(StrEnum):
     """The height's wanted source."""
     CAMERA = "camera"
     """A camera's image, or part of what perception makes of it."""
+    LENS = "lens"
+    """A camera's image, as its lens shows too little."""
     PAIR = "pair"
     """The pair of frame sets."""
     PROPOSAL = "proposal"

@@ -524,6 +524,14 @@ CATALOGUE = (
         within_s=3.0,
     ),
     Fault(
+        58, "lens-covered", "a lens is covered, dirty, fogged or in the sun", "that camera counts as blind; said",
+        (
+            f"{_HERE}cameras.py::test_a_lens_is_covered",
+            "tests/flight/perception/test_lens.py",
+        ),
+        within_s=8.0,
+    ),
+    Fault(
         60, "step-exception", "an exception that nobody expected in the pilot's step",
         "caught at the step's border; one step lost with its reason; three in a row: Hold",
         (

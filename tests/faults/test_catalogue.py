@@ -15,7 +15,7 @@ from tests.faults.catalogue import CATALOGUE, REACTION, Fault, fault_named, reac
 from tools.checks.faults import outcome
 
 ROOT = Path(__file__).parents[2]
-ROWS = (*range(1, 58), *range(60, 67))
+ROWS = (*range(1, 59), *range(60, 67))
 FAULT = fault_named("sigterm")
 
 

@@ -15,6 +15,7 @@ from flockd.core.choices import HeightSource
 from flockd.core.config import DroneConfig
 from flockd.core.config.scenario import RangeFinderConfig
 from flockd.core.messages import FloatArray, RangeReading
+from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
 from flockd.sim.autopilot.fake_vehicle import Demand
 from tests.faults.catalogue import RecordProperty, reacted
@@ -52,6 +53,11 @@ def _by(source: HeightSource) -> Callable[[DroneConfig], DroneConfig]:
     return change
 
 
+def _climbing(autopilot: FakeAutopilot) -> Demand:
+    """As it was commanded last, and higher."""
+    return Demand(np.array(autopilot.setpoints[-1][1].velocity[:2]), -HOVER_M - 4.0, 0.0)
+
+
 async def _flies_by_range(process: Process) -> None:
     """In offboard, at whatever speed; steps were made with a range, and nothing is wrong with the newest."""
     await started(process)
@@ -79,7 +85,7 @@ async def test_the_range_finder_lies(
         autopilot, told = process.fake_autopilot, len(process.events)
         sensor.lie = lie
         if climbs:
-            autopilot._demand = lambda: Demand(np.zeros(2), -HOVER_M - 4.0, 0.0)  # type: ignore[method-assign]
+            autopilot._demand = lambda: _climbing(autopilot)  # type: ignore[method-assign]
             await until(lambda: -autopilot.state.position[2] > HOVER_M + NOTICED_M, SECONDS_TO_FAIL)
         fault_s = time.monotonic()
         await process.until_event(f"{LIE}; the barometer's is used")

@@ -76,6 +76,10 @@ class NoiseParameters(Section):
     max_unexplained: Share = 0.35
     """Nor is it where this much more of it than of the other cameras' images does not follow from the image before, as
     when it is damaged in blocks, or covered by soft noise. 1: all are used."""
+    min_clarity: Share = 0.35
+    """Nor is it where the ground in it has kept less than this share of the contrast, or of the sharpness, that the
+    camera showed before, and the other cameras did not lose as much: its lens is covered, dirty, fogged or in the sun.
+    0: all are used."""
     clean_images: Annotated[int, Field(ge=1, le=100)] = 2
     """So many clean images in a row before a camera that was noisy is used again."""
 

@@ -15,6 +15,7 @@ from flockd.flight.perception.detection.detector import DetectionTrace, Detector
 from flockd.flight.perception.detection.masks import depth_of_drones, without_borders
 from flockd.flight.perception.image_noise import NoiseMonitor
 from flockd.flight.perception.interface import Networks
+from flockd.flight.perception.lens import LensMonitor
 from flockd.flight.perception.maps import KnownSize, SceneMaps
 from flockd.flight.perception.metric_depth import metric_depth
 from flockd.flight.perception.observation import CameraObservation, Observation
@@ -36,6 +37,7 @@ class Perception:
         self._needs_ground = config.scale == "height"
         self._noise = NoiseMonitor(config.noise)
         self._continuity = ContinuityMonitor(config.noise)
+        self._lens = LensMonitor(rig.cameras, config.noise)
         self._last: Observation | None = None
 
     def observe(
@@ -78,7 +80,7 @@ class Perception:
         return self._last
 
     def _usable(self, frames: FrameSet, vehicle: VehicleState) -> tuple[dict[str, Frame], tuple[str, ...], Reasons]:
-        """The frames of the rig's cameras that have the right size and show a scene, and whose show noise or damage."""
+        """Frames of the right size that show a scene, cameras whose show noise, damage or too little, and why."""
         usable, noisy, reasons = {}, [], []
         for name, camera in self._rig.cameras.items():
             width, height = camera.camera.size
@@ -97,6 +99,11 @@ class Perception:
         for name in self._continuity.broken(images, frames.time_s, vehicle.R_ned_body):
             noisy.append(name)
             reasons.append(_of_camera(name, "its image does not follow from the one before"))
+            del usable[name]
+        images = {name: frame.image for name, frame in usable.items()}
+        for name, fault in self._lens.bad(images, frames.time_s, vehicle.R_ned_body).items():
+            noisy.append(name)
+            reasons.append(Reason(ReasonKind.LENS, f"camera {name}: {fault}"))
             del usable[name]
         return usable, tuple(noisy), reasons
 

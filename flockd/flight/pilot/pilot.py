@@ -225,12 +225,19 @@ class FlockPilot:
         """The own motion with the range finder's scale where the ground shows it, and as it is otherwise."""
         if ego is None or ground is None or self._ground is None:
             return ego
-        track = self._ground.track(observation.vehicle)
+        scaled = self._scaled_by_ground(observation, ego, ground, self._ground)
+        self._ground.see_motion(_displacement(observation, scaled))
+        return scaled
+
+    def _scaled_by_ground(
+        self, observation: Observation, ego: EgoMotion, ground: GroundEstimate, ground_filter: GroundFilter
+    ) -> EgoMotion:
+        track = ground_filter.track(observation.vehicle)
         try:
             scaled, slope = scaled_by_ground(self._rig, observation, ego, ground, track)
         except ValueError:  # at a standstill, or over water and walls: the depth maps' scale stays
             return ego
-        self._ground.see_slope(slope)
+        ground_filter.see_slope(slope)
         return scaled
 
     def _is_plausible(self, displacement: FloatArray, interval_s: float) -> bool:

@@ -144,7 +144,7 @@ def judge_refusals(refusals: Sequence[Refusal]) -> list[Finding]:
 def judge_clock(clock: ClockEstimate | None) -> Finding:
     """Whether its stamps can be placed on this computer's clock."""
     if clock is None:
-        measured = "it does not answer TIMESYNC: attitudes count from when they arrive"
+        measured = "it does not answer TIMESYNC, or its stamps contradict it: attitudes count from when they arrive"
         return warned("clock", measured, "update the firmware, and check whether the link loses messages")
     measured = (
         f"{clock.offset_s:+.4f} s against this computer's, known to {1e3 * clock.error_s:.2f} ms; "

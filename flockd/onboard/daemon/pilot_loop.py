@@ -71,7 +71,7 @@ class PilotLoop:
         self._failure: str | None = None
         self._unexpected = 0
         """Errors in a row that nobody expects."""
-        self._height_reports = HeightReports()
+        self._height_reports, self._lens_reports = HeightReports(), LensReports()
         self._took_s: deque[float] = deque(maxlen=STEPS_REMEMBERED)
         self.frames: FrameSet | None = None
         """The newest; None before the first."""
@@ -152,9 +152,9 @@ class PilotLoop:
         self.newest = StepResult(taken_s, output, flight, number)
         self.stepped = frames, output
         self._count(self.newest)
-        report = self._height_reports.update(output.reasons)
-        if report is not None:
-            self._log_event(report)
+        for report in (self._height_reports.update(output.reasons), *self._lens_reports.update(output.reasons)):
+            if report is not None:
+                self._log_event(report)
         self._on_step(frames, vehicle, output, order)
 
     def _new_pilot(self) -> FlockPilot:
@@ -195,6 +195,21 @@ class HeightReports:
         if self._fault == before:
             return None
         return self._fault or "height: the range finder works again"
+
+
+class LensReports:
+    """Reports when a camera's lens begins to show too little, and when it is clear again."""
+
+    def __init__(self) -> None:
+        self._faults: dict[str, None] = {}
+
+    def update(self, reasons: Sequence[Reason]) -> list[str]:
+        """The sentences that a step's reasons are worth."""
+        before, self._faults = self._faults, dict.fromkeys(one.text for one in reasons if one.kind is ReasonKind.LENS)
+        begun = [fault for fault in self._faults if fault not in before]
+        return begun + [
+            f"{fault.partition(':')[0]}: its lens is clear again" for fault in before if fault not in self._faults
+        ]
 
 
 def _frame_period_s(config: DroneConfig) -> float:

@@ -68,6 +68,9 @@ def _mavlink(folder: Path) -> Check:
             name = random.choice(RECEIVED)
             received.add(name, {field: _value(random, kind) for field, kind in kinds[name].items()}, now_s)
             received.check_events.missing(now_s)
+            if random.random() < 0.3:  # replies of TIMESYNC, whose times are whatever somebody sends
+                for _ in range(random.choice((1, 6))):
+                    received.clock.add(now_s, random.choice((now_s, now_s + 0.9, any_float(random))), now_s + 0.002)
             if random.random() < 0.1:
                 received.add_other_heartbeat({"type": random.choice((2, 18, None, "18", 1e300))}, now_s)
         status, state = received.status(now_s), received.vehicle_state()
@@ -77,6 +80,7 @@ def _mavlink(folder: Path) -> Check:
         for vector in (status.position_ned, status.home_ned):
             assert vector is None or np.isfinite(vector).all()
         if state is not None:
+            assert now_s - 60.0 <= state.time_s <= now_s, "a state of another time"
             R = state.R_ned_body
             assert np.allclose(R @ R.T, np.eye(3), atol=1e-6), "an attitude that is no rotation"
             assert math.isfinite(state.height_m)

@@ -14,8 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from flockd.core.config.perception import RangeFinderParameters
+from flockd.core.consistency import RANGE_REPEATED
 from flockd.core.messages import FloatArray
 
+BY_BAROMETER = "the range contradicts the barometer"
 DOUBTED_AFTER = 2
 """Contradictions in a row: one alone may be a bird, or another drone below."""
 PROBATION_S = 3.0
@@ -23,6 +25,10 @@ PROBATION_S = 3.0
 FOLLOWED_M = 1.0
 """... with the ground as it was before; or with the height and itself, while it changes by this much. What is stuck or
 blocked does not change."""
+
+
+REPEATED = 8
+"""Readings: of noise of 1 cm, in whole centimetres, so many in a row are the same once in ten thousand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +44,35 @@ class GroundPoint:
     """As it was measured, slant."""
 
 
+class RepetitionMonitor:
+    """Notices readings that are the same to the last bit while the height changes. Call `update` for each step."""
+
+    def __init__(self, compare_s: float) -> None:
+        self._compare_s = compare_s
+        self._same: deque[tuple[GroundPoint, float]] = deque()
+        """Of the last seconds, those that are the same, each with the height then."""
+        self._reading_s = -np.inf
+        self._count = 0
+
+    def forget(self) -> None:
+        """What follows cannot be compared with what was."""
+        self._same.clear()
+
+    def update(self, point: GroundPoint, reading_s: float, height_m: float) -> GroundPoint | None:
+        """The first of the same readings, where a sensor that works would have said something else by now."""
+        if not self._same or point.range_m != self._same[0][0].range_m:
+            self._same.clear()
+            self._count = 0
+        self._count += reading_s != self._reading_s  # not the same one again
+        self._reading_s = reading_s
+        self._same.append((point, height_m))
+        while point.time_s - self._same[0][0].time_s > self._compare_s:
+            self._same.popleft()
+        heights_m = [height for _, height in self._same]
+        climbed = max(heights_m) - min(heights_m) >= RANGE_REPEATED.limit
+        return self._same[0][0] if climbed and self._count >= REPEATED else None
+
+
 class ContradictionMonitor:
     """Monitors one range finder. Call `update` once for each reading."""
 
@@ -49,11 +84,21 @@ class ContradictionMonitor:
         """Since it was doubted, from the last contradiction on; None: it is believed."""
         self._ground_before_m = 0.0
         self._contradictions = 0
+        self.why = BY_BAROMETER
+        """It is doubted, or the last reading was not used."""
 
     @property
     def doubted(self) -> bool:
         """It is not believed, however well a single reading fits."""
         return self._on_probation is not None
+
+    def doubt(self, point: GroundPoint, ground_before_m: float, why: str) -> None:
+        """From now on its range finder is doubted: another check than this one says so."""
+        if self._on_probation is None:
+            self._ground_before_m = ground_before_m
+        self._on_probation, self.why = [point], why
+        self._agreed.clear()
+        self._contradictions = 0
 
     def forget(self) -> None:
         """What follows cannot be compared with what was; a doubt remains."""
@@ -75,7 +120,7 @@ class ContradictionMonitor:
             if not self._is_rehabilitated(self._on_probation):
                 return True
             self._agreed.extend(self._on_probation[:-1])
-            self._on_probation = None
+            self._on_probation, self.why = None, BY_BAROMETER
         while self._agreed and point.time_s - self._agreed[0].time_s > self._parameters.compare_s:
             self._agreed.popleft()
         known = list(self._agreed)

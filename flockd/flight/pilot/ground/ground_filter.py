@@ -15,7 +15,8 @@ import numpy as np
 from flockd.core.choices import HeightSource
 from flockd.core.config.perception import RangeFinderParameters
 from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, Reason, ReasonKind, VehicleState
-from flockd.flight.pilot.ground.contradiction import ContradictionMonitor, GroundPoint
+from flockd.flight.pilot.ground.contradiction import ContradictionMonitor, GroundPoint, RepetitionMonitor
+from flockd.flight.pilot.ground.way_flown import Way, WayMonitor
 
 HEIGHT_NOISE_M = 0.03
 """Standard deviation of the autopilot's height from one reading to the next; what changes slowly does not matter."""
@@ -49,6 +50,14 @@ class GroundFilter:
         self._flown = np.zeros(2)
         """North and east since the beginning, as the autopilot says."""
         self._contradictions = ContradictionMonitor(parameters)
+        self._repetition = RepetitionMonitor(parameters.compare_s)
+        self._way_flown = WayMonitor(parameters.compare_s)
+        self._newest: GroundPoint | None = None
+        """Where the newest step's range hit the ground, used or not; None: it had none."""
+        self._moved: Way | None = None
+        """Of the newest step, by the autopilot's velocities; None: it does not say."""
+        self._used_height_m = 0.0
+        """Above the ground, of the newest step's scale."""
         self._track: deque[FloatArray] = deque(maxlen=TRACK_POINTS)
         """(3,) each: where a range hit the ground, north and east in that frame, and the ground's height there."""
 
@@ -61,6 +70,11 @@ class GroundFilter:
         """The ground at a step, and why its source is not the one that was wanted."""
         if self._source == "barometer":
             return level_ground(vehicle), None
+        ground, reason = self._judged(vehicle)
+        self._used_height_m = 0.0 if ground is None else ground.height_m
+        return ground, reason
+
+    def _judged(self, vehicle: VehicleState) -> tuple[GroundEstimate | None, Reason | None]:
         fault = self._follow(vehicle)
         age_s = vehicle.time_s - self._measured_s
         if self._state is not None and (fault is None or age_s <= self._parameters.bridge_s):
@@ -75,8 +89,24 @@ class GroundFilter:
         if self._state is not None:
             self._correct(np.eye(3)[1:], slope, np.eye(2) * SEEN_SLOPE**2)
 
+    def see_motion(self, displacement: FloatArray) -> None:
+        """Takes the way (3,) metres NED that the images of the newest step show, by the scale of its ground."""
+        if self._newest is None or self._moved is None or self._last is None:
+            self._way_flown.forget()
+            return
+        range_height_m = self._last.height_m - self._newest.ground_m
+        if not (range_height_m > 0.0 and self._used_height_m > 0.0):
+            self._way_flown.forget()
+            return
+        by_range = displacement * (range_height_m / self._used_height_m)
+        by_barometer = displacement * (self._last.height_m / self._used_height_m)
+        if self._way_flown.update(self._last.time_s, self._moved, by_range, by_barometer):
+            self._contradictions.doubt(self._newest, self._newest.ground_m, "the range contradicts the way flown")
+            self._forget()
+
     def _follow(self, vehicle: VehicleState) -> str | None:
         """Takes a step and its range; why that one is not used, None: it is."""
+        self._newest = None
         self._predict(vehicle)
         reading = vehicle.ground_range
         fault = reading_fault(reading, vehicle.time_s, self._parameters)
@@ -87,10 +117,14 @@ class GroundFilter:
         ground_m = _height_at(reading.time_s, vehicle) - float(point[2])
         place = GroundPoint(vehicle.time_s, self._flown + point[:2], ground_m, reading.range_m)
         home = None if vehicle.position is None else self._flown - vehicle.position
+        self._newest = place
+        repeated = self._repetition.update(place, reading.time_s, vehicle.height_m)
+        if repeated is not None:
+            self._contradictions.doubt(place, repeated.ground_m, "the range stays the same while the height changes")
         if self._contradictions.update(place, home):
             if self._contradictions.doubted:  # the readings before made the state false, too
                 self._forget()
-            return "the range contradicts the barometer"
+            return self._contradictions.why
         variance = (self._parameters.noise * reading.range_m) ** 2 + HEIGHT_NOISE_M**2
         row = np.array([1.0, point[0], point[1]])
         if self._state is not None and self._is_unexplained(row, ground_m, variance):
@@ -116,10 +150,13 @@ class GroundFilter:
         last, self._last = self._last, vehicle
         if last is None:
             return
+        self._moved = _moved(last, vehicle)
         way = _way(last, vehicle)
         if way is None or not 0.0 < vehicle.time_s - last.time_s <= LONGEST_GAP_S:
             self._forget()
             self._contradictions.forget()
+            self._repetition.forget()
+            self._way_flown.forget()
             return
         self._flown = self._flown + way
         if self._state is None:
@@ -175,7 +212,13 @@ def _way(before: VehicleState, now: VehicleState) -> FloatArray | None:
     """(2,) metres north and east that the autopilot says it flew; None: it does not say."""
     if before.position is not None and now.position is not None:
         return now.position - before.position
+    moved = _moved(before, now)
+    return None if moved is None else moved.metres[:2]
+
+
+def _moved(before: VehicleState, now: VehicleState) -> Way | None:
+    """By the autopilot's velocities; positions jump when its estimator is reset."""
     if before.velocity_ned is None or now.velocity_ned is None:
         return None
-    way: FloatArray = 0.5 * (before.velocity_ned + now.velocity_ned)[:2] * (now.time_s - before.time_s)
-    return way
+    elapsed_s = now.time_s - before.time_s
+    return Way(elapsed_s, 0.5 * (before.velocity_ned + now.velocity_ned) * elapsed_s)

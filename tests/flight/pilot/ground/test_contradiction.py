@@ -20,6 +20,8 @@ from flockd.sim.hills import hills
 
 STEP_S = 0.5
 LIE = Reason(ReasonKind.HEIGHT, "height: the range contradicts the barometer; the barometer's is used")
+STUCK = Reason(ReasonKind.HEIGHT, "height: the range stays the same while the height changes; the barometer's is used")
+WAY = Reason(ReasonKind.HEIGHT, "height: the range contradicts the way flown; the barometer's is used")
 Told = tuple[GroundEstimate | None, Reason | None]
 
 
@@ -31,9 +33,15 @@ class Drone:
         self.time_s, self.height_m, self.north_m, self.east_m = 0.0, height_m, 0.0, 0.0
 
     def step(
-        self, range_m: float | None, *, climb_m_s: float = 0.0, north_m_s: float = 0.0, R: FloatArray | None = None
+        self,
+        range_m: float | None,
+        *,
+        climb_m_s: float = 0.0,
+        north_m_s: float = 0.0,
+        R: FloatArray | None = None,
+        believed: FloatArray | None = None,
     ) -> Told:
-        """Half a second on; by default the range is the height."""
+        """Half a second on; by default the range is the height. ``believed``: the autopilot's velocity."""
         self.time_s += STEP_S
         self.height_m += climb_m_s * STEP_S
         self.north_m += north_m_s * STEP_S
@@ -41,7 +49,14 @@ class Drone:
         place = np.array([self.north_m, self.east_m])
         attitude = np.eye(3) if R is None else R
         return self.below.update(
-            VehicleState(self.time_s, attitude, self.height_m, np.zeros(3), place, ground_range=said)
+            VehicleState(
+                self.time_s,
+                attitude,
+                self.height_m,
+                np.zeros(3) if believed is None else believed,
+                place,
+                ground_range=said,
+            )
         )
 
     def hovers(self, seconds: float, range_m: float | None = None) -> list[Told]:
@@ -62,7 +77,74 @@ def test_stuck_while_the_drone_climbs_it_is_not_used_and_the_barometer_is() -> N
         assert isinstance(told[0], GroundEstimate)
         assert abs(told[0].height_m - (2.0 + 0.15 * (k + 1))) <= 1.0 + 0.08 * 2.0 + 2 * 0.15
     assert source(climb[-1]) == "barometer"
-    assert climb[-1][1] == LIE
+    assert climb[-1][1] == STUCK
+
+
+def climbs_at_an_angle(
+    drone: Drone, steps: int, range_m: Callable[[int], float], *, ground_rise: float = 0.0
+) -> list[tuple[Told, float]]:
+    """Flies north at 1 m/s and up at 0.2: what is told at each step, and the true height above the ground.
+
+    The images show the way in the scale of the height that is used, which is off by as much as that.
+    """
+    velocity, flown = np.array([1.0, 0.0, -0.2]), []
+    clearance_m = drone.height_m
+    for k in range(steps):
+        told = drone.step(range_m(k), climb_m_s=0.2, north_m_s=1.0, believed=velocity)
+        clearance_m += (0.2 - ground_rise) * STEP_S
+        assert isinstance(told[0], GroundEstimate)
+        drone.below.see_motion(velocity * STEP_S * told[0].height_m / clearance_m)
+        flown.append((told, clearance_m))
+    return flown
+
+
+@pytest.mark.parametrize(
+    ("noise_m", "reason", "most_off"), [(0.0, STUCK, 0.25), (0.01, WAY, 0.5)], ids=["to the last bit", "with noise"]
+)
+def test_stuck_during_a_climb_of_twenty_per_cent_it_is_found_out(
+    noise_m: float, reason: Reason, most_off: float
+) -> None:
+    """Ground that rises as fast looks the same to range finder and barometer: it was believed for the whole flight, at
+    its end 75 % off. Readings that are the same to the last bit tell, else the way flown, which takes longer.
+    """
+    drone = Drone(height_m=4.0)
+    drone.hovers(3.0)
+    flown = climbs_at_an_angle(drone, 120, lambda k: 4.0 + noise_m * (k % 3))
+    off = [abs(told[0].height_m / true_m - 1.0) for told, true_m in flown if told[0] is not None]
+    assert max(off) <= most_off
+    assert (source(flown[-1][0]), flown[-1][0][1]) == ("barometer", reason)
+    sources = [source(told) for told, _ in flown]
+    first = sources.index("barometer")
+    assert set(sources[first:]) == {"barometer"}, "never believed again while it is stuck"
+
+
+def test_stuck_it_is_not_believed_again_in_level_flight_and_works_when_it_works() -> None:
+    drone = Drone(height_m=4.0)
+    drone.hovers(3.0)
+    climbs_at_an_angle(drone, 12, lambda k: 4.0)
+    assert drone.height_m > 4.5
+    for _ in range(40):
+        told = drone.step(4.0, north_m_s=1.0)
+    assert source(told) == "barometer"
+    sources = [source(drone.step(None, north_m_s=1.0)) for _ in range(12)]
+    assert sources[-1] == "range_finder"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_ground_that_rises_as_fast_as_the_drone_is_no_lie(seed: int) -> None:
+    """Noise of 2 % of the range in whole centimetres, and an autopilot's velocity that wanders as PX4's does."""
+    drone, rng = Drone(height_m=4.0), np.random.default_rng(seed)
+    drone.hovers(3.0)
+    wander, told_all = np.zeros(3), set()
+    for _ in range(240):
+        wander = 0.9 * wander + math.sqrt(1 - 0.9**2) * 0.15 * rng.normal(size=3)
+        velocity = np.array([1.0, 0.0, -0.2])
+        seen_m = round(4.0 * (1.0 + 0.02 * float(rng.normal())), 2)
+        told = drone.step(seen_m, climb_m_s=0.2, north_m_s=1.0, believed=velocity + wander)
+        told_all.add(told[1])
+        assert isinstance(told[0], GroundEstimate)
+        drone.below.see_motion(velocity * STEP_S * (1.0 + 0.02 * float(rng.normal())))
+    assert told_all == {None}
 
 
 @pytest.mark.parametrize("range_m", [0.3, 7.0], ids=["landing gear in the beam", "a jump"])
